@@ -1,4 +1,4 @@
-"""Three sensors or more."""
+"""Rigs: three sensors or more."""
 
 from pathlib import Path
 from typing import Any

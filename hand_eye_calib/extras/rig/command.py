@@ -1,4 +1,4 @@
-"""A rig of three sensors or more: calibrated, printed and saved."""
+"""Rigs on the command line: calibrate three sensors or more, print and save the result."""
 
 import argparse
 from typing import TYPE_CHECKING
@@ -29,17 +29,18 @@ if TYPE_CHECKING:
 
 
 def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
-    """Calibrate a rig from a trajectory file of each sensor, or from topics of bags, print it and
-    save it if ``--out`` asks for that; returns the exit code.
+    """Calibrate a rig, print it, and save it if ``--out`` is set; return the exit code.
 
-    ``as_given`` puts the name of a remote bag back into plain values.
+    The data are a trajectory file for each sensor, or topics of bags. ``as_given`` puts the name of
+    a remote bag back into plain values.
     """
     from hand_eye_calib.extras.rig import rig as of_rig
     from hand_eye_calib.formats.results import fingerprint, save_rig
 
     if arguments.installed or arguments.base_frame:
         raise ConfigError("--installed and --base-frame are of two sensors, not of a rig")
-    if topics := arguments.topics:
+    topics = arguments.topics
+    if topics:
         from hand_eye_calib.formats.bags.reader import PoseBag
         from hand_eye_calib.formats.bags.sources import source_of
         from hand_eye_calib.offline.cli.bags import read_sources, refuse_recordings
@@ -61,13 +62,15 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         notes = [*repairs, *doubts]
         inputs = {"files": names}
     note(*notes)
-    frames = [each.sensor_frame or name for each, name in zip(trajectories, names, strict=True)]
-    if twice := [each for each in frames if frames.count(each) > 1]:
-        raise ConfigError(
-            f"two trajectories of the rig are of one sensor, {twice[0]!r}: sensors have the names "
-            "of their frames or files, which must differ"
-        )
-    sensors = dict(zip(frames, trajectories, strict=True))
+    sensors = {}
+    for trajectory, name in zip(trajectories, names, strict=True):
+        frame = trajectory.sensor_frame or name
+        if frame in sensors:
+            raise ConfigError(
+                f"two trajectories of the rig are of one sensor, {frame!r}: sensors have the names "
+                "of their frames or files, which must differ"
+            )
+        sensors[frame] = trajectory
     inputs = as_given(inputs) | {"options": options_from(arguments)}
     with waiting_for(f"solving for {len(sensors)} sensors"):
         rig = of_rig.calibrate_rig(sensors, inputs["options"])
@@ -75,26 +78,26 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         note(f"wrote {save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs)}")
     try:
         print_result(as_lines(rig), rig.to_dict() | {"inputs": inputs} if arguments.json else None)
-    finally:  # even if the reader of what is printed has gone
+    finally:  # also if the reader of the printed lines has ended
         if arguments.out:
             from hand_eye_calib.extras.rig.page import write_rig_report
 
             write_rig_report(arguments.out, rig, names)
-    failed = [each for each in rig.calibrations if each.status.failure]
-    for each in failed:
-        fail(f"{each.child_frame}: {each.headline}", 1)
+    failed = [calibration for calibration in rig.calibrations if calibration.status.failure]
+    for calibration in failed:
+        fail(f"{calibration.child_frame}: {calibration.headline}", 1)
     return 1 if failed else max(map(exit_code, rig.calibrations))
 
 
 def as_lines(rig: "RigCalibration") -> list[str]:
-    """What a person needs to see of a rig: extrinsics, closure."""
+    """Return the lines of a rig for a terminal: extrinsics and closures."""
     lines = [f"{rig.verdict.value}: {len(rig.sensors)} sensors", ""]
-    for each in rig.calibrations:
-        first, *others = verdict_lines(each)
-        lines += [f"{each.child_frame} in {each.parent_frame}: {first}", *others]
-        lines += transform_lines(transforms_of(each)["T_parent_child"])
-        lines += [*allowance_lines(each), ""]
-    lines += ["Results for two sensors at a time"]
-    for one in rig.closures:
-        lines += wrapped(one.sentence, "  ", "    ")
+    for calibration in rig.calibrations:
+        first, *others = verdict_lines(calibration)
+        lines += [f"{calibration.child_frame} in {calibration.parent_frame}: {first}", *others]
+        lines += transform_lines(transforms_of(calibration)["T_parent_child"])
+        lines += [*allowance_lines(calibration), ""]
+    lines.append("Results for two sensors at a time")
+    for closure in rig.closures:
+        lines += wrapped(closure.sentence, "  ", "    ")
     return lines

@@ -1,4 +1,4 @@
-"""The report of a rig: where its sensors are, and whether results for two at a time close."""
+"""Report of a rig: poses of its sensors, and closure of the results for two at a time."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,19 +11,17 @@ from hand_eye_calib.offline.cli.reporting import write_page
 from hand_eye_calib.offline.report.figures import figure_of_views
 from hand_eye_calib.offline.report.report import TONES, page
 
-# Frame of a child sensor that names none: in a rig it has the name of its input.
+# Frame of a child sensor without name. In a rig such a sensor has the name of its input.
 _NAMELESS = "child_sensor"
 
 
 def write_rig_report(directory: Path, rig: RigCalibration, names: Sequence[str]) -> None:
-    """Write the report of a rig, whose sensors have these files, topics or frames."""
+    """Write the report of a rig; ``names`` are files, topics or frames of its sensors."""
     write_page(directory, lambda: render_rig(rig, names))
 
 
 def render_rig(rig: RigCalibration, inputs: Sequence[str]) -> str:
-    """The report of a rig as HTML: where its sensors are, and whether results for two sensors at a
-    time close; ``inputs`` are where the trajectories came from.
-    """
+    """Return the report of a rig as HTML; ``inputs`` are the sources of its trajectories."""
     return page(
         Path(__file__).with_name("rig.html"),
         TONES[rig.verdict.value],
@@ -32,8 +30,8 @@ def render_rig(rig: RigCalibration, inputs: Sequence[str]) -> str:
         rig=rig,
         inputs=inputs,
         poses=[
-            printed_numbers(transforms_of(each)["T_parent_child"], (), "±")
-            for each in rig.calibrations
+            printed_numbers(transforms_of(calibration)["T_parent_child"], (), "±")
+            for calibration in rig.calibrations
         ],
         figures=[figure_of_views(rig.calibrations)],
     )
@@ -42,9 +40,8 @@ def render_rig(rig: RigCalibration, inputs: Sequence[str]) -> str:
 def write_session_rig(directory: Path, session: SessionResult) -> None:
     """Solve for all sensors of a session together, and write the files and the page.
 
-    A time offset and a scale in numbers are the child's, which has them; the others have none.
+    A time offset or a scale in numbers is that of the first child; the other children have none.
     """
-
     config = session.snapshot.config
     parent, child = session.snapshot.streams
     of_all = ["method", "max_gap", "target.translation", "target.rotation"]

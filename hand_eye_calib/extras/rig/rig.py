@@ -1,5 +1,8 @@
-"""Whole trajectories of several sensors in, the extrinsics of all of them out: a tree of
-extrinsics, and the closure test.
+"""Extrinsics of three sensors or more, and the closure test.
+
+Model: X_1k is the pose of sensor k in the frame of the first sensor. Answers for the first sensor
+with every other one, and for neighbours in the list, close if X_1k X_k(k+1) = X_1(k+1). Weighted
+least squares shares what they miss closing by among the X_1k.
 """
 
 from __future__ import annotations
@@ -26,7 +29,7 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import synchronise
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
 
-# Options that are of one pair of sensors, by their beginnings.
+# Beginnings of the names of options for two sensors.
 _OF_ONE_PAIR = ("parent_", "child_", "base_frame", "prior")
 
 
@@ -41,8 +44,8 @@ def calibrate_rig(
 
     Every other sensor is calibrated against the first one, as
     :func:`~hand_eye_calib.offline.calibrate.calibrate` does, and neighbours in the list against
-    each other. What these answers miss closing by tests them. It is then shared among them, so that
-    any chain of extrinsics between two sensors gives the same.
+    each other. The closure of these answers tests them. The closure error is then distributed, so
+    that all chains of extrinsics between two sensors agree.
 
     Parameters
     ----------
@@ -52,7 +55,7 @@ def calibrate_rig(
         By their public names, such as method, max_gap or target.translation; see
         :class:`~hand_eye_calib.core.base.config.CalibratorConfig`.
     time_offset, scale : str, optional
-        "estimate", for the scale also "auto" or "none": of every sensor against the first one.
+        "estimate", for the scale also "auto" or "none"; for every sensor against the first one.
 
     Raises
     ------
@@ -67,48 +70,51 @@ def calibrate_rig(
     >>> len(rig.calibrations)
     2
     """
-    named = {"time_offset": time_offset, "scale": scale}
-    options = dict(options or {}) | {name: each for name, each in named.items() if each is not None}
-    _refuse(trajectories, options)
-    first, *rest = [
+    options = dict(options or {})
+    if time_offset is not None:
+        options["time_offset"] = time_offset
+    if scale is not None:
+        options["scale"] = scale
+    _require_rig(trajectories, options)
+    first, *others = [
         replace(trajectory, sensor_frame=frame_name(name))
         for name, trajectory in trajectories.items()
     ]
-    star = []
-    moved = []
-    for other in rest:
-        found = run(whole_snapshot(first, other, options))
-        answer = found.calibration
-        star.append(answer)
-        other = _as_solved(other, found)
-        moved.append(other.scaled(answer.scale).shifted(answer.time_offset_s))
-    couples = zip(star, moved, moved[1:], strict=False)
-    chain = [_between(*each, found.snapshot.config.max_gap) for each in couples]
-    sensors = (first.sensor_frame, *(answer.child_frame for answer in star))
-    return RigCalibration.of(sensors, star, chain)
+    attempts = [run(whole_snapshot(first, other, options)) for other in others]
+    star = [attempt.calibration for attempt in attempts]
+    aligned = [_aligned(other, attempt) for other, attempt in zip(others, attempts, strict=True)]
+    max_gap_s = attempts[0].snapshot.config.max_gap
+    neighbours = [
+        _between(before, after, calibration.method, max_gap_s)
+        for calibration, before, after in zip(star, aligned, aligned[1:], strict=False)
+    ]
+    sensors = (first.sensor_frame, *(calibration.child_frame for calibration in star))
+    return RigCalibration.of(sensors, star, neighbours)
 
 
-def _as_solved(child: Trajectory, found: Attempt) -> Trajectory:
-    """Return the poses of a child as a run has read them, with the name of the sensor's frame.
+def _aligned(child: Trajectory, attempt: Attempt) -> Trajectory:
+    """Return the poses of a child in the convention, unit and clock of an attempt.
 
-    Inverse poses are those of the other frame of the stream: of a camera that sees a marker.
+    The frame has the name of the result: inverse poses are those of the other frame of the stream,
+    such as those of a camera that observes a marker.
     """
-    config = found.snapshot.config
+    config = attempt.snapshot.config
+    calibration = attempt.calibration
     poses = se3.put_right(child.poses, config.child_invert, config.child_quaternion)
-    return replace(child, poses=poses, sensor_frame=found.calibration.child_frame)
+    child = replace(child, poses=poses, sensor_frame=calibration.child_frame)
+    return child.scaled(calibration.scale).shifted(calibration.time_offset_s)
 
 
-def _between(
-    answer: Calibration, before: Trajectory, after: Trajectory, max_gap_s: float
-) -> Calibration:
-    """The answer for two neighbours, on one clock and in one unit, by the method of another."""
+def _between(before: Trajectory, after: Trajectory, method: str, max_gap_s: float) -> Calibration:
+    """Calibrate two neighbours, which have one clock and one unit of length."""
     pairs = synchronise(before, after, max_gap_s)
-    config = CalibratorConfig(method=answer.method, max_pairs=max(len(pairs), 10))
-    found = solve_poses(pairs, config).calibration()
-    return replace(found, parent_frame=before.sensor_frame, child_frame=after.sensor_frame)
+    config = CalibratorConfig(method=method, max_pairs=max(len(pairs), 10))
+    calibration = solve_poses(pairs, config).calibration()
+    return replace(calibration, parent_frame=before.sensor_frame, child_frame=after.sensor_frame)
 
 
-def _refuse(trajectories: Mapping[str, Trajectory], options: Mapping[str, Any]) -> None:
+def _require_rig(trajectories: Mapping[str, Trajectory], options: Mapping[str, Any]) -> None:
+    """Raise InputError or ConfigError if a rig cannot have these trajectories or options."""
     if len(trajectories) < 3:
         raise InputError(
             f"a rig has at least three sensors; found {len(trajectories)}: two are calibrated as "
@@ -130,26 +136,26 @@ def _refuse(trajectories: Mapping[str, Trajectory], options: Mapping[str, Any]) 
             )
 
 
-# Variances (m^2, rad^2) of directions that are unknown are larger.
+# Variance (m^2, rad^2) above which a direction counts as unknown.
 _UNKNOWN = 1.0
 
-# Variance (m^2, rad^2) that no answer is better than: that of poses without noise is zero.
+# Smallest variance (m^2, rad^2) of an answer: poses without noise have none.
 _ROUNDING = 1e-16
 
 
 @dataclass(frozen=True)
 class Closure:
-    """How far the pairwise answers of three sensors are from closing.
+    """Closure error of the answers for three sensors, two at a time.
 
     Attributes
     ----------
     sensors : (str, str, str)
     translation_m, rotation_rad : float
         Size of ``T_ab T_bc T_ca``, which is the identity without errors, along directions that all
-        three answers know.
+        three answers determine.
     chi2 : float
-        The same in standard deviations, squared: with the covariances of the three answers as if
-        they were independent. They share sensors, so that it is rather smaller than by chance.
+        The same squared in standard deviations, as if the three answers were independent. They
+        share sensors, so that chi2 is rather too small.
     dof : int
         Number of these directions.
     """
@@ -162,15 +168,15 @@ class Closure:
 
     @property
     def closes(self) -> bool:
-        """Whether chance makes it so large more than once in a hundred times."""
+        """Whether chi2 is not significant at 1 %."""
         return self.dof == 0 or self.chi2 <= CHI2[0.01][self.dof]
 
     @property
     def sentence(self) -> str:
-        """The closure in one sentence."""
-        how = "closes" if self.closes else "DOES NOT CLOSE"
+        """Closure error in one sentence."""
+        outcome = "closes" if self.closes else "DOES NOT CLOSE"
         return (
-            f"{' - '.join(self.sensors)} {how}: off by {length(self.translation_m)} and "
+            f"{' - '.join(self.sensors)} {outcome}: off by {length(self.translation_m)} and "
             f"{angle(self.rotation_rad)}, chi-square {self.chi2:.1f} with "
             f"{self.dof} degrees of freedom"
         )
@@ -183,13 +189,13 @@ class RigCalibration:
     Attributes
     ----------
     sensors : tuple of str
-        Frames of the S sensors. All extrinsics are stated in the first one's.
+        Frames of the S sensors. The first frame is that of all extrinsics.
     calibrations : tuple of Calibration
-        Of every other sensor in the frame of the first one: S - 1.
+        S - 1 results: every other sensor in the frame of the first sensor.
     neighbours : tuple of Calibration
-        Of every sensor from the third one on in the frame of the one before it: S - 2.
+        S - 2 results: every sensor from the third on in the frame of its predecessor.
     closures : tuple of Closure
-        Of answers for two sensors at a time: the first and two neighbours in the list each.
+        S - 2 closures: the first sensor with two neighbours in the list.
 
     Examples
     --------
@@ -210,17 +216,18 @@ class RigCalibration:
         star: Sequence[Calibration],
         neighbours: Sequence[Calibration],
     ) -> RigCalibration:
-        """From answers for two sensors at a time. What they miss closing by is shared among them,
-        as far as each is uncertain.
+        """Return the rig from answers for two sensors at a time.
+
+        The closure errors are distributed by the covariances of the answers.
         """
         triangles = zip(star, neighbours, star[1:], strict=False)
         closures = tuple(closure(*answers) for answers in triangles)
-        found = cls(sensors, tuple(star), tuple(neighbours), closures)
+        rig = cls(sensors, tuple(star), tuple(neighbours), closures)
         calibrations = tuple(
-            replace(each, T_parent_child=se3.exp(step) @ each.T_parent_child)
-            for each, step in zip(star, found._steps(), strict=True)
+            replace(calibration, T_parent_child=se3.exp(step) @ calibration.T_parent_child)
+            for calibration, step in zip(star, rig._steps(), strict=True)
         )
-        return replace(found, calibrations=calibrations)
+        return replace(rig, calibrations=calibrations)
 
     def __repr__(self) -> str:
         return f"{self.verdict.value}: {listing(self.sensors)}"
@@ -228,78 +235,84 @@ class RigCalibration:
     @property
     def verdict(self) -> Verdict:
         """The gravest verdict of all extrinsics."""
-        return max((each.verdict for each in self.calibrations), key=[*Verdict].index)
+        verdicts = [calibration.verdict for calibration in self.calibrations]
+        return max(verdicts, key=[*Verdict].index)
 
     @cached_property
     def Xs(self) -> FloatArray:
-        """Poses (S, 4, 4) of the sensors in the frame of the first one."""
-        return np.array([np.eye(4), *(each.T_parent_child for each in self.calibrations)])
+        """Poses (S, 4, 4) of the sensors in the frame of the first sensor."""
+        Xs = [calibration.T_parent_child for calibration in self.calibrations]
+        return np.array([np.eye(4), *Xs])
 
     def _steps(self) -> FloatArray:
-        """Changes (S - 1, 6) of the extrinsics, in the frame of the first sensor, that make all
-        answers close: weighted least squares.
+        """Return the changes (S - 1, 6) of the extrinsics that make all answers close.
+
+        The changes are in the frame of the first sensor, by weighted least squares: normal
+        equations ``H x = s``.
         """
         K = len(self.calibrations)
-        information = np.zeros((K, 6, K, 6))
-        pulled = np.zeros((K, 6))
-        for at, (each, X) in enumerate(zip(self.calibrations, self.Xs[1:], strict=True)):
-            information[at, :, at] += np.linalg.inv(_moved(each, X))
-        for at, each in enumerate(self.neighbours):
-            before = self.Xs[at + 1]
-            after = self.Xs[at + 2]
-            miss = se3.log(before @ each.T_parent_child @ se3.inverse(after))
-            weight = np.linalg.inv(_moved(each, after))
-            for row, sign in ((at + 1, 1.0), (at, -1.0)):
-                pulled[row] += sign * weight @ miss
-                information[row, :, at + 1] += sign * weight
-                information[row, :, at] -= sign * weight
-        steps = np.linalg.solve(information.reshape(6 * K, 6 * K), pulled.ravel())
+        H = np.zeros((K, 6, K, 6))
+        s = np.zeros((K, 6))
+        for k, calibration in enumerate(self.calibrations):
+            H[k, :, k] += np.linalg.inv(_in_first(calibration, self.Xs[k + 1]))
+        for k, neighbour in enumerate(self.neighbours):
+            before = self.Xs[k + 1]
+            after = self.Xs[k + 2]
+            error = se3.log(before @ neighbour.T_parent_child @ se3.inverse(after))
+            weight = np.linalg.inv(_in_first(neighbour, after))
+            for row, sign in ((k + 1, 1.0), (k, -1.0)):
+                s[row] += sign * weight @ error
+                H[row, :, k + 1] += sign * weight
+                H[row, :, k] -= sign * weight
+        steps = np.linalg.solve(H.reshape(6 * K, 6 * K), s.ravel())
         return np.asarray(steps.reshape(K, 6))
 
     def T(self, first: str, second: str) -> FloatArray:
-        """Pose (4, 4) of the second sensor in the frame of the first."""
+        """Return the pose (4, 4) of the second sensor in the frame of the first."""
         before, after = self.Xs[[self.sensors.index(first), self.sensors.index(second)]]
         return se3.inverse(before) @ after
 
     def covariance(self, first: str, second: str) -> FloatArray:
-        """Covariance (6, 6) of xi = (rho, phi) in ``T(first, second) @ Exp(xi)``, m and rad.
+        """Return the covariance (6, 6) of xi = (rho, phi) in ``T(first, second) @ Exp(xi)``.
 
-        It is that of the answer for both, with the allowance. Without one it is the sum of those
-        with the first sensor: rather too large, as it has that sensor's errors twice.
+        The covariance, in m and rad, is that of the answer for both sensors, with the allowance. If
+        there is none, it is the sum of their covariances with the first sensor of the rig, which
+        contains that sensor's errors twice.
         """
         return self._covariance(first, second, with_allowance=True)
 
     def covariance_measured(self, first: str, second: str) -> FloatArray:
-        """The part (6, 6) of :meth:`covariance` that the recordings show."""
+        """Return :meth:`covariance` without the allowance."""
         return self._covariance(first, second, with_allowance=False)
 
     def _covariance(self, first: str, second: str, with_allowance: bool) -> FloatArray:
         near, far = sorted(map(self.sensors.index, (first, second)))
         if near == far:
             return np.zeros((6, 6))
-        answers = [(self.calibrations[at - 1], self.Xs[at]) for at in (near, far) if at]
         if 0 < near == far - 1:
             answers = [(self.neighbours[near - 1], self.Xs[far])]
+        else:
+            answers = [(self.calibrations[k - 1], self.Xs[k]) for k in (near, far) if k]
         to_second = se3.adjoint(self.T(second, self.sensors[0]))
-        in_first = np.sum([_moved(*each, with_allowance) for each in answers], axis=0)
+        in_first = np.sum([_in_first(*answer, with_allowance) for answer in answers], axis=0)
         return np.asarray(to_second @ in_first @ to_second.T)
 
     def to_dict(self) -> Document:
-        """Everything in plain values."""
+        """Return the rig in plain values."""
         return {
             "format": "hand_eye_calib/rig",
             "version": 1,
             "sensors": list(self.sensors),
             "verdict": self.verdict.value,
-            "closures": [plain(each) | {"closes": each.closes} for each in self.closures],
-            "calibrations": {each.child_frame: each.to_dict() for each in self.calibrations},
+            "closures": [plain(closure) | {"closes": closure.closes} for closure in self.closures],
+            "calibrations": {
+                calibration.child_frame: calibration.to_dict() for calibration in self.calibrations
+            },
         }
 
 
-def _moved(calibration: Calibration, X: FloatArray, with_allowance: bool = False) -> FloatArray:
-    """Covariance (6, 6) of an answer in the frame that its child has the pose X (4, 4) in; the
-    measured part, unless the allowance is asked for.
-    """
+def _in_first(calibration: Calibration, X: FloatArray, with_allowance: bool = False) -> FloatArray:
+    """Return the covariance (6, 6) of an answer in the frame in which its child has the pose X."""
     adjoint = se3.adjoint(X)
     covariance = calibration.covariance_measured + _ROUNDING * np.eye(6)
     if with_allowance:
@@ -307,19 +320,19 @@ def _moved(calibration: Calibration, X: FloatArray, with_allowance: bool = False
     return np.asarray(adjoint @ covariance @ adjoint.T)
 
 
-def closure(to_second: Calibration, on: Calibration, to_third: Calibration) -> Closure:
-    """How the answers for a -> b, b -> c and a -> c close."""
-    ahead = to_second.T_parent_child @ on.T_parent_child
-    covariance = _moved(to_second, to_second.T_parent_child) + _moved(on, ahead)
-    covariance += _moved(to_third, to_third.T_parent_child)
+def closure(to_second: Calibration, between: Calibration, to_third: Calibration) -> Closure:
+    """Return the closure of the answers for a -> b, b -> c and a -> c."""
+    chain = to_second.T_parent_child @ between.T_parent_child
+    covariance = _in_first(to_second, to_second.T_parent_child) + _in_first(between, chain)
+    covariance += _in_first(to_third, to_third.T_parent_child)
     variances, axes = np.linalg.eigh(covariance)
     is_known = variances < _UNKNOWN
-    along = axes[:, is_known].T @ se3.log(ahead @ to_third.T_child_parent)
-    miss = axes[:, is_known] @ along
+    along = axes[:, is_known].T @ se3.log(chain @ to_third.T_child_parent)
+    error = axes[:, is_known] @ along
     return Closure(
         sensors=(to_second.parent_frame, to_second.child_frame, to_third.child_frame),
-        translation_m=float(np.linalg.norm(miss[:3])),
-        rotation_rad=float(np.linalg.norm(miss[3:])),
+        translation_m=float(np.linalg.norm(error[:3])),
+        rotation_rad=float(np.linalg.norm(error[3:])),
         chi2=float((along**2 / variances[is_known]).sum()),
         dof=int(is_known.sum()),
     )
