@@ -1,5 +1,6 @@
-"""The commands ``calibrate --batch`` and ``calibrate RECORDING RECORDING ...``: what was done
-already, what is left, and what all results say.
+"""Commands ``calibrate --batch`` and ``calibrate RECORDING RECORDING ...``.
+
+Results of an earlier run are reused; results of one vehicle are combined.
 """
 
 import argparse
@@ -32,15 +33,18 @@ from hand_eye_calib.offline.cli.options import (
 from hand_eye_calib.offline.cli.present import deliver, wrapped
 from hand_eye_calib.offline.cli.reporting import REPORT
 
-# The worst come first on the terminal; rows.csv has all.
+# Largest number of results on the terminal, the worst first; rows.csv has all.
 _MOST_LINES = 200
-_GRAVITY = ("failed", *(each.value for each in reversed(Verdict)))
-# Text that begins with one of these is a formula to spreadsheets, with full width to some.
+
+# Verdicts of outcomes, the worst first.
+_GRAVITY = ("failed", *(verdict.value for verdict in reversed(Verdict)))
+
+# Beginnings of formulas in spreadsheets; some spreadsheets also accept full-width characters.
 _FORMULA = ("=", "+", "-", "@", *"＝＋－＠")
 
 
 def run_batch(arguments: argparse.Namespace) -> int:
-    """Calibrate from many recordings; returns the exit code. A bag that fails is a row."""
+    """Calibrate from many recordings; return the exit code. A bag that fails is a row."""
     title = " ".join(arguments.batch)
     with waiting_for(f"looking for {title}"):
         groups = [[bag] for pattern in arguments.batch for bag in matching(pattern)]
@@ -51,44 +55,49 @@ def run_batch(arguments: argparse.Namespace) -> int:
     if arguments.json:
         document = {
             "batch": title,
-            "counts": dict(Counter(one.verdict for one in done)),
-            "failures": [one.row["name"] for one in done if one.row["error"]],
-            "vehicles": {name: each.to_dict() for name, each in vehicles.items()},
+            "counts": dict(Counter(outcome.verdict for outcome in done)),
+            "failures": [outcome.row["name"] for outcome in done if outcome.row["error"]],
+            "vehicles": {name: result.to_dict() for name, result in vehicles.items()},
         }
-        # Their outcomes one by one: they may be many.
+        # Outcomes are JSON texts already.
         print(json_text(document).removesuffix("\n}") + ',\n  "results": [')
-        print(",\n".join(f"    {one.text}" for one in done) + "\n  ]\n}")
+        print(",\n".join(f"    {outcome.text}" for outcome in done) + "\n  ]\n}")
     else:
         _print_results(done, vehicles)
-    alone = sum(bool(one.row["verdict"] and not one.row["vehicle"]) for one in done)
-    if alone > 1:
+    n_alone = sum(bool(outcome.row["verdict"] and not outcome.row["vehicle"]) for outcome in done)
+    if n_alone > 1:
         note(
-            f"{alone} recordings are not compared with each other: give --vehicle with the place "
+            f"{n_alone} recordings are not compared with each other: give --vehicle with the place "
             "of the vehicle in their paths, such as 'fleet/{vehicle}/*'"
         )
-    codes = {one.code for one in done}
+    codes = {outcome.code for outcome in done}
     return 1 if 1 in codes else max(codes)
 
 
 def run_together(arguments: argparse.Namespace, groups: Sequence[Sequence[Path | str]]) -> int:
-    """Calibrate from several recordings of one rig, each given by its bags, for one result; returns
-    the exit code.
+    """Calibrate from several recordings of one rig for one result; return the exit code.
+
+    ``groups`` are the bags of each recording.
     """
     done = _all_done([[*map(str, group)] for group in groups], "rig", arguments)
-    usable = {one.row["name"]: one.calibration for one in done if one.row["verdict"]}
+    usable = {
+        outcome.row["name"]: outcome.calibration for outcome in done if outcome.row["verdict"]
+    }
     if not usable:
-        raise InputError("; ".join(f"{one.row['name']}: {one.row['error']}" for one in done))
-    found = together(usable)
+        errors = [f"{outcome.row['name']}: {outcome.row['error']}" for outcome in done]
+        raise InputError("; ".join(errors))
+    result = together(usable)
     if arguments.out:
-        _write_rows_and_page(arguments.out, "recordings of one rig", done, {"rig": found}, REPORT)
-    code = deliver(found, {"recordings": {one.row["name"]: one.inputs for one in done}}, arguments)
-    return 1 if any(one.row["error"] for one in done) else code
+        _write_rows_and_page(arguments.out, "recordings of one rig", done, {"rig": result}, REPORT)
+    inputs = {"recordings": {outcome.row["name"]: outcome.inputs for outcome in done}}
+    code = deliver(result, inputs, arguments)
+    return 1 if any(outcome.row["error"] for outcome in done) else code
 
 
 def _all_done(
     groups: Sequence[Sequence[str]], vehicle: str, arguments: argparse.Namespace
 ) -> list[Outcome]:
-    """The recordings of an earlier run, and of this one, in their order."""
+    """Return the outcomes of all recordings in order, those of an earlier run reused."""
     out: Path | None = arguments.out
     tasks = tasks_of(
         groups,
@@ -98,31 +107,33 @@ def _all_done(
         with_fingerprints=bool(out),
         with_report=bool(out) and not arguments.no_report,
     )
-    found: dict[str, Outcome] = {}
-    for task in with_progress(tasks, len(tasks), "looking for earlier results") if out else ():
-        if earlier := stored(task, arguments.out):
-            found[task.name] = earlier
-    if found:
-        note(f"{len(found)} of {len(tasks)} bags are done already; their results are in {out}")
-    waiting = [task for task in tasks if task.name not in found]
-    doing = outcomes(waiting, arguments.jobs or os.cpu_count() or 1, arguments.dask)
-    for task, outcome in with_progress(doing, len(waiting), "calibrating"):
-        found[task.name] = outcome._replace(page="")
+    done: dict[str, Outcome] = {}
+    if out:
+        for task in with_progress(tasks, len(tasks), "looking for earlier results"):
+            earlier = stored(task, out)
+            if earlier:
+                done[task.name] = earlier
+    if done:
+        note(f"{len(done)} of {len(tasks)} bags are done already; their results are in {out}")
+    waiting = [task for task in tasks if task.name not in done]
+    running = outcomes(waiting, arguments.jobs or os.cpu_count() or 1, arguments.dask)
+    for task, outcome in with_progress(running, len(waiting), "calibrating"):
+        done[task.name] = outcome._replace(page="")
         if out:
             _store(task, outcome, out)
-        if outcome.row["error"] or not sys.stderr.isatty():
-            told = outcome.row["error"] or outcome.row["headline"]
-            note(f"{len(found)} of {len(tasks)}: {task.name}: {told}")
-    return [found[task.name] for task in tasks]
+        error = outcome.row["error"]
+        if error or not sys.stderr.isatty():
+            note(f"{len(done)} of {len(tasks)}: {task.name}: {error or outcome.row['headline']}")
+    return [done[task.name] for task in tasks]
 
 
 def stored(task: Task, directory: Path) -> Outcome | None:
-    """What an earlier run did; None if there is nothing, it failed, or something has changed."""
+    """Return the outcome of an earlier run; None if it is absent, failed or of other data."""
     try:
         about, text = (directory / task.name / work.STATE).read_text(encoding="utf-8").splitlines()
         state = json.loads(about)
         return Outcome(state["row"], state["code"], text) if state["key"] == task.key() else None
-    except Exception:  # to be done again, whatever is wrong with it
+    except Exception:  # the task is repeated, whatever is wrong with the file
         return None
 
 
@@ -133,49 +144,58 @@ def _store(task: Task, outcome: Outcome, directory: Path) -> None:
         save_result(outcome.calibration, folder, outcome.inputs)
     if outcome.page:
         save_text(folder / REPORT, outcome.page)
-    # What failed is done again in any case, and its bag may be out of reach.
+    # A failed task is always repeated; its bag may be out of reach for a key.
     key = "" if outcome.row["error"] else task.key()
     about = json.dumps({"key": key, "row": outcome.row, "code": outcome.code})
     save_text(folder / work.STATE, f"{about}\n{outcome.text}\n")
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
-    """Write a CSV file of rows: text in quotes, numbers without, what is not known empty."""
+    """Write a CSV file of rows: texts in quotes, numbers without, unknown values empty."""
     text = io.StringIO()
     columns = [*max(rows, key=len)]
     writer = csv.DictWriter(text, columns, None, lineterminator="\n", quoting=csv.QUOTE_NONNUMERIC)
     writer.writeheader()
     for row in rows:
-        texts = {name: value for name, value in row.items() if isinstance(value, str)}
-        # An apostrophe stands before text that would be a formula.
-        are = {name: f"'{text}" for name, text in texts.items() if text.lstrip()[:1] in _FORMULA}
-        writer.writerow(row | are)
+        safe = dict(row)
+        for name, value in row.items():
+            # An apostrophe prevents that a text becomes a formula.
+            if isinstance(value, str) and value.lstrip()[:1] in _FORMULA:
+                safe[name] = f"'{value}"
+        writer.writerow(safe)
     save_text(path, text.getvalue())
 
 
 def _vehicles(done: Sequence[Outcome], directory: Path | None) -> dict[str, Calibration]:
-    """What the recordings of each vehicle say together, or said in an earlier run, if the same."""
+    """Return the common result of the recordings of each vehicle, by the vehicle's name.
+
+    The result of an earlier run with the same recordings is reused.
+    """
     groups: dict[str, list[Outcome]] = {}
-    for one in done:
-        if one.row["vehicle"] and one.row["verdict"]:
-            groups.setdefault(one.row["vehicle"], []).append(one)
-    found: dict[str, Calibration] = {}
+    for outcome in done:
+        if outcome.row["vehicle"] and outcome.row["verdict"]:
+            groups.setdefault(outcome.row["vehicle"], []).append(outcome)
+    results: dict[str, Calibration] = {}
     for vehicle, group in sorted(groups.items()):
         if len(group) == 1:
             continue
-        of_all = hashlib.sha256("\n".join(one.text for one in group).encode()).hexdigest()
-        task = Task(name=f"{work.VEHICLES}/{vehicle}", bags=(), options={"results": of_all})
-        if directory and (earlier := stored(task, directory)):
-            found[vehicle] = earlier.calibration
+        texts = "\n".join(outcome.text for outcome in group)
+        digest = hashlib.sha256(texts.encode()).hexdigest()
+        task = Task(name=f"{work.VEHICLES}/{vehicle}", bags=(), options={"results": digest})
+        earlier = stored(task, directory) if directory else None
+        if earlier:
+            results[vehicle] = earlier.calibration
             continue
         try:
-            found[vehicle] = together({one.row["name"]: one.calibration for one in group})
+            results[vehicle] = together(
+                {outcome.row["name"]: outcome.calibration for outcome in group}
+            )
         except InputError as error:
             note(f"{vehicle} has no common result: {error}")
             continue
         if directory:
-            _store(task, Outcome.of(task, None, found[vehicle]), directory)
-    return found
+            _store(task, Outcome.of(task, None, results[vehicle]), directory)
+    return results
 
 
 def _write_rows_and_page(
@@ -187,7 +207,7 @@ def _write_rows_and_page(
 ) -> None:
     from hand_eye_calib.extras.fleet.batch_page import render_batch
 
-    rows = [one.row for one in done]
+    rows = [outcome.row for outcome in done]
     write_rows(directory / work.TABLE, rows)
     linked = {row["name"] for row in rows if (directory / row["name"] / REPORT).exists()}
     save_text(directory / page, render_batch(title, rows, vehicles, linked))
@@ -196,20 +216,22 @@ def _write_rows_and_page(
 
 
 def _print_results(done: Sequence[Outcome], vehicles: Mapping[str, Calibration]) -> None:
-    """Print a line for each recording, the worst first, and what those of each vehicle say."""
-    in_order = sorted(done, key=lambda one: _GRAVITY.index(one.verdict))
-    for one in in_order[:_MOST_LINES]:
-        told = f"failed: {one.row['error']}" if one.row["error"] else one.row["headline"]
-        print("\n".join(wrapped(f"{one.row['name']}: {told}", "", "  ")))
+    """Print a line for each recording, the worst first, and the results of the vehicles."""
+    in_order = sorted(done, key=lambda outcome: _GRAVITY.index(outcome.verdict))
+    for outcome in in_order[:_MOST_LINES]:
+        row = outcome.row
+        text = f"failed: {row['error']}" if row["error"] else row["headline"]
+        print("\n".join(wrapped(f"{row['name']}: {text}", "", "  ")))
     if len(done) > _MOST_LINES:
         print(f"{len(done) - _MOST_LINES} more, none with a worse verdict")
-    counts = Counter(one.verdict for one in in_order)
+    counts = Counter(outcome.verdict for outcome in in_order)
     failed = counts.pop("failed", 0)
     print(f"{len(done) - failed} of {counted(len(done), 'bag')} calibrated, {failed} failed")
     if counts:
         print(listing([f"{count} {verdict}" for verdict, count in counts.items()]))
-    for name, each in vehicles.items():
-        together = each.parts.get("together")
-        sentence = together.sentence if together else ""
-        told = each.headline if sentence in each.headline else f"{each.headline}. {sentence}"
-        print("\n".join(wrapped(f"{name}: {told}", "", "  ")))
+    for name, result in vehicles.items():
+        text = result.headline
+        together = result.parts.get("together")
+        if together and together.sentence not in text:
+            text = f"{text}. {together.sentence}"
+        print("\n".join(wrapped(f"{name}: {text}", "", "  ")))

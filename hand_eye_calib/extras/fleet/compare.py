@@ -1,4 +1,4 @@
-"""``compare RESULT...``: has the mount moved, or which recording shows that it has?"""
+"""Command ``compare RESULT...``: compare results with what is installed, or with each other."""
 
 import argparse
 from collections.abc import Iterator
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compare; returns the exit code."""
+    """Compare results; return the exit code."""
     from hand_eye_calib.core.assessment.comparison import compare
     from hand_eye_calib.formats.results import load_result
 
@@ -51,17 +51,20 @@ def run(arguments: argparse.Namespace) -> int:
         frames = results[0].parent_frame, results[0].child_frame
         with waiting_for(f"reading {arguments.installed}"):
             installed = open_installed(arguments.installed)(*frames)
-    found = compare(results, installed, told_apart(arguments.results))
-    print_result(_lines(found, results[0]), found if arguments.json else None)
-    return {"same": 0, "moved": 4}.get(found.verdict, 3)
+    comparison = compare(results, installed, told_apart(arguments.results))
+    print_result(_lines(comparison, results[0]), comparison if arguments.json else None)
+    return {"same": 0, "moved": 4}.get(comparison.verdict, 3)
 
 
-def _lines(found: "Comparison", result: "Calibration") -> Iterator[str]:
-    yield f"Mount of {result.child_frame} on {result.parent_frame}: {found.sentence}"
-    for each in found.differences:
-        sentence = "" if len(found.differences) == 1 else each.sentence
-        yield f"{each.second} minus {each.first}: {sentence}".rstrip(": ")
+def _lines(comparison: "Comparison", result: "Calibration") -> Iterator[str]:
+    """Yield the lines of a comparison for a terminal."""
+    yield f"Mount of {result.child_frame} on {result.parent_frame}: {comparison.sentence}"
+    for difference in comparison.differences:
+        title = f"{difference.second} minus {difference.first}"
+        if len(comparison.differences) > 1:
+            title = f"{title}: {difference.sentence}"
+        yield title
         yield f"  {'':<6}{'difference':>12}{'+/-':>10}{'seen from':>12}"
-        for axis, row in each.axes.items():
+        for axis, row in difference.axes.items():
             sizes = [amount(axis, size) for size in (row.difference, row.sigma, row.visible)]
             yield f"  {axis:<6}{sizes[0]:>12}{sizes[1]:>10}{sizes[2]:>12}  {row.verdict}"

@@ -1,4 +1,4 @@
-"""Several recordings, as a part of their common result."""
+"""Recordings as a part of their common result."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -7,18 +7,19 @@ from typing import Any
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded:
-    """One of several recordings, as it stands by itself and beside the others.
+    """One of several recordings: its own result, and its difference from the common result.
 
     Attributes
     ----------
     name, headline : str
     left_out : str
-        Why it is no part of the result; empty if it is.
+        Why the common result does not contain the recording; empty if it does.
     deviations, sigmas : mapping of str to float
-        By axis, m or rad: from the common result, and their standard deviations with the usual
-        scatter of recordings; NaN (None in files) if it does not know the axis.
+        Deviations from the common result by axis, m or rad, and their standard deviations with the
+        usual scatter of recordings; NaN (None in files) if the recording does not determine the
+        axis.
     time_offset_s, scale, stamp_ns
-        As of its own result.
+        Fields of the recording's own result.
     """
 
     name: str
@@ -33,18 +34,18 @@ class Recorded:
 
 @dataclass(frozen=True, kw_only=True)
 class Together:
-    """What several recordings of one rig say together.
+    """Agreement of several recordings of one rig.
 
     Attributes
     ----------
     kind : str
-        single, agree, scatter (more than recordings of one rig do), one off, moved (between two of
-        them), or differ (two do, and nobody knows which is wrong).
+        single, agree, scatter (more than recordings of one rig usually do), one off, moved (between
+        two recordings), or differ (two recordings contradict each other, and there is no third).
     sentence : str
     scatter : mapping of str to float
-        By axis, m or rad: what differs from recording to recording, beyond what each states.
+        Standard deviation between recordings by axis, m or rad, beyond those of the recordings.
     recordings : tuple of Recorded
-        In the order of time.
+        In order of time.
     """
 
     kind: str
@@ -53,8 +54,8 @@ class Together:
     recordings: tuple[Recorded, ...]
 
 
-# What to do if recordings belong together in one of these ways.
-_OF_RECORDINGS = {
+# Advice by kind of agreement.
+_ADVICE = {
     "differ": "record once more: then the one that is off shows",
     "moved": "calibrate from the recordings since then alone",
     "one off": "find out what was different in that recording; it is left out",
@@ -64,10 +65,10 @@ _OF_RECORDINGS = {
 
 
 def find_kinds(kinds: Sequence[str], result: Any) -> Iterator[tuple[Any, ...]]:
-    """Yield the reason of a result whose recordings belong together in one of these ways."""
+    """Yield the reason of a result whose recordings have one of these kinds of agreement."""
     together = result.parts.get("together")
     if together and together.kind in kinds:
-        yield together.sentence, _OF_RECORDINGS[together.kind], (), {}
+        yield together.sentence, _ADVICE[together.kind], (), {}
 
 
 def details(together: Together, headline: str) -> list[str]:

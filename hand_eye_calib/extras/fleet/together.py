@@ -1,4 +1,4 @@
-"""Several recordings: one extrinsic from those of one rig; a row of a table for each of many."""
+"""Several recordings: one extrinsic from recordings of one rig, or a table of many."""
 
 import math
 from collections import Counter
@@ -31,15 +31,17 @@ if TYPE_CHECKING:
 _Pair: TypeAlias = tuple[TrajectoryLike, TrajectoryLike]
 _Recordings: TypeAlias = Iterable[_Pair] | Mapping[str, _Pair]
 
-# Values of a result that are in its row as they are.
-_TAKEN = (
+# Fields of a result that its row contains.
+_FIELDS_OF_ROW = (
     *("verdict", "headline", "status", "parent_frame", "child_frame"),
     *("method", "reference", "n_poses", "n_pairs", "n_inliers"),
     *("time_offset_s", "time_offset_sigma_s", "scale", "scale_sigma"),
 )
 
-# What is that of all recordings together, and that of the newest of them.
+# Fields of the common result that are sums over the recordings.
 _COUNTS = ("n_poses", "n_pairs", "n_inliers")
+
+# Fields of the common result that are those of the newest recording.
 _OF_NEWEST = (
     *("reference", "backend", "measured", "stamp_ns", "parent_frame", "child_frame"),
     *("base_frame", "T_base_parent", "target_translation", "target_rotation", "target_axes"),
@@ -53,18 +55,19 @@ def calibrate_together(
 ) -> Calibration:
     """Estimate one extrinsic from several recordings of one rig.
 
-    Each recording is calibrated by itself, with a clock offset and a scale of its own. What they
-    say is added, with the scatter between recordings: an axis that one does not reveal comes from
-    another, and a recording that does not belong to the others is named and left out.
+    Each recording is calibrated by itself, with a clock offset and a scale of its own. The results
+    are averaged by their covariances and the scatter between recordings. An axis that a recording
+    does not determine comes from the others. A recording that contradicts the others is named and
+    left out.
 
     Parameters
     ----------
     recordings : iterable of (Trajectory, Trajectory), or of what can be read as one
-        Poses of parent and child in each; or a mapping of names to these.
+        Poses of parent and child of each recording; or a mapping of names to such pairs.
     names : sequence of str, optional
-        What to call the recordings; numbered by default.
+        Names of the recordings; numbers by default.
     **options
-        Those of :func:`~hand_eye_calib.offline.calibrate.calibrate`.
+        Options of :func:`~hand_eye_calib.offline.calibrate.calibrate`.
 
     Returns
     -------
@@ -74,9 +77,9 @@ def calibrate_together(
     Raises
     ------
     InputError
-        If no recording can be used, or they are of different frames.
+        If no recording can be used, or the recordings have different frames.
     HandEyeCalibError
-        As ``calibrate`` does, with the name of the recording.
+        As of ``calibrate``, with the name of the recording.
 
     Examples
     --------
@@ -131,7 +134,7 @@ def calibrate_many(
 
 
 def _named(recordings: _Recordings, names: Sequence[str] | None) -> Iterable[tuple[str, _Pair]]:
-    """Each recording with its name."""
+    """Return the recordings with their names."""
     if isinstance(recordings, Mapping):
         names = [*recordings]
         recordings = recordings.values()
@@ -144,9 +147,9 @@ def _named(recordings: _Recordings, names: Sequence[str] | None) -> Iterable[tup
 
 
 def row_of_result(calibration: Document) -> Document:
-    """The row of a result, from what its ``to_dict`` gave; what is not known is None."""
+    """Return the row of a result from its ``to_dict``; unknown values are None."""
     transform = calibration["T_parent_child"]
-    row = {name: calibration[name] for name in _TAKEN}
+    row = {name: calibration[name] for name in _FIELDS_OF_ROW}
     row["verdict"] = str(calibration["verdict"]).replace("_", " ")
     columns = [f"{axis}_m" for axis in AXES[:3]] + [f"{axis}_deg" for axis in AXES[3:]]
     values = [*transform["translation"], *transform["rpy_deg"]]
@@ -157,71 +160,76 @@ def row_of_result(calibration: Document) -> Document:
 
 
 def together(results: Mapping[str, Calibration]) -> Calibration:
-    """One result from the results of recordings of one rig, by the names of those.
+    """Return one result from the results of recordings of one rig.
 
-    Method, frames and targets are those of the recordings. So are the clock offset and the scale if
-    all have the same; otherwise each has its own.
+    Parameters
+    ----------
+    results : mapping of str to Calibration
+        Results by the names of the recordings. Method, frames and targets of the common result are
+        theirs; clock offset and scale too, if all recordings have the same.
 
     Raises
     ------
     InputError
-        If no recording can be used, or they are of different frames.
+        If no recording can be used, or the recordings have different frames.
     """
-    results = dict(sorted(results.items(), key=lambda one: one[1].stamp_ns))
+    results = dict(sorted(results.items(), key=lambda item: item[1].stamp_ns))
     require_same_frames(results.values())
-    unfit = {name: each.headline for name, each in results.items() if _says_nothing(each)}
-    fit = {name: each for name, each in results.items() if name not in unfit}
-    if not fit:
-        told = "; ".join(f"{name}: {why}" for name, why in unfit.items())
-        raise InputError(f"no recording can be used: {told or 'there is none'}")
-    found = agreement_of_results([*fit.values()])
-    names = [*fit]
-    unknown = dict.fromkeys(results, np.full((2, 6), np.nan))
-    unfit |= {names[index]: "it does not belong to the others" for index in found.apart}
-    used = [each for name, each in fit.items() if name not in unfit]
-    pairs = np.stack([found.deviations, found.sigmas], axis=1)
-    beside = unknown | dict(zip(names, pairs, strict=True))
+    left_out = {name: result.headline for name, result in results.items() if _is_unusable(result)}
+    usable = {name: result for name, result in results.items() if name not in left_out}
+    if not usable:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
+        raise InputError(f"no recording can be used: {reasons or 'there is none'}")
+    agreement = agreement_of_results([*usable.values()])
+    names = [*usable]
+    for index in agreement.apart:
+        left_out[names[index]] = "it does not belong to the others"
+    used = [result for name, result in usable.items() if name not in left_out]
+    deviations = dict.fromkeys(results, np.full(6, np.nan))
+    deviations |= dict(zip(names, agreement.deviations, strict=True))
+    sigmas = dict.fromkeys(results, np.full(6, np.nan))
+    sigmas |= dict(zip(names, agreement.sigmas, strict=True))
     records = tuple(
         Recorded(
             name=name,
-            headline=each.headline,
-            left_out=unfit.get(name, ""),
-            deviations=by_axis(beside[name][0]),
-            sigmas=by_axis(beside[name][1]),
-            time_offset_s=each.time_offset_s,
-            scale=each.scale,
-            stamp_ns=each.stamp_ns,
+            headline=result.headline,
+            left_out=left_out.get(name, ""),
+            deviations=by_axis(deviations[name]),
+            sigmas=by_axis(sigmas[name]),
+            time_offset_s=result.time_offset_s,
+            scale=result.scale,
+            stamp_ns=result.stamp_ns,
         )
-        for name, each in results.items()
+        for name, result in results.items()
     )
     record = Together(
-        kind=found.kind,
-        sentence=found.sentence(names),
-        scatter=by_axis(found.scatter),
+        kind=agreement.kind,
+        sentence=agreement.sentence(names),
+        scatter=by_axis(agreement.scatter),
         recordings=records,
     )
-    return _joint(used, found, record)
+    return _joint(used, agreement, record)
 
 
-def _says_nothing(result: Calibration) -> bool:
-    """Whether a result is DO NOT USE for more than axes that are unknown."""
-    never = {each.rule for each in result.reasons if each.verdict is Verdict.DO_NOT_USE}
-    return bool(never - {"nothing_known"})
+def _is_unusable(result: Calibration) -> bool:
+    """Return whether a result is DO NOT USE, not only because its axes are unknown."""
+    rules = {reason.rule for reason in result.reasons if reason.verdict is Verdict.DO_NOT_USE}
+    return bool(rules - {"nothing_known"})
 
 
-def _joint(used: Sequence[Calibration], found: Agreement, record: Together) -> Calibration:
-    """The result of recordings that belong together."""
-    T = found.T_parent_child
-    covariance = found.covariance.copy()
+def _joint(used: Sequence[Calibration], agreement: Agreement, record: Together) -> Calibration:
+    """Return the result of recordings that belong together."""
+    T = agreement.T_parent_child
+    covariance = agreement.covariance.copy()
     by_prior = set()
     for axis, name in enumerate(AXES):
-        dofs = [one.observability_measured[axis] for one in used]
-        known = [dof for dof in dofs if math.isfinite(dof.sigma)]
-        if known and all(dof.verdict is DofVerdict.PRIOR for dof in known):
-            # All have it from one measurement by hand.
+        dofs = [result.observability_measured[axis] for result in used]
+        finite = [dof for dof in dofs if math.isfinite(dof.sigma)]
+        if finite and all(dof.verdict is DofVerdict.PRIOR for dof in finite):
+            # The recordings share one measurement by hand.
             by_prior.add(name)
-            least = min(dof.sigma for dof in known)
-            covariance[axis, axis] = max(covariance[axis, axis], least**2)
+            variance = min(dof.sigma for dof in finite) ** 2
+            covariance[axis, axis] = max(covariance[axis, axis], variance)
     covariance = turned(T[:3, :3].T, covariance)
     assessed = combined(T, covariance, unknown_directions(covariance))
     observability = tuple(
@@ -230,20 +238,21 @@ def _joint(used: Sequence[Calibration], found: Agreement, record: Together) -> C
     )
     is_open = any(math.isinf(dof.sigma) for dof in observability)
     newest = used[-1]
-    own_clock = {(one.time_offset_s, one.scale) for one in used}
-    offset_s, scale = own_clock.pop() if len(own_clock) == 1 else (0.0, 1.0)
+    findings = {finding.code: finding for result in used for finding in result.findings}
+    clocks = {(result.time_offset_s, result.scale) for result in used}
+    offset_s, scale = clocks.pop() if len(clocks) == 1 else (0.0, 1.0)
     return Calibration(
         T_parent_child=T,
         covariance_measured=assessed.cov_parent_child_in_child,
-        covariance_allowance=np.mean([one.covariance_allowance for one in used], axis=0),
+        covariance_allowance=np.mean([result.covariance_allowance for result in used], axis=0),
         observability_measured=observability,
         status=SolveStatus.UNOBSERVABLE if is_open else SolveStatus.OK,
-        objective=found.chi2,
-        method=Counter(one.method for one in used).most_common(1)[0][0],
+        objective=agreement.chi2,
+        method=Counter(result.method for result in used).most_common(1)[0][0],
         time_offset_s=offset_s,
         scale=scale,
-        findings=tuple({each.code: each for one in used for each in one.findings}.values()),
+        findings=tuple(findings.values()),
         parts={"together": record},
-        **{name: sum(getattr(one, name) for one in used) for name in _COUNTS},
+        **{name: sum(getattr(result, name) for result in used) for name in _COUNTS},
         **{name: getattr(newest, name) for name in _OF_NEWEST},
     )

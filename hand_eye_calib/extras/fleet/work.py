@@ -1,6 +1,4 @@
-"""Which recordings a batch has, the work of one of them, and who does many: processes of this
-machine, or a Dask cluster.
-"""
+"""Tasks of a batch, the work of a task, and its distribution: to processes or a Dask cluster."""
 
 import hashlib
 import json
@@ -43,19 +41,19 @@ Row = Document
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """One recording to calibrate from, in plain values: it travels to other processes and machines.
+    """One recording to calibrate from, in plain values for other processes and machines.
 
     Attributes
     ----------
     name : str
-        Of its row and its folder.
+        Name of its row and its folder.
     bags : tuple of str
         Paths or URLs of its parts, or the directory of a journal.
     vehicle : str
-        The rig; recordings of one are put together. Empty if it is not known.
+        The rig; recordings of one rig get a common result. Empty if unknown.
     options : dict
     sources : dict
-        "parent" and "child" to a topic or WORLD:SENSOR, if they are given.
+        "parent" and "child" to a topic or WORLD:SENSOR, if the user set them.
     with_fingerprints, with_report : bool
     """
 
@@ -68,26 +66,40 @@ class Task:
     with_report: bool = False
 
     def key(self) -> str:
-        """Digest of the task, its options, and names, sizes and times of its files, so that no
-        older result is taken for this one's.
+        """Return a digest of the task, its options, and names, sizes and times of its files.
+
+        A stored result with another key is not that of this task.
         """
         text = json.dumps([asdict(self), list(map(_state, self.bags))], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _state(bag: str) -> list[Any]:
-    path = Path(bag)  # none of a URL
-    files = sorted(path.iterdir()) if path.is_dir() else [path] if path.exists() else []
+    """Return name, size and time of the files of a bag; empty for a URL."""
+    path = Path(bag)
+    files: list[Path] = []
+    if path.is_dir():
+        files = sorted(path.iterdir())
+    elif path.exists():
+        files = [path]
     return [[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
 
 
 def tasks_of(groups: Sequence[Sequence[str]], vehicle: str = "", **common: Any) -> list[Task]:
-    """A task for each group of bags that are one recording; ``vehicle`` is its name, or has
-    ``{vehicle}`` at its place in their paths. The other values are those of every Task.
+    """Return a task for each group of bags that are one recording.
+
+    Parameters
+    ----------
+    groups : sequence of sequences of str
+        Bags of each recording.
+    vehicle : str
+        Name of the vehicle, or a pattern of the paths with ``{vehicle}`` at its place.
+    **common
+        Further fields of all tasks.
     """
     pattern = re.escape(vehicle).replace(r"\*\*", ".*").replace(r"\*", "[^/]*")
     pattern = pattern.replace(re.escape("{vehicle}"), "([^/]+)")
-    # A path as "." has no name of its own.
+    # Resolved, because a path such as "." has no name.
     paths = [
         bag.partition("?")[0] if remote.is_url(bag) else str(Path(bag).resolve())
         for bag, *_ in groups
@@ -98,13 +110,13 @@ def tasks_of(groups: Sequence[Sequence[str]], vehicle: str = "", **common: Any) 
     for group, stem in zip(groups, stems, strict=True):
         name = stem.replace("/", "_")
         numbered = chain([name], (f"{name}_{number}" for number in count(2)))
-        name = next(one for one in numbered if one not in names)
+        name = next(candidate for candidate in numbered if candidate not in names)
         names.add(name)
-        of = vehicle
+        vehicle_name = vehicle
         if "{vehicle}" in vehicle:
             match = re.search(pattern, group[0])
-            of = match[1].strip(".") if match else ""
-        tasks.append(Task(name=name, bags=tuple(group), vehicle=of, **common))
+            vehicle_name = match[1].strip(".") if match else ""
+        tasks.append(Task(name=name, bags=tuple(group), vehicle=vehicle_name, **common))
     return tasks
 
 
@@ -117,20 +129,20 @@ def _without_suffix(path: Path) -> Path:
 
 
 class Outcome(NamedTuple):
-    """What came of a recording.
+    """Outcome of a task.
 
     Attributes
     ----------
     row : dict
-        Its row of the table, in plain values.
+        Row of the table, in plain values.
     code : int
-        The exit code of its own.
+        Exit code of this recording alone.
     text : str
         JSON of ``name``, ``vehicle``, ``bags``, ``calibration`` (Calibration.to_dict or null),
-        ``inputs``, ``error`` (text or null), and a ``traceback`` for defects of the program. As
-        text it takes little memory.
+        ``inputs``, ``error`` (text or null), and a ``traceback`` for defects of the program. Text
+        needs little memory.
     page : str
-        Its report, if it is wanted.
+        Report as HTML; empty without one.
     """
 
     row: Row
@@ -149,53 +161,55 @@ class Outcome(NamedTuple):
         as_given: remote.AsGiven = lambda value: value,
         **more: str,
     ) -> "Outcome":
-        """The outcome of a task, from its error, or its result with inputs and page; ``as_given``
-        puts URLs back, and ``more`` goes into the text.
+        """Return the outcome of a task from its error, or from its result with inputs and page.
+
+        ``as_given`` puts URLs back into plain values; ``more`` are further fields of the text.
         """
         inputs = inputs or {}
         row: Row = {"name": task.name, "vehicle": task.vehicle, "error": error}
         bags = [remote.public(bag) for bag in task.bags]
-        found = as_given(result.to_dict()) if result else None
-        whole = row | {"bags": bags, "calibration": found, "inputs": as_given(inputs), **more}
+        document = as_given(result.to_dict()) if result else None
+        whole = row | {"bags": bags, "calibration": document, "inputs": as_given(inputs), **more}
         row |= dict.fromkeys(("start", "duration_s", "verdict", "headline"))
         row["bags"] = " ".join(bags)
-        stamps = [inputs[each] for each in STREAMS if each in inputs]
-        starts = [stream["first_stamp_ns"] for stream in stamps]
+        streams = [inputs[stream] for stream in STREAMS if stream in inputs]
+        starts = [stream["first_stamp_ns"] for stream in streams]
         if starts and None not in starts:
             date = datetime.fromtimestamp(max(starts) // 1_000_000_000, UTC)
             row["start"] = date.isoformat(timespec="seconds")
-            row["duration_s"] = (min(one["last_stamp_ns"] for one in stamps) - max(starts)) * 1e-9
-        if found and result:
-            row |= row_of_result(found) | {"warnings": "; ".join(found["warnings"])}
+            end_ns = min(stream["last_stamp_ns"] for stream in streams)
+            row["duration_s"] = (end_ns - max(starts)) * 1e-9
+        if document and result:
+            row |= row_of_result(document) | {"warnings": "; ".join(document["warnings"])}
             row["findings"] = " ".join(finding.code for finding in result.findings)
         code = exit_code(result) if result and not error else 1
         return cls(row, code, json.dumps(whole, separators=(",", ":")), as_given(page))
 
     @property
     def calibration(self) -> Calibration:
-        """The result; only of a row with a verdict."""
+        """Result of a row with a verdict."""
         return Calibration.from_dict(json.loads(self.text)["calibration"])
 
     @property
     def inputs(self) -> Document:
-        """Where the data came from."""
+        """Sources of the data."""
         return json.loads(self.text)["inputs"]
 
     @property
     def verdict(self) -> str:
-        """The verdict of the result, or "failed"."""
+        """Verdict of the result, or "failed"."""
         return "failed" if self.row["error"] else str(self.row["verdict"])
 
 
-# Does a task.
+# Function that does a task.
 Work = Callable[[Task], Outcome]
 
 
 def work(task: Task) -> Outcome:
-    """Do a task; what goes wrong becomes part of the outcome, so that the others go on."""
+    """Do a task; errors become part of the outcome, so that the other tasks continue."""
     from hand_eye_calib.offline.report.report import render
 
-    limit_memory()  # this may be a process of its own
+    limit_memory()  # of this worker process
     try:
         with remote.local_copies(task.bags) as (paths, as_given):
             recording = read_recording([*map(Path, paths)], task.sources, task.options)
@@ -217,39 +231,52 @@ def work(task: Task) -> Outcome:
 def outcomes(
     tasks: Sequence[Task], jobs: int, dask: str | None = None, do: Work = work
 ) -> Iterator[tuple[Task, Outcome]]:
-    """Do tasks in so many processes of this machine, or on the Dask cluster at an address, whose
-    workers must see the bags under the same paths; yields each with its outcome when it is done.
+    """Do tasks in worker processes; yield tasks with their outcomes as they end.
 
-    If a worker dies, those tasks that may be to blame are done again one by one, and then the rest.
+    If a worker dies, the tasks that may have killed it are repeated one by one, then the others.
+
+    Parameters
+    ----------
+    tasks : sequence of Task
+    jobs : int
+        Number of processes of this machine.
+    dask : str, optional
+        Address of a Dask cluster to use instead. Its workers need the bags at the same paths.
+    do : callable
+        Function that does a task.
     """
     waiting = [[*tasks]] if tasks else []
     while waiting:
-        some = waiting.pop(0)
+        group = waiting.pop(0)
         lost = dict[str, str]()
-        with _cluster(dask) if dask else _processes(min(jobs, len(some))) as executor:
-            futures = {executor.submit(do, task): task for task in some}
+        with _cluster(dask) if dask else _processes(min(jobs, len(group))) as executor:
+            futures = {executor.submit(do, task): task for task in group}
             for future in as_completed([*futures]):
                 task = futures.pop(future)
-                if error := future.exception():
+                error = future.exception()
+                if error:
                     lost[task.name] = " ".join(str(error).split())
                 else:
                     yield task, future.result()
-        left = [task for task in some if task.name in lost]
-        if dask or len(some) == 1:
-            told = "worker processes die of it, perhaps for lack of memory: --jobs 1"
-            for task in left:
-                why = f"the cluster lost it: {lost[task.name]}" if dask else told
-                yield task, Outcome.of(task, why)
-        else:
-            # A pool begins its tasks in their order.
-            waiting[:0] = [[task] for task in left[:jobs]] + [left[jobs:]] * bool(left[jobs:])
+        unfinished = [task for task in group if task.name in lost]
+        if dask or len(group) == 1:
+            for task in unfinished:
+                reason = "worker processes die of it, perhaps for lack of memory: --jobs 1"
+                if dask:
+                    reason = f"the cluster lost it: {lost[task.name]}"
+                yield task, Outcome.of(task, reason)
+            continue
+        # A pool begins its tasks in order, so that the first ones may have killed the worker.
+        waiting[:0] = [[task] for task in unfinished[:jobs]]
+        if unfinished[jobs:]:
+            waiting.insert(jobs, unfinished[jobs:])
 
 
 @contextmanager
 def _processes(jobs: int) -> Iterator[Executor]:
-    """Worker processes, spawned: forking a program with threads is not safe."""
+    """Start worker processes by spawning: forking a program with threads is not safe."""
     spawning = multiprocessing.get_context("spawn")
-    # A worker is `python -c`, which would import modules from the current folder.
+    # A worker is `python -c`, which imports modules from the current folder unless prevented.
     with starting_trusted():
         executor = ProcessPoolExecutor(jobs, spawning, initializer=_begin)
         try:
@@ -263,14 +290,14 @@ def _processes(jobs: int) -> Iterator[Executor]:
 
 
 def _begin() -> None:
-    """Ctrl-C is for the process that waits for the workers. Their notes are in the results."""
+    """Prepare a worker: ignore Ctrl-C, print no notes, and end with the parent process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.stderr = open(os.devnull, "w")  # noqa: SIM115
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """Wait until the parent has ended, even if it was killed, and end with it."""
+    """Wait for the end of the parent process, even a killed one, and end this process."""
     parent = multiprocessing.parent_process()
     assert parent is not None, "a worker is started by another process"
     parent.join()
