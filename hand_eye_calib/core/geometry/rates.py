@@ -1,4 +1,8 @@
-"""Angular rates to orientations."""
+"""Integration of angular rates to orientations.
+
+The rate over an interval is the mean of both ends, ``R_j = R_i exp(dt (w_i + w_j) / 2)``, without
+coning terms (P. Savage, *Strapdown inertial navigation integration algorithm design*, 1998).
+"""
 
 import numpy as np
 
@@ -7,16 +11,27 @@ from hand_eye_calib.core.geometry import se3
 
 
 class RateIntegrator:
-    """Integrates the angular rates of one sensor as they come in, in parts of any length."""
+    """Integrates the angular rates of one sensor, in parts of any length."""
 
     def __init__(self) -> None:
         self._last: tuple[IntArray, FloatArray] | None = None
         self._rotation = np.eye(3)
 
     def rotations(self, stamps_ns: IntArray, rates: FloatArray) -> FloatArray:
-        """Orientations (M, 3, 3) of the sensor in its own first axes at the stamps (M,) of the next
-        rates (M, 3), rad/s, about its axes. Between two stamps the mean of both counts; a step back
-        in time is a rotation back.
+        """Return the orientations of the sensor in its own first axes.
+
+        A step back in time is a rotation back.
+
+        Parameters
+        ----------
+        stamps_ns : (M,) int64 array
+            Stamps of the next rates.
+        rates : (M, 3) array
+            rad/s, about the axes of the sensor.
+
+        Returns
+        -------
+        (M, 3, 3) array
         """
         if not len(stamps_ns):
             return np.empty((0, 3, 3))

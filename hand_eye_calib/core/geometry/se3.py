@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 
 from hand_eye_calib.core.base.arrays import FloatArray
 
-# Below this angle the coefficients of exp and log come from their Taylor series. At 1e-2 rad the
-# first term left out is of order angle^6, about 1e-16 relative; the closed forms lose digits to
-# cancellation there.
+# Angle (rad) below which the coefficients of exp and log come from their Taylor series. At 1e-2 rad
+# the first omitted term is of order angle^6, about 1e-16 relative. The closed forms lose digits to
+# cancellation below.
 _SERIES_ANGLE = 1e-2
 
 # Cosine of the pitch below which roll and yaw are about the same axis, up to rounding.
@@ -21,7 +21,7 @@ _SINGULAR_COSINE = 1e-7
 
 
 def skew(vectors: ArrayLike) -> FloatArray:
-    """Matrices S (..., 3, 3) of vectors (..., 3), with ``S @ v == cross(vector, v)``."""
+    """Return matrices S (..., 3, 3) of vectors (..., 3), with ``S @ v == cross(vector, v)``."""
     vectors = np.asarray(vectors, dtype=float)
     matrices: FloatArray = np.zeros((*vectors.shape, 3))
     x = vectors[..., 0]
@@ -37,19 +37,21 @@ def skew(vectors: ArrayLike) -> FloatArray:
 
 
 def vee(matrices: FloatArray) -> FloatArray:
-    """Vectors (..., 3) of twice the antisymmetric part of matrices (..., 3, 3): of a rotation, its
-    axis times twice the sine of its angle.
+    """Return vectors (..., 3) of twice the antisymmetric part of matrices (..., 3, 3).
+
+    The vector of a rotation is its axis times twice the sine of its angle.
     """
-    apart = matrices - np.swapaxes(matrices, -1, -2)
-    return np.stack([apart[..., 2, 1], apart[..., 0, 2], apart[..., 1, 0]], axis=-1)
+    twice = matrices - np.swapaxes(matrices, -1, -2)
+    return np.stack([twice[..., 2, 1], twice[..., 0, 2], twice[..., 1, 0]], axis=-1)
 
 
 def cross(left: FloatArray, right: FloatArray) -> FloatArray:
-    """Cross products (..., 3) of two arrays of vectors of the same shape (..., 3).
+    """Return cross products (..., 3) of two arrays of vectors of the same shape (..., 3).
 
-    For a few hundred vectors it takes a fraction of the time of ``numpy.cross``.
+    For a few hundred vectors this takes a fraction of the time of ``numpy.cross``.
     """
-    (x, y, z), (u, v, w) = (vectors.T for vectors in (left, right))
+    x, y, z = left.T
+    u, v, w = right.T
     products = np.empty(left.shape)
     products.T[0] = y * w - z * v
     products.T[1] = z * u - x * w
@@ -58,7 +60,7 @@ def cross(left: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def from_rotation_translation(rotation: ArrayLike, translation: ArrayLike) -> FloatArray:
-    """Transforms (..., 4, 4) from rotation matrices (..., 3, 3) and translations (..., 3), m."""
+    """Return transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3), m."""
     rotation = np.asarray(rotation, dtype=float)
     translation = np.asarray(translation, dtype=float)
     shape = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
@@ -70,9 +72,9 @@ def from_rotation_translation(rotation: ArrayLike, translation: ArrayLike) -> Fl
 
 
 def from_quat_xyzw(translation: ArrayLike, quat_xyzw: ArrayLike) -> FloatArray:
-    """Transforms (..., 4, 4) from translations (..., 3), m, and quaternions (..., 4), scalar last.
+    """Return transforms (..., 4, 4) of translations (..., 3), m, and quaternions (..., 4).
 
-    Quaternions are normalised; the caller checks whether they were close enough to unit length.
+    Quaternions are scalar last, and normalised here. The caller checks their length.
 
     Raises
     ------
@@ -87,8 +89,9 @@ def from_quat_xyzw(translation: ArrayLike, quat_xyzw: ArrayLike) -> FloatArray:
 
 
 def to_quat_xyzw(transforms: ArrayLike) -> FloatArray:
-    """Unit quaternions (..., 4), scalar last and not negative, of transforms (..., 4, 4) or
-    rotations (..., 3, 3).
+    """Return unit quaternions (..., 4) of transforms (..., 4, 4) or rotations (..., 3, 3).
+
+    The scalar is last and not negative.
     """
     rotations = np.asarray(transforms, dtype=float)[..., :3, :3]
     quats = _scaled_quats(rotations.reshape(-1, 3, 3))
@@ -97,52 +100,56 @@ def to_quat_xyzw(transforms: ArrayLike) -> FloatArray:
 
 
 def to_rows(transforms: ArrayLike) -> FloatArray:
-    """x y z qx qy qz qw (..., 7) of transforms (..., 4, 4), as files and messages have them."""
+    """Return rows x y z qx qy qz qw (..., 7) of transforms (..., 4, 4)."""
     Ts = np.asarray(transforms, dtype=float)
     return np.concatenate([Ts[..., :3, 3], to_quat_xyzw(Ts)], axis=-1)
 
 
 def rotation_from_rpy(rpy: ArrayLike) -> FloatArray:
-    """Rotation matrices (..., 3, 3) of roll, pitch and yaw (..., 3), rad, about the fixed axes x, y
-    and z in this order (REP 103, URDF).
+    """Return rotations (..., 3, 3) of roll, pitch and yaw (..., 3), rad.
+
+    They are about the fixed axes x, y and z in this order (REP 103, URDF).
     """
-    rpy = np.asarray(rpy, dtype=float)
-    roll, pitch, yaw = (rotation_exp(rpy[..., axis, None] * np.eye(3)[axis]) for axis in range(3))
+    roll, pitch, yaw = _about_axes(np.asarray(rpy, dtype=float))
     return yaw @ pitch @ roll
 
 
-def rotation_to_rpy(rotation: ArrayLike) -> FloatArray:
-    """Roll, pitch and yaw (..., 3), rad, of rotation matrices (..., 3, 3): the inverse of
-    :func:`rotation_from_rpy`.
+def _about_axes(angles: FloatArray) -> list[FloatArray]:
+    """Return rotations (..., 3, 3) about x, about y and about z by angles (..., 3), rad."""
+    return [rotation_exp(angles[..., axis, None] * np.eye(3)[axis]) for axis in range(3)]
 
-    The pitch is from -pi/2 to pi/2. At both ends only the sum or difference of the other two is
-    defined; the yaw is then 0.
+
+def rotation_to_rpy(rotation: ArrayLike) -> FloatArray:
+    """Return roll, pitch and yaw (..., 3), rad: the inverse of :func:`rotation_from_rpy`.
+
+    The pitch is from -pi/2 to pi/2. At both ends only the sum or difference of roll and yaw is
+    defined; the yaw is 0 there.
     """
     R = np.asarray(rotation, dtype=float)
     cosine = np.hypot(R[..., 0, 0], R[..., 1, 0])
-    singular = cosine < _SINGULAR_COSINE
-    at_pole = np.arctan2(-R[..., 1, 2], R[..., 1, 1])
-    roll = np.where(singular, at_pole, np.arctan2(R[..., 2, 1], R[..., 2, 2]))
-    yaw = np.where(singular, 0.0, np.arctan2(R[..., 1, 0], R[..., 0, 0]))
-    return np.stack([roll, np.arctan2(-R[..., 2, 0], cosine), yaw], axis=-1)
+    is_singular = cosine < _SINGULAR_COSINE
+    roll_at_pole = np.arctan2(-R[..., 1, 2], R[..., 1, 1])
+    roll = np.where(is_singular, roll_at_pole, np.arctan2(R[..., 2, 1], R[..., 2, 2]))
+    pitch = np.arctan2(-R[..., 2, 0], cosine)
+    yaw = np.where(is_singular, 0.0, np.arctan2(R[..., 1, 0], R[..., 0, 0]))
+    return np.stack([roll, pitch, yaw], axis=-1)
 
 
 def in_other_order(rotations: FloatArray) -> FloatArray:
-    """Rotations (N, 3, 3) whose roll, pitch and yaw were applied in this order about turning axes,
-    but read as those about fixed axes.
+    """Return rotations (N, 3, 3) whose roll, pitch and yaw are about turning axes.
+
+    The rotations given were read as if these angles were about fixed axes.
     """
-    angles = rotation_to_rpy(rotations)
-    roll, pitch, yaw = (
-        rotation_exp(angles[..., axis, None] * np.eye(3)[axis]) for axis in range(3)
-    )
+    roll, pitch, yaw = _about_axes(rotation_to_rpy(rotations))
     return roll @ pitch @ yaw
 
 
 def nearest_rotation(matrices: FloatArray) -> FloatArray:
-    """Rotations (..., 3, 3) nearest to matrices in the Frobenius norm.
+    """Return the rotations (..., 3, 3) nearest to matrices in the Frobenius norm.
 
-    The sign of the direction with the smallest singular value, which motion in a plane leaves open,
-    makes them rotations.
+    The direction with the smallest singular value has the sign that makes the determinant 1: motion
+    in a plane does not determine this sign (S. Umeyama, *Least-squares estimation of transformation
+    parameters between two point patterns*, 1991).
     """
     left, _, right = np.linalg.svd(matrices)
     left[..., :, 2] *= np.sign(np.linalg.det(left @ right))[..., None]
@@ -150,24 +157,26 @@ def nearest_rotation(matrices: FloatArray) -> FloatArray:
 
 
 def rotation_log(rotation: ArrayLike) -> FloatArray:
-    """Rotation vectors (..., 3), rad, of length at most pi, of rotation matrices (..., 3, 3)."""
+    """Return rotation vectors (..., 3), rad, of length at most pi, of rotations (..., 3, 3)."""
     rotation = np.asarray(rotation, dtype=float)
     return quat_log(_scaled_quats(rotation.reshape(-1, 3, 3))).reshape(rotation.shape[:-1])
 
 
 def quat_log(quat_xyzw: FloatArray) -> FloatArray:
-    """Rotation vectors (N, 3), rad, of quaternions (N, 4), scalar last, of any length and sign."""
+    """Return rotation vectors (N, 3), rad, of quaternions (N, 4) of any length and sign."""
+    vector = quat_xyzw[:, :3]
+    scalar = quat_xyzw[:, 3]
     # Sine of half the angle, times the length of the quaternion.
-    sine = np.sqrt(np.einsum("ni,ni->n", quat_xyzw[:, :3], quat_xyzw[:, :3]))
-    angle = np.copysign(2.0, quat_xyzw[:, 3]) * np.arctan2(sine, np.abs(quat_xyzw[:, 3]))
-    return quat_xyzw[:, :3] * (angle / np.where(sine > 0.0, sine, 1.0))[:, None]
+    sine = np.sqrt(np.einsum("ni,ni->n", vector, vector))
+    angle = np.copysign(2.0, scalar) * np.arctan2(sine, np.abs(scalar))
+    return vector * (angle / np.where(sine > 0.0, sine, 1.0))[:, None]
 
 
 def _scaled_quats(rotations: FloatArray) -> FloatArray:
-    """Quaternions (N, 4) of any length, scalar last and not negative, of rotations (N, 3, 3).
+    """Return quaternions (N, 4) of any length, scalar last and not negative.
 
-    The coefficients come from the largest of them, so that no digits are lost: S. W. Shepperd,
-    *Quaternion from rotation matrix*, 1978.
+    All coefficients of a rotation (N, 3, 3) follow from the largest one, so that no digits are lost
+    (S. W. Shepperd, *Quaternion from rotation matrix*, 1978).
     """
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotations.reshape(-1, 9).T
     trace = r00 + r11 + r22
@@ -179,25 +188,26 @@ def _scaled_quats(rotations: FloatArray) -> FloatArray:
         i = np.argmax(np.diagonal(R, axis1=1, axis2=2), axis=1)
         j = (i + 1) % 3
         k = (i + 2) % 3
-        far = np.empty((len(R), 4))
-        far[row, i] = 1.0 - trace[large] + 2.0 * R[row, i, i]
-        far[row, j], far[row, k] = R[row, j, i] + R[row, i, j], R[row, k, i] + R[row, i, k]
-        far[:, 3] = R[row, k, j] - R[row, j, k]
-        quats[large] = np.where(far[:, 3:] < 0.0, -far, far)
+        by_vector = np.empty((len(R), 4))
+        by_vector[row, i] = 1.0 - trace[large] + 2.0 * R[row, i, i]
+        by_vector[row, j] = R[row, j, i] + R[row, i, j]
+        by_vector[row, k] = R[row, k, i] + R[row, i, k]
+        by_vector[:, 3] = R[row, k, j] - R[row, j, k]
+        quats[large] = np.where(by_vector[:, 3:] < 0.0, -by_vector, by_vector)
     return quats
 
 
 def rotation_exp(rotation_vector: ArrayLike) -> FloatArray:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in rad."""
+    """Return rotation matrices (..., 3, 3) of rotation vectors (..., 3), rad."""
     rotation_vector = np.asarray(rotation_vector, dtype=float)
     half = 0.5 * np.sqrt(np.einsum("...i,...i", rotation_vector, rotation_vector))
-    shrunk = 0.5 * np.where(half > 0.0, np.sin(half) / np.where(half > 0.0, half, 1.0), 1.0)
-    x, y, z = (shrunk * rotation_vector[..., axis] for axis in range(3))
-    return _matrices(x, y, z, np.cos(half))
+    sine_ratio = np.where(half > 0.0, np.sin(half) / np.where(half > 0.0, half, 1.0), 1.0)
+    vector = (0.5 * sine_ratio)[..., None] * rotation_vector
+    return _matrices(vector[..., 0], vector[..., 1], vector[..., 2], np.cos(half))
 
 
 def _matrices(x: FloatArray, y: FloatArray, z: FloatArray, w: FloatArray) -> FloatArray:
-    """Rotation matrices (..., 3, 3) of unit quaternions, given by coefficient, each (...)."""
+    """Return rotation matrices (..., 3, 3) of the coefficients (...) of unit quaternions."""
     twice_x = 2.0 * x
     twice_y = 2.0 * y
     twice_z = 2.0 * z
@@ -217,17 +227,16 @@ def _matrices(x: FloatArray, y: FloatArray, z: FloatArray, w: FloatArray) -> Flo
 
 
 def inverse(transforms: ArrayLike) -> FloatArray:
-    """Inverses of transforms (..., 4, 4): ``T_source_target`` of ``T_target_source``."""
+    """Return the inverses ``T_source_target`` of transforms ``T_target_source`` (..., 4, 4)."""
     transforms = np.asarray(transforms, dtype=float)
-    rotation_inverse = np.swapaxes(transforms[..., :3, :3], -1, -2)
-    return from_rotation_translation(
-        rotation_inverse, -(rotation_inverse @ transforms[..., :3, 3:])[..., 0]
-    )
+    back = np.swapaxes(transforms[..., :3, :3], -1, -2)
+    return from_rotation_translation(back, -times(back, transforms[..., :3, 3]))
 
 
 def retracted(transform: FloatArray, step: FloatArray) -> FloatArray:
-    """A transform (4, 4) after a small step (rho, phi) in its own axes, each part by itself: to
-    first order it is ``transform @ exp(step)``.
+    """Return a transform (4, 4) after a small step (rho, phi) in its own axes.
+
+    To first order this is ``transform @ exp(step)``: both parts are applied on their own.
     """
     rotation = transform[:3, :3]
     return from_rotation_translation(
@@ -236,7 +245,7 @@ def retracted(transform: FloatArray, step: FloatArray) -> FloatArray:
 
 
 def exp(xi: ArrayLike) -> FloatArray:
-    """Exponential map of SE(3).
+    """Return the exponential map of SE(3).
 
     Parameters
     ----------
@@ -257,19 +266,20 @@ def exp(xi: ArrayLike) -> FloatArray:
     rho = xi[..., :3]
     phi = xi[..., 3:]
     angle = np.linalg.norm(phi, axis=-1)
-    small = angle < _SERIES_ANGLE
+    is_small = angle < _SERIES_ANGLE
     squared = angle**2
-    safe = np.where(small, 1.0, angle)
-    first = np.where(small, 0.5 - squared / 24 + squared**2 / 720, (1 - np.cos(safe)) / safe**2)
-    series = 1 / 6 - squared / 120 + squared**2 / 5040
-    second = np.where(small, series, (safe - np.sin(safe)) / safe**3)
+    safe = np.where(is_small, 1.0, angle)
+    first_series = 0.5 - squared / 24 + squared**2 / 720
+    first = np.where(is_small, first_series, (1 - np.cos(safe)) / safe**2)
+    second_series = 1 / 6 - squared / 120 + squared**2 / 5040
+    second = np.where(is_small, second_series, (safe - np.sin(safe)) / safe**3)
     cross_once = cross(phi, rho)
     translation = rho + first[..., None] * cross_once + second[..., None] * cross(phi, cross_once)
     return from_rotation_translation(rotation_exp(phi), translation)
 
 
 def log(transforms: ArrayLike) -> FloatArray:
-    """Logarithm of SE(3), the inverse of :func:`exp`.
+    """Return the logarithm of SE(3), the inverse of :func:`exp`.
 
     Parameters
     ----------
@@ -282,49 +292,47 @@ def log(transforms: ArrayLike) -> FloatArray:
 
     Notes
     -----
-    ``rho = V^-1 t`` with ``V^-1 = I - [phi]/2 + (1/a^2 - (1 + cos a) / (2 a sin a)) [phi]^2``;
-    written with the half angle the last coefficient is ``(1 - (a/2) cot(a/2)) / a^2``, finite up to
-    a = pi.
+    ``rho = V^-1 t`` with ``V^-1 = I - [phi]/2 + (1/a^2 - (1 + cos a) / (2 a sin a)) [phi]^2``. With
+    the half angle the last coefficient is ``(1 - (a/2) cot(a/2)) / a^2``, which is finite up to a =
+    pi.
     """
     transforms = np.asarray(transforms, dtype=float)
     phi = rotation_log(transforms[..., :3, :3])
     translation = transforms[..., :3, 3]
     angle = np.linalg.norm(phi, axis=-1)
-    small = angle < _SERIES_ANGLE
+    is_small = angle < _SERIES_ANGLE
     squared = angle**2
-    safe = np.where(small, 1.0, angle)
+    safe = np.where(is_small, 1.0, angle)
     series = 1 / 12 + squared / 720 + squared**2 / 30240
-    coefficient = np.where(small, series, (1 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
+    closed = (1 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2
+    coefficient = np.where(is_small, series, closed)
     cross_once = cross(phi, translation)
     rho = translation - 0.5 * cross_once + coefficient[..., None] * cross(phi, cross_once)
     return np.concatenate([rho, phi], axis=-1)
 
 
 def times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Matrices (..., k, m) times vectors (..., m)."""
+    """Return the products (..., k) of matrices (..., k, m) and vectors (..., m)."""
     return np.asarray((matrices @ vectors[..., None])[..., 0])
 
 
 def adjoint(transforms: ArrayLike) -> FloatArray:
-    """Adjoint matrices (..., 6, 6) of transforms (..., 4, 4).
+    """Return the adjoint matrices (..., 6, 6) of transforms (..., 4, 4).
 
-    ``T @ exp(xi) == exp(adjoint(T) @ xi) @ T``: it maps a tangent vector (rho, phi) from the source
-    frame to the target frame.
+    They map a tangent vector (rho, phi) from the source frame to the target frame:
+    ``T @ exp(xi) == exp(adjoint(T) @ xi) @ T``.
     """
     transforms = np.asarray(transforms, dtype=float)
     rotation = transforms[..., :3, :3]
-    matrices = np.zeros((*transforms.shape[:-2], 6, 6))
-    matrices[..., :3, :3] = rotation
-    matrices[..., 3:, 3:] = rotation
+    matrices = on_both(rotation)
     matrices[..., :3, 3:] = skew(transforms[..., :3, 3]) @ rotation
     return matrices
 
 
 def rotation_angle(rotation: ArrayLike) -> FloatArray:
-    """Angles (...), rad, from 0 to pi, of rotation matrices (..., 3, 3).
+    """Return the angles (...), rad, from 0 to pi, of rotation matrices (..., 3, 3).
 
-    They come from sine and cosine together, so that neither small angles nor angles near pi lose
-    digits.
+    Sine and cosine together are exact both for small angles and for angles near pi.
     """
     rotation = np.asarray(rotation, dtype=float)
     x, y, z = np.moveaxis(vee(rotation), -1, 0)
@@ -334,7 +342,7 @@ def rotation_angle(rotation: ArrayLike) -> FloatArray:
 
 
 def interpolate(start: FloatArray, end: FloatArray, fraction: ArrayLike) -> FloatArray:
-    """Poses along the geodesic of SE(3) from ``start`` to ``end`` (constant twist).
+    """Return poses along the geodesic of SE(3) from ``start`` to ``end`` (constant twist).
 
     Parameters
     ----------
@@ -352,22 +360,29 @@ def interpolate(start: FloatArray, end: FloatArray, fraction: ArrayLike) -> Floa
 
 
 def chained(steps: FloatArray) -> FloatArray:
-    """Orientations (N + 1, 3, 3) after each of the rotations (N, 3, 3), from the identity on; or
-    poses.
+    """Return the products (N + 1, k, k) of the first 0, 1, ..., N of the steps (N, k, k).
+
+    The steps are rotations or transforms.
     """
-    rotations = np.concatenate([np.eye(steps.shape[-1])[None], steps])
-    # Products of all up to each, in as many passes as their number has binary digits.
+    products = np.concatenate([np.eye(steps.shape[-1])[None], steps])
+    # After each pass the products are of twice as many steps.
     span = 1
-    while span < len(rotations):
-        rotations[span:] = rotations[:-span] @ rotations[span:]
+    while span < len(products):
+        products[span:] = products[:-span] @ products[span:]
         span *= 2
-    return rotations
+    return products
 
 
 def put_right(Ts: FloatArray, invert: str = "none", quaternion: str = "xyzw") -> FloatArray:
-    """Poses (N, 4, 4) that were written in another convention than they were read in: ``invert``
-    ("none", "poses" or "orientations") says what was of the world in the sensor, ``quaternion``
-    ("xyzw", "wxyz" or "yzwx") the order of quaternions that were read as x y z w.
+    """Correct poses (N, 4, 4) that were read in another convention than they were written in.
+
+    Parameters
+    ----------
+    Ts : (N, 4, 4) array
+    invert : {"none", "poses", "orientations"}
+        What the source writes of the world in the sensor, instead of the sensor in the world.
+    quaternion : {"xyzw", "wxyz", "yzwx"}
+        Order of the quaternions that were read as x y z w.
     """
     if quaternion != "xyzw":
         quats = np.roll(to_quat_xyzw(Ts), -quaternion.index("x"), axis=-1)
@@ -381,18 +396,19 @@ def put_right(Ts: FloatArray, invert: str = "none", quaternion: str = "xyzw") ->
 
 
 def xyz_rpy(T_target_source: FloatArray) -> FloatArray:
-    """x, y, z (m), roll, pitch and yaw (rad) of a transform (4, 4)."""
+    """Return x, y, z (m), roll, pitch and yaw (rad) of a transform (4, 4)."""
     return np.r_[T_target_source[:3, 3], rotation_to_rpy(T_target_source[:3, :3])]
 
 
 # ------------------------------------------------------------------- their uncertainty
 
-# Standard deviations above this (rad) count as unknown: the derivative does not hold that far.
+# Standard deviation (rad) above which an angle is unknown: the derivative is not valid that far.
 _UNKNOWN_ANGLE = 0.3
 
 # Roll and yaw cannot be separated if the cosine of the pitch is below this many standard deviations
-# of the rotation: their own would be 10 deg and more, and far from normal.
+# of the rotation: their own standard deviations would be 10 deg and more, and far from normal.
 _LOCKED_SIGMAS = 5.0
+# The same limit for exact rotations.
 _LOCKED_COSINE = 1e-4
 
 
@@ -416,7 +432,10 @@ def on_both(rotation: FloatArray) -> FloatArray:
 
 
 def sigmas_in_parent(rotation_parent_child: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Standard deviations (6,) along and about the parent's axes; infinite if the covariance is."""
+    """Return standard deviations (6,) along and about the parent's axes.
+
+    They are infinite if the covariance (6, 6) in the child's frame is.
+    """
     if not np.isfinite(covariance).all():
         return np.full(6, np.inf)
     variances = np.diag(turned(rotation_parent_child, covariance))
@@ -424,7 +443,7 @@ def sigmas_in_parent(rotation_parent_child: FloatArray, covariance: FloatArray) 
 
 
 def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Standard deviations (3,) of roll, pitch and yaw, rad, to first order.
+    """Return standard deviations (3,) of roll, pitch and yaw, rad, to first order.
 
     Parameters
     ----------
@@ -435,7 +454,7 @@ def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArra
     Returns
     -------
     (3,) array
-        Infinite if an angle is unknown; near gimbal lock roll and yaw are.
+        Infinite for unknown angles, such as roll and yaw near gimbal lock.
     """
     rotation = np.asarray(T_target_source, dtype=float)[:3, :3]
     covariance = np.asarray(covariance, dtype=float)[3:, 3:]
@@ -463,7 +482,7 @@ def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArra
 
 
 def inverse_covariance(T_target_source: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of the inverse transform, in the same convention.
+    """Return the covariance (6, 6) of the inverse transform, in the same convention.
 
     ``inverse(T exp(xi)) = inverse(T) exp(-Ad_T xi)``, so the covariance is ``Ad_T C Ad_T'``.
     """
@@ -477,8 +496,9 @@ def inverse_covariance(T_target_source: FloatArray, covariance: FloatArray) -> F
 def absolute_errors(
     T_parent_child: FloatArray, truth_T_parent_child: FloatArray
 ) -> tuple[float, float]:
-    """Absolute errors e_at (m) and e_aR (rad) of a transform (4, 4) against the true one: eqs 8 and
-    9 of Välimäki et al. 2023.
+    """Return the absolute errors e_at (m) and e_aR (rad) of a transform (4, 4).
+
+    Välimäki et al. 2023, eqs 8 and 9.
     """
     translation = np.linalg.norm(truth_T_parent_child[:3, 3] - T_parent_child[:3, 3])
     rotation = rotation_angle(T_parent_child[:3, :3].T @ truth_T_parent_child[:3, :3])
@@ -486,8 +506,9 @@ def absolute_errors(
 
 
 def deviation(T_parent_child: FloatArray, T_reference: FloatArray) -> FloatArray:
-    """Deviations (..., 6) of transforms (..., 4, 4) from another (4, 4), along (m) and about (rad)
-    the axes of the parent sensor's frame.
+    """Return deviations (..., 6) of transforms (..., 4, 4) from a reference (4, 4).
+
+    They are along (m) and about (rad) the axes of the parent sensor's frame.
     """
     rotation = rotation_log(T_parent_child[..., :3, :3] @ T_reference[:3, :3].T)
     translation = T_parent_child[..., :3, 3] - T_reference[:3, 3]
