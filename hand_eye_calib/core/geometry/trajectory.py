@@ -1,4 +1,13 @@
-"""Trajectories: stamped poses of one sensor in a fixed frame of its own."""
+"""Trajectories: stamped poses of one sensor in a fixed frame of its own.
+
+Interpolation at a fraction s of an interval h adds the change of the twist to the geodesic:
+
+    T(s) = T_i exp(s xi_i) exp(-m s (1 - s) h^2 / 2 * bend(s)),    xi_i = Log(T_i^-1 T_i+1)
+
+with the second derivative ``bend`` of the motion, by the change of the twist at both ends, and the
+share m of this change that is motion rather than noise, see :func:`corners`. For m = 0 this is the
+geodesic of SE(3) of Välimäki et al. 2023.
+"""
 
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -15,49 +24,51 @@ from hand_eye_calib.core.base.registry import MEASURES
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.geometry import se3
 
-# A quaternion further from unit length than this is wrong and not just rounded (tf2 has the same
-# bound).
+# Tolerance of the length of a quaternion: beyond, it is wrong and not just rounded (bound of tf2).
 QUATERNION_NORM_TOLERANCE = 1e-2
 
-# A position (m) is never so large, not even from the Earth's centre in millimetres.
+# Largest coordinate of a position (m): above those from the Earth's centre in millimetres.
 FARTHEST_M = 1e10
 
-# Tolerance for rotation matrices: a file with six digits passes, a scaled matrix does not.
+# Tolerance of rotation matrices: a file with six digits passes, a scaled matrix does not.
 ROTATION_TOLERANCE = 1e-3
 
-# Intervals on either side of one that tell motion from noise, and poses before and after a stamp
-# that interpolation looks at.
+# Number of intervals on either side of an interval that distinguish motion from noise.
 _NEARBY = 4
+# Number of poses before and after a stamp that interpolation uses.
 REACH = _NEARBY + 2
 
-# Directions of steps that are this share of the extent of the positions are compared, of a fifth of
-# that number at least.
+# Steps have this share of the extent of the positions when their directions are compared. There
+# must be a fifth of this number of steps.
 _STEPS_IN_EXTENT = 50
 
-# In a wrong convention the direction scatters at least so much, and so many times as much as in the
-# right one.
+# Least scatter of the direction of motion in a wrong convention.
 STEADY = 0.05
+# Least ratio of this scatter to that in the right convention.
 CLEARLY = 4.0
 
-# Of white noise: covariance of neighbouring changes over their variance, and variance of the mean
-# of two of them over theirs.
+# Correlation of neighbouring changes of white noise.
 _CORRELATION = -2.0 / 3.0
+# Variance of the mean of two neighbouring changes of white noise, over that of one.
 _LEFT_IN_THE_MEAN = 1.0 / 6.0
 
 
 def scatter_of_direction(poses: FloatArray) -> float:
-    """How much the direction of a sensor's motion scatters in its own axes: 0 if it is always the
-    same, as on vehicles, 1 if it goes everywhere, or if there are too few steps.
+    """Return the scatter of the direction of motion of poses (N, 4, 4) in the sensor's axes.
+
+    It is 0 if the direction is always the same, as on vehicles, and 1 if the sensor moves in all
+    directions, or if there are too few steps.
     """
     positions = poses[:, :3, 3]
     rotations = poses[:, :3, :3]
-    step = float(np.linalg.norm(np.ptp(positions, axis=0))) / _STEPS_IN_EXTENT
-    travelled = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))]
-    rows = np.flatnonzero(np.diff(np.floor(travelled / (step or np.inf)), prepend=-1.0))
+    step_m = float(np.linalg.norm(np.ptp(positions, axis=0))) / _STEPS_IN_EXTENT
+    travelled_m = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))]
+    n_steps_before = np.floor(travelled_m / (step_m or np.inf))
+    rows = np.flatnonzero(np.diff(n_steps_before, prepend=-1.0))
     steps = np.diff(positions[rows], axis=0)
     lengths = np.linalg.norm(steps, axis=1)
-    # Of a sensor that stands still, the noise of the positions adds up to a path.
-    is_step = lengths > step / 3
+    # Noise of the positions adds up to a path while a sensor stands still.
+    is_step = lengths > step_m / 3
     if is_step.sum() < _STEPS_IN_EXTENT / 5:
         return 1.0
     directions = steps[is_step] / lengths[is_step, None]
@@ -65,46 +76,48 @@ def scatter_of_direction(poses: FloatArray) -> float:
     return 1.0 - float(np.linalg.norm(in_sensor.mean(axis=0)))
 
 
-# Poses (m and entries of rotations) this close are the same, to rounding.
+# Largest difference (m, or entries of rotations) of poses that are equal to rounding.
 _SAME_POSE = 1e-6
 
 # Range of stamps (ns).
-_FIRST_NS = int(np.iinfo(np.int64).min)
-_LAST_NS = int(np.iinfo(np.int64).max)
+_STAMPS_NS = np.iinfo(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
 class WithArrays:
-    """Base of dataclasses with ``eq=False``: equal if all fields are, arrays as a whole."""
+    """Base of dataclasses with ``eq=False`` that are equal if all fields are, arrays included."""
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, type(self)) and all(map(_equal, self.columns, other.columns))
 
     @property
     def columns(self) -> tuple[Any, ...]:
-        """The values of the fields, in their order."""
-        return tuple(getattr(self, each.name) for each in fields(self))
+        """Values of the fields, in their order."""
+        return tuple(getattr(self, column.name) for column in fields(self))
 
 
-def _equal(one: Any, other: Any) -> bool:
-    return np.array_equal(one, other) if isinstance(one, np.ndarray) else one == other
+def _equal(value: Any, other: Any) -> bool:
+    return np.array_equal(value, other) if isinstance(value, np.ndarray) else value == other
 
 
 class Columns(WithArrays):
-    """Base of dataclasses whose arrays, of which the first field is one, have as many rows each."""
+    """Base of dataclasses whose arrays have equally many rows. The first field is an array."""
 
     def __len__(self) -> int:
         return len(self.columns[0])
 
     def __getitem__(self, index: slice | NDArray[Any]) -> Self:
-        """Some of the rows: a slice, mask or index array."""
-        parts = (x[index] if isinstance(x, np.ndarray) else x for x in self.columns)
-        return type(self)(*parts)
+        """Return some of the rows, by a slice, a mask or an index array."""
+        columns = []
+        for column in self.columns:
+            columns.append(column[index] if isinstance(column, np.ndarray) else column)
+        return type(self)(*columns)
 
     @classmethod
-    def concatenate(cls, *parts: Self) -> Self:
-        """The rows of all parts in the given order."""
-        return cls(*map(np.concatenate, zip(*(each.columns for each in parts), strict=True)))
+    def concatenate(cls, *tables: Self) -> Self:
+        """Return the rows of all tables in the given order."""
+        columns = zip(*(table.columns for table in tables), strict=True)
+        return cls(*map(np.concatenate, columns))
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,8 +135,8 @@ class Trajectory(Columns):
     world_frame : str
         Name of the fixed frame; empty if unknown.
     measures : {"poses", "positions", "rotations", "rates"}
-        What the sensor measures of its poses. The orientations of positions and the positions of
-        rotations mean nothing; rates are rotations that were integrated, with a bias.
+        Measured part of the poses. The orientations of positions and the positions of rotations are
+        meaningless. Rates are stored as integrated rotations, with a bias.
 
     Raises
     ------
@@ -143,8 +156,8 @@ class Trajectory(Columns):
     world_frame: str = ""
     measures: str = "poses"
 
-    # One that has the same bends: this one is it at another time.
-    _alike: ClassVar[Self | None] = None
+    # The trajectory that this one is a shifted copy of: both have the same bends.
+    _unshifted: ClassVar[Self | None] = None
 
     def __post_init__(self) -> None:
         stamps_ns = np.ascontiguousarray(self.stamps_ns)
@@ -214,16 +227,16 @@ class Trajectory(Columns):
         sensor_frame: str = "",
         world_frame: str = "",
     ) -> Self:
-        """Build from positions (N, 3), m, of a sensor that has no orientation: the antenna of a
-        GNSS receiver, the prism of a total station.
+        """Build from positions (N, 3), m, of a sensor without orientation.
+
+        Examples are the antenna of a GNSS receiver and the prism of a total station.
         """
         poses = se3.from_rotation_translation(np.eye(3), np.reshape(positions, (-1, 3)))
         return cls(stamps_ns, poses, sensor_frame, world_frame, "positions")
 
     @classmethod
     def from_rates(cls, stamps_ns: IntArray, rates: ArrayLike, sensor_frame: str = "") -> Self:
-        """Build from angular rates (N, 3), rad/s, about the sensor's own axes, as a gyroscope
-        measures them.
+        """Build from angular rates (N, 3), rad/s, of a gyroscope, about the sensor's own axes.
 
         Raises
         ------
@@ -240,33 +253,42 @@ class Trajectory(Columns):
 
     def __repr__(self) -> str:
         text = f"{len(self)} {self.measures} over {self.duration_s:.3f} s"
-        for name in ("sensor_frame", "world_frame"):
-            text += f", {name}={getattr(self, name)!r}" if getattr(self, name) else ""
+        if self.sensor_frame:
+            text += f", sensor_frame={self.sensor_frame!r}"
+        if self.world_frame:
+            text += f", world_frame={self.world_frame!r}"
         return f"Trajectory({text})"
 
     @property
     def has_positions(self) -> bool:
-        """Whether its positions mean something."""
+        """Whether the positions are measured."""
         return self.measures in ("poses", "positions")
 
     @property
     def has_rotations(self) -> bool:
-        """Whether its orientations mean something."""
+        """Whether the orientations are measured."""
         return self.measures != "positions"
 
     @property
     def duration_s(self) -> float:
-        """Seconds from first to last pose; 0 for fewer than two."""
+        """Seconds from the first to the last pose; 0 for fewer than two poses."""
         return float(self.stamps_ns[-1] - self.stamps_ns[0]) * 1e-9 if len(self) > 1 else 0.0
 
     @property
     def interval_s(self) -> float:
-        """Median time between two poses in seconds, of at least two poses."""
+        """Median time between two poses in seconds; there must be two poses."""
         return median(np.diff(self.stamps_ns)) * 1e-9
 
     def shifted(self, offset_s: float, rate: float = 0.0, about_ns: int = 0) -> Self:
-        """The same poses with ``offset_s`` seconds added to every stamp, and ``rate`` seconds more
-        for each second after a stamp.
+        """Return the same poses at shifted stamps.
+
+        Parameters
+        ----------
+        offset_s : float
+            Seconds that are added to every stamp.
+        rate : float
+            Seconds that are added for each second after ``about_ns``.
+        about_ns : int
 
         Raises
         ------
@@ -276,8 +298,9 @@ class Trajectory(Columns):
         if not len(self) or not (offset_s or rate):
             return self
         offset_ns = round(offset_s * 1e9)
-        ends_ns = [int(stamp_ns) + offset_ns for stamp_ns in self.stamps_ns[[0, -1]]]
-        if min(ends_ns) < _FIRST_NS or max(ends_ns) > _LAST_NS:
+        first_ns = int(self.stamps_ns[0]) + offset_ns
+        last_ns = int(self.stamps_ns[-1]) + offset_ns
+        if first_ns < _STAMPS_NS.min or last_ns > _STAMPS_NS.max:
             raise InputError(
                 f"a time offset of {offset_s:.10g} s moves stamps beyond 64 bits of nanoseconds; "
                 "check its unit and sign"
@@ -285,63 +308,74 @@ class Trajectory(Columns):
         stamps_ns = self.stamps_ns + np.int64(offset_ns)
         if rate:
             stamps_ns += np.round(rate * (self.stamps_ns - about_ns)).astype(np.int64)
-        return self._unchecked("stamps_ns", stamps_ns, None if rate else self._alike or self)
+        unshifted = None if rate else self._unshifted or self
+        return self._unchecked("stamps_ns", stamps_ns, unshifted)
 
     def scaled(self, scale: float) -> Self:
-        """The same rotations with every translation multiplied by ``scale``."""
+        """Return the same rotations with every translation multiplied by ``scale``."""
         if scale == 1.0:
             return self
         poses = self.poses.copy()
         poses[:, :3, 3] *= scale
-        return self._unchecked("poses", poses)  # in another unit, they may be farther away
+        # Positions in another unit may exceed the largest position: they are not checked.
+        return self._unchecked("poses", poses)
 
-    def _unchecked(self, name: str, value: NDArray[Any], alike: Self | None = None) -> Self:
+    def _unchecked(self, name: str, value: NDArray[Any], unshifted: Self | None = None) -> Self:
+        """Return a copy with another value of a field, without checks."""
         changed = object.__new__(type(self))
-        values = {each.name: getattr(self, each.name) for each in fields(self)}
-        for key, each in (values | {name: value, "_alike": alike}).items():
-            object.__setattr__(changed, key, each)
+        values = {column.name: getattr(self, column.name) for column in fields(self)}
+        values |= {name: value, "_unshifted": unshifted}
+        for key in values:
+            object.__setattr__(changed, key, values[key])
         return changed
 
     @cached_property
     def _steps(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Twists (N - 1, 6) from each pose to the next; their change (N, 6) per second, squared, at
-        each of the poses, zero at the ends; and the share (N - 1, 6) of motion in those at both
-        ends of each interval, translation and rotation each on its own, as the weight that makes
-        their mean most precise.
+        """Twists between poses, their changes, and the share of motion in the changes.
+
+        Returns
+        -------
+        steps : (N - 1, 6) array
+            Twists from each pose to the next.
+        changes : (N, 6) array
+            Second derivatives at the poses, zero at both ends.
+        shares : (N - 1, 6) array
+            Share of motion in the changes at both ends of each interval, for translation and
+            rotation on their own: the weight that makes the mean change most precise.
         """
-        if self._alike is not None:
-            return self._alike._steps
+        if self._unshifted is not None:
+            return self._unshifted._steps
         spans_s = np.diff(self.stamps_ns)[:, None] * 1e-9
         steps = se3.log(se3.inverse(self.poses[:-1]) @ self.poses[1:])
         changes = np.zeros((len(self), 6))
         changes[1:-1] = np.diff(steps / spans_s, axis=0) / (0.5 * (spans_s[1:] + spans_s[:-1]))
         shares = np.empty((len(changes) - 1, 6))
         for part in (slice(0, 3), slice(3, 6)):
-            of_part = changes[:, part]
-            power = (of_part**2).sum(axis=1)
-            both = (of_part[1:] * of_part[:-1]).sum(axis=1), 0.5 * (power[1:] + power[:-1])
-            padded = (np.pad(values, _NEARBY) for values in both)
-            nearby = (sliding_window_view(values, 2 * _NEARBY + 1) for values in padded)
-            products, powers = (values.sum(axis=1) for values in nearby)
-            alike = products / np.maximum(powers, 1e-300)
-            motion = np.clip((alike - _CORRELATION) / (1.0 - _CORRELATION), 0.0, 1.0)
-            shares[:, part] = (motion / (motion + (1.0 - motion) * _LEFT_IN_THE_MEAN))[:, None]
+            vectors = changes[:, part]
+            squares = (vectors**2).sum(axis=1)
+            products = _sums_nearby((vectors[1:] * vectors[:-1]).sum(axis=1))
+            powers = _sums_nearby(0.5 * (squares[1:] + squares[:-1]))
+            correlation = products / np.maximum(powers, 1e-300)
+            motion = np.clip((correlation - _CORRELATION) / (1.0 - _CORRELATION), 0.0, 1.0)
+            noise = (1.0 - motion) * _LEFT_IN_THE_MEAN
+            shares[:, part] = (motion / (motion + noise))[:, None]
         return steps, changes, shares
 
     def at(
         self, stamps_ns: IntArray, extrapolate: bool = False, straight: bool = False
     ) -> FloatArray:
-        """Interpolate poses (M, 4, 4) at other stamps (M,), see :func:`corners`. A stamp of the
-        trajectory gives its very pose, bit by bit.
+        """Interpolate poses (M, 4, 4) at other stamps, see :func:`corners`.
+
+        The pose at a stamp of the trajectory is returned unchanged, bit by bit.
 
         Parameters
         ----------
         stamps_ns : (M,) int64 array
         extrapolate : bool
-            Extend the twist of the first and last segment beyond the ends, as the paper's KITTI
-            experiments do.
+            Whether to extend the twist of the first and last segment beyond the ends, as the
+            paper's KITTI experiments do.
         straight : bool
-            Along the geodesic of SE(3) between neighbours, as in the paper.
+            Whether to follow the geodesic of SE(3) between neighbours, as in the paper.
 
         Raises
         ------
@@ -352,10 +386,10 @@ class Trajectory(Columns):
         stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
         if len(self) < 2:
             raise InputError(f"interpolation needs at least two poses; found {len(self)}")
-        outside = (stamps_ns < self.stamps_ns[0]) | (stamps_ns > self.stamps_ns[-1])
-        if outside.any() and not extrapolate:
+        is_outside = (stamps_ns < self.stamps_ns[0]) | (stamps_ns > self.stamps_ns[-1])
+        if is_outside.any() and not extrapolate:
             raise InputError(
-                f"{int(outside.sum())} of {len(stamps_ns)} stamps lie outside the trajectory "
+                f"{int(is_outside.sum())} of {len(stamps_ns)} stamps lie outside the trajectory "
                 f"({self.stamps_ns[0]} to {self.stamps_ns[-1]} ns); poses are not extrapolated"
             )
         after = np.clip(np.searchsorted(self.stamps_ns, stamps_ns), 1, len(self) - 1)
@@ -363,16 +397,23 @@ class Trajectory(Columns):
         span = (self.stamps_ns[after] - self.stamps_ns[before]).astype(float)
         fraction = (stamps_ns - self.stamps_ns[before]).astype(float) / span
         poses = self.poses[np.where(fraction == 1.0, after, before)]
-        between = (fraction != 0.0) & (fraction != 1.0)
-        if between.any():
-            steps, changes, motion = self._steps
-            shares = fraction[between, None]
-            bent = between & ~outside
-            poses[between] = poses[between] @ se3.exp(shares * steps[before[between]])
-            if bent.any() and not straight:
-                bends = self.stamps_ns, changes, motion, before[bent], fraction[bent]
-                poses[bent] = poses[bent] @ se3.exp(corners(*bends))
+        is_between = (fraction != 0.0) & (fraction != 1.0)
+        if not is_between.any():
+            return poses
+        steps, changes, shares = self._steps
+        twists = fraction[is_between, None] * steps[before[is_between]]
+        poses[is_between] = poses[is_between] @ se3.exp(twists)
+        is_bent = is_between & ~is_outside
+        if is_bent.any() and not straight:
+            bends = corners(self.stamps_ns, changes, shares, before[is_bent], fraction[is_bent])
+            poses[is_bent] = poses[is_bent] @ se3.exp(bends)
         return poses
+
+
+def _sums_nearby(values: FloatArray) -> FloatArray:
+    """Return the sums (K,) of values (K,) and their neighbours on either side."""
+    windows = sliding_window_view(np.pad(values, _NEARBY), 2 * _NEARBY + 1)
+    return np.asarray(windows.sum(axis=1))
 
 
 class Table(Protocol):
@@ -381,27 +422,27 @@ class Table(Protocol):
     columns: Any
 
 
-#: A trajectory, or what :func:`hand_eye_calib.read_trajectory` makes one of: a path, rows, a table.
+#: A trajectory, or an input of :func:`hand_eye_calib.read_trajectory`: a path, rows or a table.
 TrajectoryLike: TypeAlias = Trajectory | str | PathLike[str] | np.ndarray | Table
 
 
 def far_position(x: float, y: float, z: float) -> str:
-    """What is wrong with a position farther than FARTHEST_M from the origin."""
+    """Describe a position farther than FARTHEST_M from the origin."""
     return f"position ({x:.4g}, {y:.4g}, {z:.4g}) is more than {FARTHEST_M:g} m from the origin"
 
 
 def _check_finite(what: str, rows: FloatArray) -> None:
     """Raise InputError at the first row (N, K) with a value that is not finite."""
-    finite = np.isfinite(rows).all(axis=1)
-    if not finite.all():
+    is_finite = np.isfinite(rows).all(axis=1)
+    if not is_finite.all():
         raise InputError(
-            f"{what} {int(np.argmin(finite))} has a value that is not finite; "
+            f"{what} {int(np.argmin(is_finite))} has a value that is not finite; "
             "remove it or repair its source"
         )
 
 
 def check_poses(poses: FloatArray) -> None:
-    """Raise InputError at the first pose (N, 4, 4) that is no rigid transform."""
+    """Raise InputError at the first of poses (N, 4, 4) that is not a rigid transform."""
     _check_finite("pose", poses.reshape(-1, 16))
     is_far = (np.abs(poses[:, :3, 3]) > FARTHEST_M).any(axis=1)
     if is_far.any():
@@ -410,12 +451,12 @@ def check_poses(poses: FloatArray) -> None:
             f"pose {index}: {far_position(*poses[index, :3, 3])}; check its unit, or remove it"
         )
     rotation = poses[:, :3, :3]
-    apart = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3))
-    deviation = apart.max(axis=(1, 2), initial=0.0)
-    wrong = (deviation > ROTATION_TOLERANCE) | (np.linalg.det(rotation) < 0)
-    if wrong.any():
+    deviations = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3))
+    is_scaled = deviations.max(axis=(1, 2), initial=0.0) > ROTATION_TOLERANCE
+    is_wrong = is_scaled | (np.linalg.det(rotation) < 0)
+    if is_wrong.any():
         raise InputError(
-            f"pose {int(np.argmax(wrong))} is not a rigid transform: its 3x3 part is not a "
+            f"pose {int(np.argmax(is_wrong))} is not a rigid transform: its 3x3 part is not a "
             f"rotation matrix within {ROTATION_TOLERANCE} (scaled or left-handed axes?)"
         )
 
@@ -427,18 +468,32 @@ def corners(
     start: IntArray,
     fraction: FloatArray,
 ) -> FloatArray:
-    """Twists from a constant twist to the motion.
+    """Return the twists from a constant twist to the motion.
 
-    A constant twist between two poses cuts the corners of a motion: a shake of angular frequency f,
-    seen every h seconds, shrinks by (f h)^2 / 12. So the change of the twist at the poses before
-    and after counts, too, as far as it is motion and not noise. Changes by white noise s have
-    variance 6 s^2 and a covariance of -4 s^2 with the next one; those by a motion that is sampled
-    well are alike. The share of motion follows from the poses nearby. What is left of white noise
-    halfway between two poses is between 0.71 (a constant twist) and 0.80 of it.
+    A constant twist between two poses cuts the corners of a motion: a vibration of angular
+    frequency f, sampled every h seconds, shrinks by (f h)^2 / 12. The changes of the twist at both
+    poses correct this, as far as the changes are motion and not noise. White noise of standard
+    deviation s causes changes of variance 6 s^2 with a covariance of -4 s^2 between neighbours. A
+    well sampled motion causes equal changes. The share of motion follows from the poses nearby. The
+    standard deviation of white noise halfway between two poses shrinks to 0.71 (a constant twist)
+    to 0.80 of that of one pose.
 
-    Of poses at stamps (N,) with these changes of their twists, of which these shares are motion,
-    ``start`` (M,) are the indices of those before each wanted one, ``fraction`` (M,) is of the
-    interval to the next. Returns xi (M, 6) in ``T_world_sensor exp(xi)``.
+    Parameters
+    ----------
+    stamps_ns : (N,) int64 array
+    changes : (N, 6) array
+        Changes of the twist per second, squared, at the poses.
+    shares : (N - 1, 6) array
+        Share of motion in the changes.
+    start : (M,) int array
+        Index of the pose before each result.
+    fraction : (M,) array
+        Of the interval to the next pose.
+
+    Returns
+    -------
+    (M, 6) array
+        xi in ``T_world_sensor exp(xi)``.
     """
     at_start = changes[start]
     at_end = changes[start + 1]
@@ -448,7 +503,7 @@ def corners(
 
 
 def repetitions(trajectory: Trajectory, least_s: float) -> list[tuple[int, int]]:
-    """Return the times in which a stream repeats its pose: first and last stamp (ns) of each.
+    """Return the first and last stamp (ns) of each time in which a stream repeats its pose.
 
     Parameters
     ----------
@@ -456,8 +511,8 @@ def repetitions(trajectory: Trajectory, least_s: float) -> list[tuple[int, int]]
     least_s : float
         Shortest such time, in seconds.
     """
-    same = np.abs(np.diff(trajectory.poses, axis=0)).max(axis=(1, 2)) < _SAME_POSE
-    edges = np.flatnonzero(np.diff(np.r_[False, same, False].astype(int)))
+    is_same = np.abs(np.diff(trajectory.poses, axis=0)).max(axis=(1, 2)) < _SAME_POSE
+    edges = np.flatnonzero(np.diff(np.r_[False, is_same, False].astype(int)))
     times_ns = trajectory.stamps_ns[edges].reshape(-1, 2)
     is_long = times_ns[:, 1] - times_ns[:, 0] >= least_s * 1e9
     return [(from_ns, until_ns) for from_ns, until_ns in times_ns[is_long].tolist()]
