@@ -1,4 +1,4 @@
-"""Watch the mount while the robot drives."""
+"""Monitor the mount while the robot drives."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ from hand_eye_calib.core.base.registry import MOUNT_MONITORS
 
 
 def register() -> None:
-    """Register the monitor of the node."""
+    """Register the monitor of the mount for the node."""
     MOUNT_MONITORS["installed"] = _watch
 
 

@@ -1,21 +1,26 @@
-"""``monitor: true``: has the child sensor moved against the installed extrinsic?
+"""Option ``monitor: true``: detect a shift of the child sensor from the installed extrinsic.
 
-For days on end, in constant memory. Every second of motion adds its information about a shift from
-the installed extrinsic (:mod:`hand_eye_calib.core.assessment.moved`). The likelihood ratio of a
-shift is taken over the last three seconds of motion, the last four, ... up to twenty minutes, and
-over all of them; the largest tells. It is measured by what the scores really scatter over time.
+The monitor runs for days in constant memory. Each second k of motion adds its evidence on a shift
+d, the information H_k and the score S_k (:mod:`hand_eye_calib.core.assessment.moved`):
 
-What was there before a shift, the installed extrinsic is off by: by its own uncertainty, and by the
-common-mode error of both odometries (:mod:`hand_eye_calib.core.assessment.covariance`). It is
-learned from all motion before. A scale that drifts, as that of visual odometry, looks like a lever
-arm in curves: in each second the scale is a parameter. Standing still adds nothing. docs/session.md
-has what the monitor can see.
+    H = sum H_k / f,   S = sum S_k / f      over the last 3 s, 4 s, ... 20 min, and over everything
+    log ratio = 1/2 S' (H + L^-1)^-1 S - 1/2 log|I + L H|
+
+with the long-run variance f, by the real scatter of the scores over time. An alarm is raised if the
+largest ratio exceeds a threshold: the generalised likelihood ratio test of M. Basseville, I.
+Nikiforov, *Detection of abrupt changes*, 1993, section 2.4.
+
+The offset from the installed extrinsic before a shift comes from the uncertainty of the extrinsic
+and from the common-mode error of both odometries
+(:mod:`hand_eye_calib.core.assessment.covariance`). The motion before the shift estimates it. A
+drifting scale, for example of visual odometry, looks like a lever arm in curves: each second has
+its own scale parameter. A sensor at rest adds nothing. docs/session.md lists the shifts that the
+monitor detects.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
-from typing import TypeAlias
 
 import numpy as np
 
@@ -39,48 +44,56 @@ from hand_eye_calib.online.live.state import Level, MountState, by_axis
 
 @dataclass(frozen=True)
 class Tuning:
-    """Numbers of the search; times are seconds of motion unless it is said."""
+    """Numbers of the monitor; times are seconds of motion unless stated otherwise.
+
+    docs/session.md lists the shifts that are detected with them.
+    """
 
     # Log likelihood ratio from which on the mount has moved.
     threshold: float = 10.0
-    # Motions over a second are compared, and not those that took so many times as long; at most one
-    # begins in each of these steps (ns).
+    # Longest motion that counts as one over a second, as a multiple of a second.
     most_late: float = 1.5
+    # At most one motion begins in each step of this length (ns).
     step_ns: int = 100_000_000
-    # A second counts if the sensors move by this much within it (m, rad), and by so many times the
-    # noise of the rotation.
+    # A second counts if the sensors move by this distance within it (m) ...
     least_motion_m: float = 0.05
+    # ... or rotate by this angle (rad) ...
     least_rotation_rad: float = float(np.radians(1.5))
+    # ... and by this multiple of the rotation noise.
     least_of_noise: float = 3.0
-    # The noise is learned from so many seconds before anything is judged; so many are kept.
+    # Time from which the noise is learned before the first test.
     learning_s: int = 120
+    # Newest seconds whose evidence is kept one by one.
     memory_s: int = 1200
-    # Shortest time over which a shift is looked for: longer than the motions, so that one jump of a
-    # trajectory is no shift. And how many times there are up to those that are kept.
+    # Shortest time since a shift: longer than the motions, so that one jump of a trajectory is no
+    # shift.
     shortest_s: int = 3
+    # Number of tested times since a shift.
     lags: int = 16
-    # Time over which the noise is followed, and over which older motion is forgotten.
+    # Time constant of the estimate of the noise.
     noise_memory_s: float = 900.0
+    # Time constant with which older evidence is forgotten.
     old_memory_s: float = 20_000.0
-    # Factor on the variances that the installed extrinsic states; how much of the common-mode error
-    # differs from hour to hour (one standard deviation, as a share).
+    # Factor of the variances of the installed extrinsic.
     caution: float = 2.0
+    # Standard deviation of the common-mode error from hour to hour, as a share.
     wander: float = 0.25
     # Standard deviation of the child's scale in a second. A scale that drifts by 0.5 % is wrong for
-    # a minute; as errors that are new in each second, that is sqrt(60) times as much.
+    # a minute; as independent errors of seconds, this is sqrt(60) times as much.
     scale_sigma: float = 0.04
-    # Windows (s) whose scores show the long-run variance, which is taken anew every so many
-    # seconds. What is assumed of it beforehand counts as much as so many windows, and fewer say
-    # nothing. A shift spoils some: none counts for more than so many times the typical one.
+    # Lengths (s) of the windows whose scores give the long-run variance.
     windows_s: tuple[int, ...] = (10, 30, 90, 240)
+    # Interval of its estimates.
     long_run_every_s: int = 10
+    # Prior long-run variance.
     assumed: float = 10.0
+    # Weight of the prior in windows; fewer windows are no evidence.
     assumed_windows: int = 4
+    # Largest score of a window, as a multiple of the typical one: a shift spoils some windows.
     most_of_typical: float = 20.0
-    # Share of the information of the shifts that are looked for, without which a shift may be
-    # anything.
+    # Information of the expected shifts that is added to that of the motion, as a share.
     ridge: float = 1e-3
-    # What can be seen is told for a session of so many seconds.
+    # Duration of the session for which visible shifts are reported.
     session_s: float = 600.0
 
 
@@ -89,26 +102,49 @@ TUNING = Tuning()
 _LAGS = np.geomspace(TUNING.shortest_s, TUNING.memory_s, TUNING.lags).round().astype(int)
 _SECOND_NS = 1_000_000_000
 
-# What a knock may be: a translation, a rotation, both. A knock that only turns the sensor shows
-# sooner against the second.
+# Covariances of expected shifts: a translation, a rotation, or both. A shift that only rotates the
+# sensor is detected sooner with the second.
 _KNOCKS = np.array(
     [moved.shift_covariance(radians=1e-6), moved.shift_covariance(1e-6), moved.shift_covariance()]
 )
 
-# A second, its motions (K), their residuals (K, 6) at the installed extrinsic and the negative
-# derivatives (K, 6, 7) of these by a shift and by the logarithm of the child's scale.
-_Second: TypeAlias = tuple[int, MotionPairs, FloatArray, FloatArray]
-
-# Of the session that is watched, poses are paired soon, and few are kept.
+# Limits of a session that is only monitored: poses are paired soon, and few are kept.
 LIMITS = BufferLimits(
     capacity=4_000, pairing_starts=32, batch=64, batch_every=16, late_ns=500_000_000
 )
 
 
+@dataclass(frozen=True)
+class _Second:
+    """Motions that begin within one second of motion.
+
+    Attributes
+    ----------
+    stamp_ns : int
+    motions : MotionPairs
+        K motions over a second.
+    residuals : (K, 6) array
+        At the installed extrinsic.
+    jacobians : (K, 6, 7) array
+        Negative derivatives of the residuals by a shift and by the logarithm of the child's scale.
+    """
+
+    stamp_ns: int
+    motions: MotionPairs
+    residuals: FloatArray
+    jacobians: FloatArray
+
+
 @dataclass(frozen=True, kw_only=True)
 class Alarm:
-    """The mount has moved, from the installed pose, since about a stamp of the parent's clock; that
-    was clear at another.
+    """A shift of the mount from the installed pose.
+
+    Attributes
+    ----------
+    since_ns, raised_ns : int
+        Stamps of the parent's clock: of the shift, about, and of its detection.
+    shift : Moved
+    log_ratio : float
     """
 
     since_ns: int
@@ -117,28 +153,31 @@ class Alarm:
     log_ratio: float
 
     def __str__(self) -> str:
-        """Which axes have moved, by how much, since when (local time)."""
+        """Describe the axes that have moved, by how much, and since when (local time)."""
         since = datetime.fromtimestamp(self.since_ns * 1e-9).isoformat(" ", timespec="minutes")
         return f"the mount has moved: {self.shift.what}, since about {since}"
 
 
 class MountMonitor:
-    """Watches the pose of the child sensor in the parent sensor's frame.
+    """Monitors the pose of the child sensor in the parent sensor's frame.
 
     Parameters
     ----------
     T_parent_child : (4, 4) array
         The installed extrinsic.
     covariance : (6, 6) array
-        Of the error xi in ``T_parent_child @ exp(xi)``; zero if it is exact.
+        Covariance of the error xi in ``T_parent_child @ exp(xi)``; zero if it is exact.
 
     Attributes
     ----------
     alarm : Alarm or None
-        The shift that has been seen.
+        The detected shift.
     seconds : int
-        Seconds of motion seen so far; the noise is learned from the first, and nothing is judged
-        while ``is_learning``.
+        Seconds of motion so far.
+    is_learning : bool
+        Whether the noise is still learned, and nothing is tested.
+    long_run : float
+        Long-run variance of the scores in units of their information.
     """
 
     def __init__(self, T_parent_child: FloatArray, covariance: FloatArray) -> None:
@@ -149,7 +188,7 @@ class MountMonitor:
         self._learning: list[_Second] = []
         self.is_learning = True
         self._tail = PosePairs.empty()
-        # Evidence of the newest seconds of motion, and the sum of those before them.
+        # Evidence of the newest seconds of motion, and the sum of older ones.
         self._stamps_ns: IntArray = np.zeros(0, dtype=np.int64)
         self._seconds = Blocks(np.zeros((0, 6, 7)))
         self._old = np.zeros((6, 7))
@@ -161,38 +200,38 @@ class MountMonitor:
         self.long_run = TUNING.assumed
 
     def add(self, pose_pairs: PosePairs) -> Alarm | None:
-        """Take the poses that follow those before.
+        """Add the next poses.
 
         Returns
         -------
         Alarm or None
-            A new one, if it was raised by these poses.
+            A new alarm, if these poses raise it.
         """
-        before = self.alarm
+        had_alarm = self.alarm is not None
         raised = None
         for second in self._by_second(pose_pairs):
-            stamp_ns, motions, *terms = second
-            if not _is_motion(motions, self._noise):
+            if not _is_motion(second.motions, self._noise):
                 continue
             self.seconds += 1
             if self.is_learning:
                 self._learn(second)
             else:
-                self._take(stamp_ns, *terms)
+                self._add_evidence(second)
             if not self.is_learning:
-                self._judge()
-            raised = raised or (None if before else self.alarm)
+                self._test()
+            if raised is None and not had_alarm:
+                raised = self.alarm
         return raised
 
     def restart(self) -> None:
-        """Begin anew with stamps of any time; what was learned stays."""
+        """Start again with stamps of any time, without loss of what was learned."""
         self._tail = PosePairs.empty()
         self._last_s = -1
 
     # ------------------------------------------------------------- the motions
 
     def _by_second(self, pose_pairs: PosePairs) -> list[_Second]:
-        """Motions over a second that end in these poses, by the second in which they begin."""
+        """Return motions over a second that end in these poses, by the second of their begin."""
         if len(self._tail) and len(pose_pairs):
             late_ns = int(pose_pairs.stamps_ns[0] - self._tail.stamps_ns[-1])
             if not 0 < late_ns <= TUNING.most_late * _SECOND_NS:
@@ -202,20 +241,24 @@ class MountMonitor:
         stamps_ns = poses.stamps_ns
         seconds = poses.stamps_ns // _SECOND_NS
         j = np.searchsorted(stamps_ns, stamps_ns + _SECOND_NS)
-        # A second is complete once a motion of the next one has its end.
+        # A second is complete once a motion of the next second has its end.
         has_end = j < len(stamps_ns)
-        under_way = int(seconds[has_end][-1]) if has_end.any() else -1
-        self._tail = poses[seconds >= under_way]
-        i = np.flatnonzero(has_end & (seconds < under_way) & (seconds > self._last_s))
+        incomplete_s = int(seconds[has_end][-1]) if has_end.any() else -1
+        self._tail = poses[seconds >= incomplete_s]
+        i = np.flatnonzero(has_end & (seconds < incomplete_s) & (seconds > self._last_s))
         i = i[stamps_ns[j[i]] - stamps_ns[i] <= TUNING.most_late * _SECOND_NS]
-        self._last_s = max(self._last_s, under_way - 1)
+        self._last_s = max(self._last_s, incomplete_s - 1)
         pairs = pairs_between(poses.Ts_pw_p, poses.Ts_cw_c, i, j[i])
-        of_pairs = seconds[i]
-        residuals, jacobians = moved.residuals_and_jacobians(pairs, self._installed)  # all at once
+        second_of_pair = seconds[i]
+        residuals, jacobians = moved.residuals_and_jacobians(pairs, self._installed)
         by_scale = -se3.inverse(pairs.Ts_childi_childj)[:, :3, 3:]
         jacobians = np.append(jacobians, np.pad(by_scale, ((0, 0), (0, 3), (0, 0))), axis=2)
-        parts = [(each * _SECOND_NS, of_pairs == each) for each in np.unique(of_pairs).tolist()]
-        return [(ns, pairs[part], residuals[part], jacobians[part]) for ns, part in parts]
+        complete = []
+        for second in np.unique(second_of_pair).tolist():
+            rows = second_of_pair == second
+            stamp_ns = second * _SECOND_NS
+            complete.append(_Second(stamp_ns, pairs[rows], residuals[rows], jacobians[rows]))
+        return complete
 
     def _learn(self, second: _Second) -> None:
         """Collect motions; once there are enough, learn the noise about their own answer."""
@@ -224,50 +267,55 @@ class MountMonitor:
             return
         learned = self._learning
         self._learning = []
-        parent = np.concatenate([each.Ts_parenti_parentj for _, each, *_ in learned])
-        child = np.concatenate([each.Ts_childi_childj for _, each, *_ in learned])
-        index = np.arange(len(parent))
-        pairs = MotionPairs(parent, child, index, index + 1)
-        residuals = np.concatenate([each for *_, each, _ in learned])
-        jacobians = np.concatenate([each[:, :, :6] for *_, each in learned])
+        pairs = MotionPairs.concatenate(*(second.motions for second in learned))
+        # Motions count as independent, each over one step.
+        index = np.arange(len(pairs))
+        pairs = replace(pairs, i=index, j=index + 1)
+        residuals = np.concatenate([second.residuals for second in learned])
+        jacobians = np.concatenate([second.jacobians[:, :, :6] for second in learned])
         self.is_learning = False
         self._noise, _ = moved.noise_covariance(residuals)
         for _ in range(2):
-            table, _ = _information(residuals, jacobians, self._noise)
+            table, _ = _evidence(residuals, jacobians, self._noise)
             shift = moved.most_likely(table, TUNING.ridge)
             self._noise, _ = moved.noise_covariance(residuals + jacobians @ shift)
-        speed_m_s = float(np.median(np.linalg.norm(parent[:, :3, 3], axis=1)))
-        floor = floor_of_pairs(pairs, np.ones(len(parent)), self._installed, speed_m_s)
-        floor += moved.shift_covariance(1e-3, 1e-4)  # never singular
+        distances_m = np.linalg.norm(pairs.Ts_parenti_parentj[:, :3, 3], axis=1)
+        speed_m_s = float(np.median(distances_m))
+        floor = floor_of_pairs(pairs, np.ones(len(pairs)), self._installed, speed_m_s)
+        floor += moved.shift_covariance(1e-3, 1e-4)  # keeps the covariance regular
         self._covariance = self._covariance + floor
         self._wander = TUNING.wander**2 * floor
-        for second_ns, _, *terms in learned:
-            self._take(second_ns, *terms)
+        for second in learned:
+            self._add_evidence(second)
 
-    def _take(self, stamp_ns: int, residuals: FloatArray, jacobians: FloatArray) -> None:
-        """Add the information of a second whatever the scale in it, and follow the noise."""
+    def _add_evidence(self, second: _Second) -> None:
+        """Add the evidence of a second, for an unknown scale in it, and update the noise."""
         n_seconds = len(self._seconds.sums)
         if self.seconds % TUNING.long_run_every_s == 0 and n_seconds >= TUNING.learning_s:
             self._centre = moved.most_likely(self._seconds.total, TUNING.ridge)
         shift = np.append(self._centre, 0.0)
-        table, scatter = _information(residuals, jacobians, self._noise, shift)
-        of_scale = table[6, [0, 1, 2, 3, 4, 5, 7]]
-        share = table[:6, 6] / (table[6, 6] + self.long_run / TUNING.scale_sigma**2)
-        table = np.delete(table[:6], 6, axis=1) - np.outer(share, of_scale)
+        table, scatter = _evidence(second.residuals, second.jacobians, self._noise, shift)
+        # Eliminate the scale, with its prior, from the evidence [H S] (7, 8).
+        scale_information = table[6, 6] + self.long_run / TUNING.scale_sigma**2
+        by_scale = np.delete(table[6], 6)
+        table = np.delete(table[:6], 6, axis=1) - np.outer(
+            table[:6, 6] / scale_information, by_scale
+        )
         if n_seconds == TUNING.memory_s and self.alarm is None:
             self._old = (1.0 - 1.0 / TUNING.old_memory_s) * self._old + self._seconds.sums[0]
-        self._stamps_ns = np.append(self._stamps_ns, np.int64(stamp_ns))[-TUNING.memory_s :]
+        stamps_ns = np.append(self._stamps_ns, np.int64(second.stamp_ns))
+        self._stamps_ns = stamps_ns[-TUNING.memory_s :]
         tables = np.concatenate([self._seconds.sums, table[None]])
         self._seconds = Blocks(tables[-TUNING.memory_s :])
         share = 1.0 / TUNING.noise_memory_s
         self._noise = (1.0 - share) * self._noise + share * scatter
-        n_seconds = min(n_seconds + 1, 100)
-        self._motions_per_s += (len(residuals) - self._motions_per_s) / n_seconds
+        n_averaged = min(n_seconds + 1, 100)
+        self._motions_per_s += (len(second.residuals) - self._motions_per_s) / n_averaged
 
-    # ------------------------------------------------------------- the judgement
+    # ------------------------------------------------------------- the test
 
-    def _judge(self) -> None:
-        """Raise an alarm, or follow one that has become clearer."""
+    def _test(self) -> None:
+        """Raise an alarm, or update an alarm that has become clearer."""
         if self.seconds % TUNING.long_run_every_s == 0 or self.seconds <= TUNING.learning_s:
             self.long_run = _long_run_variance(self._seconds, self.long_run)
         if len(self._stamps_ns) < _LAGS[0]:
@@ -275,26 +323,36 @@ class MountMonitor:
         lags, tables = self._shifts()
         ratios = moved.log_ratio(tables, _KNOCKS[:, None]).max(axis=0)
         best = int(np.argmax(ratios))
-        if ratios[best] < (self.alarm.log_ratio if self.alarm else TUNING.threshold):
+        least_ratio = self.alarm.log_ratio if self.alarm else TUNING.threshold
+        if ratios[best] < least_ratio:
             return
         H = information(tables[best])
         S = score(tables[best])
         covariance = np.linalg.inv(H + np.linalg.inv(moved.shift_covariance(1.0, 1.0)))
-        to_parent = np.kron(np.eye(2), self._installed[:3, :3])
-        since_ns = int(self._stamps_ns[-lags[best]])
-        raised_ns = int(self._stamps_ns[-1])
+        to_parent = se3.on_both(self._installed[:3, :3])
+        values = to_parent @ covariance @ S
+        shift = change.moved(values, to_parent @ covariance @ to_parent.T, np.zeros(6))
+        log_ratio = float(ratios[best])
+        if self.alarm:
+            self.alarm = replace(self.alarm, shift=shift, log_ratio=log_ratio)
+            return
         self.alarm = Alarm(
-            since_ns=self.alarm.since_ns if self.alarm else since_ns,
-            raised_ns=self.alarm.raised_ns if self.alarm else raised_ns,
-            shift=change.moved(
-                to_parent @ covariance @ S, to_parent @ covariance @ to_parent.T, np.zeros(6)
-            ),
-            log_ratio=float(ratios[best]),
+            since_ns=int(self._stamps_ns[-lags[best]]),
+            raised_ns=int(self._stamps_ns[-1]),
+            shift=shift,
+            log_ratio=log_ratio,
         )
 
     def _shifts(self) -> tuple[IntArray, FloatArray]:
-        """Lags (l,), and the evidence (l, 6, 7) of a shift over each, with the long-run variance
-        and the uncertainty of what was before counted in; the last lag is all there is.
+        """Return the evidence of a shift at each tested time.
+
+        It includes the long-run variance and the uncertainty of the offset before the shift.
+
+        Returns
+        -------
+        lags : (l,) int array
+            Seconds since the shift; the last lag is the whole memory.
+        tables : (l, 6, 7) array
         """
         n_seconds = len(self._stamps_ns)
         lags = _LAGS[: np.searchsorted(_LAGS, n_seconds, side="right")]
@@ -302,57 +360,61 @@ class MountMonitor:
         since = np.concatenate([since, [self._old + self._seconds.total]]) / self.long_run
         before = since[-1] - since
         covariances = inverse(inverse(self._covariance) + information(before))
-        known = se3.times(covariances, score(before))
-        tables = shift_evidence(since, known, covariances + self._wander)
+        offsets = se3.times(covariances, score(before))
+        tables = shift_evidence(since, offsets, covariances + self._wander)
         return np.append(lags, n_seconds), tables
 
     def visible(self, seconds: float) -> FloatArray:
-        """Shifts (6,) along (m) and about (rad) each axis of the parent sensor that so many seconds
-        of motion like that so far would show nine times out of ten; infinite while learning.
+        """Return the shifts (6,) that are detected in nine of ten cases.
+
+        They are along (m) and about (rad) each axis of the parent sensor, after so many seconds of
+        motion like the motion so far. They are infinite while learning.
         """
         if self.is_learning:
             return np.full(6, np.inf)
         H = information(self._seconds.total)
-        known = (information(self._old) + H) / self.long_run
-        before = np.linalg.inv(np.linalg.inv(self._covariance) + known) + self._wander
+        before = (information(self._old) + H) / self.long_run
+        cov_before = np.linalg.inv(np.linalg.inv(self._covariance) + before) + self._wander
         H = H / len(self._stamps_ns)
-        # Of that, what the rotation noise of a motion seems to tell of a translation: rotations
-        # that never took place reveal nothing.
+        # Subtract the spurious translation information that rotation noise produces: rotations that
+        # never took place reveal nothing.
         turns = se3.skew(np.eye(3))
-        of_noise = np.linalg.inv(self._noise)[:3, :3]
-        seeming = np.einsum("jk,jai,ab,kbl->il", self._noise[3:, 3:], turns, of_noise, turns)
-        H[:3, :3] -= self._motions_per_s * seeming
+        precision = np.linalg.inv(self._noise)[:3, :3]
+        spurious = np.einsum("jk,jai,ab,kbl->il", self._noise[3:, 3:], turns, precision, turns)
+        H[:3, :3] -= self._motions_per_s * spurious
         H *= seconds / self.long_run
         scale = np.sqrt(np.diag(moved.shift_covariance(100.0, np.pi)))
         values, vectors = np.linalg.eigh(scale[:, None] * H * scale)
         root = scale[:, None] * vectors / np.sqrt(1.0 + np.maximum(values, 0.0))
-        covariance = root @ root.T + before
-        # A shift along or about an axis of z standard deviations has the ratio z^2 / 2 less this.
-        precision = np.linalg.inv(covariance)
-        _, log_volumes = np.linalg.slogdet(np.eye(6) + _KNOCKS[:2] @ precision)
-        seen_sigmas = np.sqrt(2.0 * TUNING.threshold + log_volumes) + NINE_TIMES_OUT_OF_TEN
+        covariance = root @ root.T + cov_before
+        # The ratio of a shift of z standard deviations along or about an axis is
+        # (z^2 - log_volume) / 2.
+        volumes = np.eye(6) + _KNOCKS[:2] @ np.linalg.inv(covariance)
+        log_volumes = np.linalg.slogdet(volumes)[1]
+        detected_sigmas = np.sqrt(2.0 * TUNING.threshold + log_volumes) + NINE_TIMES_OUT_OF_TEN
         sigmas = sigmas_in_parent(self._installed[:3, :3], covariance)
-        return np.asarray(np.repeat(seen_sigmas, 3) * sigmas)
+        return np.asarray(np.repeat(detected_sigmas, 3) * sigmas)
 
 
 def _is_motion(motions: MotionPairs, noise: FloatArray) -> bool:
-    """Whether the sensors move: where they stand, noise would look like information."""
+    """Whether the sensors move: at rest, noise would look like information."""
     parent = motions.Ts_parenti_parentj
-    rotation = np.median(se3.rotation_angle(parent[:, :3, :3]))
-    distance = np.median(np.linalg.norm(parent[:, :3, 3], axis=1))
-    of_noise = np.sqrt(np.trace(noise[3:, 3:]) / 3)
-    least = max(TUNING.least_rotation_rad, TUNING.least_of_noise * float(of_noise))
-    return bool(rotation > least or distance > TUNING.least_motion_m)
+    angle_rad = np.median(se3.rotation_angle(parent[:, :3, :3]))
+    distance_m = np.median(np.linalg.norm(parent[:, :3, 3], axis=1))
+    noise_rad = float(np.sqrt(np.trace(noise[3:, 3:]) / 3))
+    least_rad = max(TUNING.least_rotation_rad, TUNING.least_of_noise * noise_rad)
+    return bool(angle_rad > least_rad or distance_m > TUNING.least_motion_m)
 
 
-def _information(
+def _evidence(
     residuals: FloatArray,
     jacobians: FloatArray,
     noise: FloatArray,
     shift: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Evidence (p, p + 1) of motions on p parameters, and their weighted scatter (6, 6) about given
-    ones.
+    """Return the evidence (p, p + 1) of motions on p parameters, and their scatter (6, 6).
+
+    The weights and the scatter are about the residuals after a shift (p,), zero by default.
     """
     centred = residuals if shift is None else residuals + jacobians @ shift
     squared = np.einsum("ki,ki->k", centred @ np.linalg.inv(noise), centred)
@@ -361,30 +423,38 @@ def _information(
     return table, (weights[:, None] * centred).T @ centred / len(centred)
 
 
-def _long_run_variance(seconds: Blocks, known: float) -> float:
-    """Long-run variance of the scores in units of the information, from those of seconds: the
-    largest over windows of several lengths, each about the answer of all; what is known while there
-    are too few.
+def _long_run_variance(seconds: Blocks, previous: float) -> float:
+    """Return the long-run variance of the scores in units of their information.
+
+    It is the largest over windows of several lengths, about the answer of all seconds; the previous
+    value while there are too few windows.
     """
-    answer = moved.most_likely(seconds.total, TUNING.ridge)
-    found = []
+    shift = moved.most_likely(seconds.total, TUNING.ridge)
+    prior = TUNING.assumed_windows * TUNING.assumed
+    variances = []
     for length in TUNING.windows_s:
         n_windows = len(seconds.sums) // length
         if n_windows < TUNING.assumed_windows:
             break
         windows = Blocks(seconds.sums[-n_windows * length :]).merged(n_windows)
-        squared = moved.squares_about(windows.sums, answer, TUNING.ridge)
-        seen = np.minimum(squared, TUNING.most_of_typical * np.median(squared)).sum() / 6
-        found.append(
-            (seen + TUNING.assumed_windows * TUNING.assumed) / (n_windows + TUNING.assumed_windows)
-        )
-    return max(found, default=known)
+        squares = moved.squares_about(windows.sums, shift, TUNING.ridge)
+        limited = np.minimum(squares, TUNING.most_of_typical * np.median(squares))
+        variances.append((limited.sum() / 6 + prior) / (n_windows + TUNING.assumed_windows))
+    return max(variances, default=previous)
 
 
 class MountWatch:
-    """Feeds the monitor with the pose pairs of the session, once a second. ``installed`` gives the
-    pose of the child's frame in the parent's; None while it is not known, for which ``why_unknown``
-    gives the reason.
+    """Monitor of a live session: takes its pose pairs about once a second.
+
+    Parameters
+    ----------
+    session : LiveSession
+    installed : callable
+        Returns the pose of the child's frame in the parent's frame by the names of both; None while
+        it is unknown.
+    why_unknown : callable
+        Returns the reason why it is unknown.
+    log : NodeLog
     """
 
     def __init__(
@@ -402,17 +472,17 @@ class MountWatch:
         self._last_ns = -1
 
     def restart(self) -> None:
-        """The stamps have jumped back: nothing runs across; what was learned stays."""
+        """Start again after the stamps have jumped back, without loss of what was learned."""
         self._last_ns = -1
         if self._monitor is not None:
             self._monitor.restart()
 
     def look(self) -> None:
-        """Judge what has come in; to be called about once a second."""
+        """Add the new pose pairs to the monitor, and log an alarm."""
         calibrator = self._session.calibrator
         pairs = calibrator.take_pairs()
         pairs = pairs[pairs.stamps_ns > self._last_ns]
-        if self._monitor is None and len(pairs):  # before the first, the frames are not known
+        if self._monitor is None and len(pairs):  # the frames are known from the first pair on
             snapshot = calibrator.snapshot()
             installed = self._installed(snapshot.parent_frame, snapshot.child_frame)
             if installed is not None:
@@ -423,7 +493,7 @@ class MountWatch:
                 self._log.error(str(alarm))
 
     def state(self) -> MountState:
-        """Whether the mount has moved, and what can be seen of it on this robot."""
+        """Return whether the mount has moved, and the shifts that are visible on this robot."""
         monitor = self._monitor
         if monitor is None:
             return MountState(level=Level.WARN, text=self._why_unknown() or "no poses yet")
@@ -434,20 +504,21 @@ class MountWatch:
         elif monitor.is_learning:
             text = f"learning the noise: {monitor.seconds} of {TUNING.learning_s} s of motion"
         else:
-            hidden = visible > SEEN_TARGETS * np.array(self._session.calibrator.config.targets)
-            unwatched = axes_in_words([AXES[index] for index in np.flatnonzero(hidden)])
             text = "the mount has not moved"
-            text += f"; {unwatched} cannot be watched here" if unwatched else ""
-        told = np.where(visible < change.UNKNOWN_FROM, visible, np.nan)
+            is_hidden = visible > SEEN_TARGETS * np.array(self._session.calibrator.config.targets)
+            if is_hidden.any():
+                hidden = axes_in_words([AXES[index] for index in np.flatnonzero(is_hidden)])
+                text += f"; {hidden} cannot be watched here"
+        visible = np.where(visible < change.UNKNOWN_FROM, visible, np.nan)
         shift = alarm.shift.axes if alarm else {}
         return MountState(
             level=Level.ERROR if alarm else Level.OK,
             text=text,
             is_learning=monitor.is_learning,
             seconds_of_motion=monitor.seconds,
-            shift={axis: each.difference for axis, each in shift.items()},
-            shift_sigma={axis: each.sigma for axis, each in shift.items()},
-            visible_10min=by_axis(told),
+            shift={axis: shift[axis].difference for axis in shift},
+            shift_sigma={axis: shift[axis].sigma for axis in shift},
+            visible_10min=by_axis(visible),
             since_ns=alarm.since_ns if alarm else None,
             newest_ns=self._last_ns,
         )
