@@ -1,4 +1,4 @@
-"""Commands and reports for recordings."""
+"""Calibrate and report recordings."""
 
 from pathlib import Path
 from typing import Any

@@ -1,10 +1,10 @@
-"""Two whole trajectories in, the extrinsic out: the Python function :func:`calibrate`."""
+"""Calibrate from two whole trajectories: the Python function :func:`calibrate`."""
 
 import inspect
 import textwrap
 from collections.abc import Mapping
 from dataclasses import fields, replace
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError
@@ -64,26 +64,26 @@ def calibrate(
     """Estimate the pose of the child sensor in the parent sensor's frame from two trajectories.
 
     All pose pairs are used, up to 100,000, unless ``max_pairs`` is given. The streams are checked,
-    too: what a check is sure of, such as a clock offset, a unit or inverse poses, is used if it was
-    not given, and a warning says so.
+    too. If a check is sure of a clock offset, a unit or inverse poses, the solve uses it unless it
+    was given, and the result has a warning.
 
     Parameters
     ----------
     parent, child : Trajectory, path, array or DataFrame
-        Poses of each sensor in its own world, m; what is no Trajectory is read as
-        :func:`hand_eye_calib.read_trajectory` does, and sensors are named after their files. One
-        of them may be positions (:meth:`Trajectory.from_positions`): the result is the lever arm.
-        Either may be rotations or angular rates (:meth:`Trajectory.from_rates`): the result is the
-        rotation, with the bias of the rates.
+        Poses of each sensor in its own world, m. :func:`hand_eye_calib.read_trajectory` reads
+        all but a Trajectory; the files name the sensors. One of them may be positions
+        (:meth:`Trajectory.from_positions`): the result is the lever arm. Either may be rotations
+        or angular rates (:meth:`Trajectory.from_rates`): the result is the rotation, with the bias
+        of the rates.
     prior : mapping of str to (float, float) or str, optional
         Value and standard deviation of x, y, z (m), roll, pitch or yaw (rad), such as
         ``{"z": (1.85, 0.02)}``; see :data:`~hand_eye_calib.core.base.text.Prior`.
     checks : bool, optional
         False: the streams are not checked, the result is not compared with other references and
-        halves of the recording, and nothing is solved a second time. True: it is compared also if
-        a reference is given, which leaves that out otherwise.
+        halves of the recording, and there is no second solve. True: the result is compared even
+        if a reference is given. Default: it is compared unless a reference is given.
     progress : callable, optional
-        Called with the share that is done, 0 to 1, and the step that begins.
+        Called with the finished share, 0 to 1, and the name of the next step.
     OPTIONS
 
     Raises
@@ -109,25 +109,31 @@ def calibrate(
 
         first, second = read_trajectories(first, second)
     values |= prior_fields({} if prior is None else prior)
-    named = [each for each in fields(CalibratorConfig) if each.name in values]
-    given = {option_name(each): values[each.name] for each in named}
-    found = run(whole_snapshot(first, second, given), checks=checks, progress=progress)
-    return replace(found.calibration, recording=found.snapshot)
+    given = {
+        option_name(field): values[field.name]
+        for field in fields(CalibratorConfig)
+        if field.name in values
+    }
+    result = run(whole_snapshot(first, second, given), checks=checks, progress=progress)
+    return replace(result.calibration, recording=result.snapshot)
 
 
 def _options_in_words() -> str:
-    """The options of :func:`calibrate` for its docstring, from where they are declared."""
+    """Return the options of :func:`calibrate` for its docstring, from their declarations."""
     names = inspect.signature(calibrate).parameters
     lines = []
     for field in fields(CalibratorConfig):
-        if field.name in names:
-            meta = field.metadata
-            default = repr(field.default) if field.default != "" else "none"
-            unit = f" {meta['unit']}" if meta["unit"] else ""
-            kind = " or ".join(map(repr, meta["choices"] or ())) or type(field.default).__name__
-            lines += [f"{field.name} : {kind}, optional"]
-            lines += textwrap.wrap(f"{meta['doc']} Default: {default}{unit}.", 92)
-    return "\n    ".join(f"{'' if ' : ' in line else '    '}{line}" for line in lines)
+        if field.name not in names:
+            continue
+        default = repr(field.default) if field.default != "" else "none"
+        if field.metadata["unit"]:
+            default += f" {field.metadata['unit']}"
+        choices = field.metadata["choices"] or ()
+        kind = " or ".join(map(repr, choices)) or type(field.default).__name__
+        lines.append(f"{field.name} : {kind}, optional")
+        description = textwrap.wrap(f"{field.metadata['doc']} Default: {default}.", 92)
+        lines += [f"    {line}" for line in description]
+    return "\n    ".join(lines)
 
 
 if calibrate.__doc__:  # not with python -OO
@@ -135,7 +141,7 @@ if calibrate.__doc__:  # not with python -OO
 
 
 def prior_fields(prior: Prior) -> dict[str, str]:
-    """Options of a CalibratorConfig that state a prior: the text of each attribute.
+    """Return the options of a CalibratorConfig for a prior: attribute and text.
 
     Raises
     ------
@@ -146,20 +152,23 @@ def prior_fields(prior: Prior) -> dict[str, str]:
         raise ConfigError(
             f"prior must be a mapping such as {{'z': (1.85, 0.02)}}; got {shown_value(prior)}"
         )
-    fields = {}
-    for axis, known in prior.items():
+    options = {}
+    for axis, value in prior.items():
         if axis not in AXIS_UNITS:
             raise ConfigError(f"prior takes {', '.join(AXIS_UNITS)}; got {axis!r}")
-        if not isinstance(known, str):
-            try:
-                value, sigma = map(float, known)
-            except (TypeError, ValueError):
-                raise ConfigError(
-                    f"prior {axis} must be (value, standard deviation) or a text; got {known!r}"
-                ) from None
-            known = f"{value!r}+/-{sigma!r}"
-        fields[f"prior_{axis}"] = known
-    return fields
+        options[f"prior_{axis}"] = value if isinstance(value, str) else _prior_text(axis, value)
+    return options
+
+
+def _prior_text(axis: str, pair: Any) -> str:
+    """Return the option's text of a value and its standard deviation."""
+    try:
+        value, sigma = map(float, pair)
+    except (TypeError, ValueError):
+        raise ConfigError(
+            f"prior {axis} must be (value, standard deviation) or a text; got {pair!r}"
+        ) from None
+    return f"{value!r}+/-{sigma!r}"
 
 
 def cross_check(
@@ -168,17 +177,18 @@ def cross_check(
     child: Trajectory,
     config: CalibratorConfig | None = None,
 ) -> CrossCheck:
-    """Cross-check a result with DNLO at other references and with both halves of its recording, as
-    every solve with method or reference auto does by itself.
+    """Compare a result with DNLO at other references and with both halves of its recording.
+
+    Every solve with method or reference auto includes this comparison.
 
     Parameters
     ----------
     calibration : Calibration
         The result.
     parent, child : Trajectory
-        The trajectories that gave it.
+        Trajectories of the result.
     config : CalibratorConfig, optional
-        The options that gave it; the defaults, with the result's method, if left out.
+        Options of the result. Default: the defaults, with the result's method.
 
     Raises
     ------

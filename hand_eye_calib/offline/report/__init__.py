@@ -1,1 +1,1 @@
-"""Figures and reports: the only place where Matplotlib is imported."""
+"""Draw figures and reports; no other package but `fleet` imports Matplotlib."""

@@ -1,4 +1,4 @@
-"""What a report shows beside the result: paths, excitation, and both streams before any solve."""
+"""Evidence of a report beside the result: paths, excitation, both streams before any solve."""
 
 from dataclasses import dataclass, replace
 
@@ -15,18 +15,30 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
 
-# Shortest step (s) of a path length: over shorter steps it would be the length of the noise.
+# Shortest step (s) of a path length. Shorter steps would add up the noise.
 _PATH_STEP_S = 0.2
 
-# Most samples of the angular rates, and the shortest window of each (s).
+# Most samples of the angular rates of a stream.
 _MAX_RATES = 1500
+# Shortest window of an angular rate (s).
 _MIN_WINDOW_S = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
 class StreamSummary:
-    """Size and motion of a stream: the rate is of the median interval; path length and the sum of
-    all rotation angles are None without positions, orientations.
+    """Size and motion of a stream.
+
+    Attributes
+    ----------
+    poses : int
+    duration_s : float
+    rate_hz : float
+        Of the median interval.
+    longest_interval_s : float
+    path_m : float or None
+        Length of the path; None without positions.
+    rotation_rad : float or None
+        Sum of all rotation angles; None without orientations.
     """
 
     poses: int
@@ -38,7 +50,7 @@ class StreamSummary:
 
 
 def summarise(trajectory: Trajectory) -> StreamSummary:
-    """StreamSummary of a trajectory of at least two poses."""
+    """Summarise a trajectory of at least two poses."""
     intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
     poses = coarse(trajectory, max(_PATH_STEP_S, median(intervals_s))).poses
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
@@ -55,17 +67,18 @@ def summarise(trajectory: Trajectory) -> StreamSummary:
 
 @dataclass(frozen=True, kw_only=True)
 class StreamView:
-    """What the streams show before any solve, on the parent's clock and in its unit of length;
-    first the parent, then the child.
+    """Rates of the parent and of the child, in this order, before any solve.
+
+    Times are on the parent's clock, lengths in the parent's unit.
 
     Attributes
     ----------
     quantity : {"angular rate", "speed"}
-        What is shown over time: the speed if one sensor has positions alone.
+        The speed if one sensor has positions without orientations.
     rates : 2 x (times_s, rates)
         rad/s or m/s; NaN in gaps.
     spans_s : 2 x (M, 2) arrays
-        Start and end of the times in which each stream has poses, without longer gaps.
+        Start and end of the times in which each stream has poses, without long gaps.
     """
 
     quantity: str
@@ -75,27 +88,31 @@ class StreamView:
     @property
     def apart(self) -> float:
         """Median difference of both rates (rad/s) or speeds (m/s); NaN if they never overlap."""
-        (times, of_parent), (others, of_child) = self.rates
-        shared = (times >= others[0]) & (times <= others[-1]) if len(others) else times < 0
-        apart = np.abs(of_parent - np.interp(times, others, of_child))[shared]
-        return median(apart[np.isfinite(apart)])
+        (times_s, parent_rates), (child_times_s, child_rates) = self.rates
+        if not len(child_times_s):
+            return float("nan")
+        is_shared = (times_s >= child_times_s[0]) & (times_s <= child_times_s[-1])
+        differences = np.abs(parent_rates - np.interp(times_s, child_times_s, child_rates))
+        differences = differences[is_shared]
+        return median(differences[np.isfinite(differences)])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """What the figures show beside the Calibration itself.
+    """Evidence in the figures beside the Calibration itself.
 
     Attributes
     ----------
-    times_s, parent, child : (N,), (N, 3), (N, 3) arrays
-        Times, s, and two paths, m, of one sensor: as its own stream has it, and from the other
-        stream through the result. It is the parent, in its world; or the sensor that has positions
-        alone, in theirs.
+    times_s : (N,) array
+        Of both paths, s.
+    parent, child : (N, 3) arrays
+        Paths of one sensor, m: from its own stream, and from the other stream through the result.
+        The sensor is the parent, in its world, or the sensor without orientations, in its frame.
     excitation : Excitation
-        How the sensors moved.
+        Motion of the sensors.
     streams : StreamView
     has_positions_of_parent : bool
-        The parent has positions alone.
+        The parent has positions without orientations.
     """
 
     times_s: FloatArray
@@ -109,64 +126,73 @@ class Evidence:
 def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
     """Collect the evidence of a result from the poses and options that gave it."""
     config = snapshot.config
-    # The time offset is settled; estimating it again would cost time.
+    # Estimating the time offset again would cost time.
     settled = replace(config, time_offset=calibration.time_offset_s)
     pose_pairs = replace(snapshot, config=settled).pose_pairs.child_scaled(calibration.scale)
-    of_parent = config.parent_measures == "positions"
-    turned = PosePairs(pose_pairs.stamps_ns, pose_pairs.Ts_cw_c, pose_pairs.Ts_pw_p)
+    parent_is_positions = config.parent_measures == "positions"
+    oriented = pose_pairs
+    if parent_is_positions:
+        oriented = PosePairs(pose_pairs.stamps_ns, pose_pairs.Ts_cw_c, pose_pairs.Ts_pw_p)
     parent, child = snapshot.streams
     shifted = child.shifted(calibration.time_offset_s).scaled(calibration.scale)
-    paths = _paths(calibration, pose_pairs, of_parent)
+    if calibration.measured == "positions":
+        parent_path, child_path = _paths_of_positions(calibration, pose_pairs, parent_is_positions)
+    else:
+        parent_path, child_path = _paths_of_poses(calibration, pose_pairs)
     return Evidence(
         times_s=(pose_pairs.stamps_ns - pose_pairs.stamps_ns[0]) * 1e-9,
-        parent=paths[0],
-        child=paths[1],
-        excitation=excitation(turned if of_parent else pose_pairs),
+        parent=parent_path,
+        child=child_path,
+        excitation=excitation(oriented),
         streams=view_streams(parent, shifted, config.max_gap),
-        has_positions_of_parent=of_parent,
+        has_positions_of_parent=parent_is_positions,
     )
 
 
 def view_streams(parent: Trajectory, child: Trajectory, max_gap_s: float) -> StreamView:
-    """The StreamView of two trajectories on one clock, in one unit of length."""
+    """Return the rates of two trajectories on one clock, in one unit of length."""
     start_ns = min(parent.stamps_ns[0], child.stamps_ns[0])
     longest_s = max(parent.duration_s, child.duration_s)
     step_s = max(parent.interval_s, child.interval_s, longest_s / _MAX_RATES)
+    window_s = max(3 * step_s, _MIN_WINDOW_S)
     has_rates = parent.has_rotations and child.has_rotations
     rates = []
-    spans = []
+    spans_s = []
     for stream in (parent, child):
-        window_s = max(3 * step_s, _MIN_WINDOW_S)
-        found = angular_rates(stream, window_s, step_s, max_gap_s, of_speed=not has_rates)
-        steps = np.arange(len(found)) * step_s
-        rates.append(((stream.stamps_ns[0] - start_ns) * 1e-9 + steps, found))
+        values = angular_rates(stream, window_s, step_s, max_gap_s, of_speed=not has_rates)
+        first_s = (stream.stamps_ns[0] - start_ns) * 1e-9
+        rates.append((first_s + np.arange(len(values)) * step_s, values))
         gaps = np.flatnonzero(are_gaps(np.diff(stream.stamps_ns) * 1e-9, max_gap_s))
-        edges = stream.stamps_ns[np.sort(np.r_[0, gaps, gaps + 1, len(stream) - 1])]
-        spans.append((edges.reshape(-1, 2) - start_ns) * 1e-9)
-    return StreamView(
-        quantity="angular rate" if has_rates else "speed", rates=tuple(rates), spans_s=tuple(spans)
-    )
+        edges_ns = stream.stamps_ns[np.sort(np.r_[0, gaps, gaps + 1, len(stream) - 1])]
+        spans_s.append((edges_ns.reshape(-1, 2) - start_ns) * 1e-9)
+    quantity = "angular rate" if has_rates else "speed"
+    return StreamView(quantity=quantity, rates=tuple(rates), spans_s=tuple(spans_s))
 
 
-def _paths(
-    calibration: Calibration, pose_pairs: PosePairs, of_parent: bool
+def _paths_of_positions(
+    calibration: Calibration, pose_pairs: PosePairs, parent_is_positions: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Both paths, the child's world aligned with the parent's: by the mean over all poses, or by
-    the paths if one sensor has positions alone.
-    """
-    if calibration.measured == "positions":
+    """Return the paths of parent and child; rotation and mean of the path align their worlds."""
+    if parent_is_positions:
+        poses = pose_pairs.Ts_cw_c @ calibration.T_child_parent
+        positions = pose_pairs.Ts_pw_p[:, :3, 3]
+    else:
         poses = pose_pairs.Ts_pw_p @ calibration.T_parent_child
-        measured = pose_pairs.Ts_cw_c
-        if of_parent:
-            poses = pose_pairs.Ts_cw_c @ calibration.T_child_parent
-            measured = pose_pairs.Ts_pw_p
-        path = poses[:, :3, 3]
-        positions = measured[:, :3, 3]
-        path = path - path.mean(axis=0)
-        rotation = se3.nearest_rotation((positions - positions.mean(axis=0)).T @ path)
-        path = path @ rotation.T + positions.mean(axis=0)
-        parent, child = (positions, path) if of_parent else (path, positions)
-        return parent - positions[0], child - positions[0]
+        positions = pose_pairs.Ts_cw_c[:, :3, 3]
+    path = poses[:, :3, 3]
+    path = path - path.mean(axis=0)
+    center = positions.mean(axis=0)
+    rotation = se3.nearest_rotation((positions - center).T @ path)
+    path = path @ rotation.T + center
+    measured = positions - positions[0]
+    computed = path - positions[0]
+    return (measured, computed) if parent_is_positions else (computed, measured)
+
+
+def _paths_of_poses(
+    calibration: Calibration, pose_pairs: PosePairs
+) -> tuple[FloatArray, FloatArray]:
+    """Return the paths of the parent by both streams; the mean of all poses aligns the worlds."""
     Ts_cw_p = pose_pairs.Ts_cw_c @ calibration.T_child_parent
     rotations = pose_pairs.Ts_pw_p[:, :3, :3] @ np.swapaxes(Ts_cw_p[:, :3, :3], 1, 2)
     parent = pose_pairs.Ts_pw_p[:, :3, 3]

@@ -1,4 +1,4 @@
-"""``report.html``: one self-contained page with the extrinsic, its uncertainty and the evidence."""
+"""Write ``report.html``: one self-contained page with the extrinsic, its sigma and the evidence."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -27,7 +27,7 @@ from hand_eye_calib.core.results.document import (
     transforms_of,
     usable_numbers,
 )
-from hand_eye_calib.core.results.records import ROTATIONS, TRANSLATIONS
+from hand_eye_calib.core.results.records import ROTATIONS
 from hand_eye_calib.core.results.verdict import shown, target_of
 from hand_eye_calib.offline.report.evidence import Evidence, gather, summarise
 from hand_eye_calib.offline.report.figures import LOOK, figures_of
@@ -39,18 +39,25 @@ TONES = {
     Verdict.DO_NOT_USE.value: "bad",
 }
 
+# Text of each verdict on an axis.
 _WORDS = {
     "observed": "determined by the motion",
     "weak": "determined, but not well",
     "unobservable": "do not use this value",
     "prior": "mostly from the prior",
 }
-_AXIS_NAMES = {axis: f"along {axis}" for axis in TRANSLATIONS}
-_AXIS_NAMES |= {"roll": "about x (roll)", "pitch": "about y (pitch)", "yaw": "about z (yaw)"}
+_AXIS_NAMES = {
+    "x": "along x",
+    "y": "along y",
+    "z": "along z",
+    "roll": "about x (roll)",
+    "pitch": "about y (pitch)",
+    "yaw": "about z (yaw)",
+}
 
-# Names of sensors that came without one.
+# Frames of sensors without a name.
 _NAMELESS = ("parent_sensor", "child_sensor")
-# Figures for whoever uses the result; the others are evidence for whoever doubts it.
+# Figures above the details; the other figures are evidence for the result.
 _SHOWN_FIRST = ("views", "trajectories")
 
 _FOLDER = Path(__file__).parent / "templates"
@@ -69,31 +76,40 @@ _TEMPLATES.globals["axis_names"] = _AXIS_NAMES
 
 @cache
 def _template(path: Path) -> jinja2.Template:
-    """Compile a template once; what it extends or imports is among the templates here."""
+    """Compile a template once; it may extend or import the templates of this package."""
     return _TEMPLATES.from_string(path.read_text(encoding="utf-8"))
 
 
-def page(template: Path, tone: str, verdict: str, said: str, **values: Any) -> str:
-    """A page from its template: every page begins with a verdict, in words and by a tone.
+def page(template: Path, tone: str, verdict: str, sentence: str, **values: Any) -> str:
+    """Return a page from its template; every page begins with a verdict.
 
     Parameters
     ----------
     template : Path
     tone : {"good", "warn", "bad"}
-    verdict, said : str
-        In a word and in a sentence.
+    verdict : str
+        One or two words.
+    sentence : str
+        The verdict in a sentence.
     **values
-        What else the template shows.
+        Other variables of the template.
     """
     values |= {"tone": tone, "mark": MARKS[tone], "marks": MARKS, "verdict": verdict}
-    return _template(template).render(**values, said=text.capital(said))
+    return _template(template).render(**values, said=text.capital(sentence))
 
 
 def render(
     calibration: Calibration, snapshot: Snapshot | None, inputs: Document | None = None
 ) -> str:
-    """The report as HTML, of a result and the poses and options that gave it (none for stops);
-    ``inputs`` say in plain values where the data came from.
+    """Return the report of a result as HTML.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    snapshot : Snapshot or None
+        Poses and options of the result; None for stops.
+    inputs : dict, optional
+        Origin of the data in plain values.
     """
     inputs = inputs or {}
     command = calibration.static_transform_command()
@@ -104,26 +120,25 @@ def render(
     )
     parent = printable(calibration.parent_frame)
     child = printable(calibration.child_frame)
-    verdict, _, said = calibration.headline.partition(": ")
-    document = calibration.to_dict()
-    by_hand = [each for each in usable_numbers(calibration).values() if isinstance(each, str)]
+    verdict, _, sentence = calibration.headline.partition(": ")
+    by_hand = [value for value in usable_numbers(calibration).values() if isinstance(value, str)]
     evidence = gather(calibration, snapshot) if snapshot else None
     advice = ""
-    unknown = {*calibration.out_of_reach}
     if evidence and calibration.verdict is not Verdict.DO_NOT_USE:
         advice = what_is_missing(evidence.excitation, calibration)
+    parent_is_positions = evidence is not None and evidence.has_positions_of_parent
     return page(
         _FOLDER / "report.html",
         TONES[calibration.verdict.value],
         verdict,
-        said,
+        sentence,
         calibration=calibration,
         at_distance=_at_distance(calibration),
-        document=document,
+        document=calibration.to_dict(),
         parent=parent,
         child=child,
-        rotating=child if evidence and evidence.has_positions_of_parent else parent,
-        kind="Position" if unknown & {*ROTATIONS} else "Orientation" if unknown else "Pose",
+        rotating=child if parent_is_positions else parent,
+        kind=_kind_of_result(calibration),
         directions=[*transforms_of(calibration).values()][:2],
         numbers_of=partial(printed_numbers, out_of_reach=calibration.out_of_reach, sign="±"),
         axes=list(_axes(calibration)),
@@ -139,37 +154,49 @@ def render(
     )
 
 
-def _named(frame: str, known: Document) -> str:
-    """The name of a sensor: its frame, or where its poses came from if they name none."""
-    source = str(known.get("topic") or Path(str(known.get("file", ""))).stem)
+def _kind_of_result(calibration: Calibration) -> str:
+    """Return "Pose", or the part of a pose that the result has."""
+    unknown = {*calibration.out_of_reach}
+    if unknown & {*ROTATIONS}:
+        return "Position"
+    return "Orientation" if unknown else "Pose"
+
+
+def _named(frame: str, origin: Document) -> str:
+    """Return the name of a sensor: its frame, or its topic or file if the frame has no name."""
+    source = str(origin.get("topic") or Path(str(origin.get("file", ""))).stem)
     return source if frame in _NAMELESS and source else frame
 
 
 def _at_distance(calibration: Calibration) -> str:
-    """What the standard deviations do to an object at a distance; empty if one is unknown."""
+    """State the error of an object at a distance; empty if a standard deviation is unknown."""
     if not np.isfinite(calibration.sigmas).all():
         return ""
-    errors = []
+    variances = []
     for point in LOOK.distance_m * np.eye(3):
         J = np.hstack([np.eye(3), -se3.skew(point)])
-        errors.append(np.linalg.eigvalsh(J @ calibration.covariance @ J.T)[-1])
+        variances.append(np.linalg.eigvalsh(J @ calibration.covariance @ J.T)[-1])
     child = printable(calibration.child_frame)
     return (
         f"An object {LOOK.distance_m:.0f} m from {child} is misplaced by up to "
-        f"{text.length(float(np.sqrt(max(errors))))} (one standard deviation, constant odometry "
+        f"{text.length(float(np.sqrt(max(variances))))} (one standard deviation, constant odometry "
         "errors included)."
     )
 
 
 def _targets(calibration: Calibration) -> str:
-    """Target of x, y and z, of the rotations, and of the axes that have their own."""
-    of_all = text.length(calibration.target_translation), text.angle(calibration.target_rotation)
-    single = [f"{axis} {text.amount(axis, each)}" for axis, each in calibration.target_axes.items()]
-    return text.listing([*of_all, *single])
+    """Return the targets of x, y and z, of the rotations, and of the axes with their own target."""
+    targets = [
+        text.length(calibration.target_translation),
+        text.angle(calibration.target_rotation),
+    ]
+    for axis, target in calibration.target_axes.items():
+        targets.append(f"{axis} {text.amount(axis, target)}")
+    return text.listing(targets)
 
 
 class AxisRow(NamedTuple):
-    """A row of the table of uncertainties: ``bar`` is its length in per cent."""
+    """Row of the table of uncertainties; ``bar`` is a length in per cent."""
 
     name: str
     title: str
@@ -180,7 +207,7 @@ class AxisRow(NamedTuple):
 
 
 def _axes(calibration: Calibration) -> Iterable[AxisRow]:
-    """Rows of the table of uncertainties, along and about the parent's axes."""
+    """Yield the rows of the table of uncertainties, along and about the parent's axes."""
     is_bad = calibration.verdict is Verdict.DO_NOT_USE
     for dof in calibration.observability:
         if dof.name not in calibration.out_of_reach:
@@ -195,7 +222,7 @@ def _axes(calibration: Calibration) -> Iterable[AxisRow]:
 
 
 def _bar(ratio: float) -> float:
-    """Length in per cent of the bar for a standard deviation, from its ratio to the target."""
+    """Return the length of a bar in per cent from the ratio of sigma to its target."""
     with np.errstate(divide="ignore"):
         decades = LOOK.bar_above - np.log10(ratio)
     return float(np.clip(100 * (1 - decades / LOOK.bar_decades), 1, 100))
@@ -207,40 +234,52 @@ def _bar(ratio: float) -> float:
 def _data(
     calibration: Calibration, snapshot: Snapshot | None, evidence: Evidence | None, inputs: Document
 ) -> Document:
-    """What the result comes from, for the template."""
-    options = snapshot.config.to_options() if snapshot else {}
-    usual = CalibratorConfig().to_options()
-    given = [f"{name} {each}" for name, each in options.items() if each != usual[name]]
-    now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-    rows = summary(calibration)
+    """Return the origin of the result for the template."""
+    defaults = CalibratorConfig().to_options()
+    options = snapshot.config.to_options() if snapshot else defaults
+    changed = [f"{name} {value}" for name, value in options.items() if value != defaults[name]]
     kind = "stops"
     if evidence:
         kind = f"synchronised pose pairs over {text.duration(evidence.times_s[-1])}"
+    now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     streams = dict(zip(("parent", "child"), snapshot.streams, strict=True)) if snapshot else {}
-    names = [name for name in ("parent", "child") if name in streams or name in inputs]
+    rows = []
+    for name in ("parent", "child"):
+        if name in streams or name in inputs:
+            rows.append(_stream(name, inputs.get(name, {}), streams.get(name)))
     return {
         "labels": inputs.get("labels", {}),
-        "summary": rows
-        | {"Poses": f"{calibration.n_poses:,} {kind}", "Options": ", ".join(given) or "defaults"}
-        | {"Written": f"{now}, hand_eye_calib {version_of()}; extrinsic.yaml has the rest"},
-        "streams": [_stream(name, inputs, streams.get(name)) for name in names],
+        "summary": {
+            **summary(calibration),
+            "Poses": f"{calibration.n_poses:,} {kind}",
+            "Options": ", ".join(changed) or "defaults",
+            "Written": f"{now}, hand_eye_calib {version_of()}; extrinsic.yaml has the rest",
+        },
+        "streams": rows,
     }
 
 
-def _stream(name: str, inputs: Document, stream: Trajectory | None) -> dict[str, str]:
-    """Where a stream came from, how many poses, their rate, the longest gap, the path length."""
-    known = inputs.get(name, {})
-    count = known.get("messages", known.get("poses"))
-    row = {"name": name, "source": known.get("topic") or Path(known.get("file", "-")).name}
+def _stream(name: str, origin: Document, stream: Trajectory | None) -> dict[str, str]:
+    """Return origin, number of poses, duration, rate, longest gap and path length of a stream."""
+    count = origin.get("messages", origin.get("poses"))
+    row = {"name": name, "source": origin.get("topic") or Path(origin.get("file", "-")).name}
     row |= dict.fromkeys(("poses", "rate", "duration", "gap", "path"), "-")
-    # Of a bag only poses of pairs are at hand, of a long one the newest: they say nothing of gaps.
-    ends_ns = [known[name] for name in ("first_stamp_ns", "last_stamp_ns") if known.get(name)]
-    if count and ends_ns and (seconds := (ends_ns[-1] - ends_ns[0]) * 1e-9):
-        row |= {"duration": text.duration(seconds), "rate": f"{(count - 1) / seconds:.1f} Hz"}
+    ends_ns = [origin[key] for key in ("first_stamp_ns", "last_stamp_ns") if origin.get(key)]
+    if count and ends_ns:
+        duration_s = (ends_ns[-1] - ends_ns[0]) * 1e-9
+        if duration_s:
+            row["duration"] = text.duration(duration_s)
+            row["rate"] = f"{(count - 1) / duration_s:.1f} Hz"
+    # The stream of a bag has only the poses of pairs, and only the newest of a long bag. Its gaps
+    # are not those of the topic.
     if stream is not None and len(stream) >= max(2, count or 0):
         whole = summarise(stream)
         count = len(stream)
-        row |= {"gap": f"{whole.longest_interval_s:.2f} s", "rate": f"{whole.rate_hz:.1f} Hz"}
-        row |= {"duration": text.duration(whole.duration_s)}
-        row |= {"path": "-" if whole.path_m is None else text.length(whole.path_m)}
-    return row if count is None else row | {"poses": f"{count:,}"}
+        row["gap"] = f"{whole.longest_interval_s:.2f} s"
+        row["rate"] = f"{whole.rate_hz:.1f} Hz"
+        row["duration"] = text.duration(whole.duration_s)
+        if whole.path_m is not None:
+            row["path"] = text.length(whole.path_m)
+    if count is not None:
+        row["poses"] = f"{count:,}"
+    return row
