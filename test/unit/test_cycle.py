@@ -56,15 +56,15 @@ def cycle(lines, monkeypatch):
     write = {level: lambda text, level=level: lines.append((level, text)) for level in levels}
     log = NodeLog(SimpleNamespace(**write))
     session = LiveSession(log, CalibratorConfig())
-    made = SolveCycle(session, log, print, lambda each: each, print, TARGETS)
+    made = SolveCycle(session, log, print, lambda calibration: calibration, print, TARGETS)
     made.jobs = jobs
     made.ask(lambda good, text: None)
     return made
 
 
 def answered(cycle, motion_s, sigmas_m=0.005, n_poses=100, check=None, **fields):
-    found = result(sigmas_m=sigmas_m, n_poses=n_poses, **fields)
-    return cycle.conclude(Answer(0, 0.1, seen(motion_s), found, check=check))
+    newest = result(sigmas_m=sigmas_m, n_poses=n_poses, **fields)
+    return cycle.conclude(Answer(0, 0.1, seen(motion_s), newest, check=check))
 
 
 def reach_goal(cycle):
@@ -106,25 +106,25 @@ def test_what_somebody_asks_for_is_checked_and_other_solves_are_every_half_minut
 
 
 def test_who_waits_for_long_is_told_once_that_the_solve_goes_on(cycle, monkeypatch):
-    told = []
+    answers = []
     start_s = module.time.monotonic()
-    cycle.ask(lambda *answer: told.append(answer))
+    cycle.ask(lambda *answer: answers.append(answer))
     cycle.answer_overdue()
-    assert not told
+    assert not answers
     monkeypatch.setattr(module.time, "monotonic", lambda: start_s + 30.0)
     cycle.answer_overdue()
-    assert told == [(False, told[0][1])]
-    assert told[0][1].startswith("still solving after 20 s")
+    assert answers == [(False, answers[0][1])]
+    assert answers[0][1].startswith("still solving after 20 s")
     cycle._process.answers = lambda: [Answer(0, 0.1, seen(40.0), result())]
     cycle.take_answers()
-    assert len(told) == 1
+    assert len(answers) == 1
 
 
 def test_the_rotation_that_was_seen_does_not_fall_while_driving(cycle):
     for degrees in (179.0, 175.0, 174.0):
         cycle.conclude(Answer(0, 0.1, seen(40.0, (0.0, 9.0, degrees)), result()))
-        told = cycle.extrinsic_state(True, (Broadcast.OFF, "")).rotation_deg
-        assert told == pytest.approx({"x": 0.0, "y": 9.0, "z": 179.0})
+        rotation_deg = cycle.extrinsic_state(True, (Broadcast.OFF, "")).rotation_deg
+        assert rotation_deg == pytest.approx({"x": 0.0, "y": 9.0, "z": 179.0})
 
 
 def test_a_solve_that_fails_says_so_and_changes_nothing(cycle):
@@ -140,8 +140,8 @@ def test_streams_that_turn_out_faulty_end_done_and_the_verdict_says_the_same(cyc
     finding = Finding(
         code="inverse", severity=Severity.ERROR, what="inverse poses", advice="invert"
     )
-    found = CheckResult(findings=(finding,))
-    _good, text = answered(cycle, 46.0, check=found)
+    result_of_check = CheckResult(findings=(finding,))
+    _good, text = answered(cycle, 46.0, check=result_of_check)
     assert cycle.result.verdict is Verdict.DO_NOT_USE
     assert text.startswith("DO NOT USE: ")
     assert not cycle.goal.progress.done
@@ -186,15 +186,15 @@ def shape(hint):
         return f"{{KEY: {shape(inner[1])}, ...}}"
     if dataclasses.is_dataclass(hint):
         hints = typing.get_type_hints(hint)
-        return f"{{{', '.join(f'{name}: {shape(each)}' for name, each in hints.items())}}}"
+        return f"{{{', '.join(f'{name}: {shape(item)}' for name, item in hints.items())}}}"
     if hint not in words and issubclass(hint, Enum):
         return "/".join(map(plain, hint))
     return words[hint]
 
 
 def test_the_keys_of_the_progress_topic_are_on_the_page_of_the_node():
-    lines = [f"{name}: {shape(each)}" for name, each in typing.get_type_hints(NodeState).items()]
-    wrapped = [textwrap.fill(each, 98, subsequent_indent="  ") for each in lines]
+    lines = [f"{name}: {shape(item)}" for name, item in typing.get_type_hints(NodeState).items()]
+    wrapped = [textwrap.fill(line, 98, subsequent_indent="  ") for line in lines]
     text = "\n".join(["```text", *wrapped, "```"])
     page = (ROOT / "docs" / "node.md").read_text()
     assert text in page, f"docs/node.md must have this text:\n{text}"
@@ -211,12 +211,12 @@ def test_what_the_halves_of_the_whole_drive_no_longer_say_is_taken_back(cycle, l
     for motion_s in (40.0, 42.0, 44.0):
         answered(cycle, motion_s, cross_check=scatter(0.7))
     assert [reason.rule for reason in cycle.result.reasons] == ["halves"]
-    said = "the two halves of the recording disagree about the rotation about x"
-    assert "warning" in {level for level, text in lines if said in text}
+    sentence = "the two halves of the recording disagree about the rotation about x"
+    assert "warning" in {level for level, text in lines if sentence in text}
     # The newest result is worse, and the one before is kept.
     _, text = answered(cycle, 60.0, (0.005, 0.01, 0.005), 200, cross_check=scatter(0.0))
     assert "kept is the result of 100 poses" in text
     assert cycle.result.verdict is Verdict.USE
     taken_back = [(level, text) for level, text in lines if text.startswith("no longer found")]
     assert [level for level, _ in taken_back] == ["info"]
-    assert said in taken_back[0][1]
+    assert sentence in taken_back[0][1]

@@ -32,13 +32,15 @@ def result(sigmas_m=0.005, sigmas_rad=0.001, verdicts=(), **fields):
     return dataclasses.replace(made(), observability_measured=dofs, **fields)
 
 
-def told(goal, *results):
-    """What a session says after results from 40 s of motion on, 2 s apart."""
-    return [goal.add(each, seen(40.0 + 2.0 * k)) for k, each in enumerate(results)][-1]
+def progress_after(goal, *results):
+    """Return the progress after results from 40 s of motion on, 2 s apart."""
+    for k, calibration in enumerate(results):
+        progress = goal.add(calibration, seen(40.0 + 2.0 * k))
+    return progress
 
 
 def seconds_left(progress):
-    return [each.seconds_left for each in progress.axes.values()]
+    return [row.seconds_left for row in progress.axes.values()]
 
 
 def lasting(tau_s):
@@ -63,7 +65,7 @@ def test_every_axis_has_its_own_target():
     assert config.targets == pytest.approx((0.02, 0.02, 0.1, 0.00524, 0.00524, np.radians(0.5)))
     goal = Goal(config.targets)
     rough_height = result(sigmas_m=(0.004, 0.004, 0.06))
-    progress = told(goal, rough_height, rough_height)
+    progress = progress_after(goal, rough_height, rough_height)
     assert progress.done
     assert progress.axes["z"].target == pytest.approx(0.1)
     strict = Goal(CalibratorConfig(target_axes="x=1mm").targets)
@@ -110,11 +112,11 @@ def test_time_left_follows_from_the_variance_that_falls_with_time():
 
 def test_the_time_left_only_shrinks_by_one_step_at_a_result():
     goal = Goal(TARGETS)
-    found = []
+    times_s = []
     for motion_s, sigma_m in enumerate((0.03, 0.0142, 0.025, 0.025, 0.02, 0.004, 0.02), 40):
         progress = goal.add(result(sigmas_m=(0.004, sigma_m, 0.004)), seen(motion_s))
-        found.append(seconds_left(progress)[1])
-    assert found == [180.0, 120.0, 120.0, 120.0, 60.0, 0.0, 60.0]
+        times_s.append(seconds_left(progress)[1])
+    assert times_s == [180.0, 120.0, 120.0, 120.0, 60.0, 0.0, 60.0]
 
 
 def test_faults_of_the_streams_and_failed_solves_are_no_success():
@@ -130,12 +132,12 @@ def test_faults_of_the_streams_and_failed_solves_are_no_success():
 
 def test_what_was_measured_by_hand_need_not_be_shown_by_motion():
     by_hand = result(sigmas_m=(0.004, 0.004, 0.05), verdicts={"z": DofVerdict.PRIOR})
-    assert told(Goal(TARGETS), by_hand, by_hand).done
+    assert progress_after(Goal(TARGETS), by_hand, by_hand).done
 
 
 def test_a_good_result_stays_when_the_robot_is_parked_or_later_ones_are_clearly_worse():
     goal = Goal(TARGETS)
-    told(goal, result(), result())
+    progress_after(goal, result(), result())
     best = result(sigmas_m=0.004)
     goal.add(best, seen(60.0))
     for _ in range(5):
@@ -148,7 +150,7 @@ def test_a_good_result_stays_when_the_robot_is_parked_or_later_ones_are_clearly_
 
 def test_the_newest_of_equally_good_results_is_kept():
     goal = Goal(TARGETS)
-    told(goal, *[result(sigmas_m=0.004)] * 2)
+    progress_after(goal, *[result(sigmas_m=0.004)] * 2)
     for motion_s, sigma_m in ((44.0, 0.0045), (46.0, 0.0049)):
         newest = result(sigmas_m=sigma_m)
         goal.add(newest, seen(motion_s))
@@ -160,10 +162,10 @@ def test_the_newest_of_equally_good_results_is_kept():
 def test_a_saved_result_tells_how_far_the_session_was(tmp_path):
     progress = Goal(TARGETS).add(result(sigmas_m=(0.004, 0.028, np.inf)), seen(40.0))
     hec.save(made().with_part("goal", progress), tmp_path)
-    found = hec.load(tmp_path).goal
-    assert found == progress
-    assert found.sentence == progress.sentence
-    assert (found.axes["z"].sigma, found.axes["z"].target) == (np.inf, 0.02)
+    loaded = hec.load(tmp_path).goal
+    assert loaded == progress
+    assert loaded.sentence == progress.sentence
+    assert (loaded.axes["z"].sigma, loaded.axes["z"].target) == (np.inf, 0.02)
     text = " ".join(" ".join(as_lines(hec.load(tmp_path))).split())
     assert f"the session: {progress.sentence}" in text
 
@@ -212,6 +214,6 @@ def test_only_motion_counts_as_time():
 def test_positions_alone_are_done_without_a_word_of_the_rotation():
     hidden = dict.fromkeys(AXES[3:], DofVerdict.UNOBSERVABLE)
     of_positions = result(sigmas_rad=np.inf, verdicts=hidden, measured="positions")
-    progress = told(Goal(TARGETS), *[of_positions] * 3)
+    progress = progress_after(Goal(TARGETS), *[of_positions] * 3)
     assert progress.done
     assert progress.sentence.startswith("Done: x, y and z are known to 5 mm or better")

@@ -71,12 +71,12 @@ def test_its_files_are_trajectories_that_every_program_reads(tmp_path):
     calibrator = Calibrator(CONFIG)
     record(writer, calibrator, messages())
     writer.close()
-    parent, child = (hec.read_trajectory(tmp_path / f"{each}.tum") for each in BOTH)
-    found = hec.calibrate(parent, child, method="dnl", reference="B3")
+    parent, child = (hec.read_trajectory(tmp_path / f"{stream}.tum") for stream in BOTH)
+    result = hec.calibrate(parent, child, method="dnl", reference="B3")
     expected = calibrator.snapshot().streams
     np.testing.assert_array_equal(parent.stamps_ns, expected[0].stamps_ns)
     np.testing.assert_allclose(child.poses, expected[1].poses, atol=1e-15)
-    assert found.n_poses == 60
+    assert result.n_poses == 60
     first, *lines = (tmp_path / "parent.tum").read_text().splitlines()
     assert json.loads(first.removeprefix("# "))["topic"] == "/lidar"
     assert np.loadtxt(lines).shape == (60, 8)
@@ -121,7 +121,7 @@ def test_whatever_byte_the_file_ends_at_the_whole_lines_before_it_are_read(tmp_p
     for end in range(ends[0], len(data)):
         path.write_bytes(data[:end])
         journal = read_journal(tmp_path)
-        whole = max(each for each in ends if each <= end)
+        whole = max(offset for offset in ends if offset <= end)
         assert journal.whole_bytes["child"] == whole
         expected = [line for line in data[:whole].splitlines() if not line.startswith(b"#")]
         assert (journal.streams == "child").sum() == len(expected)
@@ -155,11 +155,11 @@ def test_what_is_no_journal_is_said(tmp_path):
     assert not has_session(tmp_path)
     with pytest.raises(InputError, match="no session journal in"):
         read_journal(tmp_path)
-    for text, what in (("something else\n", "damaged from its first byte"),
+    for text, message in (("something else\n", "damaged from its first byte"),
                        ('# {"format": "hand_eye_calib/journal", "version": 3}\n',
                         "is of format version 3, this program reads 2")):  # fmt: skip
         (tmp_path / "parent.tum").write_text(text)
-        with pytest.raises(InputError, match=what):
+        with pytest.raises(InputError, match=message):
             read_journal(tmp_path)
         assert count_poses(tmp_path) is None
 
@@ -186,8 +186,8 @@ def test_further_child_sensors_are_resumed_too(tmp_path):
     replay_journal(read_journal(tmp_path), tmp_path, again)
     assert again["child2"].statistics("child").received == 60
     T = engines["child"].estimate().T_parent_child
-    for each in again.values():
-        assert np.array_equal(each.estimate().T_parent_child, T)
+    for engine in again.values():
+        assert np.array_equal(engine.estimate().T_parent_child, T)
 
 
 def test_the_lock_is_on_the_directory(tmp_path):

@@ -75,10 +75,10 @@ def tf_of(stamp_ns, row):
     def make(typestore):
         message = make_edge(typestore)
         transform = message.transforms[0].transform
-        for part, value in zip("xyz", row[:3], strict=True):
-            setattr(transform.translation, part, float(value))
-        for part, value in zip("xyzw", row[3:], strict=True):
-            setattr(transform.rotation, part, float(value))
+        for component, value in zip("xyz", row[:3], strict=True):
+            setattr(transform.translation, component, float(value))
+        for component, value in zip("xyzw", row[3:], strict=True):
+            setattr(transform.rotation, component, float(value))
         return message
 
     return make

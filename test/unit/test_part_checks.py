@@ -22,7 +22,7 @@ def solved(kind, fault, platform):
 
 
 def codes(result, severity="error"):
-    return [each.code for each in result.findings if each.severity.value == severity]
+    return [finding.code for finding in result.findings if finding.severity.value == severity]
 
 
 # Kind, fault, and the finding that names it.
@@ -90,9 +90,9 @@ def test_a_fault_names_the_stream_that_has_positions(stream):
     recording = part_faults.positions("drone", "height in feet", SEED)
     streams = (recording.parent, recording.child)
     result = hec.calibrate(*(streams if stream == "child" else streams[::-1]), **part_faults.WIDE)
-    (found,) = [each for each in result.findings if each.code == "axis_scale"]
-    assert found.stream == stream
-    assert f"the {stream} stream's z coordinates" in found.what
+    (finding,) = [item for item in result.findings if item.code == "axis_scale"]
+    assert finding.stream == stream
+    assert f"the {stream} stream's z coordinates" in finding.what
 
 
 @pytest.mark.parametrize("scale", ["none", 1.0 / 1.05])
@@ -118,8 +118,8 @@ def test_auto_leaves_a_scale_that_is_one():
 
 def test_parallel_axes_and_an_antenna_at_the_origin_may_be_said_by_priors():
     rates = part_faults.rates("drone", "own rates", SEED)
-    known = {axis: (0.0, np.radians(2.0)) for axis in ("roll", "pitch", "yaw")}
-    result = hec.calibrate(rates.parent, rates.child, prior=known, **part_faults.WIDE)
+    priors = {axis: (0.0, np.radians(2.0)) for axis in ("roll", "pitch", "yaw")}
+    result = hec.calibrate(rates.parent, rates.child, prior=priors, **part_faults.WIDE)
     assert codes(result) == []
     positions = part_faults.positions("drone", "copied with noise", SEED)
     here = dict.fromkeys("xyz", (0.0, 0.02))

@@ -32,13 +32,13 @@ def node(monkeypatch):
     log = NodeLog(SimpleNamespace(**silent))
     session = LiveSession(log, CalibratorConfig())
     inputs = [
-        PoseInput(name, f"/{name}_odom", session, log, lambda each: None)
+        PoseInput(name, f"/{name}_odom", session, log, lambda source: None)
         for name in ("parent", "child")
     ]
     for source in inputs:
         source.publishers = ("/driver",)
     targets = CalibratorConfig().targets
-    cycle = SolveCycle(session, log, print, lambda each: each, print, targets)
+    cycle = SolveCycle(session, log, print, lambda calibration: calibration, print, targets)
     cycle.ask(lambda good, text: None)
     return SimpleNamespace(now=now, inputs=inputs, cycle=cycle)
 
@@ -59,7 +59,7 @@ def run(node, seconds, senders=("parent", "child"), stamps_stand=False):
 
 
 def state_of(node, may_rest=False):
-    inputs = {each.name: each.state(node.now[0], may_rest) for each in node.inputs}
+    inputs = {source.name: source.state(node.now[0], may_rest) for source in node.inputs}
     pause = pause_of(inputs, node.inputs[0].is_enabled)
     return NodeState(
         node="/calibrator",
@@ -76,8 +76,8 @@ def view_of(state):
 
 
 def with_result(node, motion_s=20.0):
-    found = good_calibration(warnings=())
-    node.cycle.conclude(Answer(0, 0.1, seen(motion_s), found))
+    newest = good_calibration(warnings=())
+    node.cycle.conclude(Answer(0, 0.1, seen(motion_s), newest))
 
 
 def test_a_stream_that_stops_pauses_the_session_and_is_named(node):
@@ -110,7 +110,7 @@ def test_messages_that_give_no_pose_are_no_sign_of_life(node, stream):
     for _ in range(80):
         run(node, 0.1, senders=[other])
         pose = pose_at(last_ns)
-        source = next(each for each in node.inputs if each.name == stream)
+        source = next(item for item in node.inputs if item.name == stream)
         source.accept(last_ns, lambda pose=pose: pose)
     state = state_of(node)
     assert state.inputs[stream].level is Level.WARN
@@ -125,7 +125,7 @@ def test_a_publisher_that_has_gone_is_named_and_a_parked_robot_asks_for_nothing(
     with_result(node)
     run(node, 8.0, senders=[])
     parked = state_of(node, may_rest=True)
-    assert {each.level for each in parked.inputs.values()} == {Level.OK}
+    assert {item.level for item in parked.inputs.values()} == {Level.OK}
     assert (parked.progress.level, parked.progress.is_paused) == (Level.OK, True)
     assert parked.progress.text == (
         "Paused: no pose of parent (/parent_odom) and child (/child_odom) for 8.0 s; "
@@ -156,7 +156,7 @@ def test_a_node_that_accepts_no_poses_is_paused(node):
         source.is_enabled = False
     run(node, 8.0)
     state = state_of(node)
-    assert {each.level for each in state.inputs.values()} == {Level.OK}
+    assert {item.level for item in state.inputs.values()} == {Level.OK}
     assert state.progress.text == "Paused: not accepting poses; call ~/set_enabled to go on."
     assert (state.progress.level, view_of(state).word) == (Level.WARN, "PAUSED")
 

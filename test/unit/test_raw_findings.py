@@ -46,17 +46,17 @@ def checked(parent, child, limits=QUICK):
         ):
             is_now = (stamps_ns - stamps_ns[0]) // 10**9 == second
             feed(calibrator, stream, trajectory[is_now])
-    found = answer(Job(0, calibrator, check=True))
-    return calibrator, {each.code for each in found.check.findings if each.makes_unusable}
+    result = answer(Job(0, calibrator, check=True))
+    return calibrator, {finding.code for finding in result.check.findings if finding.makes_unusable}
 
 
 @pytest.mark.parametrize(
     ("levels_from_s", "codes"), [(np.inf, set()), (0.0, {"interleaved"}), (40.0, {"interleaved"})]
 )
 def test_two_sources_are_found_after_poses_were_paired_also_if_one_came_later(levels_from_s, codes):
-    calibrator, found = checked(*streams(60.0, levels_from_s))
+    calibrator, errors = checked(*streams(60.0, levels_from_s))
     assert len(calibrator.snapshot().kept) > 200
-    assert found == codes
+    assert errors == codes
 
 
 def raw(code="interleaved", **fields):
@@ -87,7 +87,7 @@ def test_what_only_raw_poses_show_stays_until_a_reset(checks, fault, stays):
     checks.take(CheckResult((fault,)))
     for _ in range(3):
         checks.take(CheckResult(()))
-    assert [each.code for each in checks.findings] == [fault.code] * stays
+    assert [finding.code for finding in checks.findings] == [fault.code] * stays
     assert [fault.code in text or fault.what in text for text in checks.state().findings] == (
         [True] * stays
     )
@@ -113,7 +113,7 @@ def test_a_lasting_fault_forbids_results_of_every_kind_of_streams(monkeypatch, m
     log = NodeLog(SimpleNamespace(**silent))
     session = LiveSession(log, CalibratorConfig())
     targets = CalibratorConfig().targets
-    cycle = SolveCycle(session, log, print, lambda each: each, print, targets)
+    cycle = SolveCycle(session, log, print, lambda calibration: calibration, print, targets)
     cycle.ask(lambda good, text: None)
     good = good_calibration(measured=measured, warnings=())
     cycle.conclude(Answer(0, 0.1, seen(40.0), good, check=CheckResult((raw(),))))

@@ -43,8 +43,8 @@ solving.main()
 def poses(**options):
     calibrator = Calibrator(CalibratorConfig(**{"reference": "B3", **options}))
     parent = wandering_poses(250)
-    for stream, each in (("parent", parent), ("child", child_of(parent))):
-        feed(calibrator, stream, as_trajectory(each))
+    for stream, poses in (("parent", parent), ("child", child_of(parent))):
+        feed(calibrator, stream, as_trajectory(poses))
     return calibrator
 
 
@@ -57,8 +57,8 @@ class Started(SolvingProcess):
 
     def next(self):
         assert self.announced.acquire(timeout=PATIENCE_S)
-        (found,) = self.answers()
-        return found
+        (result,) = self.answers()
+        return result
 
 
 @pytest.fixture
@@ -97,17 +97,17 @@ def test_gives_the_same_bits_as_here_job_after_job_whatever_libraries_print(star
     for session, options in enumerate(OPTIONS, start=5):
         work = poses(**options)
         process.submit(Job(session, work, check=True))
-        there = process.next()
+        remote = process.next()
         here = answer(Job(session, poses(**options), check=True))
-        assert there.session == session
+        assert remote.session == session
         for name in ("T_parent_child", "covariance", "objective", "sigmas"):
-            values = [getattr(each.calibration, name) for each in (there, here)]
+            values = [getattr(result.calibration, name) for result in (remote, here)]
             np.testing.assert_array_equal(*values, err_msg=f"{name} with {options}")
-        assert there.check.findings == here.check.findings
-        assert there.motion.n_poses == here.motion.n_poses == 250
-        assert (there.time_offset is None) == ("time_offset" not in options)
-        if there.time_offset is not None:
-            assert there.time_offset.seconds == work.snapshot().resolved.time_offset.seconds
+        assert remote.check.findings == here.check.findings
+        assert remote.motion.n_poses == here.motion.n_poses == 250
+        assert (remote.time_offset is None) == ("time_offset" not in options)
+        if remote.time_offset is not None:
+            assert remote.time_offset.seconds == work.snapshot().resolved.time_offset.seconds
 
 
 def test_what_is_missing_and_defects_are_told_apart():
@@ -140,8 +140,8 @@ def test_one_that_hangs_is_killed_started_again_and_the_job_has_failed(start, mo
     process = start(SLOW)
     old = process._process.pid
     process.submit(Job(7, poses(), check=True))
-    what = "the solving process had no answer after 0.5 s and was killed"
-    assert process.next() == Answer(7, 0.0, failure=Failure(what, "it was started again"))
+    text = "the solving process had no answer after 0.5 s and was killed"
+    assert process.next() == Answer(7, 0.0, failure=Failure(text, "it was started again"))
     assert process._process.pid != old
     wait_gone(old)
 
@@ -191,13 +191,13 @@ def test_what_a_check_is_certain_of_is_solved_with_as_in_a_replay(pairing_starts
     live = calibrator.snapshot()
     assert (len(live.kept) > 0) == (pairing_starts < 400)
     replayed = review(live.estimate(), live).calibration
-    found = answer(Job(1, calibrator, check=True))
-    assert found.options == {"time_offset": "estimate"}
-    assert "solved with time_offset estimate" in found.messages[0]
-    again = answer(Job(1, calibrator, check=True, options=found.options))
+    first = answer(Job(1, calibrator, check=True))
+    assert first.options == {"time_offset": "estimate"}
+    assert "solved with time_offset estimate" in first.messages[0]
+    again = answer(Job(1, calibrator, check=True, options=first.options))
     assert again.calibration.time_offset_s == pytest.approx(0.3, abs=0.01)
-    for each in (found, again):
-        np.testing.assert_array_equal(each.calibration.T_parent_child, replayed.T_parent_child)
-        np.testing.assert_array_equal(each.calibration.covariance, replayed.covariance)
+    for result in (first, again):
+        np.testing.assert_array_equal(result.calibration.T_parent_child, replayed.T_parent_child)
+        np.testing.assert_array_equal(result.calibration.covariance, replayed.covariance)
     assert (again.options, again.messages) == ({}, ())
     assert "time_offset" not in {finding.code for finding in again.check.findings}

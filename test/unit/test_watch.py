@@ -93,16 +93,16 @@ def mount(**fields):
     return NodeState(node=NODE, mount=replace(MOUNT, **fields), inputs=inputs())
 
 
-def view_of(each, now_s=0.5):
+def view_of(document, now_s=0.5):
     board = Board()
-    if each is not None:
-        board.take(each, 0.0)
+    if document is not None:
+        board.take(document, 0.0)
     return board.view(now_s)
 
 
 def test_a_state_survives_its_json_and_nothing_else_is_one():
-    for each in (state(), mount()):
-        assert from_plain(NodeState, plain(each)) == each
+    for document in (state(), mount()):
+        assert from_plain(NodeState, plain(document)) == document
     for wrong in ({}, {**plain(state()), "node": 7}, {**plain(state()), "inputs": [1]}, [], "x"):
         with pytest.raises((TypeError, ValueError, KeyError)):
             from_plain(NodeState, wrong)
@@ -174,7 +174,7 @@ ERROR = {"level": Level.ERROR}
 
 
 @pytest.mark.parametrize(
-    ("each", "now_s", "tone", "word", "sentence"),
+    ("document", "now_s", "tone", "word", "sentence"),
     [
         (None, 0.5, Tone.UNKNOWN, "NO NODE", "Nothing heard of a calibrator yet."),
         (state(), 9.0, Tone.BAD, "SILENT", "No word from the node for 9 s."),
@@ -211,8 +211,8 @@ ERROR = {"level": Level.ERROR}
         ),
     ],
 )
-def test_the_headline_is_what_a_person_should_do_first(each, now_s, tone, word, sentence):
-    view = view_of(each, now_s=now_s)
+def test_the_headline_is_what_a_person_should_do_first(document, now_s, tone, word, sentence):
+    view = view_of(document, now_s=now_s)
     assert (view.tone, view.word) == (tone, word)
     assert view.sentence.startswith(sentence)
 
@@ -224,14 +224,14 @@ def test_bars_show_the_share_of_the_information_and_the_time_left():
     assert {bar.meaning for bar in bars.values()} == {""}
     on_wheels = view_of(state(extrinsic=replace(EXTRINSIC, has_vehicle_axes=True)))
     assert [bar.meaning for bar in on_wheels.bars][2:4] == ["up", "tilt to a side"]
-    assert ["sketch" in fragment(each) for each in (on_wheels, view_of(state()))] == [True, False]
+    assert ["sketch" in fragment(view) for view in (on_wheels, view_of(state()))] == [True, False]
     assert bars["z"].share == pytest.approx(0.25)  # twice the target: a quarter of the information
     assert (bars["z"].tone, bars["z"].word) == (Tone.ACT, "25 s left")
     assert (bars["z"].against, bars["yaw"].against) == ("± 4 of 2 cm", "± 0.057 of 0.3 deg")
 
 
 @pytest.mark.parametrize(
-    ("sigma", "left", "tone", "word", "share"),
+    ("sigma", "left_s", "tone", "word", "share"),
     [
         (INF, INF, Tone.UNKNOWN, "not seen yet", 0.0),
         (INF, 30.0, Tone.UNKNOWN, "out of reach", 0.0),  # as roll of an antenna
@@ -241,9 +241,9 @@ def test_bars_show_the_share_of_the_information_and_the_time_left():
         (0.08, 300.0, Tone.ACT, "5 min left", 0.0625),
     ],
 )
-def test_an_axis_in_words(sigma, left, tone, word, share):
-    known = AxisProgress(sigma=sigma, target=0.02, seconds_left=left)
-    bar = view_of(state(axes={"z": known})).bars[2]
+def test_an_axis_in_words(sigma, left_s, tone, word, share):
+    row = AxisProgress(sigma=sigma, target=0.02, seconds_left=left_s)
+    bar = view_of(state(axes={"z": row})).bars[2]
     assert (bar.tone, bar.word, bar.share) == (tone, word, pytest.approx(share))
 
 
@@ -281,17 +281,18 @@ def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
     assert (view.result[2].tone, view.result[2].text) == (Tone.ACT, "moved: z by +3 cm ± 4 mm")
     assert view.bars[2].difference == "+3.10 ± 0.40 cm"
     assert view.bars[5].difference == "unknown"
-    assert [each.name for each in view_of(state()).result] == ["verdict", "note"]
+    assert [line.name for line in view_of(state()).result] == ["verdict", "note"]
     for verdict, tone in (("same", Tone.GOOD), ("cannot tell", Tone.UNKNOWN)):
         other = replace(comparison, verdict=verdict)
         assert view_of(state(comparison=other)).result[2].tone is tone
     for broadcast, tone in ((Broadcast.ON, Tone.GOOD), (Broadcast.REFUSED, Tone.ACT)):
         extrinsic = replace(EXTRINSIC, tf_static=broadcast, tf_static_reason="why")
-        for has_ended, told in ((False, tone), (True, Tone.ACT)):  # who comes later hears nothing
+        # After the end of the node, late subscribers receive nothing.
+        for has_ended, expected in ((False, tone), (True, Tone.ACT)):
             line = view_of(replace(state(extrinsic=extrinsic), has_ended=has_ended)).result[2]
-            assert (line.tone, line.name) == (told, "on /tf_static")
-            said = "nothing" in line.text, f"{broadcast.value}: why" == line.text
-            assert said == (has_ended, not has_ended)
+            assert (line.tone, line.name) == (expected, "on /tf_static")
+            texts = "nothing" in line.text, f"{broadcast.value}: why" == line.text
+            assert texts == (has_ended, not has_ended)
 
 
 def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
@@ -382,8 +383,8 @@ def test_the_terminal_shows_words_and_signs_at_every_width(width):
 def test_a_line_is_printed_when_something_else_is_said(capsys):
     board = Board()
 
-    def printed(each, now_s):
-        board.take(each, now_s)
+    def printed(document, now_s):
+        board.take(document, now_s)
         show(board.view(now_s), False)
         return capsys.readouterr().out.splitlines()
 
@@ -392,7 +393,7 @@ def test_a_line_is_printed_when_something_else_is_said(capsys):
         assert printed(state(at={"sentence": "Go on for about 20 s: z is behind."}), 2.0) == []
         assert printed(state(at={"done": True}), 3.0)
         learning = [mount(is_learning=True, text=f"{second} of 120 s") for second in (1, 2)]
-        assert [len(printed(each, 4.0)) for each in learning] == [1, 0]
+        assert [len(printed(document, 4.0)) for document in learning] == [1, 0]
         board.answer("save", True, "result saved", 5.0)
         assert printed(learning[0], 5.0) == ["✓ save: result saved"]
         assert board.view(60.0).answer == ()
@@ -442,11 +443,12 @@ def test_keys_ask_and_a_reset_takes_two(typed):
 def test_the_fragment_is_well_formed_and_escapes_what_nodes_say():
     hostile = '<script>alert("1")</script>'
     result = replace(RESULT, reasons=(hostile,), parent_frame="<", child_frame="&")
-    each = state(at={"sentence": hostile}, extrinsic=replace(EXTRINSIC, result=result))
-    text = fragment(view_of(each))
+    document = state(at={"sentence": hostile}, extrinsic=replace(EXTRINSIC, result=result))
+    text = fragment(view_of(document))
     assert "<script" not in text
     root = ElementTree.fromstring(f"<main>{text}</main>")
-    assert [each.get("aria-label") for each in root.iter("progress")][2:4] == ["along z", "about x"]
+    labels = [element.get("aria-label") for element in root.iter("progress")]
+    assert labels[2:4] == ["along z", "about x"]
     assert root.find("*[@id='state']").get("data-buttons") == "solve save reset"
     assert "".join(root.find(".//h1").itertext()) == "▶ GO ON"
 
@@ -549,9 +551,9 @@ def test_saved_files_are_served_and_nothing_else(server, tmp_path):
     (tmp_path / "extrinsic.yaml").symlink_to("/etc/passwd")
     saved = replace(SAVED, directory=str(tmp_path))
     server.board.take(replace(state(), saved=saved), time.monotonic())
-    found = fetch(server, "GET", "/report.html?key=word")
-    assert (found.status, found.read()) == (200, b"<p>report")
-    assert "script" not in found.getheader("Content-Security-Policy")
+    response = fetch(server, "GET", "/report.html?key=word")
+    assert (response.status, response.read()) == (200, b"<p>report")
+    assert "script" not in response.getheader("Content-Security-Policy")
     assert fetch(server, "GET", "/report.html").status == 403
     for name in ("extrinsic.yaml", "../report.html", "journal"):
         assert fetch(server, "GET", f"/{name}?key=word").status == 404

@@ -104,9 +104,9 @@ def test_the_script_finds_what_it_looks_for():
 def test_the_word_is_large_on_a_phone_and_larger_on_a_wide_screen():
     style = (FOLDER / "page.css").read_text(encoding="utf-8")
     (sizes,) = re.findall(r"h1 \{ font-size: clamp\((.+?)rem, (.+?)vw, (.+?)rem\)", style)
-    least, share, most = map(float, sizes)
-    assert 16 * least >= 27
-    assert min(12.8 * share, 16 * most) >= 64  # at 1,280 px
+    smallest, share, largest = map(float, sizes)
+    assert 16 * smallest >= 27
+    assert min(12.8 * share, 16 * largest) >= 64  # at 1,280 px
 
 
 def played(steps):
@@ -139,19 +139,21 @@ def test_the_page_shows_what_comes_and_says_when_nothing_comes():
             "seen();",
         ]
     )
-    opened, title, said = ([each[key] for each in states] for key in ("opened", "title", "said"))
+    opened = [state["opened"] for state in states]
+    title = [state["title"] for state in states]
+    messages = [state["said"] for state in states]
     assert opened == [1, 1, 1, 1, 2, 2, 2, 3, 4, 4, 4]
     assert states[0]["last"] == "events?key=word"
     assert title[1:4] == ["▶ GO ON", "MOUNT MOVED", "MOUNT MOVED"]
-    assert [each["shaken"] for each in states][:9] == [0, 1, 2, 2, 2, 2, 3, 3, 3]
-    assert [each["footer"] for each in states][1:3] == [False, True]
-    assert [each["locks"] for each in states][8:] == [1, 1, 2]  # while seen, it stays on
-    assert [each["disabled"] for each in states][:9] == [k in (4, 5, 7, 8) for k in range(9)]
-    assert said[3] == said[6] == "✓ connected"
-    assert re.fullmatch(r"✗ CONNECTION LOST at \d\d:\d\d( [AP]M)?, trying again ...", said[4])
-    assert said[5] == said[4]
-    assert said[8] == "✗ OLD ADDRESS: open the address that watch shows now"
-    assert [each["lost"] for each in states][3:7] == [False, True, True, False]
+    assert [state["shaken"] for state in states][:9] == [0, 1, 2, 2, 2, 2, 3, 3, 3]
+    assert [state["footer"] for state in states][1:3] == [False, True]
+    assert [state["locks"] for state in states][8:] == [1, 1, 2]  # while seen, it stays on
+    assert [state["disabled"] for state in states][:9] == [k in (4, 5, 7, 8) for k in range(9)]
+    assert messages[3] == messages[6] == "✓ connected"
+    assert re.fullmatch(r"✗ CONNECTION LOST at \d\d:\d\d( [AP]M)?, trying again ...", messages[4])
+    assert messages[5] == messages[4]
+    assert messages[8] == "✗ OLD ADDRESS: open the address that watch shows now"
+    assert [state["lost"] for state in states][3:7] == [False, True, True, False]
 
 
 def test_buttons_are_asked_for_by_their_addresses():
@@ -167,7 +169,7 @@ def test_buttons_are_asked_for_by_their_addresses():
         ]
     )
     asked = [f"POST {name}?key=word" for name in ("solve", "save", "reset")]
-    assert [each["posts"] for each in states[:3]] == [asked[:2], asked[:2], asked]
+    assert [state["posts"] for state in states[:3]] == [asked[:2], asked[:2], asked]
     assert states[3]["posts"][-1] == "POST save?key=word"
     assert states[3]["lost"]
 
@@ -183,10 +185,10 @@ def test_what_is_to_be_pressed_first_stands_out_and_an_axis_can_be_given_by_hand
             "nodes['by-hand'].heard.submit({preventDefault() {}});",
         ]
     )
-    assert [each["main"] for each in states[:2]] == [[False] * 3, [False, True, False]]
-    assert [each["hidden"] for each in states[:2]] == [[False] * 3, [False, False, True]]
-    assert [each["link"] for each in states[:2]] == [True, "a?key=word"]
-    assert [each["form"] for each in states] == [True, True, False, False]
+    assert [state["main"] for state in states[:2]] == [[False] * 3, [False, True, False]]
+    assert [state["hidden"] for state in states[:2]] == [[False] * 3, [False, False, True]]
+    assert [state["link"] for state in states[:2]] == [True, "a?key=word"]
+    assert [state["form"] for state in states] == [True, True, False, False]
     assert states[3]["posts"] == ["POST prior?key=word&axis=z&value=1.85&sigma=0.02"]
 
 

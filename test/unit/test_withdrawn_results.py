@@ -66,13 +66,13 @@ def session(monkeypatch):
     silent = dict.fromkeys(("debug", "info", "warning", "error"), lambda text: None)
     log = NodeLog(SimpleNamespace(**silent))
     live = LiveSession(log, CalibratorConfig(prior_z="1.5m+/-0.02m"))
-    cycle = SolveCycle(live, log, print, lambda each: each, print, TARGETS)
+    cycle = SolveCycle(live, log, print, lambda calibration: calibration, print, TARGETS)
     cycle.ask(lambda good, text: None)
     return SimpleNamespace(cycle=cycle, saver=Saver(live, cycle, log), live=live)
 
 
-def conclude(session, motion_s, found=None, **fields):
-    return session.cycle.conclude(Answer(0, 0.1, seen(motion_s), found, **fields))
+def conclude(session, motion_s, newest=None, **fields):
+    return session.cycle.conclude(Answer(0, 0.1, seen(motion_s), newest, **fields))
 
 
 def state_of(session):
@@ -101,19 +101,19 @@ def drawn(view):
 # every surface says.
 FAILURES = {
     "contradicted prior": (
-        {"found": contradicted()},
+        {"newest": contradicted()},
         Standing.REFUTED,
         "CHECK THE PRIOR",
         "the prior on z is 18.2 standard deviations from the estimate from the motion",
     ),
     "faulty streams": (
-        {"found": result(), "check": CheckResult((INVERSE,))},
+        {"newest": result(), "check": CheckResult((INVERSE,))},
         Standing.REFUTED,
         "CHECK THE STREAMS",
         "inverse poses",
     ),
     "not converged": (
-        {"found": result(status=SolveStatus.NOT_CONVERGED)},
+        {"newest": result(status=SolveStatus.NOT_CONVERGED)},
         Standing.OUTDATED,
         "OLD RESULT",
         "the solver did not converge; the result shown is",
