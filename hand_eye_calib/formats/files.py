@@ -40,7 +40,7 @@ DEEPEST_YAML = 32
 
 # ---- .npz
 
-#: Largest size of all arrays of a file in bytes. The poses of 100,000 stops take 26 million.
+#: Bytes of all arrays of the largest file. The poses of 100,000 stops take 26 million.
 LARGEST_ARRAYS = 64 << 20
 
 # ---- trajectory files

@@ -156,11 +156,11 @@ def named_columns(names: Sequence[str]) -> tuple[dict[str, list[int]], list[str]
     plain = [name for name, _ in split]
     columns: dict[str, list[int]] = {}
     for quantity, text in _NAMES.items():
-        known = text.split()
-        places = [place for place, name in enumerate(plain) if name in known]
+        aliases = text.split()
+        places = [place for place, name in enumerate(plain) if name in aliases]
         if not places:
             # The longest known end of a path counts: position_x rather than x.
-            ends = tuple(f"_{end}" for end in known if "_" in end or end in _ENDS)
+            ends = tuple(f"_{end}" for end in aliases if "_" in end or end in _ENDS)
             places = [place for place, name in enumerate(plain) if name.endswith(ends)]
         if quantity in ROTATION_VECTOR:
             # Brief names in degrees are rather angles, whose order no name states.
@@ -315,11 +315,20 @@ def _split(name: str) -> tuple[str, str]:
     words = re.findall("[a-z0-9°µμ]+", outside)
     in_brackets = [match[1] for match in _BRACKETS.finditer(name) if match[2]]
     if in_brackets and name.endswith(("]", ")")):
-        # The unit deg s^-1 is deg/s.
-        unit = in_brackets[-1].strip().removesuffix("-1").removesuffix("^").strip()
-        return "_".join(words), _UNITS_IN_BRACKETS.get(re.sub(r"[\s/_]+", "/", unit), "")
+        return "_".join(words), _unit_in_brackets(in_brackets[-1])
+    return _split_words(words)
+
+
+def _unit_in_brackets(text: str) -> str:
+    """Return the unit in the brackets of a name: deg/s for "deg s^-1"."""
+    unit = text.strip().removesuffix("-1").removesuffix("^").strip()
+    return _UNITS_IN_BRACKETS.get(re.sub(r"[\s/_]+", "/", unit), "")
+
+
+def _split_words(words: list[str]) -> tuple[str, str]:
+    """Return the words of a name without a unit in the last words, joined, and the unit."""
     if len(words) > 1 and words[-1].isdigit() and words[-2] in ("q", "position"):
-        return "_".join([*words[:-2], words[-2] + words[-1]]), ""
+        return "_".join(words[:-1]) + words[-1], ""
     is_time = any(_TIME_WORD.fullmatch(word) for word in words)
     for n_words in (2, 1):
         unit = _UNITS.get("/".join(words[-n_words:]), "")

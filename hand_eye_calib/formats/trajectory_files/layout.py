@@ -307,19 +307,28 @@ def _fitted(names: Sequence[str], row: Sequence[str], is_comment: bool) -> _Head
     """
     if len(names) == len(row) + 1 and not names[-1]:
         names = names[:-1]
+    if not names:
+        return None
     for n_angle_cells in _ANGLE_CELLS:
         widths = _widths(names, row, n_angle_cells)
         if sum(widths) == len(row):
-            merge = _joining(widths) if max(widths, default=1) > 1 else None
-            kept = [name for name, width in zip(names, widths, strict=True) if width]
-            return _Header(_with_degrees(kept, merge(row) if merge else row), merge)
+            return _header_of_widths(names, widths, row)
     n_more = len(row) - len(names)
-    is_open = bool(names) and _is_open(names[-1])
-    if is_comment and n_more < 0 and not is_open:
+    if _is_open(names[-1]):
+        if len(names) > 1 and n_more >= -1:
+            return _Header((*names[:-1], *[""] * (n_more + 1)))
+    elif is_comment and n_more < 0:
         return _Header(tuple(names[-len(row) :]))
-    if is_open and len(names) > 1 and n_more >= -1:
-        return _Header((*names[:-1], *[""] * (n_more + 1)))
     return None
+
+
+def _header_of_widths(names: Sequence[str], widths: Sequence[int], row: Sequence[str]) -> _Header:
+    """Return the names that have cells, and the joining of their cells."""
+    kept = [name for name, width in zip(names, widths, strict=True) if width]
+    if max(widths) == 1:
+        return _Header(_with_degrees(kept, row))
+    merge = _joining(widths)
+    return _Header(_with_degrees(kept, merge(row)), merge)
 
 
 def _is_open(name: str) -> bool:
@@ -447,8 +456,11 @@ def _fitting(row: Sequence[str], rows: Sequence[Sequence[str]]) -> tuple[str, ..
     None if the numbers fit nothing, or no row is complete.
     """
     places = [place for place, cell in enumerate(row) if is_value(cell)]
-    values = _complete(rows, places, len(row)) if places else np.empty((0, 0))
-    columns = _columns_of(values) if len(values) else None
+    if not places:
+        return None
+    values = _complete(rows, places, len(row))
+    with np.errstate(all="ignore"):  # numbers may be of any size
+        columns = _columns_of(values) if len(values) else None
     if columns is None:
         return None
     named = [""] * len(row)
@@ -501,22 +513,23 @@ def _complete(rows: Sequence[Sequence[str]], places: Sequence[int], n_columns: i
 
 def _fits(pose: Sequence[str], values: FloatArray) -> bool:
     """Whether the columns of a pose, in this order, can have these values (N, n)."""
-    with np.errstate(all="ignore"):
-        if UNNAMED[0] in pose:
-            start = pose.index(UNNAMED[0])
-            norms = np.linalg.norm(values[:, start : start + len(UNNAMED)], axis=1)
-            is_unit = np.abs(norms - 1.0) <= QUATERNION_NORM_TOLERANCE
-            return bool(is_unit[norms > 0.0].all() and norms.any())
-        places = [pose.index(name) for name in ROTATION]
-        Rs = values[:, places].reshape(-1, 3, 3)
-        Rs = Rs[Rs.any(axis=(1, 2))]
-        errors = np.abs(Rs @ np.swapaxes(Rs, 1, 2) - np.eye(3))
-        if not len(Rs) or not (errors <= ROTATION_TOLERANCE).all():
-            return False
-        if LAST_ROW[0] not in pose:
-            return True
-        last_rows = values[:, [pose.index(name) for name in LAST_ROW]]
-        return bool(np.allclose(last_rows, [0.0, 0.0, 0.0, 1.0], atol=ROTATION_TOLERANCE))
+    if UNNAMED[0] in pose:
+        norms = np.linalg.norm(_values_of(UNNAMED, pose, values), axis=1)
+        is_unit = np.abs(norms - 1.0) <= QUATERNION_NORM_TOLERANCE
+        return bool(is_unit[norms > 0.0].all() and norms.any())
+    Rs = _values_of(ROTATION, pose, values).reshape(-1, 3, 3)
+    Rs = Rs[Rs.any(axis=(1, 2))]
+    errors = np.abs(Rs @ np.swapaxes(Rs, 1, 2) - np.eye(3))
+    if not len(Rs) or not (errors <= ROTATION_TOLERANCE).all():
+        return False
+    if LAST_ROW[0] not in pose:
+        return True
+    last_rows = _values_of(LAST_ROW, pose, values)
+    return bool(np.allclose(last_rows, [0.0, 0.0, 0.0, 1.0], atol=ROTATION_TOLERANCE))
+
+
+def _values_of(names: Sequence[str], pose: Sequence[str], values: FloatArray) -> FloatArray:
+    return values[:, [pose.index(name) for name in names]]
 
 
 def _are_seconds_and_ns(values: FloatArray) -> bool:
@@ -532,8 +545,7 @@ def _are_seconds_and_ns(values: FloatArray) -> bool:
 
 def _is_gravity(values: FloatArray) -> bool:
     """Whether vectors (N, 3) are as long as gravity."""
-    with np.errstate(over="ignore"):
-        lengths = np.linalg.norm(values, axis=1)
+    lengths = np.linalg.norm(values, axis=1)
     shortest, longest = _GRAVITY_M_S2
     return bool(((lengths >= shortest) & (lengths <= longest)).all())
 

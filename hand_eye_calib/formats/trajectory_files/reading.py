@@ -110,9 +110,9 @@ class FileOptions:
             raise ConfigError(f"{text}; the format is {self.format}")
 
 
-def _refuse_unknown(setting: str, value: str, known: Sequence[str]) -> None:
-    if value not in known:
-        raise ConfigError(f"unknown {setting} {value!r}; known are {', '.join(known)}")
+def _refuse_unknown(setting: str, value: str, choices: Sequence[str]) -> None:
+    if value not in choices:
+        raise ConfigError(f"unknown {setting} {value!r}; known are {', '.join(choices)}")
 
 
 class FileReading(NamedTuple):
@@ -399,7 +399,7 @@ def _why_no_poses(table: Table) -> str:
         return f"; expected lines of {table.expected}"
     return (
         f": all {table.n_rows} rows are empty, zero or not finite, the first on line "
-        f"{table.first_left_out}"
+        f"{table.first_skipped}"
     )
 
 
@@ -408,7 +408,7 @@ def _notes_on_left_out(table: Table) -> tuple[list[str], list[str]]:
     if not table.n_left_out:
         return [], []
     counts = without_poses(table.n_left_out, table.n_rows)
-    text = f"{table.path}: {counts}; the first is on line {table.first_left_out}"
+    text = f"{table.path}: {counts}; the first is on line {table.first_skipped}"
     if table.n_left_out <= MUCH_NULL * table.n_rows:
         return [text], []
     return [], [text]
@@ -469,17 +469,20 @@ def _in_utf8(data: bytes) -> bytes:
 
 def _with_options(layout: Layout, options: FileOptions) -> Layout:
     """Return the layout with the format and columns of the options."""
+    format = options.format
+    columns = layout.names
     if options.columns:
-        names = tuple(name.strip() for name in options.columns.split(","))
-        return replace(layout, format="csv", columns=names, is_transposable=False)
-    if options.format == "csv":
-        return replace(layout, format="csv", columns=layout.names, is_transposable=False)
-    if options.format != AUTO:
-        columns = tuple(_FORMATS[options.format][0])
-        return replace(layout, format=options.format, columns=columns, is_transposable=False)
-    # The file of times is for poses without stamps.
-    has_own_stamps = layout.columns is None or stamp_columns(named_columns(layout.columns)[0])
-    return replace(layout, format="kitti", columns=MATRIX) if has_own_stamps else layout
+        format = "csv"
+        columns = tuple(name.strip() for name in options.columns.split(","))
+    elif format == AUTO:
+        # The file of times is for poses without stamps.
+        if layout.columns and not stamp_columns(named_columns(layout.columns)[0]):
+            return layout
+        format = "kitti"
+        columns = MATRIX
+    elif format != "csv":
+        columns = tuple(_FORMATS[format][0])
+    return replace(layout, format=format, columns=columns, is_transposable=False)
 
 
 def _guesses_of(layout: Layout) -> list[str]:

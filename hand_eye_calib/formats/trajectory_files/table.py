@@ -69,7 +69,7 @@ class Table:
         Line number of each row with a pose, and its number among all rows, from 0.
     n_rows : int
         Number of all rows.
-    first_left_out : int or None
+    first_skipped : int or None
         Line of the first row that was skipped.
     stamps : list of Decimal
         Empty without a column of stamps.
@@ -107,7 +107,7 @@ class Table:
     line_numbers: "array[int]" = field(default_factory=lambda: array("q"))
     rows: "array[int]" = field(default_factory=lambda: array("q"))
     n_rows: int = 0
-    first_left_out: int | None = None
+    first_skipped: int | None = None
     stamps: list[Decimal] = field(default_factory=list)
     numbers: "array[float]" = field(default_factory=lambda: array("d"))
     images: list[str] = field(default_factory=list)
@@ -231,7 +231,7 @@ class Table:
         self.rows.extend(rows)
         self.n_rows = len(values)
         if self.n_left_out:
-            self.first_left_out = int(np.argmin(is_pose)) + 1
+            self.first_skipped = int(np.argmin(is_pose)) + 1
 
     def _add(self, cells: Sequence[str], line_number: int) -> None:
         """Add a row, or count it if it has no pose.
@@ -245,8 +245,8 @@ class Table:
         self.n_rows += 1
         values = self._numbers_in(cells)
         if not self._is_pose(values) or not self._add_stamp(cells):
-            if self.first_left_out is None:
-                self.first_left_out = line_number
+            if self.first_skipped is None:
+                self.first_skipped = line_number
             return
         self.numbers.extend(values)
         self.images += [cells[column] for column in self._image_at]
@@ -296,13 +296,13 @@ class Table:
         InputError
             For any other row.
         """
-        n_columns = len(self.names)
-        if len(cells) == n_columns + 1 and not cells[-1]:
+        n_missing = len(self.names) - len(cells)
+        if n_missing == -1 and not cells[-1]:
             return cells[:-1]
-        has_stamp = self.stamp_at and max(self.stamp_at) < len(cells) < n_columns
-        others = (cell for column, cell in enumerate(cells) if column not in self.stamp_at)
-        if has_stamp and all(map(is_null, others)):
-            return [*cells, *[""] * (n_columns - len(cells))]
+        if n_missing > 0 and self.stamp_at and max(self.stamp_at) < len(cells):
+            others = [cell for column, cell in enumerate(cells) if column not in self.stamp_at]
+            if all(map(is_null, others)):
+                return [*cells, *[""] * n_missing]
         raise InputError(
             f"{self.path}, line {line_number}: expected {self.expected}; found {len(cells)}: "
             f"{shown_value(content)}"
@@ -352,19 +352,24 @@ def columns_of_array(source: Any) -> tuple[Sequence[str], FloatArray, list[str]]
         values = np.asarray(source, dtype=float)
     except (TypeError, ValueError):
         raise InputError(f"expected {_KINDS}; found {type(source).__name__}") from None
-    notes: list[str] = []
-    if values.shape[1:] == (4, 4) and not _has_last_row(values):
-        values = np.swapaxes(values, 1, 2)
-        notes = ["matrices are transposed: read with their rows as columns"]
-        if not _has_last_row(values):
-            raise InputError("the last row of a matrix is not 0 0 0 1; expected poses (N, 4, 4)")
     if values.shape[1:] in ((3, 4), (4, 4)):
-        return MATRIX, values.reshape(len(values), -1)[:, : len(MATRIX)], notes
+        return _columns_of_matrices(values)
     names = ("t", *POSITION, *QUATERNION)
-    names_of_width = {8: names, 7: names[1:], 4: names[:4]}
-    if values.ndim != 2 or values.shape[1] not in names_of_width:
+    names_of_shape = {(8,): names, (7,): names[1:], (4,): names[:4]}
+    if values.shape[1:] not in names_of_shape:
         raise InputError(f"expected {_KINDS}; found an array {values.shape}")
-    return names_of_width[values.shape[1]], values, notes
+    return names_of_shape[values.shape[1:]], values, []
+
+
+def _columns_of_matrices(matrices: FloatArray) -> tuple[Sequence[str], FloatArray, list[str]]:
+    """Return the columns of matrices (N, 3, 4) or (N, 4, 4), perhaps transposed."""
+    notes = []
+    if matrices.shape[1:] == (4, 4) and not _has_last_row(matrices):
+        matrices = np.swapaxes(matrices, 1, 2)
+        notes = ["matrices are transposed: read with their rows as columns"]
+        if not _has_last_row(matrices):
+            raise InputError("the last row of a matrix is not 0 0 0 1; expected poses (N, 4, 4)")
+    return MATRIX, matrices[:, :3].reshape(len(matrices), len(MATRIX)), notes
 
 
 def _has_last_row(matrices: FloatArray) -> bool:
@@ -460,9 +465,12 @@ def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:
     --------
     >>> hec.write_trajectory("moved.tum", child.shifted(result.time_offset_s))
     """
-    lines = map(tum_line, trajectory.stamps_ns.tolist(), se3.to_rows(trajectory.poses).tolist())
+    stamps_ns = trajectory.stamps_ns.tolist()
+    poses = se3.to_rows(trajectory.poses).tolist()
+    lines = map(tum_line, stamps_ns, poses)
+    text = "\n".join([f"# {TUM_COLUMNS}", *lines, ""])
     with writing(path):
-        write_atomically({Path(path): "\n".join([f"# {TUM_COLUMNS}", *lines, ""])})
+        write_atomically({Path(path): text})
 
 
 def tum_line(stamp_ns: int, pose: Iterable[float]) -> str:

@@ -142,12 +142,12 @@ def fail(error: object, code: int = Exit.FAILED) -> int:
 
 
 @contextmanager
-def waiting_for(what: str) -> Iterator[None]:
-    """Print on a terminal what is being done, while the block runs."""
+def waiting_for(activity: str) -> Iterator[None]:
+    """Print the activity on a terminal while the block runs."""
     if not sys.stderr.isatty():
         yield
         return
-    print(f"{what} ...", end="", file=sys.stderr, flush=True)
+    print(f"{activity} ...", end="", file=sys.stderr, flush=True)
     try:
         yield
     finally:
@@ -301,8 +301,8 @@ def _read_config(path: Path) -> Options:
 
     document = read_yaml(path)
     if not isinstance(document, dict | None):
-        found = type(document).__name__
-        raise ConfigError(f"{path}: expected a mapping of options to values; found {found}")
+        kind = type(document).__name__
+        raise ConfigError(f"{path}: expected a mapping of options to values; found {kind}")
     options: dict[str, OptionValue] = {}
     ignored = []
     other_nodes = []
@@ -320,15 +320,15 @@ def _read_config(path: Path) -> Options:
         elif option in _NODE_OPTIONS or option.partition(".")[0] in _ROS_OPTIONS:
             ignored.append(repr(option))
         elif value is not None or not option.endswith(_OF_ROS):
-            known = sorted(OPTION_FIELDS)
+            names = sorted(OPTION_FIELDS)
             raise ConfigError(
-                f"{path}: unknown option {option!r}{did_you_mean(option, known)}; "
-                f"known are {', '.join(map(repr, known))}"
+                f"{path}: unknown option {option!r}{did_you_mean(option, names)}; "
+                f"known are {', '.join(map(repr, names))}"
             )
     if other_nodes and not (options or ignored):
-        found = ", ".join(dict.fromkeys(other_nodes))
+        nodes = ", ".join(dict.fromkeys(other_nodes))
         raise ConfigError(
-            f"{path}: no parameters for a node named calibrator; found some for {found}"
+            f"{path}: no parameters for a node named calibrator; found some for {nodes}"
         )
     if ignored:
         note(f"{path}: only the node uses {', '.join(ignored)}; ignored here")

@@ -165,22 +165,13 @@ def read_files(arguments: Namespace, paths: Sequence[Path | str], options: Optio
         files.append((Path(path), FileOptions(**settings, measures=measures, repair=True)))
     with waiting_for(f"reading {' and '.join(map(str, paths))}"):
         readings = read_trajectory_files(files)
+    repairs: list[str] = []
+    warnings: list[str] = []
     for (path, _), reading, stream in zip(files, readings, streams, strict=True):
+        repairs += [text.replace(str(path), path.name) for text in reading.repairs]
+        warnings += [text.replace(str(path), path.name) for text in reading.warnings]
         for text in reading.guesses:
-            text = text.replace(str(path), path.name)
             if stream:  # name the option of this file alone
                 text = re.sub(f"`({'|'.join(FILE_OPTIONS)})`", rf"`{stream}_\1`", text)
-            note(text)
-    return FilesRead(
-        [reading.trajectory for reading in readings],
-        _with_short_names(files, [reading.repairs for reading in readings]),
-        _with_short_names(files, [reading.warnings for reading in readings]),
-    )
-
-
-def _with_short_names(files: Sequence[tuple[Path, Any]], texts: Sequence[list[str]]) -> list[str]:
-    """Return the texts about all files, with names in place of paths."""
-    short = []
-    for (path, _), texts_of_file in zip(files, texts, strict=True):
-        short += [text.replace(str(path), path.name) for text in texts_of_file]
-    return short
+            note(text.replace(str(path), path.name))
+    return FilesRead([reading.trajectory for reading in readings], repairs, warnings)
