@@ -197,8 +197,8 @@ def _of_sensors(
 ) -> tuple[set[str], list[Any]]:
     """Return the frames that an extrinsic names, and the values under its keys.
 
-    The names are beside the values, or else above them. If there are several extrinsics, the one
-    that names a frame counts.
+    The names are in the same mapping as the values, or else in the path to it. Of several
+    extrinsics only those that name a frame are considered.
 
     Raises
     ------

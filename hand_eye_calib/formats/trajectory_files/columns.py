@@ -129,7 +129,7 @@ _UNITS_IN_BRACKETS = {
     # Degrees, minutes and seconds.
     **dict.fromkeys(("d/m/s", "+/-d/m/s", "dms", "d/m"), "deg"),
 }
-# A word of a stamp: the unit behind it is a unit of time. The last is the second of a GPS week.
+# Word in the name of a stamp, before a unit of time. The last words are seconds of a GPS week.
 _TIME_WORD = re.compile(r"t|time.*|stamp.*|(?:gps|i)?(?:tow|sow)")
 # Brackets with their content, up to the end of the name if nothing closes them.
 _BRACKETS = re.compile(r"[\[(]([^\])]*)([\])]|$)")
@@ -138,8 +138,8 @@ _BRACKETS = re.compile(r"[\[(]([^\])]*)([\])]|$)")
 def named_columns(names: Sequence[str]) -> tuple[dict[str, list[int]], list[str]]:
     """Return the columns of each quantity, and the unit in each name.
 
-    The columns of a quantity are those with one of its names. If there are none, they are those
-    with a path that ends in one of its names.
+    A column belongs to a quantity if it has one of the quantity's names. If no column has one, a
+    path that ends in one of these names counts.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def named_columns(names: Sequence[str]) -> tuple[dict[str, list[int]], list[str]
 def is_brief(name: str) -> bool:
     """Whether a column is called rx, ry or rz.
 
-    That is a rotation vector of Universal Robots, or angles of other robots.
+    Universal Robots use these names for a rotation vector, other robots for angles.
     """
     return plain_name(name) in ("rx", "ry", "rz")
 
@@ -282,7 +282,7 @@ _STAMPS = (
 def stamp_columns(columns: Mapping[str, list[int]]) -> Sequence[str]:
     """Return the quantities that make the stamp; empty if there are none.
 
-    A stamp beside a week of GPS and its second is on the clock of the recording.
+    If there are a stamp, a week of GPS and its second, the stamp is on the clock of the recording.
     """
     has_second = "sow" in columns or "mow" in columns
     if has_second and {"week", "t"} <= columns.keys():

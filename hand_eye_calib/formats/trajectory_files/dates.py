@@ -46,9 +46,9 @@ _LONGEST_TIME = len("HH:MM:SS.123456789ab")
 def seconds_of(text: str) -> Decimal:
     """Return the seconds since 1970 of a date with a time of day.
 
-    A time of day alone becomes the seconds of the day. A time without a zone is UTC. A fraction may
-    stand behind the same character as stands between minutes and seconds: then its digits are a
-    number of milliseconds, microseconds or nanoseconds.
+    A time of day alone becomes the seconds of the day. A time without a zone is UTC. If the
+    fraction has the same separator as minutes and seconds, its digits are a number of milliseconds,
+    microseconds or nanoseconds.
 
     Raises
     ------

@@ -303,7 +303,7 @@ def _is_known(names: Sequence[str]) -> bool:
 def _fitted(names: Sequence[str], row: Sequence[str], is_comment: bool) -> _Header | None:
     """Return as many names as a row has cells, or joined cells; None if the names do not fit.
 
-    The last names of a comment count, such as those behind "format:".
+    If a comment has too many names, its last names count: the first may be a word like "format:".
     """
     if len(names) == len(row) + 1 and not names[-1]:
         names = names[:-1]
@@ -350,7 +350,7 @@ def _places_of(names: Sequence[str], *quantities: str) -> set[int]:
 def _widths(names: Sequence[str], row: Sequence[str], n_angle_cells: int) -> list[int]:
     """Return the number of cells of a row that each name has.
 
-    It is 0 if the cell belongs to the name before, such as the cell of a hemisphere.
+    A name has no cells if its cell belongs to the name before, as the cell of a hemisphere does.
     """
     angles = _places_of(names, "lat", "lon")
     stamps = _places_of(names, "t", "date")

@@ -35,8 +35,8 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
     ----------
     table : Table
     stamp_unit : str or None
-        "s", "ms", "us" or "ns". If it is None, the unit is that of the format, or is recognised
-        from the size of the stamps.
+        "s", "ms", "us" or "ns". None for the unit in the column's name, or else the unit that the
+        size of the stamps suggests.
 
     Returns
     -------
