@@ -38,9 +38,16 @@ _LONGEST_OFFSET_S = 9.2e9
 
 
 class MethodRecord(NamedTuple):
-    """What other code has to know about a method: it solves the motion pairs of a reference alone,
-    or (False) uses the pose stream as a whole; outliers are left out, so that a few jumps of a
-    stream hardly change the answer; and the values of the option ``backend`` that it takes.
+    """Properties of a method.
+
+    Attributes
+    ----------
+    uses_reference : bool
+        Whether the method solves the motion pairs of a reference, rather than the pose stream.
+    rejects_outliers : bool
+        Whether outliers are left out, so that a few jumps of a stream hardly change the answer.
+    backends : tuple of str
+        Allowed values of the option ``backend``.
     """
 
     uses_reference: bool = True
@@ -278,7 +285,7 @@ class CalibratorConfig(OptionSet):
     )
 
     def is_known(self, name: str) -> bool:
-        """Whether the user set ``time_offset`` or ``scale`` to what it is: not to be estimated."""
+        """Return whether the user set ``time_offset`` or ``scale`` to a value, not to estimate."""
         return name in self.given and getattr(self, name) not in ("auto", "estimate")
 
     @property
@@ -336,10 +343,12 @@ class CalibratorConfig(OptionSet):
 
     def prior(self) -> dict[str, tuple[float, float]]:
         """The prior: axis name to (value, standard deviation), in m and rad."""
-        told = {axis: getattr(self, f"prior_{axis}") for axis in text.AXIS_UNITS}
-        return {
-            axis: text.parse_prior(f"prior.{axis}", each) for axis, each in told.items() if each
-        }
+        priors = {}
+        for axis in text.AXIS_UNITS:
+            value = getattr(self, f"prior_{axis}")
+            if value:
+                priors[axis] = text.parse_prior(f"prior.{axis}", value)
+        return priors
 
 
 MOST_OTHERS = 7  # further child sensors of the node

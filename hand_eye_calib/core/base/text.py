@@ -1,5 +1,6 @@
-"""Numbers, lengths, angles and lists as people read them, on the terminal, on pages and in the log,
-and as they type them. Every place that prints or reads a quantity takes it from here.
+"""Text of numbers, lengths, angles and lists, for output, and the values of typed quantities.
+
+Every place that prints or reads a quantity uses this module.
 """
 
 import math
@@ -11,10 +12,15 @@ from typing import TypeAlias
 
 from hand_eye_calib.core.base.errors import ConfigError
 
-# Lengths up to so many metres, and durations up to so many seconds, have this unit and factor.
+# Units of lengths: largest length (m), unit, factor.
 _LENGTHS = ((0.00995, "mm", 1000), (0.995, "cm", 100), (math.inf, "m", 1))
+
+# Units of durations: longest duration (s), unit, divisor.
 _DURATIONS = ((90.0, "s", 1), (5_400.0, "min", 60), (math.inf, "h", 3600))
+
+# Largest number of decimals.
 _MOST_DECIMALS = 6
+
 _ABOUT = {"roll": "x", "pitch": "y", "yaw": "z"}
 
 
@@ -56,8 +62,10 @@ def amount_beside(axis: str, value: float, other: float) -> str:
 def change(axis: str, value: float, sigma: float) -> str:
     """A difference along or about an axis (m, rad) with its sign and standard deviation."""
     unit, factor = ("deg", math.degrees(1.0)) if axis in _ABOUT else ("cm", 100.0)
-    told = with_sigma(factor * value, factor * sigma, 1).replace("+/-", "±")
-    return f"{'+' * (value >= 0)}{told} {unit}" if math.isfinite(sigma) else told
+    text = with_sigma(factor * value, factor * sigma, 1).replace("+/-", "±")
+    if not math.isfinite(sigma):
+        return text
+    return f"+{text} {unit}" if value >= 0 else f"{text} {unit}"
 
 
 def capital(text: str) -> str:
