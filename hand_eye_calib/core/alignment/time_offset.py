@@ -274,7 +274,8 @@ def _masked_correlation(
 ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
     """Correlate rates (M,) and (N,) at all lags: ``first[i + lag]`` with ``second[i]``.
 
-    NaNs are left out (masked normalised cross-correlation by FFT, Padfield 2012).
+    NaNs are left out: D. Padfield, *Masked object registration in the Fourier domain*, IEEE
+    Transactions on Image Processing 21(5), 2012.
 
     Returns
     -------
