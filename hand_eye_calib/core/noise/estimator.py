@@ -2,9 +2,10 @@
 
 The noise model is estimated together with X, so that all increments are used with the right
 weights. White noise favours long baselines, drift favours short ones, time-correlated errors favour
-neither; a jump cuts the trajectory. The model is that of
-:mod:`~hand_eye_calib.core.noise.increments`; :mod:`~hand_eye_calib.core.noise.stages` is the
-search. docs/adaptive.md has the derivation and tests.
+neither; a jump cuts the trajectory. The equations are in
+:mod:`~hand_eye_calib.core.noise.increments` and :mod:`~hand_eye_calib.core.noise.noise_model`, and
+the search is in :mod:`~hand_eye_calib.core.noise.stages`. docs/adaptive.md has the derivation and
+tests.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ from hand_eye_calib.core.noise.noise_model import (
     NoiseModel,
     fast_sigmas,
 )
+from hand_eye_calib.core.noise.normal import transposed
 from hand_eye_calib.core.noise.stages import (
     STAGES,
     Fit,
@@ -175,9 +177,9 @@ class AdaptiveSolution(ModelSolution):
 
     @property
     def rate_bias(self) -> FloatArray:
-        """Bias of the child's rates less that of the parent's, and standard deviations: (2, 3).
+        """Bias of rates (2, 3) in rad/s along the child's axes, and its standard deviations.
 
-        In rad/s, along the axes of the child.
+        It is the bias of the child's rates minus the bias of the parent's rates.
         """
         return np.stack([self.parameters[RATE], self.parameter_sigmas[RATE]])
 
@@ -303,7 +305,7 @@ def solve(
     quick : bool
         Stop at white noise, drift and outliers: neither time-correlated errors nor heavy tails.
     is_clock_free : bool
-        Whether the clock offset was estimated from these poses. If so, it is not known beforehand.
+        Whether the clock offset was estimated from these poses. If so, it has no prior.
     without : collection of str
         Names of :data:`~hand_eye_calib.core.noise.stages.STAGES` to leave out.
     tuning : Tuning
@@ -372,7 +374,7 @@ def _strided(problem: Problem, fit: Fit) -> IntArray:
     noise_rad = np.exp(0.5 * fit.levels[ROTATION])
     rotations = problem.streams.Ts_pw_p[sound_poses, :3, :3]
     for stride in tuning.strides:
-        turns = np.swapaxes(rotations[:-stride], 1, 2) @ rotations[stride:]
+        turns = transposed(rotations[:-stride]) @ rotations[stride:]
         if noise_rad < tuning.noisy * median(se3.rotation_angle(turns)):
             return sound_poses[:: min(stride, longest_stride)]
     return sound_poses[::longest_stride]

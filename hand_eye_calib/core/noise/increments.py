@@ -10,12 +10,12 @@ to first order. Systematic errors add columns of their own: a scale, a bias per 
 time offset, a bias of rates.
 
 Derivatives are taken at poses without the errors estimated so far; the residuals contain these
-errors. Derivatives at noisy poses would be noisy themselves if noise is not small beside the motion
-from pose to pose, and would bias X (errors in variables).
+errors. Derivatives at noisy poses would be noisy themselves if noise is not much smaller than the
+motion from pose to pose, and would bias X (errors in variables).
 
 The columns use steps without each increment's own noise: the mean of the steps two before and two
-after. Steps with the noise of the residuals would bias the scale: a child whose steps are small
-beside their noise would seem to shrink.
+after. Steps with the noise of the residuals would bias the scale: a child whose steps are smaller
+than their noise would seem to shrink.
 """
 
 from __future__ import annotations
@@ -30,13 +30,14 @@ from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Columns
+from hand_eye_calib.core.noise.normal import transposed
 from hand_eye_calib.core.pairing.motion_pairs import motions
 
 # Columns of the parameters of each systematic error:
 # - scale: share by which the child's lengths are short;
 # - bias: error per metre of the child's path, along the axes of the child (m/m);
 # - time: by how much the child's stamps are late (s);
-# - rate: bias of the child's rates minus that of the parent's, along the child's axes (rad/s).
+# - rate: bias of the child's rates minus bias of the parent's, along the child's axes (rad/s).
 PARAMETERS = {"scale": [0], "bias": [1, 2, 3], "time": [4], "rate": [5, 6, 7]}
 (SCALE,), BIAS, (TIME,), RATE = PARAMETERS.values()
 N_SYSTEMATIC = sum(map(len, PARAMETERS.values()))
@@ -124,8 +125,8 @@ class Course(Columns):
 def course_of(streams: Streams, T_parent_child: FloatArray, noise_m2: float = np.inf) -> Course:
     """Smooth the motion of the child.
 
-    The child's steps are the mean of both streams. The metres travelled are those of the parent's
-    stream, which has no bias per metre.
+    The child's steps are the mean of both streams. The metres travelled come from the
+    parent's stream, which has no bias per metre.
 
     Parameters
     ----------
@@ -133,7 +134,7 @@ def course_of(streams: Streams, T_parent_child: FloatArray, noise_m2: float = np
     T_parent_child : (4, 4) array
     noise_m2 : float
         Variance per axis up to which differences between a step and its neighbours count as
-        noise. The smaller it is beside the differences, the less the steps are smoothed.
+        noise. The larger the differences, the less the steps are smoothed.
     """
     R = T_parent_child[:3, :3]
     lever_arm = T_parent_child[:3, 3]
@@ -217,7 +218,7 @@ def linearise(
     error : (N, 6) array, optional
         Errors c that were taken out of the poses.
     """
-    R_c_transposed = np.swapaxes(streams.Ts_cw_c[:-1, :3, :3], 1, 2)
+    R_c_transposed = transposed(streams.Ts_cw_c[:-1, :3, :3])
     steps = se3.times(R_c_transposed, np.diff(course.path, axis=0))
     metres = R_c_transposed @ np.diff(course.along, axis=0)
     B, by_rate = _child_motions(streams, course, parameters, RATE[0] in columns)
@@ -253,7 +254,7 @@ def _child_motions(
 ) -> tuple[FloatArray, FloatArray]:
     """Motions (n, 4, 4) of the child without its time offset and bias of rates, and derivatives.
 
-    The derivatives (n, 3, 3) of their rotations by the bias are empty if there are no rates.
+    The derivatives (n, 3, 3) of the rotations by the bias of rates are empty without rates.
     """
     Ts_cw_c = streams.Ts_cw_c
     by_rate = np.empty(0)
@@ -272,7 +273,7 @@ def _derivatives_by_rate_bias(rotations: FloatArray, intervals_s: FloatArray) ->
 
     They are the interval times the mean of the body's axes at both ends, in the frame of the end.
     """
-    mean_axes: FloatArray = 0.5 * (np.eye(3) + np.swapaxes(rotations, 1, 2))
+    mean_axes: FloatArray = 0.5 * (np.eye(3) + transposed(rotations))
     return intervals_s[:, None, None] * mean_axes
 
 
@@ -284,7 +285,10 @@ def without_rate_bias(stamps_ns: IntArray, Ts_cw_c: FloatArray, bias: FloatArray
     (N, 4, 4) array
         Poses at the origin, from the identity on.
     """
-    rotations = motions(Ts_cw_c[:-1], Ts_cw_c[1:])[:, :3, :3]
-    by_rate = _derivatives_by_rate_bias(rotations, np.diff(stamps_ns) * 1e-9)
-    integrated = se3.chained(rotations @ se3.rotation_exp(-by_rate @ bias))
+    child_motions = motions(Ts_cw_c[:-1], Ts_cw_c[1:])
+    rotations = child_motions[:, :3, :3]
+    intervals_s = np.diff(stamps_ns) * 1e-9
+    by_rate = _derivatives_by_rate_bias(rotations, intervals_s)
+    corrections = se3.rotation_exp(-by_rate @ bias)
+    integrated = se3.chained(rotations @ corrections)
     return se3.from_rotation_translation(integrated, np.zeros((len(integrated), 3)))

@@ -22,6 +22,7 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.noise.increments import PATH_PARTS, Linearisation, Streams
+from hand_eye_calib.core.noise.normal import transposed
 from hand_eye_calib.core.noise.reml import Prior
 from hand_eye_calib.core.noise.state_space import WHITE, StateSpace
 from hand_eye_calib.core.noise.tuning import Tuning
@@ -170,7 +171,7 @@ class NoiseModel:
         swing[:, 3:] = np.eye(3)
         if self.centre == "parent":
             swing = to_child @ swing
-        return swing @ np.swapaxes(swing, 1, 2)
+        return swing @ transposed(swing)
 
     def shares(
         self, levels: FloatArray, streams: Streams, T_parent_child: FloatArray
@@ -179,7 +180,7 @@ class NoiseModel:
 
         White errors are split by ``Ad(X^-1) a = S' (S' + S)^-1 c`` and ``b = -S (S' + S)^-1 c``
         with the white covariances S' of the parent and S of the child, in the child's frame. With a
-        lever arm, a translation shows which of the sensors rotated. Both sensors have half of the
+        lever arm, the translation depends on which sensor rotated. Both sensors have half of the
         noise, but rotation noise about a world's origin is that sensor's alone.
         """
         to_child = se3.adjoint(se3.inverse(T_parent_child))
@@ -195,7 +196,7 @@ class NoiseModel:
             S_child = S_child + rotation * self._swing(streams, to_child)
         else:
             S_parent = S_parent + rotation * self._swing(streams, to_child)
-        return np.swapaxes(np.linalg.solve(S_parent + S_child, S_parent), 1, 2)
+        return transposed(np.linalg.solve(S_parent + S_child, S_parent))
 
     def prior(self, levels: FloatArray) -> Prior:
         """Return the prior of the levels for a search that starts at these levels."""
@@ -251,7 +252,7 @@ def _directions(kind: str, part: str, streams: Streams, to_child: FloatArray) ->
     """Matrices M (N, 6, 3) from a process to the error c."""
     if kind == "body":
         return np.broadcast_to(np.eye(6)[:, PARTS[part]], (len(streams), 6, 3))
-    return to_child[:, PARTS[part]] @ np.swapaxes(streams.Ts_pw_p[:, :3, :3], 1, 2)
+    return to_child[:, PARTS[part]] @ transposed(streams.Ts_pw_p[:, :3, :3])
 
 
 def fast_sigmas(levels: FloatArray) -> FastSigmas:

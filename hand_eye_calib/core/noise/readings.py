@@ -39,7 +39,9 @@ def loss_difference(
     first: tuple[FloatArray, FloatArray],
     second: tuple[FloatArray, FloatArray],
 ) -> float:
-    """Return the restricted negative log likelihood of the second reading less that of the first.
+    """Return the loss of the second reading minus the loss of the first reading.
+
+    The loss is the restricted negative log likelihood of the noise.
 
     Parameters
     ----------
@@ -81,7 +83,7 @@ def loss_difference(
 def _smallest_loss(workspace: stages.Workspace, start: stages.Fit, outliers: Outliers) -> float:
     """Return the smallest loss of a reading over all centres of rotation noise.
 
-    The fit has the given outliers and no robust weights.
+    The fit has these outliers and no robust weights.
     """
     streams = workspace.problem.streams
     n_poses = len(streams)

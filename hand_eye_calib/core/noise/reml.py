@@ -53,7 +53,17 @@ Reduced: TypeAlias = tuple[StateSpace, FloatArray, Prior] | None
 
 
 class _Move(NamedTuple):
-    """A step that lowers the loss: the posterior there, the gain, and the radius of the next."""
+    """A step that lowers the loss.
+
+    Attributes
+    ----------
+    posterior : Posterior
+        After the step.
+    gain : float
+        Decrease of the loss.
+    radius : float
+        Of the next step.
+    """
 
     posterior: Posterior
     gain: float
@@ -128,8 +138,9 @@ def _move(
 ) -> _Move | None:
     """Return a step that lowers the loss; None if no step promises to lower it enough.
 
-    The radius follows the usual rules of a trust region: it grows after a step that keeps half of
-    what it promised, and shrinks after one that keeps a fifth or less, or that raises the loss.
+    The radius follows the usual rules of a trust region (Nocedal, Wright, *Numerical optimization*,
+    chapter 4). It grows after a step whose gain is more than half of the predicted gain. It shrinks
+    after a step whose gain is less than a fifth of it.
     """
     while radius > _SHORTEST_STEP:
         step, is_newton = _step(posterior.levels, gradient, curvature, prior, radius)

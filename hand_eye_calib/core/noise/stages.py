@@ -116,7 +116,7 @@ class Problem:
         return course_of(self.streams, T_parent_child, self.tuning.caution * noise_m**2)
 
     def is_noisy(self, fit: Fit) -> bool:
-        """Whether the rotation between poses is not large beside its noise."""
+        """Whether rotation noise exceeds a share of the rotation between poses."""
         turns = se3.rotation_angle(self.streams.motions_p[:, :3, :3])
         return bool(np.exp(0.5 * fit.levels[ROTATION]) > self.tuning.noisy * median(turns))
 
@@ -210,9 +210,9 @@ class Fit:
         """Return the fit with the errors of states (N, d) taken out of the given poses.
 
         White errors are split between the sensors by their covariances, which holds for errors of
-        these covariances only. A lasting error of some centimetres beside white noise of a
-        millimetre would become large and opposite rotations. So other errors are split in halves,
-        and those of outlier poses, too.
+        these covariances only. A lasting error of some centimetres, split by white noise of a
+        millimetre, would become large and opposite rotations. So all other errors are split in
+        halves, and the errors of outlier poses, too.
         """
         spikes = self.outliers.spikes
         T = self.T
@@ -256,12 +256,13 @@ def prior_products(values: FloatArray, sigmas: FloatArray, size: int) -> FloatAr
 
 def sample(n_poses: int, tuning: Tuning) -> IntArray | None:
     """Return poses to fit noise levels with: evenly spread bursts. None means all poses."""
-    most = tuning.most_poses
-    if n_poses <= most:
+    if n_poses <= tuning.most_poses:
         return None
     burst = np.array(tuning.burst)
-    offsets = burst[2 * len(burst) * n_poses // most > burst]
-    starts = np.linspace(0, n_poses - 1 - offsets[-1], most // len(burst)).astype(int)
+    n_bursts = tuning.most_poses // len(burst)
+    # A burst is at most twice as long as the time between the starts of two bursts.
+    offsets = burst[2 * len(burst) * n_poses // tuning.most_poses > burst]
+    starts = np.linspace(0, n_poses - 1 - offsets[-1], n_bursts).astype(int)
     return np.unique(starts[:, None] + offsets)
 
 
@@ -294,7 +295,7 @@ def start(problem: Problem) -> Fit:
 def _centre(streams: Streams, T: FloatArray, residuals: FloatArray, decisive: float) -> str:
     """Centre of white rotation noise, see :data:`~hand_eye_calib.core.noise.noise_model.CENTRES`.
 
-    It is the origin of a world if residuals there are clearly smaller.
+    It is the origin of a world if residuals at that origin are clearly smaller.
     """
     worlds = {"child": streams.Ts_cw_c[1:], "parent": streams.Ts_pw_p[1:] @ T}
     sizes = {"sensors": median(np.linalg.norm(residuals[:, :3], axis=1))}
@@ -502,7 +503,7 @@ def _likeliest(
     tuning = problem.tuning
     choices_of_time = [[], [TIME]] if TIME in problem.columns else [[]]
     if problem.is_clock_free:
-        # A time offset that is not known beforehand is present.
+        # A time offset without a prior is present for sure.
         choices_of_time = choices_of_time[-1:]
     products = posterior.products - problem.prior(fit)
     log_odds = np.log(tuning.odds)
@@ -536,15 +537,16 @@ def polish(workspace: Workspace, fit: Fit) -> Fit:
 
 
 def is_settled(workspace: Workspace, fit: Fit) -> bool:
-    """Return whether the next step is small beside its standard deviations.
+    """Return whether the next step is a small share of its standard deviations.
 
     Translations that the motion does not excite need not settle.
     """
     tuning = workspace.problem.tuning
     normal = workspace.posterior(fit).normal
-    variances, axes = np.linalg.eigh(normal.covariance[:3, :3])
+    principal_variances, axes = np.linalg.eigh(normal.covariance[:3, :3])
     steps = np.r_[axes.T @ normal.step[:3], normal.step[3:]]
-    sigmas = np.sqrt(np.maximum(np.r_[variances, np.diag(normal.covariance)[3:]], 0.0))
+    variances = np.r_[principal_variances, np.diag(normal.covariance)[3:]]
+    sigmas = np.sqrt(np.maximum(variances, 0.0))
     limits = np.maximum(tuning.settled_sigmas * sigmas, _ROUNDING_STEP)
     limits[:3][sigmas[:3] > tuning.unknown_m] = np.inf
     return bool((np.abs(steps) < limits).all())

@@ -7,12 +7,12 @@ see :mod:`~hand_eye_calib.core.noise.increments`, depend on parameters beta and 
     e_i + J_i beta = H1_i x_{i+1} - H0_i x_i + w_i          (in short: e + J beta = U x + w)
 
 With the precision Pi of all states before the data and the precision W of the walk, the precision
-after the data is block tridiagonal, and gives the covariance V of the increments:
+after the data is block tridiagonal. The covariance V of the increments follows from it:
 
     P = Pi + U' W U,       log|V| = log|P| - log|Pi| - log|W|,       V^-1 Z = W (Z - U P^-1 U' W Z)
 
-One factorisation P = L L' gives the likelihood in time linear in the number of poses. Products need
-only the forward half of the solution: ``Z' V^-1 Z = Z' W Z - Y' Y`` with ``Y = L^-1 U' W Z``.
+One factorisation P = L L' yields the likelihood in time linear in the number of poses. Products
+need only the forward half of the solution: ``Z' V^-1 Z = Z' W Z - Y' Y`` with ``Y = L^-1 U' W Z``.
 This is the information form of the Kalman smoother (Rauch, Tung, Striebel, AIAA J. 3, 1965).
 """
 
@@ -261,7 +261,7 @@ class Posterior:
         return groups
 
     def _log_determinant(self, white_log_determinants: FloatArray) -> float:
-        """Return log|V| by those of P, Pi and W."""
+        """Return log|V| from the log determinants of P, Pi and W."""
         space = self.space
         weights = space.weights[space.weights != 0.0]
         of_pi = float((WHITE * np.log(weights) - white_log_determinants).sum())
@@ -275,9 +275,9 @@ class Posterior:
     def _precision_blocks(self, start: int, end: int) -> tuple[FloatArray, FloatArray]:
         """Blocks of P on the diagonal (m + 1, d, d) and below it (m, d, d).
 
-        They are those of the m increments from pose ``start`` to pose ``end``. The precision of
-        each pose's white error belongs to the increment before the pose; that of the first pose
-        belongs to the first increment.
+        They belong to the m increments from pose ``start`` to pose ``end``. The precision of each
+        pose's white error belongs to the increment before the pose, except that of the first pose,
+        which belongs to the first increment.
         """
         space = self.space
         increments = slice(start, end)
@@ -350,16 +350,21 @@ class Posterior:
         return total
 
     def part_products(self) -> FloatArray:
-        """Return what each part of the recording adds to the products: (K, p + 1, p + 1), K <= 20.
+        """Return the contribution of each part of the recording to the products.
 
         Solutions without a part would scatter more than the error does: without its increments the
-        trajectory would be cut, although white noise keeps most knowledge across the gap. So the
-        contribution of a part is that of its innovations, given the parts before. Contributions are
-        independent of each other if the model is right.
+        trajectory would be cut, although white noise keeps most knowledge across the gap. So
+        each contribution is that of the innovations of a part after all parts before. Contributions
+        are independent of each other if the model is right.
 
         Each part is a quadratic form of the states at its two ends and of the columns; all states
         between are eliminated. The forms are added in order of time. The prior of the parameters
         counts in equal shares.
+
+        Returns
+        -------
+        (K, p + 1, p + 1) array
+            K is at most 20.
         """
         n, _, n_columns = self.space.columns.shape
         size = self.space.behind.shape[2]
@@ -388,25 +393,21 @@ class Posterior:
         weighted = self._walk_precisions[increments] @ columns_of_part
         part_space = replace(space, ahead=space.ahead[increments], behind=space.behind[increments])
         forces = part_space.apply_u_transposed(weighted)
-        form = np.zeros((2 * size + forces.shape[2],) * 2)
-        first = slice(size)
-        last = slice(size, 2 * size)
-        columns = slice(2 * size, None)
-        form[first, first] = diagonal[0]
-        form[last, last] = diagonal[-1]
-        form[first, columns] = forces[0]
-        form[last, columns] = forces[-1]
-        form[columns, first] = forces[0].T
-        form[columns, last] = forces[-1].T
-        form[columns, columns] = multiplied(columns_of_part, weighted)
+        corner = below[0] if len(diagonal) == 2 else np.zeros((size, size))
+        products = multiplied(columns_of_part, weighted)
+        form = np.block(
+            [
+                [diagonal[0], corner.T, forces[0]],
+                [corner, diagonal[-1], forces[-1]],
+                [forces[0].T, forces[-1].T, products],
+            ]
+        )
         if len(diagonal) == 2:
-            form[last, first] = below[0]
-            form[first, last] = below[0].T
             return form
         couplings = np.zeros((len(diagonal) - 2, size, len(form)))
-        couplings[:, :, columns] = forces[1:-1]
-        couplings[0, :, first] += below[0]
-        couplings[-1, :, last] += below[-1].T
+        couplings[:, :, 2 * size :] = forces[1:-1]
+        couplings[0, :, :size] += below[0]
+        couplings[-1, :, size : 2 * size] += below[-1].T
         whitened = Factor(diagonal[1:-1], below[1:-1]).whiten(couplings)
         return np.asarray(form - multiplied(whitened, whitened))
 

@@ -1,4 +1,4 @@
-"""Numbers that decide something in the search of the adaptive estimator."""
+"""Numbers that decide the search of the adaptive estimator."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class Tuning:
     """
 
     # -- The start --
-    # Reference of DNLO for the robust start. It sees through jumps, and needs no noise levels.
+    # Reference of DNLO for the robust start. It is robust to jumps, and needs no noise levels.
     start_reference: str = "B3"
-    # Rotation noise turns about the origin of a world if residuals from there are smaller than
-    # this share of the residuals at the sensors.
+    # Rotation noise turns about the origin of a world if residuals at that origin are smaller
+    # than this share of the residuals at the sensors.
     decisive_centre: float = 0.7
 
     # -- Noise levels, which are logarithms of variances --
@@ -57,8 +57,8 @@ class Tuning:
     tail_rounds: int = 3
     # False alarms expected in a whole recording.
     false_alarms: float = 0.01
-    # A large step of a walk with heavy tails is a jump if its chi-square exceeds that of false
-    # alarms by this factor.
+    # A large step of a walk with heavy tails is a jump if its chi-square exceeds the threshold of
+    # false alarms by this factor.
     decisive: float = 2.5
     # Tails are heavy if the fourth moment exceeds the square of the second by this factor (4/3 for
     # normal errors): of the steps of the walk below the level of false alarms.
@@ -66,7 +66,7 @@ class Tuning:
     # The same of the white errors.
     heavy_kurtosis: float = 1.7
     # First search for jumps: increments this many robust standard deviations out. The limit is wide
-    # because the noise levels are not known yet.
+    # because the noise levels are not estimated yet.
     first_jump_sigmas: float = 5.0
     # Largest share of poses that are outliers.
     most_spikes: float = 0.2
@@ -107,9 +107,9 @@ class Tuning:
     first_tau: float = 10.0
     # ... and this share of the recording.
     last_tau: float = 0.06
-    # Variance of undetected body-fixed errors, as a share of that of detected ones. Such errors
-    # have all time scales (flicker). Errors about as long as the recording are not detected; X
-    # contains their mean.
+    # Variance of undetected body-fixed errors, as a share of the variance of detected errors. Such
+    # errors have all time scales (flicker). Errors about as long as the recording are not detected;
+    # X contains their mean.
     unseen_share: float = 0.05
 
     # -- Systematic errors --
@@ -149,7 +149,7 @@ class Tuning:
     # direction (rad: 0.15 deg), of the time offset (s), of the response of positions to
     # acceleration (s^2).
     of_positions: tuple[float, ...] = (*[10.0] * 3, 0.01, *[math.radians(0.15)] * 3, 1.0, 0.002)
-    # Prior standard deviation of a scale that is not known.
+    # Prior standard deviation of an unknown scale.
     any_scale: float = 1.0
     # Time (s) over which accelerations are taken.
     accelerating_s: float = 0.2
@@ -159,8 +159,8 @@ class Tuning:
     jump_factor: float = 10.0
     # Number of neighbouring positions over which the quality of a position is measured.
     neighbours: int = 11
-    # Positions whose squared errors exceed that of the best quarter of the recording by this factor
-    # are left out: they would hardly count, and their errors last.
+    # Positions whose squared errors exceed those of the best quarter of the recording by this
+    # factor are left out: they would hardly count, and their errors last.
     worse: float = 16.0
     # Poses of the windows that are aligned by themselves for the start.
     window: int = 200

@@ -132,9 +132,9 @@ def pair_costs(pairs: MotionPairs, T_parent_child: FloatArray) -> FloatArray:
 def start_rotations(pairs: MotionPairs) -> FloatArray:
     """Return rotations (4, 3, 3) to start from.
 
-    The first one aligns the child's rotation axes with the parent's. It is close to the solution if
-    there is rotation at all. The others do so after a rotation by pi about an axis of the child,
-    for motion with hardly any rotation.
+    The first rotation aligns the child's rotation axes with the parent's. It is close to the
+    solution if the sensors rotate at all. The other rotations add a rotation by pi about an axis of
+    the child, for motion with hardly any rotation.
     """
     # Skew parts align axes as well as rotation vectors do, and faster.
     axes_parent = se3.vee(pairs.Ts_parenti_parentj)

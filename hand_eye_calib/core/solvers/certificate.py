@@ -54,13 +54,16 @@ def is_global(Q: FloatArray, T_parent_child: FloatArray) -> bool:
     # The form of S in R = R_minimum S, so that S is the identity at the minimum.
     turn = np.eye(10)
     turn[:9, :9] = np.kron(Ts[0, :3, :3], np.eye(3))
-    M = turn.T @ quadratic_form.without_translation(Q[None])[0][0] @ turn
+    forms, _ = quadratic_form.without_translation(Q[None])
+    M = turn.T @ forms[0] @ turn
     scale = max(float(np.trace(M)) / len(M), np.finfo(float).tiny)
-    tolerance = _RELATIVE * max(float(values[0]), 0.0) / scale + _ROUNDING
+    minimum = max(float(values[0]), 0.0)
+    tolerance = _RELATIVE * minimum / scale + _ROUNDING
     lowest = _highest_lowest_eigenvalue(M / scale, enough=-0.25 * tolerance)
     # |x|^2 is 4 for every rotation.
     gap = 4.0 * max(-lowest, 0.0)
-    gap += max(float(quadratic_form.decrease(Q, T_parent_child, Ts[0])), 0.0) / scale
+    decrease = float(quadratic_form.decrease(Q, T_parent_child, Ts[0]))
+    gap += max(decrease, 0.0) / scale
     return gap <= tolerance
 
 
@@ -121,7 +124,7 @@ class _Tables(NamedTuple):
     across : (10, 9) array
         Directions perpendicular to ``identity``.
     equations : (21, 10, 10) array
-        Independent symmetric matrices A_i, that of the last variable at the end.
+        Independent symmetric matrices A_i; the last one belongs to the last variable.
     stationary : (21, 10) array
         Factors that take ``M x`` to minus the multipliers that make ``Z x = 0``.
     free : (14, 10, 10) array
@@ -137,14 +140,14 @@ class _Tables(NamedTuple):
 
 @cache
 def _tables() -> _Tables:
-    """Compute the constants; the equations are those that hold for many random rotations."""
+    """Compute the constants from equations that many random rotations fulfil."""
     rotations = se3.rotation_exp(np.random.default_rng(0).normal(size=(200, 3)))
     x = np.append(rotations.reshape(-1, 9), np.ones((200, 1)), axis=1)
     upper = np.triu_indices(10)
     _, singular, rows = np.linalg.svd(x[:, upper[0]] * x[:, upper[1]])
     equations = np.zeros((21, 10, 10))
     equations[:20, *upper] = rows[singular < 1e-9]
-    equations += np.swapaxes(equations, 1, 2)
+    equations += equations.swapaxes(1, 2)
     equations[20, 9, 9] = 1.0
     identity = np.append(np.eye(3).ravel(), 1.0)
     across = np.linalg.svd(identity[None])[2][1:].T

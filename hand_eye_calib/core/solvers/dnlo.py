@@ -2,7 +2,7 @@
 
 Minimise ``sum alpha_k e_k(X) + (1 - alpha_k) c`` over X and weights 0 <= alpha_k <= 1 that sum to
 at least d, with ``e_k = |A X - X B|_F^2``. For a fixed X the weights have a closed form: a pair
-counts if its cost is below c; if those are fewer than d, the d pairs of the smallest cost count.
+counts if its cost is below c; if fewer than d pairs are, the d pairs of the smallest cost count.
 DNLO is thus truncated least squares with a minimum number of inliers. Weights and X are improved in
 turn until nothing changes. That ends in one of many local minima, so a search comes first:
 
@@ -64,7 +64,7 @@ _MAX_ROUNDS = 100
 _SETTLED = 1e-4
 _CONVERGED = 1e-9
 
-# Cost of a pair that is left out: finite, and never that of an inlier.
+# Cost of a pair that is left out: finite, and larger than the cost of any inlier.
 _NEVER = 1e100
 
 # Smallest divisor.
@@ -167,7 +167,7 @@ def truncate(costs: FloatArray, threshold: float, floor: float) -> tuple[FloatAr
         c, in the unit of the costs.
     floor : float
         d: the weights add up to at least d. If fewer pairs are below c, pairs of equal cost share
-        what those of smaller cost leave of d.
+        the remainder of d.
 
     Returns
     -------
@@ -244,7 +244,7 @@ class _Search:
         return best[0]
 
     def _rivals(self, T: FloatArray, random: np.random.Generator) -> FloatArray:
-        """Return the most promising minima (6, 4, 4) beside T (1, 4, 4).
+        """Return the most promising rivals (6, 4, 4) of a minimum T (1, 4, 4).
 
         Three are minima over random parts of the inliers of T; three are minima over small random
         subsets of all pairs.

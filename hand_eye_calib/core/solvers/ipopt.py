@@ -34,8 +34,9 @@ def solve_dnl(pairs: MotionPairs) -> Solution:
 
 
 def solve_dnlo(pairs: MotionPairs, threshold: float, min_inlier_fraction: float) -> Solution:
-    """Minimise eq. (5) from the identity with all weights 1; see
-    :func:`hand_eye_calib.core.solvers.dnlo.solve`.
+    """Minimise eq. (5) from the identity with all weights 1.
+
+    Parameters are as for :func:`hand_eye_calib.core.solvers.dnlo.solve`.
     """
     n_pairs = len(pairs)
     pose = casadi.MX.sym("pose", 6)
@@ -65,8 +66,8 @@ def _minimum(
     """Solve from the identity and weights 1: X (4, 4), and whether Ipopt settled."""
     solver = casadi.nlpsol("solver", "ipopt", problem, _IPOPT_OPTIONS)
     # The rotation angle has no derivative at zero.
-    answer = solver(x0=np.r_[np.full(3, 1e-6), np.zeros(3), np.ones(n_weights)], **bounds)
-    pose = np.array(answer["x"]).ravel()[:6]
+    solution = solver(x0=np.r_[np.full(3, 1e-6), np.zeros(3), np.ones(n_weights)], **bounds)
+    pose = np.array(solution["x"]).ravel()[:6]
     T_parent_child = se3.from_rotation_translation(se3.rotation_exp(pose[:3]), pose[3:])
     return T_parent_child, bool(solver.stats()["success"])
 

@@ -96,7 +96,7 @@ def condense(pairs: MotionPairs) -> FloatArray:
         block = slice(start, start + _BLOCK)
         residuals = (u[block] @ _RESIDUAL.reshape(24, -1)).reshape(-1, 12, DIMENSION)
         # numpy multiplies two arrays of small matrices faster than it squares one.
-        forms = np.swapaxes(residuals, 1, 2) @ residuals.copy()
+        forms = residuals.swapaxes(1, 2) @ residuals.copy()
         condensed[block] = forms.reshape(-1, DIMENSION**2).take(upper, axis=1)
     return condensed
 
@@ -181,7 +181,8 @@ def minimise(Q: FloatArray, rotation_start: FloatArray) -> tuple[FloatArray, Flo
         Whether the iteration settled.
     """
     R = np.array(rotation_start, dtype=float)
-    forms, to_translation = without_translation(np.broadcast_to(Q, (len(R), DIMENSION, DIMENSION)))
+    whole_forms = np.broadcast_to(Q, (len(R), DIMENSION, DIMENSION))
+    forms, to_translation = without_translation(whole_forms)
     constant = forms[:, 9, 9]
     value, gradient, hessian = _derivatives(forms, R)
     damping = np.zeros(len(R))
@@ -223,10 +224,11 @@ def without_translation(Q: FloatArray) -> tuple[FloatArray, FloatArray]:
     others = np.append(np.arange(9), 12)
     coupling = Q[:, 9:12][:, :, others]
     values, vectors = np.linalg.eigh(Q[:, 9:12, 9:12])
-    observed = values > _RANK_TOLERANCE * np.maximum(values[:, -1:], np.finfo(float).tiny)
-    inverse_values = np.where(observed, 1.0 / np.where(observed, values, 1.0), 0.0)
-    inverse = (vectors * inverse_values[:, None]) @ np.swapaxes(vectors, 1, 2)
-    eliminated = np.swapaxes(coupling, 1, 2) @ inverse @ coupling
+    largest = np.maximum(values[:, -1:], np.finfo(float).tiny)
+    is_observed = values > _RANK_TOLERANCE * largest
+    inverse_values = np.divide(1.0, values, np.zeros_like(values), where=is_observed)
+    inverse = (vectors * inverse_values[:, None]) @ vectors.swapaxes(1, 2)
+    eliminated = coupling.swapaxes(1, 2) @ inverse @ coupling
     return Q[:, others[:, None], others] - eliminated, inverse @ coupling
 
 
@@ -243,7 +245,7 @@ def _newton_step(
     largest = curvatures.max(axis=1)
     # The limit avoids a division by rounding.
     curvatures = np.maximum(curvatures, 1e-14 * np.maximum(largest, _TINY)[:, None])
-    along = np.swapaxes(axes, 1, 2) @ gradient[:, :, None]
+    along = axes.swapaxes(1, 2) @ gradient[:, :, None]
     step = -(axes @ (along / (curvatures + damping[:, None])[:, :, None]))[:, :, 0]
     length = np.linalg.norm(step, axis=1)
     step *= np.minimum(1.0, 1.0 / np.maximum(length, _TINY))[:, None]
@@ -290,11 +292,11 @@ def _derivatives(forms: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArr
     r = R.reshape(-1, 9)
     S_r = se3.times(S, r)
     value = ((S_r + 2 * linear) * r).sum(axis=1)
-    product = np.swapaxes(R, 1, 2) @ (S_r + linear).reshape(-1, 3, 3)
+    product = R.swapaxes(1, 2) @ (S_r + linear).reshape(-1, 3, 3)
     gradient = 2 * se3.vee(product)
     tangents = (R[:, None] @ _GENERATORS).reshape(-1, 3, 9)
     trace = np.trace(product, axis1=1, axis2=2)
-    symmetric = 0.5 * (product + np.swapaxes(product, 1, 2))
-    hessian = tangents @ S @ np.swapaxes(tangents, 1, 2) + symmetric
+    symmetric = 0.5 * (product + product.swapaxes(1, 2))
+    hessian = tangents @ S @ tangents.swapaxes(1, 2) + symmetric
     hessian = 2 * (hessian - trace[:, None, None] * np.eye(3))
     return value, gradient, hessian

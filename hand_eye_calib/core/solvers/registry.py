@@ -69,7 +69,7 @@ class Method:
         Raises
         ------
         NotEnoughDataError
-            If there is no pair.
+            If the pairs are empty.
         """
         if len(pairs) == 0:
             raise NotEnoughDataError(
