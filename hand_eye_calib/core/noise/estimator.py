@@ -369,7 +369,8 @@ def _strided(problem: Problem, fit: Fit) -> IntArray:
     sound_poses = np.flatnonzero(~fit.outliers.spikes)
     longest_stride = 1
     for stride in tuning.strides:
-        if len(sound_poses) >= stride * tuning.fewest_strides:
+        # A solution needs some fifty poses.
+        if len(sound_poses) >= stride * 50:
             longest_stride = max(stride, longest_stride)
     noise_rad = np.exp(0.5 * fit.levels[ROTATION])
     rotations = problem.streams.Ts_pw_p[sound_poses, :3, :3]

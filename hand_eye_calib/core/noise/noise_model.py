@@ -210,10 +210,12 @@ class NoiseModel:
         lower[WHITES] = np.maximum(lower[WHITES], total + _LOWEST_WHITE)
         lower[WALKS] = np.maximum(lower[WALKS], total + _LOWEST_WALK)
         mean[JITTER] = tuning.jitter
-        precision[JITTER] = tuning.jitter_precision
+        # The jitter may differ by a factor of 10 (a level by 4.5).
+        precision[JITTER] = 0.05
         precision[TIME_CONSTANTS] = tuning.tau_precision
         lower[TIME_CONSTANTS] = shortest
-        longest = max(np.log(tuning.longest_share * self.duration_s), shortest)
+        # An error that lasts for more than a quarter of the recording is constant.
+        longest = max(np.log(0.25 * self.duration_s), shortest)
         # A direction that lasts is a bias or a rotated mount, which have parameters.
         longest_of_direction = shortest + np.log(tuning.first_tau)
         is_direction = [part == "direction" for _, part in self.slow]

@@ -234,7 +234,8 @@ def tail_weights(posterior: Posterior, tuning: Tuning) -> FloatArray:
         levels.append((STUDENT + of_neighbours) / (STUDENT + 6.0 * n_neighbours))
     losses = [_student_loss(expected[~is_free], m[~is_free]) for m in levels]
     best = int(np.argmin(losses))
-    if losses[best] >= losses[0] - tuning.least_gain_of_widths:
+    # A level that changes needs a clear gain per pose.
+    if losses[best] >= losses[0] - 0.1:
         best = 0
     m = levels[best]
     return robust_weights("student", expected / m) / m

@@ -328,7 +328,7 @@ def rough_levels(residuals: FloatArray, left_out: BoolArray, tuning: Tuning) -> 
             covariance = float(np.mean(products))
         white = float(np.clip(-covariance, *np.multiply(tuning.first_white, total)))
         whites[at] = np.log(white)
-        walks[at] = np.log(max(total - 2 * white, tuning.first_walk * total))
+        walks[at] = np.log(max(total - 2 * white, 0.02 * total))
     return levels
 
 
@@ -398,7 +398,8 @@ def tails(workspace: Workspace, fit: Fit) -> Fit:
         return fit
     for _ in range(2):
         posterior = workspace.posterior(fit)
-        for _ in range(tuning.tail_rounds - 1):
+        # Three rounds of weights at one model; the last weights are those of the next fit.
+        for _ in range(2):
             weights = np.where(fit.outliers.spikes, 0.0, tail_weights(posterior, tuning))
             posterior = Posterior(replace(posterior.space, weights=weights), posterior.levels)
         fit = noise(workspace, replace(fit, weights=tail_weights(posterior, tuning)))
@@ -417,12 +418,13 @@ def lasting(workspace: Workspace, fit: Fit) -> Fit:
     total = whole(fit.levels)
     levels = fit.levels.copy()
     levels[WHITES] = np.maximum(levels[WHITES], total + np.log(tuning.audible))
-    levels[WALKS] = np.maximum(levels[WALKS], total + np.log(tuning.audible_walk))
+    levels[WALKS] = np.maximum(levels[WALKS], total + np.log(1e-3))
     model, levels = fit.model.with_lasting(LASTING, levels)
     # Large biases are possible here. Otherwise a bias would become drift and never be found.
     free = replace(fit, sigmas=np.array(tuning.sizes), model=model)
     prior = model.prior(levels)
-    faint_levels = levels - tuning.faded
+    # Processes whose level has fallen since the start may be dropped.
+    faint_levels = levels - 0.2
 
     def without_faint(levels: FloatArray, information: FloatArray) -> reml.Reduced:
         """Drop processes below their faint level that make no difference."""

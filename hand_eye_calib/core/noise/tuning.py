@@ -35,14 +35,10 @@ class Tuning:
     longest_gap: int = 60
     # Prior mean of the level of the jitter of stamps (s^2): 1 ms.
     jitter: float = -14.0
-    # Prior precision of that level.
-    jitter_precision: float = 0.05
     # Prior precision of the levels of time constants.
     tau_precision: float = 0.3
     # Bounds of white noise at the start, as shares of the whole.
     first_white: tuple[float, float] = (0.05, 0.5)
-    # Smallest share of the walk in the whole at the start.
-    first_walk: float = 0.02
     # Steps of the child count as noise until their squared differences from their neighbours
     # exceed the noise variance by this factor.
     caution: float = 10.0
@@ -53,8 +49,6 @@ class Tuning:
     # -- Outliers and heavy tails --
     # Largest number of rounds of detecting outliers.
     outlier_rounds: int = 4
-    # Rounds of weighting tails.
-    tail_rounds: int = 3
     # False alarms expected in a whole recording.
     false_alarms: float = 0.01
     # A large step of a walk with heavy tails is a jump if its chi-square exceeds the threshold of
@@ -74,8 +68,6 @@ class Tuning:
     negligible: float = 0.005
     # Poses on either side that may share a level of the white errors.
     widths: tuple[int, ...] = (2, 5, 12, 30)
-    # A level that changes is accepted if it lowers the loss per pose by this.
-    least_gain_of_widths: float = 0.1
 
     # -- Rotation noise that is large beside the rotation --
     # Rotation noise is not small if it exceeds this share of the rotation between poses.
@@ -83,8 +75,6 @@ class Tuning:
     # Strides tried if rotation noise exceeds the rotation between poses. Without them, the
     # recording primesense is 20 mm off at a sigma of 2 mm.
     strides: tuple[int, ...] = (3, 10, 30)
-    # Fewest poses that a stride may leave.
-    fewest_strides: int = 50
 
     # -- Time-correlated errors --
     # They are part of the model if they lower the loss by this: two levels each, by Akaike's
@@ -92,15 +82,9 @@ class Tuning:
     least_gain: float = 4.0
     # A process makes no difference if the data have less information than this on its level.
     least_information: float = 0.3
-    # Such a process is dropped once its level has fallen by this.
-    faded: float = 0.2
-    # Time constants are between an interval and this share of the recording.
-    longest_share: float = 0.25
     # The search begins with processes of this share of the white and walking noise. White noise is
     # at least as large then.
     audible: float = 0.1
-    # Smallest share of the walk in the whole during that search.
-    audible_walk: float = 1e-3
     # Level of a drifting scale and direction of travel at which the search begins.
     first_of_path: float = -10.0
     # The search begins at a time constant between this many intervals ...
