@@ -211,9 +211,9 @@ def rotation_gain(slow: Regression, axes: FloatArray, inverse: bool = False) -> 
     """A gain of the child's rotations about an axis; ``inverse`` if the parent's are fitted."""
     gains, sigmas = slow.fit("gain")
     biases = slow.biases("gain")
-    most_sigmas, least, *_ = LIMITS["rotation_gain"]
-    limits = np.maximum(most_sigmas * sigmas, BIASES * biases)
-    ratios = np.abs(gains) / np.maximum(limits, least)
+    limits = LIMITS["rotation_gain"]
+    noise = np.maximum(limits.sigmas * sigmas, BIASES * biases)
+    ratios = np.abs(gains) / np.maximum(noise, limits.note)
     ratios = np.where(biases < biases[0] / _LITTLE**2, ratios, 0.0)
     k = int(np.argmax(ratios))
     if ratios[k] < 1.0:
@@ -228,9 +228,9 @@ def _turned(slow: Regression, stream: str) -> Finding | None:
     """Positions of a stream that are turned against its orientations."""
     turns, sigmas = slow.fit(f"turned_{stream}")
     sizes = np.abs(turns)
-    most_sigmas, least, *_ = LIMITS["worlds_turned"]
-    limits = np.hypot(most_sigmas * sigmas, BIASES * slow.biases(f"turned_{stream}"))
-    if (sizes < limits).all() or sizes.max() < least:
+    limits = LIMITS["worlds_turned"]
+    noise = np.hypot(limits.sigmas * sigmas, BIASES * slow.biases(f"turned_{stream}"))
+    if (sizes < noise).all() or sizes.max() < limits.note:
         return None
     turned_rad = float(np.linalg.norm(sizes))
     values = {"axis": "xyz"[int(np.argmax(sizes))], "turned_deg": float(np.degrees(turned_rad))}
@@ -266,7 +266,7 @@ def axis_gain(slow: Regression, columns_of: str, stream: str = "") -> Finding | 
     of_drift = _DRIFT**2 * of_noise / slow.biases("scale")[0]
     if abs(off) < BIASES * (of_noise + of_drift):
         return None
-    size = off if slow.share(group) > _SOME else min(abs(off), LIMITS["axis_scale"][-1])
+    size = off if slow.share(group) > _SOME else min(abs(off), LIMITS["axis_scale"].error)
     factor = 1.0 / max(1.0 + off, _LEAST_FACTOR) if is_inverse else 1.0 + off
     values = {"axis": "xyz"[k], "factor": factor, "sigma": sigma}
     return graded("axis_scale", stream or columns_of, size, sigma, **values)
@@ -279,7 +279,7 @@ def moved_mount(change: MountChange, start_ns: int) -> Finding | None:
     moved_m, moved_rad = (float(np.linalg.norm(part)) for part in np.split(known, 2))
     if change.log_ratio < SIGNIFICANT:
         return None
-    most = LIMITS["mount_moved"][-1] if change.log_ratio < 2.0 * SIGNIFICANT else np.inf
+    most = LIMITS["mount_moved"].error if change.log_ratio < 2.0 * SIGNIFICANT else np.inf
     told = listing([length(moved_m)] * (moved_m > 0) + [angle(moved_rad)] * (moved_rad > 0))
     values = {"size": told, "at_s": (change.at_ns - start_ns) * 1e-9}
     return graded("mount_moved", "both", min(max(moved_m, moved_rad), most), **values)
@@ -292,7 +292,7 @@ def _world_drift(slow: Regression, pose_pairs: PosePairs, usual: float) -> Findi
     turning = np.cross(drift[3:], positions - positions.mean(axis=0))
     moving = np.sqrt(((drift[:3] + turning) ** 2).sum(axis=1).mean())
     share = float(moving) / max(usual, 1e-9)
-    if (np.abs(drift) < LIMITS["world_drift"][0] * sigmas).all():
+    if (np.abs(drift) < LIMITS["world_drift"].sigmas * sigmas).all():
         return None
     speed, rate = (60 * float(np.linalg.norm(part)) for part in np.split(drift, 2))
     values = {"deg_per_minute": float(np.degrees(rate)), "m_per_minute": speed}
@@ -327,13 +327,13 @@ def delay_suspects(
                 if is_expected := abs(late_s / abs(offset_s or 1.0) - 1.0) < 1.0 - _EXPECTED:
                     sigma_m *= _EXPECTED
                 is_plain = late_s > max(_PLAIN_S, _PLAIN_SIGMAS * sigma_s) and (
-                    shift_m > LIMITS["late"][-1]
+                    shift_m > LIMITS["late"].error
                     or (shift_m > _PLAIN_SHIFT_M and share > _PLAIN_SHARE)
                 )
                 if is_plain:
-                    shift_m = max(shift_m, _ERROR * LIMITS["late"][-1])
+                    shift_m = max(shift_m, _ERROR * LIMITS["late"].error)
                 elif is_expected or late_s < _GRAVE * _DELAY_S or share < _SOME:
-                    least = min(1.0, LIMITS["late"][-1] / max(shift_m, 1e-9))
+                    least = min(1.0, LIMITS["late"].error / max(shift_m, 1e-9))
                     shift_m = least * shift_m
                     sigma_m = least * sigma_m
                 values |= {"part": part, "others": others}
@@ -349,9 +349,9 @@ def smoothing_suspects(fast: Regression, interval_s: float, speed: float) -> Ite
         for stream in _STREAMS:
             groups = f"{part}_{stream}", f"late_{stream}"
             value_s2, sigma_s2 = (float(each[0]) for each in fast.fit(*groups))
-            if value_s2 >= max(least_s2 + more_s2, LIMITS["smoothed"][0] * sigma_s2):
+            if value_s2 >= max(least_s2 + more_s2, LIMITS["smoothed"].sigmas * sigma_s2):
                 smoothing_s = value_s2**0.5
                 displaced_m = value_s2 * float(fast.displaced(groups[0])[0])
-                shift_m = max(displaced_m, min(smoothing_s * speed, LIMITS["smoothed"][-1]))
+                shift_m = max(displaced_m, min(smoothing_s * speed, LIMITS["smoothed"].error))
                 values = {"part": part, "smoothing_s": smoothing_s, "shift_m": displaced_m}
                 yield fast.share(*groups), graded("smoothed", stream, shift_m, **values)

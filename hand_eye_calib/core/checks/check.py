@@ -261,7 +261,8 @@ def _as_they_are(streams: StreamPair, X: FloatArray) -> tuple[Explanation | None
     """The fit from a known extrinsic X, and the clock offset with it, of streams that clearly agree
     as they are, in one unit and on about one clock; no explanation of others.
     """
-    _, least_s, _, grave_s = LIMITS["time_offset"]
+    least_s = LIMITS["time_offset"].note
+    grave_s = LIMITS["time_offset"].error
     lag_s = hypotheses.LAGS_S[1]
     # In one step if it is below half of what is told.
     given = streams.parent, streams.child, TimeOffset(), streams.max_gap_s, 2.0 * least_s
@@ -279,7 +280,7 @@ def _as_they_are(streams: StreamPair, X: FloatArray) -> tuple[Explanation | None
 
 def _fine_offset(right: StreamPair, at: TimeOffset, fit: SimilarityFit) -> TimeOffset:
     """What is left of the clock offset in streams that agree by a fit."""
-    least_s = LIMITS["time_offset"][1]
+    least_s = LIMITS["time_offset"].note
     if at.fit and at.largest_s(right.child.duration_s) < least_s:
         return at
     if right.is_slow:
@@ -334,7 +335,7 @@ def _explained(
         explanation = hypotheses.explain(streams, correlation.is_clear, start)
     except NotEnoughDataError as error:
         if correlation.is_clear:
-            return None, [finding("too_short", text=str(error))]
+            return None, [finding("too_short", reason=str(error))]
     else:
         if explanation.holds:
             return explanation, [*explanation.findings]
@@ -346,8 +347,7 @@ def _explained(
         return None, []
     if correlation.variation < time_offset.MIN_VARIATION:
         return None, [finding("no_turning")]
-    doubt = f"the streams agree at no clock offset: {correlation.doubt()}"
-    return None, [finding("unrelated", text=doubt)]
+    return None, [finding("unrelated", doubt=correlation.doubt())]
 
 
 def _check_sizes(

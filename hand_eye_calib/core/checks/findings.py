@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from numbers import Real
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,54 +22,93 @@ __all__ = [
     "repair_message",
 ]
 
-_NOTE = Severity.NOTE
-_WARNING = Severity.WARNING
-
-# Jumps up to this share hardly matter to the methods that reject outliers.
+# Jumps up to this share of the steps hardly affect the methods that reject outliers.
 _FEW_JUMPS = 0.02
-
 
 _NEVER = float("inf")
 
-# How many standard deviations a fault must exceed, and from which size on it is a note, a warning
-# and an error: at least half of what spoils an extrinsic by 1 cm or 0.5 deg.
+
+class Limits(NamedTuple):
+    """Limits of the size of a fault.
+
+    Attributes
+    ----------
+    sigmas : float
+        Fewest standard deviations of its size.
+    note, warning, error : float
+        Sizes from which on the fault is a note, a warning, an error.
+    """
+
+    sigmas: float
+    note: float
+    warning: float
+    error: float
+
+
+# Sizes are at least half of what changes an extrinsic by 1 cm or 0.5 deg.
 LIMITS = {
-    "time_offset": (5.0, 0.005, 0.01, 0.1),  # s
-    "scale": (0.0, 0.01, 0.01, 0.03),  # of the factor, less 1; the fit knows more
-    "jumps": (0.0, 0.002, 0.002, _NEVER),  # share of the steps
-    # Share of the time; a second or more is at least a note.
-    "frozen": (0.0, 1e-9, 0.02, 0.02),
-    "coarse_positions": (0.0, 0.002, 0.005, 0.02),  # m
-    # A delay is most of a lever arm at constant speed and needs less; the standard deviation of
-    # smoothing does not contain noise of the columns. Both by the shift of positions, m.
-    "late": (4.5, 0.008, 0.008, 0.05),
-    "smoothed": (8.0, 0.008, 0.008, 0.02),
-    "rotation_gain": (6.0, 0.003, 0.003, 0.03),  # of the factor, less 1
-    # Symmetric part of the matrix between the rates (rad): the rotation is off by as much. The
-    # visual-inertial odometries of three tango devices differ by up to 0.016.
-    "misaligned": (6.0, 0.004, 0.004, 0.0175),
-    "turns": (0.0, 0.4, 0.4, 0.4),  # logarithm of a factor that noise does not cause
-    # Of the factor, less 1: of three scales of 0.9 to 11 % under USE, nobody was told but in the
-    # paragraph on noise. Odometries are right to 1 %.
-    "model_scale": (3.0, 0.01, 0.03, _NEVER),
-    "axis_scale": (6.0, 0.015, 0.015, 0.05),  # of the factor, less 1
-    "worlds_turned": (6.0, np.radians(0.5), np.radians(0.5), np.radians(1.5)),  # rad
-    # Share of the speed: the direction is then off by half the usual target of a rotation.
-    "world_drift": (6.0, 0.003, 0.003, _NEVER),
-    "mount_moved": (0.0, 0.005, 0.005, 0.0175),  # m, of a place up to 1 m from the sensor
+    # Seconds.
+    "time_offset": Limits(5.0, 0.005, 0.01, 0.1),
+    # Factor, less 1. The fit has tested its significance.
+    "scale": Limits(0.0, 0.01, 0.01, 0.03),
+    # Share of the steps.
+    "jumps": Limits(0.0, 0.002, 0.002, _NEVER),
+    # Share of the time. A second or more is at least a note.
+    "frozen": Limits(0.0, 1e-9, 0.02, 0.02),
+    # Metres.
+    "coarse_positions": Limits(0.0, 0.002, 0.005, 0.02),
+    # Shift of positions, m. At constant speed a delay looks like a lever arm, so that fewer
+    # standard deviations suffice than for smoothing.
+    "late": Limits(4.5, 0.008, 0.008, 0.05),
+    # Shift of positions, m. The standard deviation does not contain the noise of the columns.
+    "smoothed": Limits(8.0, 0.008, 0.008, 0.02),
+    # Factor, less 1.
+    "rotation_gain": Limits(6.0, 0.003, 0.003, 0.03),
+    # Symmetric part of the matrix between the rates, rad: the error of the rotation is as large.
+    # The visual-inertial odometries of three tango devices differ by up to 0.016.
+    "misaligned": Limits(6.0, 0.004, 0.004, 0.0175),
+    # Logarithm of a factor that noise does not cause.
+    "turns": Limits(0.0, 0.4, 0.4, 0.4),
+    # Factor, less 1. Scales of odometries are accurate to 1 %; three recordings with scales of 0.9
+    # to 11 % were judged USE without this limit.
+    "model_scale": Limits(3.0, 0.01, 0.03, _NEVER),
+    # Factor, less 1.
+    "axis_scale": Limits(6.0, 0.015, 0.015, 0.05),
+    # Radians.
+    "worlds_turned": Limits(6.0, np.radians(0.5), np.radians(0.5), np.radians(1.5)),
+    # Share of the speed: the error of the direction is half the usual target of a rotation.
+    "world_drift": Limits(6.0, 0.003, 0.003, _NEVER),
+    # Metres, of a place up to 1 m from the sensor.
+    "mount_moved": Limits(0.0, 0.005, 0.005, 0.0175),
 }
 
 
 def graded(
     key: str, stream: str, size: float, sigma: float = 0.0, /, **values: Any
 ) -> Finding | None:
-    """The finding of a row, as grave as its size; None for a size that does not matter, or within
-    its noise.
+    """Return a finding whose severity follows from its size, or None below its limits.
+
+    Parameters
+    ----------
+    key : str
+        Key of its words and of its limits.
+    stream : str
+        "parent", "child" or "both".
+    size, sigma : float
+        Size of the fault and its standard deviation, in the unit of the limits.
+    **values
+        Values of the finding, see :func:`finding`.
     """
-    sigmas, *begin = LIMITS[key]
-    if not abs(size) >= max(begin[0], sigmas * sigma):
+    limits = LIMITS[key]
+    size = abs(size)
+    if not size >= max(limits.note, limits.sigmas * sigma):  # NaN is below all limits
         return None
-    severity = [_NOTE, _WARNING, Severity.ERROR][sum(abs(size) > limit for limit in begin[1:])]
+    if size > limits.error:
+        severity = Severity.ERROR
+    elif size > limits.warning:
+        severity = Severity.WARNING
+    else:
+        severity = Severity.NOTE
     return finding(key, stream, severity, **values)
 
 
@@ -80,38 +119,38 @@ def finding(
     options: Mapping[str, float | str] | None = None,
     **values: Any,
 ) -> Finding:
-    """The finding of a row with its values.
+    """Return a finding with its values and its words.
 
     Parameters
     ----------
     key : str
-        Of the row.
+        Key of its words, see :func:`hand_eye_calib.core.checks.words.words_of`.
     stream : str
         "parent", "child" or "both".
     severity : Severity, optional
-        Instead of that of the row.
+        Severity in place of the usual one.
     options : mapping, optional
-        Options that help, by name.
+        Options that repair the fault, by name.
     **values
-        What the texts of the row name; the numbers among them are the evidence.
+        Values that the words name. The numbers among them are the evidence.
     """
-    row = words_of(key)
+    words = words_of(key)
     whose = "both streams'" if stream == "both" else f"the {stream} stream's"
     values |= {"stream": stream, "whose": whose}
     return Finding(
-        code=row.code.format(**values) or key,
+        code=words.code.format(**values) or key,
         stream=stream,
-        severity=severity or row.severity,
-        what=row.what.format(**values),
-        advice=row.advice.format(**values),
-        cause=row.cause.format(**values),
+        severity=severity or words.severity,
+        what=words.what.format(**values),
+        advice=words.advice.format(**values),
+        cause=words.cause.format(**values),
         evidence={name: float(value) for name, value in values.items() if isinstance(value, Real)},
         options=options or {},
     )
 
 
-# Code of a finding to the option that puts a stream right, and its value, in the order in which
-# mistakes are undone.
+# Code of a finding to the option that corrects the convention of a stream, and its value, in the
+# order in which mistakes are undone.
 CONVENTIONS = {
     "quaternion_order": ("quaternion", "wxyz"),
     "quaternion_names": ("quaternion", "yzwx"),
@@ -121,11 +160,15 @@ CONVENTIONS = {
 
 
 def conventions(code: str, stream: str) -> dict[str, float | str]:
-    """The options that put the convention of a stream, or of both, right; empty if none can."""
+    """Return the options that correct the convention of a stream ("parent", "child" or "both").
+
+    The result is empty for a finding that is not about conventions.
+    """
     if code not in CONVENTIONS:
         return {}
     kind, value = CONVENTIONS[code]
-    return {f"{each}_{kind}": value for each in ("parent", "child") if stream in (each, "both")}
+    names = ("parent", "child") if stream == "both" else (stream,)
+    return {f"{name}_{kind}": value for name in names}
 
 
 def repair_message(findings: Sequence[Finding], options: Options, verdicts: str = "") -> str:
@@ -134,31 +177,33 @@ def repair_message(findings: Sequence[Finding], options: Options, verdicts: str 
     Parameters
     ----------
     findings : sequence of Finding
-        Those that the options repair.
+        Findings that the options repair.
     options : mapping
     verdicts : str
         Verdicts with and without the repair, in words.
     """
-    what = "; ".join(found.what for found in findings)
+    what = "; ".join([found.what for found in findings])
     undo = options_in_words(defaults_of(options))
     return f"repaired: {what}. Solved with {options_in_words(options)}{verdicts} (undo with {undo})"
 
 
 def answered(findings: Sequence[Finding], config: CalibratorConfig) -> list[Finding]:
-    """Grade findings by the options that are set. A finding that an option answers becomes a note,
-    and so do a few jumps if the method rejects outliers.
+    """Return findings, graded by the options of a configuration.
+
+    A finding whose options are all set becomes a note, and so do a few jumps if the method rejects
+    outliers.
     """
-    given = config.to_options()
-    told = []
-    for each in findings:
-        options = dict(each.options)
-        if each.code in CONVENTIONS:
-            # A stream that was put right already, and needs it again, was right before.
-            set_so = [name for name, value in options.items() if given[name] == value]
-            options |= defaults_of(set_so)
-        is_answered = options and all(given.get(name) == options[name] for name in options)
-        if each.code == "jumps" and METHODS[config.method].rejects_outliers:
-            is_answered = is_answered or each.evidence["share"] < _FEW_JUMPS
-        severity = Severity.NOTE if is_answered else each.severity
-        told.append(replace(each, options=options, severity=severity))
-    return told
+    current = config.to_options()
+    graded_findings = []
+    for found in findings:
+        options = dict(found.options)
+        if found.code in CONVENTIONS:
+            # A stream that was corrected already, and needs it again, was right before.
+            repeated = [name for name, value in options.items() if current[name] == value]
+            options |= defaults_of(repeated)
+        is_answered = options and all(current.get(name) == options[name] for name in options)
+        if found.code == "jumps" and METHODS[config.method].rejects_outliers:
+            is_answered = is_answered or found.evidence["share"] < _FEW_JUMPS
+        severity = Severity.NOTE if is_answered else found.severity
+        graded_findings.append(replace(found, options=options, severity=severity))
+    return graded_findings

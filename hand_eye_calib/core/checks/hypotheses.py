@@ -356,8 +356,7 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
         findings = (*noisy.findings, finding("noisy", share=unexplained))
         return replace(noisy, findings=findings, limit=_NOISY)
     share = min(unexplained, 1.0)
-    text = f"no extrinsic, scale or usual mistake explains {share:.0%} of the motion"
-    return replace(best, findings=(finding("unrelated", text=text, share=share),))
+    return replace(best, findings=(finding("unexplained", share=share),))
 
 
 def _or_rival(

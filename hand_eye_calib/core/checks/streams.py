@@ -126,10 +126,9 @@ def check_stream(
 def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> list[Finding]:
     """Findings about the stamps of one stream, and about its positions without its orientations."""
     if len(trajectory) < 4:
-        text = f"the {stream} stream has {len(trajectory)} poses"
-        return [finding("too_short", stream, text=text)]
+        return [finding("too_few_poses", stream, poses=str(len(trajectory)))]
     if leap := find_leap(trajectory.stamps_ns):
-        return [finding("leap", stream, text=leap[0], remedy=leap[1])]
+        return [finding("leap", stream, leap=leap[0], remedy=leap[1])]
     intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
     findings = []
     if (gaps := are_gaps(intervals_s, max_gap_s)).any():
@@ -141,7 +140,7 @@ def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> li
         return [*findings, finding("interleaved", stream, distance_m=apart_m)]
     step_m = max(_grid_step(column) for column in trajectory.poses[:, :3, 3].T)
     # Of positions alone, rounding is noise like any other.
-    most = np.inf if trajectory.has_rotations else LIMITS["coarse_positions"][-1]
+    most = np.inf if trajectory.has_rotations else LIMITS["coarse_positions"].error
     coarse = graded("coarse_positions", stream, min(step_m, most), step_m=step_m)
     return [*findings, coarse] if coarse else findings
 

@@ -35,10 +35,17 @@ class FindingWords:
     code: str = ""
 
 
+#: What to do about streams that do not agree.
+UNRELATED_ADVICE = (
+    "check that both sensors are on one rigid body, and that both streams are of one recording and "
+    "in known units; if the clocks differ, have the offset estimated (time_offset estimate); in a "
+    "file, call angles that are clockwise from north heading, not yaw"
+)
+
 _WORDS = {
     # Of one stream.
     "disorder": FindingWords("{text}", "repair the source of the stamps", severity=Severity.NOTE),
-    "leap": FindingWords("{whose} {text}", "{remedy}"),
+    "leap": FindingWords("{whose} {leap}", "{remedy}"),
     "gaps": FindingWords(
         "the {stream} stream has {gaps} gaps of up to {longest_s:.2f} s ({share:.0%} of the time)",
         "nothing is paired across a gap; raise max_gap if the motion there is smooth",
@@ -82,17 +89,25 @@ _WORDS = {
     ),
     # Of both streams together.
     "unrelated": FindingWords(
-        "{text}",
-        "check that both sensors are on one rigid body, and that both streams are of one recording "
-        "and in known units; if the clocks differ, have the offset estimated (time_offset "
-        "estimate); in a file, call angles that are clockwise from north heading, not yaw",
+        "the streams agree at no clock offset: {doubt}",
+        UNRELATED_ADVICE,
+    ),
+    "unexplained": FindingWords(
+        "no extrinsic, scale or usual mistake explains {share:.0%} of the motion",
+        UNRELATED_ADVICE,
+        code="unrelated",
     ),
     "no_turning": FindingWords(
         "the streams hardly rotate, or at a constant rate, so that neither clock nor extrinsic can "
         "be checked",
         "rotate about several axes (a vehicle: curves, and slopes if there are any)",
     ),
-    "too_short": FindingWords("{text}", "record longer"),
+    "too_few_poses": FindingWords(
+        "the {stream} stream has {poses} poses",
+        "record longer",
+        code="too_short",
+    ),
+    "too_short": FindingWords("{reason}", "record longer"),
     "not_independent": FindingWords(
         "{evidence}. Was one computed from the other (TF, fusion)? Then this result only returns "
         "the old transform",

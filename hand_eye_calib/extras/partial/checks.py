@@ -500,7 +500,7 @@ def _shear(fit: Regression, stream: str) -> Finding | None:
     values, sigmas = fit.fit("shear", "gain")
     limits = agreement.BIASES * fit.biases("shear")
     significant = np.where(
-        np.abs(values) > np.maximum(LIMITS["misaligned"][0] * sigmas, limits), values, 0
+        np.abs(values) > np.maximum(LIMITS["misaligned"].sigmas * sigmas, limits), values, 0
     )
     size = float(np.abs(significant).max())
     # If the symmetric part is s, the angle between two axes is wrong by 2 s.

@@ -209,8 +209,7 @@ def _check_path(
             return _check_scale(scaled, scaled.model.tuning.any_scale, paths)
     share = min(share, 1.0)
     severity = Severity.WARNING if is_near else Severity.ERROR
-    text = f"{share:.0%} of the motion of the positions is not that of the odometry"
-    return (finding("unrelated", severity=severity, share=share, text=text),)
+    return (finding("unrelated_positions", severity=severity, share=share),)
 
 
 def _check_units(solution: of_positions.LeverArmSolution, paths: _Paths) -> Finding | None:
@@ -342,8 +341,7 @@ def _check_rotation(
     if share < _UNRELATED_ROTATION:
         return ()
     share = min(share, 1.0)
-    text = f"{share:.0%} of the rotation of one sensor is not that of the other"
-    return (finding("unrelated", share=share, text=text),)
+    return (finding("unrelated_rotations", share=share),)
 
 
 def _check_rate_unit(steps: MotionPairs, config: CalibratorConfig) -> tuple[Finding, ...]:

@@ -1,8 +1,18 @@
 """Sentences of the findings about streams of positions, rotations or angular rates."""
 
-from hand_eye_calib.core.checks.words import FindingWords
+from hand_eye_calib.core.checks.words import UNRELATED_ADVICE, FindingWords
 
 WORDS = {
+    "unrelated_positions": FindingWords(
+        "{share:.0%} of the motion of the positions is not that of the odometry",
+        UNRELATED_ADVICE,
+        code="unrelated",
+    ),
+    "unrelated_rotations": FindingWords(
+        "{share:.0%} of the rotation of one sensor is not that of the other",
+        UNRELATED_ADVICE,
+        code="unrelated",
+    ),
     "rate_unit": FindingWords(
         "the {stream} rotates {ratio:.3g} times as far as the other sensor: its rates are {unit} "
         "and were read as {read_as}",
