@@ -126,9 +126,8 @@ def calibrate_arm(
     Parameters
     ----------
     robot, tracking : array-likes
-        Poses of the hand in the base (parent), and of the target in the camera (child), as MoveIt
-        and easy_handeye2 store them. Forms as for :func:`calibrate_stops`; a pair (R, t) is what
-        ``cv2.calibrateHandEye`` takes.
+        Poses of the hand in the base (parent), and of the target in the camera (child), in the
+        forms of :func:`calibrate_stops`; ``cv2.calibrateHandEye`` takes pairs (R, t).
     config : CalibratorConfig, optional
         As for :func:`calibrate_stops`.
     names : mapping of str to str, optional

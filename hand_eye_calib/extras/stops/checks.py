@@ -11,6 +11,7 @@ and their likelihoods are compared.
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -76,6 +77,8 @@ _CENTIMETRE = 0.01
 _MILLIMETRE = 0.001
 _UNITS = {_CENTIMETRE: "centimetres", _MILLIMETRE: "millimetres"}
 
+_UNEXPLAINED = attrgetter("unexplained")
+
 # Codes of conventions that each side may have wrong.
 _CODES = ("", "quaternion_order", "quaternion_names", "inverse_orientation")
 
@@ -92,37 +95,25 @@ class Examination:
         Mistakes that their options repair.
     scale : float or None
         Rough factor of the child's lengths after the repairs; None if it is not determined.
+    child_unit : float
+        Unit of the child's lengths if it is no finding, because the scale is estimated anyway.
     """
 
     findings: tuple[Finding, ...] = ()
     repairs: tuple[Finding, ...] = ()
     scale: float | None = None
+    child_unit: float = 1.0
 
 
-@dataclass(frozen=True)
-class _Hypothesis:
-    """Assumed mistakes, and the rough fit without them."""
-
-    mistakes: Mistakes
-    fit: RoughFit
-
-    @classmethod
-    def of(cls, poses: StopPoses, mistakes: Mistakes) -> "_Hypothesis":
-        """Fit stops with the mistakes undone."""
-        return cls(mistakes, rough_fit(poses, mistakes))
-
-    def objective(self, poses: StopPoses) -> float:
-        """Return the negative log likelihood of the solved stops, in lengths of the parent."""
-        return solve(poses.without(self.mistakes, self.fit.scale or 1.0)).objective
-
-
-def examine(poses: StopPoses) -> Examination:
-    """Look for usual mistakes in stops.
+def examine(poses: StopPoses, is_scale_free: bool) -> Examination:
+    """Detect usual mistakes in stops.
 
     Parameters
     ----------
     poses : StopPoses
         With the options of the user applied.
+    is_scale_free : bool
+        Whether the factor of the child's lengths is estimated anyway.
     """
     if len(poses) < FEWEST_STOPS:
         return Examination()
@@ -135,9 +126,9 @@ def examine(poses: StopPoses) -> Examination:
     sample = poses.sample()
     if not turns_about_two_axes(poses.parent):
         # The rotations do not determine where the positions belong.
-        return _with_units(sample, Examination())
+        return _with_units(sample, Examination(), is_scale_free)
     chosen, rivals = _explain(sample)
-    if axes := _check_axes(sample, chosen.fit):
+    if axes := _check_axes(sample, chosen):
         return Examination((axes,))
     repairs = tuple(
         finding(code, stream, options=conventions(code, stream))
@@ -145,62 +136,61 @@ def examine(poses: StopPoses) -> Examination:
     )
     findings = _check_conventions(sample, chosen.mistakes, rivals)
     if not (findings or repairs):
-        findings = _check_agreement(chosen.fit)
+        findings = _check_agreement(chosen)
     examination = Examination(tuple(findings), repairs)
     if has_error(findings):
         return examination
-    return _with_units(sample, replace(examination, scale=chosen.fit.scale))
+    return _with_units(sample, replace(examination, scale=chosen.scale), is_scale_free)
 
 
 # ------------------------------------------------------------------ conventions
 
 
-def _explain(sample: StopPoses) -> tuple[_Hypothesis, list[Mistakes]]:
-    """Return the hypothesis that explains the stops, and mistakes that explain them equally well.
+def _explain(sample: StopPoses) -> tuple[RoughFit, list[Mistakes]]:
+    """Return the fit that explains the stops, and mistakes that explain them equally well.
 
-    The hypothesis has no mistakes unless some are certain.
+    The fit is that without mistakes unless some are certain.
     """
-    plain = [_Hypothesis.of(sample, Mistakes(is_inverse=way)) for way in sample.ways]
+    plain = [rough_fit(sample, Mistakes(is_inverse=way)) for way in sample.ways]
     # Rotations decide whether the camera is on the hand; positions choose only where they do not.
-    largest_turning = CLEARLY_BETTER * min(hypothesis.fit.turning for hypothesis in plain)
-    agreeing = [hypothesis for hypothesis in plain if hypothesis.fit.turning <= largest_turning]
-    as_given = min(agreeing, key=_unexplained)
-    if as_given.fit.unexplained < EXPLAINED_SHARE or not sample.has_positions:
+    largest_turning = CLEARLY_BETTER * min(fit.turning for fit in plain)
+    as_given = min((fit for fit in plain if fit.turning <= largest_turning), key=_UNEXPLAINED)
+    if as_given.unexplained < EXPLAINED_SHARE or not sample.has_positions:
         return as_given, []
-    objectives = {rival: rival.objective(sample) for rival in _rivals(sample, plain)}
+    objectives = {rival: _objective(sample, rival) for rival in _rivals(sample)}
     smallest = min(objectives.values())
-    gain = min(hypothesis.objective(sample) for hypothesis in plain) - smallest
+    gain = min(_objective(sample, fit) for fit in plain) - smallest
     good = _simplest([rival for rival in objectives if objectives[rival] < smallest + LEAST_LEAD])
     if gain < -LEAST_LEAD:
         return as_given, []
     if gain < certain_gain(len(sample)):
         return as_given, [rival.mistakes for rival in good]
-    best = min(good, key=_unexplained)
-    if best.fit.unexplained > LARGEST_SHARE:
+    best = min(good, key=_UNEXPLAINED)
+    if best.unexplained > LARGEST_SHARE:
         return as_given, []
     return best, [rival.mistakes for rival in good if rival is not best]
 
 
-def _simplest(hypotheses: Sequence[_Hypothesis]) -> list[_Hypothesis]:
-    """Return the hypotheses with the fewest different mistakes."""
-    fewest = min(hypothesis.mistakes.complexity for hypothesis in hypotheses)
-    return [hypothesis for hypothesis in hypotheses if hypothesis.mistakes.complexity == fewest]
+def _simplest(fits: Sequence[RoughFit]) -> list[RoughFit]:
+    """Return the fits with the fewest different mistakes."""
+    fewest = min(fit.mistakes.complexity for fit in fits)
+    return [fit for fit in fits if fit.mistakes.complexity == fewest]
 
 
-def _unexplained(hypothesis: _Hypothesis) -> float:
-    return hypothesis.fit.unexplained
-
-
-def _rivals(sample: StopPoses, plain: Sequence[_Hypothesis]) -> list[_Hypothesis]:
-    """Return the mistakes with the best rough fits."""
-    plain_mistakes = [hypothesis.mistakes for hypothesis in plain]
+def _rivals(sample: StopPoses) -> list[RoughFit]:
+    """Return the best rough fits with mistakes undone."""
     rivals = []
     for parent, child, is_inverse in itertools.product(_CODES, _CODES, (False, True)):
-        mistakes = Mistakes(parent, child, is_inverse)
-        if mistakes not in plain_mistakes:
-            rivals.append(_Hypothesis.of(sample, mistakes))
-    rivals.sort(key=lambda rival: -rival.fit.log_likelihood)
+        is_plain = not (parent or child) and is_inverse in sample.ways
+        if not is_plain:
+            rivals.append(rough_fit(sample, Mistakes(parent, child, is_inverse)))
+    rivals.sort(key=lambda rival: -rival.log_likelihood)
     return rivals[:_MOST_SOLVED]
+
+
+def _objective(sample: StopPoses, fit: RoughFit) -> float:
+    """Return the negative log likelihood of the solved stops, in lengths of the parent."""
+    return solve(sample.without(fit.mistakes, fit.scale or 1.0)).objective
 
 
 def _check_conventions(
@@ -316,7 +306,7 @@ def _axes_in_words(axes: FloatArray) -> str:
 # ------------------------------------------------------------------ lengths
 
 
-def _with_units(sample: StopPoses, examination: Examination) -> Examination:
+def _with_units(sample: StopPoses, examination: Examination, is_scale_free: bool) -> Examination:
     """Return the examination with findings or repairs of lengths in other units, and with the scale
     that remains.
     """
@@ -332,17 +322,23 @@ def _with_units(sample: StopPoses, examination: Examination) -> Examination:
         of_child = nearest if is_unit else 1.0
         scale = to_metres / of_child
     units = []
-    for stream, option, unit in (
-        ("parent", "parent_scale", of_parent),
-        ("child", "scale", of_child),
-    ):
-        if unit != 1.0:
-            options = {option: unit}
-            units.append(finding("stop_units", stream, options=options, unit=_UNITS[unit]))
+    if of_parent != 1.0:
+        units.append(_unit_finding("parent", "parent_scale", of_parent))
+    if of_child != 1.0:
+        units.append(_unit_finding("child", "scale", of_child))
     # Stops of two vehicles may be far apart; an arm is not that large.
-    if sample.is_arm or (len(units) == 1 and scale is not None):
-        return replace(examination, repairs=(*examination.repairs, *units), scale=scale)
-    return replace(examination, findings=(*examination.findings, *units), scale=scale)
+    is_certain = sample.is_arm or (len(units) == 1 and scale is not None)
+    examination = replace(examination, scale=scale)
+    if is_scale_free and of_child != 1.0:
+        units.pop()
+        examination = replace(examination, child_unit=of_child)
+    if is_certain:
+        return replace(examination, repairs=(*examination.repairs, *units))
+    return replace(examination, findings=(*examination.findings, *units))
+
+
+def _unit_finding(stream: str, option: str, unit: float) -> Finding:
+    return finding("stop_units", stream, options={option: unit}, unit=_UNITS[unit])
 
 
 def _unit_of_size(positions: FloatArray) -> float:

@@ -248,12 +248,32 @@ def _products(rows: FloatArray, pairs: list[_Pair], n_values: int) -> FloatArray
     return products
 
 
-def _variances(means: FloatArray, stops: Stops, n_values: int) -> FloatArray:
-    """Return the variances (2,) of positions and rotations from weighted mean squares (2,).
+def _variances(
+    stops: Stops, squared: FloatArray, weights: FloatArray, n_values: int, degrees: float
+) -> FloatArray:
+    """Return the variances (2,) of positions and rotations.
 
     If all positions may fit exactly, both are one level, over the spread of the places.
+
+    Parameters
+    ----------
+    stops : Stops
+    squared : (N, 2) array
+        Squared errors of positions and rotations.
+    weights : (N,) array
+    n_values : int
+        Number of estimated values.
+    degrees : float
+        Degrees of freedom of the Student-t distribution.
     """
-    if 3 * len(stops) <= n_values:
+    n = len(stops)
+    # Estimated values make the errors smaller.
+    n_free = max(3.0 * n - 0.5 * n_values, 0.5)
+    # Sum of the weights at convergence. Variances that use it from the start settle sooner:
+    # C. Liu, D. B. Rubin, Y. N. Wu, *Parameter expansion to accelerate EM*, Biometrika 85, 1998.
+    final_sum = ((degrees + 6.0) * n - 2.0 * n_free) / degrees
+    means = final_sum / weights.sum() * (weights @ squared) / n_free
+    if 3 * n <= n_values:
         places_m2 = stops.Ts_world_child[:, :3, 3].var(axis=0).sum() + _SMALLEST_VARIANCE
         means = means @ [0.5 / places_m2, 0.5] * np.array([places_m2, 1.0])
     return np.maximum(means, _SMALLEST_VARIANCE)
@@ -292,17 +312,11 @@ def _fit(
     n = len(stops)
     n_values = 6 * (len(Xs) + len(Zs))
     pairs = _pairs(stops, len(Xs))
-    # Estimated values make the errors smaller.
-    n_free = max(3.0 * n - 0.5 * n_values, 0.5)
-    # Sum of the weights at convergence. Variances that use it from the start settle sooner:
-    # C. Liu, D. B. Rubin, Y. N. Wu, *Parameter expansion to accelerate EM*, Biometrika 85, 1998.
-    final_sum = ((degrees + 6.0) * n - 2.0 * n_free) / degrees
     weights = rests
     for _ in range(_ROUNDS):
         errors, jacobian = _linearise(stops, Xs, Zs, in_world)
         squared = np.sum(errors.reshape(n, 2, 3) ** 2, axis=2)
-        means = final_sum / weights.sum() * (weights @ squared) / n_free
-        variances = _variances(means, stops, n_values)
+        variances = _variances(stops, squared, weights, n_values, degrees)
         distances = squared @ (1.0 / variances)
         weights = rests * student_weights(distances, degrees)
         whitening = np.sqrt(weights[:, None] * np.repeat(1.0 / variances, 3))

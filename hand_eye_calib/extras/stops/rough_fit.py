@@ -113,6 +113,8 @@ class RoughFit:
 
     Attributes
     ----------
+    mistakes : Mistakes
+        Undone before the fit.
     turning, placing : float
         Unexplained shares of the rotations and of the positions: median residual over spread.
     beyond : float
@@ -123,6 +125,7 @@ class RoughFit:
         Of the median residuals, up to a constant.
     """
 
+    mistakes: Mistakes
     turning: float
     placing: float
     beyond: float = 0.0
@@ -190,11 +193,12 @@ def rough_fit(poses: StopPoses, mistakes: Mistakes) -> RoughFit:
     # Rotations of few degrees are not judged: noise may be as large.
     turning = error_rad / max(*turns_rad, LEAST_TURN_RAD)
     if not poses.has_positions:
-        return RoughFit(turning, 0.0)
+        return RoughFit(mistakes, turning, 0.0)
     placing, error_m, scale = _fit_positions(A, B, Z)
     distance_m = (scale or 1.0) * median(np.linalg.norm(B[:, :3, 3], axis=1))
     logs = np.log(max(error_rad, _TINY)) + np.log(max(error_m, _TINY))
     return RoughFit(
+        mistakes=mistakes,
         turning=turning,
         placing=placing,
         beyond=error_m / max(error_rad * distance_m, _TINY),

@@ -161,12 +161,10 @@ def solve_checked(
 
 def _repaired(poses: StopPoses, config: CalibratorConfig) -> _Repaired:
     """Check stops, and repair what is certain and not set by the user."""
-    unit = config.given_scale
-    examination = examine(_in_metres(poses, config, unit))
-    if config.scale in ("auto", "estimate"):
-        # The unit of the child's lengths is a part of the scale that is estimated.
-        unit = _child_unit(examination)
-        examination = _without_child_unit(examination)
+    is_scale_free = config.scale in ("auto", "estimate")
+    examination = examine(_in_metres(poses, config, config.given_scale), is_scale_free)
+    # The unit of the child's lengths is a part of a scale that is estimated.
+    unit = config.given_scale * examination.child_unit
     findings, repairs = _with_user_options(examination, config)
     # The rough scale is that of lengths whose units are put right.
     is_whole = len(repairs) == len(examination.repairs)
@@ -188,25 +186,6 @@ def _in_metres(poses: StopPoses, config: CalibratorConfig, child_unit: float) ->
     return replace(
         poses, parent=scaled(parent, config.parent_scale), child=scaled(child, child_unit)
     )
-
-
-def _child_unit(examination: Examination) -> float:
-    """Return the factor to metres of the child's lengths; 1 if they are in metres."""
-    for issue in (*examination.findings, *examination.repairs):
-        if _is_child_unit(issue):
-            return float(issue.options["scale"])
-    return 1.0
-
-
-def _is_child_unit(issue: Finding) -> bool:
-    return {*issue.options} == {"scale"}
-
-
-def _without_child_unit(examination: Examination) -> Examination:
-    """Return the examination without the finding about the unit of the child's lengths."""
-    findings = tuple(issue for issue in examination.findings if not _is_child_unit(issue))
-    repairs = tuple(issue for issue in examination.repairs if not _is_child_unit(issue))
-    return replace(examination, findings=findings, repairs=repairs)
 
 
 def _with_user_options(
