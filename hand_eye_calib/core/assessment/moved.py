@@ -3,7 +3,7 @@
 A shift d of the extrinsic, ``X exp(d)``, has an estimate with covariance C: information ``H =
 C^-1``, score ``S = H d``. With shifts of covariance L expected, the log likelihood ratio of a shift
 against none is (a Gaussian form of the generalised likelihood ratio: M. Basseville, I. Nikiforov,
-*Detection of abrupt changes*, 1993, chapter 2)
+*Detection of abrupt changes*, 1993)
 
     1/2 S' (H + L^-1)^-1 S - 1/2 log|I + L H|.
 

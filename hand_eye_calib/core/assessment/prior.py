@@ -7,7 +7,7 @@ residuals r(X) of the prior in its standard deviations, the result minimises (Ga
 
 Only the prior determines a direction that the motion does not reveal. Without a prior, the
 translation along such a direction is set to zero, because the estimate is only noise, and the
-direction stays unknown. Reference: T. Barfoot, *State estimation for robotics*, 2017, section 7.3.
+direction stays unknown. Reference: T. Barfoot, *State estimation for robotics*, 2017.
 """
 
 from collections.abc import Mapping

@@ -8,7 +8,7 @@ stated sigma of 0.16 m.
 
 The test regresses the change of tilt about the level axes on the change of acceleration along them,
 over baselines of half a second: ``tilt = K acceleration + noise``. A large coefficient of
-determination means springs (T. D. Gillespie, *Fundamentals of vehicle dynamics*, 1992, chapter 5).
+determination means springs (T. D. Gillespie, *Fundamentals of vehicle dynamics*, 1992).
 """
 
 import numpy as np

@@ -8,7 +8,7 @@ d, the information H_k and the score S_k (:mod:`hand_eye_calib.core.assessment.m
 
 with the long-run variance f, by the real scatter of the scores over time. An alarm is raised if the
 largest ratio exceeds a threshold: the generalised likelihood ratio test of M. Basseville, I.
-Nikiforov, *Detection of abrupt changes*, 1993, section 2.4.
+Nikiforov, *Detection of abrupt changes*, 1993.
 
 The offset from the installed extrinsic before a shift comes from the uncertainty of the extrinsic
 and from the common-mode error of both odometries

@@ -9,7 +9,7 @@ Rotations and rates: the rotation vectors of the streams, in the parent sensor's
 ``y = (I + [phi]_x + S) x + noise``. The antisymmetric part [phi]_x corrects the extrinsic rotation.
 The symmetric part S is a fault: gains on its diagonal, misaligned axes off the diagonal (D.
 Tedaldi, A. Pretto, E. Menegatti, *A robust and easy to implement method for IMU calibration without
-external equipments*, 2014, eq. 5).
+external equipments*, 2014).
 """
 
 from collections.abc import Collection
