@@ -80,7 +80,7 @@ def checks():
         (raw("frozen"), True),
         (raw("coarse_positions"), True),
         (finding("units", "child", scale=0.001, sigma=0.0, unit="mm", other="parent"), False),
-        (finding("unrelated", text="at no clock offset"), False),
+        (finding("unrelated", doubt="at no clock offset"), False),
     ],
 )  # fmt: skip
 def test_what_only_raw_poses_show_stays_until_a_reset(checks, fault, stays):
