@@ -1,7 +1,7 @@
 """The verdict on a result, and the rules that lead to it.
 
-Each rule of :data:`RULES` looks at what is known of a result and gives reasons why it may not be
-used as it is. The gravest reason decides. docs/verdict.md has the same table; a test compares them.
+Each rule of :data:`RULES` examines a result and yields grounds against its use. The gravest rule
+that yields a ground decides. docs/verdict.md has the same table; a test compares both.
 """
 
 import math
@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property, partial
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 from hand_eye_calib.core.base.config import METHODS
 from hand_eye_calib.core.base.registry import EXTRA_RULES
-from hand_eye_calib.core.base.text import amount, amount_beside, axes_in_words, listing
+from hand_eye_calib.core.base.text import amount, amount_beside, axes_in_words, counted, listing
 from hand_eye_calib.core.results.parts import part
 from hand_eye_calib.core.results.records import (
     ROTATIONS,
@@ -42,6 +42,10 @@ class Verdict(str, Enum):
     DO_NOT_USE = "DO NOT USE"
 
 
+# Options of reasons that no option repairs.
+NO_OPTIONS: Mapping[str, float | str] = {}
+
+
 @dataclass(frozen=True)
 class Reason:
     """Why a result may not be used as it is.
@@ -51,16 +55,16 @@ class Reason:
     rule : str
         Name of the rule in :data:`RULES`, stable over versions.
     verdict : Verdict
-        What this reason alone leads to.
+        The verdict if there were no other reason.
     sentence : str
-        What was found, with its values.
+        The problem, with its values.
     what_to_do : str
     axes : tuple of str
-        x, y, z, roll, pitch, yaw; empty if it is about the whole result.
+        x, y, z, roll, pitch, yaw; empty if the reason concerns the whole result.
     options : mapping
-        Options that repair it, by their public names.
+        Options that repair the problem, by their public names.
     kind : {"physics", "suspicion"}
-        A limit of the motion, the recording or the sensors; or a sign that something is wrong.
+        A limit of the motion, the recording or the sensors; or a sign of a fault.
 
     Examples
     --------
@@ -79,39 +83,46 @@ class Reason:
 
     @property
     def is_finding(self) -> bool:
-        """Whether a stream check found it."""
+        """Whether the reason is a finding of a stream check."""
         return self.rule in ("error_finding", "warning_finding")
 
 
-_Found: TypeAlias = tuple[str, str, tuple[str, ...], Mapping[str, float | str]]
+class Ground(NamedTuple):
+    """What a rule yields: the fields of a reason that the rule itself does not set."""
+
+    sentence: str
+    what_to_do: str
+    axes: tuple[str, ...] = ()
+    options: Mapping[str, float | str] = NO_OPTIONS
 
 
 class Rule(NamedTuple):
-    """A row of the table of rules: what its reasons lead to, the condition in words, and
-    ``find(result)``, which gives sentence, what to do, axes and options of each reason.
-    """
+    """A row of the table of rules: its verdict, its condition in words, and ``find(result)``."""
 
     name: str
     verdict: Verdict
     when: str
-    find: "Callable[[Result], Iterator[_Found]]"
+    find: Callable[[Result], Iterator[Ground]]
 
 
-# Other answers contradict a result if they lie farther away than so many joint standard deviations
-# and than this share of the target; other references that are about as certain also if they scatter
-# by so many of its own standard deviations and so many targets: that they are uncertain themselves
-# does not excuse a large scatter. However far, they never forbid a result: they know less of the
-# noise than the method that gave it, and state no time-correlated errors.
+# Other answers contradict a result on an axis if their distance exceeds this number of joint
+# standard deviations and this share of the target. However large the distance is, other answers
+# never forbid a result: their methods contain less of the noise, and no time-correlated errors.
 CONTRADICTED_SIGMAS = 3.0
 CONTRADICTED_SHARE = 0.25
+
+# Answers that are about as certain as the result contradict it, too, if their scatter exceeds
+# CONTRADICTED_SIGMAS of the result's own standard deviations and this number of targets. Their own
+# uncertainty is no excuse for such a scatter.
 CONTRADICTED_TARGETS = 2.0
 
-# Smallest share of the motion pairs that are inliers in a recording whose noise is understood; of
-# the poses, for a method that models the noise and need not reject what is merely noisy.
+# Smallest share of inliers among the motion pairs of a recording without a fault.
 FEWEST_INLIERS = 0.7
+
+# The same among the poses, for a method that models the noise and rejects only outliers.
 FEWEST_OF_MODEL = 0.9
 
-# Rules that state a limit of the recording; the others are signs that something is wrong.
+# Rules that state a limit of the recording. Reasons of all others are suspicions.
 _KINDS = dict.fromkeys(
     ("nothing_known", "unobservable", "unconfirmed", "target", "floor", "part_of_poses"),
     "physics",
@@ -139,11 +150,12 @@ class Judged(Result):
         """Why the result may not be used as it is, the gravest first; empty if it may. The rules
         are :data:`hand_eye_calib.core.results.verdict.RULES`.
         """
-        return tuple(
-            Reason(rule.name, rule.verdict, *found, _KINDS.get(rule.name, "suspicion"))
-            for rule in RULES
-            for found in rule.find(self)
-        )
+        reasons = []
+        for rule in RULES:
+            kind = _KINDS.get(rule.name, "suspicion")
+            for ground in rule.find(self):
+                reasons.append(Reason(rule.name, rule.verdict, *ground, kind))
+        return tuple(reasons)
 
     @property
     def verdict(self) -> Verdict:
@@ -158,26 +170,34 @@ class Judged(Result):
     @property
     def headline(self) -> str:
         """The verdict with its gravest reason, or with what is known, in one line."""
-        decided = self.verdict.value
         gravest = shown(self.reasons)
+        notable = "".join(f"; {note}" for note in self._notes())
+        if not gravest:
+            return f"{self.verdict.value}: {what_is_known(self)}{notable}"
+        first = gravest[0]
+        if first.rule == "unobservable":
+            hidden = listing(first.axes)
+            it = hidden if len(first.axes) == 1 else "them"
+            text = f"all but {hidden}; measure {it} by hand"
+            if len(gravest) > 1:
+                text += f"; {gravest[1].sentence}"
+        elif [reason.rule for reason in gravest] == ["part_of_poses"]:
+            text = f"{what_is_known(self)}; {first.sentence}"
+        else:
+            text = first.sentence
+            if len(gravest) > 1:
+                text += f" (and {counted(len(gravest) - 1, 'more reason')})"
+            if all(reason.kind == "physics" for reason in self.reasons):
+                text += _NO_FAULT
+            if self.verdict is Verdict.DO_NOT_USE:
+                notable = ""
+        return f"{self.verdict.value}: {text}{notable}"
+
+    def _notes(self) -> list[str]:
+        """Notes for the headline, of extras and of findings that are no reasons."""
         notes = [part(name).headline(value) for name, value in self.parts.items()]
         notes += [finding.what for finding in self.findings if _is_notable(finding)]
-        notable = "".join(f"; {note}" for note in notes if note)
-        if not gravest:
-            return f"{decided}: {what_is_known(self)}{notable}"
-        if gravest[0].rule == "unobservable":
-            hidden = listing(gravest[0].axes)
-            it = hidden if len(gravest[0].axes) == 1 else "them"
-            also = "".join(f"; {each.sentence}" for each in gravest[1:2])
-            return f"{decided}: all but {hidden}; measure {it} by hand{also}{notable}"
-        if [reason.rule for reason in gravest] == ["part_of_poses"]:
-            return f"{decided}: {what_is_known(self)}; {gravest[0].sentence}{notable}"
-        note = "" if any(reason.kind == "suspicion" for reason in self.reasons) else _NO_FAULT
-        more = len(gravest) - 1
-        rest = f" (and {more} more reason{'s' * (more > 1)})" if more else ""
-        if self.verdict is Verdict.DO_NOT_USE:
-            notable = ""
-        return f"{decided}: {gravest[0].sentence}{rest}{note}{notable}"
+        return [note for note in notes if note]
 
 
 def _is_notable(finding: Finding) -> bool:
@@ -185,22 +205,21 @@ def _is_notable(finding: Finding) -> bool:
     return finding.code in ("model_scale", "outliers") and finding.severity is Severity.NOTE
 
 
-def shown(found: Sequence[Reason]) -> tuple[Reason, ...]:
-    """The reasons that a person has to read: under DO NOT USE those that lead to it, because the
-    others may be its consequences; otherwise all.
+def shown(reasons: Sequence[Reason]) -> tuple[Reason, ...]:
+    """Return the reasons that a person has to read.
+
+    Under DO NOT USE these are the reasons that lead to it: the others may be consequences.
     """
-    return tuple(each for each in found if each.verdict is found[0].verdict)
+    return tuple(reason for reason in reasons if reason.verdict is reasons[0].verdict)
 
 
 def what_is_known(result: Result) -> str:
-    """Axes, and the largest standard deviations of a translation and of a rotation, with the floor,
-    in words.
-    """
+    """Return the axes and the largest standard deviation of each part, in words."""
     axes = _axes(result)
     texts = []
     for names in (TRANSLATIONS, ROTATIONS):
-        if known := [axis for axis in axes if axis.name in names]:
-            worst = max(known, key=lambda axis: axis.total)
+        if axes_of_part := [axis for axis in axes if axis.name in names]:
+            worst = max(axes_of_part, key=lambda axis: axis.total)
             texts.append(amount(worst.name, worst.total))
     if not result.out_of_reach:
         known_to = " along and ".join(texts)
@@ -212,54 +231,61 @@ def what_is_known(result: Result) -> str:
 
 
 def target_of(axis: str, result: Result) -> float:
-    """The standard deviation (m or rad) that is good enough for an axis."""
-    of_kind = result.target_rotation if axis in ROTATIONS else result.target_translation
-    return float(result.target_axes.get(axis, of_kind))
+    """Return the standard deviation (m or rad) that is good enough for an axis."""
+    usual = result.target_rotation if axis in ROTATIONS else result.target_translation
+    return float(result.target_axes.get(axis, usual))
 
 
 # ---------------------------------------------------------------- the rules
 
 
-def _not_converged(result: Result) -> Iterator[_Found]:
-    # Poses that contradict each other have no solution; an error finding names the cause.
+def _not_converged(result: Result) -> Iterator[Ground]:
+    # An error finding names the cause if the poses contradict each other, and have no solution.
     if result.status is SolveStatus.NOT_CONVERGED and not has_error(result.findings):
-        yield "the solver did not converge", "record more varied motion", (), {}
+        yield Ground("the solver did not converge", "record more varied motion")
 
 
-def _contradicted(result: Result) -> Iterator[_Found]:
+def _contradicted(result: Result) -> Iterator[Ground]:
     if result.status is SolveStatus.CONTRADICTED:
-        far = result.contradictions
-        apart = [f"on {axis} is {far[axis]:.1f} standard deviations from" for axis in far]
-        which = f"the prior {listing(apart)}" if apart else "a prior contradicts"
-        names = listing([f"prior.{axis}" for axis in far]) or "the prior"
-        advice = f"check value, unit and sign of {names}"
-        yield f"{which} the estimate from the motion", advice, tuple(far), {}
+        distances = result.contradictions
+        which = "a prior contradicts"
+        names = "the prior"
+        if distances:
+            texts = [
+                f"on {axis} is {d:.1f} standard deviations from" for axis, d in distances.items()
+            ]
+            which = f"the prior {listing(texts)}"
+            names = listing([f"prior.{axis}" for axis in distances])
+        sentence = f"{which} the estimate from the motion"
+        yield Ground(sentence, f"check value, unit and sign of {names}", tuple(distances))
 
 
-def _nothing_known(result: Result) -> Iterator[_Found]:
+def _nothing_known(result: Result) -> Iterator[Ground]:
     if result.reference == "stops" and has_error(result.findings):
         # Stops that contradict each other determine nothing; an error finding names the cause.
         return
     if all(axis.is_hidden for axis in _axes(result)):
-        text = "nothing about the mounting can be determined from this motion"
-        yield text, "record motion with rotations about all axes", (), {}
+        yield Ground(
+            "nothing about the mounting can be determined from this motion",
+            "record motion with rotations about all axes",
+        )
     elif result.reference == "stops" and result.hidden:
-        text, advice, axes, _ = next(_hidden(result))
         is_flat = any(finding.code == "one_axis" for finding in result.findings)
         why = "do not turn about two axes" if is_flat else "turn too little for their errors"
-        text = text.replace("this motion", f"these stops, which {why}")
-        yield text, f"turn the hand about at least two axes between them, or {advice}", axes, {}
+        ground = _hidden_ground(result, f"these stops, which {why}")
+        advice = f"turn the hand about at least two axes between them, or {ground.what_to_do}"
+        yield ground._replace(what_to_do=advice)
 
 
-def _findings_of(severity: Severity, result: Result) -> Iterator[_Found]:
+def _findings_of(severity: Severity, result: Result) -> Iterator[Ground]:
     for finding in result.findings:
         if finding.severity is severity:
-            yield finding.what, finding.advice, (), finding.options
+            yield Ground(finding.what, finding.advice, options=finding.options)
 
 
-def _contradiction(kind: str, result: Result) -> Iterator[_Found]:
-    """Other answers (``kind``: halves or methods) that lie farther away than they may."""
-    told = {}
+def _contradiction(kind: str, result: Result) -> Iterator[Ground]:
+    """Yield the axes on which other answers (``kind``: halves or methods) are too far away."""
+    distances = {}
     sigmas = []
     for axis in _axes(result):
         row = (result.cross_check or {}).get(axis.name)
@@ -267,16 +293,18 @@ def _contradiction(kind: str, result: Result) -> Iterator[_Found]:
             continue
         scatter, is_far = _scatter_of(kind, row, axis)
         if is_far:
-            told[axis.name] = f"about {axes_in_words([axis.name])} by {amount(axis.name, scatter)}"
+            distances[axis.name] = (
+                f"about {axes_in_words([axis.name])} by {amount(axis.name, scatter)}"
+            )
             sigmas.append(f"+/- {amount(axis.name, axis.total)}")
-    if told:
+    if distances:
         who, advice = _OTHERS[kind]
-        differ = f"{who} disagree {listing([*told.values()])}"
-        yield f"{differ}; this result claims {listing(sigmas)}", advice, tuple(told), {}
+        disagree = f"{who} disagree {listing([*distances.values()])}"
+        yield Ground(f"{disagree}; this result claims {listing(sigmas)}", advice, tuple(distances))
 
 
 def _scatter_of(kind: str, row: AxisScatter, axis: "_Axis") -> tuple[float, bool]:
-    """Scatter of other answers (``kind``: halves or methods) on an axis, and if it is too large."""
+    """Return the scatter of other answers on an axis, and whether it is too large."""
     if kind == "halves":
         scatter = row.of_halves
         excess = row.excess_of_halves
@@ -286,7 +314,7 @@ def _scatter_of(kind: str, row: AxisScatter, axis: "_Axis") -> tuple[float, bool
         excess = row.excess_of_methods
         over_own = row.excess_over_own
     if scatter is None and over_own is not None:
-        # Too few answers determine the axis for a scatter, but those that do are about as certain.
+        # Too few answers have a scatter, but they are about as certain as the result.
         scatter = over_own * axis.total
     if scatter is None:
         return 0.0, False
@@ -297,7 +325,7 @@ def _scatter_of(kind: str, row: AxisScatter, axis: "_Axis") -> tuple[float, bool
     return scatter, is_far
 
 
-def _unconfirmed(result: Result) -> Iterator[_Found]:
+def _unconfirmed(result: Result) -> Iterator[Ground]:
     rows = result.cross_check or {}
     axes = [
         (axis.name, axis.total)
@@ -307,19 +335,26 @@ def _unconfirmed(result: Result) -> Iterator[_Found]:
     if axes:
         names = tuple(name for name, _ in axes)
         text = f"only the noise model determines {_amounts(axes, ' to ')}; no other method does"
-        yield text, f"compare {axes_in_words(names)} with a drawing or a tape measure", names, {}
+        advice = f"compare {axes_in_words(names)} with a drawing or a tape measure"
+        yield Ground(text, advice, names)
 
 
-def _hidden(result: Result) -> Iterator[_Found]:
+def _hidden(result: Result) -> Iterator[Ground]:
+    axes = _axes(result)
+    if 0 < sum(axis.is_hidden for axis in axes) < len(axes):
+        yield _hidden_ground(result, "this motion")
+
+
+def _hidden_ground(result: Result, source: str) -> Ground:
+    """Return the ground that a source of motion leaves axes open."""
     axes = tuple(axis.name for axis in _axes(result) if axis.is_hidden)
-    if 0 < len(axes) < len(_axes(result)):
-        priors = listing([f"prior.{axis} VALUE+/-SIGMA" for axis in axes])
-        it = "it" if len(axes) == 1 else "them"
-        text = f"{axes_in_words(axes)} cannot be determined from this motion"
-        yield text, f"measure {it} by hand and give {priors}", axes, {}
+    priors = listing([f"prior.{axis} VALUE+/-SIGMA" for axis in axes])
+    it = "it" if len(axes) == 1 else "them"
+    sentence = f"{axes_in_words(axes)} cannot be determined from {source}"
+    return Ground(sentence, f"measure {it} by hand and give {priors}", axes)
 
 
-def _few_inliers(result: Result) -> Iterator[_Found]:
+def _few_inliers(result: Result) -> Iterator[Ground]:
     if result.reference == "stops":
         # A finding has the numbers of the stops that were left out.
         return
@@ -327,64 +362,66 @@ def _few_inliers(result: Result) -> Iterator[_Found]:
     uses_reference = METHODS[result.method].uses_reference
     if share < (FEWEST_INLIERS if uses_reference else FEWEST_OF_MODEL):
         text = f"{1 - share:.0%} of the motion pairs were rejected as outliers"
-        yield text, "find out why the odometry jumps, and record again", (), {}
+        yield Ground(text, "find out why the odometry jumps, and record again")
 
 
-_OF_FLOOR = (
+_FLOOR_ADVICE = (
     "set the target that you need; if a stream has no such errors, such as motion capture, give "
     "parent_kind or child_kind exact"
 )
 
 
-def _amounts(axes: Iterable[tuple[str, float]], of: str = " ") -> str:
-    """Axes and their sizes, rotations as such: the table has angles about other axes."""
-    return listing([f"{axes_in_words([name])}{of}{amount(name, size)}" for name, size in axes])
+def _amounts(axes: Iterable[tuple[str, float]], between: str = " ") -> str:
+    """Return axes and their sizes in words."""
+    texts = [f"{axes_in_words([name])}{between}{amount(name, size)}" for name, size in axes]
+    return listing(texts)
 
 
-def _worse_than_target(result: Result) -> Iterator[_Found]:
+def _worse_than_target(result: Result) -> Iterator[Ground]:
     rough = [axis for axis in _axes(result) if axis.target < axis.sigma < math.inf]
-    if rough:
-        names = tuple(axis.name for axis in rough)
-        sizes = [amount_beside(axis.name, axis.total, axis.target) for axis in rough]
-        told = listing(
-            [
-                f"{axes_in_words([axis.name])} {size}"
-                for axis, size in zip(rough, sizes, strict=True)
-            ]
-        )
-        targets = listing([*dict.fromkeys(amount(axis.name, axis.target) for axis in rough)])
-        more = "more rotation about other axes" if {*names} & {*TRANSLATIONS} else "more rotation"
-        text = f"standard deviations above the target of {targets}: {told}"
-        floors = [(axis, math.sqrt(axis.total**2 - axis.sigma**2)) for axis in rough]
-        left = [(each.name, of) for each, of in floors if of > each.target]
-        advice = [f"record longer, with {more}"] if len(left) < len(rough) else []
-        if left:
-            advice.append(f"constant odometry errors alone leave {_amounts(left)}: {_OF_FLOOR}")
-        yield text, "; ".join(advice), names, {}
+    if not rough:
+        return
+    names = tuple(axis.name for axis in rough)
+    sizes = [f"{axes_in_words([axis.name])} {axis.beside_target()}" for axis in rough]
+    sentence = f"standard deviations above the target of {_targets(rough)}: {listing(sizes)}"
+    allowances = [(axis, math.sqrt(axis.total**2 - axis.sigma**2)) for axis in rough]
+    # A longer recording does not help where the allowance alone is above the target.
+    hopeless = [(axis.name, size) for axis, size in allowances if size > axis.target]
+    advice = []
+    if len(hopeless) < len(rough):
+        is_translation = bool({*names} & {*TRANSLATIONS})
+        more = "more rotation about other axes" if is_translation else "more rotation"
+        advice.append(f"record longer, with {more}")
+    if hopeless:
+        alone = f"constant odometry errors alone leave {_amounts(hopeless)}"
+        advice.append(f"{alone}: {_FLOOR_ADVICE}")
+    yield Ground(sentence, "; ".join(advice), names)
 
 
-def _floor(result: Result) -> Iterator[_Found]:
+def _floor(result: Result) -> Iterator[Ground]:
     rough = [axis for axis in _axes(result) if axis.sigma <= axis.target < axis.total]
-    if rough:
-        names = tuple(axis.name for axis in rough)
-        sizes = [amount_beside(axis.name, axis.total, axis.target) for axis in rough]
-        others = [
-            f"{axes_in_words([axis.name])} to {size}"
-            for axis, size in zip(rough[1:], sizes[1:], strict=True)
-        ]
-        good_to = listing([f"{axes_in_words(names[:1])} is good to {sizes[0]}", *others])
-        targets = [*dict.fromkeys(amount(axis.name, axis.target) for axis in rough)]
-        target_is = "the target is" if len(targets) == 1 else "the targets are"
-        share = "Most" if all(axis.total**2 > 2.0 * axis.sigma**2 for axis in rough) else "Part"
-        kind = "" if result.measured == "positions" else "odometry "
-        text = (
-            f"{good_to}; {target_is} {listing(targets)}. "
-            f"{share} of it is an allowance for constant {kind}errors"
-        )
-        yield text, _OF_FLOOR, names, {}
+    if not rough:
+        return
+    names = tuple(axis.name for axis in rough)
+    sizes = [f"{axes_in_words(names[:1])} is good to {rough[0].beside_target()}"]
+    sizes += [f"{axes_in_words([axis.name])} to {axis.beside_target()}" for axis in rough[1:]]
+    is_one = len({amount(axis.name, axis.target) for axis in rough}) == 1
+    target_is = "the target is" if is_one else "the targets are"
+    share = "Most" if all(axis.total**2 > 2.0 * axis.sigma**2 for axis in rough) else "Part"
+    errors = "constant errors" if result.measured == "positions" else "constant odometry errors"
+    sentence = (
+        f"{listing(sizes)}; {target_is} {_targets(rough)}. "
+        f"{share} of it is an allowance for {errors}"
+    )
+    yield Ground(sentence, _FLOOR_ADVICE, names)
 
 
-# What the checks of streams that are no poses cannot see, and what to do.
+def _targets(axes: Sequence["_Axis"]) -> str:
+    """Return the different targets of axes in words."""
+    return listing([*dict.fromkeys(amount(axis.name, axis.target) for axis in axes)])
+
+
+# Faults that no check of positions or rotations alone detects, and what to do.
 _UNSEEN = {
     "positions": (
         "delays and smoothing of positions cannot be seen",
@@ -397,15 +434,16 @@ _UNSEEN = {
 }
 
 
-def _part_of_poses(result: Result) -> Iterator[_Found]:
-    """Streams that are no poses, which have few checks."""
+def _part_of_poses(result: Result) -> Iterator[Ground]:
     if result.measured in _UNSEEN:
-        sentence, advice = _UNSEEN[result.measured]
-        yield sentence, advice, (), {}
+        yield Ground(*_UNSEEN[result.measured])
 
 
 class _Axis(NamedTuple):
-    """An axis within reach of the streams, its standard deviation without and with the floor."""
+    """An axis within reach of the streams.
+
+    ``sigma`` is the measured standard deviation (m or rad), ``total`` has the allowance, too.
+    """
 
     name: str
     sigma: float
@@ -413,6 +451,10 @@ class _Axis(NamedTuple):
     target: float
     is_hidden: bool
     is_known_by_hand: bool
+
+    def beside_target(self) -> str:
+        """Return the standard deviation with digits that tell it from the target."""
+        return amount_beside(self.name, self.total, self.target)
 
 
 def _axes(result: Result) -> list[_Axis]:
