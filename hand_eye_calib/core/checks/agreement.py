@@ -1,10 +1,11 @@
-"""Checks of two streams that agree, on one clock and in one unit of length: faults that leave
-little of the motion unexplained and yet spoil the extrinsic.
+"""Checks of two streams that agree, on one clock and in one unit of length.
+
+They detect faults that explain little of the motion and yet bias the extrinsic.
 """
 
 from collections.abc import Callable, Iterator
-from functools import partial
-from typing import TypeAlias
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -23,94 +24,100 @@ from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
 #: X (4, 4) and its standard deviations (6,), (rho, phi).
 Known: TypeAlias = tuple[FloatArray, FloatArray]
 
-# The share of the squared residuals that something explains, and its finding if it is significant.
+# Share of the squared residuals that a fault explains, and its finding if it is significant.
 Suspect: TypeAlias = tuple[float, Finding | None]
 
 _STREAMS = ("child", "parent")
 
-# How many times a fault of the response must exceed what noise of its columns may make of it.
+# Factor by which a fault of the response must exceed the bias that noise of its columns may cause.
 BIASES = 2.0
 
-# An odometry may drift along one axis by this share of the distance: on a flat floor that alone
-# is its motion along z, and the other stream knows nothing of it.
+# Drift of an odometry along one axis, as a share of the distance. On a flat floor this drift is
+# the whole motion along z, and the other stream does not contain it.
 _DRIFT = 0.02
 
-# Two frames are one if they are this close (m, rad), within so many standard deviations; that of
-# the rotation must not be larger than the third.
+# Two frames are one frame if their distance is below this (m) or within its noise.
 _SAME_M = 0.005
+# Largest angle (rad) of axes that are parallel, unless its noise is larger.
 SAME_RAD = float(np.radians(0.3))
+# Largest standard deviation of the rotation (rad) with which frames are compared.
 MAX_SIGMA_RAD = float(np.radians(0.5))
+# Standard deviations within which a distance or an angle may be zero.
 _WITHIN = 3.0
 
-# Upper bounds of the lever arm (m; two standard deviations above its length). Hardly two sensors
-# fit closer than the second, or, with axes that are parallel by no accident, than the third; of
-# other orientations, none are closer than the first.
+# Upper bounds of a lever arm (m), two standard deviations above its length. No two sensors with
+# different orientations are closer than this:
 _SAME_POSITION_M = 0.002
+# Hardly two sensors are mounted closer than this:
 _NEARLY_M = 0.012
+# The same if their axes are parallel, which is no accident:
 _PARALLEL_M = 0.03
 
-# A recording is split at these shares of its poses. A part is sound if its own rotation leaves
-# less than the first share of its rotations. It has other axes if the rotation of the other part
-# leaves more than the second.
+# A recording is split at these shares of its poses.
 _SPLITS = (0.5, 0.25, 0.75)
+# A part of it is sound if its own rotation leaves less than this share of its rotations.
 _SOUND_PART = 0.25
+# The part has other axes if the rotation of the other part leaves more than this share.
 _OTHER_PART = 0.5
 
-# An axis whose root mean square rotation is below this share of the main axis's has no gain.
+# Fewest rotation about an axis, root mean square, relative to the main axis, for which a gain is
+# estimated.
 _LITTLE = 0.1
 
-# Smallest factor of a coordinate whose inverse is stated: less is noise.
+# Smallest factor of a coordinate whose inverse is stated. Smaller ones are noise.
 _LEAST_FACTOR = 1e-3
 
-# A coordinate explains why streams disagree if it takes away this share of the squared residuals;
-# with less than the second it may be jumps of a clean recording, and is no error.
+# A coordinate explains why streams disagree if it removes this share of the squared residuals.
 _MOST = 0.3
+# Below this share jumps of a clean recording may be the cause, and the finding is no error.
 _SOME = 0.1
 
-# Delays and smoothing are looked for in motions over this time (s), so many at most. Vehicles whose
-# streams are as they should be are off by some milliseconds: a delay counts from the second line on
-# (s), and is an error from so many times that; the offset of the clocks is shown by so much of the
-# evidence. Smallest smoothing (s^2); that of interpolation is a share of the squared interval.
+# Duration (s) and largest number of motions in which delays and smoothing are estimated.
 SHORT_S = 1.0
 MOST_SHORT = 6000
+# Smallest delay (s): streams of vehicles without faults differ by some milliseconds.
 _DELAY_S = 2.5 * FLOOR_TRAVEL_S
+# A delay is an error from this multiple of the smallest one on.
 _GRAVE = 2.0
+# Share of the significance that a delay needs if it equals the clock offset.
 _EXPECTED = 2.0 / 3.0
-# A delay above this time (s) and so many standard deviations is an error whatever explains it, if
-# its shift is; or with this shift (m) and this share of the evidence. The largest delays in 81
-# clean recordings are 33 ms, 38 mm and a share of 0.06 (EuRoC).
+# A delay is an error, whatever explains it, above this time (s) and this many standard deviations,
+# if its shift is an error or exceeds this distance (m) and this share of the evidence. The largest
+# delays in 81 clean recordings are 33 ms, 38 mm and a share of 0.06 (EuRoC).
 _PLAIN_S = 0.04
 _PLAIN_SIGMAS = 8.0
 _PLAIN_SHIFT_M = 0.02
 _PLAIN_SHARE = 0.35
-# Of the size from which on a finding is an error: just above.
+# Factor that lifts a size just above the limit of an error.
 _ERROR = 1.001
 
+# Smallest smoothing (s^2) of each part of the poses.
 _SMOOTHING_S2 = {"positions": 0.003, "orientations": 0.002}
+# Smoothing by interpolation, as a share of the squared interval between poses.
 _OF_INTERVAL = 0.25
 
 
 def check_agreement(
     pose_pairs: PosePairs, motions: MotionPairs, X: FloatArray, known: Known, offset_s: float
 ) -> list[Finding]:
-    """Findings about two streams that agree.
+    """Return the finding about two streams that agree, or none.
 
-    One fault shows in several groups of columns: the one that explains most is it, or none if that
-    is not significant. Odometries drift against each other, and a drift looks a little like a shift
-    of the mount, worlds that are turned or a scale by axis.
+    One fault affects several groups of columns. The group that explains most names the fault, if
+    it is significant. Odometries drift against each other, and a drift resembles a shift of the
+    mount, worlds that are turned, or a scale of one axis.
 
     Parameters
     ----------
     pose_pairs : PosePairs
-        On one clock, in one unit of length.
+        Poses on one clock, in one unit of length.
     motions : MotionPairs
-        Over some seconds.
+        Motions over some seconds.
     X : (4, 4) array
-        By a fit to these motions.
+        Extrinsic fitted to these motions.
     known : ((4, 4) array, (6,) array)
-        X as well as it is known, and its standard deviations.
+        Best estimate of X, and its standard deviations.
     offset_s : float
-        By which the clocks differed, by the orientations.
+        Clock offset that the orientations have shown, s.
     """
     if same := check_same(*known):
         return same
@@ -120,38 +127,52 @@ def check_agreement(
     tried: dict[str, Callable[[], Finding | None]] = {
         "drift": lambda: _world_drift(slow, pose_pairs, speed),
         "gain": lambda: rotation_gain(slow, axes),
-        **{f"turned_{each}": partial(_turned, slow, each) for each in (*_STREAMS, "both")},
-        **{f"axes_{each}": partial(axis_gain, slow, each) for each in _STREAMS},
+        "turned_child": lambda: _turned(slow, "child"),
+        "turned_parent": lambda: _turned(slow, "parent"),
+        "turned_both": lambda: _turned(slow, "both"),
+        "axes_child": lambda: axis_gain(slow, "child"),
+        "axes_parent": lambda: axis_gain(slow, "parent"),
     }
     if change:
         tried["moved"] = lambda: moved_mount(change, int(pose_pairs.stamps_ns[0]))
-    most = max(tried, key=slow.share)
-    # Streams that are turned explain about the same: one of them may be significant.
-    alike = [each for each in tried if each[:6] == most[:6] == "turned"] or [most]
-    suspects: list[Suspect] = [(slow.share(each), tried[each]()) for each in alike]
+    groups = [max(tried, key=slow.share)]
+    if groups[0].startswith("turned"):
+        # Streams that are turned explain about the same: any of them may be significant.
+        groups = ["turned_child", "turned_parent", "turned_both"]
+    suspects: list[Suspect] = [(slow.share(group), tried[group]()) for group in groups]
     motions = pairs_over(pose_pairs, SHORT_S, MOST_SHORT)
     if fast := delays(pose_pairs, motions, X):
         suspects += delay_suspects(fast, pose_pairs, speed, offset_s)
         interval_s = median(np.diff(pose_pairs.stamps_ns)) * 1e-9
         suspects += smoothing_suspects(fast, interval_s, speed)
-    found = [(share, each) for share, each in suspects if each and share > 0.0]
-    return [max(found, key=lambda each: each[0])[1]] if found else []
+    largest_share = 0.0
+    findings: list[Finding] = []
+    for share, suspect in suspects:
+        if suspect and share > largest_share:
+            largest_share = share
+            findings = [suspect]
+    return findings
 
 
 def check_coordinates(pose_pairs: PosePairs, motions: MotionPairs) -> list[Finding]:
-    """Finding about a coordinate that explains why two streams with the same rotations disagree."""
+    """Return the finding about a coordinate that explains why two streams disagree, or none.
+
+    Both streams have the same rotations.
+    """
     X = se3.from_rotation_translation(align_rotation_vectors(motions), np.zeros(3))
     slow, _ = response(pose_pairs, motions, X)
-    stream = max(_STREAMS, key=lambda each: slow.share(f"axes_{each}"))
-    is_most = slow.share(f"axes_{stream}") > _MOST
-    return [*filter(None, [axis_gain(slow, stream)])] if is_most else []
+    stream = max(_STREAMS, key=lambda name: slow.share(f"axes_{name}"))
+    if slow.share(f"axes_{stream}") <= _MOST:
+        return []
+    gain = axis_gain(slow, stream)
+    return [gain] if gain else []
 
 
 def check_parts(pose_pairs: PosePairs) -> list[Finding]:
-    """Finding about parts of a recording that agree, each by itself, on different rotations.
+    """Return the finding about parts of a recording whose extrinsic rotations differ, or none.
 
     A stream that starts anew with other axes leaves two sound parts. The noise model follows one
-    of them, and takes the other for outliers.
+    of them and rejects the other as outliers.
     """
     motions = pairs_over(pose_pairs, SHORT_S, MOST_SHORT)
     angles = se3.rotation_angle(motions.Ts_parenti_parentj[:, :3, :3])
@@ -166,9 +187,9 @@ def check_parts(pose_pairs: PosePairs) -> list[Finding]:
             for part in parts
         ]
         shares = np.array([[_unexplained(part, X) for X in own] for part in parts])
-        is_sound = shares.diagonal().max() < _SOUND_PART
-        is_apart = shares[[0, 1], [1, 0]].min() > max(_OTHER_PART, 3.0 * shares.diagonal().max())
-        if is_sound and is_apart:
+        of_own = shares.diagonal().max()
+        of_other = min(shares[0, 1], shares[1, 0])
+        if of_own < _SOUND_PART and of_other > max(_OTHER_PART, 3.0 * of_own):
             turned_rad = float(se3.rotation_angle(own[0][:3, :3].T @ own[1][:3, :3]))
             at_s = float(pose_pairs.stamps_ns[split] - pose_pairs.stamps_ns[0]) * 1e-9
             size = angle(turned_rad)
@@ -177,15 +198,22 @@ def check_parts(pose_pairs: PosePairs) -> list[Finding]:
 
 
 def _unexplained(motions: MotionPairs, X: FloatArray) -> float:
-    """Share of the rotations that an extrinsic does not explain; those of the upper quarter."""
-    turned = se3.rotation_angle(motions.Ts_parenti_parentj[:, :3, :3])
-    most = turned >= quantile(turned, 0.75)
-    remaining = np.linalg.norm(motions.residuals(X)[1], axis=1)
-    return median(remaining[most]) / max(median(turned[most]), 1e-12)
+    """Return the share that an extrinsic X (4, 4) does not explain of the largest rotations.
+
+    The largest rotations are the upper quarter.
+    """
+    angles = se3.rotation_angle(motions.Ts_parenti_parentj[:, :3, :3])
+    are_large = angles >= quantile(angles, 0.75)
+    _, residuals = motions.residuals(X)
+    remaining = np.linalg.norm(residuals[are_large], axis=1)
+    return median(remaining) / max(median(angles[are_large]), 1e-12)
 
 
 def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
-    """Finding about an extrinsic, or a translation, of zero."""
+    """Return the finding about an extrinsic (4, 4), or its translation, of zero, or none.
+
+    ``sigmas`` (6,) are its standard deviations, m and rad.
+    """
     distance_m = float(np.linalg.norm(T_parent_child[:3, 3]))
     sigma_m = float(sigmas[:3].max())
     upper_m = distance_m + 2 * sigma_m
@@ -208,7 +236,17 @@ def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
 
 
 def rotation_gain(slow: Regression, axes: FloatArray, inverse: bool = False) -> Finding | None:
-    """A gain of the child's rotations about an axis; ``inverse`` if the parent's are fitted."""
+    """Return the finding about a gain of the child's rotations about an axis, or None.
+
+    Parameters
+    ----------
+    slow : Regression
+        Regression with the columns "gain".
+    axes : (3, 3) array
+        Axes of the gains in the parent sensor's frame, one a column.
+    inverse : bool
+        Whether the gains are those of the parent's rotations.
+    """
     gains, sigmas = slow.fit("gain")
     biases = slow.biases("gain")
     limits = LIMITS["rotation_gain"]
@@ -225,7 +263,7 @@ def rotation_gain(slow: Regression, axes: FloatArray, inverse: bool = False) -> 
 
 
 def _turned(slow: Regression, stream: str) -> Finding | None:
-    """Positions of a stream that are turned against its orientations."""
+    """Return the finding about positions turned against the orientations of a stream, or None."""
     turns, sigmas = slow.fit(f"turned_{stream}")
     sizes = np.abs(turns)
     limits = LIMITS["worlds_turned"]
@@ -237,121 +275,247 @@ def _turned(slow: Regression, stream: str) -> Finding | None:
     return graded("worlds_turned", stream, turned_rad, **values)
 
 
-def _odd_one(values: FloatArray, sigmas: FloatArray) -> tuple[int, float, float]:
-    """The index of the value that differs most from the others, of three that should be one; by how
-    much, and the standard deviation of that.
-    """
-    best = (0, 0.0, 1.0)
+class _Deviation(NamedTuple):
+    """Deviation of the value on one of three axes from the mean of the others."""
+
+    axis: int
+    size: float
+    sigma: float
+
+
+def _largest_deviation(values: FloatArray, sigmas: FloatArray) -> _Deviation:
+    """Return the most significant deviation among three values (3,) that should be equal."""
+    largest = _Deviation(0, 0.0, 1.0)
     weights = 1.0 / np.maximum(sigmas, 1e-9) ** 2
-    for k in range(3):
-        rest = np.arange(3) != k
-        mean = float(weights[rest] @ values[rest] / weights[rest].sum())
-        sigma = float(np.hypot(sigmas[k], 1.0 / np.sqrt(weights[rest].sum())))
-        off = float(values[k]) - mean
-        if abs(off) / sigma > abs(best[1]) / best[2]:
-            best = k, off, sigma
-    return best
+    for axis in range(3):
+        others = np.arange(3) != axis
+        total_weight = weights[others].sum()
+        mean = float(weights[others] @ values[others] / total_weight)
+        sigma = float(np.hypot(sigmas[axis], 1.0 / np.sqrt(total_weight)))
+        deviation = _Deviation(axis, float(values[axis]) - mean, sigma)
+        if abs(deviation.size) / sigma > abs(largest.size) / largest.sigma:
+            largest = deviation
+    return largest
 
 
 def axis_gain(slow: Regression, columns_of: str, stream: str = "") -> Finding | None:
-    """A coordinate of a stream that has another scale than the others.
+    """Return the finding about a coordinate with another scale than the others, or None.
 
-    The finding names the stream that the columns are of, or ``stream``, which then has the
-    inverse factor.
+    Parameters
+    ----------
+    slow : Regression
+    columns_of : str
+        The stream ("parent" or "child") whose coordinates the columns scale.
+    stream : str
+        The stream that the finding names, if it is the other one. Its factor is the inverse.
     """
     group = f"axes_{columns_of}"
-    is_inverse = stream not in ("", columns_of)
-    k, off, sigma = _odd_one(*slow.fit(group))
-    of_noise = slow.biases(group)[k]
+    gain = _largest_deviation(*slow.fit(group))
+    of_noise = slow.biases(group)[gain.axis]
     of_drift = _DRIFT**2 * of_noise / slow.biases("scale")[0]
-    if abs(off) < BIASES * (of_noise + of_drift):
+    if abs(gain.size) < BIASES * (of_noise + of_drift):
         return None
-    size = off if slow.share(group) > _SOME else min(abs(off), LIMITS["axis_scale"].error)
-    factor = 1.0 / max(1.0 + off, _LEAST_FACTOR) if is_inverse else 1.0 + off
-    values = {"axis": "xyz"[k], "factor": factor, "sigma": sigma}
-    return graded("axis_scale", stream or columns_of, size, sigma, **values)
+    size = gain.size
+    if slow.share(group) <= _SOME:
+        size = min(abs(size), LIMITS["axis_scale"].error)
+    factor = 1.0 + gain.size
+    if stream not in ("", columns_of):
+        factor = 1.0 / max(factor, _LEAST_FACTOR)
+    values = {"axis": "xyz"[gain.axis], "factor": factor, "sigma": gain.sigma}
+    return graded("axis_scale", stream or columns_of, size, gain.sigma, **values)
 
 
 def moved_mount(change: MountChange, start_ns: int) -> Finding | None:
-    """A mount that has moved."""
-    sigmas = np.sqrt(np.diag(change.covariance))
-    known = np.where(np.abs(change.xi) > 2.0 * sigmas, change.xi, 0.0)
-    moved_m, moved_rad = (float(np.linalg.norm(part)) for part in np.split(known, 2))
+    """Return the finding about a mount that has moved, or None if the change is not significant.
+
+    ``start_ns`` is the first stamp of the recording.
+    """
     if change.log_ratio < SIGNIFICANT:
         return None
-    most = LIMITS["mount_moved"].error if change.log_ratio < 2.0 * SIGNIFICANT else np.inf
-    told = listing([length(moved_m)] * (moved_m > 0) + [angle(moved_rad)] * (moved_rad > 0))
-    values = {"size": told, "at_s": (change.at_ns - start_ns) * 1e-9}
-    return graded("mount_moved", "both", min(max(moved_m, moved_rad), most), **values)
+    sigmas = np.sqrt(np.diag(change.covariance))
+    significant = np.where(np.abs(change.xi) > 2.0 * sigmas, change.xi, 0.0)
+    moved_m = float(np.linalg.norm(significant[:3]))
+    moved_rad = float(np.linalg.norm(significant[3:]))
+    size = max(moved_m, moved_rad)
+    if change.log_ratio < 2.0 * SIGNIFICANT:
+        size = min(size, LIMITS["mount_moved"].error)
+    sizes = []
+    if moved_m > 0:
+        sizes.append(length(moved_m))
+    if moved_rad > 0:
+        sizes.append(angle(moved_rad))
+    at_s = (change.at_ns - start_ns) * 1e-9
+    return graded("mount_moved", "both", size, size=listing(sizes), at_s=at_s)
 
 
-def _world_drift(slow: Regression, pose_pairs: PosePairs, usual: float) -> Finding | None:
-    """A world that moves against the other."""
+def _world_drift(slow: Regression, pose_pairs: PosePairs, speed_m_s: float) -> Finding | None:
+    """Return the finding about a world that moves against the other, or None.
+
+    ``speed_m_s`` is the usual speed of the sensors.
+    """
     drift, sigmas = slow.fit("drift")
+    if (np.abs(drift) < LIMITS["world_drift"].sigmas * sigmas).all():
+        return None
     positions = pose_pairs.Ts_cw_c[:, :3, 3]
     turning = np.cross(drift[3:], positions - positions.mean(axis=0))
     moving = np.sqrt(((drift[:3] + turning) ** 2).sum(axis=1).mean())
-    share = float(moving) / max(usual, 1e-9)
-    if (np.abs(drift) < LIMITS["world_drift"].sigmas * sigmas).all():
-        return None
-    speed, rate = (60 * float(np.linalg.norm(part)) for part in np.split(drift, 2))
-    values = {"deg_per_minute": float(np.degrees(rate)), "m_per_minute": speed}
-    return graded("world_drift", "both", share, **values, percent=100 * share)
+    share = float(moving) / max(speed_m_s, 1e-9)
+    rad_per_minute = 60 * float(np.linalg.norm(drift[3:]))
+    values = {
+        "deg_per_minute": float(np.degrees(rad_per_minute)),
+        "m_per_minute": 60 * float(np.linalg.norm(drift[:3])),
+        "percent": 100 * share,
+    }
+    return graded("world_drift", "both", share, **values)
+
+
+@dataclass(frozen=True)
+class _Delay:
+    """Delay of some coordinates of a stream against the others.
+
+    Attributes
+    ----------
+    code : str
+        Code of the finding.
+    part, others : str
+        The coordinates that are late, and those that are not, in words.
+    size_s, sigma_s : float
+        Delay and its standard deviation, s.
+    speed_m_s : float
+        Usual speed along these coordinates.
+    share : float
+        Share of the squared residuals that the delay explains.
+    """
+
+    code: str
+    part: str
+    others: str
+    size_s: float
+    sigma_s: float
+    speed_m_s: float
+    share: float
+
+    def finding(self, stream: str, offset_s: float) -> Finding | None:
+        """Return the finding, or None if the delay is too small.
+
+        Weaker evidence suffices if the delay equals the clock offset ``offset_s`` (s).
+        """
+        shift_m = self.size_s * self.speed_m_s
+        size_m = shift_m
+        sigma_m = self.sigma_s * self.speed_m_s
+        is_expected = abs(self.size_s / abs(offset_s or 1.0) - 1.0) < 1.0 - _EXPECTED
+        if is_expected:
+            sigma_m *= _EXPECTED
+        error_m = LIMITS["late"].error
+        if self._is_clear(shift_m):
+            size_m = max(shift_m, _ERROR * error_m)
+        elif is_expected or self.size_s < _GRAVE * _DELAY_S or self.share < _SOME:
+            # No error: the shift and its noise are scaled to the limit of errors.
+            factor = min(1.0, error_m / max(shift_m, 1e-9))
+            size_m = factor * shift_m
+            sigma_m = factor * sigma_m
+        values = {
+            "delay_s": self.size_s,
+            "sigma_s": self.sigma_s,
+            "shift_m": shift_m,
+            "code": self.code,
+            "part": self.part,
+            "others": self.others,
+        }
+        return graded("late", stream, size_m, sigma_m, **values)
+
+    def _is_clear(self, shift_m: float) -> bool:
+        """Return whether the delay is an error whatever may explain it."""
+        if self.size_s <= max(_PLAIN_S, _PLAIN_SIGMAS * self.sigma_s):
+            return False
+        return shift_m > LIMITS["late"].error or (
+            shift_m > _PLAIN_SHIFT_M and self.share > _PLAIN_SHARE
+        )
 
 
 def delay_suspects(
-    fast: Regression, pairs: PosePairs, speed: float, offset_s: float
+    fast: Regression, pairs: PosePairs, speed_m_s: float, offset_s: float
 ) -> Iterator[Suspect]:
-    """Positions that are late, or early, against orientations of their stream: all, or those along
-    one axis of its world. Less evidence does for positions that do not share the offset of clocks.
+    """Yield suspects for positions with a delay against the orientations of their stream.
+
+    The delay is that of all positions, or of those along one axis of the stream's world.
+
+    Parameters
+    ----------
+    fast : Regression
+        Regression with the columns of delays.
+    pairs : PosePairs
+    speed_m_s : float
+        Usual speed of the sensors.
+    offset_s : float
+        Clock offset between the streams.
     """
-    for stream, Ts in zip(_STREAMS, (pairs.Ts_cw_c, pairs.Ts_pw_p), strict=True):
-        beside = [f"{part}_{stream}" for part in _SMOOTHING_S2]
-        groups = f"late_{stream}", f"late_axes_{stream}"
-        delays_s, sigmas_s = fast.fit(groups[0], *beside)
-        k, off_s, off_sigma_s = _odd_one(*fast.fit(groups[1], *beside))
+    for stream, poses in (("child", pairs.Ts_cw_c), ("parent", pairs.Ts_pw_p)):
+        smoothing = [f"{part}_{stream}" for part in _SMOOTHING_S2]
+        of_all = f"late_{stream}"
+        of_axes = f"late_axes_{stream}"
+        delays_s, sigmas_s = fast.fit(of_all, *smoothing)
         delay_s = float(delays_s[0])
-        along = usual_speed(pairs.stamps_ns, Ts[:, [k], 3])
-        parts = ("positions", "orientations")[:: 1 if delay_s > 0 else -1]
-        of_axis = (f"{'xyz'[k]} coordinates", "others")
-        for group, late_s, sigma_s, speed_m_s, code, (part, others) in (
-            (groups[0], abs(delay_s), sigmas_s[0], speed, "position_clock", parts),
-            # The other stream's coordinate cannot be early.
-            (groups[1], off_s, off_sigma_s, along, "axis_lag", of_axis),
-        ):
-            if late_s > _DELAY_S:
-                share = fast.share(group, *beside)
-                shift_m = late_s * speed_m_s
-                sigma_m = sigma_s * speed_m_s
-                values = {"delay_s": late_s, "sigma_s": sigma_s, "shift_m": shift_m, "code": code}
-                if is_expected := abs(late_s / abs(offset_s or 1.0) - 1.0) < 1.0 - _EXPECTED:
-                    sigma_m *= _EXPECTED
-                is_plain = late_s > max(_PLAIN_S, _PLAIN_SIGMAS * sigma_s) and (
-                    shift_m > LIMITS["late"].error
-                    or (shift_m > _PLAIN_SHIFT_M and share > _PLAIN_SHARE)
-                )
-                if is_plain:
-                    shift_m = max(shift_m, _ERROR * LIMITS["late"].error)
-                elif is_expected or late_s < _GRAVE * _DELAY_S or share < _SOME:
-                    least = min(1.0, LIMITS["late"].error / max(shift_m, 1e-9))
-                    shift_m = least * shift_m
-                    sigma_m = least * sigma_m
-                values |= {"part": part, "others": others}
-                yield share, graded("late", stream, shift_m, sigma_m, **values)
+        late = _Delay(
+            code="position_clock",
+            part="positions" if delay_s > 0 else "orientations",
+            others="orientations" if delay_s > 0 else "positions",
+            size_s=abs(delay_s),
+            sigma_s=sigmas_s[0],
+            speed_m_s=speed_m_s,
+            share=fast.share(of_all, *smoothing),
+        )
+        # The other stream's coordinate cannot be early: negative delays are skipped.
+        deviation = _largest_deviation(*fast.fit(of_axes, *smoothing))
+        late_axis = _Delay(
+            code="axis_lag",
+            part=f"{'xyz'[deviation.axis]} coordinates",
+            others="others",
+            size_s=deviation.size,
+            sigma_s=deviation.sigma,
+            speed_m_s=usual_speed(pairs.stamps_ns, poses[:, [deviation.axis], 3]),
+            share=fast.share(of_axes, *smoothing),
+        )
+        for delay in (late, late_axis):
+            if delay.size_s > _DELAY_S:
+                yield delay.share, delay.finding(stream, offset_s)
 
 
-def smoothing_suspects(fast: Regression, interval_s: float, speed: float) -> Iterator[Suspect]:
-    """Smoothing of one part of the poses: an error by what it displaces, a warning by what its time
-    is at this speed. Poses are ``interval_s`` apart.
+def smoothing_suspects(fast: Regression, interval_s: float, speed_m_s: float) -> Iterator[Suspect]:
+    """Yield suspects for one part of the poses that is smoothed.
+
+    A smoothing is an error by the distance that it displaces poses, and a warning by its time at
+    the usual speed.
+
+    Parameters
+    ----------
+    fast : Regression
+        Regression with the columns of smoothing.
+    interval_s : float
+        Interval between poses.
+    speed_m_s : float
+        Usual speed of the sensors.
     """
-    more_s2 = _OF_INTERVAL * interval_s**2
-    for part, least_s2 in _SMOOTHING_S2.items():
+    of_interpolation_s2 = _OF_INTERVAL * interval_s**2
+    limits = LIMITS["smoothed"]
+    for part, smallest_s2 in _SMOOTHING_S2.items():
         for stream in _STREAMS:
-            groups = f"{part}_{stream}", f"late_{stream}"
-            value_s2, sigma_s2 = (float(each[0]) for each in fast.fit(*groups))
-            if value_s2 >= max(least_s2 + more_s2, LIMITS["smoothed"].sigmas * sigma_s2):
-                smoothing_s = value_s2**0.5
-                displaced_m = value_s2 * float(fast.displaced(groups[0])[0])
-                shift_m = max(displaced_m, min(smoothing_s * speed, LIMITS["smoothed"].error))
-                values = {"part": part, "smoothing_s": smoothing_s, "shift_m": displaced_m}
-                yield fast.share(*groups), graded("smoothed", stream, shift_m, **values)
+            group = f"{part}_{stream}"
+            delay = f"late_{stream}"
+            values, sigmas = fast.fit(group, delay)
+            smoothing_s2 = float(values[0])
+            noise_s2 = limits.sigmas * float(sigmas[0])
+            if smoothing_s2 < max(smallest_s2 + of_interpolation_s2, noise_s2):
+                continue
+            smoothing_s = smoothing_s2**0.5
+            displaced_m = smoothing_s2 * float(fast.displaced(group)[0])
+            shift_m = max(displaced_m, min(smoothing_s * speed_m_s, limits.error))
+            smoothed = graded(
+                "smoothed",
+                stream,
+                shift_m,
+                part=part,
+                smoothing_s=smoothing_s,
+                shift_m=displaced_m,
+            )
+            yield fast.share(group, delay), smoothed
