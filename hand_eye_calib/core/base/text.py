@@ -74,10 +74,13 @@ def capital(text: str) -> str:
 
 
 def axes_in_words(axes: Sequence[str]) -> str:
-    """Axes as in "x and the rotation about z" for x and yaw."""
+    """Name axes as in "x and the rotation about z" for x and yaw."""
+    names = [axis for axis in axes if axis not in _ABOUT]
     about = [_ABOUT[axis] for axis in axes if axis in _ABOUT]
-    rotations = [f"the rotation{'s' * (len(about) > 1)} about {listing(about)}"] if about else []
-    return listing([*(axis for axis in axes if axis not in _ABOUT), *rotations])
+    if about:
+        rotations = "rotation" if len(about) == 1 else "rotations"
+        names.append(f"the {rotations} about {listing(about)}")
+    return listing(names)
 
 
 def two_digits(value: float) -> str:

@@ -297,14 +297,18 @@ _USUAL = [
 
 
 def _axes() -> Iterator[Hypothesis]:
-    """All permutations and flips of the axes of the positions, except the mirror of all three. On
-    flat ground some of them are the same as an inverted orientation.
+    """Yield all permutations and flips of the axes of the positions, but not the mirror of all.
+
+    On flat ground some of them are the same as an inverted orientation.
     """
     flips = itertools.product((1, -1), repeat=3)
     for order, signs in itertools.product(itertools.permutations(range(3)), flips):
         matrix = np.diag(signs) @ np.eye(3)[list(order)]
-        parts = zip(order, signs, strict=True)
-        detail = " ".join(f"{'-' * (sign < 0)}{'xyz'[k]}" for k, sign in parts)
+        names = []
+        for axis, sign in zip(order, signs, strict=True):
+            name = "xyz"[axis]
+            names.append(name if sign > 0 else f"-{name}")
+        detail = " ".join(names)
         if not (np.array_equal(matrix, np.eye(3)) or np.array_equal(matrix, _MIRROR)):
             yield Hypothesis((), ("axes",), matrix, detail)
             yield Hypothesis(("axes",), (), matrix, detail)

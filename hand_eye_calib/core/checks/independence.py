@@ -4,7 +4,7 @@ it through an assumed transform. Such a result only returns that transform.
 
 import numpy as np
 
-from hand_eye_calib.core.base.arrays import FloatArray, IntArray
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.blocks import Blocks, jackknife_covariance
 from hand_eye_calib.core.base.stats import median, quantile, robust_weights
 from hand_eye_calib.core.base.text import angle, length
@@ -30,16 +30,16 @@ _SMALL_SHARE = 0.005
 # compared: a hundredth of them, at least and at most so many.
 _NEAREST = (40, 300)
 
-# Noise that is in both streams shows what was fused from the other, or has noise of its own. In the
-# upper half of their spectra both have so many times more than what remains, in positions or
-# orientations; sensors that shake together at most 1.2 and 16 times more. They are white (the
-# quarters of that half differ by less than the first), or what remains is not: it falls as motion
-# does, more steeply than errors that add up. Times when both accelerate so many times more than
-# usual are left out: an impulse is white as well. So is motion that intervals are too long for:
-# noise of orientations is a small share of the squared rotation.
+# Limits of noise that both streams share, in the upper half of their spectra.
+# Ratio of the two quarters of that half, below which noise is white.
 _FLAT = 1.75
+# Accelerations of both streams above this number of medians are impulses, which are white as well.
 _ABRUPT = 4.0
+# Most noise of the orientations as a share of the squared rotation: more may be motion that is too
+# fast for the interval.
 _LITTLE_NOISE = 1e-3
+# Noise of a stream over the noise of the difference of both, of positions and of orientations.
+# Sensors that shake together reach 1.2 and 16.
 _SHARED = np.array([3.0, 30.0])
 
 # A filter that corrects one stream by the other through an assumed mount shows the true mount in
@@ -156,33 +156,64 @@ def _left(motions: MotionPairs) -> float:
 
 
 def _shared_noise(slow: Trajectory, fast: Trajectory) -> float:
-    """How many times more noise a part of one stream has in common with the other than two sensors
-    have; 0 if it is motion that makes them rough, or a pose is missing.
+    """Return the noise that both streams share, over the largest that two sensors share.
+
+    Model: noise of two sensors is independent, so that the noise of the difference of both motions
+    is the sum of the noises of both. If one stream was computed from the other, the difference has
+    far less noise than either. 0 if the shared part may be motion, or if a pose is missing.
     """
     intervals_ns = np.diff(slow.stamps_ns)
     if len(slow) < _NEAREST[0] or intervals_ns.max() > 1.5 * median(intervals_ns):
         return 0.0
-    both = slow.poses, fast.at(slow.stamps_ns, straight=True)
-    steps = (se3.log(se3.inverse(Ts[:-1]) @ Ts[1:]) for Ts in both)
-    a, b = (np.diff(each, 2, axis=0).reshape(-1, 2, 3) for each in steps)
-    b = b @ se3.nearest_rotation(b[:, 1].T @ a[:, 1])
-    left = b - a
-    arms = se3.skew(a[:, 1])
-    left[:, 0] -= arms @ np.linalg.lstsq(arms.reshape(-1, 3), left[:, 0].ravel(), rcond=None)[0]
-    sizes = np.linalg.norm([a, b], axis=3)
+    of_slow = _second_differences(slow.poses)
+    of_fast = _second_differences(fast.at(slow.stamps_ns, straight=True))
+    of_fast = of_fast @ se3.nearest_rotation(of_fast[:, 1].T @ of_slow[:, 1])
+    difference = of_fast - of_slow
+    arms = se3.skew(of_slow[:, 1])
+    lever_arm = np.linalg.lstsq(arms.reshape(-1, 3), difference[:, 0].ravel(), rcond=None)[0]
+    difference[:, 0] -= arms @ lever_arm
+    is_calm = _is_calm(of_slow, of_fast)
+    quarters = _upper_quarters(np.stack([of_slow, of_fast, difference]) * is_calm[:, None, None])
+    noise = quarters[:, :2]
+    noise_of_difference = quarters[:, 2]
+    rotation = len(slow) * slow.poses[:, :3, :3].var(axis=0).sum()
+    if not noise[1, :, 1].max() < _LITTLE_NOISE * rotation:
+        return 0.0
+    smaller = noise.min(axis=1)
+    common = (smaller / np.maximum(noise_of_difference, 1e-300)).min(axis=0)
+    of_positions, of_orientations = (common**0.5 / _SHARED).tolist()
+    is_white = (quarters.max(axis=0) < _FLAT * quarters.min(axis=0))[:2].all()
+    if is_white:
+        return max(of_positions, of_orientations)
+    # The difference falls as motion does, more steeply than errors that add up.
+    is_steep = noise_of_difference[0, 1] > _FLAT**2 * noise_of_difference[1, 1]
+    return max(of_orientations, 0.0) if is_steep else 0.0
+
+
+def _second_differences(Ts: FloatArray) -> FloatArray:
+    """Second differences (N - 3, 2, 3) of the steps of poses (N, 4, 4): positions, rotations."""
+    steps = se3.log(se3.inverse(Ts[:-1]) @ Ts[1:])
+    return np.diff(steps, 2, axis=0).reshape(-1, 2, 3)
+
+
+def _is_calm(of_slow: FloatArray, of_fast: FloatArray) -> BoolArray:
+    """Whether (N,) at least one stream has no impulse, in positions and in rotations."""
+    sizes = np.linalg.norm([of_slow, of_fast], axis=3)
     usual = _ABRUPT * np.median(sizes, axis=1, keepdims=True)
-    is_calm = (sizes <= usual).any(axis=0).all(axis=1)[:, None, None]
-    spectra = (np.abs(np.fft.rfft(is_calm * [a, b, left], axis=1)) ** 2).sum(axis=3)
-    # Of poses, as differences raise it.
-    spectra /= (2.0 * np.sin(np.linspace(1e-3, np.pi / 2.0, spectra.shape[1])))[:, None] ** 6
-    half = np.stack([each.mean(axis=1) for each in np.array_split(spectra, 4, axis=1)[2:]])
-    is_white = (half.max(axis=0) < _FLAT * half.min(axis=0))[:2].all()
-    turned = len(slow) * slow.poses[:, :3, :3].var(axis=0).sum()
-    is_noise = half[1, :2, 1].max() < _LITTLE_NOISE * turned
-    common = (half[:, :2].min(axis=1) / np.maximum(half[:, 2], 1e-300)).min(axis=0)
-    follows = half[0, 2, 1] > _FLAT**2 * half[1, 2, 1]
-    found = common**0.5 / _SHARED * [is_white, is_white or follows]
-    return float(is_noise * found.max())
+    return np.asarray((sizes <= usual).any(axis=0).all(axis=1))
+
+
+def _upper_quarters(second_differences: FloatArray) -> FloatArray:
+    """Mean spectra (2, S, 2) of the third and the fourth quarter of frequencies.
+
+    ``second_differences`` is (S, N, 2, 3). The spectra are those of poses: differences raise the
+    spectrum of poses with the frequency.
+    """
+    spectra = (np.abs(np.fft.rfft(second_differences, axis=1)) ** 2).sum(axis=3)
+    angles = np.linspace(1e-3, np.pi / 2.0, spectra.shape[1])
+    spectra /= (2.0 * np.sin(angles))[:, None] ** 6
+    quarters = np.array_split(spectra, 4, axis=1)
+    return np.stack([quarter.mean(axis=1) for quarter in quarters[2:]])
 
 
 def _other_mount(pose_pairs: PosePairs) -> Finding | None:
