@@ -326,7 +326,7 @@ class CalibratorConfig(OptionSet):
         Raises
         ------
         ConfigError
-            If one does not; the message begins with ``what`` needs them.
+            If a sensor does not. The message begins with ``what``.
         """
         if self.measured != "poses":
             raise ConfigError(

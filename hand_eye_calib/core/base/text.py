@@ -186,7 +186,7 @@ AXIS_UNITS = dict.fromkeys(("x", "y", "z"), "m") | dict.fromkeys(("roll", "pitch
 _IN_SI = {"m": {"m": 1.0, "cm": 0.01, "mm": 0.001}, "rad": {"rad": 1.0, "deg": math.pi / 180}}
 _QUANTITY = re.compile(r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)(m|cm|mm|rad|deg)?")
 
-# Lengths (m) and angles (rad) that a person gives are smaller: no square of one overflows.
+# Largest length (m) and angle (rad) that a user may give: its square is far from an overflow.
 _LARGEST = 1e6
 
 # Longest length (m) of a prior that may have no unit: sensors are seldom farther apart, and 22 of

@@ -20,7 +20,7 @@ INVERSIONS = frozenset({"parent_invert", "child_invert"})
 def solve(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
     """Solve synchronised poses, and compare the result with other references and with both halves.
 
-    Without a decision about the ``cross_check``, it is made unless the user set the reference.
+    With ``cross_check`` None, the comparison is made unless the user set the reference.
     """
     config = snapshot.config
     pairs = snapshot.pose_pairs

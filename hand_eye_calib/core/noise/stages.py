@@ -131,7 +131,7 @@ class Workspace:
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
-        # Only of the last fit: a posterior of all poses is large.
+        # Only the posterior of the last fit is stored, because a posterior of all poses is large.
         self._fit: Fit | None = None
         self._posterior: Posterior | None = None
 

@@ -137,7 +137,7 @@ class Tuning:
     any_scale: float = 1.0
     # Time (s) over which accelerations are taken.
     accelerating_s: float = 0.2
-    # Accelerations count if no gap makes this time longer by this factor.
+    # Accelerations over more than this multiple of that time, because of a gap, are left out.
     near: float = 2.5
     # A jump is a step of the walk with this many times the variance that it needs.
     jump_factor: float = 10.0

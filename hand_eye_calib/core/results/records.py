@@ -145,7 +145,7 @@ class Severity(str, Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """Something about the streams that a person should know.
+    """A problem of the streams that a check found.
 
     Attributes
     ----------
@@ -163,8 +163,8 @@ class Finding:
     evidence : mapping of str to float
         The numbers in ``what``, by name.
     options : mapping
-        Options that do it, by their names in :mod:`hand_eye_calib.core.base.config`; empty if none
-        can.
+        Options that repair the problem, by their names in :mod:`hand_eye_calib.core.base.config`;
+        empty if no option repairs it.
     """
 
     code: str

@@ -227,9 +227,7 @@ def _units(hessian: FloatArray) -> FloatArray:
 
 
 def _log_volume(solution: RobustSolution) -> float:
-    """Logarithm of the determinant of the covariance; infinite without any evidence of a
-    direction.
-    """
+    """Logarithm of the determinant of the covariance; infinite if a direction has no evidence."""
     if solution.unseen.shape[1]:
         return np.inf
     return float(np.linalg.slogdet(solution.cov_parent_child_in_child)[1])
