@@ -1,12 +1,13 @@
-"""The stream checks: whether two streams can be of sensors on one rigid body, and if not, what is
-wrong with them.
+"""The stream checks: can two streams be of sensors on one rigid body, and if not, which fault do
+they have?
 
-1. Each stream alone (:mod:`~hand_eye_calib.core.checks.streams`).
-2. The angular rates (:mod:`~hand_eye_calib.core.alignment.time_offset`): whether they agree at any
-   clock offset. Reordered or inverted quaternions, units and axes do not affect them.
-3. The whole motion (:mod:`~hand_eye_calib.core.checks.hypotheses`): the usual mistake without
-   which the streams agree.
-4. Under the hypothesis that holds: clock offset, scale, and directions that the motion hides.
+1. Check each stream alone (:mod:`~hand_eye_calib.core.checks.streams`).
+2. Correlate the angular rates (:mod:`~hand_eye_calib.core.alignment.time_offset`): do they agree at
+   any clock offset? Reordered or inverted quaternions, units and axes do not change angular rates.
+3. Fit the whole motion (:mod:`~hand_eye_calib.core.checks.hypotheses`): without which usual mistake
+   do the streams agree?
+4. Under the hypothesis that holds, check the clock offset, the scale, and the directions that the
+   motion does not excite.
 """
 
 from collections.abc import Callable, Sequence
@@ -41,15 +42,16 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
 
-# Of the interval of slow streams: accuracy of the coarse offset between them, and the gap that they
-# are interpolated across if their clocks differ by more.
+# Accuracy of the coarse clock offset of slow streams, in intervals between poses.
 _COARSE = 0.5
+# Longest gap to interpolate across if the clocks of slow streams differ by more, in intervals.
 _SLOW_GAP = 1.5
 
 _UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches", 0.3048: "feet"}
 
-# A scale is that of a unit within so many of its standard deviations, or to rounding (share).
+# Distance of a scale from a unit that still is the unit, in standard deviations of the scale.
 UNIT_SIGMAS = 3.0
+# The same for a scale without noise, as a share.
 _UNIT_ROUNDING = 1e-6
 # Distance of a scale from a parent's unit that is still that unit (share). Noise of the child
 # biases the scale: by 0.2 % for simulated arms, several standard deviations.
@@ -57,17 +59,18 @@ _PARENT_UNIT_SHARE = 0.005
 # A scale this close to a unit may be that of a unit and an odometry with a scale error (share).
 _UNIT_NEAR = 0.05
 
-# Standard deviations of a lever arm that are taken off to get its least length.
+# Standard deviations to subtract from a lever arm for its least length.
 _LEVER_ARM_SIGMAS = 3.0
 
-# Code of positions that are rounded, which is a matter of the unit of length.
+# Code of rounded positions, whose severity depends on the unit of length.
 _ROUNDED = "coarse_positions"
 
-# Most motions that faults of their response are looked for in.
+# Most motions for the checks of the response.
 _MAX_MOTIONS = 1500
 
-# Shortest duration and smallest rotation with which the checks of a live session mean something.
+# Shortest duration of a live session before its streams are checked.
 MIN_DURATION_S = 20.0
+# Smallest rotation before that.
 MIN_ROTATION_RAD = float(np.radians(30.0))
 
 
@@ -80,12 +83,12 @@ class CheckResult:
     findings : tuple of Finding
         The gravest first.
     fit : SimilarityFit or None
-        The fit under the hypothesis that holds; None if none does.
+        The fit under the hypothesis that holds; None if no hypothesis holds.
     offset : TimeOffset or None
-        What is left of the clock offset, beside the one that is known; None if no hypothesis holds.
+        Clock offset beyond the known one; None if no hypothesis holds.
     readings : Readings or None
-        Two readings of the streams that fit alike, if another than that of the findings may be
-        right: one in which both streams are inverted besides.
+        Two readings of the streams that fit alike, if the reading of the findings may be wrong. The
+        other reading also inverts both streams.
     """
 
     findings: tuple[Finding, ...]
@@ -110,20 +113,20 @@ def check_streams(
     ----------
     parent, child : Trajectory
     time_offset_s, scale : float
-        Known: seconds to add to the child's stamps, and factor of its lengths.
+        Known seconds to add to the child's stamps, and known factor of its lengths.
     max_gap_s : float
         Longest time between two poses that interpolation may bridge, in seconds.
     correlate : callable, optional
-        Correlates the angular rates of the streams as they are, which is not always needed.
+        Correlates the angular rates of the streams as they are. Called only if needed.
     known : ((4, 4) array, (6,) array), optional
         An extrinsic of these streams, and its standard deviations.
     are_exact : bool
-        The user called both streams exact: that they do not drift apart is no reason for doubt.
+        Whether the user called both streams exact. Exact streams need not drift apart.
     """
     given = StreamPair(parent, child.scaled(scale), max_gap_s)
     findings = check_stream(given.parent, "parent", max_gap_s)
     findings += check_stream(given.child, "child", max_gap_s)
-    # Whether positions are coarse is decided once the unit of length is known.
+    # Rounded positions are judged later, when the unit of length is known.
     if any(found.makes_unusable for found in findings if found.code != _ROUNDED):
         return CheckResult(gravest_first(findings))
     streams = given.shifted(time_offset_s)
@@ -177,8 +180,9 @@ def _check_explained(
     findings: list[Finding],
     about: _Given,
 ) -> CheckResult:
-    """Check streams that a hypothesis explains: ``streams`` have the known time offset, and
-    ``findings`` were found before.
+    """Check streams that a hypothesis explains.
+
+    ``streams`` have the known time offset; ``findings`` are those of the checks before.
     """
     right = explanation.hypothesis.undo(streams)
     offset = _fine_offset(right, at, explanation.fit)
@@ -187,11 +191,11 @@ def _check_explained(
     lengths = check_lengths(
         right.parent, right.child, least_lever_arm(fit.T_parent_child, fit.sigmas[:3])
     )
-    # Whether both are inverse is not decided yet: streams as they are may be right.
+    # It is open whether both streams are inverse: the streams as they are may be right.
     of_reading = explanation.findings if explanation.may_be_upright else ()
     readings = explanation.readings
     if of_reading and lengths:
-        # Of one reading, the distance of the sensors is that of the worlds.
+        # In one reading, the distance of the sensors is the distance of the worlds.
         lengths = check_lengths(streams.parent, streams.child)
     if readings and lengths:
         # Noise and shape decide between the readings only if the unit of length is known.
@@ -227,14 +231,14 @@ def least_lever_arm(T_parent_child: FloatArray, sigmas: FloatArray) -> float:
 def _in_metres(
     findings: Sequence[Finding], units: Sequence[Finding], scale: float
 ) -> list[Finding]:
-    """Return findings with steps of positions in metres, by the units that were found.
+    """Return the findings with steps of positions in metres.
 
     Parameters
     ----------
     findings : sequence of Finding
         The child's lengths were multiplied by ``scale``.
     units : sequence of Finding
-        Those that say in which unit a stream's lengths are.
+        Findings about the unit of a stream's lengths.
     scale : float
         Known factor of the child's lengths.
     """
@@ -258,13 +262,15 @@ def _in_metres(
 
 
 def _as_they_are(streams: StreamPair, X: FloatArray) -> tuple[Explanation | None, TimeOffset]:
-    """The fit from a known extrinsic X, and the clock offset with it, of streams that clearly agree
-    as they are, in one unit and on about one clock; no explanation of others.
+    """Return the fit from a known extrinsic X, and the clock offset with it.
+
+    The explanation is None unless the streams clearly agree as they are, in one unit and on about
+    one clock.
     """
     least_s = LIMITS["time_offset"].note
     grave_s = LIMITS["time_offset"].error
     lag_s = hypotheses.LAGS_S[1]
-    # In one step if it is below half of what is told.
+    # One step of refinement suffices if the offset is below half of the size that is reported.
     given = streams.parent, streams.child, TimeOffset(), streams.max_gap_s, 2.0 * least_s
     offset = time_offset.offset_over(lag_s, *given, X, hypotheses.HOLDS)
     fit = offset.fit
@@ -279,7 +285,7 @@ def _as_they_are(streams: StreamPair, X: FloatArray) -> tuple[Explanation | None
 
 
 def _fine_offset(right: StreamPair, at: TimeOffset, fit: SimilarityFit) -> TimeOffset:
-    """What is left of the clock offset in streams that agree by a fit."""
+    """Return the remaining clock offset of streams that agree by a fit."""
     least_s = LIMITS["time_offset"].note
     if at.fit and at.largest_s(right.child.duration_s) < least_s:
         return at
@@ -292,9 +298,10 @@ def _fine_offset(right: StreamPair, at: TimeOffset, fit: SimilarityFit) -> TimeO
 def _of_slow(
     streams: StreamPair, moved: StreamPair, known_s: float, correlation: Correlation
 ) -> tuple[StreamPair, Correlation]:
-    """Streams whose poses are too far apart to interpolate, and the correlation from there: as they
-    are or ``moved`` by the known offset, where they have stamps in common, unless the coarse offset
-    is off by more than its accuracy.
+    """Return slow streams on one clock, and the correlation of their angular rates.
+
+    Poses of slow streams are too far apart to interpolate. The streams as they are, or ``moved`` by
+    the known offset, serve if they have common stamps and the coarse offset agrees with that.
     """
     for at_s, found in ((known_s, moved), (0.0, streams)):
         is_near = abs(correlation.offset_s - at_s) < _COARSE * streams.interval_s
@@ -311,8 +318,9 @@ def _explained_or_misread(
     known: Known | None,
     frozen: Sequence[Finding],
 ) -> tuple[Explanation | None, list[Finding]]:
-    """The explanation that holds, if there is one, or what the streams are in truth, and findings.
-    ``given`` are the streams with the clock offset that is known, ``aligned`` with all of it.
+    """Return the explanation that holds, or None, and the findings about misread streams.
+
+    ``given`` has the known clock offset, ``aligned`` the whole one.
     """
     start = known[0] if known else None
     is_frozen = any(found.makes_unusable for found in frozen)

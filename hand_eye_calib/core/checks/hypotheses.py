@@ -1,16 +1,17 @@
-"""Hypotheses about what is wrong with two streams: each undoes one usual mistake, and the fit that
-follows shows whether the streams agree without it.
+"""Hypotheses about mistakes in two streams.
 
-For every motion pair and any X, both sensors rotate through the same angle and move by the same
-distance along the same screw axis. The robust fit of
-:mod:`~hand_eye_calib.core.alignment.similarity` measures how much of the motion breaks this. The
-plain hypothesis, nothing is wrong, is kept unless another leaves several times less of the motion
-unexplained.
+Each hypothesis undoes one usual mistake, and a fit measures whether the streams agree without it.
 
-Two inverted streams agree with each other as well as two correct ones: X is then the pose of one
-world in the other. Vehicles move in a steady direction of their own. Of other bodies, some point
-moves less than any point of the world does, seen from the sensor; and the lever arm between the
-worlds is longer than that between the sensors.
+Model: in every motion pair, whatever X is, both sensors rotate through the same angle and move by
+the same distance along the same screw axis. The robust fit of
+:mod:`~hand_eye_calib.core.alignment.similarity` measures the share of the motion that breaks this
+rule. The plain hypothesis (no mistake) is rejected only if another hypothesis leaves several times
+less of the motion unexplained.
+
+Two inverted streams agree as well as two correct ones. X is then the pose of one world in the
+other. Three signs decide between both readings. Vehicles travel in a steady direction in their own
+frame. On other bodies, a point of the body moves less than any point of the world moves as seen
+from the sensor. The lever arm between the worlds is longer than the lever arm between the sensors.
 """
 
 import itertools
@@ -37,58 +38,63 @@ from hand_eye_calib.core.checks.streams import coarse
 from hand_eye_calib.core.geometry import se3, trajectory
 from hand_eye_calib.core.pairing import motion_pairs
 
-# Motions over these times (s) are compared, the shorter ones only if the longer ones do not agree;
-# so many at most, and to see which mistake it is.
+# Durations of the compared motions, s. Shorter ones are used only if longer ones do not agree.
 LAGS_S = (3.0, 1.0, 0.4)
+# Most motions in a fit.
 MAX_PAIRS = 400
+# Most motions in the rough fits that rank the hypotheses.
 _MAX_ROUGH = 120
+# Fewest motions in a fit.
 MIN_PAIRS = 12
 
 # Largest angle (rad) of a rotation vector: near half a turn its sign is ambiguous.
 MAX_ROTATION_RAD = 2.8
 
-# A hypothesis holds if it leaves at most this share of the motion unexplained. If the plain one
-# does not hold, another replaces it that leaves this many times less.
+# A hypothesis holds if it leaves at most this share of the motion unexplained.
 HOLDS = 0.12
+# Another hypothesis replaces a plain one that does not hold if it leaves this many times less.
 _DECISIVE = 2.0
 
 # Largest unexplained share that noise can cause, in streams whose angular rates clearly agree.
 _NOISY = 0.3
 
-# Among hypotheses that are about equally good the simpler one is taken, and the child's rather than
-# the parent's. A scale farther from 1 than this (logarithm) makes one less simple.
+# Ratio of unexplained shares below which two hypotheses are equally good. The simpler one is then
+# preferred, and a mistake of the child to one of the parent.
 _ABOUT_EQUAL = 1.5
+# A scale farther from 1 than this (logarithm) counts as one more mistake.
 _ODD_SCALE = 0.05
 
-# Shape of the motion: the sum of the logarithms of paths and of lever arms. In 190 right recordings
-# (KinHEC, real, simulated) it was -0.25 at most, and below -0.4 in all but six; inverted, it has
-# the other sign. Another reading is considered above the first; the second decides where the noise
-# does not.
+# Shape of the motion: the sum of the log ratios of the paths and of the lever arms. In 190 right
+# recordings (KinHEC, real, simulated) it was -0.25 at most, and below -0.4 in all but six. Inverse
+# streams have the other sign.
+# Above this shape, the reading with both streams inverted is considered.
 _SUSPICIOUS = -0.2
+# From this size on, the shape decides between two readings if the noise does not.
 CLEAR_SHAPE = 0.4
-# Paths say less by this much if the sensors look at a point. A camera around its target had 0.4.
+# Subtracted from the log ratio of the paths if the sensors look at a point: a camera that moved
+# around its target had 0.4.
 _OF_TARGET = 0.5
-# What counts as the shape where a steady direction of travel decides.
+# Shape if a steady direction of travel decides.
 STEADY_SHAPE = 1.0
 
-# Rounds of weights of the shortest path.
+# Reweighted rounds of the search for the point with the shortest path.
 _ROUNDS = 5
 
-# Frames with parallel axes this close (m, rad) may be one: hardly two sensors are. Of one world for
-# both streams, the lever arm between the worlds says nothing.
+# Two frames with parallel axes may be one frame below this distance (m) and this angle (rad). If
+# both streams have one world, the lever arm between the worlds is no evidence.
 _SAME_FRAME_M = 0.03
 _SAME_FRAME_RAD = 0.01
 # Shortest lever arm (m) that is compared.
 _SHORTEST_ARM_M = 0.01
 
-# An arm about its base may move more than the base seen from it. Sensors that stay within this
-# distance (m), an arm's reach, may be such; stops too.
+# Reach of a robot arm (m). The hand of an arm may move more than its base does as seen from the
+# hand: inverse poses may be right for sensors that stay within this distance.
 _REACH_M = 3.0
 
 
 @dataclass(frozen=True)
 class StreamPair:
-    """Two streams on about one clock, and the longest gap to interpolate across."""
+    """Two streams on about one clock, and the longest gap (s) to interpolate across."""
 
     parent: trajectory.Trajectory
     child: trajectory.Trajectory
@@ -105,16 +111,16 @@ class StreamPair:
         return all(each.interval_s > self.max_gap_s for each in (self.parent, self.child))
 
     def correlate(self) -> Correlation:
-        """Correlation of the angular rates of both."""
+        """Correlate the angular rates of both streams."""
         return correlate_rates(self.parent, self.child, self.max_gap_s)
 
     def shifted(self, offset_s: float) -> "StreamPair":
-        """The pair with ``offset_s`` added to the child's stamps."""
+        """Return the pair with ``offset_s`` added to the child's stamps."""
         return replace(self, child=self.child.shifted(offset_s))
 
     @cached_property
     def synchronised(self) -> motion_pairs.PosePairs:
-        """Poses of both at common stamps."""
+        """Poses of both streams at common stamps."""
         return motion_pairs.synchronise(self.parent, self.child, self.max_gap_s)
 
     def pairs(self, lag_s: float, max_pairs: int) -> motion_pairs.MotionPairs:
@@ -123,7 +129,7 @@ class StreamPair:
         Raises
         ------
         NotEnoughDataError
-            If the streams have too few in common.
+            If the streams have too few common motions.
         """
         pairs = motion_pairs.pairs_over(self.synchronised, lag_s, max_pairs)
         if len(pairs) < MIN_PAIRS:
@@ -139,8 +145,9 @@ _EULER_ORDER: _Way = ("euler_order",)
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """What is wrong with each stream, as codes of findings. ``axes`` (3, 3) undoes wrong axes,
-    which ``detail`` names as what (x, y, z) should be.
+    """Mistakes of each stream, as codes of findings.
+
+    ``axes`` (3, 3) undoes wrong axes of positions; ``detail`` names what (x, y, z) should be.
     """
 
     parent: _Way = ()
@@ -160,21 +167,22 @@ class Hypothesis:
 
     @property
     def mistakes(self) -> list[tuple[str, str]]:
-        """Code and stream of each mistake; one exporter often makes it in "both"."""
+        """Code and stream ("parent", "child" or "both") of each mistake."""
         streams = {(False, True): "child", (True, False): "parent", (True, True): "both"}
         codes = dict.fromkeys((*self.parent, *self.child))
         return [(code, streams[code in self.parent, code in self.child]) for code in codes]
 
     @property
     def complexity(self) -> tuple[int, int]:
-        """How many mistakes there are, those of axes by how many are wrong; for equal numbers, the
-        child's come first.
+        """Number of mistakes, and a number that prefers mistakes of the child among equals.
+
+        Each wrong axis counts as one mistake.
         """
         n_axes = 0 if self.axes is None else int((self.axes != np.eye(3)).any(axis=1).sum())
         return len(self.mistakes) + n_axes, 2 * len(self.parent) + len(self.child)
 
     def corrected(self, stream: str, poses: FloatArray) -> FloatArray:
-        """The poses (N, 4, 4) of a stream without its mistakes."""
+        """Return the poses (N, 4, 4) of a stream without its mistakes."""
         way = self.child if stream == "child" else self.parent
         if way and self.axes is not None:
             return se3.from_rotation_translation(poses[:, :3, :3], poses[:, :3, 3] @ self.axes.T)
@@ -184,7 +192,7 @@ class Hypothesis:
         return se3.put_right(poses, **dict(map(CONVENTIONS.__getitem__, way)))
 
     def undo(self, streams: StreamPair) -> StreamPair:
-        """Both streams without the mistakes."""
+        """Return both streams without the mistakes."""
         if self is PLAIN:
             return streams
         given = (("parent", streams.parent), ("child", streams.child))
@@ -192,7 +200,7 @@ class Hypothesis:
         return replace(streams, parent=right["parent"], child=right["child"])
 
     def inverted(self) -> "Hypothesis":
-        """The one with both streams inverted besides, which fits as well."""
+        """Return the hypothesis that also inverts both streams. It fits equally well."""
         parent, child = (
             tuple([code for code in CONVENTIONS if (code in way) != (code == "inverse")])
             for way in (self.parent, self.child)
@@ -202,20 +210,20 @@ class Hypothesis:
 
 @dataclass(frozen=True, kw_only=True)
 class Readings:
-    """Two hypotheses that fit alike, as the second inverts both streams besides.
+    """Two hypotheses that fit alike: the second one also inverts both streams.
 
     Attributes
     ----------
     hypotheses : tuple of two Hypothesis
-        The first is the upright one, if there is one.
+        An upright hypothesis is the first.
     shape : float
-        By how much the shape of the motion speaks for the second: the sum of the logarithms of
+        Evidence of the shape of the motion for the second hypothesis: the sum of the log ratios of
         paths and lever arms.
     paths : float
-        The part of the paths.
+        The part of ``shape`` from the paths.
     is_small : bool
-        Whether all sensors stay within the reach of an arm. Inverse poses may be right there: those
-        of an arm beside a fixed camera.
+        Whether all sensors stay within the reach of an arm. Inverse poses may be right for an arm
+        beside a fixed camera.
     """
 
     hypotheses: tuple["Hypothesis", "Hypothesis"]
@@ -225,17 +233,17 @@ class Readings:
 
     @property
     def by_shape(self) -> int:
-        """1 if the shape speaks clearly for the second reading, -1 for the first, 0 for neither."""
+        """1 if the shape is clear evidence for the second reading, -1 for the first, else 0."""
         return int(np.sign(self.shape)) if abs(self.shape) > CLEAR_SHAPE else 0
 
     @property
     def is_clear(self) -> bool:
-        """Whether the shape decides: not if a fixed camera beside an arm would explain it, too."""
+        """Whether the shape decides. A fixed camera beside an arm may explain it as well."""
         is_fixed_camera = self.is_small and self.hypotheses[0].is_upright and self.shape > 0.0
         return self.by_shape != 0 and not is_fixed_camera
 
     def ordered(self) -> "Readings":
-        """The same readings, the upright one first."""
+        """Return the readings with the upright one first."""
         first, second = self.hypotheses
         if not second.is_upright:
             return self
@@ -244,8 +252,10 @@ class Readings:
 
 @dataclass(frozen=True)
 class Explanation:
-    """A hypothesis with its fit, which holds below the unexplained share ``limit``; with
-    ``same_unit`` its scale was kept at 1. ``readings`` are there if another one may be right.
+    """A hypothesis with its fit.
+
+    The hypothesis holds below the unexplained share ``limit``. With ``same_unit``, the scale of the
+    fit is 1. ``readings`` are set if another reading may be right.
     """
 
     hypothesis: Hypothesis
@@ -257,7 +267,7 @@ class Explanation:
 
     @property
     def may_be_upright(self) -> bool:
-        """Whether another reading is open, and the streams may be right as they are."""
+        """Whether another reading is possible in which the streams are right as they are."""
         return self.readings is not None and self.readings.hypotheses[0].is_upright
 
     @property
@@ -267,13 +277,13 @@ class Explanation:
 
     @property
     def complexity(self) -> tuple[int, int]:
-        """That of the hypothesis; an odd scale is one more mistake."""
+        """Complexity of the hypothesis. An odd scale is one more mistake."""
         n_mistakes, of_streams = self.hypothesis.complexity
         return n_mistakes + int(abs(np.log(self.fit.scale)) > _ODD_SCALE), of_streams
 
 
 _MIRROR = -np.eye(3)
-# Orientations that are inverted and written w x y z are those of other axes.
+# Inverted orientations in the order w x y z are missing: they equal orientations of other axes.
 _WAYS: list[_Way] = [
     (),
     ("inverse",),
@@ -286,7 +296,7 @@ _ALL_WAYS = [Hypothesis(of_parent, of_child) for of_parent in _WAYS for of_child
 PLAIN = _ALL_WAYS[0]
 
 
-# Those that invert both streams besides fit about as well.
+# Hypotheses that also invert both streams are missing: they fit equally well.
 _USUAL = [
     *(each for each in _ALL_WAYS[1:] if ("inverse", "both") not in each.mistakes),
     Hypothesis(child=("left_handed",), axes=_MIRROR),
@@ -315,9 +325,15 @@ def _axes() -> Iterator[Hypothesis]:
 
 
 def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None) -> Explanation:
-    """Find the mistake that explains the streams, or that none does; ``thorough`` if the angular
-    rates agree, so that it pays to try wrong axes, too, which are many. ``start`` (4, 4) is the
-    extrinsic if the streams are as they should be.
+    """Find the mistake that explains the streams, if one does.
+
+    Parameters
+    ----------
+    streams : StreamPair
+    thorough : bool
+        Whether to try all wrong axes, too. It pays only if the angular rates agree.
+    start : (4, 4) array, optional
+        The extrinsic if the streams have no mistake.
 
     Raises
     ------
@@ -333,10 +349,10 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
         except NotEnoughDataError as error:
             too_few = error
             continue
-        # Streams that nearly agree may have one mistake: an arm's, or one on nearly flat ground.
+        # Streams of an arm, or on nearly flat ground, may agree in spite of one mistake.
         rivals = [each for each in _USUAL if len(each.mistakes) == 1 or not plain.holds]
         if not plain.holds:
-            # A body that rotates about one of its sensors: that one's translations are noise.
+            # If a body rotates about one of its sensors, the translations of that sensor are noise.
             in_one_unit = _fitted(PLAIN, streams, lag_s, same_unit=True)
             plain = in_one_unit if in_one_unit.holds else plain
         chosen = _or_rival(plain, rivals, streams, lag_s, _NOISY if thorough else HOLDS)
@@ -349,7 +365,7 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
                 chosen, doubts = _or_axes(chosen, streams, lag_s)
             found = attributed(chosen, streams, lag_s)
             return replace(found, findings=(*found.findings, *doubts))
-        # Jumps spoil long motions more than short ones.
+        # Jumps affect long motions more than short ones.
         failed.append(chosen)
     if not failed:
         raise too_few
@@ -370,7 +386,7 @@ def _or_rival(
     lag_s: float,
     limit: float,
 ) -> Explanation:
-    """The simplest of the rivals that explain the motion best, if they are decisively better."""
+    """Return the simplest of the best rivals, or ``plain`` if no rival is decisively better."""
     most = min(limit, plain.fit.unexplained / _DECISIVE)
     if plain.fit.unexplained < EXPLAINED or not (best := _below(most, rivals, streams, lag_s)):
         return plain
@@ -380,7 +396,7 @@ def _or_rival(
 def _below(
     most: float, rivals: Iterable[Hypothesis], streams: StreamPair, lag_s: float
 ) -> list[Explanation]:
-    """The best of the rivals, and those about as good, that leave less than this unexplained."""
+    """Return the best rivals: about equal, and with at most the share ``most`` unexplained."""
     pairs = streams.pairs(lag_s, _MAX_ROUGH)
     few = streams.synchronised[np.concatenate([pairs.i, pairs.j])]
     first = np.arange(len(pairs))
@@ -388,7 +404,7 @@ def _below(
     for rival in rivals:
         poses = rival.corrected("parent", few.Ts_pw_p), rival.corrected("child", few.Ts_cw_c)
         motions = motion_pairs.pairs_between(*poses, first, first + len(pairs))
-        # The start of a fit leaves about as much as the fit.
+        # A fit is stopped early if its start leaves far more than ``most`` unexplained.
         tried.append(Explanation(rival, fit_similarity(motions, most=_DECISIVE * most)))
         most = min(most, _ABOUT_EQUAL * tried[-1].fit.unexplained)
     return [each for each in tried if each.fit.unexplained <= most]
@@ -409,8 +425,10 @@ def _fitted(
 def _or_axes(
     chosen: Explanation, streams: StreamPair, lag_s: float
 ) -> tuple[Explanation, list[Finding]]:
-    """The explanation by other orientations, but wrong axes if they explain clearly more; or the
-    finding that they would explain about as much.
+    """Compare an explanation by orientations with explanations by wrong axes.
+
+    Wrong axes are returned if they explain clearly more. If they explain about as much, the finding
+    "ambiguous" is returned as well.
     """
     unexplained = chosen.fit.unexplained
     rivals = _below(_ABOUT_EQUAL * unexplained, _axes(), streams, lag_s)
@@ -425,8 +443,10 @@ def _or_axes(
 
 
 def _steadier(chosen: Explanation, streams: StreamPair, lag_s: float) -> tuple[Explanation, bool]:
-    """The explanation, or one that holds, too, with which both sensors move in a steady direction
-    of their own, as those of vehicles do; and whether they do.
+    """Return an explanation in which both sensors travel in a steady direction, as on vehicles.
+
+    If there is none, return the chosen explanation. The second value says whether the direction is
+    steady, or cannot be judged.
     """
     if chosen.hypothesis.axes is not None or _EULER_ORDER in chosen.hypothesis.ways:
         return chosen, True
@@ -448,11 +468,11 @@ def _steadier(chosen: Explanation, streams: StreamPair, lag_s: float) -> tuple[E
 
 
 def attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> Explanation:
-    """Add the findings of an explanation, after a choice between two readings that fit alike: the
-    hypothesis, and both streams inverted besides.
+    """Choose between two readings that fit alike, and add the findings of the choice.
 
-    The shape of the motion chooses here. Where another reading is possible, the explanation has
-    :class:`Readings`, so that the noise can be compared as well.
+    The readings are the hypothesis, and the hypothesis with both streams inverted. The shape of the
+    motion decides. If the other reading is possible, the explanation has :class:`Readings`, so that
+    the noise of both readings can be compared later.
     """
     given = explanation.hypothesis
     explanation, is_settled = _steadier(explanation, streams, lag_s)
@@ -463,7 +483,7 @@ def attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> E
     if is_settled:
         if hypothesis.is_upright and hypothesis == given:
             return replace(explanation, findings=findings_of(hypothesis))
-        # A steady direction of travel speaks for the hypothesis as clearly as paths ever do.
+        # A steady direction of travel is as clear evidence as paths can be.
         readings = Readings(
             hypotheses=(hypothesis.inverted(), hypothesis),
             shape=STEADY_SHAPE,
@@ -488,7 +508,7 @@ def attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> E
         likelier = hypothesis
     if likelier is not hypothesis:
         explanation = _fitted(likelier, streams, lag_s)
-    # An option repairs only what is clear.
+    # Options are set only if the choice is clear.
     findings = findings_of(likelier, has_options=readings.is_clear or likelier.is_upright)
     if likelier.is_upright:
         options = conventions("inverse", "both")
@@ -497,8 +517,9 @@ def attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> E
 
 
 def findings_of(hypothesis: Hypothesis, has_options: bool = True) -> tuple[Finding, ...]:
-    """Return the findings of the mistakes of a hypothesis; inverse poses without the options that
-    repair them unless ``has_options``.
+    """Return the findings of the mistakes of a hypothesis.
+
+    Inverse poses have the options that repair them only with ``has_options``.
     """
     findings = []
     for code, stream in hypothesis.mistakes:
@@ -509,7 +530,7 @@ def findings_of(hypothesis: Hypothesis, has_options: bool = True) -> tuple[Findi
 
 
 def _may_be_an_arm(streams: StreamPair) -> bool:
-    """Whether inverse poses may be right, or paths deceive: stops, or a small space."""
+    """Whether the streams are stops, or stay within the reach of an arm."""
     both = (streams.parent.poses, streams.child.poses)
     positions = [poses[:, :3, 3] for given in both for poses in (given, se3.inverse(given))]
     return streams.is_slow or all(
@@ -518,17 +539,17 @@ def _may_be_an_arm(streams: StreamPair) -> bool:
 
 
 def _evidence_for_inverse(right: StreamPair, fit: SimilarityFit) -> tuple[float, float]:
-    """Return the logarithms by which the paths, and half of that by which the lever arm, are
-    shorter with both streams inverted.
+    """Return evidence for inverse poses: the log ratio of the paths, and half that of lever arms.
 
-    A body moves little beside some point of its own, such as an axle. The inverse of its path is
-    that of some point of the world, seen from the body. Sensors that move around a point that they
-    look at have paths like those of inverse poses: less than half of their path is that point's.
+    A ratio is that of the streams as they are over both streams inverted. Some point of a body,
+    such as an axle, has a short path. With inverse poses, the point is one of the world, seen from
+    the body. Sensors that move around a point that they look at have such paths, too: the path of
+    that point is less than half of their own.
     """
     logs = []
     for stream in (right.parent, right.child):
         poses = coarse(stream, LAGS_S[-1]).poses
-        # Of stops only their places are known, not how it moves between them.
+        # Stops show only places, and not the motion between them.
         order = 2 if stream.interval_s < LAGS_S[-1] else 1
         least, of_origin = _least(poses, order)
         of_inverse, _ = _least(se3.inverse(poses), order)
@@ -548,8 +569,9 @@ def _evidence_for_inverse(right: StreamPair, fit: SimilarityFit) -> tuple[float,
 
 
 def _least(poses: FloatArray, order: int) -> tuple[float, float]:
-    """Return the sums of the changes of place (m), or of velocity for order 2, of the point that is
-    fixed to a body with these poses and has the least, and of its origin.
+    """Return the path (m) of the point of a body with the shortest path, and that of its origin.
+
+    For ``order`` 2 the path is the sum of the changes of velocity instead of place.
     """
     changes = np.diff(poses[:, :3], order, axis=0)
     steps = changes[:, :, 3]
