@@ -103,7 +103,7 @@ def refused(run):
 def test_replay_finds_the_extrinsic_and_says_it_in_both_directions(run, new_bag, storage):
     code, out, err = run("calibrate", new_bag(storage=storage), *TOPICS, "-v")
     assert (code, err) == (0, "")
-    assert out.startswith("USE: all six axes are known to ")
+    assert out.startswith("USE: good to ")
     assert "\ncamera in lidar: maps coordinates of camera into lidar\n" in out
     assert "\nlidar in camera: maps coordinates of lidar into camera\n" in out
     rows = re.findall(r"^  [xyz] +(\S+) \+/- \d\S* m ", out, flags=re.MULTILINE)

@@ -57,7 +57,7 @@ def test_two_good_results_in_a_row_end_the_session_and_one_does_not():
     assert not once.done
     done = goal.add(result(), seen(46.0))
     assert (done.done, done.limiting_axis, max(seconds_left(done))) == (True, "", 0.0)
-    assert done.sentence.startswith("Done: all six axes are known to 5 mm along and 0.057 deg")
+    assert done.sentence.startswith("Done: good to 5 mm and 0.057 deg")
 
 
 def test_every_axis_has_its_own_target():
@@ -216,4 +216,4 @@ def test_positions_alone_are_done_without_a_word_of_the_rotation():
     of_positions = result(sigmas_rad=np.inf, verdicts=hidden, measured="positions")
     progress = progress_after(Goal(TARGETS), *[of_positions] * 3)
     assert progress.done
-    assert progress.sentence.startswith("Done: x, y and z are known to 5 mm or better")
+    assert progress.sentence.startswith("Done: x, y and z are good to 5 mm")

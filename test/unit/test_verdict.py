@@ -156,10 +156,7 @@ def test_a_method_that_models_the_noise_may_reject_less():
 def test_nothing_against_it_is_use():
     result = good()
     assert (result.verdict, result.reasons) == (Verdict.USE, ())
-    assert result.headline == (
-        "USE: all six axes are known to 3 mm along and 0.057 deg about them or better, one "
-        "standard deviation"
-    )
+    assert result.headline == "USE: good to 3 mm and 0.057 deg on every axis (1 sigma)"
 
 
 @pytest.mark.parametrize(

@@ -222,12 +222,11 @@ def what_is_known(result: Result) -> str:
             worst = max(axes_of_part, key=lambda axis: axis.total)
             texts.append(amount(worst.name, worst.total))
     if not result.out_of_reach:
-        known_to = " along and ".join(texts)
-        return f"all six axes are known to {known_to} about them or better, one standard deviation"
-    return (
-        f"{listing([axis.name for axis in axes])} are known to {listing(texts)} or better, one "
-        f"standard deviation; {listing(result.out_of_reach)} are out of reach of these streams"
-    )
+        return f"good to {listing(texts)} on every axis (1 sigma)"
+    within_reach = listing([axis.name for axis in axes])
+    hidden = listing(result.out_of_reach)
+    good_to = f"{within_reach} are good to {listing(texts)} (1 sigma)"
+    return f"{good_to}; {hidden} are out of reach of these streams"
 
 
 def target_of(axis: str, result: Result) -> float:
