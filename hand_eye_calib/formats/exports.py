@@ -103,7 +103,7 @@ def role_of(frame: str) -> str:
         for role, beginnings in _ROLES.items()
         if any(word.startswith(beginnings) for word in words)
     ]
-    # camera_base_link belongs to a camera, imu_link of the base to an IMU.
+    # Another role behind "base" decides: base_imu_link belongs to an IMU.
     if len(roles) > 1 and roles[0] == "base":
         return roles[1]
     return roles[0] if roles else ""
@@ -254,5 +254,6 @@ def _listed(values: FloatArray, separator: str = ", ") -> str:
 
 def _number(value: float) -> str:
     """Return a number with a decimal point and without a power of ten, for every parser."""
+    # Adding 0.0 turns -0.0 into 0.0.
     text = f"{round(float(value), _DECIMALS) + 0.0:.{_DECIMALS}f}".rstrip("0")
     return f"{text}0" if text.endswith(".") else text

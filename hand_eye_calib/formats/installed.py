@@ -175,7 +175,10 @@ def _nodes(document: Any, path: tuple[str, ...]) -> Iterator[_Node]:
 
 
 def _named(path: tuple[str, ...], node: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Return parent, child and pose of a node that names both frames; empty for other nodes."""
+    """Return parent and child of a node that names both frames, and its pose.
+
+    The pose is one value, or two: translation and angles (deg). Empty for other nodes.
+    """
     header = node.get("header")
     parameters = node.get("parameters")
     if isinstance(header, Mapping) and "child_frame_id" in node:  # TransformStamped

@@ -346,7 +346,7 @@ class TimeOffset:
     rate: ClockRate | None = None
 
     def steadied(self, child: Trajectory) -> Trajectory:
-        """Return the child's poses with stamps without a clock rate, if the rate is used."""
+        """Return the child's poses with the clock rate, if it is used, removed from the stamps."""
         return child.shifted(0.0, self.rate.used, self.rate.at_ns) if self.rate else child
 
     def largest_s(self, duration_s: float) -> float:

@@ -89,7 +89,7 @@ def compare(
 def _who_moved(
     names: Sequence[str], results: Sequence[Calibration], differences: Sequence[Difference]
 ) -> tuple[tuple[str, ...], str]:
-    """Return the results without which the others agree, if there are such, and a sentence."""
+    """Return the names of the results that the others contradict, and a sentence about them."""
     # Two results differ for sure: weaker evidence is enough to name one of them.
     agreement = agreement_of_results(results, level=0.05)
     if agreement.kind in ("one off", "moved"):

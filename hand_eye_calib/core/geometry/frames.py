@@ -27,7 +27,7 @@ _ROTATION_WITHIN = 1e-2
 
 # Last row of a matrix.
 _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
-# Tolerance of the last row.
+# Largest deviation of the last row of a transform from 0 0 0 1.
 LAST_ROW_WITHIN = 1e-6
 
 # Words in the name of a fixed frame: a map, the start of an odometry.

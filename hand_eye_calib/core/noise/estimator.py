@@ -71,7 +71,7 @@ _FIXED_TO = {"body": "the child's body", "world": "the parent's world"}
 
 
 class NoiseModelError(InputError):
-    """No noise model fits the poses: their matrices are singular to rounding."""
+    """No noise model fits the poses: a matrix is singular within rounding."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,8 @@ from hand_eye_calib.core.solvers import (
 )
 from hand_eye_calib.core.solvers.all_pairs import Solution
 
-# Arguments: motion pairs; for dnlo also a threshold and the least share of inliers.
+# Arguments: motion pairs; for dnlo also a threshold and the least share of inliers. Taylor's
+# method has the same solution as Park's.
 _SOLVERS: dict[str, Callable[..., Solution]] = {
     "dnlo": dnlo.solve,
     "dnl": all_pairs.solve_dnl,

@@ -192,7 +192,7 @@ def stamp_of(names: Sequence[str], cells: Sequence[str], unit: str = "") -> Deci
 
 
 def _stamp_in_week(week_text: str, second: Decimal, unit: str) -> Decimal:
-    """Return the seconds since 1970, in GPS time, of a second of a week of GPS.
+    """Convert a GPS week and the second in it to seconds since 1970, in GPS time.
 
     A number that is too large for a second of a week is returned as it is.
     """

@@ -233,7 +233,7 @@ def _without_last(cells: Sequence[str]) -> list[str]:
 
 
 def _joining(widths: Sequence[int]) -> _Merge:
-    """Return a function that joins as many cells as each width."""
+    """Return a function that joins neighbouring cells of a row; each width is a number of cells."""
     ends = np.cumsum([width for width in widths if width]).tolist()
     spans = list(zip([0, *ends[:-1]], ends, strict=True))
 

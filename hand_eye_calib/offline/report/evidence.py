@@ -192,7 +192,10 @@ def _paths_of_positions(
 def _paths_of_poses(
     calibration: Calibration, pose_pairs: PosePairs
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the paths of the parent by both streams; the mean of all poses aligns the worlds."""
+    """Return the path of the parent as measured, and as computed from the child.
+
+    The mean rotation and the median shift of all poses align the worlds.
+    """
     Ts_cw_p = pose_pairs.Ts_cw_c @ calibration.T_child_parent
     rotations = pose_pairs.Ts_pw_p[:, :3, :3] @ np.swapaxes(Ts_cw_p[:, :3, :3], 1, 2)
     parent = pose_pairs.Ts_pw_p[:, :3, 3]

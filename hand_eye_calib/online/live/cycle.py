@@ -184,7 +184,7 @@ class SolveCycle:
         )
 
     def result_to_save(self) -> Calibration | None:
-        """Return the result, with a warning if every solve since has failed, or None."""
+        """Return the result or None. A warning is added if all later solves have failed."""
         if self.result is None or self.standing is not Standing.OUTDATED:
             return self.result
         return replace(self.result, warnings=(*self.result.warnings, self.problem))

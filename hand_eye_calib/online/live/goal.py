@@ -93,7 +93,7 @@ class Goal:
         self._start_over(_NO_RESULT)
 
     def _start_over(self, sentence: str) -> None:
-        """Reset the goal to not reached, and keep the results."""
+        """Forget the progress towards the goal; the newest and the previous result stay."""
         self.best: Calibration | None = None
         self._best_information = 0.0
         self._steps = np.full(6, len(_STEPS_S) - 1)

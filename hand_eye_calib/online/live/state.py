@@ -65,8 +65,8 @@ Outcome: TypeAlias = tuple[bool, str]
 class Standing(Enum):
     """Validity of the session's result.
 
-    OUTDATED: every solve since has failed. REFUTED: the motion contradicts a prior, or the streams
-    are faulty; such a result is not published.
+    OUTDATED: every solve after this result has failed. REFUTED: the motion contradicts a prior, or
+    the streams are faulty; such a result is not published.
     """
 
     NONE = "none"
