@@ -64,18 +64,23 @@ def solve_park(pairs: MotionPairs) -> Solution:
     ``objective`` is the sum of squared translation residuals, the cost of the second step, in m^2.
     """
     R = align_rotation_vectors(pairs)
-    A = pairs.Ts_parenti_parentj
-    rows = A[:, :3, :3] - np.eye(3)
-    targets = pairs.Ts_childi_childj[:, :3, 3] @ R.T - A[:, :3, 3]
+    rows, targets = translation_equations(pairs, R)
     t = np.linalg.lstsq(rows.reshape(-1, 3), targets.ravel(), rcond=RANK_TOLERANCE)[0]
     T_parent_child = se3.from_rotation_translation(R, t)
     objective = float((pairs.residuals(T_parent_child)[0] ** 2).sum())
     return Solution(T_parent_child, objective, True, np.ones(len(pairs)))
 
 
-def align_rotation_vectors(pairs: MotionPairs) -> FloatArray:
+def translation_equations(pairs: MotionPairs, R: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return ``R_A - I`` (K, 3, 3) and ``R t_B - t_A`` (K, 3), which it maps the translation to."""
+    A = pairs.Ts_parenti_parentj
+    return A[:, :3, :3] - np.eye(3), pairs.Ts_childi_childj[:, :3, 3] @ R.T - A[:, :3, 3]
+
+
+def align_rotation_vectors(pairs: MotionPairs, weights: FloatArray | None = None) -> FloatArray:
     """Estimate the rotation (3, 3) from the child's rotation vectors b to the parent's a.
 
+    ``weights`` (K,) are those of the motion pairs, 1 by default.
     ``R_A = R R_B R'`` means ``a = R b``. The best R in least squares comes from the singular value
     decomposition of the 3 x 3 correlation of the vectors (Kabsch 1976), mirrored back if it is a
     reflection. No centroid is subtracted, because the vectors have a common origin. If a rotation
@@ -83,7 +88,8 @@ def align_rotation_vectors(pairs: MotionPairs) -> FloatArray:
     """
     a = se3.rotation_log(pairs.Ts_parenti_parentj[:, :3, :3])
     b = se3.rotation_log(pairs.Ts_childi_childj[:, :3, :3])
-    return se3.nearest_rotation(a.T @ b)
+    weighted = a if weights is None else a * weights[:, None]
+    return se3.nearest_rotation(weighted.T @ b)
 
 
 def solve_dnl(pairs: MotionPairs) -> Solution:

@@ -19,7 +19,11 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.stats import MEDIAN_NORMAL, median, robust_weights
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, motion_pairs
-from hand_eye_calib.core.solvers.all_pairs import Solution
+from hand_eye_calib.core.solvers.all_pairs import (
+    Solution,
+    align_rotation_vectors,
+    translation_equations,
+)
 
 # Residual, in standard deviations, at which a Cauchy weight is a half: 95 % efficiency for normal
 # errors (Holland and Welsch 1977, table 1).
@@ -89,21 +93,21 @@ def solve(pairs: MotionPairs, T_start: FloatArray | None = None) -> RobustSoluti
         parts = _parts(pairs, T_parent_child)
         if step_number < _FREE_SCALE_STEPS:
             scales = _scales(parts)
-        hessian, scores, _ = _normal_equations(parts, scales)
-        step = -_inverse(hessian) @ scores.sum(axis=0)
+        hessian, scores = _normal_equations(parts, scales, _weights(parts, scales))
+        step = -_inverse(hessian) @ scores.sum(axis=(0, 1))
         T_parent_child = se3.retracted(T_parent_child, step)
         if step @ hessian @ step < _STEP_TOLERANCE**2:
             converged = True
             break
     parts = _parts(pairs, T_parent_child)
-    hessian, scores, curvature = _normal_equations(parts, scales)
-    squared = _squared(parts, scales)
+    weights = _weights(parts, scales)
+    hessian, scores = _normal_equations(parts, scales, weights)
     return RobustSolution(
         T_parent_child=T_parent_child,
-        objective=float(np.log1p(squared).sum()),
+        objective=float(np.log(1.0 / weights).sum()),
         converged=converged,
-        weights=robust_weights("cauchy", squared).min(axis=0),
-        cov_parent_child_in_child=_covariance(hessian - curvature, scores, pairs),
+        weights=weights.min(axis=0),
+        cov_parent_child_in_child=_covariance(hessian, scores, pairs),
         unseen=_null_space(hessian),
     )
 
@@ -153,37 +157,32 @@ def _scales(parts: tuple[_Part, _Part]) -> FloatArray:
     return np.maximum(np.array(medians) / MEDIAN_NORMAL, _MIN_SCALE)
 
 
-def _squared(parts: tuple[_Part, _Part], scales: FloatArray) -> FloatArray:
-    """Squared residuals (2, K) in units at which the weight is a half."""
+def _weights(parts: tuple[_Part, _Part], scales: FloatArray) -> FloatArray:
+    """Cauchy weights (2, K) of translations and rotations."""
     squared = []
     for part, scale in zip(parts, scales, strict=True):
         squared.append((part.residuals**2).sum(axis=1) / 3.0 / (_CAUCHY_UNIT * scale) ** 2)
-    return np.array(squared)
+    return robust_weights("cauchy", np.array(squared))
 
 
 def _normal_equations(
-    parts: tuple[_Part, _Part], scales: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the weighted Hessian (6, 6), the scores (K, 6) of the pairs, and what the slope of the
-    weights takes from the Hessian (6, 6).
-    """
-    n_pairs = len(parts[0].residuals)
+    parts: tuple[_Part, _Part], scales: FloatArray, weights: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the weighted Hessian (6, 6), and the scores (2, K, 6) of both parts of the pairs."""
     hessian = np.zeros((6, 6))
-    scores = np.zeros((n_pairs, 6))
-    curvature = np.zeros((6, 6))
-    weights = robust_weights("cauchy", _squared(parts, scales))
+    scores = []
     for part, scale, part_weights in zip(parts, scales, weights, strict=True):
         jacobians = part.jacobians / scale
         weighted = jacobians * part_weights[:, None, None]
-        part_scores = np.einsum("kij,ki->kj", weighted, part.residuals / scale)
         hessian += np.einsum("kij,kil->jl", weighted, jacobians)
-        scores += part_scores
-        curvature += 2.0 / 3.0 / _CAUCHY_UNIT**2 * part_scores.T @ part_scores
-    return hessian, scores, curvature
+        scores.append(np.einsum("kij,ki->kj", weighted, part.residuals / scale))
+    return hessian, np.stack(scores)
 
 
 def _covariance(hessian: FloatArray, scores: FloatArray, pairs: MotionPairs) -> FloatArray:
-    """Covariance (6, 6) from the Hessian (6, 6) and the scores (K, 6) of the pairs."""
+    """Covariance (6, 6) from the weighted Hessian (6, 6) and the scores (2, K, 6) of the pairs."""
+    # The weights fall with the residuals, which makes the cost flatter.
+    curvature = 2.0 / 3.0 / _CAUCHY_UNIT**2 * np.einsum("pki,pkj->ij", scores, scores)
     n_poses = int(pairs.j[-1] - pairs.i[0])
     motion = median(pairs.j - pairs.i)
     lasting = max(_LASTING_SHARE * n_poses, _LASTING_MOTIONS * motion)
@@ -191,7 +190,7 @@ def _covariance(hessian: FloatArray, scores: FloatArray, pairs: MotionPairs) -> 
     # The residuals are smaller than the errors, as six unknowns follow the errors.
     n_motions = n_poses / motion
     n_free = max(n_motions - 6.0, 1.0)
-    return n_motions / n_free * _sandwich(hessian, scores, window)
+    return n_motions / n_free * _sandwich(hessian - curvature, scores.sum(axis=0), window)
 
 
 def _sandwich(hessian: FloatArray, scores: FloatArray, window: int) -> FloatArray:
@@ -248,7 +247,7 @@ def _start(pairs: MotionPairs) -> FloatArray:
     differences = np.linalg.norm(vectors_parent, axis=1) - np.linalg.norm(vectors_child, axis=1)
     unit = max(1.5 * median(np.abs(differences)), _MIN_SCALE)
     weights = robust_weights("cauchy", (differences / unit) ** 2)
-    aligned = se3.nearest_rotation((vectors_parent * weights[:, None]).T @ vectors_child)
+    aligned = align_rotation_vectors(pairs, weights)
     common_axis = np.linalg.svd(vectors_parent, full_matrices=False)[2][0]
     turned = median(np.linalg.norm(vectors_parent, axis=1))
     candidates = []
@@ -270,9 +269,7 @@ def _with_translation(
     Returns the transform (4, 4), the median misfit (m), and the median length (m) that the
     translation has to explain.
     """
-    # (R_A - I) t = R t_B - t_A.
-    slopes = pairs.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
-    targets = pairs.Ts_childi_childj[:, :3, 3] @ rotation.T - pairs.Ts_parenti_parentj[:, :3, 3]
+    slopes, targets = translation_equations(pairs, rotation)
     weighted_slopes = (weights[:, None, None] * slopes).reshape(-1, 3)
     weighted_targets = (weights[:, None] * targets).ravel()
     translation = np.linalg.lstsq(weighted_slopes, weighted_targets, rcond=1e-9)[0]
