@@ -419,6 +419,15 @@ class _Unpacked(NamedTuple):
     end: int
 
 
+class _Frames(NamedTuple):
+    """Frames of a pose in CDR: their bytes, behind the stamp, and the position behind these."""
+
+    data: bytes
+    end: int
+    world_frame: str
+    sensor_frame: str | None
+
+
 def _unpack(row: MessageType, is_ros1: bool, data: bytes) -> _Unpacked:
     """Unpack one message; raise MALFORMED if it is not of its type."""
     cursor = Cursor(data, is_ros1)
@@ -494,6 +503,8 @@ class MessageReader:
         self._measures = measures
         self._are_poses = message_type in POSE_TYPES and measures == "poses"
         self._rates = RateIntegrator()
+        # Frames of the previous pose. No message has these bytes.
+        self._frames = _Frames(data=b" ", end=0, world_frame="", sensor_frame=None)
         self._origin = origin or LocalOrigin()
         self.n_left_out = 0
 
@@ -548,6 +559,20 @@ class MessageReader:
         lat, lon = np.radians(values[:, :2]).T
         return self._origin.local(lat, lon, values[:, 2])
 
+    def _pose_fields(self, data: bytes) -> PoseFields:
+        """Unpack a pose in CDR. Frames are decoded only if they differ from those before."""
+        start = _START + _STAMP_SIZE
+        if data[start : self._frames.end] != self._frames.data:
+            unpacked = _unpack(self._row, False, data)
+            end = unpacked.end - _POSE_SIZE
+            self._frames = _Frames(
+                data[start:end], end, unpacked.world_frame, unpacked.sensor_frame
+            )
+        frames = self._frames
+        pose = struct.unpack_from("<7d", data, frames.end)
+        stamp_ns = Cursor(data, False).stamp_ns()
+        return PoseFields(stamp_ns, frames.world_frame, frames.sensor_frame, pose[:3], pose[3:])
+
     def __call__(self, data: bytes) -> PoseFields:
         """Unpack the next message, in CDR.
 
@@ -560,8 +585,7 @@ class MessageReader:
         """
         try:
             if self._are_poses:
-                stamp_ns, world, sensor, pose, _ = _unpack(self._row, False, data)
-                return PoseFields(stamp_ns, world, sensor, pose[:3], pose[3:])
+                return self._pose_fields(data)
             columns, is_usable = self.columns([data], is_ros1=False)
         except InputError:
             raise
