@@ -64,7 +64,7 @@ _ROUNDS = 4
 # Smallest standard deviations of residuals (m, rad).
 _LEAST_SIGMA = np.repeat([1e-6, 1e-7], 3)
 
-# The recording is cut into so many windows of equal duration for the long-run variance.
+# Number of windows of equal duration in a recording for the long-run variance.
 _WINDOWS = (8, 16)
 # Fewest windows on either side of a shift.
 _LEAST_WINDOWS = 2

@@ -77,13 +77,13 @@ def rocking_axis(pose_pairs: PosePairs) -> FloatArray | None:
 
 
 def _products(rotations: FloatArray, baseline: int) -> FloatArray:
-    """Lever arm products (3, 3) of rotations (N, 3, 3) over a baseline of so many poses."""
+    """Lever arm products (3, 3) of rotations (N, 3, 3) between poses ``baseline`` poses apart."""
     motions = np.swapaxes(rotations[:-baseline], 1, 2) @ rotations[baseline:]
     return lever_arm_products(motions - np.eye(3))
 
 
 def _turning_axis(rotations: FloatArray) -> FloatArray | None:
-    """Axis (3,) in the sensor if it hardly turns about any other axis; None otherwise."""
+    """Axis (3,) in the sensor frame if nearly all rotation is about that axis; None otherwise."""
     powers, directions = np.linalg.eigh(_products(rotations, len(rotations) // 10))
     is_single = powers[0] < _SHARE_OF_TILT**2 * powers[2]
     return directions[:, 0] if is_single else None

@@ -98,7 +98,7 @@ class ExtraRule(NamedTuple):
     when : str
         The condition in words.
     find : callable
-        Yield sentence, what to do, axes and options of each reason of a result.
+        Yield the grounds against a result, ``Ground`` of that module.
     """
 
     after: str

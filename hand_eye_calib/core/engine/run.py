@@ -46,10 +46,6 @@ _CERTAIN_CODES = ("time_offset", "scale", "units", "unit_or_scale")
 # Findings whose options are estimated, so that their uncertainty counts.
 _ESTIMATED_CODES = ("time_offset", "scale", "unit_or_scale")
 
-# Share of the motion that the fit of streams without wrong conventions leaves unexplained at most,
-# with margin: the checks accept 0.12.
-_MOST_UNEXPLAINED = HOLDS
-
 # A clock rate counts as known if its spread is below this share of the largest time offset.
 _CLEAR_SPREAD = 0.5
 
@@ -168,7 +164,7 @@ def _on_another_clock(snapshot: Snapshot) -> Attempt | None:
         return None
     # Streams with wrong conventions or units are solved as given first: the message of a repair
     # needs that verdict.
-    if look.fit.has_own_unit or look.fit.unexplained > _MOST_UNEXPLAINED:
+    if look.fit.has_own_unit or look.fit.unexplained > HOLDS:
         return None
     offset = refine_time_offset(*snapshot.streams, look, snapshot.max_gap_s)
     other = replace(snapshot, config=replace(config, **_ESTIMATED_CLOCK), time_offset=offset)

@@ -4,6 +4,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from hand_eye_calib.core.results.verdict import Ground
+
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded:
@@ -64,11 +66,11 @@ _ADVICE = {
 }
 
 
-def find_kinds(kinds: Sequence[str], result: Any) -> Iterator[tuple[Any, ...]]:
-    """Yield the reason of a result whose recordings have one of these kinds of agreement."""
+def find_kinds(kinds: Sequence[str], result: Any) -> Iterator[Ground]:
+    """Yield the ground against a result whose recordings have one of these kinds of agreement."""
     together = result.parts.get("together")
     if together and together.kind in kinds:
-        yield together.sentence, _ADVICE[together.kind], (), {}
+        yield Ground(together.sentence, _ADVICE[together.kind])
 
 
 def details(together: Together, headline: str) -> list[str]:
