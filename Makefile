@@ -104,7 +104,7 @@ docs: export HAND_EYE_CALIB_ALL_PAGES := 1
 docs: $(VENV)/.ready-docs
 	PATH="$(CURDIR)/$(VENV)/bin:$$PATH" $(VENV)/bin/mkdocs build --strict --quiet
 	$(VENV)/bin/python docs/check_site.py site
-	$(VENV)/bin/python -m pytest test/unit/test_docs.py $(PYTEST_ARGS)
+	$(VENV)/bin/python -m pytest test/project/test_docs.py $(PYTEST_ARGS)
 
 notebook: $(VENV)/.ready-test
 	$(VENV)/bin/python examples/run_notebooks.py

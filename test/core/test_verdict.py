@@ -1,6 +1,6 @@
 """The verdict: each rule alone, the order of reasons, and the table in docs/verdict.md.
 
-``PYTHONPATH=test:. python test/unit/test_verdict.py`` writes the table after a change of the rules.
+``PYTHONPATH=test:. python test/core/test_verdict.py`` writes the table after a change of the rules.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ def table():
 
 def test_the_page_has_the_rules_of_the_code():
     assert table() in PAGE.read_text(encoding="utf-8"), (
-        "run PYTHONPATH=test:. python test/unit/test_verdict.py"
+        "run PYTHONPATH=test:. python test/core/test_verdict.py"
     )
 
 

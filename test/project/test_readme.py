@@ -25,7 +25,7 @@ HEADER = ("Name", "Default", "Unit", "Allowed", "Meaning")
 FEWEST_WORDS = 700
 MOST_WORDS = 900
 LIMITS = ROOT / "hand_eye_calib" / "formats/files.py"
-HINT = "PYTHONPATH=. python test/unit/test_readme.py writes it"
+HINT = "PYTHONPATH=. python test/project/test_readme.py writes it"
 
 
 def parameter_table(config):
