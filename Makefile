@@ -1,10 +1,11 @@
 # Needs python3 (3.11 or newer) and pip; everything else is installed into .venv here.
 #   make demo          simulate a drive, calibrate it offline and on the live node, compare with the truth
-#   make test          the whole test suite
-#   make test-oldest   the same without slow tests, on the oldest supported versions
+#   make test          the test suite, without the tests of the next line
+#   make test-statistics  tests that judge errors and sigmas of many recordings
+#   make test-oldest   make test on the oldest supported versions
 #   make fuzz          5,400 files, damaged on purpose (INPUTS=500)
 #   make lint          style, types and the contracts of the layers
-#   make coverage      the test suite, and the lines that no test runs
+#   make coverage      all tests, and the lines that no test runs
 #   make paper DATA=x  every figure and table of the paper from its published data in x, to reproduced/
 #   make coverage-study DATA=x  errors over their lower bound, and what the stated sigmas are worth
 #   make gate DATA=x   did errors or stated uncertainties get worse than the stored baseline? Five
@@ -17,9 +18,11 @@
 #                      tried; nothing is fetched
 #   make notebook      run the notebooks of examples/ again and keep their outputs
 #   make clean         remove everything that the targets above made
-# PYTHON=python3.12 chooses the interpreter, PYTEST_ARGS="-k name" goes to pytest.
+# PYTHON=python3.12 chooses the interpreter, PYTEST_ARGS="-k name" goes to pytest, WORKERS=1 is the
+# number of tests that run at once: by default one a core.
 PYTHON ?= python3
 PYTEST_ARGS ?=
+WORKERS ?= auto
 BENCH_ARGS ?=
 PAPER_ARGS ?=
 FUZZ_ARGS ?=
@@ -35,9 +38,10 @@ unexport PYTHONDONTWRITEBYTECODE
 VENV := .venv
 OLDEST := .venv-oldest
 PIP_FLAGS := --quiet --disable-pip-version-check
+PYTEST := python -m pytest --numprocesses $(WORKERS)
 SETUP_FILES := setup.py setup.cfg pyproject.toml package.xml
 
-.PHONY: help demo test test-oldest coverage coverage-study fuzz gate gate-quick paper bench \
+.PHONY: help demo test test-statistics test-oldest coverage coverage-study fuzz gate gate-quick paper bench \
 	bench-node lint format dist docs notebook clean
 
 help:
@@ -48,17 +52,20 @@ demo: $(VENV)/.ready-demo
 
 # One thread per process: small matrices gain nothing from more, and results do not depend on the
 # number of cores.
-test test-oldest coverage coverage-study gate paper: export OMP_NUM_THREADS := 1
-test test-oldest coverage coverage-study gate paper: export OPENBLAS_NUM_THREADS := 1
+test test-statistics test-oldest coverage coverage-study gate paper: export OMP_NUM_THREADS := 1
+test test-statistics test-oldest coverage coverage-study gate paper: export OPENBLAS_NUM_THREADS := 1
 
 test: $(VENV)/.ready-test
-	$(VENV)/bin/python -m pytest $(PYTEST_ARGS)
+	$(VENV)/bin/$(PYTEST) -m 'not statistics' $(PYTEST_ARGS)
+
+test-statistics: $(VENV)/.ready-test
+	$(VENV)/bin/$(PYTEST) -m statistics $(PYTEST_ARGS)
 
 test-oldest: $(OLDEST)/.ready-test
-	$(OLDEST)/bin/python -m pytest -m 'not slow' $(PYTEST_ARGS)
+	$(OLDEST)/bin/$(PYTEST) -m 'not statistics' $(PYTEST_ARGS)
 
 coverage: $(VENV)/.ready-test
-	$(VENV)/bin/python -m pytest --cov --cov-report=term:skip-covered $(PYTEST_ARGS)
+	$(VENV)/bin/$(PYTEST) --cov --cov-report=term:skip-covered $(PYTEST_ARGS)
 
 fuzz: $(VENV)/.ready-test
 	FUZZ_INPUTS=$(or $(INPUTS),5400) $(VENV)/bin/python -m pytest test/fuzz $(PYTEST_ARGS)

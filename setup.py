@@ -131,6 +131,7 @@ setup(
             "nbclient>=0.9",
             "packaging",
             "pytest>=7.4",
+            "pytest-xdist>=3.5",
             "wheel",
         ],
         "lint": ["import-linter==2.17", "mypy==2.4.1", "ruff==0.17.5", "types-PyYAML"],

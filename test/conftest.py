@@ -18,6 +18,21 @@ settings.load_profile("hand_eye_calib")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Give each file to one worker, and all files whose tests start nodes to the same worker.
+
+    Fixtures of a module are made once, and no two nodes compete for processor time.
+    """
+    from xdist.scheduler import LoadScopeScheduling
+
+    class FileScheduling(LoadScopeScheduling):
+        def _split_scope(self, nodeid):
+            return "test/ros" if nodeid.startswith("test/ros/") else nodeid.partition("::")[0]
+
+    return FileScheduling(config, log)
+
+
 def pytest_collection_finish():
     """What is imported stays: the collector need not walk through it again and again."""
     gc.freeze()

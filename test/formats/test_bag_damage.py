@@ -119,7 +119,6 @@ def test_cut_off_anywhere(bag, capsys):
     assert outcomes == ({"refused", "recovered"} if path.suffix == ".mcap" else {"refused"})
 
 
-@pytest.mark.slow
 def test_a_bit_flipped_anywhere(bag, capsys):
     data, path = bag
     path.write_bytes(data)

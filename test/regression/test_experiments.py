@@ -110,7 +110,7 @@ def one_error_figure(monkeypatch):
     return drawn
 
 
-@pytest.mark.slow
+@pytest.mark.statistics
 def test_everything_from_one_command(tmp_path, few_levels, one_error_figure):
     rows, files = made("all", tmp_path)
     four = rows[rows["method"].isin(["park", "taylor", "zhuang", "dnl"])]

@@ -271,7 +271,7 @@ def fault_table(every=1):
     return table
 
 
-@pytest.mark.slow
+@pytest.mark.statistics
 def test_faults_are_found_and_named():
     every = 1 if os.environ.get("HAND_EYE_CALIB_ALL_FAULTS") else 12
     table = fault_table(every)
