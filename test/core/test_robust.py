@@ -68,10 +68,10 @@ class TestSolver:
 
     def test_the_stride_with_the_smallest_covariance_is_taken(self):
         parent, child = noisy_poses(3)
-        best, reference = solve_best_stride(parent, child)
-        assert reference != "B1"
+        best = solve_best_stride(parent, child)
+        assert best.reference != "B1"
         short = solve(motion_pairs(parent, child, "B1"))
-        of_best = np.linalg.slogdet(best.cov_parent_child_in_child)[1]
+        of_best = np.linalg.slogdet(best.solution.cov_parent_child_in_child)[1]
         assert of_best < np.linalg.slogdet(short.cov_parent_child_in_child)[1]
 
 

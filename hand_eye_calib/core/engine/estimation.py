@@ -30,7 +30,7 @@ from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, Sol
 from hand_eye_calib.core.results.records import Residuals
 from hand_eye_calib.core.solvers.all_pairs import Solution
 from hand_eye_calib.core.solvers.registry import Method
-from hand_eye_calib.core.solvers.robust import solve_best_stride
+from hand_eye_calib.core.solvers.robust import BestStride
 
 # Largest share of the increments that may be jumps without a warning. With jumps at a tenth of the
 # poses of both trajectories, a fifth of the increments are jumps.
@@ -389,8 +389,10 @@ def _solve_pairs(
     reason = ""
     spread = _no_spread()
     warnings: tuple[str, ...] = ()
-    if reference == "auto" and method.name == "robust":
-        _, reference = solve_best_stride(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c)
+    best: BestStride | None = None
+    if reference == "auto" and method.solve_best_stride:
+        best = method.solve_best_stride(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c)
+        reference = best.reference
         reason = f"{reference}: of all numbers of poses, its covariance is the smallest"
     elif reference == "auto":
         from hand_eye_calib.core.assessment.reference_selection import select_reference
@@ -401,8 +403,12 @@ def _solve_pairs(
         model = choice.model
         if model.converged and not model.unseen.size:
             spread, warnings = possible_shift(model.part_products, model.misfit)
-    pairs = motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
-    solution = method.solve(pairs)
+    if best:
+        pairs = best.pairs
+        solution: Solution = best.solution
+    else:
+        pairs = motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
+        solution = method.solve(pairs)
     solve_without = partial(method.solve_without, pairs, solution)
     return Solved(
         solution=solution,

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,16 +21,34 @@ from hand_eye_calib.core.solvers import (
 )
 from hand_eye_calib.core.solvers.all_pairs import Solution
 
-# Arguments: motion pairs; for dnlo also a threshold and the least share of inliers. Taylor's
-# method has the same solution as Park's.
-_SOLVERS: dict[str, Callable[..., Solution]] = {
-    "dnlo": dnlo.solve,
-    "dnl": all_pairs.solve_dnl,
-    "park": all_pairs.solve_park,
-    "taylor": all_pairs.solve_park,
-    "zhuang": zhuang.solve,
-    "ali": all_pairs.solve_ali,
-    "robust": robust.solve,
+
+class _Solver(NamedTuple):
+    """Functions of a method.
+
+    Attributes
+    ----------
+    solve : callable
+        Takes motion pairs; for dnlo also a threshold and the least share of inliers.
+    solve_near : callable or None
+        Solves motion pairs from ``T_start``, a transform (4, 4) near the solution: saves time.
+    solve_best_stride : callable or None
+        Chooses the reference ``auto`` from poses; None if the adaptive estimator chooses it.
+    """
+
+    solve: Callable[..., Solution]
+    solve_near: Callable[..., Solution] | None = None
+    solve_best_stride: Callable[[FloatArray, FloatArray], robust.BestStride] | None = None
+
+
+# Taylor's method has the same solution as Park's.
+_SOLVERS = {
+    "dnlo": _Solver(dnlo.solve),
+    "dnl": _Solver(all_pairs.solve_dnl),
+    "park": _Solver(all_pairs.solve_park),
+    "taylor": _Solver(all_pairs.solve_park),
+    "zhuang": _Solver(zhuang.solve),
+    "ali": _Solver(all_pairs.solve_ali),
+    "robust": _Solver(robust.solve, robust.solve, robust.solve_best_stride),
 }
 
 
@@ -64,6 +83,11 @@ class Method:
             raise ConfigError(f"method {self.name!r} is unknown; known are {', '.join(_SOLVERS)}")
         require_backend(self.name, self.backend)
 
+    @property
+    def solve_best_stride(self) -> Callable[[FloatArray, FloatArray], robust.BestStride] | None:
+        """Solver that chooses the reference ``auto`` itself; None if the method has none."""
+        return _SOLVERS[self.name].solve_best_stride
+
     def solve(self, pairs: MotionPairs) -> Solution:
         """Solve AX = XB.
 
@@ -76,7 +100,7 @@ class Method:
             raise NotEnoughDataError(
                 "no motion pairs: there are too few common poses for the chosen reference"
             )
-        solve = _SOLVERS[self.name]
+        solve = _SOLVERS[self.name].solve
         if self.backend == "ipopt":
             # The import takes a second.
             from hand_eye_calib.core.solvers import ipopt
@@ -120,6 +144,6 @@ class Method:
                 pairs, solution, left_out, self.threshold, self.min_inlier_fraction
             )
         solve = self.solve
-        if self.name == "robust":
-            solve = partial(robust.solve, T_start=solution.T_parent_child)
+        if solve_near := _SOLVERS[self.name].solve_near:
+            solve = partial(solve_near, T_start=solution.T_parent_child)
         return np.stack([solve(pairs[~row]).T_parent_child for row in left_out])

@@ -12,6 +12,7 @@ consistent covariance matrix*, Econometrica 55, 1987.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -112,24 +113,40 @@ def solve(pairs: MotionPairs, T_start: FloatArray | None = None) -> RobustSoluti
     )
 
 
-def solve_best_stride(Ts_pw_p: FloatArray, Ts_cw_c: FloatArray) -> tuple[RobustSolution, str]:
+class BestStride(NamedTuple):
+    """Motions over one number of poses, and their solution.
+
+    Attributes
+    ----------
+    reference : str
+    pairs : MotionPairs
+        Pairs of the reference; some of them if neighbours overlap a lot, or if there are many.
+    solution : RobustSolution
+    """
+
+    reference: str
+    pairs: MotionPairs
+    solution: RobustSolution
+
+
+def solve_best_stride(Ts_pw_p: FloatArray, Ts_cw_c: FloatArray) -> BestStride:
     """Solve with motions over several numbers of poses; return the solution with the smallest
-    covariance, and its reference.
+    covariance.
 
     Parameters
     ----------
     Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
         Synchronised poses of both sensors, in order of time.
     """
-    solutions = {}
+    candidates = []
     for stride in _STRIDES:
         if stride == 1 or _MIN_MOTIONS * stride < len(Ts_pw_p):
             reference = f"B{stride}"
             pairs = motion_pairs(Ts_pw_p, Ts_cw_c, reference)
             every = max(stride // _MOTIONS_PER_STRIDE, -(-len(pairs) // _MOST_MOTIONS), 1)
-            solutions[reference] = solve(pairs[::every])
-    best = min(solutions, key=lambda reference: _log_volume(solutions[reference]))
-    return solutions[best], best
+            pairs = pairs[::every]
+            candidates.append(BestStride(reference, pairs, solve(pairs)))
+    return min(candidates, key=lambda candidate: _log_volume(candidate.solution))
 
 
 @dataclass(frozen=True)
