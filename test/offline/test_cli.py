@@ -25,6 +25,7 @@ from source_code import ROOT
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.option import option_name
+from hand_eye_calib.core.base.registry import COMMANDS
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import SolveStatus
@@ -280,8 +281,20 @@ def test_nan_is_left_out_and_counted_by_topic(run, new_bag):
 # ---- options
 
 
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_fits_a_screen_and_names_options_that_exist(run, command):
+    code, brief, _ = run(command, "--help")
+    assert code == 0
+    assert len(brief.splitlines()) <= 30
+    _, whole, _ = run(command, "--help", "all")
+    if brief != whole:
+        assert f"all options: hand_eye_calib {command} --help all" in brief
+    named = set(re.findall(r"--[a-z][a-z-]+", brief)) - {"--help", "--ros-args", "--params-file"}
+    assert named <= set(re.findall(r"--[a-z][a-z-]+", whole))
+
+
 def test_help_lists_every_option_with_its_default(run):
-    code, out, _ = run("calibrate", "--help")
+    code, out, _ = run("calibrate", "--help", "all")
     assert code == 0
     assert out.startswith("usage: hand_eye_calib calibrate [OPTION ...] PATH ...\n")
     assert out.index("--method") < out.index("rarely needed") < out.index("--max-gap")

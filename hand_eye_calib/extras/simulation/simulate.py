@@ -40,9 +40,22 @@ TUM format:
   {TRUTH_FILE}  the true extrinsic, one pose: the child sensor in the parent sensor's frame
   bag, bag.bag   with --bag: topics {PARENT_TOPIC} and {CHILD_TOPIC} (nav_msgs/msg/Odometry)"""
 
+# The help of at most a screen.
+_BRIEF = f"""\
+most used options:
+  --out DIR         directory to make; it must be empty or not exist
+  --runs N          number of recordings
+  --seed SEED       the same seed gives the same recordings
+  --drive hilly     two minutes outdoors in place of the paper's ten seconds
+  --mixture         the noise of the paper: errors, jumps and drift
+  --bag mcap        also write a bag of every recording
+
+{_EPILOG}"""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.set_defaults(brief=_BRIEF)
     parser.usage = "%(prog)s [OPTION ...] --out DIR"
     parser.epilog = _EPILOG
     add = parser.add_argument

@@ -35,12 +35,37 @@ examples:
   hand_eye_calib replay my_bag --topics /lidar/odometry /front/vio odom:rear --out rig
   hand_eye_calib replay live/journal --out result"""
 
+# The help of at most a screen.
+_BRIEF = """\
+PATH:
+  lidar.tum camera.tum          trajectory files of parent and child: TUM, KITTI, EuRoC, CSV
+  my_bag                        a bag of ROS 2 or ROS 1 with two pose topics
+  live/journal                  the journal of a session of the node
+  samples.yaml                  the stops of an arm: MoveIt, easy_handeye2, OpenCV
+  lidar.tum front.tum rear.tum  three sensors or more
+
+most used options:
+  --list                        show the topics of the bag, and exit
+  --parent-topic, --child-topic TOPIC   pose topics of the bag, if it has more than two
+  --out DIR                     save the result, the files for ROS and report.html
+  --time-offset estimate        the sensors' clocks differ
+  --scale auto                  the child's lengths have no unit (a single camera)
+  --prior z=1.85+/-0.02         a value that was measured by hand, in m (yaw=-90deg+/-2deg)
+  --installed SOURCE            compare with a URDF, an earlier result or a bag's /tf_static
+  --json                        print one JSON document
+
+examples:
+  hand_eye_calib calibrate lidar.tum camera.tum --out result
+  hand_eye_calib calibrate my_bag --parent-topic /lidar/odometry --child-topic /camera/odometry
+  hand_eye_calib calibrate gnss.csv slam.txt --time-offset estimate --prior z=1.85+/-0.02"""
+
 # Format of a row in the table of topics.
 _ROW = "{:<32} {:<42} {:>8} {:>10}  {:<5}  {}"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.set_defaults(brief=_BRIEF)
     parser.usage = "%(prog)s [OPTION ...] PATH ..."
     parser.epilog = EXAMPLES
     parser.set_defaults(parser=parser)

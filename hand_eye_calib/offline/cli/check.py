@@ -27,11 +27,26 @@ examples:
   hand_eye_calib check lidar.txt camera.txt
   hand_eye_calib check lidar.txt gnss.csv"""
 
+# The help of at most a screen.
+_BRIEF = f"""\
+PATH:
+  my_bag                   a bag of ROS 2 or ROS 1 with two pose topics
+  lidar.tum camera.tum     trajectory files of parent and child: TUM, KITTI, EuRoC, CSV
+
+most used options:
+  --parent-topic, --child-topic TOPIC   pose topics of the bag, if it has more than two
+  --time-offset estimate   the sensors' clocks differ
+  --scale auto             the child's lengths have no unit (a single camera)
+  --json                   print one JSON document
+
+{_EPILOG}"""
+
 _HEADINGS = ("", "poses", "seconds", "per s", "longest gap", "path length", "rotation")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.set_defaults(brief=_BRIEF)
     parser.usage = "%(prog)s [OPTION ...] PATH ..."
     parser.epilog = _EPILOG
     options.add_input_arguments(parser, "a bag, or the trajectory files of parent and child")

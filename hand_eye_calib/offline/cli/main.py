@@ -9,7 +9,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from hand_eye_calib.core.base.errors import ConfigError, HandEyeCalibError, installing
 from hand_eye_calib.core.base.option import did_you_mean
@@ -22,7 +22,7 @@ _EPILOG = """\
 examples:
   hand_eye_calib calibrate lidar.tum camera.tum  calibrate from two trajectory files
   hand_eye_calib calibrate my_bag --out result   calibrate from a bag, with report.html
-  hand_eye_calib COMMAND --help                  options and examples of a command
+  hand_eye_calib COMMAND --help                  a command in short; --help all: every option
 
 exit codes: 0 good, 1 bad input or failed, 2 wrong usage, 3 solved but something is
 unobservable or the verdict is DO NOT USE"""
@@ -107,6 +107,30 @@ class CommandParser(argparse.ArgumentParser):
         self.exit(Exit.USAGE, f"hand_eye_calib: error: {text}\n")
 
 
+class _ShowHelp(argparse.Action):
+    """Print the help of a command.
+
+    A command with many options has a brief help of at most a screen, the default ``brief`` of its
+    parser. ``--help all`` prints all options.
+    """
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> NoReturn:
+        """Print the help and exit with code 0."""
+        brief = parser.get_default("brief")
+        if brief and values is None:
+            print(f"{parser.format_usage()}\n{parser.description}\n\n{brief}\n")
+            print(f"all options: {parser.prog} --help all")
+        else:
+            parser.print_help()
+        parser.exit()
+
+
 def _run(argv: Sequence[str]) -> int:
     command = next((word for word in argv if not word.startswith("-")), None)
     parser = CommandParser(
@@ -119,7 +143,19 @@ def _run(argv: Sequence[str]) -> int:
         known = f"expected one of {', '.join(COMMANDS)}{did_you_mean(command, COMMANDS)}"
         parser.error(f"invalid choice: {command!r}, {known}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    parsers = {name: commands.add_parser(name, help=COMMANDS[name].help) for name in COMMANDS}
+    parsers = {
+        name: commands.add_parser(name, help=COMMANDS[name].help, add_help=False)
+        for name in COMMANDS
+    }
+    for command_parser in parsers.values():
+        command_parser.add_argument(
+            "-h",
+            "--help",
+            nargs="?",
+            choices=("all",),
+            action=_ShowHelp,
+            help="show the help and exit; all: with every option",
+        )
     for any_parser in (parser, *parsers.values()):
         any_parser.formatter_class = argparse.RawDescriptionHelpFormatter
         any_parser.allow_abbrev = False

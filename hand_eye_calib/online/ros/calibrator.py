@@ -6,7 +6,8 @@ import textwrap
 
 from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig
 
-_INTERFACE = """\
+# The help of at most a screen.
+_BRIEF = """\
 examples:
   hand_eye_calib calibrator --ros-args -r parent_odom:=/lidar/odometry -r child_odom:=/camera/odom
   hand_eye_calib calibrator --ros-args --params-file calibrator.yaml
@@ -25,16 +26,16 @@ published topics:
 
 services:
   ~/solve, ~/save, ~/reset       std_srvs/Trigger
-  ~/set_enabled                  std_srvs/SetBool: stop or resume accepting poses
+  ~/set_enabled                  std_srvs/SetBool: stop or resume accepting poses"""
 
-parameters (-p NAME:=VALUE):
-"""
+_PARAMETERS = "All parameters (-p NAME:=VALUE) are in config/calibrator.yaml, with their defaults."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the usage of the command; its arguments are passed on to the node."""
     parser.usage = "%(prog)s [--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO ...]"
-    epilog = _INTERFACE
+    parser.set_defaults(brief=f"{_BRIEF}\n\n{_PARAMETERS}")
+    epilog = f"{_BRIEF}\n\nparameters (-p NAME:=VALUE):\n"
     for name, field in (CalibratorConfig.by_name() | NodeConfig.by_name()).items():
         value = " ".join(filter(None, (json.dumps(field.default), field.metadata["unit"])))
         doc = textwrap.indent(textwrap.fill(field.metadata["doc"], 90), "      ")
