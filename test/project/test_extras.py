@@ -8,20 +8,12 @@ import subprocess
 import sys
 
 import pytest
+from package_copy import WITHOUT_FINDER, copy_of_the_package
 from source_code import PACKAGE, SOURCE
 
 import hand_eye_calib as hec
 from hand_eye_calib.extras import EXTRAS
 from hand_eye_calib.offline.cli.main import main
-
-# Without the finder of an editable install, which would find the deleted folder elsewhere.
-WITHOUT_FINDER = """
-import sys
-
-sys.meta_path[:] = [
-    finder for finder in sys.meta_path if "__editable__" not in getattr(finder, "__module__", "")
-]
-"""
 
 WITHOUT = (
     WITHOUT_FINDER
@@ -75,13 +67,6 @@ def expected(tmp_path_factory):
     arguments = ["calibrate", "sample:lidar.tum", "sample:camera.tum", "--out", str(out)]
     assert main(arguments) == 0
     return hec.load(out).to_dict()
-
-
-def copy_of_the_package(folder):
-    """The folder of a copy."""
-    copy = folder / PACKAGE
-    shutil.copytree(SOURCE, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    return copy
 
 
 def run_without(extra, folder, needing):
