@@ -1,78 +1,130 @@
-"""The script of the page of ``watch``: it finds what it looks for, and does what it should."""
+"""The page of ``watch`` in a browser: what it displays, and what its buttons request."""
 
 import json
+import queue
 import re
-import shutil
-import subprocess
+import threading
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from browser import PATIENCE_S, Browser
 
 from hand_eye_calib.online.watch import view, web
+from hand_eye_calib.online.watch.view import Tone, View
+from hand_eye_calib.online.watch.web import WebServer
 
 FOLDER = Path(web.__file__).parent / "page"
 SCRIPT = (FOLDER / "page.js").read_text(encoding="utf-8")
 PAGE = (FOLDER / "page.html").read_text(encoding="utf-8")
 
-# A browser as far as the script needs one: it stands still until it is told what happens.
-BROWSER = """
-let now = 0, tick = null; const log = {posts: [], opened: [], shaken: 0, locks: []};
-Date.now = () => now;
-const element = (more) => withClasses({
-  dataset: {}, hidden: false, disabled: false, textContent: "", heard: {}, classes: new Set(),
-  value: "", innerHTML: "",
-  setAttribute() {},
-  addEventListener(name, run) { this.heard[name] = run; }, ...more});
-const withClasses = (one) => { one.classList = {toggle(name, on) {
-  on ? one.classes.add(name) : one.classes.delete(name); }}; return one; };
-const anchors = [element({dataset: {file: "a"}, hidden: true})];
-const nodes = {connection: element(), footer: element(), view: element({
-  innerHTML: "",
-  querySelector() {
-    const textContent = this.innerHTML.match(/<h1>(.*?)<.h1>/)[1].replace(/<[^>]*>/g, "");
-    return {textContent, innerText: this.innerHTML};
-  }})};
-for (const id of ["by-hand", "files", "sound", "asked", "unit", "icon", "said", "forget"])
-  nodes[id] = element();
-const shown = {buttons: "solve save reset", byHand: "", priors: "{}", files: ""};
-nodes.state = {className: "busy", dataset: shown};
-const keys = ["solve", "save", "reset"].map((request) => element(
-  {dataset: request === "reset" ? {request, sure: "Forget all poses?"} : {request}}));
-globalThis.document = {title: "", getElementById: (id) => nodes[id], visibilityState: "visible",
-  addEventListener(name, run) { seen = run; }, querySelector: () => nodes.footer,
-  querySelectorAll: (what) => what.startsWith("a") ? anchors : keys};
-globalThis.FormData = class {
-  *[Symbol.iterator]() { yield ["axis", "?"]; yield ["value", "1.85"]; yield ["sigma", "0.02"]; }
+GO_ON = View(
+    node="/calibrator",
+    tone=Tone.BUSY,
+    word="GO ON",
+    sentence="z is behind.",
+    buttons=("solve", "save", "reset"),
+)
+MOVED = View(node="/calibrator", tone=Tone.BAD, word="MOUNT MOVED", sentence="by 2 cm.")
+
+# Counts vibrations of the phone, and requests that the screen stays on, in attributes of the page.
+COUNTERS = """
+const counts = {vibrations: 0, locks: 0};
+const count = (name) => {
+  counts[name] += 1;
+  document.documentElement.dataset[name] = counts[name];
 };
-globalThis.location = {search: "?key=word"};
-Object.defineProperty(globalThis, "navigator", {value: {
-  vibrate() { log.shaken += 1; },
-  wakeLock: {request(kind) { log.locks.push(kind); return Promise.resolve(); }}}});
-let seen = null, sure = false, asks = [], answer = {ok: true, text: async () => ""};
-globalThis.confirm = (text) => { asks.push(text); return sure; };
-globalThis.fetch = (address, {method}) => {
-  log.posts.push(`${method} ${address}`); return Promise.resolve(answer); };
-globalThis.setInterval = (run) => { tick = run; };
-globalThis.EventSource = class {
-  static CLOSED = 2;
-  constructor(address) { this.readyState = 1; log.opened.push(address); events = this; }
-  close() { this.readyState = 2; }
-};
-let events = null;
-const state = () => ({...log, posts: [...log.posts], locks: log.locks.length,
-  opened: log.opened.length, last: log.opened.at(-1),
-  title: document.title, said: nodes.connection.textContent,
-  lost: nodes.connection.classes.has("lost"), footer: nodes.footer.hidden,
-  form: nodes["by-hand"].hidden, axes: nodes.asked.innerHTML, chosen: nodes.asked.value,
-  unit: nodes.unit.textContent, forget: nodes.forget.hidden, asks: [...asks],
-  hidden: keys.map((key) => key.hidden),
-  main: keys.map((key) => key.classes.has("main")), link: anchors[0].hidden || anchors[0].href,
-  disabled: keys.every((button) => button.disabled)});
+Navigator.prototype.vibrate = () => { count("vibrations"); return true; };
+const request = WakeLock.prototype.request;
+WakeLock.prototype.request = function (kind) { count("locks"); return request.call(this, kind); };
 """
 
 
-class Found(HTMLParser):
+class Shown:
+    """A board whose view the test sets, and which can stop to answer."""
+
+    def __init__(self):
+        self.current = GO_ON
+        self.answers = threading.Event()
+        self.answers.set()
+
+    def view(self, now_s):
+        self.answers.wait(PATIENCE_S)
+        return self.current
+
+
+class Page:
+    """The page of a server in a browser."""
+
+    def __init__(self, browser, server):
+        self.browser = browser
+        self.server = server
+        browser.open(f"http://127.0.0.1:{server.server_port}/?key=word", COUNTERS)
+        self.wait_for_word(server.board.current.word)
+
+    def show(self, shown):
+        """Set the view of the server, and wait until the page displays it."""
+        self.server.board.current = shown
+        self.wait_for_word(shown.word)
+
+    def wait_for_word(self, word):
+        self.browser.wait_for(f"document.title.endsWith({json.dumps(word)})")
+
+    def wait_for_connection(self, text):
+        """Wait until the line about the connection begins with a text, and return the line."""
+        line = "document.getElementById('connection').textContent"
+        self.browser.wait_for(f"{line}.startsWith({json.dumps(text)})")
+        return self.browser.evaluate(line)
+
+    def get(self, selector, field):
+        """Return a field of an element."""
+        return self.browser.evaluate(f"document.querySelector({json.dumps(selector)}).{field}")
+
+    def wait_for_count(self, name, number):
+        self.browser.wait_for(f"document.documentElement.dataset.{name} === '{number}'")
+
+    def visible_buttons(self):
+        return self.browser.evaluate(
+            "[...document.querySelectorAll('button[data-request]')]"
+            ".filter((button) => button.checkVisibility()).map((button) => button.dataset.request)"
+        )
+
+    def request(self):
+        """Return the next request that the server has received."""
+        return self.server.requests.get(timeout=PATIENCE_S)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    started = Browser(tmp_path_factory.mktemp("profile"))
+    yield started
+    started.close()
+
+
+def started_server(port=0, key="word"):
+    requests = queue.SimpleQueue()
+    server = WebServer(Shown(), requests.put, ("127.0.0.1", port))
+    server.key = key
+    server.requests = requests
+    return server
+
+
+@pytest.fixture
+def server(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    started = started_server()
+    yield started
+    started.board.answers.set()
+    started.stop()
+
+
+@pytest.fixture
+def page(browser, server):
+    return Page(browser, server)
+
+
+class Elements(HTMLParser):
     """Ids, tags and data attributes of a piece of HTML."""
 
     def __init__(self, text):
@@ -92,7 +144,7 @@ class Found(HTMLParser):
 
 
 def test_the_script_finds_what_it_looks_for():
-    page = Found(PAGE)
+    page = Elements(PAGE)
     assert set(re.findall(r'part\("([\w-]+)"\)', SCRIPT)) - {"state"} <= page.ids
     assert set(re.findall(r'document\.querySelector(?:All)?\("(\w+)"\)', SCRIPT)) <= set(page.tags)
     assert page.data["data-file"] == list(web.SAVED)
@@ -101,119 +153,168 @@ def test_the_script_finds_what_it_looks_for():
     assert len(page.data["data-sure"]) == 3
 
 
-def test_the_word_is_large_on_a_phone_and_larger_on_a_wide_screen():
-    style = (FOLDER / "page.css").read_text(encoding="utf-8")
-    (sizes,) = re.findall(r"h1 \{ font-size: clamp\((.+?)rem, (.+?)vw, (.+?)rem\)", style)
-    smallest, share, largest = map(float, sizes)
-    assert 16 * smallest >= 27
-    assert min(12.8 * share, 16 * largest) >= 64  # at 1,280 px
+def test_the_word_is_large_on_a_phone_and_larger_on_a_wide_screen(page):
+    def height_px(width):
+        screen = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": width < 600}
+        page.browser.call("Emulation.setDeviceMetricsOverride", **screen)
+        return float(
+            page.browser.evaluate("getComputedStyle(document.querySelector('h1')).fontSize")[:-2]
+        )
+
+    assert height_px(390) >= 27
+    assert height_px(1280) >= 64
 
 
-def played(steps):
-    """States of the page after each step, given in JavaScript."""
-    run = "\n".join(f"{step}\nawait null; await null; states.push(state());" for step in steps)
-    text = f"{BROWSER}{SCRIPT.replace('use strict', '')}"
-    text += f"(async () => {{ const states = []; {run}\nconsole.log(JSON.stringify(states)); }})();"
-    node = shutil.which("node")
-    if node is None:
-        pytest.skip("the script runs in Node.js, which is not installed")
-    done = subprocess.run([node, "-"], input=text, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+# ------------------------------------------------------------------------ what it displays
 
 
-def test_the_page_shows_what_comes_and_says_when_nothing_comes():
-    go_on = "'<h1><span>▶</span> GO ON</h1><progress></progress>'"
-    states = played(
-        [
-            "",
-            f"now = 100; events.onmessage({{data: {go_on}}});",
-            "shown.buttons = ''; now = 200; events.onmessage({data: '<h1>MOUNT MOVED</h1>'});",
-            "now = 3000; events.onmessage({data: ''}); tick();",
-            "now = 7500; tick();",
-            "now = 9500; tick();",
-            f"now = 9800; events.onmessage({{data: {go_on}}});",
-            "events.onerror(); now = 10800; tick();",
-            "answer = {status: 403}; events.onerror(); await null; now = 11800; tick();",
-            "document.visibilityState = 'hidden'; seen(); document.visibilityState = 'visible';",
-            "seen();",
-        ]
+def test_the_title_is_the_word_of_the_newest_view(page):
+    assert page.browser.evaluate("document.title") == f"{Tone.BUSY.value} GO ON"
+    assert page.get("#said", "textContent").startswith(f"{Tone.BUSY.value} GO ON")
+    page.show(MOVED)
+    assert page.browser.evaluate("document.title") == f"{Tone.BAD.value} MOUNT MOVED"
+    assert page.wait_for_connection("✓") == "✓ connected"
+
+
+def test_a_phone_shakes_at_each_new_word_once_it_was_touched(page):
+    page.show(MOVED)
+    assert page.get("html", "dataset.vibrations") is None
+    page.browser.click("#sound")
+    page.show(GO_ON)
+    page.wait_for_count("vibrations", 1)
+    page.show(MOVED)
+    page.wait_for_count("vibrations", 2)
+    assert page.get("#sound", "textContent") == "Sound: on"
+
+
+def test_the_screen_stays_on_while_the_page_is_visible(page):
+    page.wait_for_count("locks", 1)
+    session_of_page = page.browser.session
+    page.browser.open("about:blank")
+    page.browser.session = session_of_page
+    assert page.browser.evaluate("document.visibilityState") == "hidden"
+    page.browser.call("Page.bringToFront")
+    page.wait_for_count("locks", 2)
+
+
+def test_a_silent_connection_is_stated_and_opened_again(page):
+    page.server.board.answers.clear()
+    lost = page.wait_for_connection("✗")
+    assert re.fullmatch(r"✗ CONNECTION LOST at \d\d:\d\d(\W[AP]M)?, trying again \.\.\.", lost)
+    assert page.get("#connection", "className") == "lost"
+    assert page.get("button[data-request=solve]", "disabled")
+    page.server.board.answers.set()
+    assert page.wait_for_connection("✓") == "✓ connected"
+    assert page.get("#connection", "className") == ""
+    assert not page.get("button[data-request=solve]", "disabled")
+
+
+def test_a_server_with_another_key_is_an_old_address(page):
+    page.server.stop()
+    page.wait_for_connection("✗ CONNECTION LOST")
+    other = started_server(page.server.server_port, "other")
+    try:
+        old = page.wait_for_connection("✗ OLD")
+    finally:
+        other.stop()
+    assert old == "✗ OLD ADDRESS: open the address that watch shows now"
+
+
+# ------------------------------------------------------------------------ buttons
+
+
+def test_buttons_send_their_requests(page):
+    page.browser.click("button[data-request=solve]")
+    assert page.request() == "solve"
+    page.browser.click("button[data-request=save]")
+    assert page.request() == "save"
+
+
+def test_a_reset_is_confirmed_first(page):
+    assert page.browser.click("button[data-request=reset]", [False]) == ["Forget all poses?"]
+    assert page.browser.click("button[data-request=reset]", [True]) == ["Forget all poses?"]
+    assert page.request() == "reset"
+    assert page.server.requests.empty()
+
+
+def test_a_request_that_is_refused_is_a_lost_connection(page):
+    page.server.key = "other"
+    page.browser.click("button[data-request=save]")
+    page.wait_for_connection("✗")
+
+
+def test_the_recommended_button_stands_out_and_the_others_are_hidden(page):
+    def main_buttons():
+        return page.browser.evaluate(
+            "[...document.querySelectorAll('button.main')].map((button) => button.dataset.request)"
+        )
+
+    assert page.visible_buttons() == ["reset", "save", "solve"]
+    assert main_buttons() == []
+    page.show(replace(GO_ON, word="SAVE", buttons=("save", "solve")))
+    assert page.visible_buttons() == ["save", "solve"]
+    assert main_buttons() == ["save"]
+    page.show(MOVED)
+    assert page.visible_buttons() == []
+
+
+def test_saved_files_are_linked(page, tmp_path):
+    assert page.get("a[data-file='report.html']", "hidden")
+    (tmp_path / "report.html").write_text("<p>report")
+    page.show(replace(GO_ON, word="DONE", saved_in=str(tmp_path)))
+    assert page.get("a[data-file='report.html']", "href").endswith("/report.html?key=word")
+    assert not page.get("a[data-file='report.html']", "hidden")
+    assert page.get("a[data-file='extrinsic.yaml']", "hidden")
+
+
+# ------------------------------------------------------------------------ priors
+
+
+WITH_PRIOR = replace(
+    GO_ON, word="CHECK THE PRIOR", by_hand=("z", "yaw"), priors=(("z", "1.5m+/-0.02m"),)
+)
+
+
+def choose(page, axis):
+    page.browser.evaluate(
+        f"asked.value = {json.dumps(axis)}; asked.dispatchEvent(new Event('change'))"
     )
-    opened = [state["opened"] for state in states]
-    title = [state["title"] for state in states]
-    messages = [state["said"] for state in states]
-    assert opened == [1, 1, 1, 1, 2, 2, 2, 3, 4, 4, 4]
-    assert states[0]["last"] == "events?key=word"
-    assert title[1:4] == ["▶ GO ON", "MOUNT MOVED", "MOUNT MOVED"]
-    assert [state["shaken"] for state in states][:9] == [0, 1, 2, 2, 2, 2, 3, 3, 3]
-    assert [state["footer"] for state in states][1:3] == [False, True]
-    assert [state["locks"] for state in states][8:] == [1, 1, 2]  # while seen, it stays on
-    assert [state["disabled"] for state in states][:9] == [k in (4, 5, 7, 8) for k in range(9)]
-    assert messages[3] == messages[6] == "✓ connected"
-    assert re.fullmatch(r"✗ CONNECTION LOST at \d\d:\d\d( [AP]M)?, trying again ...", messages[4])
-    assert messages[5] == messages[4]
-    assert messages[8] == "✗ OLD ADDRESS: open the address that watch shows now"
-    assert [state["lost"] for state in states][3:7] == [False, True, True, False]
 
 
-def test_buttons_are_asked_for_by_their_addresses():
-    def click(index):
-        return f"keys[{index}].heard.click();"
-
-    states = played(
-        [
-            click(0) + click(1),
-            click(2),
-            "sure = true;" + click(2),
-            "answer = {ok: false, text: async () => ''};" + click(1),
-        ]
-    )
-    asked = [f"POST {name}?key=word" for name in ("solve", "save", "reset")]
-    assert [state["posts"] for state in states[:3]] == [asked[:2], asked[:2], asked]
-    assert states[3]["posts"][-1] == "POST save?key=word"
-    assert states[3]["lost"]
+def test_an_axis_measured_by_hand_is_sent(page):
+    assert page.get("#by-hand", "hidden")
+    page.show(replace(GO_ON, word="MEASURE", by_hand=("z",)))
+    assert not page.get("#by-hand", "hidden")
+    page.browser.fill("input[name=value]", "1.85")
+    page.browser.fill("input[name=sigma]", "0.02")
+    page.browser.click("#by-hand button")
+    assert page.request() == "prior.z:=1.85m+/-0.02m"
 
 
-def test_what_is_to_be_pressed_first_stands_out_and_an_axis_can_be_given_by_hand():
-    go_on = "events.onmessage({data: '<h1>GO ON</h1>'});"
-    linked = "shown.files = 'a b';"
-    states = played(
-        [
-            go_on,
-            f"shown.buttons = 'save solve'; {linked}{go_on}",
-            f"shown.byHand = 'z'; {go_on}",
-            "nodes['by-hand'].heard.submit({preventDefault() {}});",
-        ]
-    )
-    assert [state["main"] for state in states[:2]] == [[False] * 3, [False, True, False]]
-    assert [state["hidden"] for state in states[:2]] == [[False] * 3, [False, False, True]]
-    assert [state["link"] for state in states[:2]] == [True, "a?key=word"]
-    assert [state["form"] for state in states] == [True, True, False, False]
-    assert states[3]["posts"] == ["POST prior?key=word&axis=z&value=1.85&sigma=0.02"]
+def test_the_unit_and_the_button_to_remove_follow_the_axis(page):
+    page.show(WITH_PRIOR)
+    options = "[...asked.options].map((option) => option.value)"
+    assert page.browser.evaluate(options) == ["z", "yaw"]
+    assert (page.get("#unit", "textContent"), page.get("#forget", "hidden")) == ("m", False)
+    choose(page, "yaw")
+    assert (page.get("#unit", "textContent"), page.get("#forget", "hidden")) == ("deg", True)
 
 
-def test_a_prior_can_be_corrected_and_removed_and_what_somebody_has_chosen_stays():
-    message = "events.onmessage({data: '<h1>CHECK THE PRIOR</h1>'});"
-    states = played(
-        [
-            f"""shown.byHand = 'z yaw'; shown.priors = '{{"z": "1.5m+/-0.02m"}}'; {message}""",
-            "nodes.asked.value = 'yaw'; nodes.asked.heard.change();",
-            f"shown.byHand = 'yaw z x'; {message}",
-            "nodes.asked.value = 'z'; nodes.asked.heard.change(); nodes.forget.heard.click();",
-            "sure = true; keys[2].heard.click();",
-            f"shown.priors = '{{}}'; {message} keys[2].heard.click();",
-        ]
-    )
-    assert [state["form"] for state in states] == [False] * 6
-    assert states[0]["axes"] == "<option>z</option><option>yaw</option>"
-    assert [state["chosen"] for state in states[:4]] == ["z", "yaw", "yaw", "z"]
-    assert [state["unit"] for state in states[:4]] == ["m", "deg", "deg", "m"]
-    assert [state["forget"] for state in states[:4]] == [False, True, True, False]
-    assert states[3]["posts"] == ["POST forget?key=word&axis=z"]
-    assert states[4]["asks"] == [
-        "Forget all poses?",
-        "Remove the prior, too? It is z = 1.5m+/-0.02m.",
-    ]
-    assert states[4]["posts"][1:] == ["POST forget?key=word", "POST reset?key=word"]
-    assert states[5]["asks"][2:] == ["Forget all poses?"]
-    assert states[5]["posts"][3:] == ["POST reset?key=word"]
+def test_a_chosen_axis_stays_when_the_axes_change(page):
+    page.show(WITH_PRIOR)
+    choose(page, "yaw")
+    page.show(replace(WITH_PRIOR, word="GO ON", by_hand=("yaw", "z", "x")))
+    assert page.get("#asked", "value") == "yaw"
+
+
+def test_a_prior_is_removed(page):
+    page.show(WITH_PRIOR)
+    page.browser.click("#forget")
+    assert page.request() == "prior.z:="
+
+
+def test_a_reset_offers_to_remove_the_priors_too(page):
+    page.show(replace(WITH_PRIOR, buttons=("solve", "forget", "reset")))
+    messages = page.browser.click("button[data-request=reset]", [True, True])
+    assert messages == ["Forget all poses?", "Remove the prior, too? It is z = 1.5m+/-0.02m."]
+    assert {page.request(), page.request()} == {"forget", "reset"}
