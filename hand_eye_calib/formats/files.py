@@ -9,11 +9,12 @@ import os
 import stat
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
 
 from hand_eye_calib.core.base.errors import InputError, printable
+from hand_eye_calib.core.base.option import did_you_mean
 
 # ---- all files
 
@@ -94,6 +95,14 @@ def reading_memory() -> Iterator[None]:
             _before.pop()
 
 
+def similar(path: str | Path) -> str:
+    """Return ``; did you mean NAME?`` for a missing file with a neighbour of a similar name."""
+    with suppress(OSError, ValueError):  # no folder, or a zero byte in the path
+        if not Path(path).exists():
+            return did_you_mean(Path(path).name, os.listdir(Path(path).parent))
+    return ""
+
+
 def open_regular(path: str | Path) -> BufferedReader:
     """Open a file for reading.
 
@@ -108,7 +117,7 @@ def open_regular(path: str | Path) -> BufferedReader:
         )
     except (OSError, ValueError) as error:  # a ValueError for a path with a zero byte
         reason = getattr(error, "strerror", None) or error
-        raise InputError(f"cannot read {printable(str(path))}: {reason}") from None
+        raise InputError(f"cannot read {printable(str(path))}: {reason}{similar(path)}") from None
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         return file
     file.close()

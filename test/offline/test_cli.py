@@ -268,6 +268,25 @@ def test_what_is_not_there_is_named_with_what_is(refused, new_bag, tmp_path):
     assert ", ".join(topics) in line
 
 
+def test_a_misspelt_name_is_answered_with_a_similar_one(refused, new_bag, tmp_path):
+    file = tmp_path / "camera.tum"
+    file.write_text("0 0 0 0 0 0 0 1\n")
+    line = refused("calibrate", tmp_path / "camra.tum", file)
+    assert line.endswith("No such file or directory; did you mean camera.tum?")
+    bag = new_bag()
+    line = refused("replay", bag.with_name(f"{bag.name}s"), *TOPICS)
+    assert line.endswith(f"; did you mean {bag.name}?")
+    line = refused("replay", bag, "--parent-topic", "/lidar/odo", "--child-topic", CHILD_TOPIC)
+    assert f"; did you mean {PARENT_TOPIC}? The bag has" in line
+
+
+@pytest.mark.parametrize("command", [["calibrate"], ["check"], ["calibrate", "lidar.tum"]])
+def test_a_file_that_is_given_twice_is_refused(run, command):
+    code, out, err = run(*command, "camera.tum", "camera.tum")
+    assert (code, out) == (2, "")
+    assert "error: camera.tum is given twice: give the file of each sensor" in err
+
+
 def test_nan_is_left_out_and_counted_by_topic(run, new_bag):
     child = drive()[1]
     child.poses.setflags(write=True)

@@ -128,8 +128,9 @@ def _files_of(path: Path) -> list[Path]:
     if not path.is_dir():
         if _suffix(path) and path.is_file():
             return [path]
-        what = f"{path} is not a bag" if path.exists() else f"no bag at {path}"
-        raise InputError(f"{what}; expected {_EXPECTED}")
+        if path.exists():
+            raise InputError(f"{path} is not a bag; expected {_EXPECTED}")
+        raise InputError(f"no bag at {path}{files.similar(path) or f'; expected {_EXPECTED}'}")
     paths = {file for file in path.iterdir() if _suffix(file) and file.is_file()}
     if not paths:
         raise InputError(_no_files(path))

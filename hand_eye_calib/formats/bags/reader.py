@@ -13,6 +13,7 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import IntArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError, InputError
+from hand_eye_calib.core.base.option import did_you_mean
 from hand_eye_calib.core.base.registry import BAG_READINGS
 from hand_eye_calib.core.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.core.geometry.trajectory import Trajectory
@@ -180,7 +181,8 @@ class PoseBag:
         parts = self._parts_of(topic)
         for part in parts:
             if part not in self.topics:
-                raise InputError(f"no topic {part} in {self}. {self._listing()}")
+                hint = did_you_mean(part, self.topics) or "."
+                raise InputError(f"no topic {part} in {self}{hint} {self._listing()}")
         if len(parts) > 1:
             self.measured(parts[0], "positions")
             self.measured(parts[1], "rotations")

@@ -3,6 +3,7 @@
 import dataclasses
 import re
 from argparse import Namespace
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,8 +74,11 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
     Raises
     ------
     ConfigError
-        If only some are bags, or there is only one file.
+        If only some are bags, there is only one file, or a path is given twice.
     """
+    for path, count in Counter(map(str, paths)).items():
+        if count > 1:
+            raise ConfigError(f"{path} is given twice: give the file of each sensor")
     bags = [path for path in paths if isinstance(path, str)]
     local_bags = [path for path in paths if isinstance(path, Path) and _looks_like_bag(path)]
     n_bags = len(bags) + len(local_bags)
