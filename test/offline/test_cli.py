@@ -273,7 +273,7 @@ def test_a_misspelt_name_is_answered_with_a_similar_one(refused, new_bag, tmp_pa
     file.write_text("0 0 0 0 0 0 0 1\n")
     line = refused("calibrate", tmp_path / "camra.tum", file)
     assert line.endswith("No such file or directory; did you mean camera.tum?")
-    bag = new_bag()
+    bag = Path(new_bag())
     line = refused("replay", bag.with_name(f"{bag.name}s"), *TOPICS)
     assert line.endswith(f"; did you mean {bag.name}?")
     line = refused("replay", bag, "--parent-topic", "/lidar/odo", "--child-topic", CHILD_TOPIC)
