@@ -11,7 +11,6 @@ import socket
 import subprocess
 import sys
 import time
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +30,6 @@ import hand_eye_calib
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.formats.bags.messages import ns_of
 from hand_eye_calib.offline.cli.main import main
-from hand_eye_calib.online.live import solving
 from hand_eye_calib.online.ros import conversions
 
 # Nothing is measured with this: it is how long a hang takes to fail a test, on a machine that is
@@ -115,8 +113,8 @@ def matrix(transform):
     return se3.from_quat_xyzw([t.x, t.y, t.z], [q.x, q.y, q.z, q.w])
 
 
-# Importing is most of what a start takes: nodes are forked from a process that has done so. It has
-# looked for the file of each module, too, as rclpy does with the first line of a log.
+# Most of a start is importing: nodes are forked from a process that has imported their modules. The
+# process has also looked for the file of each module, as rclpy does with the first line of a log.
 _FORKS = multiprocessing.get_context("forkserver")
 _FORKS.set_forkserver_preload(
     [
@@ -143,34 +141,8 @@ def _run_node(arguments, log_file, environment, before):
     os.chdir(log_file.parent)
     sys.stdout.reconfigure(write_through=True)
     sys.argv = ["hand_eye_calib", *arguments]
-    if not before:
-        # What forked this process goes on, and has no threads: it forks the solving process, too.
-        multiprocessing.forkserver._forkserver.ensure_running = lambda: None
-        solving.start = _forked_solver
     exec(before, {})
     sys.exit(main(arguments))
-
-
-def _forked_solver(*_, **__):
-    stdin, to = os.pipe()
-    back, stdout = os.pipe()
-    streams = [Connection(each) for each in (stdin, stdout, os.dup(2))]
-    solver = _Forked(target=_solve, args=streams, daemon=True)
-    solver.start()
-    solver.stdin = os.fdopen(to, "wb")
-    solver.stdout = os.fdopen(back, "rb")
-    return solver
-
-
-def _solve(*streams):
-    """The solving process, from the fork to its end."""
-    gc.freeze()
-    for number, each in enumerate(streams):
-        os.dup2(each.fileno(), number)
-        each.close()
-    os.setpgid(0, 0)
-    sys.stdin = os.fdopen(0)
-    solving.main()
 
 
 class _Forked(_FORKS.Process):
@@ -186,16 +158,22 @@ class _Forked(_FORKS.Process):
         assert self.exitcode is not None, f"process {self.pid} does not end"
         return self.exitcode
 
-    communicate = wait
-
     def send_signal(self, number):
         os.kill(self.pid, number)
 
 
 class NodeProcess:
-    """The command ``calibrator`` in a process of its own, with its output in a file; ``before`` is
-    Python code that runs first, ``fresh`` starts an interpreter for it. Either of them has the node
-    start its solving process as for users; otherwise it is forked.
+    """The command ``calibrator`` in a process of its own, with its output in a file.
+
+    The node starts its solving process as it does for users.
+
+    Parameters
+    ----------
+    before : str
+        Python code that runs in the process before the node.
+    fresh : bool
+        Whether an interpreter is started for the node. By default, the process is forked from one
+        that has imported the modules of the node.
     """
 
     def __init__(self, domain, log_file, ros_arguments, before="", fresh=False):

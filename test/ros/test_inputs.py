@@ -101,7 +101,7 @@ def test_solves_at_once_have_answers_and_a_reset_forgets_poses_and_result(start_
 
 
 def test_result_of_a_session_that_was_reset_meanwhile_is_dropped(start_node, peer):
-    node = start_node(*QUIET, before="pass")
+    node = start_node(*QUIET)
     peer.solve(peer.publishers(), *drive())
     heard = peer.listen(TransformStamped, "extrinsic")
     statuses = peer.diagnostics()
