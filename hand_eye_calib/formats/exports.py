@@ -226,8 +226,8 @@ def _remarks(
 
 def _numbers(T: FloatArray) -> dict[str, str]:
     """Return the texts of a pose (4, 4) for layouts."""
-    t = T[:3, 3]
-    R = T[:3, :3]
+    t = se3.translation_of(T)
+    R = se3.rotation_of(T)
     rpy_rad = se3.rotation_to_rpy(R)
     quat_xyzw = se3.to_quat_xyzw(T)
     numbers = dict(zip(AXES, [*t, *rpy_rad], strict=True))

@@ -291,7 +291,7 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     ranked = pairs[np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_RANKED_PAIRS)).astype(int)]
     parent = ranked.Ts_parenti_parentj.copy()
     child = ranked.Ts_childi_childj.copy()
-    rms = [np.linalg.norm(Ts[:, :3, 3]) / len(Ts) ** 0.5 for Ts in (parent, child)]
+    rms = [np.linalg.norm(se3.translation_of(Ts)) / len(Ts) ** 0.5 for Ts in (parent, child)]
     units = np.maximum(rms, 1e-12)
     parent[:, :3, 3] /= units[0]
     child[:, :3, 3] /= units[1]
@@ -335,17 +335,17 @@ class _Problem:
     ) -> None:
         A = pairs.Ts_parenti_parentj
         B = pairs.Ts_childi_childj
-        rotation_a = A[:, :3, :3]
-        self.translation_a = A[:, :3, 3]
-        rotation_b = B[:, :3, :3]
-        self.translation_b = B[:, :3, 3]
+        rotation_a = se3.rotation_of(A)
+        self.translation_a = se3.translation_of(A)
+        rotation_b = se3.rotation_of(B)
+        self.translation_b = se3.translation_of(B)
         self.chord_a = rotation_a - np.eye(3)
         self.chord_b = rotation_b - np.eye(3)
         self.quats_a = se3.to_quat_xyzw(rotation_a)
         self.quats_b = se3.to_quat_xyzw(rotation_b)
         self.skew_b = se3.skew(self.translation_b)
-        self.rms_a = float(np.linalg.norm(A[:, :3, 3]) / len(pairs) ** 0.5)
-        self.rms_b = float(np.linalg.norm(B[:, :3, 3]) / len(pairs) ** 0.5)
+        self.rms_a = float(np.linalg.norm(se3.translation_of(A)) / len(pairs) ** 0.5)
+        self.rms_b = float(np.linalg.norm(se3.translation_of(B)) / len(pairs) ** 0.5)
         self.rms_rotation = float(np.sqrt(np.mean(se3.rotation_angle(rotation_a) ** 2)))
         self.free = list(range(_SCALE))
         if not same_unit:
@@ -377,8 +377,8 @@ class _Problem:
         root : (K,) array
             Roots of the robust weights.
         """
-        rotation = T[:3, :3]
-        back = T[:3, :3].T
+        rotation = se3.rotation_of(T)
+        back = se3.rotation_of(T).T
         of_translation, of_rotation = np.zeros((2, len(self.translation_a), 3, _N_UNKNOWNS + 1))
         of_translation[:, :, :3] = _times(self.chord_a, rotation)
         of_translation[:, :, 3:6] = -scale * np.swapaxes(_times(self.skew_b, back), 1, 2)
@@ -394,7 +394,7 @@ class _Problem:
         vector = wa * vb - wb * va + se3.cross(vb, va)
         scalar = wa * wb + (va * vb).sum(axis=1, keepdims=True)
         moved_b = self.translation_b + self.translation_by_offset * offset_s
-        of_translation[:, :, -1] = self.chord_a @ T[:3, 3] + self.translation_a
+        of_translation[:, :, -1] = self.chord_a @ se3.translation_of(T) + self.translation_a
         of_translation[:, :, -1] -= scale * moved_b @ back
         of_rotation[:, :, -1] = se3.quat_log(np.concatenate([vector, scalar], axis=1))
         of_rotation[:, :, -1] += offset_s * of_rotation[:, :, _OFFSET]

@@ -258,9 +258,11 @@ def angular_rates(
     ends_ns = starts_ns + round(window_s * 1e9)
     before, after = np.split(trajectory.at(np.concatenate([starts_ns, ends_ns])), 2)
     if of_speed:
-        moved = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
+        moved = np.linalg.norm(se3.translation_of(after) - se3.translation_of(before), axis=1)
     else:
-        moved = se3.rotation_angle(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
+        moved = se3.rotation_angle(
+            np.swapaxes(se3.rotation_of(before), 1, 2) @ se3.rotation_of(after)
+        )
     rates = moved / window_s
     gaps_before = np.r_[0, np.cumsum(np.diff(stamps_ns) > (max_gap_s + window_s) * 1e9)]
     first = np.searchsorted(stamps_ns, starts_ns, side="right") - 1

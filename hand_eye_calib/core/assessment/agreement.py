@@ -216,8 +216,8 @@ def _common(
         step = shares @ means
         covariance = np.einsum("g,gij->ij", shares, means_covariances)
         covariance += (shares * (means - step).T) @ (means - step)
-        rotation = se3.rotation_exp(step[3:]) @ T[:3, :3]
-        T = se3.from_rotation_translation(rotation, T[:3, 3] + step[:3])
+        rotation = se3.rotation_exp(step[3:]) @ se3.rotation_of(T)
+        T = se3.from_rotation_translation(rotation, se3.translation_of(T) + step[:3])
     return _Common(T, covariance, np.sqrt(shares @ variances))
 
 

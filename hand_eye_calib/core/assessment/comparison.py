@@ -12,6 +12,7 @@ from hand_eye_calib.core.assessment.moved import scatter_of_recordings
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.text import listing
+from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import Extrinsic
 from hand_eye_calib.core.geometry.se3 import deviation, turned, xyz_rpy
 from hand_eye_calib.core.results.calibration import Calibration
@@ -142,7 +143,7 @@ def _spread(extrinsic: Calibration | Extrinsic) -> FloatArray:
 
     They are the measured covariance, the scatter between recordings of the rig, and the allowance.
     """
-    rotation = extrinsic.T_parent_child[:3, :3]
+    rotation = se3.rotation_of(extrinsic.T_parent_child)
     covariance = np.diag(UNKNOWN**2)
     allowance = np.zeros((6, 6))
     if isinstance(extrinsic, Calibration):
@@ -168,7 +169,7 @@ def agreement_of_results(results: Sequence[Calibration], level: float = 0.01) ->
     """
     Ts = np.array([result.T_parent_child for result in results])
     measured = np.array([result.covariance_measured for result in results])
-    covariances = turned(Ts[:, :3, :3], measured)
+    covariances = turned(se3.rotation_of(Ts), measured)
     variances = [np.diag(scatter_of_recordings(covariance)) for covariance in covariances]
     return agreement_of(Ts, covariances, np.sqrt(np.median(variances, axis=0)), level)
 

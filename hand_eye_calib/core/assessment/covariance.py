@@ -263,7 +263,7 @@ def _hidden_by_noise(
     """
     longest = max(len(Ts_pw_p) // BLOCKS, 1)
     baselines = np.unique(np.geomspace(1, longest, 4).astype(int))
-    rotations = Ts_pw_p[:, :3, :3]
+    rotations = se3.rotation_of(Ts_pw_p)
     jumps_before = np.concatenate([[0], np.cumsum(jumps)])
     candidates: list[FloatArray] = []
     for baseline in baselines[::-1].tolist():
@@ -272,7 +272,7 @@ def _hidden_by_noise(
         weights = (jumps_before[baseline:] == jumps_before[:-baseline]).astype(float)
         if not weights.any():
             weights[:] = 1.0
-        chords = (motions - np.eye(3)) @ T_parent_child[:3, :3]
+        chords = (motions - np.eye(3)) @ se3.rotation_of(T_parent_child)
         noise = rotation_variance(baseline) * np.eye(3)
         products = lever_arm_products(chords, weights)
         candidates.append(_hidden_directions(products, noise, least_share).T)
@@ -310,9 +310,9 @@ def combined(T_parent_child: FloatArray, covariance: FloatArray, unknown: FloatA
     known = np.eye(6) - unknown @ unknown.T
     scaled = UNKNOWN_SIGMAS[:, None] * unknown
     whole = known @ covariance @ known + scaled @ scaled.T
-    rotation = T_parent_child[:3, :3]
+    rotation = se3.rotation_of(T_parent_child)
     sigmas = sigmas_in_parent(rotation, whole)
-    unknown_shares = ((se3.on_both(rotation) @ unknown) ** 2).sum(axis=1)
+    unknown_shares = ((se3.block_diagonal(rotation) @ unknown) ** 2).sum(axis=1)
     sigmas = np.where(unknown_shares > _HIDDEN_SHARE, np.inf, sigmas)
     return Assessment(T_parent_child, whole, tuple(map(judged, AXES, sigmas.tolist())))
 
@@ -327,7 +327,7 @@ def without_axes(assessment: Assessment, axes: Collection[str]) -> Assessment:
     ]
     if not any(is_hidden):
         return assessment
-    in_parent = se3.on_both(assessment.T_parent_child[:3, :3])
+    in_parent = se3.block_diagonal(se3.rotation_of(assessment.T_parent_child))
     return _without(assessment, in_parent[is_hidden].T)
 
 
@@ -337,7 +337,7 @@ def without_direction(assessment: Assessment, axis: FloatArray) -> Assessment:
     # hide another axis.
     if any(dof.verdict is DofVerdict.UNOBSERVABLE for dof in assessment.observability[:3]):
         return assessment
-    in_child = assessment.T_parent_child[:3, :3].T @ axis
+    in_child = se3.rotation_of(assessment.T_parent_child).T @ axis
     return _without(assessment, _translations(in_child[None]).T)
 
 
@@ -370,7 +370,7 @@ def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray
     cov_r = (weights[:, None] * residual_r).T @ residual_r / n_effective
     variance_r = np.trace(cov_r) / 3
 
-    jacobian_t, jacobian_r = _derivatives(pairs, solution.T_parent_child[:3, :3])
+    jacobian_t, jacobian_r = _derivatives(pairs, se3.rotation_of(solution.T_parent_child))
     weight_of_pair = weights[:, None, None]
     information_t = multiplied(weight_of_pair * jacobian_t, jacobian_t)
     information_r = np.zeros((6, 6))
@@ -398,9 +398,9 @@ def _derivatives(pairs: MotionPairs, rotation: FloatArray) -> tuple[FloatArray, 
     of_rotation : (K, 3, 3) array
         By phi, in axes that rotate with each pair.
     """
-    chords = pairs.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
-    by_phi = rotation @ se3.skew(pairs.Ts_childi_childj[:, :3, 3])
-    of_rotation = pairs.Ts_childi_childj[:, :3, :3] - np.eye(3)
+    chords = se3.rotation_of(pairs.Ts_parenti_parentj) - np.eye(3)
+    by_phi = rotation @ se3.skew(se3.translation_of(pairs.Ts_childi_childj))
+    of_rotation = se3.rotation_of(pairs.Ts_childi_childj) - np.eye(3)
     return np.concatenate([chords @ rotation, by_phi], axis=2), of_rotation
 
 
@@ -565,9 +565,9 @@ def floor_of_pairs(
     speed_m_s : float
         Usual speed of the recording.
     """
-    rotation = T_parent_child[:3, :3]
+    rotation = se3.rotation_of(T_parent_child)
     by_xi, of_rotation = _derivatives(pairs, rotation)
-    by_log_scale = (pairs.Ts_childi_childj[:, :3, 3] @ rotation.T)[:, :, None]
+    by_log_scale = (se3.translation_of(pairs.Ts_childi_childj) @ rotation.T)[:, :, None]
     residuals = pairs.residuals(T_parent_child)[0][:, :, None]
     columns = np.concatenate([by_xi, by_log_scale, residuals], axis=2)
     weight_of_pair = weights[:, None, None]

@@ -110,7 +110,7 @@ def excitation(pose_pairs: PosePairs) -> Excitation:
         n_poses=n_poses,
         rotation=rotation,
         lever_arms=lever_arms,
-        distance=float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()),
+        distance=float(np.linalg.norm(np.diff(se3.translation_of(poses), axis=0), axis=1).sum()),
         motion_s=seconds_of_motion(pose_pairs),
         drives=share >= _ALONG_ONE_AXIS,
         forward=forward,
@@ -138,7 +138,7 @@ def seconds_of_motion(pose_pairs: PosePairs) -> float:
         return 0.0
     durations_s = np.diff(stamps_ns[rows]) * 1e-9
     poses = pose_pairs.Ts_pw_p[rows]
-    speeds = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / durations_s
+    speeds = np.linalg.norm(np.diff(se3.translation_of(poses), axis=0), axis=1) / durations_s
     rotations = np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3]
     rates = se3.rotation_angle(rotations) / durations_s
     is_moving = (speeds > _MOVES_M_S) | (rates > _MOVES_RAD_S)

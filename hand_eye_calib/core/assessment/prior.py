@@ -72,13 +72,13 @@ def fuse(assessment: Assessment, prior: Prior) -> Assessment:
         return without_prior
     root, inverse_root, targets = _whitened(start, covariance, unknown)
     T = start
-    back = start[:3, :3].T
+    back = se3.rotation_of(start).T
     for _ in range(_MAX_STEPS):
         residuals, jacobian = _prior_residuals(T, prior)
         jacobian = jacobian @ root
         normal = np.eye(6) + jacobian.T @ jacobian
-        translation = back @ (T[:3, 3] - start[:3, 3])
-        change = np.concatenate([translation, se3.rotation_log(back @ T[:3, :3])])
+        translation = back @ (se3.translation_of(T) - se3.translation_of(start))
+        change = np.concatenate([translation, se3.rotation_log(back @ se3.rotation_of(T))])
         step = -root @ np.linalg.solve(
             normal, inverse_root @ change - targets + jacobian.T @ residuals
         )
@@ -88,8 +88,8 @@ def fuse(assessment: Assessment, prior: Prior) -> Assessment:
     if not prior:
         return replace(without_prior, T_parent_child=T)
     posterior = root @ np.linalg.inv(normal) @ root.T
-    sigmas = sigmas_in_parent(T[:3, :3], posterior)
-    motion_sigmas = sigmas_in_parent(start[:3, :3], covariance)
+    sigmas = sigmas_in_parent(se3.rotation_of(T), posterior)
+    motion_sigmas = sigmas_in_parent(se3.rotation_of(start), covariance)
     verdicts = []
     for axis, sigma, motion_sigma in zip(AXES, sigmas.tolist(), motion_sigmas, strict=True):
         verdict = judged(axis, sigma)
@@ -104,7 +104,7 @@ def fuse(assessment: Assessment, prior: Prior) -> Assessment:
 
 def widened(assessment: Assessment, spread: FloatArray) -> Assessment:
     """Return an assessment with an added covariance (6, 6) of (rho, phi), in the child's frame."""
-    added_sigmas = sigmas_in_parent(assessment.T_parent_child[:3, :3], spread)
+    added_sigmas = sigmas_in_parent(se3.rotation_of(assessment.T_parent_child), spread)
     observability = []
     for dof, added in zip(assessment.observability, added_sigmas, strict=True):
         if dof.verdict is not DofVerdict.UNOBSERVABLE:
@@ -141,7 +141,7 @@ def _whitened(
     unknown_sigmas = np.where(is_translation, UNKNOWN_SIGMAS[0], UNKNOWN_SIGMAS[-1])
     directions = np.concatenate([known @ axes, unknown], axis=1)
     sigmas = np.concatenate([np.sqrt(np.maximum(variances, ROUNDING_VARIANCE)), unknown_sigmas])
-    in_child = T_parent_child[:3, :3].T @ T_parent_child[:3, 3]
+    in_child = se3.rotation_of(T_parent_child).T @ se3.translation_of(T_parent_child)
     targets = np.where(is_translation, -(unknown[:3].T @ in_child), 0.0) / unknown_sigmas
     targets = np.concatenate([np.zeros(len(variances)), targets])
     return directions * sigmas, (directions / sigmas).T, targets
@@ -160,15 +160,17 @@ def _prior_residuals(T: FloatArray, prior: Prior) -> tuple[FloatArray, FloatArra
 
 def _weighted(T: FloatArray, prior: Prior) -> FloatArray:
     """Values (P,) of the transform less those of the prior, in its standard deviations."""
-    errors = dict(zip(TRANSLATIONS, T[:3, 3], strict=True))
+    errors = dict(zip(TRANSLATIONS, se3.translation_of(T), strict=True))
     errors = {axis: errors[axis] - prior[axis][0] for axis in TRANSLATIONS if axis in prior}
     angles = {axis: prior[axis][0] for axis in ROTATIONS if axis in prior}
     if len(angles) == 3:
         # A full rotation: no angle is singular.
         nominal = se3.rotation_from_rpy(list(angles.values()))
-        errors |= dict(zip(ROTATIONS, se3.rotation_log(T[:3, :3] @ nominal.T), strict=True))
+        errors |= dict(
+            zip(ROTATIONS, se3.rotation_log(se3.rotation_of(T) @ nominal.T), strict=True)
+        )
     elif angles:
-        rpy = dict(zip(ROTATIONS, se3.rotation_to_rpy(T[:3, :3]), strict=True))
+        rpy = dict(zip(ROTATIONS, se3.rotation_to_rpy(se3.rotation_of(T)), strict=True))
         for axis, angle in angles.items():
             errors[axis] = np.angle(np.exp(1j * (rpy[axis] - angle)))
     return np.array([errors[axis] / max(sigma, _SMALL) for axis, (_, sigma) in prior.items()])

@@ -16,6 +16,7 @@ import numpy as np
 from hand_eye_calib.core.assessment.covariance import lever_arm_products
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.stats import median
+from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import rotation_log
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 
@@ -62,15 +63,15 @@ def rocking_axis(pose_pairs: PosePairs) -> FloatArray | None:
         return None
     Ts_pw_p = pose_pairs.Ts_pw_p[kept]
     Ts_cw_c = pose_pairs.Ts_cw_c[kept]
-    parent_axis = _turning_axis(Ts_pw_p[:, :3, :3])
+    parent_axis = _turning_axis(se3.rotation_of(Ts_pw_p))
     if parent_axis is None:
         return None
     # Noise increases a tilt and hides its cause: the less noisy stream decides.
-    tilt_rad = min(_largest_tilt(Ts_pw_p[:, :3, :3]), _largest_tilt(Ts_cw_c[:, :3, :3]))
+    tilt_rad = min(_largest_tilt(se3.rotation_of(Ts_pw_p)), _largest_tilt(se3.rotation_of(Ts_cw_c)))
     if tilt_rad > _FLAT_RAD:
         return None
     share = _explained(stamps_ns, Ts_pw_p, parent_axis)
-    child_axis = _turning_axis(Ts_cw_c[:, :3, :3])
+    child_axis = _turning_axis(se3.rotation_of(Ts_cw_c))
     if child_axis is not None:
         share = max(share, _explained(stamps_ns, Ts_cw_c, child_axis))
     return parent_axis if share > _EXPLAINED else None
@@ -100,8 +101,8 @@ def _explained(stamps_ns: IntArray, Ts: FloatArray, axis: FloatArray) -> float:
     """Coefficient of determination of the change of tilt by the change of acceleration."""
     step_s = median(np.diff(stamps_ns)) * 1e-9
     span = max(round(_SPRING_S / step_s), 1)
-    rotations = Ts[:, :3, :3]
-    positions = Ts[:, :3, 3]
+    rotations = se3.rotation_of(Ts)
+    positions = se3.translation_of(Ts)
     bends = positions[2 * span :] - 2.0 * positions[span:-span] + positions[: -2 * span]
     accelerations = np.einsum("nji,nj->ni", rotations[span:-span], bends / (span * step_s) ** 2)
     motions = np.swapaxes(rotations[span : -2 * span], 1, 2) @ rotations[2 * span : -span]

@@ -123,7 +123,7 @@ def check_agreement(
         return same
     change = find_change(pose_pairs, X)
     slow, axes = response(pose_pairs, motions, X, change.at_ns if change else None)
-    speed = usual_speed(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p[:, :3, 3])
+    speed = usual_speed(pose_pairs.stamps_ns, se3.translation_of(pose_pairs.Ts_pw_p))
     tried: dict[str, Callable[[], Finding | None]] = {
         "drift": lambda: _world_drift(slow, pose_pairs, speed),
         "gain": lambda: rotation_gain(slow, axes),
@@ -175,7 +175,7 @@ def check_parts(pose_pairs: PosePairs) -> list[Finding]:
     of them and rejects the other as outliers.
     """
     motions = pairs_over(pose_pairs, SHORT_S, MOST_SHORT)
-    angles = se3.rotation_angle(motions.Ts_parenti_parentj[:, :3, :3])
+    angles = se3.rotation_angle(se3.rotation_of(motions.Ts_parenti_parentj))
     motions = motions[angles < MAX_ROTATION_RAD]
     for share in _SPLITS:
         split = int(share * len(pose_pairs))
@@ -190,7 +190,9 @@ def check_parts(pose_pairs: PosePairs) -> list[Finding]:
         of_own = shares.diagonal().max()
         of_other = min(shares[0, 1], shares[1, 0])
         if of_own < _SOUND_PART and of_other > max(_OTHER_PART, 3.0 * of_own):
-            turned_rad = float(se3.rotation_angle(own[0][:3, :3].T @ own[1][:3, :3]))
+            turned_rad = float(
+                se3.rotation_angle(se3.rotation_of(own[0]).T @ se3.rotation_of(own[1]))
+            )
             at_s = float(pose_pairs.stamps_ns[split] - pose_pairs.stamps_ns[0]) * 1e-9
             size = angle(turned_rad)
             return [finding("parts_turned", size=size, at_s=at_s, turned_rad=turned_rad)]
@@ -202,7 +204,7 @@ def _unexplained(motions: MotionPairs, X: FloatArray) -> float:
 
     The largest rotations are the upper quarter.
     """
-    angles = se3.rotation_angle(motions.Ts_parenti_parentj[:, :3, :3])
+    angles = se3.rotation_angle(se3.rotation_of(motions.Ts_parenti_parentj))
     are_large = angles >= quantile(angles, 0.75)
     _, residuals = motions.residuals(X)
     remaining = np.linalg.norm(residuals[are_large], axis=1)
@@ -214,10 +216,10 @@ def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
 
     ``sigmas`` (6,) are its standard deviations, m and rad.
     """
-    distance_m = float(np.linalg.norm(T_parent_child[:3, 3]))
+    distance_m = float(np.linalg.norm(se3.translation_of(T_parent_child)))
     sigma_m = float(sigmas[:3].max())
     upper_m = distance_m + 2 * sigma_m
-    angle_rad = float(se3.rotation_angle(T_parent_child[:3, :3]))
+    angle_rad = float(se3.rotation_angle(se3.rotation_of(T_parent_child)))
     is_parallel = angle_rad < max(SAME_RAD, _WITHIN * sigmas[3:].max())
     may_be_zero = distance_m < _WITHIN * sigma_m
     near_m = _PARALLEL_M if is_parallel or may_be_zero else _NEARLY_M
@@ -356,7 +358,7 @@ def _world_drift(slow: Regression, pose_pairs: PosePairs, speed_m_s: float) -> F
     drift, sigmas = slow.fit("drift")
     if (np.abs(drift) < LIMITS["world_drift"].sigmas * sigmas).all():
         return None
-    positions = pose_pairs.Ts_cw_c[:, :3, 3]
+    positions = se3.translation_of(pose_pairs.Ts_cw_c)
     turning = np.cross(drift[3:], positions - positions.mean(axis=0))
     moving = np.sqrt(((drift[:3] + turning) ** 2).sum(axis=1).mean())
     share = float(moving) / max(speed_m_s, 1e-9)

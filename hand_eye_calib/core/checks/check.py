@@ -224,7 +224,7 @@ def least_lever_arm(T_parent_child: FloatArray, sigmas: FloatArray) -> float:
     sigmas : (3,) array
         Standard deviations of its translation, m.
     """
-    sizes = np.abs(T_parent_child[:3, 3]) - _LEVER_ARM_SIGMAS * sigmas
+    sizes = np.abs(se3.translation_of(T_parent_child)) - _LEVER_ARM_SIGMAS * sigmas
     return float(np.linalg.norm(np.clip(np.nan_to_num(sizes, neginf=0.0), 0.0, None)))
 
 
@@ -367,7 +367,7 @@ def _check_sizes(
     pose_pairs = streams.synchronised
     motions = _motions(pose_pairs, hypotheses.MAX_PAIRS)
     fit = explanation.fit
-    chords = motions.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
+    chords = se3.rotation_of(motions.Ts_parenti_parentj) - np.eye(3)
     hidden = hidden_axes(lever_arm_products(chords), fit.sigma_rotation**2 * np.eye(3))
     findings: list[Finding | None] = [unseen(hidden)] if hidden else []
     if not (explanation.same_unit or fit.is_in_one_unit):
@@ -434,7 +434,7 @@ def can_check(parent: Trajectory, child: Trajectory) -> bool:
     asked during a session.
     """
     return min(stream.duration_s for stream in (parent, child)) >= MIN_DURATION_S and any(
-        se3.rotation_angle(stream.poses[0, :3, :3].T @ stream.poses[:, :3, :3]).max()
+        se3.rotation_angle(stream.poses[0, :3, :3].T @ se3.rotation_of(stream.poses)).max()
         >= MIN_ROTATION_RAD
         for stream in (parent, child)
     )

@@ -185,10 +185,12 @@ class Hypothesis:
         """Return the poses (N, 4, 4) of a stream without its mistakes."""
         way = self.child if stream == "child" else self.parent
         if way and self.axes is not None:
-            return se3.from_rotation_translation(poses[:, :3, :3], poses[:, :3, 3] @ self.axes.T)
+            return se3.from_rotation_translation(
+                se3.rotation_of(poses), se3.translation_of(poses) @ self.axes.T
+            )
         if way == _EULER_ORDER:
-            rotations = se3.in_other_order(poses[:, :3, :3])
-            return se3.from_rotation_translation(rotations, poses[:, :3, 3])
+            rotations = se3.in_other_order(se3.rotation_of(poses))
+            return se3.from_rotation_translation(rotations, se3.translation_of(poses))
         return se3.put_right(poses, **dict(map(CONVENTIONS.__getitem__, way)))
 
     def undo(self, streams: StreamPair) -> StreamPair:
@@ -532,7 +534,9 @@ def findings_of(hypothesis: Hypothesis, has_options: bool = True) -> tuple[Findi
 def _may_be_an_arm(streams: StreamPair) -> bool:
     """Whether the streams are stops, or stay within the reach of an arm."""
     both = (streams.parent.poses, streams.child.poses)
-    positions = [poses[:, :3, 3] for given in both for poses in (given, se3.inverse(given))]
+    positions = [
+        se3.translation_of(poses) for given in both for poses in (given, se3.inverse(given))
+    ]
     return streams.is_slow or all(
         np.linalg.norm(each - medians(each.T), axis=1).max() < _REACH_M for each in positions
     )
@@ -561,8 +565,8 @@ def _evidence_for_inverse(right: StreamPair, fit: SimilarityFit) -> tuple[float,
     pairs = right.synchronised.child_scaled(fit.scale)
     worlds = pairs.Ts_pw_p @ fit.T_parent_child @ se3.inverse(pairs.Ts_cw_c)
     Ts = np.array([fit.T_parent_child, medians(np.moveaxis(worlds, 0, 2))])
-    arms_m = np.maximum(np.linalg.norm(Ts[:, :3, 3], axis=1), _SHORTEST_ARM_M)
-    angles_rad = se3.rotation_angle(Ts[:, :3, :3])
+    arms_m = np.maximum(np.linalg.norm(se3.translation_of(Ts), axis=1), _SHORTEST_ARM_M)
+    angles_rad = se3.rotation_angle(se3.rotation_of(Ts))
     is_same = bool(((arms_m <= _SAME_FRAME_M) & (angles_rad <= _SAME_FRAME_RAD)).any())
     arms = 0.0 if is_same else 0.5 * np.log(arms_m[0] / arms_m[1])
     return float(paths), float(arms)

@@ -144,7 +144,7 @@ def _left_at_nearest(slow: Trajectory, fast: Trajectory) -> float:
 
 def _left(motions: MotionPairs) -> float:
     """Angle (rad) that remains between the rotations of both; infinite unless a small share."""
-    angles = se3.rotation_angle(motions.Ts_parenti_parentj[:, :3, :3])
+    angles = se3.rotation_angle(se3.rotation_of(motions.Ts_parenti_parentj))
     is_clear = angles < MAX_ROTATION_RAD
     motions = motions[is_clear]
     angles = angles[is_clear]
@@ -176,7 +176,7 @@ def _shared_noise(slow: Trajectory, fast: Trajectory) -> float:
     quarters = _upper_quarters(np.stack([of_slow, of_fast, difference]) * is_calm[:, None, None])
     noise = quarters[:, :2]
     noise_of_difference = quarters[:, 2]
-    rotation = len(slow) * slow.poses[:, :3, :3].var(axis=0).sum()
+    rotation = len(slow) * se3.rotation_of(slow.poses).var(axis=0).sum()
     if not noise[1, :, 1].max() < _LITTLE_NOISE * rotation:
         return 0.0
     smaller = noise.min(axis=1)
@@ -241,8 +241,8 @@ def _rotations_of_blocks(motions: MotionPairs, n_poses: int) -> FloatArray | Non
     """Return rotations (1 + blocks, 3, 3) of X: by all motions, and without each block of time;
     None if there are too few motions.
     """
-    of_parent = se3.rotation_log(motions.Ts_parenti_parentj[:, :3, :3])
-    of_child = se3.rotation_log(motions.Ts_childi_childj[:, :3, :3])
+    of_parent = se3.rotation_log(se3.rotation_of(motions.Ts_parenti_parentj))
+    of_child = se3.rotation_log(se3.rotation_of(motions.Ts_childi_childj))
     is_clear = np.linalg.norm(of_parent, axis=1) < MAX_ROTATION_RAD
     blocks = motions.i * _BLOCKS // n_poses
     if is_clear.sum() < MIN_PAIRS or len(np.unique(blocks[is_clear])) < _BLOCKS:
@@ -261,11 +261,11 @@ def _rotations_of_blocks(motions: MotionPairs, n_poses: int) -> FloatArray | Non
 def _no_drift(pose_pairs: PosePairs, X: FloatArray) -> Finding | None:
     """Return the doubt about streams that hardly drift against each other on a long path."""
     path = coarse(Trajectory(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p), _STEP_S)
-    path_m = float(np.linalg.norm(np.diff(path.poses[:, :3, 3], axis=0), axis=1).sum())
+    path_m = float(np.linalg.norm(np.diff(se3.translation_of(path.poses), axis=0), axis=1).sum())
     if path_m < _LONG_PATH_M:
         return None
     few = pose_pairs[:: 1 + len(pose_pairs) // _MOST_POSES]
-    apart_m = _after_alignment((few.Ts_pw_p @ X)[:, :3, 3], few.Ts_cw_c[:, :3, 3])
+    apart_m = _after_alignment(se3.translation_of(few.Ts_pw_p @ X), se3.translation_of(few.Ts_cw_c))
     if apart_m > _LEAST_DRIFT * path_m:
         return None
     text = f"the streams drift apart by only {length(apart_m)} over {length(path_m)}"

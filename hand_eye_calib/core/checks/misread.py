@@ -99,7 +99,7 @@ def _are_motions(child: Trajectory, streams: StreamPair) -> bool:
     """Whether the child's poses are motions since the pose before, of this or of the other
     direction.
     """
-    if len(child) < 2 or se3.rotation_angle(child.poses[:, :3, :3]).max() > _MOST_TURN_RAD:
+    if len(child) < 2 or se3.rotation_angle(se3.rotation_of(child.poses)).max() > _MOST_TURN_RAD:
         return False
     ways = (child.poses[1:], se3.inverse(child.poses[1:]))
     chains = (replace(child, poses=se3.chained(steps)) for steps in ways)
@@ -132,8 +132,8 @@ def _turn_of_positions(streams: StreamPair) -> _Turn | None:
             rotation = _fitted_turn(streams, lag_s)
         except (NotEnoughDataError, np.linalg.LinAlgError):
             continue
-        positions = child.poses[:, :3, 3] @ rotation.T
-        poses = se3.from_rotation_translation(child.poses[:, :3, :3], positions)
+        positions = se3.translation_of(child.poses) @ rotation.T
+        poses = se3.from_rotation_translation(se3.rotation_of(child.poses), positions)
         unexplained = _unexplained(replace(streams, child=replace(child, poses=poses)))
         if unexplained < HOLDS:
             return _Turn(rotation, unexplained)
@@ -142,7 +142,7 @@ def _turn_of_positions(streams: StreamPair) -> _Turn | None:
 
 def _is_earth_centred(stream: Trajectory) -> bool:
     """Whether positions count from the centre of the earth."""
-    distances = np.linalg.norm(stream.poses[:, :3, 3], axis=1)
+    distances = np.linalg.norm(se3.translation_of(stream.poses), axis=1)
     least, most = _EARTH_M
     return bool(((distances > least) & (distances < most)).all())
 
@@ -154,16 +154,16 @@ def _fitted_turn(streams: StreamPair, lag_s: float) -> FloatArray:
     pairs = streams.pairs(lag_s, MAX_PAIRS)
     poses: PosePairs = streams.synchronised
     R_X = _rotation_between(
-        se3.rotation_log(pairs.Ts_parenti_parentj[:, :3, :3]),
-        se3.rotation_log(pairs.Ts_childi_childj[:, :3, :3]),
+        se3.rotation_log(se3.rotation_of(pairs.Ts_parenti_parentj)),
+        se3.rotation_log(se3.rotation_of(pairs.Ts_childi_childj)),
     )
     displacements = poses.Ts_cw_c[pairs.j, :3, 3] - poses.Ts_cw_c[pairs.i, :3, 3]
     to_parent = R_X @ np.swapaxes(poses.Ts_cw_c[pairs.i, :3, :3], 1, 2)
     # Columns of W row by row: (K, 3, 3, 3) to (K, 3, 9).
     of_turn = np.einsum("kab,kc->kabc", to_parent, displacements).reshape(len(pairs), 3, 9)
-    of_lever = -(pairs.Ts_parenti_parentj[:, :3, :3] - np.eye(3))
+    of_lever = -(se3.rotation_of(pairs.Ts_parenti_parentj) - np.eye(3))
     rows = np.concatenate([of_turn, of_lever], axis=2)
-    target = pairs.Ts_parenti_parentj[:, :3, 3]
+    target = se3.translation_of(pairs.Ts_parenti_parentj)
     unknowns, _ = robust_regression("huber", rows, target, _ROUNDS, lambda _: _LEAST_RESIDUAL_M)
     return se3.nearest_rotation(unknowns[:9].reshape(3, 3))
 

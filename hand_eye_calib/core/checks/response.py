@@ -128,11 +128,13 @@ class _Stream:
         self._turned = turned
         self.rows = pairs.i, (pairs.i + pairs.j) // 2, pairs.j
         start, middle, end = (poses[rows] for rows in self.rows)
-        self.from_world = turned @ np.swapaxes(middle[:, :3, :3], 1, 2)
-        self.ends = self.from_world @ start[:, :3, :3], self.from_world @ end[:, :3, :3]
+        self.from_world = turned @ np.swapaxes(se3.rotation_of(middle), 1, 2)
+        self.ends = self.from_world @ se3.rotation_of(start), self.from_world @ se3.rotation_of(end)
         self.chords = self.ends[1] - self.ends[0]
-        self.rotations = turned @ np.swapaxes(start[:, :3, :3], 1, 2) @ end[:, :3, :3] @ turned.T
-        self.displaced = end[:, :3, 3] - start[:, :3, 3]
+        self.rotations = (
+            turned @ np.swapaxes(se3.rotation_of(start), 1, 2) @ se3.rotation_of(end) @ turned.T
+        )
+        self.displaced = se3.translation_of(end) - se3.translation_of(start)
         self.moved = se3.times(self.from_world, self.displaced)
 
     def back(self, vectors: FloatArray) -> FloatArray:
@@ -144,7 +146,7 @@ class _Stream:
         """Velocity and acceleration (N, 3) of all poses in their world, angular velocity and
         acceleration in the parent's axes, by differences over steps of ``h`` seconds.
         """
-        p = self._poses[:, :3, 3]
+        p = se3.translation_of(self._poses)
         n = len(self._poses)
         rows = {k: np.clip(np.arange(n) + k * step, 0, n - 1) for k in (-2, -1, 1, 2)}
         turned = [
@@ -179,9 +181,9 @@ def response(
     is given.
     """
     parent = _Stream(pose_pairs.Ts_pw_p, motions, np.eye(3))
-    child = _Stream(pose_pairs.Ts_cw_c, motions, T_parent_child[:3, :3])
+    child = _Stream(pose_pairs.Ts_cw_c, motions, se3.rotation_of(T_parent_child))
     # What the other stream makes of the displacements of each.
-    arm = se3.times(parent.chords, T_parent_child[:3, 3])
+    arm = se3.times(parent.chords, se3.translation_of(T_parent_child))
     p_seen = se3.times(np.swapaxes(parent.from_world, 1, 2), child.moved - arm)
     c_seen = se3.times(np.swapaxes(child.from_world, 1, 2), parent.moved + arm)
     stamps_ns = pose_pairs.stamps_ns
@@ -239,10 +241,10 @@ def delays(
     Ts_child = pose_pairs.Ts_cw_c
     as_seen = Ts_child @ se3.inverse(X), Ts_parent @ X  # by the other stream
     own, seen = (
-        (_Stream(of_parent, motions, np.eye(3)), _Stream(of_child, motions, X[:3, :3]))
+        (_Stream(of_parent, motions, np.eye(3)), _Stream(of_child, motions, se3.rotation_of(X)))
         for of_parent, of_child in ((Ts_parent, Ts_child), as_seen)
     )
-    groups, probes = (_of_filters(*each, X[:3, 3], step, h) for each in (own, seen))
+    groups, probes = (_of_filters(*each, se3.translation_of(X), step, h) for each in (own, seen))
     late = {name: probes[name] for name in ("late_child", "late_parent")}
     return _regression(*own, X, groups, late, "late")
 
@@ -293,7 +295,7 @@ def _regression(
     """Regression on groups of columns, and on those of X and the scale."""
     displaced = child.moved - parent.moved
     turned = se3.rotation_log(child.rotations @ np.swapaxes(parent.rotations, 1, 2))
-    unexplained = displaced - se3.times(parent.chords, X[:3, 3])
+    unexplained = displaced - se3.times(parent.chords, se3.translation_of(X))
     of_both = ((unexplained, 1e-7), (turned, 1e-8))
     sizes = [max(float(robust_sigma(v)), least) for v, least in of_both]
     units = np.repeat(sizes, 3)[:, None]

@@ -106,7 +106,9 @@ def check_stream(
         return findings
     interval_s = np.diff(trajectory.stamps_ns) * 1e-9
     poses = trajectory.poses
-    translations = np.einsum("kji,kj->ki", poses[:-1, :3, :3], np.diff(poses[:, :3, 3], axis=0))
+    translations = np.einsum(
+        "kji,kj->ki", poses[:-1, :3, :3], np.diff(se3.translation_of(poses), axis=0)
+    )
     rotations = se3.rotation_log(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
     are_jumps = np.zeros(len(interval_s), dtype=bool)
     for steps in (translations, rotations):
@@ -138,7 +140,7 @@ def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> li
         findings = [finding("gaps", stream, gaps=n_gaps, longest_s=longest_s, share=share)]
     if apart_m := _interleaved(trajectory):
         return [*findings, finding("interleaved", stream, distance_m=apart_m)]
-    step_m = max(_grid_step(column) for column in trajectory.poses[:, :3, 3].T)
+    step_m = max(_grid_step(column) for column in se3.translation_of(trajectory.poses).T)
     # Of positions alone, rounding is noise like any other.
     most = np.inf if trajectory.has_rotations else LIMITS["coarse_positions"].error
     coarse = graded("coarse_positions", stream, min(step_m, most), step_m=step_m)
@@ -149,7 +151,7 @@ def _interleaved(trajectory: Trajectory) -> float:
     """Distance of the two levels (m), if two sensors take turns in a stream: positions that are
     rougher from one pose to the next than over several; otherwise 0.
     """
-    positions = trajectory.poses[:, :3, 3]
+    positions = se3.translation_of(trajectory.poses)
     stamps_ns = trajectory.stamps_ns
     repeats = np.abs(np.diff(positions, axis=0)).max(axis=1) < _SAME
     if len(positions) < (_TURNS + 2) * _MAX_PERIOD or repeats.mean() > _MAX_REPEATS:
@@ -231,7 +233,7 @@ def frozen_share(trajectory: Trajectory, other: Trajectory) -> float:
     other : Trajectory
         The stream of the other sensor, on the same clock.
     """
-    usual_m_s = usual_speed(other.stamps_ns, other.poses[:, :3, 3])
+    usual_m_s = usual_speed(other.stamps_ns, se3.translation_of(other.poses))
     frozen_ns = 0
     for from_ns, until_ns in repetitions(trajectory, _FROZEN_S):
         n_parts = max(1, round((until_ns - from_ns) * 1e-9 / _PART_S))
@@ -247,8 +249,8 @@ def _moves(part: Trajectory, usual_m_s: float) -> bool:
     """Return whether a sensor moves in a part of its stream: drift and noise are no motion."""
     if len(part) < 2:
         return False
-    positions = part.poses[:, :3, 3]
-    angles = se3.rotation_log(part.poses[0, :3, :3].T @ part.poses[:, :3, :3])
+    positions = se3.translation_of(part.poses)
+    angles = se3.rotation_log(part.poses[0, :3, :3].T @ se3.rotation_of(part.poses))
     least_m = max(_MOVES_M, _MOVES_SHARE * usual_m_s * part.duration_s)
     return _exceeds(positions - positions[0], least_m) or _exceeds(angles, _MOVES_RAD)
 
@@ -331,7 +333,7 @@ def _usual_motion(trajectory: Trajectory) -> tuple[float, float]:
     if len(few) < 4:
         return 0.0, 0.0
     intervals_s = np.diff(few.stamps_ns)[:, None] * 1e-9
-    velocities = np.diff(few.poses[:, :3, 3], axis=0) / intervals_s
+    velocities = np.diff(se3.translation_of(few.poses), axis=0) / intervals_s
     changes = np.diff(velocities, axis=0) / (0.5 * (intervals_s[1:] + intervals_s[:-1]))
     speed = quantile(np.linalg.norm(velocities, axis=1), USUAL)
     change = quantile(np.linalg.norm(changes, axis=1), USUAL)

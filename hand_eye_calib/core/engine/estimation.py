@@ -20,6 +20,7 @@ from hand_eye_calib.core.base.config import CalibratorConfig, require_backend
 from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.base.registry import OUT_OF_REACH
 from hand_eye_calib.core.base.text import parse_targets
+from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.noise import estimator as adaptive_estimator
 from hand_eye_calib.core.noise.estimator import AdaptiveSolution, NoiseModelError
@@ -278,7 +279,7 @@ def floor_of(solved: Solved, pose_pairs: PosePairs, config: CalibratorConfig) ->
     """Return the common-mode covariance (6, 6) of the sensors that are odometries."""
     # The functions of `covariance` assume two odometries.
     share = [config.parent_kind, config.child_kind].count("odometry") / 2
-    speed_m_s = covariance.usual_speed(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p[:, :3, 3])
+    speed_m_s = covariance.usual_speed(pose_pairs.stamps_ns, se3.translation_of(pose_pairs.Ts_pw_p))
     if isinstance(solved.solution, AdaptiveSolution):
         return share * covariance.common_mode_floor(speed_m_s)
     T = solved.solution.T_parent_child

@@ -350,7 +350,7 @@ def downsample(pose_pairs: PosePairs, max_pairs: int) -> PosePairs:
     """
     while len(pose_pairs) > max_pairs:
         candidates = np.arange(1, len(pose_pairs) - 1, 2)
-        rotations = pose_pairs.Ts_pw_p[:, :3, :3]
+        rotations = se3.rotation_of(pose_pairs.Ts_pw_p)
         # Trace of the rotation between both neighbours: 1 + 2 cos(angle).
         traces = np.einsum("kij,kij->k", rotations[candidates - 1], rotations[candidates + 1])
         n_drop = min(len(pose_pairs) - max_pairs + max_pairs // 10, (len(candidates) + 1) // 2)

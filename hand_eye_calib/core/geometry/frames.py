@@ -159,8 +159,8 @@ def _rigid(Ts: FloatArray, what: str = "") -> FloatArray:
     Raises InputError at the first matrix without a rotation, or with another last row than 0 0 0 1.
     The message names the row of ``what``, if given.
     """
-    rotations = se3.nearest_rotation(Ts[:, :3, :3])
-    deviations = np.abs(rotations - Ts[:, :3, :3]).max(axis=(1, 2), initial=0.0)
+    rotations = se3.nearest_rotation(se3.rotation_of(Ts))
+    deviations = np.abs(rotations - se3.rotation_of(Ts)).max(axis=(1, 2), initial=0.0)
     if (deviations > _ROTATION_WITHIN).any():
         row = int(np.argmax(deviations > _ROTATION_WITHIN))
         raise InputError(_place(what, row) + "the rotation is not one")
@@ -168,7 +168,7 @@ def _rigid(Ts: FloatArray, what: str = "") -> FloatArray:
     if (deviations > LAST_ROW_WITHIN).any():
         row = int(np.argmax(deviations > LAST_ROW_WITHIN))
         raise InputError(_place(what, row) + wrong_last_row(Ts[row]))
-    return se3.from_rotation_translation(rotations, Ts[:, :3, 3])
+    return se3.from_rotation_translation(rotations, se3.translation_of(Ts))
 
 
 def _place(what: str, row: int) -> str:

@@ -59,6 +59,16 @@ def cross(left: FloatArray, right: FloatArray) -> FloatArray:
     return products
 
 
+def rotation_of(transforms: FloatArray) -> FloatArray:
+    """Return the rotations (..., 3, 3), a view of transforms (..., 4, 4)."""
+    return transforms[..., :3, :3]
+
+
+def translation_of(transforms: FloatArray) -> FloatArray:
+    """Return the translations (..., 3), m, a view of transforms (..., 4, 4)."""
+    return transforms[..., :3, 3]
+
+
 def from_rotation_translation(rotation: ArrayLike, translation: ArrayLike) -> FloatArray:
     """Return transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3), m."""
     rotation = np.asarray(rotation, dtype=float)
@@ -93,7 +103,7 @@ def to_quat_xyzw(transforms: ArrayLike) -> FloatArray:
 
     The scalar is last and not negative.
     """
-    rotations = np.asarray(transforms, dtype=float)[..., :3, :3]
+    rotations = rotation_of(np.asarray(transforms, dtype=float))
     quats = _scaled_quats(rotations.reshape(-1, 3, 3))
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     return quats.reshape((*rotations.shape[:-2], 4))
@@ -102,7 +112,7 @@ def to_quat_xyzw(transforms: ArrayLike) -> FloatArray:
 def to_rows(transforms: ArrayLike) -> FloatArray:
     """Return rows x y z qx qy qz qw (..., 7) of transforms (..., 4, 4)."""
     Ts = np.asarray(transforms, dtype=float)
-    return np.concatenate([Ts[..., :3, 3], to_quat_xyzw(Ts)], axis=-1)
+    return np.concatenate([translation_of(Ts), to_quat_xyzw(Ts)], axis=-1)
 
 
 def rotation_from_rpy(rpy: ArrayLike) -> FloatArray:
@@ -229,8 +239,8 @@ def _matrices(x: FloatArray, y: FloatArray, z: FloatArray, w: FloatArray) -> Flo
 def inverse(transforms: ArrayLike) -> FloatArray:
     """Return the inverses ``T_source_target`` of transforms ``T_target_source`` (..., 4, 4)."""
     transforms = np.asarray(transforms, dtype=float)
-    back = np.swapaxes(transforms[..., :3, :3], -1, -2)
-    return from_rotation_translation(back, -times(back, transforms[..., :3, 3]))
+    back = np.swapaxes(rotation_of(transforms), -1, -2)
+    return from_rotation_translation(back, -times(back, translation_of(transforms)))
 
 
 def retracted(transform: FloatArray, step: FloatArray) -> FloatArray:
@@ -238,9 +248,9 @@ def retracted(transform: FloatArray, step: FloatArray) -> FloatArray:
 
     To first order this is ``transform @ exp(step)``: both parts are applied on their own.
     """
-    rotation = transform[:3, :3]
+    rotation = rotation_of(transform)
     return from_rotation_translation(
-        rotation @ rotation_exp(step[3:]), transform[:3, 3] + rotation @ step[:3]
+        rotation @ rotation_exp(step[3:]), translation_of(transform) + rotation @ step[:3]
     )
 
 
@@ -297,8 +307,8 @@ def log(transforms: ArrayLike) -> FloatArray:
     pi.
     """
     transforms = np.asarray(transforms, dtype=float)
-    phi = rotation_log(transforms[..., :3, :3])
-    translation = transforms[..., :3, 3]
+    phi = rotation_log(rotation_of(transforms))
+    translation = translation_of(transforms)
     angle = np.linalg.norm(phi, axis=-1)
     is_small = angle < _SERIES_ANGLE
     squared = angle**2
@@ -323,9 +333,9 @@ def adjoint(transforms: ArrayLike) -> FloatArray:
     ``T @ exp(xi) == exp(adjoint(T) @ xi) @ T``.
     """
     transforms = np.asarray(transforms, dtype=float)
-    rotation = transforms[..., :3, :3]
-    matrices = on_both(rotation)
-    matrices[..., :3, 3:] = skew(transforms[..., :3, 3]) @ rotation
+    rotation = rotation_of(transforms)
+    matrices = block_diagonal(rotation)
+    matrices[..., :3, 3:] = skew(translation_of(transforms)) @ rotation
     return matrices
 
 
@@ -386,18 +396,18 @@ def put_right(Ts: FloatArray, invert: str = "none", quaternion: str = "xyzw") ->
     """
     if quaternion != "xyzw":
         quats = np.roll(to_quat_xyzw(Ts), -quaternion.index("x"), axis=-1)
-        Ts = from_quat_xyzw(Ts[..., :3, 3], quats)
+        Ts = from_quat_xyzw(translation_of(Ts), quats)
     if invert == "poses":
         return inverse(Ts)
     if invert == "orientations":
         Ts = Ts.copy()
-        Ts[..., :3, :3] = np.swapaxes(Ts[..., :3, :3], -1, -2)
+        Ts[..., :3, :3] = np.swapaxes(rotation_of(Ts), -1, -2)
     return Ts
 
 
 def xyz_rpy(T_target_source: FloatArray) -> FloatArray:
     """Return x, y, z (m), roll, pitch and yaw (rad) of a transform (4, 4)."""
-    return np.r_[T_target_source[:3, 3], rotation_to_rpy(T_target_source[:3, :3])]
+    return np.r_[translation_of(T_target_source), rotation_to_rpy(rotation_of(T_target_source))]
 
 
 # ------------------------------------------------------------------- their uncertainty
@@ -420,12 +430,12 @@ def turned(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
     to first order, and rotates the child by ``R phi`` about the parent's axes through this origin.
     There is no lever arm.
     """
-    both = on_both(rotation)
+    both = block_diagonal(rotation)
     return np.asarray(both @ covariance @ np.swapaxes(both, -1, -2))
 
 
-def on_both(rotation: FloatArray) -> FloatArray:
-    """Matrices (..., 6, 6) that rotate rho and phi by the same rotations (..., 3, 3)."""
+def block_diagonal(rotation: FloatArray) -> FloatArray:
+    """Return matrices (..., 6, 6) that rotate both rho and phi by rotations (..., 3, 3)."""
     both = np.zeros((*np.shape(rotation)[:-2], 6, 6))
     both[..., :3, :3] = both[..., 3:, 3:] = rotation
     return both
@@ -456,7 +466,7 @@ def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArra
     (3,) array
         Infinite for unknown angles, such as roll and yaw near gimbal lock.
     """
-    rotation = np.asarray(T_target_source, dtype=float)[:3, :3]
+    rotation = rotation_of(np.asarray(T_target_source, dtype=float))
     covariance = np.asarray(covariance, dtype=float)[3:, 3:]
     if not np.isfinite(covariance).all():
         return np.full(3, np.inf)
@@ -500,8 +510,10 @@ def absolute_errors(
 
     Välimäki et al. 2023, eqs 8 and 9.
     """
-    translation = np.linalg.norm(truth_T_parent_child[:3, 3] - T_parent_child[:3, 3])
-    rotation = rotation_angle(T_parent_child[:3, :3].T @ truth_T_parent_child[:3, :3])
+    translation = np.linalg.norm(
+        translation_of(truth_T_parent_child) - translation_of(T_parent_child)
+    )
+    rotation = rotation_angle(rotation_of(T_parent_child).T @ rotation_of(truth_T_parent_child))
     return float(translation), float(rotation)
 
 
@@ -510,6 +522,6 @@ def deviation(T_parent_child: FloatArray, T_reference: FloatArray) -> FloatArray
 
     They are along (m) and about (rad) the axes of the parent sensor's frame.
     """
-    rotation = rotation_log(T_parent_child[..., :3, :3] @ T_reference[:3, :3].T)
-    translation = T_parent_child[..., :3, 3] - T_reference[:3, 3]
+    rotation = rotation_log(rotation_of(T_parent_child) @ rotation_of(T_reference).T)
+    translation = translation_of(T_parent_child) - translation_of(T_reference)
     return np.concatenate([translation, rotation], axis=-1)

@@ -59,8 +59,8 @@ def scatter_of_direction(poses: FloatArray) -> float:
     It is 0 if the direction is always the same, as on vehicles, and 1 if the sensor moves in all
     directions, or if there are too few steps.
     """
-    positions = poses[:, :3, 3]
-    rotations = poses[:, :3, :3]
+    positions = se3.translation_of(poses)
+    rotations = se3.rotation_of(poses)
     step_m = float(np.linalg.norm(np.ptp(positions, axis=0))) / _STEPS_IN_EXTENT
     travelled_m = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))]
     n_steps_before = np.floor(travelled_m / (step_m or np.inf))
@@ -444,13 +444,13 @@ def _check_finite(what: str, rows: FloatArray) -> None:
 def check_poses(poses: FloatArray) -> None:
     """Raise InputError at the first of poses (N, 4, 4) that is not a rigid transform."""
     _check_finite("pose", poses.reshape(-1, 16))
-    is_far = (np.abs(poses[:, :3, 3]) > FARTHEST_M).any(axis=1)
+    is_far = (np.abs(se3.translation_of(poses)) > FARTHEST_M).any(axis=1)
     if is_far.any():
         index = int(np.argmax(is_far))
         raise InputError(
             f"pose {index}: {far_position(*poses[index, :3, 3])}; check its unit, or remove it"
         )
-    rotation = poses[:, :3, :3]
+    rotation = se3.rotation_of(poses)
     deviations = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3))
     is_scaled = deviations.max(axis=(1, 2), initial=0.0) > ROTATION_TOLERANCE
     is_wrong = is_scaled | (np.linalg.det(rotation) < 0)

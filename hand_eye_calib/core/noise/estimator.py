@@ -411,7 +411,7 @@ def _solution(workspace: Workspace, fit: Fit) -> AdaptiveSolution:
     for (kind, _), level in zip(fit.model.slow, fit.levels[VARIANCES], strict=True):
         if kind == "body":
             undetected[:3] += problem.tuning.unseen_share * np.exp(level)
-    steps = np.diff(problem.streams.Ts_pw_p[:, :3, 3], axis=0)
+    steps = np.diff(se3.translation_of(problem.streams.Ts_pw_p), axis=0)
     return AdaptiveSolution(
         T_parent_child=final.T,
         cov_parent_child_in_child=covariance[:6, :6] + np.diag(undetected),
@@ -438,7 +438,9 @@ def _solution(workspace: Workspace, fit: Fit) -> AdaptiveSolution:
 def _degrees_of_freedom(problem: Problem, fit: Fit) -> int:
     """Number of residuals that are evidence, less the parameters; at least 1."""
     streams = problem.streams
-    positions = np.concatenate([streams.Ts_pw_p[:, :3, 3], streams.Ts_cw_c[:, :3, 3]], axis=1)
+    positions = np.concatenate(
+        [se3.translation_of(streams.Ts_pw_p), se3.translation_of(streams.Ts_cw_c)], axis=1
+    )
     # Streams of rotations alone have constant positions.
     n_rows = 6 if np.ptp(positions, axis=0).any() else 3
     n_evidence = int((~fit.outliers.jumps).sum()) - int(fit.outliers.spikes.sum())

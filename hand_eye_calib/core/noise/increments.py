@@ -136,11 +136,11 @@ def course_of(streams: Streams, T_parent_child: FloatArray, noise_m2: float = np
         Variance per axis up to which differences between a step and its neighbours count as
         noise. The larger the differences, the less the steps are smoothed.
     """
-    R = T_parent_child[:3, :3]
-    lever_arm = T_parent_child[:3, 3]
-    by_child = streams.motions_c[:, :3, 3]
-    chords = streams.motions_p[:, :3, :3] @ lever_arm - lever_arm
-    by_parent = (chords + streams.motions_p[:, :3, 3]) @ R
+    R = se3.rotation_of(T_parent_child)
+    lever_arm = se3.translation_of(T_parent_child)
+    by_child = se3.translation_of(streams.motions_c)
+    chords = se3.rotation_of(streams.motions_p) @ lever_arm - lever_arm
+    by_parent = (chords + se3.translation_of(streams.motions_p)) @ R
     intervals_s = np.diff(streams.stamps_s)
     steps = _smoothed(0.5 * (by_child + by_parent), intervals_s, noise_m2)
     metres = np.linalg.norm(_smoothed(by_parent, intervals_s, noise_m2), axis=1)
@@ -222,9 +222,9 @@ def linearise(
     steps = se3.times(R_c_transposed, np.diff(course.path, axis=0))
     metres = R_c_transposed @ np.diff(course.along, axis=0)
     B, by_rate = _child_motions(streams, course, parameters, RATE[0] in columns)
-    B[:, :3, 3] = (1.0 + parameters[SCALE]) * B[:, :3, 3] - metres @ parameters[BIAS]
+    B[:, :3, 3] = (1.0 + parameters[SCALE]) * se3.translation_of(B) - metres @ parameters[BIAS]
     B_inverse = se3.inverse(B)
-    R_B_transposed = B_inverse[:, :3, :3]
+    R_B_transposed = se3.rotation_of(B_inverse)
     adjoints = se3.adjoint(B_inverse)
     by_steps = np.zeros((len(steps), 6, 4))
     by_steps[:, :3] = -R_B_transposed @ np.dstack([steps, se3.skew(steps)])
@@ -262,7 +262,7 @@ def _child_motions(
         Ts_cw_c = Ts_cw_c @ se3.exp(parameters[TIME] * course.twists)
     child_motions = motions(Ts_cw_c[:-1], Ts_cw_c[1:])
     if has_rates:
-        rotations = child_motions[:, :3, :3]
+        rotations = se3.rotation_of(child_motions)
         by_rate = _derivatives_by_rate_bias(rotations, np.diff(streams.stamps_s))
         child_motions[:, :3, :3] = rotations @ se3.rotation_exp(-by_rate @ parameters[RATE])
     return child_motions, by_rate
@@ -286,7 +286,7 @@ def without_rate_bias(stamps_ns: IntArray, Ts_cw_c: FloatArray, bias: FloatArray
         Poses at the origin, from the identity on.
     """
     child_motions = motions(Ts_cw_c[:-1], Ts_cw_c[1:])
-    rotations = child_motions[:, :3, :3]
+    rotations = se3.rotation_of(child_motions)
     intervals_s = np.diff(stamps_ns) * 1e-9
     by_rate = _derivatives_by_rate_bias(rotations, intervals_s)
     corrections = se3.rotation_exp(-by_rate @ bias)

@@ -167,7 +167,7 @@ class NoiseModel:
         """Covariances (N, 6, 6) of c by rotation noise of 1 rad about the origin of a world."""
         poses = streams.Ts_cw_c if self.centre == "child" else streams.Ts_pw_p
         swing = np.zeros((len(poses), 6, 3))
-        swing[:, :3] = se3.skew(se3.inverse(poses)[:, :3, 3])
+        swing[:, :3] = se3.skew(se3.translation_of(se3.inverse(poses)))
         swing[:, 3:] = np.eye(3)
         if self.centre == "parent":
             swing = to_child @ swing
@@ -254,7 +254,7 @@ def _directions(kind: str, part: str, streams: Streams, to_child: FloatArray) ->
     """Matrices M (N, 6, 3) from a process to the error c."""
     if kind == "body":
         return np.broadcast_to(np.eye(6)[:, PARTS[part]], (len(streams), 6, 3))
-    return to_child[:, PARTS[part]] @ transposed(streams.Ts_pw_p[:, :3, :3])
+    return to_child[:, PARTS[part]] @ transposed(se3.rotation_of(streams.Ts_pw_p))
 
 
 def fast_sigmas(levels: FloatArray) -> FastSigmas:

@@ -117,7 +117,7 @@ class Problem:
 
     def is_noisy(self, fit: Fit) -> bool:
         """Whether rotation noise exceeds a share of the rotation between poses."""
-        turns = se3.rotation_angle(self.streams.motions_p[:, :3, :3])
+        turns = se3.rotation_angle(se3.rotation_of(self.streams.motions_p))
         return bool(np.exp(0.5 * fit.levels[ROTATION]) > self.tuning.noisy * median(turns))
 
 
@@ -300,7 +300,7 @@ def _centre(streams: Streams, T: FloatArray, residuals: FloatArray, decisive: fl
     worlds = {"child": streams.Ts_cw_c[1:], "parent": streams.Ts_pw_p[1:] @ T}
     sizes = {"sensors": median(np.linalg.norm(residuals[:, :3], axis=1))}
     for centre, poses in worlds.items():
-        to_origin = se3.inverse(poses)[:, :3, 3]
+        to_origin = se3.translation_of(se3.inverse(poses))
         at_origin = residuals[:, :3] + np.cross(residuals[:, 3:], to_origin)
         sizes[centre] = median(np.linalg.norm(at_origin, axis=1))
     best = min(CENTRES, key=lambda centre: sizes[centre])

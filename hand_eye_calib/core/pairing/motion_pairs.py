@@ -148,10 +148,10 @@ def select_keyframes(
         is_late = stamps_ns[window] - last_ns >= min_interval_s * 1e9
         has_moved = np.full(len(is_late), max(min_translation, min_rotation) == 0.0)
         if min_translation > 0.0:
-            distances_m = np.linalg.norm(poses[window, :3, 3] - T_last[:3, 3], axis=1)
+            distances_m = np.linalg.norm(poses[window, :3, 3] - se3.translation_of(T_last), axis=1)
             has_moved |= distances_m >= min_translation
         if min_rotation > 0.0:
-            angles = se3.rotation_angle(T_last[:3, :3].T @ poses[window, :3, :3])
+            angles = se3.rotation_angle(se3.rotation_of(T_last).T @ poses[window, :3, :3])
             has_moved |= angles >= min_rotation
         candidates = np.flatnonzero(is_late & has_moved)
         if not candidates.size:
@@ -215,13 +215,15 @@ class MotionPairs(Columns):
         child sensor at instant j, from ``R_A R`` to ``R R_B``. Their lengths are the angles of
         eq. (7).
         """
-        rotation = T_parent_child[:3, :3]
-        translation = T_parent_child[:3, 3]
-        chord = self.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
-        moved_child = self.Ts_childi_childj[:, :3, 3] @ rotation.T
-        of_translation = chord @ translation + self.Ts_parenti_parentj[:, :3, 3] - moved_child
-        via_parent = self.Ts_parenti_parentj[:, :3, :3] @ rotation
-        via_child = rotation @ self.Ts_childi_childj[:, :3, :3]
+        rotation = se3.rotation_of(T_parent_child)
+        translation = se3.translation_of(T_parent_child)
+        chord = se3.rotation_of(self.Ts_parenti_parentj) - np.eye(3)
+        moved_child = se3.translation_of(self.Ts_childi_childj) @ rotation.T
+        of_translation = (
+            chord @ translation + se3.translation_of(self.Ts_parenti_parentj) - moved_child
+        )
+        via_parent = se3.rotation_of(self.Ts_parenti_parentj) @ rotation
+        via_child = rotation @ se3.rotation_of(self.Ts_childi_childj)
         return of_translation, se3.rotation_log(np.swapaxes(via_parent, 1, 2) @ via_child)
 
 
@@ -275,8 +277,8 @@ def motions(start: FloatArray, end: FloatArray) -> FloatArray:
     first costs ten digits.
     """
     motion = end.copy()
-    motion[..., :3, 3] -= start[..., :3, 3]
-    motion[..., :3, :] = np.swapaxes(start[..., :3, :3], -1, -2) @ motion[..., :3, :]
+    motion[..., :3, 3] -= se3.translation_of(start)
+    motion[..., :3, :] = np.swapaxes(se3.rotation_of(start), -1, -2) @ motion[..., :3, :]
     return motion
 
 

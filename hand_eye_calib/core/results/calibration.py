@@ -92,7 +92,7 @@ class Calibration(Judged):
         """
         T = self.T_parent_child
         covariance = inverse_covariance(T, self.covariance_measured)
-        sigmas = sigmas_in_parent(self.T_child_parent[:3, :3], covariance)
+        sigmas = sigmas_in_parent(se3.rotation_of(self.T_child_parent), covariance)
         if self.unobservable():
             sigmas[sigmas > document.UNKNOWN_M] = np.inf
         known = (DofVerdict.UNOBSERVABLE, DofVerdict.OBSERVED)

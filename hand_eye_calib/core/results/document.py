@@ -146,7 +146,9 @@ def transforms_of(result: Result) -> dict[str, Notation]:
     for name, T, source, target, covariances, sigmas_m in rows:
         measured, allowance = covariances
         sigmas = sigmas_rpy(T, measured)
-        along, allowance_m = (sigmas_in_parent(T[:3, :3], each)[:3] for each in covariances)
+        along, allowance_m = (
+            sigmas_in_parent(se3.rotation_of(T), each)[:3] for each in covariances
+        )
         if sigmas_m is None:
             is_unsure = bool(hidden) or name in extra
             sigmas_m = np.where(is_unsure & (along > UNKNOWN_M), np.inf, along)
@@ -155,11 +157,11 @@ def transforms_of(result: Result) -> dict[str, Notation]:
         known = np.isfinite(sigmas) | is_turn_known
         found[name] = Notation(
             maps=f"coordinates of {source} into {target}",
-            translation=np.where(np.isfinite(sigmas_m), T[:3, 3], np.nan),
+            translation=np.where(np.isfinite(sigmas_m), se3.translation_of(T), np.nan),
             sigma_translation=np.hypot(sigmas_m, allowance_m),
             sigma_measured_translation=sigmas_m,
             quat_xyzw=se3.to_quat_xyzw(T) if is_turn_known else None,
-            rpy_deg=np.degrees(np.where(known, se3.rotation_to_rpy(T[:3, :3]), np.nan)),
+            rpy_deg=np.degrees(np.where(known, se3.rotation_to_rpy(se3.rotation_of(T)), np.nan)),
             sigma_rpy_deg=np.degrees(np.hypot(sigmas, sigmas_rpy(T, allowance))),
             sigma_measured_rpy_deg=np.degrees(sigmas),
             matrix=T,
@@ -282,11 +284,11 @@ def usable_numbers(result: Judged) -> dict[str, float | str]:
     unknown = {*result.unobservable()}
     hidden = np.array([axis in unknown for axis in TRANSLATIONS])
     if result.T_base_parent is not None:  # axes that share a direction that the motion hides
-        of_base = np.abs(result.T_base_parent[:3, :3][:, hidden])
+        of_base = np.abs(se3.rotation_of(result.T_base_parent)[:, hidden])
         hidden = of_base.max(axis=1, initial=0.0) > _SHARED
     numbers: dict[str, float | str] = {
         axis: by_hand(axis) if is_hidden else float(value)
-        for axis, value, is_hidden in zip(TRANSLATIONS, T[:3, 3], hidden, strict=True)
+        for axis, value, is_hidden in zip(TRANSLATIONS, se3.translation_of(T), hidden, strict=True)
     }
     if unknown.intersection(ROTATIONS):
         return numbers | usable_angles(result)
@@ -312,7 +314,7 @@ def usable_angles(result: Result) -> dict[str, float | str]:
     known = np.full(3, True)  # near gimbal lock roll and yaw have no sigma and are known
     if set(result.unobservable()).intersection(ROTATIONS):
         known = np.isfinite(sigmas_rpy(T, result.covariance_measured))
-    angles = se3.rotation_to_rpy(T[:3, :3]).tolist()
+    angles = se3.rotation_to_rpy(se3.rotation_of(T)).tolist()
     return {
         name: angle if is_known else by_hand(name)
         for name, angle, is_known in zip(ROTATIONS, angles, known, strict=True)

@@ -190,12 +190,12 @@ class Result:
         """Rotation of ``T_parent_child``, as SciPy has it."""
         from scipy.spatial.transform import Rotation
 
-        return Rotation.from_matrix(self.T_parent_child[:3, :3])
+        return Rotation.from_matrix(se3.rotation_of(self.T_parent_child))
 
     @property
     def translation(self) -> FloatArray:
         """(3,) array: position of the child sensor in the parent sensor's frame, m."""
-        return self.T_parent_child[:3, 3]
+        return se3.translation_of(self.T_parent_child)
 
     @property
     def quat_xyzw(self) -> FloatArray:
@@ -205,7 +205,7 @@ class Result:
     @property
     def rpy_deg(self) -> FloatArray:
         """(3,) array: roll, pitch and yaw about fixed axes, as in URDF, degrees."""
-        return np.degrees(se3.rotation_to_rpy(self.T_parent_child[:3, :3]))
+        return np.degrees(se3.rotation_to_rpy(se3.rotation_of(self.T_parent_child)))
 
     @property
     def T_child_parent(self) -> FloatArray:
@@ -250,7 +250,7 @@ class Result:
         """(6,) array: the part of :attr:`sigmas` that allows for constant errors of the odometries,
         which no recording shows.
         """
-        return sigmas_in_parent(self.T_parent_child[:3, :3], self.covariance_allowance)
+        return sigmas_in_parent(se3.rotation_of(self.T_parent_child), self.covariance_allowance)
 
     @property
     def observability(self) -> tuple[records.DofObservability, ...]:

@@ -74,7 +74,8 @@ def solve_park(pairs: MotionPairs) -> Solution:
 def translation_equations(pairs: MotionPairs, R: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return ``R_A - I`` (K, 3, 3) and ``R t_B - t_A`` (K, 3), which it maps the translation to."""
     A = pairs.Ts_parenti_parentj
-    return A[:, :3, :3] - np.eye(3), pairs.Ts_childi_childj[:, :3, 3] @ R.T - A[:, :3, 3]
+    t_B = se3.translation_of(pairs.Ts_childi_childj)
+    return se3.rotation_of(A) - np.eye(3), t_B @ R.T - se3.translation_of(A)
 
 
 def align_rotation_vectors(pairs: MotionPairs, weights: FloatArray | None = None) -> FloatArray:
@@ -86,8 +87,8 @@ def align_rotation_vectors(pairs: MotionPairs, weights: FloatArray | None = None
     reflection. No centroid is subtracted, because the vectors have a common origin. If a rotation
     is nearly pi, noise decides the sign of its vector.
     """
-    a = se3.rotation_log(pairs.Ts_parenti_parentj[:, :3, :3])
-    b = se3.rotation_log(pairs.Ts_childi_childj[:, :3, :3])
+    a = se3.rotation_log(se3.rotation_of(pairs.Ts_parenti_parentj))
+    b = se3.rotation_log(se3.rotation_of(pairs.Ts_childi_childj))
     weighted = a if weights is None else a * weights[:, None]
     return se3.nearest_rotation(weighted.T @ b)
 
@@ -117,9 +118,9 @@ def residual_rows(pairs: MotionPairs) -> FloatArray:
     """
     rows = np.zeros((len(pairs), 3, quadratic_form.DIMENSION))
     for axis in range(3):
-        rows[:, axis, 3 * axis : 3 * axis + 3] = -pairs.Ts_childi_childj[:, :3, 3]
-    rows[:, :, 9:12] = pairs.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
-    rows[:, :, 12] = pairs.Ts_parenti_parentj[:, :3, 3]
+        rows[:, axis, 3 * axis : 3 * axis + 3] = -se3.translation_of(pairs.Ts_childi_childj)
+    rows[:, :, 9:12] = se3.rotation_of(pairs.Ts_parenti_parentj) - np.eye(3)
+    rows[:, :, 12] = se3.translation_of(pairs.Ts_parenti_parentj)
     return rows.reshape(-1, quadratic_form.DIMENSION)
 
 

@@ -164,8 +164,8 @@ def _parts(pairs: MotionPairs, T_parent_child: FloatArray) -> tuple[_Part, _Part
     errors = se3.inverse(pairs.Ts_childi_childj) @ predicted
     # Exp(-xi) Y Exp(xi) = Y Exp(xi - Ad(Y^-1) xi) to first order.
     jacobians = np.eye(6) - se3.adjoint(se3.inverse(predicted))
-    rotation = se3.rotation_log(errors[:, :3, :3])
-    return _Part(errors[:, :3, 3], jacobians[:, :3]), _Part(rotation, jacobians[:, 3:])
+    rotation = se3.rotation_log(se3.rotation_of(errors))
+    return _Part(se3.translation_of(errors), jacobians[:, :3]), _Part(rotation, jacobians[:, 3:])
 
 
 def _scales(parts: tuple[_Part, _Part]) -> FloatArray:
@@ -258,8 +258,8 @@ def _start(pairs: MotionPairs) -> FloatArray:
     The rotation aligns the rotation vectors of both sensors. Motions about one axis leave the angle
     about that axis open. So several angles are tried, each with the translation by least squares.
     """
-    vectors_parent = se3.rotation_log(pairs.Ts_parenti_parentj[:, :3, :3])
-    vectors_child = se3.rotation_log(pairs.Ts_childi_childj[:, :3, :3])
+    vectors_parent = se3.rotation_log(se3.rotation_of(pairs.Ts_parenti_parentj))
+    vectors_child = se3.rotation_log(se3.rotation_of(pairs.Ts_childi_childj))
     # Angles of both motions are equal, whatever X is.
     differences = np.linalg.norm(vectors_parent, axis=1) - np.linalg.norm(vectors_child, axis=1)
     unit = max(1.5 * median(np.abs(differences)), _MIN_SCALE)

@@ -84,15 +84,15 @@ def _condense(pairs: MotionPairs) -> FloatArray:
     """
     A = pairs.Ts_parenti_parentj
     B = pairs.Ts_childi_childj
-    t_A = A[:, :3, 3]
-    t_B = B[:, :3, 3]
-    k_A = _axes(A[:, :3, :3])
-    k_B = _axes(B[:, :3, :3])
+    t_A = se3.translation_of(A)
+    t_B = se3.translation_of(B)
+    k_A = _axes(se3.rotation_of(A))
+    k_B = _axes(se3.rotation_of(B))
     # Factors of (1, z) in f.
     f = np.concatenate([(k_A - k_B)[:, :, None], se3.skew(k_A + k_B)], axis=2)
     # Factors of z_i t_j, with z_0 = t_0 = 1, in g: first without the skew matrices of z.
     g = np.zeros((len(pairs), 3, 4, 4))
-    g[..., 1:] = (A[:, :3, :3] - np.eye(3))[:, :, None]
+    g[..., 1:] = (se3.rotation_of(A) - np.eye(3))[:, :, None]
     g[:, :, 0, 0] = t_A - t_B
     g[:, :, 1:, 0] = (t_A + t_B)[:, :, None]
     g[:, :, 1:] = -np.einsum("zij,njzt->nizt", se3.skew(np.eye(3)), g[:, :, 1:])
@@ -128,7 +128,7 @@ def _rotation(z: FloatArray) -> FloatArray:
 
 def _parameters(T_parent_child: FloatArray) -> FloatArray:
     """(z, t) (6,) of a transform."""
-    rotvec = se3.rotation_log(T_parent_child[:3, :3])
+    rotvec = se3.rotation_log(se3.rotation_of(T_parent_child))
     angle = np.linalg.norm(rotvec)
     factor = np.tan(angle / 2) / angle if angle > 0.0 else 0.5
-    return np.append(rotvec * factor, T_parent_child[:3, 3])
+    return np.append(rotvec * factor, se3.translation_of(T_parent_child))

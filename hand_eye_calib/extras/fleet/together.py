@@ -18,6 +18,7 @@ from hand_eye_calib.core.assessment.comparison import (
 from hand_eye_calib.core.assessment.covariance import combined
 from hand_eye_calib.core.base.errors import HandEyeCalibError, InputError, located
 from hand_eye_calib.core.base.plain import Document
+from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import turned
 from hand_eye_calib.core.geometry.trajectory import TrajectoryLike
 from hand_eye_calib.core.results.calibration import Calibration, Verdict, data_frame
@@ -230,7 +231,7 @@ def _joint(used: Sequence[Calibration], agreement: Agreement, record: Together) 
             by_prior.add(name)
             variance = min(dof.sigma for dof in finite) ** 2
             covariance[axis, axis] = max(covariance[axis, axis], variance)
-    covariance = turned(T[:3, :3].T, covariance)
+    covariance = turned(se3.rotation_of(T).T, covariance)
     assessed = combined(T, covariance, unknown_directions(covariance))
     observability = tuple(
         replace(dof, verdict=DofVerdict.PRIOR) if dof.name in by_prior else dof

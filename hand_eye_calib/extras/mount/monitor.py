@@ -279,7 +279,7 @@ class MountMonitor:
             table, _ = _evidence(residuals, jacobians, self._noise)
             shift = moved.most_likely(table, TUNING.ridge)
             self._noise, _ = moved.noise_covariance(residuals + jacobians @ shift)
-        distances_m = np.linalg.norm(pairs.Ts_parenti_parentj[:, :3, 3], axis=1)
+        distances_m = np.linalg.norm(se3.translation_of(pairs.Ts_parenti_parentj), axis=1)
         speed_m_s = float(np.median(distances_m))
         floor = floor_of_pairs(pairs, np.ones(len(pairs)), self._installed, speed_m_s)
         floor += moved.shift_covariance(1e-3, 1e-4)  # keeps the covariance regular
@@ -329,7 +329,7 @@ class MountMonitor:
         H = information(tables[best])
         S = score(tables[best])
         covariance = np.linalg.inv(H + np.linalg.inv(moved.shift_covariance(1.0, 1.0)))
-        to_parent = se3.on_both(self._installed[:3, :3])
+        to_parent = se3.block_diagonal(se3.rotation_of(self._installed))
         values = to_parent @ covariance @ S
         shift = change.moved(values, to_parent @ covariance @ to_parent.T, np.zeros(6))
         log_ratio = float(ratios[best])
@@ -392,15 +392,15 @@ class MountMonitor:
         volumes = np.eye(6) + _KNOCKS[:2] @ np.linalg.inv(covariance)
         log_volumes = np.linalg.slogdet(volumes)[1]
         detected_sigmas = np.sqrt(2.0 * TUNING.threshold + log_volumes) + NINE_TIMES_OUT_OF_TEN
-        sigmas = sigmas_in_parent(self._installed[:3, :3], covariance)
+        sigmas = sigmas_in_parent(se3.rotation_of(self._installed), covariance)
         return np.asarray(np.repeat(detected_sigmas, 3) * sigmas)
 
 
 def _is_motion(motions: MotionPairs, noise: FloatArray) -> bool:
     """Whether the sensors move: at rest, noise would look like information."""
     parent = motions.Ts_parenti_parentj
-    angle_rad = np.median(se3.rotation_angle(parent[:, :3, :3]))
-    distance_m = np.median(np.linalg.norm(parent[:, :3, 3], axis=1))
+    angle_rad = np.median(se3.rotation_angle(se3.rotation_of(parent)))
+    distance_m = np.median(np.linalg.norm(se3.translation_of(parent), axis=1))
     noise_rad = float(np.sqrt(np.trace(noise[3:, 3:]) / 3))
     least_rad = max(TUNING.least_rotation_rad, TUNING.least_of_noise * noise_rad)
     return bool(angle_rad > least_rad or distance_m > TUNING.least_motion_m)

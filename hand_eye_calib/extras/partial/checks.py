@@ -132,7 +132,7 @@ def check_solved(
         has_rates = "rates" in (parent.measures, child.measures)
         return _check_turning(pairs, calibration, stream, priors, has_rates)
     measured = {"parent": parent, "child": child}[stream]
-    interpolated = check_interpolated(measured.poses[:, :3, 3], stream)
+    interpolated = check_interpolated(se3.translation_of(measured.poses), stream)
     return _check_moving(pairs, calibration, stream, priors, least_share, interpolated)
 
 
@@ -146,7 +146,7 @@ def _check_turning(
     """Check rotations or rates; return the findings of the first check that has any."""
     T_parent_child = calibration.T_parent_child
     sigmas = calibration.sigmas_measured[3:]
-    parallel = check_rotation(T_parent_child[:3, :3], sigmas, priors, has_rates)
+    parallel = check_rotation(se3.rotation_of(T_parent_child), sigmas, priors, has_rates)
     if copied := _copied_rotations(pairs, T_parent_child):
         return _as_errors(parallel) or copied
     if findings := parallel or _check_handedness(pairs, stream):
@@ -165,7 +165,7 @@ def _check_moving(
     """Check positions; return the findings of the first check that has any."""
     T_parent_child = calibration.T_parent_child
     sigmas = calibration.sigmas_measured[:3]
-    no_lever_arm = check_position(T_parent_child[:3, 3], sigmas, priors)
+    no_lever_arm = check_position(se3.translation_of(T_parent_child), sigmas, priors)
     pairs = _with_orientations(pairs, T_parent_child, stream)
     if copied := _copied_positions(pairs, T_parent_child):
         return _as_errors(no_lever_arm) or copied
@@ -282,7 +282,7 @@ def check_positions(
     ]
     short = pairs_over(pairs, agreement.SHORT_S, agreement.MOST_SHORT)
     if fast := delays(pairs, short, T_parent_child):
-        speed = usual_speed(pairs.stamps_ns, pairs.Ts_pw_p[:, :3, 3])
+        speed = usual_speed(pairs.stamps_ns, se3.translation_of(pairs.Ts_pw_p))
         interval_s = median(np.diff(pairs.stamps_ns)) * 1e-9
         suspects += agreement.delay_suspects(fast, pairs, speed, 0.0)
         suspects += agreement.smoothing_suspects(fast, interval_s, speed)
@@ -343,7 +343,7 @@ def _copied_positions(pairs: PosePairs, T_parent_child: FloatArray) -> list[Find
     if len(motions) < MIN_PAIRS:
         return []
     residual_m = median(np.linalg.norm(motions.residuals(T_parent_child)[0], axis=1))
-    moved_m = median(np.linalg.norm(motions.Ts_parenti_parentj[:, :3, 3], axis=1))
+    moved_m = median(np.linalg.norm(se3.translation_of(motions.Ts_parenti_parentj), axis=1))
     if residual_m > min(_COPIED_M, _COPIED_SHARE * moved_m):
         return []
     return _copied("The positions agree with the poses to rounding", residual_m=residual_m)
@@ -374,7 +374,7 @@ def _copied_rotations(pairs: PosePairs, T_parent_child: FloatArray) -> list[Find
     of_parent, of_child = _rotation_vectors(pairs)
     if len(of_parent) < MIN_PAIRS:
         return []
-    residuals = of_child @ T_parent_child[:3, :3].T - of_parent
+    residuals = of_child @ se3.rotation_of(T_parent_child).T - of_parent
     residual_rad = median(np.linalg.norm(residuals, axis=1))
     usual_rad = median(np.linalg.norm(of_parent, axis=1))
     if residual_rad > min(_COPIED_RAD, _COPIED_SHARE * usual_rad):
@@ -403,15 +403,15 @@ def check_rotations(
     list of Finding
         At most one finding.
     """
-    rotation = T_parent_child[:3, :3]
+    rotation = se3.rotation_of(T_parent_child)
     of_parent, of_child = _rotation_vectors(pairs)
     if len(of_parent) < BLOCKS * MIN_PAIRS:
         return []
     still = np.zeros(3)
     turning = PosePairs(
         pairs.stamps_ns,
-        se3.from_rotation_translation(pairs.Ts_pw_p[:, :3, :3], still),
-        se3.from_rotation_translation(pairs.Ts_cw_c[:, :3, :3], still),
+        se3.from_rotation_translation(se3.rotation_of(pairs.Ts_pw_p), still),
+        se3.from_rotation_translation(se3.rotation_of(pairs.Ts_cw_c), still),
     )
     change = find_change(turning, se3.from_rotation_translation(rotation, still))
     moved = agreement.moved_mount(change, int(pairs.stamps_ns[0])) if change else None
@@ -427,8 +427,8 @@ def check_rotations(
 def _rotation_vectors(pairs: PosePairs) -> tuple[FloatArray, FloatArray]:
     """Rotation vectors (K, 3) of parent and child over 1 s, each in its own sensor frame."""
     motions = pairs_over(pairs, agreement.SHORT_S, _MOST_MOTIONS)
-    of_parent = se3.rotation_log(motions.Ts_parenti_parentj[:, :3, :3])
-    of_child = se3.rotation_log(motions.Ts_childi_childj[:, :3, :3])
+    of_parent = se3.rotation_log(se3.rotation_of(motions.Ts_parenti_parentj))
+    of_child = se3.rotation_log(se3.rotation_of(motions.Ts_childi_childj))
     angles = np.maximum(np.linalg.norm(of_parent, axis=1), np.linalg.norm(of_child, axis=1))
     is_usable = angles < MAX_ROTATION_RAD
     return of_parent[is_usable], of_child[is_usable]

@@ -112,11 +112,11 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     Ts_cw_c = pose_pairs.child_scaled(config.given_scale).Ts_cw_c
     if config.child_measures == "positions":
         sign = 1.0
-        paths = _Paths(stamps_ns, Ts_pw_p, Ts_cw_c[:, :3, 3], is_child=True)
+        paths = _Paths(stamps_ns, Ts_pw_p, se3.translation_of(Ts_cw_c), is_child=True)
         allowance = _allowance(paths, config.parent_kind, config.child_kind)
     else:
         sign = -1.0
-        paths = _Paths(stamps_ns, Ts_cw_c, Ts_pw_p[:, :3, 3], is_child=False)
+        paths = _Paths(stamps_ns, Ts_cw_c, se3.translation_of(Ts_pw_p), is_child=False)
         allowance = _allowance(paths, config.child_kind, config.parent_kind)
     try:
         solution = paths.solve(config.scale in ("auto", "estimate"))
@@ -162,15 +162,15 @@ def _allowance(paths: _Paths, kind_of_poses: str, kind_of_positions: str) -> Flo
     if kind_of_positions != "exact":
         variance += _POINT_M**2
     if kind_of_poses != "exact":
-        speed_m_s = covariance.usual_speed(paths.stamps_ns, paths.poses[:, :3, 3])
+        speed_m_s = covariance.usual_speed(paths.stamps_ns, se3.translation_of(paths.poses))
         variance += (covariance.FLOOR_TRAVEL_S * speed_m_s) ** 2
     return variance * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 
 
 def _step_residuals(solution: of_positions.LeverArmSolution, paths: _Paths) -> Residuals:
     """Residuals of the distances between positions, along the steps of the sensor with poses."""
-    rotations = paths.poses[:, :3, :3]
-    steps = np.diff(rotations @ solution.lever_arm + paths.poses[:, :3, 3], axis=0)
+    rotations = se3.rotation_of(paths.poses)
+    steps = np.diff(rotations @ solution.lever_arm + se3.translation_of(paths.poses), axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     excess = lengths - np.linalg.norm(np.diff(paths.positions, axis=0), axis=1)
     along = (excess / np.maximum(lengths, 1e-12))[:, None] * steps
@@ -290,7 +290,7 @@ def estimate_rotation(
 
 def _rotations_of(Ts: FloatArray) -> FloatArray:
     """Poses (N, 4, 4) with the same rotations and zero translations."""
-    return se3.from_rotation_translation(Ts[:, :3, :3], np.zeros(3))
+    return se3.from_rotation_translation(se3.rotation_of(Ts), np.zeros(3))
 
 
 def _solve_rotation(
@@ -320,7 +320,7 @@ def _rate_bias(solution: adaptive_estimator.AdaptiveSolution, config: Calibrator
     bias, sigmas = solution.rate_bias
     of = "child" if config.parent_measures != "rates" else "child less parent, child's axes"
     if config.child_measures != "rates":
-        rotation = solution.T_parent_child[:3, :3]
+        rotation = se3.rotation_of(solution.T_parent_child)
         of = "parent"
         bias = -rotation @ bias
         sigmas = np.sqrt(np.diag(rotation @ np.diag(sigmas**2) @ rotation.T))
@@ -334,7 +334,7 @@ def _check_rotation(
     span = min(_SPAN, max(len(Ts_pw_p) // 10, 1))
     pairs = motion_pairs(Ts_pw_p, Ts_cw_c, f"B{span}")
     residuals = np.linalg.norm(pairs.residuals(T_parent_child)[1], axis=1)
-    angles = se3.rotation_angle(pairs.Ts_parenti_parentj[:, :3, :3])
+    angles = se3.rotation_angle(se3.rotation_of(pairs.Ts_parenti_parentj))
     is_turning = angles >= np.quantile(angles, _TURNING)
     usual_angle = float(np.median(angles[is_turning]))
     share = float(np.median(residuals[is_turning]) / max(usual_angle, 1e-12))
@@ -360,4 +360,4 @@ def _check_rate_unit(steps: MotionPairs, config: CalibratorConfig) -> tuple[Find
 
 def _large_angle(motions: FloatArray) -> float:
     """Return a large rotation angle (rad) of motions (K, 4, 4), above zero."""
-    return max(float(np.quantile(se3.rotation_angle(motions[:, :3, :3]), _TURNING)), 1e-12)
+    return max(float(np.quantile(se3.rotation_angle(se3.rotation_of(motions)), _TURNING)), 1e-12)

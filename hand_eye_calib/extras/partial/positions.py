@@ -216,7 +216,7 @@ class _State:
         interval_s = float(np.median(np.diff(stamps_s)))
         duration_s = float(stamps_s[-1])
         state = cls(
-            positions=streams.Ts_cw_c[:, :3, 3],
+            positions=se3.translation_of(streams.Ts_cw_c),
             streams=streams,
             X=se3.from_rotation_translation(np.eye(3), lever_arm),
             sigmas=sigmas,
@@ -274,7 +274,7 @@ class _State:
 
         It has no rotation to estimate, orientations without bounds, and the odometry's walk.
         """
-        values = np.r_[self.X[:3, 3], self.parameters[[*_SHARED, RESPONSE]]]
+        values = np.r_[se3.translation_of(self.X), self.parameters[[*_SHARED, RESPONSE]]]
         prior = prior_products(values, self.sigmas, len(values) + 1)
         space = (model or self.model).state_space(
             self.streams,
@@ -338,7 +338,7 @@ class _State:
         jump_factors = np.maximum(tuning.jump_factor * of_walk, self.walk_factors)
         errors = posterior.states_after(posterior.normal.step)[:, :3]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
-        path = Ts_cw_c[:, :3, 3] + se3.times(Ts_cw_c[:, :3, :3], errors)
+        path = se3.translation_of(Ts_cw_c) + se3.times(se3.rotation_of(Ts_cw_c), errors)
         spread = posterior.factor.selected_inverse[0][:, range(3), range(3)]
         drift = 3.0 * float(np.exp(self.levels[WALK_TRANSLATION]))
         squares = ((self.positions - path) ** 2 + spread).sum(axis=1)
@@ -356,7 +356,7 @@ class _State:
         """Return the state after a step, with the orientations that the positions ask for."""
         turns = posterior.states_after(np.r_[step, 0.0])[:, 3:6]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
-        Ts_cw_c[:, :3, :3] = Ts_cw_c[:, :3, :3] @ se3.rotation_exp(turns)
+        Ts_cw_c[:, :3, :3] = se3.rotation_of(Ts_cw_c) @ se3.rotation_exp(turns)
         X = self.X.copy()
         parameters = self.parameters.copy()
         X[:3, 3] += step[:3]
@@ -411,7 +411,7 @@ def _solution(
     # An error that lasts for a share of the recording may last for all of it: X absorbs its mean.
     lasting = float(np.exp(state.levels[N_FAST])) if state.model.slow else 0.0
     return LeverArmSolution(
-        lever_arm=state.X[:3, 3] + normal.step[:3],
+        lever_arm=se3.translation_of(state.X) + normal.step[:3],
         covariance=covariance[:3, :3] + np.outer(shift, shift) + lasting * np.eye(3),
         parameters=parameters,
         parameter_sigmas=sigmas,
@@ -443,7 +443,7 @@ def _accelerations(streams: increments.Streams, X: FloatArray, tuning: Tuning) -
     They come from steps on either side of each pose, without the noise of the pose itself. They are
     zero beside gaps and at the ends.
     """
-    path = (streams.Ts_pw_p @ X)[:, :3, 3]
+    path = se3.translation_of(streams.Ts_pw_p @ X)
     stamps_s = streams.stamps_s
     accelerations = np.zeros((len(path), 6))
     interval_s = float(np.median(np.diff(stamps_s)))
@@ -475,8 +475,8 @@ def _start(
     lever_arm = np.zeros(3)
     scale = 1.0
     size = min(window, len(positions))
-    axes = _windows(Ts_pw_p[:, :3, :3], size)
-    path = _windows(Ts_pw_p[:, :3, 3], size)
+    axes = _windows(se3.rotation_of(Ts_pw_p), size)
+    path = _windows(se3.translation_of(Ts_pw_p), size)
     measured = _windows(positions, size)
     information = np.einsum("nkij,nkil->njl", axes, axes) + _DRAWN * size * np.eye(3)
     for _ in range(_START_STEPS):
@@ -498,7 +498,7 @@ def _start(
         if np.abs(lever_arm - previous).max() < _START_SETTLED_M:
             break
     window_of_pose = np.minimum(np.arange(len(positions)) // size, len(turns) - 1)
-    return lever_arm, scale, turns[window_of_pose] @ Ts_pw_p[:, :3, :3]
+    return lever_arm, scale, turns[window_of_pose] @ se3.rotation_of(Ts_pw_p)
 
 
 def unexplained_share(
@@ -521,7 +521,7 @@ def unexplained_share(
     float
         1 if nothing moves.
     """
-    predicted = Ts_pw_p[:, :3, :3] @ lever_arm + Ts_pw_p[:, :3, 3]
+    predicted = se3.rotation_of(Ts_pw_p) @ lever_arm + se3.translation_of(Ts_pw_p)
     size = max(len(positions) // _PATH_PARTS, min(_PATH_PARTS, len(positions)))
     expected = _windows(predicted, size)
     measured = _windows(scale * positions, size)

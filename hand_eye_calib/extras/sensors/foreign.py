@@ -266,7 +266,7 @@ def _of_json(data: bytes, _: str | None) -> _Rows:
             "nuScenes, or csv"
         )
     Ts_world_camera = np.array([item["transform_matrix"] for item in frames], dtype=float)
-    Ts_world_camera[:, :3, :3] = Ts_world_camera[:, :3, :3] @ _FLIP
+    Ts_world_camera[:, :3, :3] = se3.rotation_of(Ts_world_camera) @ _FLIP
     note = "axes of the camera: x right, y down, z forward, not those of OpenGL in the file"
     return _of_images([str(item["file_path"]) for item in frames], Ts_world_camera, [note])
 

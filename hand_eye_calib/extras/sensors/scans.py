@@ -337,7 +337,9 @@ class ScanReading(Reading):
         parts, part_of_point = np.unique(part_numbers, return_inverse=True)
         powers = np.vander(parts * TUNING.part_s, len(since_s))
         Ts = se3.exp(powers @ polynomial)[part_of_point]
-        return np.asarray(np.einsum("nij,nj->ni", Ts[:, :3, :3], scan.points) + Ts[:, :3, 3])
+        return np.asarray(
+            np.einsum("nij,nj->ni", se3.rotation_of(Ts), scan.points) + se3.translation_of(Ts)
+        )
 
     def _thinned(self, points: FloatArray, step: Step) -> Any:
         """Return one of the points (N, 3) in each voxel, with their local planes."""
@@ -353,8 +355,8 @@ class ScanReading(Reading):
         """
         means = np.array(self._fine_map.voxel_points())[:, :3]
         covariances = np.reshape(self._fine_map.voxel_covs(), (-1, 4, 4))[:, :3, :3]
-        points = still @ pose[:3, :3].T + pose[:3, 3]
-        rays = scan.points @ pose[:3, :3].T
+        points = still @ se3.rotation_of(pose).T + se3.translation_of(pose)
+        rays = scan.points @ se3.rotation_of(pose).T
         nearest = self._gicp.KdTree(means).batch_nearest_neighbor_search(points)[0]
         voxels, voxel_of_point = np.unique(nearest, return_inverse=True)
         variances, axes = np.linalg.eigh(covariances[voxels])

@@ -121,7 +121,7 @@ def simulate_drive(
     Ts_pw_p = _poses_on_terrain(config, positions, headings)
     Ts_pw_p_at_child = Ts_pw_p[config.poses :]
     Ts_pw_p = Ts_pw_p[: config.poses]
-    rotation = se3.from_quat_xyzw(np.zeros(3), extrinsic_rng.standard_normal(4))[:3, :3]
+    rotation = se3.rotation_of(se3.from_quat_xyzw(np.zeros(3), extrinsic_rng.standard_normal(4)))
     offset = extrinsic_rng.uniform(-_LARGEST_OFFSET_M, _LARGEST_OFFSET_M, 3)
     T_parent_child = se3.from_rotation_translation(rotation, offset)
     # Euler angles (rad) and translation (m) are differences of two uniform numbers from 0 to 1.
@@ -262,7 +262,7 @@ def add_noise(
     Ts_cw_c = _with_gaussian(Ts_cw_c, noise, gaussian_rng)
     # Each step grows by a share of its length along one axis of the sensor.
     axis = drift_rng.integers(3)
-    lengths_m = np.linalg.norm(np.diff(Ts_cw_c[:, :3, 3], axis=0), axis=1)
+    lengths_m = np.linalg.norm(np.diff(se3.translation_of(Ts_cw_c), axis=0), axis=1)
     steps = noise.drift * lengths_m[:, None] * Ts_cw_c[:-1, :3, axis]
     Ts_cw_c[1:, :3, 3] += np.cumsum(steps, axis=0)
     Ts_pw_p = _with_jumps(Ts_pw_p, noise.outliers, jump_rng)

@@ -227,8 +227,8 @@ def _checked_poses(
     has_positions = config.measured == "poses"
     if not has_positions:
         zeros = np.zeros((n_stops, 3))
-        parent = se3.from_rotation_translation(parent[:, :3, :3], zeros)
-        child = se3.from_rotation_translation(child[:, :3, :3], zeros)
+        parent = se3.from_rotation_translation(se3.rotation_of(parent), zeros)
+        child = se3.from_rotation_translation(se3.rotation_of(child), zeros)
     return StopPoses(parent, child, is_arm, has_positions)
 
 
@@ -272,10 +272,10 @@ def _check_distances(reading: Reading, frames: Mapping[str, str]) -> list[Findin
     The finding needs a counterpart near the base: then inverse poses are more probable.
     """
     fit = reading.fit
-    if fit.undetermined().size or not reading.stops.Ts_world_child[:, :3, 3].any():
+    if fit.undetermined().size or not se3.translation_of(reading.stops.Ts_world_child).any():
         return []
-    on_hand_m = float(np.linalg.norm(fit.Ts_parent_child[0][:3, 3]))
-    from_base_m = float(np.linalg.norm(fit.Ts_world_world[0][:3, 3]))
+    on_hand_m = float(np.linalg.norm(se3.translation_of(fit.Ts_parent_child[0])))
+    from_base_m = float(np.linalg.norm(se3.translation_of(fit.Ts_world_world[0])))
     moving = frames["camera"]
     fixed = frames["target"]
     if reading.is_inverse:
@@ -346,7 +346,7 @@ def _calibration_of(solved: SolvedStops, warnings: Sequence[str], frames: _Frame
     errors = se3.log(se3.inverse(Z @ stops.Ts_world_child) @ stops.Ts_world_parent @ X)
     rows = np.arange(len(errors))
     residuals = Residuals(
-        translation=errors[:, :3] @ X[:3, :3].T,
+        translation=errors[:, :3] @ se3.rotation_of(X).T,
         rotation=errors[:, 3:],
         weights=fit.weights,
         start_ns=rows,

@@ -277,7 +277,9 @@ def _check_axes(sample: StopPoses, fit: RoughFit) -> Finding | None:
             continue
         for axes, stream in itertools.product(_other_axes(), ("child", "parent")):
             Ts = getattr(sample, stream)
-            turned = se3.from_rotation_translation(Ts[:, :3, :3], Ts[:, :3, 3] @ axes.T)
+            turned = se3.from_rotation_translation(
+                se3.rotation_of(Ts), se3.translation_of(Ts) @ axes.T
+            )
             other = rough_fit(sample.with_side(stream, turned), mistakes)
             if other.log_likelihood > largest and other.unexplained < LARGEST_SHARE:
                 best = finding("axes", stream, detail=_axes_in_words(axes))
@@ -313,8 +315,8 @@ def _with_units(sample: StopPoses, examination: Examination, is_scale_free: bool
     if not sample.has_positions:
         return examination
     scale = examination.scale
-    of_parent = _unit_of_size(sample.parent[:, :3, 3])
-    of_child = _unit_of_size(sample.child[:, :3, 3])
+    of_parent = _unit_of_size(se3.translation_of(sample.parent))
+    of_child = _unit_of_size(se3.translation_of(sample.child))
     if scale is not None:
         to_metres = scale * of_parent
         nearest = min((1.0, *_UNITS), key=lambda unit: abs(np.log(to_metres / unit)))

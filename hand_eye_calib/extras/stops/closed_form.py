@@ -111,13 +111,14 @@ def start_poses(stops: Stops, counts: IntArray) -> tuple[FloatArray, FloatArray]
 
 def _closed_form(stops: Stops) -> tuple[FloatArray, FloatArray]:
     """Return X and Z (4, 4) of one child and one world."""
-    R_A = stops.Ts_world_parent[:, :3, :3]
-    R_B = stops.Ts_world_child[:, :3, :3]
+    R_A = se3.rotation_of(stops.Ts_world_parent)
+    R_B = se3.rotation_of(stops.Ts_world_child)
     R_X, R_Z = closest_rotations(R_A, R_B)
     # R_A t_X - t_Z = R_Z t_B - t_A
     minus_one = -np.broadcast_to(np.eye(3), (len(stops), 3, 3))
     columns = np.concatenate([R_A, minus_one], axis=2)
-    values = stops.Ts_world_child[:, :3, 3] @ R_Z.T - stops.Ts_world_parent[:, :3, 3]
+    t_A = se3.translation_of(stops.Ts_world_parent)
+    values = se3.translation_of(stops.Ts_world_child) @ R_Z.T - t_A
     translations = np.linalg.lstsq(columns.reshape(-1, 6), values.ravel(), rcond=1e-9)[0]
     X = se3.from_rotation_translation(R_X, translations[:3])
     Z = se3.from_rotation_translation(R_Z, translations[3:])
@@ -149,6 +150,6 @@ def _most_central(Ts: FloatArray) -> FloatArray:
 def _logs_of_medians(errors: FloatArray) -> FloatArray:
     """Return the logarithm (M,) of median distance times median angle of errors (M, N, 4, 4)."""
     tiny = np.finfo(float).tiny
-    distances_m = np.median(np.linalg.norm(errors[..., :3, 3], axis=-1), axis=1)
-    angles_rad = np.median(se3.rotation_angle(errors[..., :3, :3]), axis=1)
+    distances_m = np.median(np.linalg.norm(se3.translation_of(errors), axis=-1), axis=1)
+    angles_rad = np.median(se3.rotation_angle(se3.rotation_of(errors)), axis=1)
     return np.asarray(np.log(distances_m + tiny) + np.log(angles_rad + tiny))

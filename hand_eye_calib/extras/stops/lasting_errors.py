@@ -12,6 +12,7 @@ Reference: D. A. Harville, *Maximum likelihood approaches to variance component 
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.geometry import se3
 
 # Range of each kernel (rad of view) and white share of its variance. The first kernel is of errors
 # that do not last, the second of errors that come back with their place; the others are of errors
@@ -31,11 +32,11 @@ def views_of(Ts_world_parent: FloatArray, Ts_world_child: FloatArray) -> FloatAr
     root of two, and the place. Places are divided by a usual distance: that to the target, and
     between stops.
     """
-    positions = Ts_world_parent[:, :3, 3]
-    distances_m = np.linalg.norm(Ts_world_child[:, :3, 3], axis=1)
+    positions = se3.translation_of(Ts_world_parent)
+    distances_m = np.linalg.norm(se3.translation_of(Ts_world_child), axis=1)
     ways_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     usual_m = np.median(distances_m) + ways_m.sum() / len(positions) + _TINY
-    rotations = Ts_world_parent[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0)
+    rotations = se3.rotation_of(Ts_world_parent).reshape(-1, 9) / np.sqrt(2.0)
     turns_rad = np.linalg.norm(np.diff(rotations, axis=0), axis=1)
     changes_rad = turns_rad + ways_m / usual_m
     return np.c_[np.cumsum(np.r_[0.0, changes_rad]), rotations, positions / usual_m]

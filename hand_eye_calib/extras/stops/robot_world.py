@@ -274,7 +274,7 @@ def _variances(
     final_sum = ((degrees + 6.0) * n - 2.0 * n_free) / degrees
     means = final_sum / weights.sum() * (weights @ squared) / n_free
     if 3 * n <= n_values:
-        places_m2 = stops.Ts_world_child[:, :3, 3].var(axis=0).sum() + _SMALLEST_VARIANCE
+        places_m2 = se3.translation_of(stops.Ts_world_child).var(axis=0).sum() + _SMALLEST_VARIANCE
         means = means @ [0.5 / places_m2, 0.5] * np.array([places_m2, 1.0])
     return np.maximum(means, _SMALLEST_VARIANCE)
 
@@ -439,9 +439,9 @@ def _whitened_rows(stops: Stops, fit: RobotWorld, in_world: bool) -> FloatArray:
     errors, jacobian = _linearise(stops, fit.Ts_parent_child, fit.Ts_world_world, in_world)
     by_length = np.zeros((len(stops), 6))
     if in_world:
-        by_length[:, :3] = -stops.Ts_world_child[:, :3, 3]
+        by_length[:, :3] = -se3.translation_of(stops.Ts_world_child)
     else:
-        by_length[:, :3] = se3.inverse(stops.Ts_world_child)[:, :3, 3]
+        by_length[:, :3] = se3.translation_of(se3.inverse(stops.Ts_world_child))
     rows = np.concatenate([jacobian, by_length[..., None], errors[..., None]], axis=2)
     levels = np.repeat([fit.level_m, fit.level_rad], 3)
     return np.asarray(rows / levels[:, None])

@@ -64,7 +64,7 @@ def check_frozen(poses: StopPoses) -> Iterator[Finding]:
     """Yield a finding for a side that repeats its pose while the other side rotates."""
     for stream, other in _BOTH_WAYS:
         own = getattr(poses, stream)
-        others = getattr(poses, other)[:, :3, :3]
+        others = se3.rotation_of(getattr(poses, other))
         steps = se3.log(se3.inverse(own[:-1]) @ own[1:])
         is_repeated = np.abs(steps).max(axis=1) < _ROUNDING
         turns_rad = se3.rotation_angle(np.swapaxes(others[:-1], 1, 2) @ others[1:])
@@ -269,12 +269,12 @@ def _readings(sample: StopPoses, stream: str, of_other: FloatArray) -> Iterator[
     """
     Ts = getattr(sample, stream)
     for read_as, numbers_of in _NUMBERS_OF:
-        numbers = numbers_of(Ts[:, :3, :3])
+        numbers = numbers_of(se3.rotation_of(Ts))
         for meant, rotations_of in _ROTATIONS_OF.items():
             if meant == read_as:
                 continue
             rotations = rotations_of(numbers)
-            reread = se3.from_rotation_translation(rotations, Ts[:, :3, 3])
+            reread = se3.from_rotation_translation(rotations, se3.translation_of(Ts))
             yield _AngleReading(
                 difference_rad=median_difference(angles_between(reread), of_other),
                 stream=stream,

@@ -145,7 +145,7 @@ def certain_gain(n_stops: int) -> float:
 
 def scaled(Ts: FloatArray, factor: float) -> FloatArray:
     """Return poses (N, 4, 4) with their lengths multiplied by a factor."""
-    return se3.from_rotation_translation(Ts[:, :3, :3], factor * Ts[:, :3, 3])
+    return se3.from_rotation_translation(se3.rotation_of(Ts), factor * se3.translation_of(Ts))
 
 
 def angles_between(Ts: FloatArray) -> FloatArray:
@@ -171,7 +171,7 @@ def spread(positions: FloatArray) -> float:
 
 def turns_about_two_axes(Ts: FloatArray) -> bool:
     """Return whether poses (N, 4, 4) differ by 3 deg or more about at least two axes."""
-    rotations = Ts[:, :3, :3]
+    rotations = se3.rotation_of(Ts)
     central = rotations[int(np.argmin(medians(angles_between(Ts))))]
     vectors = se3.rotation_log(central.T @ rotations)
     sizes_rad = np.linalg.svd(vectors, compute_uv=False) / np.sqrt(len(vectors))
@@ -185,8 +185,10 @@ def rough_fit(poses: StopPoses, mistakes: Mistakes) -> RoughFit:
     B = stops.Ts_world_child
     weights = np.ones(len(A))
     for _ in range(_ROUNDS):
-        X, Z = closest_rotations(A[:, :3, :3], B[:, :3, :3], weights)
-        angles_rad = se3.rotation_angle(np.swapaxes(Z @ B[:, :3, :3], 1, 2) @ A[:, :3, :3] @ X)
+        X, Z = closest_rotations(se3.rotation_of(A), se3.rotation_of(B), weights)
+        angles_rad = se3.rotation_angle(
+            np.swapaxes(Z @ se3.rotation_of(B), 1, 2) @ se3.rotation_of(A) @ X
+        )
         weights = robust_weights("cauchy", (angles_rad / max(median(angles_rad), _TINY)) ** 2)
     error_rad = median(angles_rad)
     turns_rad = [median(above_diagonal(angles_between(Ts))) for Ts in (A, B)]
@@ -195,7 +197,7 @@ def rough_fit(poses: StopPoses, mistakes: Mistakes) -> RoughFit:
     if not poses.has_positions:
         return RoughFit(mistakes, turning, 0.0)
     placing, error_m, scale = _fit_positions(A, B, Z)
-    distance_m = (scale or 1.0) * median(np.linalg.norm(B[:, :3, 3], axis=1))
+    distance_m = (scale or 1.0) * median(np.linalg.norm(se3.translation_of(B), axis=1))
     logs = np.log(max(error_rad, _TINY)) + np.log(max(error_m, _TINY))
     return RoughFit(
         mistakes=mistakes,
@@ -221,10 +223,10 @@ def _fit_positions(
     """Return the unexplained share of the positions, their median residual (m), and the factor of
     the child's lengths; None if the stops do not determine the factor.
     """
-    of_parent = A[:, :3, 3]
-    of_child = B[:, :3, 3] @ R_Z.T
+    of_parent = se3.translation_of(A)
+    of_child = se3.translation_of(B) @ R_Z.T
     minus_one = np.broadcast_to(-np.eye(3), (len(A), 3, 3))
-    levers = np.concatenate([A[:, :3, :3], minus_one], axis=2)
+    levers = np.concatenate([se3.rotation_of(A), minus_one], axis=2)
     with_factor = np.concatenate([levers, -of_child[:, :, None]], axis=2)
     error_of_none, _ = _regression(levers, of_parent)
     error_of_free, values = _regression(with_factor, of_parent)

@@ -319,7 +319,7 @@ def _check_unknown(poses: StopPoses, fit: RobotWorld, findings: Sequence[Finding
     """
     if not turns_about_two_axes(poses.parent):
         return [finding("turning_about_one_axis")] if poses.has_positions else []
-    rotations = poses.parent[:, :3, :3]
+    rotations = se3.rotation_of(poses.parent)
     turn_rad = median(se3.rotation_angle(rotations[0].T @ rotations))
     if has_error(findings) or not fit.undetermined().size or turn_rad < _FAR_RAD:
         return []

@@ -105,7 +105,7 @@ def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, ...]:
 
 def _rotations_of(quats_xyzw: FloatArray) -> FloatArray:
     """Return the rotations (N, 3, 3) of quaternions (N, 4)."""
-    return se3.from_quat_xyzw(np.zeros((len(quats_xyzw), 3)), quats_xyzw)[:, :3, :3]
+    return se3.rotation_of(se3.from_quat_xyzw(np.zeros((len(quats_xyzw), 3)), quats_xyzw))
 
 
 def _positions(table: Table) -> tuple[FloatArray, FloatArray | None]:

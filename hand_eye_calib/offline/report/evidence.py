@@ -53,7 +53,7 @@ def summarise(trajectory: Trajectory) -> StreamSummary:
     """Summarise a trajectory of at least two poses."""
     intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
     poses = coarse(trajectory, max(_PATH_STEP_S, median(intervals_s))).poses
-    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(se3.translation_of(poses), axis=0), axis=1)
     angles = se3.rotation_angle(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
     return StreamSummary(
         poses=len(trajectory),
@@ -175,11 +175,11 @@ def _paths_of_positions(
     """Return the paths of parent and child; rotation and mean of the path align their worlds."""
     if parent_is_positions:
         poses = pose_pairs.Ts_cw_c @ calibration.T_child_parent
-        positions = pose_pairs.Ts_pw_p[:, :3, 3]
+        positions = se3.translation_of(pose_pairs.Ts_pw_p)
     else:
         poses = pose_pairs.Ts_pw_p @ calibration.T_parent_child
-        positions = pose_pairs.Ts_cw_c[:, :3, 3]
-    path = poses[:, :3, 3]
+        positions = se3.translation_of(pose_pairs.Ts_cw_c)
+    path = se3.translation_of(poses)
     path = path - path.mean(axis=0)
     center = positions.mean(axis=0)
     rotation = se3.nearest_rotation((positions - center).T @ path)
@@ -197,8 +197,8 @@ def _paths_of_poses(
     The mean rotation and the median shift of all poses align the worlds.
     """
     Ts_cw_p = pose_pairs.Ts_cw_c @ calibration.T_child_parent
-    rotations = pose_pairs.Ts_pw_p[:, :3, :3] @ np.swapaxes(Ts_cw_p[:, :3, :3], 1, 2)
-    parent = pose_pairs.Ts_pw_p[:, :3, 3]
-    child = Ts_cw_p[:, :3, 3] @ se3.nearest_rotation(rotations.mean(axis=0)).T
+    rotations = se3.rotation_of(pose_pairs.Ts_pw_p) @ np.swapaxes(se3.rotation_of(Ts_cw_p), 1, 2)
+    parent = se3.translation_of(pose_pairs.Ts_pw_p)
+    child = se3.translation_of(Ts_cw_p) @ se3.nearest_rotation(rotations.mean(axis=0)).T
     child = child + np.median(parent - child, axis=0)
     return parent - parent[0], child - parent[0]

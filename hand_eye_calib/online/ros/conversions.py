@@ -80,13 +80,13 @@ def to_pose_with_covariance(calibration: Calibration) -> PoseWithCovarianceStamp
     message.header.frame_id = calibration.parent_frame
     T = calibration.T_parent_child
     _fill(message.pose.pose.position, message.pose.pose.orientation, T)
-    covariance = turned(T[:3, :3], calibration.covariance)
+    covariance = turned(se3.rotation_of(T), calibration.covariance)
     message.pose.covariance = covariance.ravel().tolist()
     return message
 
 
 def _fill(position: Any, orientation: Any, T_target_source: FloatArray) -> None:
     """Write a transform into the two parts of a message."""
-    position.x, position.y, position.z = T_target_source[:3, 3].tolist()
+    position.x, position.y, position.z = se3.translation_of(T_target_source).tolist()
     quat_xyzw = se3.to_quat_xyzw(T_target_source).tolist()
     orientation.x, orientation.y, orientation.z, orientation.w = quat_xyzw

@@ -19,6 +19,7 @@ from hand_eye_calib.core.assessment.comparison import with_comparison
 from hand_eye_calib.core.base.config import NodeConfig
 from hand_eye_calib.core.base.errors import ConfigError, HandEyeCalibError, InputError
 from hand_eye_calib.core.base.text import axes_in_words
+from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import Extrinsic, FrameTree, checked_pose
 from hand_eye_calib.core.geometry.se3 import turned
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
@@ -195,7 +196,7 @@ def _with_axis_of(installed: Extrinsic, calibration: Calibration) -> Calibration
         return calibration
     index = AXES.index(axis)
     T = calibration.T_parent_child.copy()
-    covariance = turned(T[:3, :3], calibration.covariance_measured)
+    covariance = turned(se3.rotation_of(T), calibration.covariance_measured)
     missing = float(installed.T_parent_child[index, 3] - T[index, 3])
     # The other axes follow as far as the motion correlates them with this axis.
     T[:3, 3] += covariance[:3, index] / covariance[index, index] * missing
