@@ -16,7 +16,7 @@ from hand_eye_calib.extras.simulation.options import NoiseConfig
 MESSAGES = ("nav", "sensor", "geometry", "std", "diagnostic", "tf2", "rosgraph")
 ROS_LIBRARIES = [f"{name}_msgs" for name in MESSAGES]
 ROS_LIBRARIES += ["rclpy", "rcl_interfaces", "builtin_interfaces", "rosidl_runtime_py"]
-ROS_LIBRARIES += ["std_srvs", "tf2_ros"]
+ROS_LIBRARIES += ["std_srvs", "tf2_ros", "visualization_msgs"]
 ROS = ("online/ros/", "extras/simulation/player.py")
 PAGES = ("offline/report/", "extras/fleet/batch_page.py")
 CONFINED = dict.fromkeys(ROS_LIBRARIES, ROS) | {

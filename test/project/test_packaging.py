@@ -54,6 +54,7 @@ DECLARED_AS = {
         for name in (
             "builtin_interfaces",
             "std_srvs",
+            "visualization_msgs",
             *tuple(f"{kind}_msgs" for kind in ("diagnostic", "geometry", "nav", "sensor", "std")),
         )
     },
@@ -295,7 +296,10 @@ def test_rviz_shows_the_latched_extrinsic_with_its_covariance():
     assert extrinsic["Topic"]["Value"] == "/calibrator/extrinsic_with_covariance"
     assert extrinsic["Topic"]["Durability Policy"] == "Transient Local"
     assert extrinsic["Covariance"]["Position"]["Value"] is True
+    (markers,) = (each for each in rviz["Displays"] if each["Name"] == "Result")
+    assert markers["Topic"]["Value"] == "/calibrator/markers"
     assert "`~/extrinsic_with_covariance`" in NODE_PAGE
+    assert "`~/markers`" in NODE_PAGE
 
 
 def test_foxglove_shows_what_the_node_publishes_and_serves_each_panel_once():
@@ -305,7 +309,8 @@ def test_foxglove_shows_what_the_node_publishes_and_serves_each_panel_once():
     assert sorted(services) == [f"/calibrator/{name}" for name in ("reset", "save", "solve")]
     for name in services:
         assert f"`~/{name.rpartition('/')[2]}`" in NODE_PAGE
-    assert list(panels["3D!extrinsic"]["topics"]) == ["/calibrator/extrinsic_with_covariance"]
+    topics = ["/calibrator/extrinsic_with_covariance", "/calibrator/markers"]
+    assert list(panels["3D!extrinsic"]["topics"]) == topics
     values = [path["value"] for each in panels.values() for path in each.get("paths", ())]
     keys = set(re.findall(r'key=="([a-z.]+)"', " ".join(values)))
     assert keys == {*(f"sigma.{axis}" for axis in AXES), "target.x", "target.roll"}

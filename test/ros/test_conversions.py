@@ -8,14 +8,17 @@ from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
 from result_making import NAMES, dofs, good_calibration
 from sensor_msgs.msg import Imu, NavSatFix
+from visualization_msgs.msg import Marker
 
 from hand_eye_calib.core.base import config
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import turned
+from hand_eye_calib.core.results.context import Comparison
 from hand_eye_calib.formats.bags.messages import MESSAGE_TYPES, MessageReader, ns_of
 from hand_eye_calib.online.live.log import NodeLog
 from hand_eye_calib.online.ros import conversions
+from hand_eye_calib.online.ros.markers import to_markers
 from hand_eye_calib.online.ros.outputs import ResultTopics
 
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
@@ -84,6 +87,52 @@ def test_messages_carry_frames_stamp_and_transform():
         np.testing.assert_allclose(read, T_PARENT_CHILD, atol=1e-15)
 
 
+def test_markers_draw_sensors_uncertainty_and_what_is_installed():
+    sigmas_m = np.array([0.01, 0.02, 0.03])
+    in_parent = np.diag([*sigmas_m**2, 1e-4, 1e-4, 1e-4])
+    in_child = turned(se3.inverse(T_PARENT_CHILD)[:3, :3], in_parent)
+    installed = dict(zip(NAMES, (0.4, -0.3, 0.2, 0.0, 0.0, np.pi / 2), strict=True))
+    comparison = Comparison(sentence="same", values=installed)
+    message = to_markers(calibration(in_child, comparison=comparison))
+    clear, *markers = message.markers
+    assert clear.action == Marker.DELETEALL
+    assert {marker.header.frame_id for marker in markers} == {"lidar"}
+    by_name = {marker.ns: marker for marker in markers}
+    assert list(by_name) == ["parent", "child", "uncertainty", "text", "installed"]
+    np.testing.assert_allclose(pose_of(by_name["parent"]), np.eye(4), atol=1e-15)
+    np.testing.assert_allclose(pose_of(by_name["child"]), T_PARENT_CHILD, atol=1e-12)
+    x_axis = pose_of(by_name["installed"])[:3, 0]
+    np.testing.assert_allclose(x_axis, [0.0, 1.0, 0.0], atol=1e-12)
+    ellipsoid = by_name["uncertainty"]
+    size = ellipsoid.scale
+    np.testing.assert_allclose([size.x, size.y, size.z], 6.0 * sigmas_m, rtol=1e-9)
+    T_parent_ellipsoid = pose_of(ellipsoid)
+    np.testing.assert_allclose(np.abs(T_parent_ellipsoid[:3, :3]), np.eye(3), atol=1e-9)
+    assert "camera in lidar" in by_name["text"].text
+
+
+def test_without_a_result_markers_are_deleted():
+    (marker,) = to_markers(None).markers
+    assert marker.action == Marker.DELETEALL
+
+
+def test_the_ellipsoid_of_an_unobservable_axis_stays_in_the_scene():
+    (ellipsoid,) = (
+        marker
+        for marker in to_markers(calibration(9.0 * np.eye(6))).markers
+        if marker.ns == "uncertainty"
+    )
+    assert (ellipsoid.scale.x, ellipsoid.scale.y, ellipsoid.scale.z) == (2.0, 2.0, 2.0)
+
+
+def pose_of(marker):
+    """The pose (4, 4) of a marker in the parent sensor's frame."""
+    place = marker.pose.position
+    turn = marker.pose.orientation
+    quat_xyzw = [turn.x, turn.y, turn.z, turn.w]
+    return se3.from_quat_xyzw([place.x, place.y, place.z], quat_xyzw)
+
+
 def test_a_result_that_is_too_uncertain_withdraws_the_one_before():
     """A late subscriber gets what the page says, not an older pose."""
     made = []
@@ -101,6 +150,9 @@ def test_a_result_that_is_too_uncertain_withdraws_the_one_before():
     )
     for each in (unsure, sure, unsure, unsure):  # the last is not new
         topics.publish(each)
+    markers, *made = made
+    # A subscriber that is there deletes what it has drawn.
+    assert (markers.name, len(markers.sent)) == ("~/markers", 3)
     assert [(each.name, len(each.sent)) for each in made] == [
         ("~/extrinsic", 1),
         ("~/extrinsic_with_covariance", 2),

@@ -8,6 +8,7 @@ from nav_msgs.msg import Odometry
 from published_data import kitti_short
 from ros_harness import POSE_KINDS, RELIABLE_INPUTS, START_NS, T_PARENT_CHILD, drive, matrix, ns_of
 from std_msgs.msg import String
+from visualization_msgs.msg import MarkerArray
 
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.engine.calibrator import Calibrator
@@ -76,7 +77,9 @@ def test_each_message_type_is_found_from_the_graph(start_node, peer, kind):
     assert (extrinsic.header.frame_id, extrinsic.child_frame_id) == ("lidar", "camera")
     late = peer.listen(TransformStamped, "extrinsic")
     late_with_covariance = peer.listen(PoseWithCovarianceStamped, "extrinsic_with_covariance")
-    peer.spin_until(lambda: late and late_with_covariance, "the latched result")
+    late_markers = peer.listen(MarkerArray, "markers")
+    peer.spin_until(lambda: late and late_with_covariance and late_markers, "the latched result")
+    assert {marker.ns for marker in late_markers[-1].markers} > {"parent", "child", "text"}
     assert late == [extrinsic]
     assert late_with_covariance[0].header == extrinsic.header
 

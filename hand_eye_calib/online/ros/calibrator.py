@@ -20,6 +20,7 @@ subscribed topics (-r NAME:=TOPIC):
 published topics:
   ~/extrinsic                    geometry_msgs/TransformStamped: pose of the child in the parent
   ~/extrinsic_with_covariance    geometry_msgs/PoseWithCovarianceStamped
+  ~/markers                      visualization_msgs/MarkerArray: the result for RViz
   ~/progress                     std_msgs/String: the whole state as JSON
   /diagnostics                   diagnostic_msgs/DiagnosticArray
   /tf_static                     with publish_tf, once the goal is reached

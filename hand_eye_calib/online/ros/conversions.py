@@ -66,7 +66,7 @@ def to_transform(calibration: Calibration, is_mounting: bool = False) -> Transfo
     message.header.stamp = to_time(calibration.stamp_ns)
     message.header.frame_id = frame
     message.child_frame_id = calibration.child_frame
-    _fill(message.transform.translation, message.transform.rotation, T)
+    fill(message.transform.translation, message.transform.rotation, T)
     return message
 
 
@@ -79,14 +79,14 @@ def to_pose_with_covariance(calibration: Calibration) -> PoseWithCovarianceStamp
     message.header.stamp = to_time(calibration.stamp_ns)
     message.header.frame_id = calibration.parent_frame
     T = calibration.T_parent_child
-    _fill(message.pose.pose.position, message.pose.pose.orientation, T)
+    fill(message.pose.pose.position, message.pose.pose.orientation, T)
     covariance = turned(se3.rotation_of(T), calibration.covariance)
     message.pose.covariance = covariance.ravel().tolist()
     return message
 
 
-def _fill(position: Any, orientation: Any, T_target_source: FloatArray) -> None:
-    """Write a transform into the two parts of a message."""
+def fill(position: Any, orientation: Any, T_target_source: FloatArray) -> None:
+    """Write a transform into the position and the orientation of a message."""
     position.x, position.y, position.z = se3.translation_of(T_target_source).tolist()
     quat_xyzw = se3.to_quat_xyzw(T_target_source).tolist()
     orientation.x, orientation.y, orientation.z, orientation.w = quat_xyzw

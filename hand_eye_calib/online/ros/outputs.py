@@ -9,6 +9,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from rclpy.duration import Duration
 from rclpy.node import Node
 from std_msgs.msg import String
+from visualization_msgs.msg import MarkerArray
 
 from hand_eye_calib.core.base.plain import plain
 from hand_eye_calib.core.base.text import in_words
@@ -21,6 +22,7 @@ from hand_eye_calib.online.ros.conversions import (
     to_time,
     to_transform,
 )
+from hand_eye_calib.online.ros.markers import to_markers
 
 PROGRESS_TOPIC = "progress"
 # Time for which the end of the node waits until listeners have its last state.
@@ -31,11 +33,15 @@ _OMITTED = ("progress", "axes", "result", "differences")
 
 
 class ResultTopics:
-    """Publishes results on ``~/extrinsic`` and ``~/extrinsic_with_covariance``, latched."""
+    """Publishes results on ``~/extrinsic``, ``~/extrinsic_with_covariance`` and ``~/markers``.
+
+    All topics are latched.
+    """
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self._newest: Calibration | None = None
+        self._markers = node.create_publisher(MarkerArray, "~/markers", LATCHED)
         self._advertise()
 
     def _advertise(self) -> None:
@@ -55,6 +61,7 @@ class ResultTopics:
         if calibration is self._newest:
             return
         self._newest = calibration
+        self._markers.publish(to_markers(calibration))
         if calibration is None:
             self._withdraw()
             return
