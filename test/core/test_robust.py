@@ -10,6 +10,7 @@ from motions import (
     planar_poses,
     wandering_poses,
 )
+from sigmas import assert_nees, nees
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.geometry import se3
@@ -51,13 +52,12 @@ class TestSolver:
 
     @pytest.mark.parametrize("reference", ["B1", "B5", "B10"])
     def test_covariance_counts_that_motions_overlap(self, reference):
-        nees = []
+        values = []
         for seed in range(30):
             solution = solve(motion_pairs(*noisy_poses(seed), reference))
-            error = error_of(solution)
-            nees.append(error @ np.linalg.solve(solution.cov_parent_child_in_child, error))
+            values.append(nees(error_of(solution), solution.cov_parent_child_in_child))
         # Six degrees of freedom; few independent motions widen the distribution.
-        assert 4.0 < np.mean(nees) < 11.0, "covariance is of the wrong size"
+        assert_nees(values, 4.0, 11.0)
 
     def test_flat_ground_leaves_the_height_open(self):
         parent = planar_poses(200)

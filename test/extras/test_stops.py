@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from real_data import data_folder
+from sigmas import assert_nees, nees
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import CalibratorConfig
@@ -252,23 +253,28 @@ def test_exact_stops_are_solved_exactly(random, n):
     assert np.abs(off(fit.Ts_world_world[0], Z)).max() < 1e-7
 
 
-# Shares of outliers, sizes of the target, stops.
-@pytest.mark.parametrize("given", [(0, 1, 20), (0.15, 1, 20), (0, 0.98, 20), (0, 1, 4)])
-def test_covariance_is_that_of_the_errors(random, given):
-    squared = []
-    outliers, size, n = given
+def nees_of(fit, X, Z):
+    error = np.r_[off(fit.Ts_parent_child[0], X), off(fit.Ts_world_world[0], Z)]
+    return nees(error, fit.covariance)
+
+
+# NEES of twelve is expected; the mean of 40 has a standard error of 0.8. A target of another size,
+# or few stops, have larger sigmas.
+@pytest.mark.parametrize(
+    ("outliers", "size", "n", "lowest_nees"),
+    [(0, 1, 20, 8.0), (0.15, 1, 20, 8.0), (0, 0.98, 20, 4.0), (0, 1, 4, 4.0)],
+)
+def test_covariance_is_that_of_the_errors(random, outliers, size, n, lowest_nees):
+    values = []
     for _ in range(40):
         X, Z, stops = recorded(random, n, outliers=outliers)
         stops.Ts_world_child[:, :3, 3] *= size
-        fit = solve(stops)
-        error = np.r_[off(fit.Ts_parent_child[0], X), off(fit.Ts_world_world[0], Z)]
-        squared.append(error @ np.linalg.solve(fit.covariance, error))
-    # Twelve are expected; the mean of 40 scatters by 0.8. Of another size, or few, they are wider.
-    assert (8.0 if size == 1 and n == 20 else 4.0) < np.mean(squared) < 18.0
+        values.append(nees_of(solve(stops), X, Z))
+    assert_nees(values, lowest_nees, 18.0)
 
 
 def test_covariance_is_that_of_errors_that_last(random):
-    squared = []
+    values = []
     n = 40
     lasting = np.linalg.cholesky(0.7 ** np.abs(np.subtract.outer(np.arange(n), np.arange(n))))
     for _ in range(30):
@@ -276,10 +282,9 @@ def test_covariance_is_that_of_errors_that_last(random):
         X, Z, stops = recorded(random, n, noise=0.0, Ts_world_parent=se3.exp(0.5 * waves))
         errors = se3.exp(lasting @ random.normal(size=(n, 6)) * LEVELS)
         fit = solve(Stops.of_one(stops.Ts_world_parent, stops.Ts_world_child @ errors))
-        error = np.r_[off(fit.Ts_parent_child[0], X), off(fit.Ts_world_world[0], Z)]
-        squared.append(error @ np.linalg.solve(fit.covariance, error))
-    # Twelve are expected; 25 were found when errors counted as independent.
-    assert 6.0 < np.mean(squared) < 18.0
+        values.append(nees_of(fit, X, Z))
+    # NEES of twelve is expected; it was 25 when errors counted as independent.
+    assert_nees(values, 6.0, 18.0)
 
 
 def test_an_arm_that_rests_makes_no_outliers_of_the_other_stops(random):

@@ -44,18 +44,19 @@ def pair(seed, n_poses=150):
 
 
 def test_more_recordings_know_more_and_the_interval_is_honest():
-    errors = {1: [], 3: [], 6: []}
-    inside = []
+    errors_m = {1: [], 3: [], 6: []}
+    is_inside = []
     for seed in range(15):
-        recorded = named(*(result(seed=20 * seed + i) for i in range(6)))
-        for count, found in errors.items():
-            joint = together(dict(list(recorded.items())[:count]))
+        recordings = [result(seed=20 * seed + i) for i in range(6)]
+        for count in errors_m:
+            joint = together(named(*recordings[:count]))
             error = deviation(joint.T_parent_child, X)
-            found.append(np.linalg.norm(error[:3]))
-            inside.extend(np.abs(error) < 1.645 * joint.sigmas_measured)
+            errors_m[count].append(np.linalg.norm(error[:3]))
+            is_inside.extend(np.abs(error) < 1.645 * joint.sigmas_measured)
         assert joint.together.kind == "agree"
-    assert np.median(errors[6]) < 0.75 * np.median(errors[1])
-    assert np.mean(inside) > 0.85
+    assert np.median(errors_m[6]) < 0.75 * np.median(errors_m[1])
+    share = np.mean(is_inside)
+    assert share > 0.85, f"sigmas are too small: {share:.0%} of errors are in 90 % intervals"
 
 
 def test_an_axis_that_one_recording_hides_comes_from_another():
@@ -150,12 +151,14 @@ def results_of(seed, count, unknown_z=False, apart=(), factor=1.0):
 @pytest.mark.parametrize("count", [2, 3, 8, 30])
 def test_honest_results_agree_with_the_chance_that_is_stated(count, unknown_z):
     seeds = range(40 if count < 10 else 15)
-    found = [agreement_of(*results_of(seed, count, unknown_z)) for seed in seeds]
-    alarms = sum(one.kind != "agree" for one in found)
-    assert alarms <= 4  # 0.8 expected, 5 or more once in 800
-    p_values = np.array([one.p_value for one in found])
-    assert 0.35 < p_values.mean() < 0.65
-    assert all(one.dof == (5 if unknown_z else 6) * (count - 1) for one in found)
+    agreements = [agreement_of(*results_of(seed, count, unknown_z)) for seed in seeds]
+    alarms = [agreement.kind for agreement in agreements if agreement.kind != "agree"]
+    assert len(alarms) <= 4  # 0.8 expected, 5 or more once in 800
+    p_value = np.mean([agreement.p_value for agreement in agreements])
+    assert p_value > 0.35, f"sigmas are too small: p is {p_value:.2f} on average, expected 0.5"
+    assert p_value < 0.65, f"sigmas are too large: p is {p_value:.2f} on average, expected 0.5"
+    axes = 5 if unknown_z else 6
+    assert {agreement.dof for agreement in agreements} == {axes * (count - 1)}
 
 
 @pytest.mark.parametrize("unknown_z", [False, True])
@@ -174,10 +177,11 @@ def test_which_one_is_off_and_since_when(apart, kind, unknown_z):
 
 
 def test_results_that_all_scatter_more_than_stated_accuse_none():
-    found = [agreement_of(*results_of(seed, 12, factor=0.25)) for seed in range(20)]
-    scattered = [one for one in found if one.kind == "scatter"]
-    assert len(scattered) >= 19
-    assert all(1.5 < one.excess < 2.5 for one in scattered)
+    agreements = [agreement_of(*results_of(seed, 12, factor=0.25)) for seed in range(20)]
+    excesses = [agreement.excess for agreement in agreements if agreement.kind == "scatter"]
+    assert len(excesses) >= 19
+    assert min(excesses) > 1.5
+    assert max(excesses) < 2.5
     assert agreement_of(*results_of(0, 12, factor=0.001)).kind == "differ"  # of no one mount
 
 

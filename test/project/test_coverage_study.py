@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from published_data import data_folder
 from result_making import calibration
+from sigmas import assert_nees, nees
 
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.calibration import DofObservability, DofVerdict, SolveStatus
@@ -55,13 +56,13 @@ def shown(recording):
 
 
 def test_ideal_weighted_estimator_scatters_by_the_bound():
-    squared = []
+    values = []
     for seed in range(40):
         recording = classes.simulate(SMALL, seed)
         xi = ideal_estimate(recording.sides, recording.sides[1].Ts, recording.dt, shown(recording))
-        squared.append(xi @ np.linalg.solve(recording.bound(), xi))
+        values.append(nees(xi, recording.bound()))
     # The mean of chi-squared with 6 degrees of freedom over 40 draws: 6 +/- 0.55.
-    assert 4.4 < np.mean(squared) < 7.6
+    assert_nees(values, 4.4, 7.6)
 
 
 def test_information_of_heavy_tails():
@@ -109,16 +110,16 @@ def test_cycle_of_true_answers_closes_and_its_covariance_counts_each_answer():
     off = se3.exp(np.array([0.0, 0.0, 0.01, 0.0, 0.0, 0.0]))
     xi, _ = misclosure([*answers[:2], _calibration(T_ca @ off, covariances[2], 0.5)])
     assert xi[2] == pytest.approx(0.02)
-    draws = []
+    values = []
     for _ in range(400):
         errors = [rng.multivariate_normal(np.zeros(6), c) for c in covariances]
         moved = [
-            dataclasses.replace(one, T_parent_child=one.T_parent_child @ se3.exp(error))
-            for one, error in zip(answers, errors, strict=True)
+            dataclasses.replace(answer, T_parent_child=answer.T_parent_child @ se3.exp(error))
+            for answer, error in zip(answers, errors, strict=True)
         ]
         xi, _ = misclosure(moved)
-        draws.append(xi @ np.linalg.solve(covariance, xi))
-    assert np.mean(draws) == pytest.approx(6.0, abs=0.6)
+        values.append(nees(xi, covariance))
+    assert_nees(values, 5.4, 6.6)
 
 
 def _calibration(T_parent_child, covariance, scale):
