@@ -16,6 +16,9 @@ from pathlib import Path
 from hand_eye_calib.core.base.errors import InputError, printable
 from hand_eye_calib.core.base.option import did_you_mean
 
+#: Recordings that come with the package, for ``sample:NAME``.
+SAMPLES = Path(__file__).parents[1] / "sample"
+
 # ---- all files
 
 #: Bytes of the largest trajectory file, and of the memory to read a bag in a command.
@@ -93,6 +96,12 @@ def reading_memory() -> Iterator[None]:
             if len(_before) == 1:
                 resource.setrlimit(resource.RLIMIT_AS, _before[0])
             _before.pop()
+
+
+def local_path(source: str | Path) -> Path:
+    """Return a path; for ``sample:NAME`` that of a recording in the package."""
+    name = str(source)
+    return SAMPLES / name.removeprefix("sample:") if name.startswith("sample:") else Path(source)
 
 
 def similar(path: str | Path) -> str:

@@ -22,7 +22,7 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import InputError, located
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import pose_of, pose_stack
-from hand_eye_calib.formats.files import LONGEST_NAME
+from hand_eye_calib.formats.files import LONGEST_NAME, local_path
 from hand_eye_calib.formats.npz import read_arrays
 from hand_eye_calib.formats.yaml_files import read_yaml
 
@@ -93,7 +93,7 @@ class ArmSamples:
 
 
 def read_arm_samples(path: str | Path) -> ArmSamples:
-    """Read the samples of an arm.
+    """Read the samples of an arm; ``sample:arm.yaml`` comes with the package.
 
     Raises
     ------
@@ -111,7 +111,8 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     >>> hec.read_arm_samples("samples.yaml").robot.shape
     (40, 4, 4)
     """
-    is_npz = Path(path).suffix == ".npz"
+    path = local_path(path)
+    is_npz = path.suffix == ".npz"
     document: Any = read_arrays(path) if is_npz else read_yaml(path, _EXPECTED)
     with located(path):
         samples = _opencv_samples(document) if isinstance(document, Mapping) else None

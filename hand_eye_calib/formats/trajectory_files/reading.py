@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from decimal import Decimal
-from os import PathLike
+from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.base.registry import FILE_READERS
 from hand_eye_calib.core.base.text import MUCH_NULL, shortened, told_apart, without_poses
 from hand_eye_calib.core.geometry.trajectory import Trajectory, TrajectoryLike
-from hand_eye_calib.formats.files import LONGEST_NAME, decoded, read_bytes, read_text
+from hand_eye_calib.formats.files import LONGEST_NAME, decoded, local_path, read_bytes, read_text
 from hand_eye_calib.formats.trajectory_files.columns import (
     MATRIX,
     POSITION,
@@ -151,7 +151,8 @@ def read_trajectory(
     Parameters
     ----------
     source : str, path-like or object
-        A file, or a bag if ``topic`` is given; or matrices (N, 4, 4) with ``times``, rows (N, 8)
+        A file, or a bag if ``topic`` is given; ``sample:NAME`` for one that comes with the package;
+        or matrices (N, 4, 4) with ``times``, rows (N, 8)
         of t, x, y, z, qx, qy, qz, qw or (N, 7) without t, or a pandas DataFrame with columns named
         as in csv files.
     format : str
@@ -201,7 +202,7 @@ def read_trajectory(
     """
     if isinstance(source, Trajectory):
         return source
-    path = Path(source) if isinstance(source, str | PathLike) else None
+    path = local_path(fspath(source)) if isinstance(source, str | PathLike) else None
     file_of_times = Path(times) if isinstance(times, str | PathLike) else None
     has_times_in_memory = times is not None and not file_of_times
     is_format_named = format not in (FileOptions.format, AUTO)

@@ -20,6 +20,7 @@ import hand_eye_calib.core.base.config as config
 from hand_eye_calib.core.base.errors import ConfigError, printable
 from hand_eye_calib.core.base.option import Options, OptionValue, check_value, did_you_mean
 from hand_eye_calib.core.base.text import quantities
+from hand_eye_calib.formats.files import local_path
 
 _Item = TypeVar("_Item")
 
@@ -430,10 +431,5 @@ def add_json_argument(parser: argparse._ActionsContainer, or_verbose: bool = Fal
 
 
 def _path(text: str) -> Path | str:
-    """Return a path; for sample:NAME that of a recording in the package.
-
-    A URL stays a text, because a path would lose one of its two slashes.
-    """
-    if text.startswith("sample:"):
-        return Path(__file__).parents[2] / "sample" / text.removeprefix("sample:")
-    return text if "://" in text else Path(text)
+    """Return a path; a URL stays a text, because a path would lose one of its two slashes."""
+    return text if "://" in text else local_path(text)

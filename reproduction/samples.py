@@ -1,0 +1,104 @@
+"""Make the sample bag and the sample arm of the package: ``python -m reproduction.samples``.
+
+The bag has the poses of the sample files ``lidar.tum`` and ``camera.tum``. The arm is simulated;
+the first lines of its file have the true extrinsic.
+"""
+
+import argparse
+import json
+import shutil
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.formats.bags.writer import write_streams
+from hand_eye_calib.formats.files import SAMPLES
+from hand_eye_calib.formats.trajectory_files.reading import read_trajectory
+
+# The arm: stops, camera on the hand, target on the table (x, y, z in m; rotation vector in rad).
+N_STOPS = 24
+CAMERA_IN_GRIPPER = [0.06, -0.03, 0.09, 0.1, -0.05, 1.5]
+TARGET_IN_BASE = [0.5, 0.05, 0.02, 0.0, 0.0, 0.4]
+# Hand above the target, the camera looks down.
+HAND_IN_BASE = [0.45, 0.0, 0.4, 3.0, 0.05, 0.1]
+# Standard deviations of the hand's positions (m) and rotations (rad) between the stops.
+SPREAD_M = 0.1
+SPREAD_RAD = 0.35
+# Noise of the poses of the target: position (m), rotation (rad).
+NOISE = np.repeat([0.0005, 0.001], 3)
+SEED = 1
+
+
+def write_sample_bag(path: Path) -> None:
+    """Write the bag, in chunks that are compressed."""
+    streams = {}
+    for name in ("lidar", "camera"):
+        trajectory = read_trajectory(SAMPLES / f"{name}.tum")
+        named = replace(trajectory, world_frame=f"{name}_odom", sensor_frame=name)
+        streams[f"/{name}/odometry"] = (named, "nav_msgs/msg/Odometry")
+    with tempfile.TemporaryDirectory() as folder:
+        bag = Path(folder) / "drive"
+        writer = Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP)
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        with writer:
+            write_streams(writer, streams, "mcap")
+        shutil.copyfile(bag / "drive.mcap", path)
+
+
+def write_sample_arm(path: Path) -> None:
+    """Write the stops as easy_handeye2 does."""
+    random = np.random.default_rng(SEED)
+    turns = se3.rotation_exp(SPREAD_RAD * random.normal(size=(N_STOPS, 3)))
+    T_base_hand = se3_of(HAND_IN_BASE)
+    rotations = se3.rotation_of(T_base_hand) @ turns
+    positions = HAND_IN_BASE[:3] + SPREAD_M * random.normal(size=(N_STOPS, 3))
+    Ts_base_gripper = se3.from_rotation_translation(rotations, positions)
+    T_gripper_camera = se3_of(CAMERA_IN_GRIPPER)
+    Ts_camera_base = se3.inverse(Ts_base_gripper @ T_gripper_camera)
+    noise = se3.exp(NOISE * random.normal(size=(N_STOPS, 6)))
+    Ts_camera_target = Ts_camera_base @ se3_of(TARGET_IN_BASE) @ noise
+    parameters = {
+        "calibration_type": "eye_in_hand",
+        "robot_base_frame": "base",
+        "robot_effector_frame": "gripper",
+        "tracking_base_frame": "camera",
+        "tracking_marker_frame": "target",
+    }
+    lines = [
+        "# Stops of a simulated arm with a camera on the gripper, and a target on the table.",
+        f"# True pose of the camera in the gripper: x y z {CAMERA_IN_GRIPPER[:3]} m,",
+        f"# rotation vector {CAMERA_IN_GRIPPER[3:]} rad.",
+        f"parameters: {json.dumps(parameters)}",
+        "samples:",
+    ]
+    for robot, tracking in zip(Ts_base_gripper, Ts_camera_target, strict=True):
+        lines.append(f"- robot: {json.dumps(message_of(robot))}")
+        lines.append(f"  tracking: {json.dumps(message_of(tracking))}")
+    path.write_text("\n".join([*lines, ""]), encoding="utf-8")
+
+
+def se3_of(values: list[float]) -> FloatArray:
+    """Return the transform (4, 4) of a position and a rotation vector."""
+    return se3.from_rotation_translation(se3.rotation_exp(np.array(values[3:])), values[:3])
+
+
+def message_of(T: FloatArray) -> dict[str, dict[str, float]]:
+    """Return a transform as the fields of geometry_msgs/Transform, to a micrometre."""
+    x, y, z, *quat_xyzw = (round(value, 6) for value in se3.to_rows(T).tolist())
+    return {
+        "translation": {"x": x, "y": y, "z": z},
+        "rotation": dict(zip("xyzw", quat_xyzw, strict=True)),
+    }
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=SAMPLES)
+    folder = parser.parse_args().out
+    write_sample_bag(folder / "drive.mcap")
+    write_sample_arm(folder / "arm.yaml")

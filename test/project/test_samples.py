@@ -1,0 +1,44 @@
+"""The recordings that come with the package."""
+
+import numpy as np
+
+import hand_eye_calib as hec
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.se3 import deviation
+from hand_eye_calib.formats.files import SAMPLES
+from reproduction.samples import CAMERA_IN_GRIPPER, se3_of, write_sample_arm
+
+
+def test_the_bag_has_the_poses_of_the_files():
+    for sensor in ("lidar", "camera"):
+        in_file = hec.read_trajectory(f"sample:{sensor}.tum")
+        in_bag = hec.read_trajectory("sample:drive.mcap", topic=f"/{sensor}/odometry")
+        np.testing.assert_array_equal(in_bag.stamps_ns, in_file.stamps_ns)
+        np.testing.assert_allclose(in_bag.poses, in_file.poses, atol=1e-12)
+        assert in_bag.sensor_frame == sensor
+
+
+def test_the_drive_is_calibrated_within_its_standard_deviations():
+    result = hec.calibrate(
+        hec.read_trajectory("sample:lidar.tum"), hec.read_trajectory("sample:camera.tum")
+    )
+    (truth,) = hec.read_trajectory("sample:truth.tum").poses
+    assert result.verdict is hec.Verdict.USE
+    assert (np.abs(deviation(result.T_parent_child, truth)) < 3.0 * result.sigmas).all()
+
+
+def test_the_arm_is_calibrated_within_its_standard_deviations():
+    samples = hec.read_arm_samples("sample:arm.yaml")
+    result = hec.calibrate_arm(samples.robot, samples.tracking, names=samples.frames)
+    truth = se3_of(CAMERA_IN_GRIPPER)
+    assert result.verdict is hec.Verdict.USE
+    assert (result.parent_frame, result.child_frame) == ("gripper", "camera")
+    assert (np.abs(deviation(result.T_parent_child, truth)) < 3.0 * result.sigmas).all()
+
+
+def test_the_arm_is_made_by_its_script(tmp_path):
+    write_sample_arm(tmp_path / "arm.yaml")
+    made = hec.read_arm_samples(tmp_path / "arm.yaml")
+    kept = hec.read_arm_samples(SAMPLES / "arm.yaml")
+    np.testing.assert_allclose(se3.log(se3.inverse(made.robot) @ kept.robot), 0.0, atol=1e-5)
+    np.testing.assert_allclose(se3.log(se3.inverse(made.tracking) @ kept.tracking), 0.0, atol=1e-5)
