@@ -287,8 +287,11 @@ def ntu_viral(folder: Path) -> Iterator[Row]:
 
 def page(rows: list[Row]) -> str:
     """Markdown of all rows."""
-    about = "Figures that others published for their own recordings, and ours by the same protocol"
-    about += "\n(`python -m reproduction.independent`)."
+    about = (
+        "How do our errors compare with those that others published for their own recordings?\n"
+        "For readers who compare programs.\n\n"
+        "Both are computed by the same protocol (`python -m reproduction.independent`)."
+    )
     return f"# Recordings of others\n\n{about}\n\n{markdown_table(map(vars, rows))}\n"
 
 

@@ -24,13 +24,14 @@ _TITLES = {
 _ABOUT = {
     "simulated": (
         "Errors are in units of the Cramer-Rao bound under the true noise: "
-        "sqrt(median(e' C^-1 e) / 5.35), 1 is efficient. NEES is the squared error under the "
-        "stated covariance: 5.35 is honest. The pooled row has the geometric mean of the errors."
+        "sqrt(median(e' C^-1 e) / 5.35); the smallest possible value is 1. NEES is the squared "
+        "error over the stated covariance; its expected median is 5.35. The pooled row contains "
+        "the geometric mean of the errors."
     ),
     "levels": "Medians over the 38 trajectories of the strongest noise, outliers and drift.",
     "known answer": (
-        "Errors over the axes that the truth and the motion both know. The last column adds the "
-        "uncertainty of the truth itself to the stated one."
+        "Errors are over the axes that the truth and the motion both determine. The last column "
+        "adds the uncertainty of the truth to the stated uncertainty."
     ),
 }
 _PERCENT = ("covers", "covers_floor", "covers_truth", "refused")
@@ -76,11 +77,11 @@ def page(rows: Sequence[Row], absent: Sequence[str], seeds: range) -> str:
     methods = list(dict.fromkeys(row.method for row in rows))
     blocks = [
         "# Certified coverage",
-        "Made by `make coverage-study`; do not edit. Is the error as small as it can be, and does "
-        "the stated uncertainty hold?",
+        "How close is the error to its theoretical bound, and do the stated intervals contain the "
+        "truth?\nFor readers who check the method. `make coverage-study` writes this page.",
         f"Absent, and left out: {', '.join(absent)}." if absent else "",
         "## Goals",
-        "Bold is missed.",
+        "Missed goals are bold.",
         markdown_table(
             {"goal": goal.text} | {one: reached(goal, rows, one) for one in methods}
             for goal in GOALS
