@@ -17,7 +17,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.formats.bags.writer import write_streams
-from hand_eye_calib.formats.files import SAMPLES
+from hand_eye_calib.formats.files import local_path
 from hand_eye_calib.formats.trajectory_files.reading import read_trajectory
 
 # The arm: stops, camera on the hand, target on the table (x, y, z in m; rotation vector in rad).
@@ -38,7 +38,7 @@ def write_sample_bag(path: Path) -> None:
     """Write the bag, in chunks that are compressed."""
     streams = {}
     for name in ("lidar", "camera"):
-        trajectory = read_trajectory(SAMPLES / f"{name}.tum")
+        trajectory = read_trajectory(f"sample:{name}.tum")
         named = replace(trajectory, world_frame=f"{name}_odom", sensor_frame=name)
         streams[f"/{name}/odometry"] = (named, "nav_msgs/msg/Odometry")
     with tempfile.TemporaryDirectory() as folder:
@@ -98,7 +98,7 @@ def message_of(T: FloatArray) -> dict[str, dict[str, float]]:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=SAMPLES)
+    parser.add_argument("--out", type=Path, default=local_path("sample:"))
     folder = parser.parse_args().out
     write_sample_bag(folder / "drive.mcap")
     write_sample_arm(folder / "arm.yaml")

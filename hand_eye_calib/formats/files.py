@@ -16,8 +16,8 @@ from pathlib import Path
 from hand_eye_calib.core.base.errors import InputError, printable
 from hand_eye_calib.core.base.option import did_you_mean
 
-#: Recordings that come with the package, for ``sample:NAME``.
-SAMPLES = Path(__file__).parents[1] / "sample"
+# Recordings that come with the package, for ``sample:NAME``.
+_SAMPLES = Path(__file__).parents[1] / "sample"
 
 # ---- all files
 
@@ -101,7 +101,7 @@ def reading_memory() -> Iterator[None]:
 def local_path(source: str | Path) -> Path:
     """Return a path; for ``sample:NAME`` that of a recording in the package."""
     name = str(source)
-    return SAMPLES / name.removeprefix("sample:") if name.startswith("sample:") else Path(source)
+    return _SAMPLES / name.removeprefix("sample:") if name.startswith("sample:") else Path(source)
 
 
 def similar(path: str | Path) -> str:

@@ -198,19 +198,32 @@ def test_launch_arguments_make_targets_and_files_exist(page):
     assert [name for name in names if not any((top / name).exists() for top in folders)] == []
 
 
-def test_python_of_the_readme_runs(tmp_path, monkeypatch, capsys):
+def test_first_command_of_the_readme_prints_its_output(capsys):
+    (command,) = [
+        words for words in commands(PAGES["README.md"]) if words[1:2] == ("sample:lidar.tum",)
+    ]
+    (output,) = re.findall(r"```text\n(.*?)```", PAGES["README.md"], re.DOTALL)
+    assert main(list(command)) == 0
+    assert capsys.readouterr().out.startswith(output)
+
+
+def test_commands_of_the_readme_on_samples_run(tmp_path, monkeypatch, no_figures):
     monkeypatch.chdir(tmp_path)
-    assert main(["simulate", "--out", "drives", "--seed", "3"]) == 0
-    for sensor, name in ((1, "lidar"), (2, "camera")):
-        drive = tmp_path / "drives" / "run_01" / f"T_S{sensor}_W{sensor}.txt"
-        drive.rename(tmp_path / f"{name}.tum")
+    runnable = [words for words in commands(PAGES["README.md"]) if "sample:" in " ".join(words)]
+    assert [words[1] for words in runnable[1:]] == ["sample:drive.mcap", "sample:arm.yaml"]
+    assert [main(list(words)) for words in runnable] == [0, 0, 0]
+    assert (tmp_path / "result" / "extrinsic.yaml").exists()
+
+
+def test_python_of_the_readme_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     (block,) = re.findall(r"```python\n(.*?)```", PAGES["README.md"], re.DOTALL)
     names = {}
     exec(compile(block, "README.md", "exec"), names)
     result = names["result"]
     assert result.T_parent_child.shape == (4, 4)
     assert result.covariance.shape == (6, 6)
-    truth = names["hec"].read_trajectory("drives/run_01/T_S2_S1.txt").poses[0]
+    truth = names["hec"].read_trajectory("sample:truth.tum").poses[0]
     np.testing.assert_allclose(result.T_parent_child, truth, atol=5e-3)
     assert (tmp_path / "result" / "extrinsic.yaml").exists()
 

@@ -5,7 +5,6 @@ import numpy as np
 import hand_eye_calib as hec
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import deviation
-from hand_eye_calib.formats.files import SAMPLES
 from reproduction.samples import CAMERA_IN_GRIPPER, se3_of, write_sample_arm
 
 
@@ -39,6 +38,6 @@ def test_the_arm_is_calibrated_within_its_standard_deviations():
 def test_the_arm_is_made_by_its_script(tmp_path):
     write_sample_arm(tmp_path / "arm.yaml")
     made = hec.read_arm_samples(tmp_path / "arm.yaml")
-    kept = hec.read_arm_samples(SAMPLES / "arm.yaml")
+    kept = hec.read_arm_samples("sample:arm.yaml")
     np.testing.assert_allclose(se3.log(se3.inverse(made.robot) @ kept.robot), 0.0, atol=1e-5)
     np.testing.assert_allclose(se3.log(se3.inverse(made.tracking) @ kept.tracking), 0.0, atol=1e-5)
