@@ -10,6 +10,7 @@ from hand_eye_calib.core.results.calibration import (
     DofVerdict,
     SolveStatus,
 )
+from hand_eye_calib.core.results.records import AS_WRITTEN, Finding
 
 NAMES = ("x", "y", "z", "roll", "pitch", "yaw")
 
@@ -87,3 +88,9 @@ def good_calibration(**changes):
 def seen(motion_s, rotation_deg=(40.0, 30.0, 60.0)):
     """A motion that shows much."""
     return Excitation(100, np.radians(rotation_deg), np.zeros((3, 3)), 10.0, motion_s)
+
+
+def written_finding(code, severity, what, advice="convert them", **fields):
+    """Return a finding with these sentences, as from a document without values."""
+    values = {"what": what, "advice": advice, "cause": ""}
+    return Finding(code=code, key=AS_WRITTEN, severity=severity, values=values, **fields)

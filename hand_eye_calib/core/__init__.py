@@ -2,11 +2,18 @@
 
 from typing import Any
 
-from hand_eye_calib.core.base.registry import KINDS, MEASURES, OUT_OF_REACH, Measure
+from hand_eye_calib.core.base.registry import (
+    FINDING_WORDS,
+    KINDS,
+    MEASURES,
+    OUT_OF_REACH,
+    Measure,
+)
 
 
 def register() -> None:
-    """Register two streams of poses as a kind of data, and what messages and files contain."""
+    """Register two streams of poses, their findings, and what messages and files contain."""
+    FINDING_WORDS["core"] = _words
     KINDS["poses"] = _poses
     MEASURES["poses"] = Measure("poses")
     MEASURES["positions"] = Measure(
@@ -16,6 +23,12 @@ def register() -> None:
     MEASURES["rates"] = Measure("rotations")
     OUT_OF_REACH["rotations"] = ("x", "y", "z")
     OUT_OF_REACH["positions"] = ("roll", "pitch", "yaw")
+
+
+def _words() -> Any:
+    from hand_eye_calib.core.checks.words import WORDS
+
+    return WORDS
 
 
 def _poses() -> Any:

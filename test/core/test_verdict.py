@@ -8,13 +8,13 @@ import re
 
 import numpy as np
 import pytest
-from result_making import NAMES, dofs
+from result_making import NAMES, dofs, written_finding
 from result_making import good_calibration as good
 from source_code import ROOT
 
 from hand_eye_calib.core.results import verdict as rules
 from hand_eye_calib.core.results.calibration import Calibration, SolveStatus, Verdict
-from hand_eye_calib.core.results.records import AxisScatter, Finding, Severity
+from hand_eye_calib.core.results.records import AxisScatter, Severity
 from hand_eye_calib.core.results.verdict import RULES
 from hand_eye_calib.extras.fleet.records import Together
 
@@ -45,12 +45,8 @@ def checked(axis, scatter, excess, kind):
     return dict.fromkeys(NAMES, nothing) | {axis: dataclasses.replace(nothing, **there)}
 
 
-FINDING = Finding(
-    code="units",
-    severity=Severity.ERROR,
-    what="lengths are in mm",
-    advice="convert them",
-    options={"scale": 0.001},
+FINDING = written_finding(
+    "units", Severity.ERROR, "lengths are in mm", "convert them", options={"scale": 0.001}
 )
 FLOOR = np.diag([0.03, 0, 0, 0, 0, 0]) ** 2
 
@@ -257,7 +253,7 @@ def scaled(severity):
     text = (
         "the child's lengths are 2.1 +/- 0.1 % longer than the parent's; the result allows for it"
     )
-    return dataclasses.replace(FINDING, code="model_scale", severity=severity, what=text)
+    return written_finding("model_scale", severity, text)
 
 
 def test_a_scale_that_the_model_found_is_in_the_headline_and_a_large_one_is_a_reason():

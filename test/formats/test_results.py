@@ -81,6 +81,57 @@ def test_a_result_with_findings_and_all_records_comes_back(tmp_path):
     assert read.out_of_reach == written.out_of_reach == ("z",)
 
 
+def written_and_read(finding, **changes):
+    """Return a finding that was read from its document, with changes of the document."""
+    document = json.loads(json_text(calibration(findings=(finding,)).to_dict()))
+    (row,) = document["findings"]
+    for name, value in changes.items():
+        if value is None:
+            del row[name]
+        else:
+            row[name] = value
+    (read,) = Calibration.from_dict(document).findings
+    return read
+
+
+LATE = {"delay_s": 0.12, "sigma_s": 0.01, "shift_m": 0.2}
+
+
+@pytest.mark.parametrize(
+    "finding",
+    [
+        wording.finding("gaps", "parent", gaps=np.int64(3), longest_s=np.float64(2.5), share=0.1),
+        wording.finding("late", code="late", part="positions", others="orientations", **LATE),
+        wording.finding("unexplained", share=0.2),
+        wording.finding("inverse", "child", options={"child_invert": "poses"}),
+    ],
+)
+def test_a_finding_in_a_file_has_its_values_and_its_sentences(finding):
+    assert written_and_read(finding) == finding
+    row = finding.to_dict()
+    assert row["what"] == finding.what
+    assert row["values"] == finding.values
+    assert row["evidence"] == finding.evidence
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"values": None, "key": None},
+        {"key": "of_an_extra_that_is_not_installed"},
+        {"values": {"gaps": 3}},
+        {"values": {"gaps": 3, "longest_s": "long", "share": 0.1}},
+    ],
+    ids=["of version 0.2", "unknown key", "missing value", "value of another type"],
+)
+def test_a_finding_without_words_keeps_the_sentences_of_its_file(changes):
+    finding = wording.finding("gaps", "parent", gaps=3, longest_s=2.5, share=0.1)
+    read = written_and_read(finding, **changes)
+    for name in ("code", "stream", "severity", "what", "advice", "cause", "evidence"):
+        assert getattr(read, name) == getattr(finding, name)
+    assert written_and_read(read) == read
+
+
 def test_an_axis_that_is_not_known_has_no_number_in_json_and_yaml(tmp_path):
     written = calibration()
     path = save_result(written, tmp_path)

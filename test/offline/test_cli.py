@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 import yaml
 from motions import disturbed, walked, write_pair
+from result_making import written_finding
 from source_code import ROOT
 
 import hand_eye_calib as hec
@@ -29,7 +30,7 @@ from hand_eye_calib.core.base.registry import COMMANDS
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import SolveStatus
-from hand_eye_calib.core.results.records import Finding, Severity
+from hand_eye_calib.core.results.records import Severity
 from hand_eye_calib.formats.bags.writer import write_bag
 from hand_eye_calib.formats.results import load_result
 from hand_eye_calib.offline.cli.main import main
@@ -199,9 +200,7 @@ def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag):
 def test_each_reason_stands_above_what_to_do_about_it(run, new_bag, tmp_path):
     """The headline of planar motion names the second reason, too."""
     assert run("replay", new_bag(*drive(planar=True)), *TOPICS, "--out", tmp_path / "out")[0] == 3
-    jumps = Finding(
-        code="jumps", severity=Severity.WARNING, what="many jumps", advice="find out why"
-    )
+    jumps = written_finding("jumps", Severity.WARNING, "many jumps", "find out why")
     calibration = dataclasses.replace(load_result(tmp_path / "out"), findings=(jumps,))
     lines = as_lines(calibration)
     assert lines[0] == "USE WITH CARE: all but z; measure z by hand; many jumps"

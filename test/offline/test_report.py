@@ -16,7 +16,7 @@ pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
 
 from matplotlib.lines import Line2D
-from result_making import NAMES, calibration, dofs
+from result_making import NAMES, calibration, dofs, written_finding
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.assessment.comparison import with_comparison
@@ -25,7 +25,7 @@ from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import Extrinsic
 from hand_eye_calib.core.results.calibration import DofVerdict, SolveStatus, Verdict
-from hand_eye_calib.core.results.records import Finding, Severity
+from hand_eye_calib.core.results.records import Severity
 from hand_eye_calib.extras.simulation.demo import DRIVE
 from hand_eye_calib.extras.simulation.drive import simulate_drive
 from hand_eye_calib.extras.simulation.options import REALISTIC
@@ -242,9 +242,7 @@ def test_positions_are_along_the_axes_of_the_other_sensor_and_have_their_path(pa
 def test_hostile_names_stay_text():
     hostile = ('<script>alert("x")</script>', "_a$b$ & 'c' id=\"y\" --> ünï 雷")
     snapshot, calibration = simulated(poses=60, frames=hostile)
-    finding = Finding(
-        code="x", severity=Severity.NOTE, stream="<em>", what="<img src=x>", advice="</li>"
-    )
+    finding = written_finding("x", Severity.NOTE, "<img src=x>", "</li>", stream="<em>")
     calibration = dataclasses.replace(calibration, findings=(finding,))
     _, page = page_of(snapshot, calibration, inputs={"parent": {"topic": "<em>"}})
     assert {"script", "img", "em"} & {tag for tag, _ in page.elements} == set()

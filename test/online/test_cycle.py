@@ -9,13 +9,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from result_making import calibration, seen
+from result_making import calibration, seen, written_finding
 from source_code import ROOT
 
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.plain import plain
 from hand_eye_calib.core.checks.check import CheckResult
-from hand_eye_calib.core.checks.findings import Finding, Severity
+from hand_eye_calib.core.checks.findings import Severity
 from hand_eye_calib.core.results.calibration import (
     DofObservability,
     DofVerdict,
@@ -137,9 +137,7 @@ def test_a_solve_that_fails_says_so_and_changes_nothing(cycle):
 
 def test_streams_that_turn_out_faulty_end_done_and_the_verdict_says_the_same(cycle):
     reach_goal(cycle)
-    finding = Finding(
-        code="inverse", severity=Severity.ERROR, what="inverse poses", advice="invert"
-    )
+    finding = written_finding("inverse", Severity.ERROR, "inverse poses", "invert")
     result_of_check = CheckResult(findings=(finding,))
     _good, text = answered(cycle, 46.0, check=result_of_check)
     assert cycle.result.verdict is Verdict.DO_NOT_USE

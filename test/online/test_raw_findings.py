@@ -5,11 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from motions import as_trajectory, disturbed, feed, smooth_poses
-from result_making import good_calibration, seen
+from result_making import good_calibration, seen, written_finding
 
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.checks.check import CheckResult
-from hand_eye_calib.core.checks.findings import Finding, Severity, finding
+from hand_eye_calib.core.checks.findings import Severity, finding
 from hand_eye_calib.core.engine.calibrator import BufferLimits, Calibrator
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.calibration import Verdict
@@ -60,10 +60,9 @@ def test_two_sources_are_found_after_poses_were_paired_also_if_one_came_later(le
 
 
 def raw(code="interleaved", **fields):
-    return Finding(
-        code=code, severity=Severity.ERROR, stream="child", what="it alternates", advice="part it",
-        **fields,
-    )  # fmt: skip
+    return written_finding(
+        code, Severity.ERROR, "it alternates", "part it", stream="child", **fields
+    )
 
 
 @pytest.fixture

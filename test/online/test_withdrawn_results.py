@@ -6,12 +6,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from result_making import calibration, seen
+from result_making import calibration, seen, written_finding
 from rich.console import Console
 
 from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.core.checks.check import CheckResult
-from hand_eye_calib.core.checks.findings import Finding, Severity
+from hand_eye_calib.core.checks.findings import Severity
 from hand_eye_calib.core.results.calibration import (
     DofObservability,
     DofVerdict,
@@ -32,9 +32,7 @@ from hand_eye_calib.online.watch.board import Board, Tone
 from hand_eye_calib.online.watch.web import fragment
 
 TARGETS = (0.02,) * 3 + (0.005,) * 3
-INVERSE = Finding(
-    code="inverse", severity=Severity.ERROR, what="inverse poses", advice="invert them"
-)
+INVERSE = written_finding("inverse", Severity.ERROR, "inverse poses", "invert them")
 
 
 def dofs(sigma_m=0.005, **verdicts):

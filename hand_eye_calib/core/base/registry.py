@@ -158,6 +158,6 @@ OUT_OF_REACH: Registry[tuple[str, ...]] = Registry("kind of streams")
 #: both sensors measure together.
 KINDS: Registry[Callable[[], Any]] = Registry("kind of streams")
 
-#: Sentences of the findings of extras: functions that return
+#: Sentences of findings: functions that return
 #: :class:`hand_eye_calib.core.checks.words.FindingWords` by the key of the finding.
 FINDING_WORDS: Registry[Callable[[], Any]] = Registry("sentences of findings")

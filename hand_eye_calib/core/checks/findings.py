@@ -2,15 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from hand_eye_calib.core.base.config import METHODS, CalibratorConfig, defaults_of
 from hand_eye_calib.core.base.option import Options, options_in_words
-from hand_eye_calib.core.checks.words import words_of
-from hand_eye_calib.core.results.records import Finding, Severity, gravest_first
+from hand_eye_calib.core.results.records import Finding, Severity, gravest_first, words_of
 
 __all__ = [
     "Finding",
@@ -119,12 +118,12 @@ def finding(
     options: Mapping[str, float | str] | None = None,
     **values: Any,
 ) -> Finding:
-    """Return a finding with its values and its words.
+    """Return a finding with its values.
 
     Parameters
     ----------
     key : str
-        Key of its words, see :func:`hand_eye_calib.core.checks.words.words_of`.
+        Key of its words, see :mod:`hand_eye_calib.core.checks.words`.
     stream : str
         "parent", "child" or "both".
     severity : Severity, optional
@@ -132,21 +131,24 @@ def finding(
     options : mapping, optional
         Options that repair the fault, by name.
     **values
-        Values that the words name. The numbers among them are the evidence.
+        Values that the words name, and other numbers that were measured.
     """
     words = words_of(key)
-    whose = "both streams'" if stream == "both" else f"the {stream} stream's"
-    values |= {"stream": stream, "whose": whose}
     return Finding(
         code=words.code.format(**values) or key,
+        key=key,
         stream=stream,
         severity=severity or words.severity,
-        what=words.what.format(**values),
-        advice=words.advice.format(**values),
-        cause=words.cause.format(**values),
-        evidence={name: float(value) for name, value in values.items() if isinstance(value, Real)},
+        values={name: _plain_value(value) for name, value in values.items()},
         options=options or {},
     )
+
+
+def _plain_value(value: Real | str) -> float | int | str:
+    """Return a value as files contain it: a number of Python, or a text."""
+    if isinstance(value, str):
+        return value
+    return int(value) if isinstance(value, Integral) else float(value)
 
 
 # Code of a finding to the option that corrects the convention of a stream, and its value, in the

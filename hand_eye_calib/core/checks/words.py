@@ -1,10 +1,8 @@
 """Sentences of the stream checks: one row per finding, filled with the values of the finding."""
 
 from dataclasses import dataclass
-from functools import cache
 
-from hand_eye_calib.core.base.registry import FINDING_WORDS
-from hand_eye_calib.core.results.records import Severity
+from hand_eye_calib.core.results.records import AS_WRITTEN, Severity
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,10 @@ UNRELATED_ADVICE = (
     "file, call angles that are clockwise from north heading, not yaw"
 )
 
-_WORDS = {
+#: Words of the findings of the core, by the key of the finding.
+WORDS = {
+    # The sentences of documents without values.
+    AS_WRITTEN: FindingWords("{what}", "{advice}", "{cause}"),
     # Of one stream.
     "disorder": FindingWords("{text}", "repair the source of the stamps", severity=Severity.NOTE),
     "leap": FindingWords("{whose} {leap}", "{remedy}"),
@@ -313,12 +314,3 @@ _WORDS = {
         "a mount that came loose or was knocked, or an estimator that started anew",
     ),
 }
-
-
-@cache
-def words_of(key: str) -> FindingWords:
-    """Return the templates of a finding by the key of its row, those of extras included."""
-    words = {**_WORDS}
-    for load in FINDING_WORDS.values():
-        words |= load()
-    return words[key]

@@ -18,7 +18,14 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import inverse_covariance, sigmas_in_parent, sigmas_rpy
 from hand_eye_calib.core.geometry.trajectory import check_poses
 from hand_eye_calib.core.results.parts import ExtraTransform, all_parts, part
-from hand_eye_calib.core.results.records import AXES, ROTATIONS, TRANSLATIONS, CrossCheck, by_hand
+from hand_eye_calib.core.results.records import (
+    AXES,
+    ROTATIONS,
+    TRANSLATIONS,
+    CrossCheck,
+    Finding,
+    by_hand,
+)
 from hand_eye_calib.core.results.result import Result
 from hand_eye_calib.core.results.verdict import Judged, Verdict
 
@@ -32,6 +39,8 @@ _READABLE = (1, 2)
 _TRANSFORMS = ("T_parent_child", "T_method", "T_base_parent")
 _COVARIANCES = ("covariance_measured", "covariance_allowance")
 _NOT_IN_FILES = ("motion_residuals", "recording", "parts")
+# Fields that have readers of their own.
+_READ_APART = (*_NOT_IN_FILES, "findings")
 
 # The fields of a covariance in version 2 and what they were called in version 1.
 _OLD_COVARIANCES = {"covariance_measured": "covariance", "covariance_allowance": "floor"}
@@ -86,6 +95,7 @@ def document_of(result: Judged) -> Document:
     if result.T_method is not None:
         of = "T_parent_child as the method solved it: nothing set, no prior added"
         document["T_method"] = {"of": of, "matrix": result.T_method}
+    document["findings"] = [finding.to_dict() for finding in result.findings]
     left_out = {*_TRANSFORMS, *_COVARIANCES, *_NOT_IN_FILES, "observability_measured"}
     for name in (each.name for each in fields(result)):
         if name not in left_out.union(document):
@@ -375,11 +385,11 @@ def _result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
     if "T_base_child" in arrays:
         T_child_parent = se3.inverse(arrays["T_parent_child"])
         arrays["T_base_parent"] = arrays["T_base_child"] @ T_child_parent
-    known = {name: each for name, each in data.items() if name not in _NOT_IN_FILES}
+    known = {name: value for name, value in data.items() if name not in _READ_APART}
     found = {added.name: added.read(data) for added in all_parts()}
     parts = {name: value for name, value in found.items() if value is not None}
     result: _OfResult = from_plain(of, known | arrays, Comparison=Comparison)
-    result = replace(result, parts=parts)
+    result = replace(result, parts=parts, findings=_findings_of(data))
     if data["version"] == 1 and result.cross_check:
         result = replace(result, cross_check=_with_allowance(result))
     if tuple(dof.name for dof in result.observability) != AXES:
@@ -392,6 +402,14 @@ def _result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
     if result.method not in METHODS:
         raise ValueError(f"method {result.method} is not known")
     return result
+
+
+def _findings_of(data: Mapping[str, Any]) -> tuple[Finding, ...]:
+    """Return the findings of a document."""
+    rows = data.get("findings", [])
+    if not isinstance(rows, (list, tuple)):
+        raise TypeError(f"findings: a list is {type(rows).__name__}")
+    return tuple(map(Finding.from_dict, rows))
 
 
 def _require_sigmas(result: Result, rows: Sequence[Mapping[str, Any]]) -> None:

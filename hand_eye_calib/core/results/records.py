@@ -8,11 +8,14 @@ them.
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TypeAlias
+from functools import cache
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.core.base.plain import Document, from_plain, plain
+from hand_eye_calib.core.base.registry import FINDING_WORDS
 from hand_eye_calib.core.geometry.trajectory import Columns
 
 # Motion pairs with more weight than this count as inliers.
@@ -143,47 +146,128 @@ class Severity(str, Enum):
     ERROR = "error"
 
 
+#: Key of the words of a finding whose sentences are among its values.
+AS_WRITTEN = "as_written"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Finding:
     """A problem of the streams that a check found.
+
+    The sentences are not stored. They are made from the values by the templates of ``key`` in
+    :data:`hand_eye_calib.core.base.registry.FINDING_WORDS`.
 
     Attributes
     ----------
     code : str
         Short name, stable over versions.
+    key : str
+        Key of the templates of its sentences. Findings with one code may have different sentences.
     stream : str
         "parent", "child" or "both".
     severity : Severity
-    what : str
-        What was found, with its values.
-    advice : str
-        What to do.
-    cause : str
-        Usual cause, if ``what`` does not name it.
-    evidence : mapping of str to float
-        The numbers in ``what``, by name.
+    values : mapping of str to number or str
+        Values that the sentences name, and other numbers that were measured.
     options : mapping
         Options that repair the problem, by their names in :mod:`hand_eye_calib.core.base.config`;
         empty if no option repairs it.
     """
 
     code: str
+    key: str
     severity: Severity
-    what: str
-    advice: str
     stream: str = "both"
-    cause: str = ""
-    evidence: Mapping[str, float] = field(default_factory=dict)
+    values: Mapping[str, float | int | str] = field(default_factory=dict)
     options: Mapping[str, float | str] = field(default_factory=dict)
+
+    @property
+    def what(self) -> str:
+        """What was found, with its values."""
+        return self._filled(words_of(self.key).what)
+
+    @property
+    def advice(self) -> str:
+        """What to do."""
+        return self._filled(words_of(self.key).advice)
+
+    @property
+    def cause(self) -> str:
+        """Usual cause; empty if :attr:`what` names it."""
+        return self._filled(words_of(self.key).cause)
+
+    @property
+    def evidence(self) -> dict[str, float]:
+        """Numbers among the values, by name."""
+        return {
+            name: float(value) for name, value in self.values.items() if not isinstance(value, str)
+        }
 
     @property
     def makes_unusable(self) -> bool:
         """Whether a result from these streams as they are is unusable."""
         return self.severity is Severity.ERROR
 
+    def to_dict(self) -> Document:
+        """Return the finding with its sentences as a plain mapping."""
+        document: Document = plain(self)
+        for name in ("what", "advice", "cause", "evidence"):
+            document[name] = plain(getattr(self, name))
+        return document
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Build from the mapping that :meth:`to_dict` returned.
+
+        The sentences of the mapping are kept if this installation has no words for its values: the
+        mapping is of another version, or of an extra that is missing here.
+
+        Raises
+        ------
+        KeyError, TypeError, ValueError
+            If a field is missing or was changed.
+        """
+        if "values" in data:
+            finding: Self = from_plain(cls, data)
+            if finding._has_words():
+                return finding
+        values: Document = from_plain(dict[str, float], data.get("evidence", {}))
+        sentences = {"cause": "", **data}
+        for name in ("what", "advice", "cause"):
+            values[name] = from_plain(str, sentences[name])
+        as_written: Self = from_plain(cls, {**data, "key": AS_WRITTEN, "values": values})
+        return as_written
+
+    def _has_words(self) -> bool:
+        """Whether this installation has words for the values of the finding."""
+        try:
+            str(self)
+        except (KeyError, TypeError, ValueError):
+            return False
+        return True
+
+    def _filled(self, template: str) -> str:
+        """Return a template with the values of the finding."""
+        whose = "both streams'" if self.stream == "both" else f"the {self.stream} stream's"
+        return template.format(stream=self.stream, whose=whose, **self.values)
+
     def __str__(self) -> str:
         cause = f" ({self.cause})" if self.cause else ""
         return f"{self.what.rstrip('.')}{cause}; {self.advice}"
+
+
+@cache
+def words_of(key: str) -> Any:
+    """Return the templates of a finding, ``FindingWords``, by the key of the finding.
+
+    Raises
+    ------
+    KeyError
+        If no layer has registered the key.
+    """
+    words: dict[str, Any] = {}
+    for load in FINDING_WORDS.values():
+        words |= load()
+    return words[key]
 
 
 def has_error(findings: Iterable[Finding]) -> bool:

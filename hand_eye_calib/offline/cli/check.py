@@ -80,7 +80,9 @@ def run(arguments: argparse.Namespace) -> int:
     summaries = {
         stream: {"source": sources[stream]} | plain(summary) for stream, summary in streams.items()
     }
-    document = {"streams": summaries, "findings": findings} if arguments.json else None
+    document = None
+    if arguments.json:
+        document = {"streams": summaries, "findings": [found.to_dict() for found in findings]}
     lines = [_verdict(findings), "", *_table(findings), "", *_lines(sources, streams)]
     print_result(lines, document)
     if findings and findings[0].makes_unusable:
