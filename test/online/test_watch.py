@@ -171,6 +171,7 @@ def test_a_state_with_any_wrong_value_is_shown_or_left_out(kind, hostile):
 
 
 ERROR = {"level": Level.ERROR}
+REACHED = {"done": True, "precision": "good to 4 mm"}
 
 
 @pytest.mark.parametrize(
@@ -185,7 +186,7 @@ ERROR = {"level": Level.ERROR}
             state(at={"done": True, "is_faulty": True, "sentence": "Stop: feet."}),
             *(0.5, Tone.ACT, "CHECK THE STREAMS", "Stop: "),
         ),
-        (state(at={"done": True}), 0.5, Tone.GOOD, "DONE", "Go on"),
+        (state(at=REACHED), 0.5, Tone.GOOD, "DONE", "Good to 4 mm."),
         (state(inputs=inputs(child=Level.WARN)), 0.5, Tone.ACT, "CHECK INPUT", "/odom has been"),
         (state(inputs=inputs(Level.WARN, Level.ERROR)), 0.5, Tone.BAD, "BAD INPUT", "/odom: bad"),
         (
@@ -196,12 +197,18 @@ ERROR = {"level": Level.ERROR}
             state(checks=replace(CHECKS, level=Level.WARN, age_s=None)),
             *(0.5, Tone.BUSY, "GO ON", "Go on for"),
         ),
-        (mount(**ERROR, text="it moved"), 0.5, Tone.BAD, "MOUNT MOVED", "It moved; check it, then"),
+        (mount(**ERROR, text="it moved"), 0.5, Tone.BAD, "MOUNT MOVED", "It moved."),
         (mount(), 0.5, Tone.GOOD, "WATCHING", "It has not."),
         (mount(is_learning=True), 0.5, Tone.BUSY, "LEARNING", "It has not."),
         (mount(level=Level.WARN, text="no URDF"), 0.5, Tone.ACT, "NOT WATCHING", "No URDF."),
         (state(journal=FULL), 0.5, Tone.BAD, "BROKEN", "Cannot write."),
-        (state(journal=FULL, at={"done": True}, saved=SAVED), 0.5, Tone.GOOD, "DONE", "Go on"),
+        (
+            state(journal=FULL, at=REACHED, saved=SAVED),
+            0.5,
+            Tone.GOOD,
+            "DONE",
+            "Good to 4 mm. Saved",
+        ),
         (state(extrinsic=replace(EXTRINSIC, **ERROR)), 0.5, Tone.BAD, "BROKEN", "Known."),
         (replace(state(), has_ended=True), 9.0, Tone.ACT, "ENDED", "The node has ended. The"),
         (replace(mount(), has_ended=True), 0.5, Tone.ACT, "ENDED", "The node has ended: nobody"),
@@ -227,7 +234,7 @@ def test_bars_show_the_share_of_the_information_and_the_time_left():
     assert ["sketch" in fragment(view) for view in (on_wheels, view_of(state()))] == [True, False]
     assert bars["z"].share == pytest.approx(0.25)  # twice the target: a quarter of the information
     assert (bars["z"].tone, bars["z"].word) == (Tone.ACT, "25 s left")
-    assert (bars["z"].against, bars["yaw"].against) == ("± 4 of 2 cm", "± 0.057 of 0.3 deg")
+    assert (bars["z"].against, bars["yaw"].against) == ("± 4 cm of 2 cm", "± 0.057 deg of 0.3 deg")
 
 
 @pytest.mark.parametrize(
@@ -263,17 +270,19 @@ def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
     differs = context.AxisDifference(difference=0.031, sigma=0.004, visible=0.01, verdict="moved")
     axes = dict.fromkeys(AXES, differs) | {"yaw": replace(differs, sigma=INF)}
     difference = Difference(first="a", second="b", verdict="moved", sentence="", axes=axes)
+    difference = replace(difference, change="z by +3 cm +/- 4 mm")
     comparison = Comparison(
         sentence="moved: z by +3 cm +/- 4 mm", verdict="moved", differences=(difference,)
     )
-    done = {"at": {"done": True, "sentence": "Done: known. Stop and save."}}
+    done = {"at": {"done": True, "precision": "known"}}
     view = view_of(state(comparison=comparison, **done))
     assert (view.word, view.tone, view.buttons[0]) == ("DONE", Tone.ACT, "save")
-    assert view.sentence.startswith("camera HAS MOVED: z by +3 cm ± 4 mm. Save.")
-    assert view.sentence.endswith("Save.")
+    assert view.sentence == "camera HAS MOVED: z by +3 cm ± 4 mm."
+    assert view.advice == "Save."
+    assert view_of(state(**done)).text == "Known. Stop and save."
     saved = view_of(replace(state(**done), saved=SAVED))
-    assert saved.sentence.startswith("Known. Saved at ")
-    assert saved.sentence.endswith(" in /home/live.")
+    assert saved.text.startswith("Known. Saved at ")
+    assert saved.text.endswith(" in /home/live.")
     assert (saved.tone, saved.buttons[0], saved.saved_in) == (Tone.GOOD, "solve", "/home/live")
     assert (saved.result[-1].name, saved.result[-1].tone) == ("saved", Tone.GOOD)
     assert (view.result[0].tone, view.result[0].text) == (Tone.ACT, "USE WITH CARE")
@@ -312,7 +321,7 @@ def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
     assert lines["along x"] == (Tone.GOOD, "not moved (would see 4 mm)")
     assert lines["along z"] == (Tone.UNKNOWN, "cannot be watched with this motion")
     assert (view.bars, view.result, view.word) == ((), (), "MOUNT MOVED")
-    assert view.sentence == "The mount has moved; check it, then recalibrate or acknowledge."
+    assert view.text == "The mount has moved. Check it, then recalibrate or acknowledge."
     assert view.facts == "2 min ago; a reset ends the alarm"
     assert view.buttons[:2] == ("recalibrate", "acknowledge")
     assert "the mount, after ten minutes" in fragment(view)
@@ -346,7 +355,7 @@ def test_an_alarm_that_somebody_knows_of_is_quiet_until_the_next():
     quiet = "MOUNT MOVED", Tone.ACT, ("recalibrate", "reset")
     assert (view.word, view.tone, view.buttons) == quiet
     assert view.facts.endswith("; acknowledged")
-    assert view.sentence.endswith("then recalibrate.")
+    assert view.text.endswith("then recalibrate.")
     board.take(mount(**ERROR, text="moved", since_ns=2 * 10**18), 1.0)
     assert board.view(1.0).tone is Tone.BAD
 
@@ -373,7 +382,7 @@ def drawn(view, width):
 @pytest.mark.parametrize("width", [60, 120])
 def test_the_terminal_shows_words_and_signs_at_every_width(width):
     text = drawn(view_of(state()), width)
-    words = ("▶ GO ON", "✓ enough", "! 25 s left", "0.420 m", "± 4 of 2 cm", "━━━", "20.0 Hz",
+    words = ("▶ GO ON", "✓ enough", "! 25 s left", "0.420 m", "± 4 cm of 2 cm", "━━━", "20.0 Hz",
              "USE WITH CARE")  # fmt: skip
     for word in words:
         assert word in text

@@ -130,6 +130,7 @@ def _difference(first: _Named, second: tuple[str, Calibration]) -> Difference:
         verdict=difference.verdict.value,
         sentence=difference.sentence,
         axes=difference.axes,
+        change=difference.what if difference.verdict is Change.MOVED else "",
     )
 
 

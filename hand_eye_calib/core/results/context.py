@@ -9,8 +9,18 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class AxisDifference:
-    """Difference on one axis (m, rad), its standard deviation (infinite if unknown), the change
-    that would have been seen nine times out of ten, and the verdict: same, moved or cannot tell.
+    """Difference of two extrinsics on one axis.
+
+    Attributes
+    ----------
+    difference : float
+        Along or about the axis, m or rad.
+    sigma : float
+        Standard deviation of the difference; infinite if unknown.
+    visible : float
+        Change that the comparison would detect nine times out of ten.
+    verdict : str
+        same, moved or cannot tell.
     """
 
     difference: float
@@ -21,19 +31,46 @@ class AxisDifference:
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """How an extrinsic differs from another, axis by axis: ``second`` minus ``first``."""
+    """Difference of two extrinsics: ``second`` minus ``first``.
+
+    Attributes
+    ----------
+    first, second : str
+        Names of the extrinsics.
+    verdict : str
+        same, moved or cannot tell.
+    sentence : str
+        The verdict with its evidence.
+    axes : mapping of str to AxisDifference
+    change : str
+        Axes that have moved, and how far, in words; empty unless the verdict is moved.
+    """
 
     first: str
     second: str
     verdict: str
     sentence: str
     axes: Mapping[str, AxisDifference]
+    change: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Comparison of a result with what is installed: where that comes from, its ``values`` by axis
-    (m, rad), and the differences.
+    """Comparison of a result with what is installed.
+
+    Attributes
+    ----------
+    sentence : str
+        The verdict with its evidence, or the reason why there is no comparison.
+    verdict : str
+        same, moved or cannot tell; empty without a comparison.
+    installed : str
+        Origin of what is installed.
+    values : mapping of str to float
+        Installed values by axis, m or rad.
+    moved : tuple of str
+        Names of the results that have moved.
+    differences : tuple of Difference
     """
 
     sentence: str

@@ -29,7 +29,7 @@ class Part:
     load : callable
         Return the type of the record.
     details : callable, optional
-        Return lines about the record of a result, whose headline is the second argument.
+        Return lines about the record of a result; called with both.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Part:
         self,
         name: str,
         load: Callable[[], type],
-        details: Callable[[Any, str], list[str]] | None = None,
+        details: Callable[[Any, Any], list[str]] | None = None,
     ) -> None:
         self.name = name
         self.load = load
@@ -80,9 +80,9 @@ class Part:
         """Return the transforms of the part by their names."""
         return {}
 
-    def details(self, value: Any, headline: str) -> list[str]:
-        """Return lines for a person about the part of a result with this headline."""
-        return self._details(value, headline) if self._details else []
+    def details(self, value: Any, result: Any) -> list[str]:
+        """Return lines for a person about the part of a result."""
+        return self._details(value, result) if self._details else []
 
     def headline(self, value: Any) -> str:
         """Return what the first line of a usable result says of the part; empty for nothing."""

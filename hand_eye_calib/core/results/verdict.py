@@ -170,28 +170,42 @@ class Judged(Result):
     @property
     def headline(self) -> str:
         """The verdict with its gravest reason, or with what is known, in one line."""
+        return f"{self.verdict.value}: {self.sentence}"
+
+    @property
+    def sentence(self) -> str:
+        """The headline without the verdict."""
+        notes = self._notes()
         gravest = shown(self.reasons)
-        notable = "".join(f"; {note}" for note in self._notes())
         if not gravest:
-            return f"{self.verdict.value}: {what_is_known(self)}{notable}"
-        first = gravest[0]
+            return "; ".join([what_is_known(self), *notes])
+        first, *others = gravest
         if first.rule == "unobservable":
             hidden = listing(first.axes)
             it = hidden if len(first.axes) == 1 else "them"
             text = f"all but {hidden}; measure {it} by hand"
-            if len(gravest) > 1:
-                text += f"; {gravest[1].sentence}"
-        elif [reason.rule for reason in gravest] == ["part_of_poses"]:
+            if others:
+                text += f"; {others[0].sentence}"
+        elif first.rule == "part_of_poses" and not others:
             text = f"{what_is_known(self)}; {first.sentence}"
         else:
             text = first.sentence
-            if len(gravest) > 1:
-                text += f" (and {counted(len(gravest) - 1, 'more reason')})"
+            if others:
+                text += f" (and {counted(len(others), 'more reason')})"
             if all(reason.kind == "physics" for reason in self.reasons):
                 text += _NO_FAULT
             if self.verdict is Verdict.DO_NOT_USE:
-                notable = ""
-        return f"{self.verdict.value}: {text}{notable}"
+                notes = []
+        return "; ".join([text, *notes])
+
+    @property
+    def reasons_in_headline(self) -> tuple[Reason, ...]:
+        """Reasons whose sentences the headline contains."""
+        gravest = shown(self.reasons)
+        if gravest and gravest[0].rule == "unobservable":
+            # The headline states the first reason in other words.
+            return gravest[1:2]
+        return gravest[:1]
 
     def _notes(self) -> list[str]:
         """Notes for the headline, of extras and of findings that are no reasons."""

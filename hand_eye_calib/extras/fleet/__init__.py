@@ -94,10 +94,10 @@ def _together() -> Any:
 def _recordings_differ(result: Any) -> Any:
     from hand_eye_calib.extras.fleet.records import find_kinds
 
-    return find_kinds(("differ", "moved"), result)
+    return find_kinds("recordings_differ", result)
 
 
 def _recordings(result: Any) -> Any:
     from hand_eye_calib.extras.fleet.records import find_kinds
 
-    return find_kinds(("one off", "scatter"), result)
+    return find_kinds("recordings", result)

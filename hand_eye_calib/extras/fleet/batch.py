@@ -19,6 +19,7 @@ from hand_eye_calib.core.base.plain import json_text
 from hand_eye_calib.core.base.text import counted, listing
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
 from hand_eye_calib.extras.fleet import work
+from hand_eye_calib.extras.fleet.records import is_in_headline
 from hand_eye_calib.extras.fleet.together import together
 from hand_eye_calib.extras.fleet.work import Outcome, Row, Task, outcomes, tasks_of
 from hand_eye_calib.formats.bags.patterns import matching
@@ -232,6 +233,6 @@ def _print_results(done: Sequence[Outcome], vehicles: Mapping[str, Calibration])
     for name, result in vehicles.items():
         text = result.headline
         together = result.parts.get("together")
-        if together and together.sentence not in text:
+        if together and not is_in_headline(result):
             text = f"{text}. {together.sentence}"
         print("\n".join(wrapped(f"{name}: {text}", "", "  ")))

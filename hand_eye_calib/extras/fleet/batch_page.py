@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from hand_eye_calib.core.base.errors import printable
 from hand_eye_calib.core.base.plain import Document
-from hand_eye_calib.core.base.text import axes_in_words, counted, listing, with_sigma
+from hand_eye_calib.core.base.text import counted, listing, with_sigma
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.extras.fleet.together import row_of_result
 from hand_eye_calib.offline.report.figures import (
@@ -29,6 +29,14 @@ from hand_eye_calib.offline.report.figures import (
 from hand_eye_calib.offline.report.report import TONES, page
 
 _AXES = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}
+_TITLES = {
+    "x": "x",
+    "y": "y",
+    "z": "z",
+    "roll": "about x",
+    "pitch": "about y",
+    "yaw": "about z",
+}
 _GRAVITY = ("bad", "warn", "good")
 
 
@@ -82,9 +90,9 @@ def _trend(result: Calibration, number: int) -> Drawn:
         points = [(each.deviations[axis], each.sigmas[axis]) for each in recordings]
         values, sigmas = factor * np.where(np.isfinite(points), points, np.nan).T
         band = factor * LOOK.sigmas * sigma
-        told = axes_in_words([axis]).removeprefix("the rotation ")
-        told += f", {unit}" if np.isfinite(band) else ": not determined"
-        panel.set_title(told, loc="left")
+        title = _TITLES[axis]
+        title += f", {unit}" if np.isfinite(band) else ": not determined"
+        panel.set_title(title, loc="left")
         panel.axhline(0, color=GRID, lw=0.8)
         if np.isfinite(band):
             panel.axhspan(-band, band, color=PARENT, alpha=0.15, lw=0)

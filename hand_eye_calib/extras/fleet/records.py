@@ -1,6 +1,6 @@
 """Recordings as a part of their common result."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -56,6 +56,12 @@ class Together:
     recordings: tuple[Recorded, ...]
 
 
+#: Rule of the verdict to the kinds of agreement that it is about.
+RULES = {
+    "recordings_differ": ("differ", "moved"),
+    "recordings": ("one off", "scatter"),
+}
+
 # Advice by kind of agreement.
 _ADVICE = {
     "differ": "record once more: then the one that is off shows",
@@ -66,16 +72,21 @@ _ADVICE = {
 }
 
 
-def find_kinds(kinds: Sequence[str], result: Any) -> Iterator[Ground]:
-    """Yield the ground against a result whose recordings have one of these kinds of agreement."""
+def find_kinds(rule: str, result: Any) -> Iterator[Ground]:
+    """Yield the ground against a result whose recordings have a kind of agreement of the rule."""
     together = result.parts.get("together")
-    if together and together.kind in kinds:
+    if together and together.kind in RULES[rule]:
         yield Ground(together.sentence, _ADVICE[together.kind])
 
 
-def details(together: Together, headline: str) -> list[str]:
-    """Return lines about the recordings, for a person."""
-    lines = [] if together.sentence in headline else [together.sentence]
+def is_in_headline(result: Any) -> bool:
+    """Whether the headline of a result contains the sentence about its recordings."""
+    return any(reason.rule in RULES for reason in result.reasons_in_headline)
+
+
+def details(together: Together, result: Any) -> list[str]:
+    """Return lines about the recordings of a result, for a person."""
+    lines = [] if is_in_headline(result) else [together.sentence]
     for recording in together.recordings:
         left_out = recording.left_out and f"left out, {recording.left_out}"
         lines.append(f"{recording.name}: {left_out or recording.headline}")

@@ -145,7 +145,7 @@ def as_lines(
         lines += [f"To publish it ({calibration.verdict.value}{condition})", f"  {command}"]
     details = []
     for name, value in calibration.parts.items():
-        details += part(name).details(value, calibration.headline)
+        details += part(name).details(value, calibration)
     if comparison := calibration.comparison:
         details.append(
             f"compared with what is installed ({comparison.installed}): {comparison.sentence}"
@@ -186,9 +186,10 @@ def _extrinsic_lines(calibration: Calibration, with_details: bool) -> list[str]:
 def verdict_lines(calibration: Calibration) -> Iterator[str]:
     """Yield the headline, the reasons with their advice, and the notes."""
     yield calibration.headline
+    in_headline = calibration.reasons_in_headline
     for number, reason in enumerate(shown(calibration.reasons)):
-        # The headline may have the sentence of the first reason: then only its advice follows.
-        if number or reason.sentence not in calibration.headline:
+        # Only the advice follows the headline if that has the sentence of the first reason.
+        if number or reason not in in_headline:
             yield from wrapped(reason.sentence, "- ", "  ")
         advice = reason.what_to_do
         if reason.options:

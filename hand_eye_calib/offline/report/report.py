@@ -120,7 +120,6 @@ def render(
     )
     parent = printable(calibration.parent_frame)
     child = printable(calibration.child_frame)
-    verdict, _, sentence = calibration.headline.partition(": ")
     by_hand = [value for value in usable_numbers(calibration).values() if isinstance(value, str)]
     evidence = gather(calibration, snapshot) if snapshot else None
     advice = ""
@@ -130,8 +129,8 @@ def render(
     return page(
         _FOLDER / "report.html",
         TONES[calibration.verdict.value],
-        verdict,
-        sentence,
+        calibration.verdict.value,
+        calibration.sentence,
         calibration=calibration,
         at_distance=_at_distance(calibration),
         document=calibration.to_dict(),

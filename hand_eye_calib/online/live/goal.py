@@ -162,6 +162,7 @@ class Goal:
         self.progress = Progress(
             sentence=sentence,
             done=is_done and not newest.faults,
+            precision=what_is_known(self.best) if self.best else "",
             is_faulty=bool(newest.faults),
             limiting_axis="" if is_done else AXES[worst],
             will_not_get_there=is_stuck,

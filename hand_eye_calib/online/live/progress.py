@@ -34,6 +34,8 @@ class Progress:
         Next step of the person who moves the robot.
     done : bool
         Whether the goal is reached.
+    precision : str
+        Precision of the best result, in words; empty before the goal is reached.
     is_faulty : bool
         Whether the streams have faults that make a calibration impossible.
     limiting_axis : str
@@ -45,12 +47,13 @@ class Progress:
 
     sentence: str
     done: bool = False
+    precision: str = ""
     is_faulty: bool = False
     limiting_axis: str = ""
     will_not_get_there: bool = False
     axes: Mapping[str, AxisProgress] = field(default_factory=dict)
 
 
-def details(goal: Progress, headline: str) -> list[str]:
-    """Return a line about the session, for a person."""
+def details(goal: Progress, result: object) -> list[str]:
+    """Return a line about the session of a result, for a person."""
     return [f"the session: {goal.sentence}"]

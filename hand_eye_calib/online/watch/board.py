@@ -74,11 +74,14 @@ _TONES: dict[object, Tone] = {
 
 
 class Headline(NamedTuple):
-    """The most important fact about a node: sign, a word or two in capitals, and a sentence."""
+    """The most important fact about a node: sign, a word or two in capitals, a sentence, and what
+    to do.
+    """
 
     tone: Tone
     word: str
     sentence: str
+    advice: str = ""
 
 
 class Board:
@@ -142,7 +145,7 @@ class Board:
             view = replace(
                 view,
                 tone=Tone.ACT,
-                sentence=view.sentence.replace(" or acknowledge", ""),
+                advice="Check it, then recalibrate.",
                 facts=f"{view.facts}; acknowledged",
                 buttons=("recalibrate", "reset"),
             )
@@ -252,8 +255,8 @@ def _alarm(state: NodeState) -> Headline | None:
     """Return the gravest condition that requires a person; None if there is none."""
     for tone, word, level, part in _conditions(state):
         if part is not None and part.level is level:
-            advice = "; check it, then recalibrate or acknowledge" if word == MOVED else ""
-            return Headline(tone, word, _sentence(part.text + advice))
+            advice = "Check it, then recalibrate or acknowledge." if word == MOVED else ""
+            return Headline(tone, word, _sentence(part.text), advice)
     return None
 
 
@@ -293,12 +296,12 @@ def _activity(state: NodeState) -> Headline:
     if at is None:
         text = "The node is there, and says nothing of a result yet."
         return Headline(Tone.UNKNOWN, "LISTENING", text)
-    sentence = _sentence(at.text.removeprefix("Done: "))
+    sentence = _sentence(at.text)
     # The streams are faulty, although an earlier result was good.
     if at.progress.is_faulty:
         return Headline(Tone.ACT, "CHECK THE STREAMS", sentence)
     if at.progress.done:
-        return _done(state, at, sentence)
+        return _done(state, at)
     tone = Tone.BUSY if at.level is Level.OK else Tone.ACT
     if at.is_paused:
         return Headline(tone, "PAUSED", sentence)
@@ -307,22 +310,23 @@ def _activity(state: NodeState) -> Headline:
     return Headline(tone, "GO ON" if tone is Tone.BUSY else CHANGE_MOTION, sentence)
 
 
-def _done(state: NodeState, at: ProgressState, sentence: str) -> Headline:
+def _done(state: NodeState, at: ProgressState) -> Headline:
     """Return the headline of a session that has reached its goal.
 
     The sentence describes what has moved compared with the installed transform, or the precision.
-    It ends with the next step, or with the directory of the saved result.
     """
     tone = Tone.GOOD
-    if at.comparison and at.comparison.verdict == "moved":
+    sentence = _sentence(at.progress.precision)
+    advice = "Stop and save."
+    if state.result and at.comparison and at.comparison.verdict == "moved":
         tone = Tone.ACT
-        if state.result:
-            moved = _typeset(at.comparison.sentence.removeprefix("moved: "))
-            sentence = f"{state.result.child_frame} HAS MOVED: {moved}. Save."
+        displacement = _typeset(at.comparison.differences[0].change)
+        sentence = f"{state.result.child_frame} HAS MOVED: {displacement}."
+        advice = "Save."
     if state.saved:
-        sentence = sentence.removesuffix(" Save.").removesuffix(" Stop and save.")
         sentence = f"{sentence} Saved {_saved_at(state.saved)}."
-    return Headline(tone, DONE, sentence)
+        advice = ""
+    return Headline(tone, DONE, sentence, advice)
 
 
 def _silence(state: NodeState, silent_s: float) -> Headline:
@@ -389,8 +393,7 @@ def _bar(axis: str, at: ProgressState, extrinsic: ExtrinsicState | None) -> Bar:
         against = f"wanted: {target}"
     elif math.isfinite(row.sigma):
         tone, word = _progress_in_words(row, at, axis)
-        unit = target.rpartition(" ")[2]
-        against = f"± {amount(axis, row.sigma).removesuffix(f' {unit}')} of {target}"
+        against = f"± {amount(axis, row.sigma)} of {target}"
     else:
         tone = Tone.UNKNOWN
         # A time left without a standard deviation: these streams never observe the axis.

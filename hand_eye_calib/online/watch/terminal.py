@@ -43,7 +43,7 @@ def screen(view: View, width: int, footer: str = "") -> RenderableType:
     word = f" {view.tone.value} {view.word} "
     parts: list[RenderableType] = [
         Text.assemble((word, f"reverse {_STYLES[view.tone]}")),
-        Text(view.sentence, style="bold"),
+        Text(view.text, style="bold"),
     ]
     if view.facts:
         parts.append(_dim(view.facts))
@@ -65,7 +65,7 @@ def screen(view: View, width: int, footer: str = "") -> RenderableType:
 def lines(view: View) -> list[str]:
     """Return headline and answer to a button, as lines for a file or a pipe."""
     answers = [f"{line.tone.value} {line.name}: {line.text}" for line in view.answer]
-    return [f"{view.tone.value} {view.word}: {view.sentence}", *answers]
+    return [f"{view.tone.value} {view.word}: {view.text}", *answers]
 
 
 def _dim(text: str) -> Text:

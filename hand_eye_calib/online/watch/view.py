@@ -80,6 +80,8 @@ class View:
         Fully qualified name of the node.
     tone, word, sentence
         The headline.
+    advice : str
+        What to do about the headline; empty if the sentence contains it.
     facts : str
         Amount of motion, and age of the result.
     title : str
@@ -112,6 +114,7 @@ class View:
     tone: Tone
     word: str
     sentence: str
+    advice: str = ""
     facts: str = ""
     title: str = ""
     values: AxisTexts = ()
@@ -126,3 +129,8 @@ class View:
     priors: AxisTexts = ()
     saved_in: str = ""
     answer: Lines = ()
+
+    @property
+    def text(self) -> str:
+        """Sentence and advice in one line."""
+        return f"{self.sentence} {self.advice}".rstrip()

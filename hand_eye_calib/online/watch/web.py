@@ -24,7 +24,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from hand_eye_calib.core.base.errors import ConfigError, printable
-from hand_eye_calib.core.base.text import AXIS_UNITS, capital, prior_as_typed
+from hand_eye_calib.core.base.text import AXIS_UNITS, prior_as_typed
 from hand_eye_calib.online.live.state import REPORT_PERIOD_S
 from hand_eye_calib.online.watch.board import Board
 from hand_eye_calib.online.watch.view import KEYS, Bar, Line, Tone, View
@@ -258,10 +258,9 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
     files : sequence of str
         Saved files to which the page may link.
     """
-    sentence, _, advice = view.sentence.partition("; ")
-    headline = f"<h1>{_sign(view.tone)} {escape(view.word)}</h1>{_element('p', sentence)}"
-    if advice:
-        headline += _element("p", capital(advice), "advice")
+    headline = f"<h1>{_sign(view.tone)} {escape(view.word)}</h1>{_element('p', view.sentence)}"
+    if view.advice:
+        headline += _element("p", view.advice, "advice")
     if view.facts:
         headline += _element("p", view.facts, "facts")
     axes_title = "precision against the target"
