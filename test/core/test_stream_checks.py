@@ -317,7 +317,7 @@ class TestCommand:
     def test_good_streams(self, files, capsys):
         assert main(["check", *files(*drive())]) == 0
         out, err = capsys.readouterr()
-        assert out.startswith("USE: nothing speaks against calibrating with these streams.\n")
+        assert out.startswith("USE: no fault found in these streams.\n")
         assert "500" in out
         assert err == ""
 
@@ -327,7 +327,9 @@ class TestCommand:
         out, err = capsys.readouterr()
         assert "--time-offset 2.0" in out
         assert "ERROR    time_offset" in out
-        assert out.startswith("DO NOT USE: not as they are; calibrate with --time-offset 2.0.\n")
+        assert out.startswith(
+            "DO NOT USE: the streams need a repair; calibrate with --time-offset 2.0.\n"
+        )
         assert len(err.splitlines()) == 1
         assert main(["check", *files(parent, child.shifted(-2.0)), "--time-offset", "2"]) == 0
 
@@ -340,7 +342,7 @@ class TestCommand:
         assert main(["check", *jumping]) == 0
         out, err = capsys.readouterr()
         assert re.search(r"^note +jumps", out, re.MULTILINE)
-        assert "nothing speaks against" in out
+        assert "no fault found" in out
         assert err == ""
         assert main(["check", *jumping, "--method", "park"]) == 0
         out, err = capsys.readouterr()

@@ -113,7 +113,7 @@ def test_many_null_poses_ask_for_another_recording(tmp_path):
     path = bag_of(tmp_path / "bag", "mcap", ODOMETRY, spoiled(CHILD, NULLS["all zero"], MANY))
     _, _, (warning,) = read(path, "/b")
     assert warning.startswith("/b: 40 of 200 poses (20%) were left out: ")
-    assert warning.endswith("So many: does the source lose track? Record again where it does not")
+    assert warning.endswith("check whether the source loses track, and record again")
 
 
 def test_the_result_with_null_poses_is_the_truth_and_says_their_number(tmp_path, capsys):

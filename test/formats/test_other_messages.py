@@ -267,4 +267,4 @@ def test_calibrate_takes_fields_and_two_topics(bag, tmp_path, capsys):
     with PoseBag(bag) as opened:
         assert {"/twist", "/geo", "/px4", "/array"} <= opened.topics.keys()
     assert main(["calibrate", str(bag), "--child-fields", fields]) == 2
-    assert "give --child-topic as well" in capsys.readouterr().err
+    assert "--child-fields needs --child-topic" in capsys.readouterr().err

@@ -186,7 +186,7 @@ def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag):
     assert out.startswith("USE WITH CARE: all but z; measure z by hand\n")
     command = next(line for line in out.splitlines() if "static_transform_publisher" in line)
     assert " --z MEASURE_Z_BY_HAND --qx " in command
-    assert "\nTo publish it (USE WITH CARE, once you have put in MEASURE_Z_BY_HAND)\n" in out
+    assert "\nTo publish it (USE WITH CARE, after you have replaced MEASURE_Z_BY_HAND)\n" in out
     (step,) = re.findall(r"^  hand_eye_calib (replay .*)$", out, flags=re.MULTILINE)
     again = step.replace("VALUE+/-SIGMA", "0.1±0.01")
     code, out, err = run(*shlex.split(again))
@@ -283,7 +283,7 @@ def test_a_misspelt_name_is_answered_with_a_similar_one(refused, new_bag, tmp_pa
 def test_a_file_that_is_given_twice_is_refused(run, command):
     code, out, err = run(*command, "camera.tum", "camera.tum")
     assert (code, out) == (2, "")
-    assert "error: camera.tum is given twice: give the file of each sensor" in err
+    assert "error: camera.tum appears twice: pass the file of each sensor" in err
 
 
 def test_nan_is_left_out_and_counted_by_topic(run, new_bag):
@@ -361,8 +361,8 @@ def parsed(options):
     ("arguments", "message"),
     [
         (["fly"], "invalid choice: 'fly'"),
-        (["calibrate", str(ROOT / "README.md")], "is one trajectory file: give those of two"),
-        (["calibrate", "a.tum", "b.mcap"], "b.mcap is a bag, but not all of the others are"),
+        (["calibrate", str(ROOT / "README.md")], "is one trajectory file: pass those of two"),
+        (["calibrate", "a.tum", "b.mcap"], "b.mcap is a bag, and another path is not"),
         (["check", "a.mcap", "b.mcap"], "expected one bag or two trajectory files"),
         (["replay", "bag", "--methd", "dnl"], "unknown '--methd'; did you mean --method?"),
         (["replay", "bag", "--threshold", "-1"], "--threshold: must be at least 1e-12 m^2; got -1"),
@@ -428,7 +428,7 @@ def test_the_config_file_of_the_package_holds_the_defaults(config_file, capsys):
         ("{methd: dnl}", r"config\.yaml: unknown option 'methd'; did you mean method\?; known"),
         ("{threshold: -1.0}", r"config\.yaml: 'threshold' must be at least"),
         ("[1, 2]", r"config\.yaml: expected a mapping of options to values; found list"),
-        ("/slam: {ros__parameters: {a: 1}}", "named calibrator; found some for /slam"),
+        ("/slam: {ros__parameters: {a: 1}}", "named calibrator; the file has those of /slam"),
         ("/calibrator: {ros__parameters: [1]}", "unknown option '/calibrator.ros__parameters'"),
         ("reference: B" + "9" * 3000, "reference"),
         ("max_gap: 2024-13-45", "max_gap"),

@@ -85,7 +85,7 @@ def test_what_does_not_go_with_a_journal(run, tmp_path):
     write_session(tmp_path, {})
     code, out, err = run(tmp_path, *STREAMS)
     assert (code, out) == (2, "")
-    assert "is the journal of a session, which has two streams; it cannot be combined" in err
+    assert "has two streams; omit the options for topics" in err
     (tmp_path / "parent.tum").write_text('# {"options": [1]}')
     code, out, err = run(tmp_path)
     assert (code, out) == (1, "")
@@ -146,7 +146,7 @@ def test_parts_that_continue_each_other_are_one_recording_in_any_order(run, bag,
 
 @pytest.mark.parametrize(
     ("later_s", "reason"),
-    [(0.03, "both are of the same 9.9 s"), (3600, "there is a pause of 3590 s between them")],
+    [(0.03, "both cover the same 9.9 s"), (3600, "there is a pause of 3590 s between them")],
 )
 @pytest.mark.usefixtures("no_processes")
 def test_recordings_are_not_joined_but_give_one_result(run, tmp_path, later_s, reason):

@@ -186,7 +186,7 @@ def test_what_is_unobservable_is_said_first_with_what_to_do(planar):
     assert "USE WITH CARE All but z; measure z by hand" in verdict
     assert "z cannot be determined from this motion" in verdict
     assert re.search(r"Motion: .*z cannot be determined", verdict)
-    assert "To publish it (USE WITH CARE, once you have put in MEASURE_Z_BY_HAND)" in page.text
+    assert "To publish it (USE WITH CARE, after you have replaced MEASURE_Z_BY_HAND)" in page.text
     assert "--z MEASURE_Z_BY_HAND --qx" in page.text
     assert "z: unknown, unobservable" in {a.get("aria-label") for a in page.all("div")}
 

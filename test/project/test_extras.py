@@ -50,7 +50,7 @@ NEEDING = {
         ["calibrate", *SAMPLE, "--child-measures", "rotations"],
         "unknown kind of streams 'rotations'",
     ),
-    "rig": (["calibrate", *SAMPLE, SAMPLE[0]], "expected the trajectory files of two sensors"),
+    "rig": (["calibrate", *SAMPLE, "sample:truth.tum"], "expected the trajectory files of two sensors"),
     "sensors": (
         ["calibrate", SAMPLE[0], ".", "--target", "charuco:5x7:0.04:0.03", "--camera", "c.yaml"],
         "unknown reader of images of a target 'folder'",
@@ -210,4 +210,6 @@ def test_a_new_kind_of_data_is_a_folder_and_a_line(tmp_path):
     both = "the parent measures poses, the child flat"
     assert method == f"method dnl needs poses of both sensors; {both}"
     assert prior == f"prior_z 1.0+/-0.1 needs poses of both sensors; {both}"
-    assert other.startswith("these streams have no result in common; the parent measures rates")
+    assert other.startswith(
+        "these kinds of streams cannot be calibrated together; the parent measures rates"
+    )

@@ -70,7 +70,7 @@ def require_backend(method: str, backend: str) -> None:
     if backend not in METHODS[method].backends:
         able = [name for name, record in METHODS.items() if backend in record.backends]
         raise ConfigError(
-            f"method {method} has no {backend} backend; only {' and '.join(able)} have"
+            f"method {method} has no backend {backend}; methods with it: {' and '.join(able)}"
         )
 
 
@@ -315,7 +315,7 @@ class CalibratorConfig(OptionSet):
         reasons = [measure.needs_poses for measure in partial if measure.needs_poses]
         if len(kinds) == 1 and not (reasons and len(partial) == 2):
             return kinds.pop()
-        reason = reasons[0] if reasons else "these streams have no result in common"
+        reason = reasons[0] if reasons else "these kinds of streams cannot be calibrated together"
         raise ConfigError(
             f"{reason}; the parent measures {self.parent_measures}, the child {self.child_measures}"
         )

@@ -74,7 +74,7 @@ def from_plain(kind: Any, value: Any, **names: type) -> Any:
         return {key: from_plain(args[1], each) for key, each in _of_type(Mapping, value).items()}
     if get_origin(kind) is tuple:
         if isinstance(value, str):
-            raise TypeError("a list is a text")
+            raise TypeError("found a text in place of a list")
         return tuple(from_plain(args[0], each) for each in _of_type(Sequence, value))
     if get_origin(kind) in (np.ndarray, NDArray):  # which is an alias from NumPy 2.5 on
         return _of_type(np.ndarray, value)

@@ -145,7 +145,7 @@ def without_poses(n_null: int, n_all: int) -> str:
     counts = f"{n_null:,} of {n_all:,} poses ({share(n_null / n_all)}) were left out"
     text = f"{counts}: their quaternion is 0, or a value is not finite or absent"
     if n_null > MUCH_NULL * n_all:
-        text += ". So many: does the source lose track? Record again where it does not"
+        text += ". This is a large share: check whether the source loses track, and record again"
     return text
 
 
@@ -294,7 +294,9 @@ def parse_targets(name: str, text: str) -> dict[str, float]:
             )
         (targets[axis],) = quantities(f"{name}: {axis}", [AXIS_UNITS[axis]], [value], "TARGET", 0.0)
         if AXIS_UNITS[axis] == "rad" and targets[axis] > math.pi:
-            raise ConfigError(f"{name} is in rad without a unit; write {axis}={value}deg")
+            raise ConfigError(
+                f"{name} is in rad without a unit; for degrees write {axis}={value}deg"
+            )
     return targets
 
 
@@ -317,7 +319,8 @@ def quantities(
             raise ConfigError(f"{name} needs a standard deviation above 0; got {shown_value(word)}")
         if unit == "rad" and not match[2] and abs(value) > 2 * math.pi:
             raise ConfigError(
-                f"{name} is in radians unless it says deg; got {word[:20]}: write {word[:20]}deg"
+                f"{name} is in radians without a unit; got {word[:20]}: write "
+                f"{word[:20]}deg for degrees"
             )
         found.append(value)
     return found

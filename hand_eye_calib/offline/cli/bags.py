@@ -72,8 +72,7 @@ def read_recording(
         return _read_bags(paths, wanted, CalibratorConfig.from_options(dict(options)))
     if wanted:
         raise ConfigError(
-            f"{journal} is the journal of a session, which has two streams; it cannot be combined "
-            "with topics, frames or stamps"
+            f"the journal {journal} has two streams; omit the options for topics, frames and stamps"
         )
     return read_journal_of(journal, options)
 
@@ -87,8 +86,8 @@ def select(
     parent, child = bag.select(named.get("parent"), named.get("child"), frames)
     if len(named) < len(STREAMS):
         note(
-            f"parent is {parent}, child is {child}; to change that, give --parent-topic and "
-            "--child-topic"
+            f"parent is {parent}, child is {child}; to change this, set "
+            "--parent-topic and --child-topic"
         )
     measures = {
         "parent": bag.measured(parent, config.parent_measures),
@@ -226,7 +225,7 @@ class _Part(NamedTuple):
         reason = f"there is a pause of {pause_s:.0f} s between them"
         if pause_s < 0:
             until_ns = min(latest.end_ns, self.end_ns)
-            reason = f"both are of the same {(until_ns - self.begin_ns) * 1e-9:.1f} s"
+            reason = f"both cover the same {(until_ns - self.begin_ns) * 1e-9:.1f} s"
         return f"{latest.path} and {self.path} are two recordings, not parts of one: {reason}"
 
 

@@ -71,12 +71,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(parser=parser)
     options.add_input_arguments(
         parser,
-        "trajectory files of parent and child, and of more sensors; or a rosbag2 directory, .mcap, "
-        ".db3 or .bag file, or the URL of one, as s3://..., of which several are the parts of one "
-        "recording; or the journal of a node's session, or the output directory that holds it",
+        "trajectory files of the parent, the child and further sensors; or "
+        "bags, the parts of one recording: a rosbag2 directory, a .mcap, "
+        ".db3 or .bag file, or a URL such as s3://...; or the journal of a "
+        "node's session, or its output directory",
     )
     add = parser.add_argument
-    listing = "show the bag's topics with types, counts, rates and frames, and exit"
+    listing = "print the bag's topics with types, counts, rates and frames, and exit"
     add("--list", action="store_true", help=listing)
     options.add_config_arguments(parser)
     group = parser.add_argument_group("output")
@@ -92,7 +93,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="extend",
         default=[],
         type=_label,
-        help="what the report and the files say of the recording, such as vehicle=7 operator=Kim",
+        help="labels of the recording for the report and the files, such as vehicle=7 operator=Kim",
     )
     options.add_json_argument(group, or_verbose=True)
     for route in ROUTES.values():
@@ -116,8 +117,8 @@ def _add_installed(parser: argparse.ArgumentParser) -> None:
     )
     add("--installed", metavar="SOURCE", help=installed)
     base_frame = (
-        "state the child's pose in this frame too, as the URDF of --installed or the bag's "
-        "/tf_static has it"
+        "also print the child's pose in this frame, from the URDF of "
+        "--installed or the bag's /tf_static"
     )
     add("--base-frame", metavar="FRAME", help=base_frame)
 
@@ -223,7 +224,7 @@ def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         ]
         lines.append(_ROW.format(*cells).rstrip())
     lines.append(
-        "--parent-topic and --child-topic take the topics with poses, or frames of /tf: odom:lidar"
+        "--parent-topic and --child-topic accept a topic with poses, or frames of /tf: odom:lidar"
     )
     print_result(lines, document if arguments.json else None)
     return 0

@@ -144,14 +144,14 @@ def _verdict(findings: "Sequence[Finding]") -> str:
 
     serious = [finding for finding in findings if finding.severity.value != "note"]
     if not serious:
-        return f"{Verdict.USE.value}: nothing speaks against calibrating with these streams."
+        return f"{Verdict.USE.value}: no fault found in these streams."
     errors = [finding for finding in serious if finding.makes_unusable]
     verdict = Verdict.DO_NOT_USE if errors else Verdict.USE_WITH_CARE
     if all(finding.options for finding in serious):
         typed = " ".join(typed_options(finding.options.items()) for finding in serious)
-        return f"{verdict.value}: not as they are; calibrate with {typed}."
+        return f"{verdict.value}: the streams need a repair; calibrate with {typed}."
     codes = ", ".join(finding.code for finding in errors or serious)
-    return f"{verdict.value}: look at the findings first ({codes})."
+    return f"{verdict.value}: check these findings first: {codes}."
 
 
 def _table(findings: "Sequence[Finding]") -> Iterator[str]:

@@ -13,7 +13,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "examples:\n  hand_eye_calib info result\n  hand_eye_calib info result --json\n"
         "  hand_eye_calib info result --as kalibr > camchain-imucam.yaml"
     )
-    result = "extrinsic.yaml, or the directory that holds it"
+    result = "extrinsic.yaml, or the directory that contains it"
     parser.add_argument("result", metavar="RESULT", help=result)
     formats = f"print it as the file of another program instead: {', '.join(EXPORT_FORMATS)}"
     parser.add_argument(

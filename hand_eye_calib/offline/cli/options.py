@@ -40,10 +40,11 @@ _COMMON = ("method", "reference", "time_offset", "scale", "parent_frame", "child
 FILE_OPTIONS: dict[str, dict[str, Any]] = {
     "format": {
         "choices": config.TRAJECTORY_FORMATS,
-        "help": "tum: t x y z qx qy qz qw; kitti: 12 numbers, with --times; euroc: ns, qw first; "
-        "csv: columns by the names in the header, or with --columns: positions as x y z or lat lon "
-        "height, orientations as quaternion, roll pitch yaw or heading. Default: what the file "
-        "looks like",
+        "help": "tum: t x y z qx qy qz qw; kitti: 12 numbers, with --times; "
+        "euroc: ns, qw first; csv: columns by the names in the "
+        "header, or with --columns: positions as x y z or lat lon "
+        "height, orientations as quaternion, roll pitch yaw or "
+        "heading. Default: recognised from the content",
     },
     "columns": {
         "metavar": "NAMES",
@@ -249,8 +250,9 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     add = group.add_argument
     metavar = "AXIS=VALUE+/-SIGMA"
     prior = (
-        "what is known of an axis beforehand, such as z=1.85+/-0.02 (m) or yaw=-90deg+/-2deg; AXIS "
-        f"is one of {_AXES}; may be repeated"
+        "value of an axis from another measurement, with its standard "
+        "deviation, such as z=1.85+/-0.02 (m) or yaw=-90deg+/-2deg; AXIS is "
+        f"one of {_AXES}; may be repeated"
     )
     add("--prior", metavar=metavar, dest="options", action="append", type=_prior, help=prior)
     file = "YAML file with these options by name, or a ROS parameter file"
@@ -329,7 +331,7 @@ def _read_config(path: Path) -> Options:
     if other_nodes and not (options or ignored):
         nodes = ", ".join(dict.fromkeys(other_nodes))
         raise ConfigError(
-            f"{path}: no parameters for a node named calibrator; found some for {nodes}"
+            f"{path}: no parameters of a node named calibrator; the file has those of {nodes}"
         )
     if ignored:
         note(f"{path}: only the node uses {', '.join(ignored)}; ignored here")
@@ -353,30 +355,32 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
     parser.add_argument("paths", metavar="PATH", nargs="*", type=_path, help=help_of_paths)
     group = parser.add_argument_group(
         "pose streams of a bag",
-        "Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped or Path; may be left "
-        "out if the bag has only two",
+        "Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped "
+        "or Path; may be omitted if the bag has only two",
     )
     for stream in STREAMS:
         topic = (
-            f"poses of the {stream} sensor, of any type; FIX+IMU of two topics; or from /tf and "
-            "/tf_static: fixed frame and the sensor's, as odom:lidar"
+            f"topic with poses of the {stream} sensor; FIX+IMU for two "
+            "topics; or two frames of /tf and /tf_static as WORLD:SENSOR, "
+            "such as odom:lidar"
         )
         group.add_argument(f"--{stream}-topic", metavar="TOPIC", help=topic)
         fields = (
-            f"where the poses are in messages of any type on --{stream}-topic: "
-            "t=header.stamp,x=pose.position.x,..."
+            "fields of the poses in messages of any type on "
+            f"--{stream}-topic: t=header.stamp,x=pose.position.x,..."
         )
         group.add_argument(f"--{stream}-fields", metavar="NAME=PATH,...", help=fields)
     help_of_stamps = (
-        "stamps of the poses: of their headers, or the times at which the recorder received them, "
-        "for headers without. Default: header"
+        "origin of the stamps: the header, or the time at which the recorder "
+        "received the message. Default: header"
     )
     group.add_argument("--stamps", choices=STAMPS, help=help_of_stamps)
     for stream in STREAMS:
         same = f"the same for the {stream} only"
         group.add_argument(f"--{stream}-stamps", choices=STAMPS, help=same)
     group = parser.add_argument_group(
-        "trajectory files", "each also as --parent-... and --child-... for one of the two files"
+        "trajectory files",
+        "each option also exists as --parent-... and --child-... for one of the two files",
     )
     for name, settings in FILE_OPTIONS.items():
         group.add_argument(f"--{flag(name)}", dest=name, **settings)
@@ -384,8 +388,8 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
             for_stream = settings | {"help": f"the same for {stream.upper()} only"}
             group.add_argument(f"--{stream}-{flag(name)}", dest=f"{stream}_{name}", **for_stream)
     pair_by = (
-        "time: by the stamps; row: poses without stamps, in their order; name: poses of images of "
-        "the same name. For both files"
+        "pairing of the poses of both files: time, by their stamps; row, by "
+        "their order, without stamps; name, by the names of their images"
     )
     group.add_argument("--pair-by", choices=config.PAIR_BY, help=pair_by)
 
@@ -404,7 +408,7 @@ def sources_from(arguments: argparse.Namespace) -> dict[str, str]:
         topic = getattr(arguments, f"{stream}_topic")
         fields = getattr(arguments, f"{stream}_fields")
         if fields and not topic:
-            raise ConfigError(f"--{stream}-fields is for messages; give --{stream}-topic as well")
+            raise ConfigError(f"--{stream}-fields needs --{stream}-topic")
         if stream == "child" and topic and getattr(arguments, "target", None):
             fields = "@".join(map(str, filter(None, [arguments.target, arguments.camera])))
         sources[stream] = f"{topic}?{fields}" if fields else topic
@@ -416,9 +420,7 @@ def refuse_stamps(arguments: argparse.Namespace) -> None:
     """Raise a ConfigError if an option about the stamps of bags is set for trajectory files."""
     for name in ("stamps", *(f"{stream}_stamps" for stream in STREAMS)):
         if getattr(arguments, name, None):
-            raise ConfigError(
-                f"--{flag(name)} is for bags; trajectory files have one kind of stamps"
-            )
+            raise ConfigError(f"--{flag(name)} applies to bags only; omit it for trajectory files")
 
 
 def add_json_argument(parser: argparse._ActionsContainer, or_verbose: bool = False) -> None:
@@ -426,7 +428,7 @@ def add_json_argument(parser: argparse._ActionsContainer, or_verbose: bool = Fal
     text = "print one JSON document on stdout instead of text"
     parser.add_argument("--json", action="store_true", help=text)
     if or_verbose:
-        text = "print details of the solution, too"
+        text = "also print details of the solution"
         parser.add_argument("-v", "--verbose", action="store_true", help=text)
 
 

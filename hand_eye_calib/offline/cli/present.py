@@ -141,14 +141,14 @@ def as_lines(
         by_hand = [
             number for number in usable_numbers(calibration).values() if isinstance(number, str)
         ]
-        condition = f", once you have put in {listing(by_hand)}" if by_hand else ""
+        condition = f", after you have replaced {listing(by_hand)}" if by_hand else ""
         lines += [f"To publish it ({calibration.verdict.value}{condition})", f"  {command}"]
     details = []
     for name, value in calibration.parts.items():
         details += part(name).details(value, calibration)
     if comparison := calibration.comparison:
         details.append(
-            f"compared with what is installed ({comparison.installed}): {comparison.sentence}"
+            f"compared with the installed transform ({comparison.installed}): {comparison.sentence}"
         )
     if with_details:
         details += [f"{name}: {value}" for name, value in summary(calibration).items()]

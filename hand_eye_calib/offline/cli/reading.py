@@ -78,7 +78,7 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
     """
     for path, count in Counter(map(str, paths)).items():
         if count > 1:
-            raise ConfigError(f"{path} is given twice: give the file of each sensor")
+            raise ConfigError(f"{path} appears twice: pass the file of each sensor")
     bags = [path for path in paths if isinstance(path, str)]
     local_bags = [path for path in paths if isinstance(path, Path) and _looks_like_bag(path)]
     n_bags = len(bags) + len(local_bags)
@@ -87,17 +87,17 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
     for folder in local_bags:
         if folder.is_dir() and not any(map(_looks_like_file_of_bag, folder.iterdir())):
             raise ConfigError(
-                f"{folder} is a folder without a bag: give a trajectory file of each sensor, or a "
-                "bag"
+                f"{folder} is a folder without a bag: pass a trajectory file "
+                "of each sensor, or a bag"
             )
     if n_bags:
         raise ConfigError(
-            f"{[*bags, *local_bags][0]} is a bag, but not all of the others are: give two "
-            "trajectory files, or the parts of one bag"
+            f"{[*bags, *local_bags][0]} is a bag, and another path is not: "
+            "pass two trajectory files, or the parts of one bag"
         )
     if len(paths) == 1:
         raise ConfigError(
-            f"{paths[0]} is one trajectory file: give those of two sensors, PARENT CHILD, or a bag"
+            f"{paths[0]} is one trajectory file: pass those of two sensors, PARENT CHILD, or a bag"
         )
     return False
 
@@ -157,7 +157,9 @@ def read_files(arguments: Namespace, paths: Sequence[Path | str], options: Optio
     streams = STREAMS[: len(paths)] if len(paths) < 3 else [""] * len(paths)
     for name in (f"{stream}_{name}" for stream in STREAMS for name in FILE_OPTIONS):
         if len(paths) > 2 and getattr(arguments, name):
-            raise ConfigError(f"--{flag(name)} is of two files; give it for all of a rig's")
+            raise ConfigError(
+                f"--{flag(name)} is for two files; a rig needs the option for all files"
+            )
     files = []
     for path, stream in zip(paths, streams, strict=True):
         settings: dict[str, Any] = {"format": "auto"}
