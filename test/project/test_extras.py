@@ -50,7 +50,7 @@ NEEDING = {
         ["calibrate", *SAMPLE, "--child-measures", "rotations"],
         "unknown kind of streams 'rotations'",
     ),
-    "rig": (["calibrate", *SAMPLE, "sample:truth.tum"], "expected the trajectory files of two sensors"),
+    "rig": (["calibrate", *SAMPLE, "sample:truth.tum"], "the trajectory files of two sensors"),
     "sensors": (
         ["calibrate", SAMPLE[0], ".", "--target", "charuco:5x7:0.04:0.03", "--camera", "c.yaml"],
         "unknown reader of images of a target 'folder'",
