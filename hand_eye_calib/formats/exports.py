@@ -159,8 +159,9 @@ def export_text(result: Judged, name: str) -> str:
         T = result.mounting[1]
     if unknown := [axis for axis in result.unobservable() if axis in layout.axes]:
         raise InputError(
-            f"nothing is written: this recording does not determine {axes_in_words(unknown)}; "
-            "measure it by hand and calibrate again with --prior"
+            "no file is written: this recording does not determine "
+            f"{axes_in_words(unknown)}; measure it by hand and calibrate "
+            "again with --prior"
         )
     target, source = frames
     offset_s = result.time_offset_s
@@ -197,7 +198,7 @@ def _delay_of_px4(delay_ms: float) -> str:
     """Return the line that sets a delay in PX4, or a comment if PX4 does not accept the delay."""
     if 0 <= delay_ms <= _LONGEST_DELAY_MS:
         return f"param set EKF2_EV_DELAY {_number(round(delay_ms, 3))}"
-    return f"# EKF2_EV_DELAY would be {delay_ms:.1f} ms; PX4 takes 0 to 300 ms"
+    return f"# EKF2_EV_DELAY would be {delay_ms:.1f} ms; PX4 accepts 0 to 300 ms"
 
 
 def _remarks(
@@ -218,7 +219,7 @@ def _remarks(
     if not arrangement.is_certain:
         kinds = ((target, layout.target), (source, layout.source))
         assumed = ", ".join(f"{frame} is the {kind}" for frame, kind in kinds if kind)
-        lines.append(f"Assumed, because the names of the frames do not say it: {assumed}.")
+        lines.append(f"Assumed, because the names of the frames do not contain it: {assumed}.")
     if layout.axes_note:
         lines.append(layout.axes_note % {"target": target, "source": source})
     return lines

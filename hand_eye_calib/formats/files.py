@@ -130,7 +130,9 @@ def open_regular(path: str | Path) -> BufferedReader:
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         return file
     file.close()
-    raise InputError(f"cannot read {path}: it is not a regular file; save its content to one first")
+    raise InputError(
+        f"cannot read {path}: it is not a regular file; save its content to a file first"
+    )
 
 
 def read_bytes(path: str | Path, largest: int = LARGEST) -> bytes:
@@ -173,7 +175,9 @@ def writing(path: str | Path) -> Iterator[None]:
         yield
     except OSError as error:
         name = error.filename or path
-        raise InputError(f"cannot write {name}: {error.strerror}; choose another place") from None
+        raise InputError(
+            f"cannot write {name}: {error.strerror}; choose another directory"
+        ) from None
 
 
 def write_atomically(contents: Mapping[Path, str | bytes]) -> None:

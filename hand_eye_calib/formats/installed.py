@@ -64,8 +64,8 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
             values = parse_pose("installed", text)
         except ConfigError as error:
             raise ConfigError(
-                "what is installed must be a file that exists (URDF, extrinsic.yaml, bag) or six "
-                f"numbers in m and rad: {error}"
+                "the installed transform must be an existing file (URDF, "
+                f"extrinsic.yaml, bag) or six numbers in m and rad: {error}"
             ) from None
         T = se3.from_rotation_translation(se3.rotation_from_rpy(values[3:]), values[:3])
         return lambda parent_frame, child_frame: Extrinsic(T, text)
@@ -113,8 +113,8 @@ def _of_result(result: Calibration, path: Path, parent_frame: str, child_frame: 
         result = result.inverse()
     elif (result_parent, result_child) != wanted:
         raise InputError(
-            f"{path}: is about {result_child} in {result_parent}; expected {child_frame} in "
-            f"{parent_frame}"
+            f"{path}: contains {result_child} in {result_parent}; expected "
+            f"{child_frame} in {parent_frame}"
         )
     return Extrinsic(
         result.T_parent_child, str(path), result.covariance_measured, is_calibration=True
@@ -217,8 +217,8 @@ def _of_sensors(
         extrinsics = [(names, values) for names, values in extrinsics if names]
     if len(extrinsics) != 1:
         raise InputError(
-            "it has several extrinsics, and the names of the frames do not say which is meant "
-            f"({' or '.join(sorted(frames))}); delete the others"
+            "it has several extrinsics, and the names of the frames do not "
+            f"select one ({' or '.join(sorted(frames))}); delete the others"
         )
     return extrinsics[0]
 
@@ -254,7 +254,7 @@ def read_urdf(path: str | Path) -> FrameTree:
 
 def _frames(data: bytes) -> FrameTree:
     if b"<xacro:" in data:
-        raise InputError("has xacro macros; give the URDF that xacro makes of it")
+        raise InputError("has xacro macros; pass the URDF that xacro makes from it")
     try:
         root = ElementTree.fromstring(data)
     except (ElementTree.ParseError, LookupError, ValueError) as error:

@@ -271,7 +271,7 @@ def keep_aside(directory: str | Path) -> Path:
             shutil.rmtree(aside)
         if not os.path.lexists(aside):
             return directory.replace(aside)
-    raise OSError(f"{aside} and those before it are no session journals; move them away")
+    raise OSError(f"{aside} and earlier ones are no session journals; move them away")
 
 
 def _is_journal(directory: Path) -> bool:

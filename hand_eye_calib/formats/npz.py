@@ -65,4 +65,4 @@ def _check_array_size(member: IO[bytes], size: int) -> None:
         raise ValueError(f"an array of format version {version}")
     shape, _, dtype = read_header(member)
     if math.prod(shape) * dtype.itemsize > size:
-        raise ValueError("an array is cut off")
+        raise ValueError("an array is truncated")

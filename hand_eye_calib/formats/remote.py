@@ -141,12 +141,12 @@ def _reached(url: str) -> Iterator[tuple[Any, str]]:
     except ImportError as error:
         raise MissingDependencyError(
             f"{public(url)} needs a package that is not installed: {error}; "
-            f"{installing('fleet')}, and that of the store"
+            f"{installing('fleet')}, and the package of the store"
         ) from None
     except HandEyeCalibError as error:
         raise InputError(f"cannot read {public(url)}: {error}") from None
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(".:")
         raise InputError(
-            f"cannot read {public(url)}: {reason}; check the address and the permission to read it"
+            f"cannot read {public(url)}: {reason}; check the address and the read permission"
         ) from error

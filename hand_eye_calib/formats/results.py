@@ -188,7 +188,7 @@ def keep_earlier_results(directory: str | Path) -> str:
         for copy in copies:
             _keep_foreign(copy)
         write_atomically(copies)
-    return f"; the files that were there are in {previous}"
+    return f"; the earlier files are in {previous}"
 
 
 def fingerprint(path: str | Path) -> dict[str, str | int]:
@@ -272,8 +272,8 @@ def _remarks(calibration: Calibration) -> list[str]:
         calibration.headline,
         *(f"{reason.sentence}: {reason.what_to_do}" for reason in calibration.reasons),
         f"Pose of {child} in {parent}: maps coordinates of {child} into {parent}.",
-        f"Made by hand_eye_calib {version_of()}; {FILE_NAME} beside this file has the "
-        "covariance and where it came from.",
+        f"Made by hand_eye_calib {version_of()}; {FILE_NAME} beside this file "
+        "contains the covariance and the origin.",
     ]
     return [printable(" ".join(remark.split())) for remark in remarks]
 

@@ -132,8 +132,11 @@ class TfStream:
         except InputError as error:
             return str(error)
         if all(self._tree.edges[frame].is_static for frame in up + down):
-            return f"it does not move: all of its transforms are static; {self._tree.listing()}"
-        return "its transforms do not come at the same times"
+            return (
+                "it does not move, because all of its transforms are static; "
+                f"{self._tree.listing()}"
+            )
+        return "its transforms have no common time"
 
     def _find_chain(self) -> None:
         self._slowest = ""

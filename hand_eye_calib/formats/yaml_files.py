@@ -94,7 +94,7 @@ def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
     # A loader raises errors of many kinds for values that do not fit their tags.
     except Exception as error:
         reason = shortened(" ".join(str(error).split()), LONGEST_NAME // 2) or type(error).__name__
-        raise InputError(f"{path} is not YAML that can be read: {reason}") from None
+        raise InputError(f"{path} is not readable YAML: {reason}") from None
 
 
 def yaml_text(document: Any) -> str:
@@ -112,5 +112,5 @@ def _check_events(text: str) -> None:
             raise ValueError(f"it is nested more than {DEEPEST_YAML} levels deep")
         if isinstance(event, yaml.AliasEvent):
             raise ValueError(
-                f"aliases are not read: write out the value of {str(event.anchor)[:40]!r}"
+                f"aliases are not supported: write the value of {str(event.anchor)[:40]!r}"
             )

@@ -193,7 +193,7 @@ def test_the_images_of_a_bag_are_poses_of_the_camera(tmp_path, capsys, no_figure
         of_file = f"/eye/image_raw/compressed?{board}@{tmp_path / 'camera.yaml'}"
         np.testing.assert_array_equal(opened.trajectory(of_file)[0].poses, found.poses)
         for topic, said in (
-            ("/eye/image_raw", "name what images show"),
+            ("/eye/image_raw", "name the target in the images"),
             (f"/hand?{board}", "has no images"),
         ):
             with pytest.raises(InputError, match=said):

@@ -113,7 +113,7 @@ def test_two_pose_topics_leave_no_choice(new_bag, named, selected):
     ("named", "message"),
     [
         (("/odom", "/b"), "no topic /odom in "),
-        (("/a", "/log"), r"/log of .* is of type std_msgs/msg/String, which is not read"),
+        (("/a", "/log"), r"/log of .* has type std_msgs/msg/String, which cannot be read"),
         (("/a", "/a"), "parent and child topic are both /a"),
     ],
 )
@@ -134,7 +134,7 @@ def test_a_wrong_topic_is_answered_with_those_that_are_there(tmp_path, named, me
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_without_names_there_must_be_exactly_two_pose_topics(new_bag, count):
     path = new_bag(streams={f"/odom_{number}": STREAMS["/a"] for number in range(count)})
-    message = "name the topics of poses with --parent-topic and --child-topic"
+    message = "set --parent-topic and --child-topic to topics with poses"
     with PoseBag(path) as bag, pytest.raises(InputError, match=message):
         bag.select()
 
@@ -155,7 +155,7 @@ def test_several_publishers_and_types_on_one_topic(tmp_path):
     assert sum(pose.stream == "parent" for pose in poses) == len(PARENT) + 1
     with (
         PoseBag(tmp_path / "two.bag") as bag,
-        pytest.raises(InputError, match="topic /a of .* is of type several types"),
+        pytest.raises(InputError, match="topic /a of .* has type several types"),
     ):
         bag.select("/a", "/b")
 
@@ -201,7 +201,7 @@ def test_a_chain_of_moving_and_static_transforms(tmp_path, storage):
     backwards = hec.read_trajectory(path, topic="lidar:odom")
     assert_same_motion(backwards, PARENT.stamps_ns, se3.inverse(PARENT.poses @ MOUNT))
     said = (
-        r"transform lidar:rear: it does not move: all of its transforms are static; it has "
+        r"transform lidar:rear: it does not move, because all of its transforms are static; it has "
         r"base:lidar \(static\), base:rear \(static\), map:odom"
     )
     with pytest.raises(InputError, match=said):

@@ -198,7 +198,9 @@ def test_an_axis_that_is_not_known_is_refused():
 
 def test_what_the_names_do_not_say_is_assumed_and_said():
     text = result("a", "b").export("fast_lio")
-    said = "Assumed, because the names of the frames do not say it: a is the imu, b is the lidar."
+    said = (
+        "Assumed, because the names of the frames do not contain it: a is the imu, b is the lidar."
+    )
     assert said in text
     for frame in ("CAM_FRONT", "frontCamera", "camera_base_link"):
         assert role_of(frame) == "camera"

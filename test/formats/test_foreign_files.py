@@ -190,7 +190,7 @@ FORMATS = {
     "seconds_and_nanoseconds": (of_rows(f"#sec,nsec,{POSE}", *divmod(STAMPS, 10**9), P, Q), ""),
     "units_below": (of_rows(UNITS, STAMPS, P * 1e3, WXYZ), ""),
     "order_in_words": (of_rows("# as: t x y z qw qx qy qz\n", SECONDS, P, WXYZ, separator=" "), ""),
-    "order_in_a_comment": (of_rows(f"{GNSS_POSES}\n", STAMPS, P, Q), "looks like format csv"),
+    "order_in_a_comment": (of_rows(f"{GNSS_POSES}\n", STAMPS, P, Q), "is read as format csv"),
     "lio_sam": (of_lio_sam(), "read in rad"),
     "iso": (of_rows(f"time,{POSE}", DATES, P, Q), ""),
     "decimal_comma": (of_rows(f"t,{POSE}", SECONDS, P, Q).replace(",", ";").replace(".", ","), ""),
@@ -202,12 +202,12 @@ FORMATS = {
     "stamp_of_the_header": (of_rows(HEADER, SECONDS + 0.1, SECONDS, P, Q), ""),
     "ulog2csv": (of_rows(ULOG2CSV, STAMPS // 1000, P, WXYZ), ""),
     "okvis": (of_rows(OKVIS, STAMPS, P, Q, P[:, :1], separator=", "), ""),
-    "euroc_names": (of_rows(EUROC, STAMPS, P, WXYZ), "looks like format csv"),
+    "euroc_names": (of_rows(EUROC, STAMPS, P, WXYZ), "is read as format csv"),
     "rot": (of_rows(ROT, STAMPS, P, WXYZ), ""),
     "euroc_scalar_last": (of_rows("", STAMPS, P, Q), "the scalar last, t x y z qx qy qz qw"),
-    "euroc": (of_rows("", STAMPS, P, WXYZ, P, separator=", "), "looks like format euroc"),
+    "euroc": (of_rows("", STAMPS, P, WXYZ, P, separator=", "), "is read as format euroc"),
     "kitti": (of_rows("", MATRICES[:, :12], separator=" "), "stamps read from"),
-    "stamp_and_rows": (of_rows("", STAMPS, MATRICES[:, :12]), "looks like format csv"),
+    "stamp_and_rows": (of_rows("", STAMPS, MATRICES[:, :12]), "is read as format csv"),
     "stamp_and_matrix": (of_rows("", SECONDS, MATRICES, separator=" "), ""),
     "echo": (of_echo(), ""),
     "echo_of_poses": (of_echo("map"), ""),
@@ -283,7 +283,7 @@ def test_poses_without_stamps_are_paired_by_row_or_by_the_names_of_images(tmp_pa
         assert "the poses have no stamps" in capsys.readouterr().err
     mixed = ["calibrate", str(tmp_path / "a.json"), str(tmp_path / "b.json"), "--pair-by", "row"]
     assert main(mixed) == 1
-    assert "files need as many poses each; found [40, 35]" in capsys.readouterr().err
+    assert "files with the same number of poses; found [40, 35]" in capsys.readouterr().err
     kitti = ["calibrate", *(str(tmp_path / f"{name}.kitti") for name in "ab"), "--pair-by", "name"]
     assert main(kitti) == 1
     assert "no image has a name that is in all files" in capsys.readouterr().err
@@ -351,7 +351,7 @@ def test_a_log_of_px4(tmp_path, topics):
         (b'{"type": "FeatureCollection"}', "transforms.json of nerfstudio"),
         (b"[1, 2]", "ego_pose.json of nuScenes"),
         (b"2023-11-14T22:13:20Z" + b" 1e999" * 15, "expected 8 numbers, .* found 16"),
-        (b"1e999" + b",1" * 15 + b"\n", "so that their order is unknown; name the 16"),
+        (b"1e999" + b",1" * 15 + b"\n", "so their order is unknown; name the 16"),
         (b"EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 1\n", "a g2o graph without vertices"),
         (b"t,x,y,z,roll,pitch,yaw\n0,1,2,3,0,0,1e200\n", "line 2: found angle 1e.200"),
         (b"source_timestamp,destination_timestamp,x,y,z,yaw\n1,2,0,0,0,0\n", "chain"),

@@ -153,7 +153,7 @@ def test_a_missing_split_is_named_with_its_share(tmp_path, storage, with_counts,
 def test_a_bag_of_which_only_the_metadata_was_copied_names_its_files(tmp_path):
     path, _ = split_bag(tmp_path, "mcap", with_counts=True)
     storage_file(path).unlink()
-    with pytest.raises(InputError, match=r"lists split\.mcap and split_1\.mcap, missing there"):
+    with pytest.raises(InputError, match=r"lists split\.mcap and split_1\.mcap, and no such file"):
         PoseBag(path)
 
 

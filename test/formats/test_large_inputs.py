@@ -57,9 +57,9 @@ def array_file(header):
         (array_file("{'descr': '<f8', 'fortran_order': False, 'shape': (10**12,)}"), "ormed"),
         (
             array_file("{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,)}"),
-            "cut off",
+            "truncated",
         ),
-        (array_file("{'descr': '|O', 'fortran_order': False, 'shape': (1,)}"), "cut off|pickle"),
+        (array_file("{'descr': '|O', 'fortran_order': False, 'shape': (1,)}"), "truncated|pickle"),
         (b"\x93NUMPY\x09\x00", "version"),
         (b"", "magic|EOF"),
     ],

@@ -316,7 +316,7 @@ def edited(**changes):
         (edited(T_parent_child={"matrix": [[1.0, 0.0]]}), "was changed after it was written"),
         (edited(status="splendid"), "was changed after it was written: 'splendid'"),
         (edited(warnings=None), "was changed after it was written"),
-        ("a: [1", "is not YAML"),
+        ("a: [1", "is not readable YAML"),
     ],
 )
 def test_what_is_no_calibration_is_refused_with_the_file(tmp_path, text, message):

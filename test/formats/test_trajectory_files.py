@@ -21,7 +21,7 @@ START_NS = 1_700_000_000_123_456_789
 TRAJECTORY = as_trajectory(wandering_poses(30), start_ns=START_NS)
 POSITIONS = TRAJECTORY.poses[:, :3, 3].tolist()
 QUATS_XYZW = se3.to_quat_xyzw(TRAJECTORY.poses).tolist()
-NO_QUATERNION = "no column for qx, .* or rotvec_x,rotvec_y,rotvec_z for turns"
+NO_QUATERNION = "no column for qx, .* or rotvec_x,rotvec_y,rotvec_z for rotations"
 XYZW = "t,x,y,z,qx,qy,qz,qw"
 WXYZ = "t,x,y,z,qw,qx,qy,qz"
 
@@ -89,14 +89,17 @@ def test_what_is_written_reads_back_to_the_last_bit_of_stamp_and_translation(tmp
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        ([], "no poses in it"),
+        ([], "the file contains no poses"),
         (["0 1 2 3 0 0 0 1 9"], "line 1: expected 8 numbers, .* found 9"),
         ([f"0 {POSE}", "", "1 1 2 3"], "line 3: expected 8 numbers, .* found 4: '1 1 2 3'"),
         (["0 1 2 x 0 0 0 1"], "line 1: expected 8 numbers, .* 'x'"),
         ([f"now {POSE}"], "line 1: .* found 'now' for the timestamp"),
-        ([f"13173756256617361230 {POSE}"], "line 1: .* 1.31738e.19 is too large for ns; name its"),
+        ([f"13173756256617361230 {POSE}"], "line 1: .* 1.31738e.19 is too large for ns; set its"),
         ([f"{t} {POSE}" for t in (0, 33, 66)], "is unclear; read as s, the poses are 33 s apart"),
-        (["0 nan 2 3 0 0 0 1"], "no poses in it: all 1 rows are empty, zero or not finite, the f"),
+        (
+            ["0 nan 2 3 0 0 0 1"],
+            "the file contains no poses: all 1 rows are empty, zero or not finite, the f",
+        ),
         (["# x", f"0 {POSE}", "1 1 2 3 0 0 0 1.1"], "line 3: found a quaternion of length 1.1, ex"),
         ([f"5 {POSE}", "#", f"5.0 {POSE}"], "line 3: timestamps must increase, found 5.0+ after"),
     ],
@@ -130,7 +133,7 @@ def test_kitti_has_its_stamps_in_a_file_of_their_own(file):
     poses = file(lines, "poses.txt")
     times = file([seconds(stamp) for stamp in TRAJECTORY.stamps_ns], "times.txt")
     assert_is_the_trajectory(hec.read_trajectory(poses, "kitti", times=times))
-    said = r"poses\.txt: the poses have no stamps; name their column t, give `times`, or pair"
+    said = r"poses\.txt: the poses have no stamps; name their column t, set `times`, or pair"
     with pytest.raises(InputError, match=said):
         hec.read_trajectory(poses, "kitti")
     one = file(["0.0"], "one.txt")
@@ -158,7 +161,7 @@ def test_exports_of_messages_have_stamps_in_two_columns_and_quoted_tuples(file):
 
 def test_without_a_header_the_columns_must_be_named(file):
     path = file(rows(TRAJECTORY.stamps_ns, "wxyz", " "))
-    said = "so that their order is unknown; name the 8 with `columns`, such as"
+    said = "so their order is unknown; name the 8 with `columns`, such as"
     with pytest.raises(InputError, match=said):
         hec.read_trajectory(path, "csv")
     assert_is_the_trajectory(hec.read_trajectory(path, "csv", columns=WXYZ))
@@ -175,7 +178,7 @@ def test_without_a_header_the_columns_must_be_named(file):
         ("t,x,y,z,rx [deg],ry [deg],rz [deg],e", NO_QUATERNION),
         ("t,ax,ay,az,gx,gy,gz,temperature", "gz, temperature .accelerations show no pose.; na"),
         ("t,north,east,down,qx,qy,qz,qw", "no column for x, y, z among"),
-        (f"t,time,{XYZW[2:]}", "line 1: names 9 columns, but the rows have 8 cells; give each"),
+        (f"t,time,{XYZW[2:]}", "line 1: names 9 columns, but the rows have 8 cells; write one"),
         ("t,time,x,y,z,qx,qy,qz", "columns t, time could all be t; name them|no column for qw"),
     ],
 )
@@ -200,7 +203,7 @@ def test_units_of_stamps_are_recognised_named_or_taken_from_the_header(file, uni
     for name in (f"time [{unit}]", f"t_{unit}", f"timestamp ({unit})"):
         named = file([f"{name},{XYZW[2:]}", *rows(relative)])
         assert_is_the_trajectory(hec.read_trajectory(named, "csv"), relative_ns)
-    said = r"unclear; read as \w+, the poses are .* s apart; name it with `stamp_unit`"
+    said = r"unclear; read as \w+, the poses are .* s apart; set `stamp_unit`"
     if unit != "s":
         with pytest.raises(InputError, match=said):
             hec.read_trajectory(path)
@@ -213,7 +216,7 @@ def test_stamps_out_of_order_are_refused_or_repaired_with_a_warning(file):
     said = r"line 12: timestamps must increase, .*; 4 such lines; sort .* `repair`"
     with pytest.raises(InputError, match=said):
         hec.read_trajectory(path, "csv")
-    said = "went back at 3 of 32 poses, which were sorted; dropped 2 whose stamp was there already"
+    said = "decrease at 3 of 32 poses; the poses were sorted; dropped 2 with a repeated stamp"
     with pytest.warns(UserWarning, match=said):
         assert_is_the_trajectory(hec.read_trajectory(path, "csv", repair=True))
 
@@ -223,7 +226,7 @@ def test_stamps_out_of_order_are_refused_or_repaired_with_a_warning(file):
     [
         ({"stamp_unit": "minutes"}, "unknown unit of stamps 'minutes'; known are s, ms, us"),
         ({"format": "bvh"}, "unknown trajectory format 'bvh'; known are tum"),
-        ({"format": "kitti", "columns": "t"}, "columns are named for format csv only"),
+        ({"format": "kitti", "columns": "t"}, "columns can be set for format csv only"),
         ({"format": "csv", "times": "t"}, "a file of times belongs to format kitti only"),
     ],
 )
@@ -245,8 +248,11 @@ def test_calibrate_reads_each_file_in_its_own_format(tmp_path, file, capsys):
     for more in ([], ["--parent-format", "csv"]):
         assert main([*command, *more]) in (0, 3)
         out, err = capsys.readouterr()
-        assert "went back at 1 of 31 poses, which were sorted; dropped 1 whose stamp was" in err
+        assert (
+            "decrease at 1 of 31 poses; the poses were sorted; dropped 1 with a repeated stamp"
+            in err
+        )
         document = json.loads(out)
         np.testing.assert_allclose(document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-3)
     assert main([*command, "--format", "tum"]) == 2
-    assert "columns are named for format csv only; the format is tum" in capsys.readouterr().err
+    assert "columns can be set for format csv only; the format is tum" in capsys.readouterr().err

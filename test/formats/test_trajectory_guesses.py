@@ -43,9 +43,12 @@ def read(path, **options):
 @pytest.mark.parametrize(
     ("truth", "said"),
     [
-        (driven(), "the motion keeps a steady direction that way"),
+        (driven(), "the motion then has a steady direction"),
         *(
-            (as_trajectory(wandering_poses(200, seed)), "the first orientation is the identity")
+            (
+                as_trajectory(wandering_poses(200, seed)),
+                "the first orientation is then the identity",
+            )
             for seed in range(3)
         ),
     ],
@@ -55,14 +58,14 @@ def test_motion_or_start_tell_the_order(tmp_path, truth, said):
         for order in (SCALAR_FIRST, SCALAR_LAST):
             trajectory, guesses = read(write_unnamed(tmp_path / name, truth, order, separator))
             np.testing.assert_allclose(trajectory.poses, truth.poses, atol=1e-12)
-            guesses = [text for text in guesses if "looks like" not in text]
+            guesses = [text for text in guesses if "is read as format" not in text]
             assert len(guesses) == (order == SCALAR_FIRST)
             assert all("read with the scalar first" in text and said in text for text in guesses)
 
 
 def test_an_order_that_nothing_tells_is_said(tmp_path):
     truth = as_trajectory(se3.exp(np.array([1.0, 2.0, 3.0, 1.0, 0.5, -1.0])) @ wandering_poses(200))
-    said = "nothing names the order of the quaternion; read with the scalar last"
+    said = "does not name its columns or the order of the quaternion; read with the scalar"
     for name, separator, is_said in (("a.csv", ",", 1), ("a.txt", " ", 0)):
         trajectory, guesses = read(write_unnamed(tmp_path / name, truth, SCALAR_LAST, separator))
         np.testing.assert_allclose(trajectory.poses, truth.poses, atol=1e-12)
@@ -72,7 +75,7 @@ def test_an_order_that_nothing_tells_is_said(tmp_path):
 def test_only_auto_guesses(tmp_path):
     path = write_unnamed(tmp_path / "poses.mat", driven(), SCALAR_FIRST)
     assert read_trajectory_file(path).guesses == []
-    with pytest.raises(InputError, match="so that their order is unknown; name the 8 with"):
+    with pytest.raises(InputError, match="so their order is unknown; name the 8 with"):
         read_trajectory_file(path, "csv")
 
 
@@ -118,8 +121,8 @@ def test_small_angles_in_degrees_are_read_by_the_name_of_their_unit(tmp_path):
     np.testing.assert_allclose(trajectory.poses[1, :3, 3], [0.5, 0, 0])
     np.testing.assert_allclose(se3.rotation_to_rpy(trajectory.poses[1, :3, :3])[2], np.radians(2))
     assert [text for text in guesses if "no column" in text] == [
-        ": no column of heights: taken as 0",
-        ": no columns of roll and pitch: taken as 0",
+        ": no column of heights: 0 is assumed",
+        ": no columns of roll and pitch: 0 is assumed",
     ]
 
 
@@ -220,9 +223,17 @@ def test_latitude_and_longitude_become_metres_of_the_first_position(tmp_path, he
 @pytest.mark.parametrize(
     ("lat", "lon", "message"),
     [
-        ([139.7, 139.8], [35, 35], "line 2: found latitude 139.7 deg, .* perhaps they are swapped"),
+        (
+            [139.7, 139.8],
+            [35, 35],
+            "line 2: found latitude 139.7 deg, .* check whether both are swapped",
+        ),
         ([60.0, 60.0], [1, 361], "line 3: found latitude 60 deg, longitude 361 deg"),
-        ([60.0, 91.0], [1, 1], "line 3: found latitude 91 deg, longitude 1 deg; expected no lat"),
+        (
+            [60.0, 91.0],
+            [1, 1],
+            "line 3: found latitude 91 deg, longitude 1 deg; the limit of the lat",
+        ),
         ([60.0, 60.0], [1, 1e300], r"line 3: found angle 1e\+300; repair"),
     ],
 )

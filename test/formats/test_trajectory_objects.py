@@ -63,9 +63,9 @@ class TestReading:
             (5, {"times": SECONDS}, InputError, r"expected a path, .* found an array \(\)"),
             ({"a": 1}, {}, InputError, "expected a path, .* found dict"),
             (np.zeros((3, 5)), {}, InputError, r"of t, x, .*; found an array \(3, 5\)"),
-            (POSES, {"times": SECONDS, "columns": "x"}, ConfigError, "for text files"),
+            (POSES, {"times": SECONDS, "columns": "x"}, ConfigError, "to text files"),
             (POSES, {"times": SECONDS, "stamp_unit": "h"}, ConfigError, "unknown unit"),
-            (POSES, {"times": SECONDS, "format": "csv"}, ConfigError, "for text files"),
+            (POSES, {"times": SECONDS, "format": "csv"}, ConfigError, "to text files"),
             (POSES, {"topic": "/a"}, ConfigError, "for bags"),
             (POSES, {"times": SECONDS * np.nan}, InputError, "finite numbers"),
             (POSES, {"times": SECONDS * 1e12}, InputError, "too large"),
@@ -80,7 +80,7 @@ class TestReading:
         order = np.r_[0, 2, 1, 2, 3:30]
         with pytest.raises(InputError, match="stamps must increase"):
             hec.read_trajectory(POSES[order], times=SECONDS[order])
-        with pytest.warns(UserWarning, match="were sorted; dropped 1 whose stamp"):
+        with pytest.warns(UserWarning, match="were sorted; dropped 1 with a repeated stamp"):
             assert_same(hec.read_trajectory(POSES[order], times=SECONDS[order], repair=True))
 
 

@@ -175,7 +175,7 @@ def test_out_saves_what_info_shows(run, new_bag, tmp_path):
     assert file["sha256"] == hashlib.sha256(Path(file["file"]).read_bytes()).hexdigest()
     assert provenance["parameters"]["method"] == "auto"
     again = run("replay", file["file"], *TOPICS, "--out", out_dir)
-    assert f"extrinsic.yaml; the files that were there are in {out_dir}/previous\n" in again[2]
+    assert f"extrinsic.yaml; the earlier files are in {out_dir}/previous\n" in again[2]
 
 
 def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag):

@@ -101,8 +101,8 @@ def test_a_wrong_path_to_what_is_installed_ends_the_start_in_one_line(start_node
     node = start_node("-p monitor:=true", f"-p installed:={path}")
     assert node.wait() == 1
     assert node.log == (
-        "calibrator: what is installed must be a file that exists (URDF, extrinsic.yaml, bag) or "
-        "six numbers in m and rad: installed must be X Y Z ROLL PITCH YAW; "
+        "calibrator: the installed transform must be an existing file (URDF, extrinsic.yaml, bag) "
+        "or six numbers in m and rad: installed must be X Y Z ROLL PITCH YAW; "
         f"got '{path}'\n"
     )
 

@@ -88,9 +88,11 @@ def _complete(file: Path, unfinished: Iterable[Path], copy: Path) -> None:
             database.execute("SELECT count(*) FROM sqlite_master").fetchall()
     except (OSError, sqlite3.Error) as error:
         raise InputError(
-            f"cannot read bag {file}: its recorder was stopped, and its newest messages are in "
-            f"{', '.join(path.name for path in unfinished)}, which cannot be added to a copy in "
-            f"{copy.parent.parent} ({reason_of(error)}); set TMPDIR to a folder with more space, "
+            f"cannot read bag {file}: its recorder was stopped, and its "
+            "newest messages are in "
+            f"{', '.join(path.name for path in unfinished)}. Merging them "
+            f"into a copy in {copy.parent.parent} failed "
+            f"({reason_of(error)}); set TMPDIR to a folder with more space, "
             f"or repair the bag with {REPAIRS['.db3']}"
         ) from error
 
@@ -109,8 +111,8 @@ def _unpack(file: Path, target: Path) -> str:
                 n_bytes += unpacked.write(piece)
                 if n_bytes > most_bytes:
                     raise InputError(
-                        f"cannot read bag {file}: its content unpacks to more than "
-                        f"{files.LARGEST_RATIO} times its size, which is not believable"
+                        f"cannot read bag {file}: it unpacks to more than "
+                        f"{files.LARGEST_RATIO} times its size; the file is damaged"
                     )
         except (EOFError, zstd.ZstdError) as error:
             return f"its compression is damaged ({reason_of(error)})"
@@ -144,13 +146,16 @@ def _no_files(folder: Path) -> str:
     missing = missing_files(folder).n_messages
     if missing:
         return (
-            f"no messages in {folder}: its {_METADATA} lists {_listing(missing)}, missing there; "
-            "copy the whole bag"
+            f"no messages in {folder}: its {_METADATA} lists "
+            f"{_listing(missing)}, and no such file is there; copy the whole "
+            "bag"
         )
     advice = "check the path"
     for subfolder in sorted(file.parent for file in [*folder.glob("*/*"), *folder.glob("*/*/*")]):
         if any(map(_suffix, subfolder.iterdir())):
-            advice = f"give {subfolder}, or all below it with calibrate --batch {folder}"
+            advice = (
+                f"pass {subfolder}, or all bags below the folder with calibrate --batch {folder}"
+            )
             break
     return f"no bag in {folder}: expected files that end in {', '.join(REPAIRS)}; {advice}"
 

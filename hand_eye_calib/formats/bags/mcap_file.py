@@ -86,10 +86,10 @@ class McapFile(Storage):
         if times_ns:
             self.span_ns = min(times_ns), max(times_ns)
             seconds = (self.span_ns[1] - self.span_ns[0]) * 1e-9
-            recovered = f"recovered are {len(times_ns)} messages covering {seconds:.1f} s"
+            recovered = f"{len(times_ns)} messages over {seconds:.1f} s were recovered"
             self.losses = [f"{loss}; {recovered}" for loss in self.losses]
         elif self.losses:
-            raise ValueError(f"{self.losses[0]}, and nothing before that can be read") from reason
+            raise ValueError(f"{self.losses[0]}, and no message before can be read") from reason
 
     def _messages(self, kinds: Mapping[int, MessageKind]) -> Iterable[Message]:
 
@@ -122,7 +122,7 @@ class McapFile(Storage):
         except MemoryError:
             raise
         except Exception as error:
-            losses.append(f"it is cut off or damaged ({reason_of(error)}), the rest is lost")
+            losses.append(f"it is truncated or damaged ({reason_of(error)}); the rest is lost")
             if isinstance(error, EOFError):
                 with suppress(Exception):  # the cut ends the records of the chunk, too
                     yield from self._records_of_cut_chunk(position)

@@ -290,8 +290,8 @@ def _decoder(kind: MessageKind) -> Callable[[bytes], Any]:
         return partial(json.loads, object_hook=lambda fields: SimpleNamespace(**fields))
     if kind.encoding not in ("cdr", "ros1", "protobuf"):
         raise InputError(
-            f"messages of type {kind.type} are encoded as {kind.encoding[:40]!r}; expected cdr, "
-            "ros1, json or protobuf"
+            f"messages of type {kind.type} have the encoding "
+            f"{kind.encoding[:40]!r}; expected cdr, ros1, json or protobuf"
         )
     make_decoder = _protobuf_decoder if kind.encoding == "protobuf" else _rosbags_decoder
     try:
@@ -300,8 +300,8 @@ def _decoder(kind: MessageKind) -> Callable[[bytes], Any]:
         raise
     except Exception as error:  # of many kinds, at damaged definitions
         raise InputError(
-            f"the bag has no definition of {kind.type} that can be read; record it as mcap, which "
-            "stores definitions"
+            f"the bag contains no readable definition of {kind.type}; record "
+            "it as mcap, which stores definitions"
         ) from error
 
 
@@ -401,8 +401,8 @@ class Run(NamedTuple):
     def unreadable(self, error: Exception) -> InputError:
         """Return the error to raise for a message that is not of its type."""
         return InputError(
-            f"{self.kind.topic}: a message is not a readable {self.kind.type} ({error}); the bag "
-            "is damaged, record it again"
+            f"{self.kind.topic}: a message of type {self.kind.type} cannot be "
+            f"read ({error}); the bag is damaged: record it again"
         )
 
 
@@ -553,8 +553,8 @@ class MessageReader:
         beyond = values[(np.abs(values[:, :2]) > (90, 360)).any(axis=1)]
         if len(beyond):
             raise InputError(
-                "found latitude {:.7g} and longitude {:.7g}: no latitude is beyond 90 deg, no "
-                "longitude beyond 360; if they are swapped, repair their source".format(*beyond[0])
+                "found latitude {:.7g} and longitude {:.7g}; the limits are "
+                "90 deg and 360 deg. If both are swapped, repair their source".format(*beyond[0])
             )
         lat, lon = np.radians(values[:, :2]).T
         return self._origin.local(lat, lon, values[:, 2])

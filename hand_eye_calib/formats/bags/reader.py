@@ -198,10 +198,10 @@ class PoseBag:
         if type_ in messages.TF_TYPES:
             hint = "name two of its frames instead, as odom:lidar"
         elif type_ in messages.IMAGE_TYPES:
-            hint = f"name what images show, {topic}?charuco:5x7:0.04:0.03, or with --target"
+            hint = f"name the target in the images, {topic}?charuco:5x7:0.04:0.03, or set --target"
         raise InputError(
-            f"topic {topic} of {self} is of type {type_ or 'several types'}, which is not read as "
-            f"it is; {hint}. {self._listing()}"
+            f"topic {topic} of {self} has type {type_ or 'several types'}, "
+            f"which cannot be read; {hint}. {self._listing()}"
         )
 
     def select(
@@ -260,8 +260,8 @@ class PoseBag:
                 return [topic.name for topic in topics]
         edges = sorted({edge for topic in self.topics for edge in self.edges_on(topic)})
         text = (
-            "name the topics of poses with --parent-topic and --child-topic, or frames as "
-            f"odom:lidar. {self._listing()}"
+            "set --parent-topic and --child-topic to topics with poses, or "
+            f"to frames such as odom:lidar. {self._listing()}"
         )
         if edges:
             text += f". Transforms are {', '.join(edges)[:LONGEST_NAME]}"
@@ -394,8 +394,9 @@ class PoseBag:
         notes = []
         if (np.diff(poses.stamps_ns) <= 0).any():
             notes.append(
-                f"{source}: poses were put in the order of their stamps; "
-                f"{len(poses) - len(trajectory)} of {len(poses)} repeated one and were dropped"
+                f"{source}: poses were sorted by their stamps; "
+                f"{len(poses) - len(trajectory)} of {len(poses)} repeated a "
+                "stamp and were dropped"
             )
         return trajectory, notes
 

@@ -60,8 +60,8 @@ def parent_and_child(
         return by_words
     names = " and ".join(named.values())
     raise InputError(
-        f"nothing says which of the topics {topics[0]} and {topics[1]} is of {names}: name them "
-        "with --parent-topic and --child-topic"
+        f"the names do not decide which of the topics {topics[0]} and "
+        f"{topics[1]} is of {names}: set --parent-topic and --child-topic"
     )
 
 

@@ -92,8 +92,9 @@ class Reading(ABC):
         """Return the table with the chosen stamps, without poses whose stamp is 0."""
         if self.stamps == "receive":
             self.notes.append(
-                f"{self.name}: the stamps are the times at which the recorder received the "
-                "messages; the delay on the way counts as offset of the clocks"
+                f"{self.name}: the stamps are the times at which the recorder "
+                "received the messages; the transport delay counts as clock "
+                "offset"
             )
             return replace(table, stamps_ns=table.bag_ns)
         is_zero = table.stamps_ns == 0
@@ -111,8 +112,9 @@ class Reading(ABC):
         """Raise InputError if most header stamps are 0."""
         if n_zero > max(1, _MOSTLY * n_all):
             raise InputError(
-                f"{self.name}: {n_zero:,} of {n_all:,} header stamps are 0: have the publisher set "
-                f"header.stamp; or take the times of the recorder: `{self.stream}_stamps` receive"
+                f"{self.name}: {n_zero:,} of {n_all:,} header stamps are 0. "
+                "Set header.stamp in the publisher, or use the times of the "
+                f"recorder: `{self.stream}_stamps` receive"
             )
 
     def _refuse_whole_seconds(self, stamps_ns: IntArray) -> None:
@@ -122,9 +124,10 @@ class Reading(ABC):
         n_stamps = len(np.unique(stamps_ns))
         if 0 < n_stamps <= _MOSTLY * len(stamps_ns):
             raise InputError(
-                f"{self.name}: the header stamps have whole seconds only: {len(stamps_ns):,} poses "
-                f"have {n_stamps:,} stamps; have the publisher set header.stamp.nanosec; or take "
-                f"the times of the recorder: `{self.stream}_stamps` receive"
+                f"{self.name}: the header stamps have whole seconds only: "
+                f"{len(stamps_ns):,} poses have {n_stamps:,} stamps. Set "
+                "header.stamp.nanosec in the publisher, or use the times of "
+                f"the recorder: `{self.stream}_stamps` receive"
             )
 
     def _note_null(self, n_null: int, n_all: int) -> None:
@@ -158,8 +161,9 @@ class TopicReading(Reading):
         is_right = are_believable(table.stamps_ns, table.bag_ns)
         if not is_right.all():
             self.notes.append(
-                f"{self.name}: {(~is_right).sum()} poses were left out: their stamps jump away "
-                "from the bag's own time and back; the bag may be damaged"
+                f"{self.name}: {(~is_right).sum()} poses were left out: their "
+                "stamps jump away from the bag's time and back; the bag may "
+                "be damaged"
             )
             table = table[is_right]
         n_null = self._reader.n_left_out
@@ -167,8 +171,8 @@ class TopicReading(Reading):
             self._note_null(n_null, n_null + n_read)
         elif n_null:
             self.notes.append(
-                f"{self.name}: {n_null} messages without a fix, or without the quantity that is "
-                "read, were left out"
+                f"{self.name}: {n_null} messages without a fix, or without "
+                "the quantity to be read, were left out"
             )
         return table
 
@@ -244,8 +248,8 @@ class PathReading(Reading):
     def use_stamps(self, stamps: str) -> None:
         if stamps == "receive":
             raise ConfigError(
-                f"{self.name} is a path, which is received as a whole: its poses have no times of "
-                f"receipt; leave out `{self.stream}_stamps`"
+                f"{self.name} is a path, which is received as a whole, so its "
+                f"poses have no times of receipt; omit `{self.stream}_stamps`"
             )
 
     def take(self, run: messages.Run) -> None:
@@ -259,8 +263,8 @@ class PathReading(Reading):
         stamps_ns = [messages.ns_of(item.header.stamp) for item in path.poses]
         if len(rows) > 1 and not any(stamps_ns):
             raise InputError(
-                f"the poses of path {self.name} have no stamps: all are zero; use the odometry "
-                "that the path was made from"
+                f"the poses of path {self.name} have no stamps (all are "
+                "zero); use the odometry from which the path was made"
             )
         frame = printable(frame_name(path.header.frame_id))
         poses = np.reshape(rows, (-1, 7))
@@ -293,8 +297,8 @@ class FieldReading(Reading):
             name, _, path = field.partition("=")
             if not (name and path):
                 raise ConfigError(
-                    "fields are written NAME=PATH,..., such as t=header.stamp,x=pose.position.x; "
-                    f"got {fields!r}"
+                    "fields must be NAME=PATH,..., such as "
+                    f"t=header.stamp,x=pose.position.x; got {fields!r}"
                 )
             paths.append((name, path))
         names = [name for name, _ in paths]
@@ -304,7 +308,7 @@ class FieldReading(Reading):
         self._bag_ns: list[int] = []
         self.measures = "poses" if are_twists else self._table.measures
         if self.measures == "rates":
-            raise InputError(f"{topic}: wx, wy, wz alone are no poses; name vx, vy, vz, too")
+            raise InputError(f"{topic}: wx, wy, wz alone are no poses; also name vx, vy, vz")
 
     def take(self, run: messages.Run) -> None:
         rows = [[self._cell(message, path) for path in self._paths] for message in run.decoded()]

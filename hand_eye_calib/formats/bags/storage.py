@@ -142,11 +142,12 @@ class Storage(ABC):
         except Exception as error:
             # rosbags reads SQLite with apsw, whose NoMemError is no MemoryError.
             if isinstance(error, MemoryError) or type(error).__name__ == "NoMemError":
-                why = "reading it takes more memory than any bag should; it is damaged, or hostile"
+                why = "reading it needs too much memory; the file is damaged or malicious"
             else:
                 why = (
-                    f"it is cut off, damaged or of an unsupported kind ({reason_of(error)}); "
-                    f"repair it with {self._repair}, or record it again"
+                    "it is truncated, damaged or of an unsupported kind "
+                    f"({reason_of(error)}); repair it with {self._repair}, or "
+                    "record it again"
                 )
             raise InputError(f"cannot read bag {self.paths[0]}: {why}") from error
 
@@ -164,7 +165,7 @@ class RosbagsFile(Storage):
         if suffix == ".db3":  # SQLite reads the path as a URI
             reader.storage.path = Path(quote(str(self._file)))
         if suffix == ".mcap":
-            self._repair = "the library that reads what is left, 'pip install mcap'"
+            self._repair = "the library for damaged mcap files, 'pip install mcap'"
         reader.open()
         opened.callback(reader.close)
         if suffix == ".mcap":

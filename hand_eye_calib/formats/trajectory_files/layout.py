@@ -290,8 +290,9 @@ def _refuse_other_number(
         names = names_in(line, separator)[0]
         if _is_known(names) and len(row) > 1:
             raise InputError(
-                f"{path}, line {line_number}: names {len(names)} columns, but the rows have "
-                f"{len(row)} cells; give each column one name, or name all with `columns`"
+                f"{path}, line {line_number}: names {len(names)} columns, but "
+                f"the rows have {len(row)} cells; write one name for each "
+                "column, or name all with `columns`"
             )
 
 

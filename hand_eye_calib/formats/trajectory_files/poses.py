@@ -123,7 +123,7 @@ def _positions(table: Table) -> tuple[FloatArray, FloatArray | None]:
         names = ("x", "y", *up)
         positions[:, : len(names)] = _in_si(table, names, "length")
     if not up and {"x", "lat"} & table.at.keys():
-        table.guess("no column of heights: taken as 0")
+        table.guess("no column of heights: 0 is assumed")
     _refuse_far(table, positions)
     return positions, to_first
 
@@ -160,7 +160,7 @@ def _of_matrices(table: Table) -> tuple[FloatArray, FloatArray]:
     }
     fitting = _fitting(positions, ways)
     reason = ", because the motion fits that" if len(fitting) == 1 else ""
-    table.guess(f"rotations are not beside the translations; read {fitting[0]}{reason}")
+    table.guess(f"rotations and translations are in separate columns; read {fitting[0]}{reason}")
     return positions, ways[fitting[0]]
 
 
@@ -215,8 +215,8 @@ def _on_earth(table: Table, up: Sequence[str]) -> tuple[FloatArray, FloatArray]:
         (np.abs(lat_rad) > np.pi / 2) | (np.abs(lon_rad) > _LARGEST_ANGLE_RAD),
         lambda row: (
             f"found latitude {np.degrees(lat_rad[row]):.7g} deg, longitude "
-            f"{np.degrees(lon_rad[row]):.7g} deg; expected no latitude beyond 90 deg: perhaps "
-            "they are swapped"
+            f"{np.degrees(lon_rad[row]):.7g} deg; the limit of the latitude "
+            "is 90 deg: check whether both are swapped"
         ),
     )
     height_m = _in_si(table, up, "length")[:, 0] if up else np.zeros(len(lat_rad))
@@ -250,8 +250,9 @@ def _in_si(table: Table, names: Sequence[str], kind: str) -> FloatArray:
     unit = second if largest > largest_of_first else first
     if kind != "length":
         table.guess(
-            f"{', '.join(names)} read in {unit}, the largest is {largest:.4g}; to change that, "
-            f"name the unit in the header, such as {names[-1]}_{unit.replace('/', '_')}"
+            f"{', '.join(names)} read in {unit}, the largest is "
+            f"{largest:.4g}; to change this, name the unit in the header, "
+            f"such as {names[-1]}_{unit.replace('/', '_')}"
         )
     return values * factors[unit]
 
@@ -300,9 +301,9 @@ def _of_quaternions(table: Table, names: Sequence[str], positions: FloatArray) -
     }
     reason = ""
     if fitting == [other]:
-        reason = "the motion keeps a steady direction that way"
+        reason = "the motion then has a steady direction"
     elif is_identity[other] and other in fitting:
-        reason = "the first orientation is the identity that way"
+        reason = "the first orientation is then the identity"
     if reason:
         order = "qw qx qy qz" if other == "first" else "qx qy qz qw"
         table.guess(f"quaternions read with the scalar {other}, t x y z {order}: {reason}")
@@ -310,8 +311,9 @@ def _of_quaternions(table: Table, names: Sequence[str], positions: FloatArray) -
     is_sure = fitting == [usual] or is_identity[usual]
     if names == UNNAMED and table.format != "tum" and not is_sure:
         table.guess(
-            "no columns are named, and nothing names the order of the quaternion; read with the "
-            "scalar last, t x y z qx qy qz qw; to change that, give `columns`"
+            "the file does not name its columns or the order of the "
+            "quaternion; read with the scalar last, t x y z qx qy qz qw; to "
+            "change this, set `columns`"
         )
     return ways[usual]
 
@@ -329,7 +331,7 @@ def _require_rotation_vectors(table: Table) -> None:
             "rotvec_x_deg, rotvec_y_deg, rotvec_z_deg"
         ),
     )
-    table.guess("rx, ry, rz read as a rotation vector, as Universal Robots have it")
+    table.guess("rx, ry, rz read as a rotation vector, as of Universal Robots")
 
 
 def _of_angles(table: Table, positions: FloatArray, convention: str) -> FloatArray:
@@ -342,7 +344,7 @@ def _of_angles(table: Table, positions: FloatArray, convention: str) -> FloatArr
     names = [name for name in ("roll", "pitch", "yaw", "heading") if name in table.at]
     *tilt, angle = _in_si(table, names, "angle").T
     if not tilt:
-        table.guess("no columns of roll and pitch: taken as 0")
+        table.guess("no columns of roll and pitch: 0 is assumed")
     roll, pitch = tilt or np.zeros((2, len(angle)))
     as_compass = np.stack([roll, -pitch, np.pi / 2 - angle], axis=1)
     usual = se3.rotation_from_rpy(np.stack([roll, pitch, angle], axis=1))

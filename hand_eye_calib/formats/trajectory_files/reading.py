@@ -103,7 +103,7 @@ class FileOptions:
         _refuse_unknown("trajectory format", self.format, (*TRAJECTORY_FORMATS, AUTO))
         text = ""
         if self.columns is not None and self.format not in ("csv", AUTO):
-            text = "columns are named for format csv only"
+            text = "columns can be set for format csv only"
         elif self.times is not None and self.format not in ("kitti", AUTO):
             text = "a file of times belongs to format kitti only"
         if text:
@@ -214,7 +214,8 @@ def read_trajectory(
         return _of_bag(path, topic, measures)
     if has_times_in_memory if path else has_file_options:
         raise ConfigError(
-            "format, columns and a file of times are for text files, other times for objects"
+            "format, columns and a file of times apply to text files only; "
+            "pass arrays of times for objects"
         )
     options = FileOptions(
         format=format,
@@ -300,10 +301,11 @@ def _other_conventions(tables: Sequence[Table]) -> dict[int, str]:
             common = [way for way in common if way in tables[number].conventions]
         if not common:
             raise InputError(
-                f"{' and '.join(str(tables[number].path) for number in numbers)} have the same "
-                "columns, but no convention of their angles fits the motion of all; write "
-                "quaternions instead, or name the column of one yaw (counterclockwise) and of the "
-                "other heading (clockwise from north) if that is what they are"
+                f"{' and '.join(str(tables[number].path) for number in numbers)} "
+                "have the same columns, but no convention of their angles "
+                "fits the motion of all. Write quaternions, or name the "
+                "columns yaw (counterclockwise) and heading (clockwise from "
+                "north) if the conventions differ"
             )
         for number in numbers:
             if tables[number].conventions[0] != common[0]:
@@ -340,7 +342,9 @@ def _rows_without_stamps(tables: Sequence[Table], pair_by: str) -> list[IntArray
     """
     n_rows = [table.n_rows for table in tables]
     if pair_by == "row" and len({*n_rows}) > 1:
-        raise InputError(f"to be paired by row, files need as many poses each; found {n_rows}")
+        raise InputError(
+            f"pairing by row needs files with the same number of poses; found {n_rows}"
+        )
     keys: list[Sequence[Any]] = [
         table.images if pair_by == "name" else table.rows for table in tables
     ]
@@ -369,7 +373,7 @@ def _read(
         Convention of the table's angles; by default it is recognised by the motion.
     """
     if not table.line_numbers:
-        raise InputError(f"{table.path}: no poses in it{_why_no_poses(table)}")
+        raise InputError(f"{table.path}: the file contains no poses{_why_no_poses(table)}")
     repairs, doubts = _notes_on_left_out(table)
     if rows is None:
         stamps_ns = stamps_in_ns(table, options.stamp_unit)
@@ -388,7 +392,7 @@ def _read(
         positions, quats_xyzw = values
         trajectory = Trajectory.from_quat_xyzw(stamps_ns[rows], positions[rows], quats_xyzw[rows])
     if table.measures not in ("poses", "rates"):
-        table.guess(f"{table.measures} alone, as its columns have it")
+        table.guess(f"{table.measures} only, by its columns")
     measures = table.measures if options.measures == AUTO else options.measures
     if measures != "poses":
         trajectory = replace(trajectory, measures=measures)
@@ -491,13 +495,14 @@ def _guesses_of(layout: Layout) -> list[str]:
     if layout.format == "tum":
         return []
     order = ", qw qx qy qz" if layout.format == "euroc" else ""
-    guesses = [f" looks like format {layout.format}{order}; to change that, give `format`"]
+    guesses = [f" is read as format {layout.format}{order}; to change this, set `format`"]
     is_usual = layout.columns in (STAMPED_POSE, STAMPED_POSE[1:])
     if layout.names is None and layout.format == "csv" and layout.columns and not is_usual:
         columns = ",".join(name or "-" for name in layout.columns).rstrip(",-")
         guesses.append(
-            f": no columns are named; the numbers fit {shortened(columns, LONGEST_NAME)}; to "
-            "change that, give `columns`"
+            ": no columns are named; the numbers fit "
+            f"{shortened(columns, LONGEST_NAME)}; to change this, set "
+            "`columns`"
         )
     return guesses
 
@@ -508,9 +513,10 @@ def _empty_table(path: str | Path, layout: Layout, options: FileOptions) -> Tabl
     columns = layout.columns
     if columns is None and n_columns:
         raise InputError(
-            f"{path}: the first line names no columns, so that their order is unknown; name the "
-            f"{n_columns} with `columns`, such as t,x,y,z,qx,qy,qz,qw, "
-            "t,x,y,z,roll_deg,pitch_deg,yaw_deg or t,wx,wy,wz"
+            f"{path}: the first line does not name the columns, so their "
+            f"order is unknown; name the {n_columns} with `columns`, such as "
+            "t,x,y,z,qx,qy,qz,qw, t,x,y,z,roll_deg,pitch_deg,yaw_deg or "
+            "t,wx,wy,wz"
         )
     columns = columns or STAMPED_POSE
     if layout.format == "euroc":
@@ -532,7 +538,7 @@ def _add_times(table: Table, options: FileOptions) -> None:
     is_auto = options.format == AUTO and not options.columns
     if times is None and is_auto and path.is_file():
         times = path
-        table.guess(f"stamps read from {path}; to change that, give `times`")
+        table.guess(f"stamps read from {path}; to change this, set `times`")
     if times is not None:
         table.stamps = _stamps_of(times, table)
 

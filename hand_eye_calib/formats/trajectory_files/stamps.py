@@ -49,8 +49,8 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
     """
     if not table.stamps:
         raise InputError(
-            f"{table.path}: the poses have no stamps; name their column t, give `times`, or pair "
-            "poses by row with `pair_by`"
+            f"{table.path}: the poses have no stamps; name their column t, "
+            "set `times`, or pair poses by row with `pair_by`"
         )
     unit = stamp_unit or table.stamp_unit
     stamps = table.stamps
@@ -62,8 +62,8 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
     table.refuse(
         np.asarray(sizes * factor >= float(np.iinfo(np.int64).max)),
         lambda index: (
-            f"the timestamp {stamps[index]:.6g} is too large for {recognised}; name its unit "
-            "with `stamp_unit`"
+            f"the timestamp {stamps[index]:.6g} is too large for "
+            f"{recognised}; set its unit with `stamp_unit`"
         ),
     )
     whole = (int((stamp * factor).to_integral_value()) for stamp in stamps)
@@ -97,9 +97,9 @@ def _refuse_unclear_unit(table: Table, stamps_ns: IntArray, recognised: str) -> 
     intervals_s = np.abs(np.diff(stamps_ns.astype(float))) * 1e-9
     if len(intervals_s) and median(intervals_s) > _LONGEST_INTERVAL_S:
         raise InputError(
-            f"{table.path}: the unit of the timestamps is unclear; read as {recognised}, the "
-            f"poses are {median(intervals_s):.4g} s apart; name it with `stamp_unit`: s, ms, "
-            "us or ns"
+            f"{table.path}: the unit of the timestamps is unclear; read as "
+            f"{recognised}, the poses are {median(intervals_s):.4g} s apart; "
+            "set `stamp_unit` to s, ms, us or ns"
         )
 
 
@@ -138,9 +138,9 @@ def refuse_coarse(table: Table, stamps_ns: IntArray, values: FloatArray) -> None
     else:
         problem = "have whole seconds only"
     raise InputError(
-        f"{table.path}: the timestamps {problem}: {len(stamps_ns)} poses have {len(different)} "
-        "different ones; write timestamps with all their digits, such as with %.9f instead of %g "
-        "or %e, or give `times`"
+        f"{table.path}: the timestamps {problem}: {len(stamps_ns)} poses have "
+        f"{len(different)} different stamps; write all digits (%.9f instead "
+        "of %g or %e), or set `times`"
     )
 
 
@@ -157,9 +157,10 @@ def in_order(table: Table, stamps_ns: IntArray, repair: bool) -> tuple[IntArray,
         table.refuse(
             is_wrong,
             lambda index: (
-                f"timestamps must increase, found {seconds(stamps_ns[index])} after "
-                f"{seconds(stamps_ns[index - 1])}; {int(is_wrong.sum())} such lines; sort the "
-                "lines and drop repeated timestamps, or have that done with `repair`"
+                f"timestamps must increase, found {seconds(stamps_ns[index])} "
+                f"after {seconds(stamps_ns[index - 1])}; "
+                f"{int(is_wrong.sum())} such lines; sort the lines and drop "
+                "repeated timestamps, or set `repair`"
             ),
         )
     indices = np.unique(stamps_ns, return_index=True)[1]
@@ -168,8 +169,8 @@ def in_order(table: Table, stamps_ns: IntArray, repair: bool) -> tuple[IntArray,
     repairs = []
     if n_backward:
         repairs.append(
-            f"stamps went back at {n_backward} of {len(stamps_ns)} poses, which were sorted"
+            f"stamps decrease at {n_backward} of {len(stamps_ns)} poses; the poses were sorted"
         )
     if n_dropped:
-        repairs.append(f"dropped {n_dropped} whose stamp was there already")
+        repairs.append(f"dropped {n_dropped} with a repeated stamp")
     return indices, [f"{table.path}: {'; '.join(repairs)}"]

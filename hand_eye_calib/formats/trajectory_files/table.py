@@ -140,16 +140,18 @@ class Table:
             has_accelerations = re.search(r", a(cc\w*)?_?x", listed)
             no_pose = " (accelerations show no pose)" if has_accelerations else ""
             raise InputError(
-                f"{self.path}: no column for {', '.join(missing)} among {listed}{no_pose}; name "
-                "all columns with `columns`, such as t,x,y,z,qw,qx,qy,qz, or roll_deg,pitch_deg,"
-                "yaw_deg or rotvec_x,rotvec_y,rotvec_z for turns, or t,wx,wy,wz of a gyroscope; "
-                "remove other text above the rows"
+                f"{self.path}: no column for {', '.join(missing)} among "
+                f"{listed}{no_pose}; name all columns with `columns`, such as "
+                "t,x,y,z,qw,qx,qy,qz, with roll_deg,pitch_deg,yaw_deg or "
+                "rotvec_x,rotvec_y,rotvec_z for rotations, or t,wx,wy,wz of "
+                "a gyroscope; remove other text above the rows"
             )
         for name in (*self.stamp_names, *quantities):
             if len(columns[name]) > 1:
                 listed = self._listed([self.names[column] for column in columns[name]])
                 raise InputError(
-                    f"{self.path}: columns {listed} could all be {name}; name them with `columns`"
+                    f"{self.path}: each of the columns {listed} could be {name}; "
+                    "name them with `columns`"
                 )
 
     def _set_stamp_units(self, units: Sequence[str]) -> None:
@@ -212,7 +214,8 @@ class Table:
             column = self.names[self._sensor_at[0]]
             raise InputError(
                 f"{self.path}: poses of several sensors, {column} "
-                f"{self._listed(sorted(self._sensors))}; write a file for each"
+                f"{self._listed(sorted(self._sensors))}; write one file for "
+                "each sensor"
             )
         return self
 
@@ -366,7 +369,7 @@ def _columns_of_matrices(matrices: FloatArray) -> tuple[Sequence[str], FloatArra
     notes = []
     if matrices.shape[1:] == (4, 4) and not _has_last_row(matrices):
         matrices = np.swapaxes(matrices, 1, 2)
-        notes = ["matrices are transposed: read with their rows as columns"]
+        notes = ["matrices are transposed: their rows were read as columns"]
         if not _has_last_row(matrices):
             raise InputError("the last row of a matrix is not 0 0 0 1; expected poses (N, 4, 4)")
     return MATRIX, matrices[:, :3].reshape(len(matrices), len(MATRIX)), notes
