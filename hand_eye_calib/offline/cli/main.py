@@ -101,6 +101,11 @@ def named_command() -> int:
 class CommandParser(argparse.ArgumentParser):
     """Parser whose errors are one line on stderr, with exit code 2."""
 
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(
+            formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False, **settings
+        )
+
     def error(self, message: str) -> NoReturn:
         """Print one line on stderr and exit with code 2."""
         text = as_typed(f"{message} (see {self.prog} --help)")
@@ -142,32 +147,14 @@ def _run(argv: Sequence[str]) -> int:
     if command is not None and command not in COMMANDS:
         known = f"expected one of {', '.join(COMMANDS)}{did_you_mean(command, COMMANDS)}"
         parser.error(f"invalid choice: {command!r}, {known}")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    parsers = {
-        name: commands.add_parser(name, help=COMMANDS[name].help, add_help=False)
-        for name in COMMANDS
-    }
-    for command_parser in parsers.values():
-        command_parser.add_argument(
-            "-h",
-            "--help",
-            nargs="?",
-            choices=("all",),
-            action=_ShowHelp,
-            help="show the help and exit; all: with every option",
-        )
-    for any_parser in (parser, *parsers.values()):
-        any_parser.formatter_class = argparse.RawDescriptionHelpFormatter
-        any_parser.allow_abbrev = False
+    parsers = _add_commands(parser)
     if command is not None:
         module = COMMANDS[command].load()
         parsers[command].description = COMMANDS[command].help
         module.add_arguments(parsers[command])
     arguments, rest = parser.parse_known_args(argv)
     if rest and command != "calibrator":
-        option = next((word for word in rest if word.startswith("-")), rest[0]).partition("=")[0]
-        used = parsers.get(command or "", parser)
-        used.error(f"unknown {option!r}{did_you_mean(option, used._option_string_actions)}")
+        _refuse(rest, parsers.get(command or "", parser))
     if arguments.version:
         from hand_eye_calib.core.base.version import version_of
 
@@ -179,3 +166,27 @@ def _run(argv: Sequence[str]) -> int:
         arguments.typed = list(argv)
         return int(module.run(arguments))
     return 0
+
+
+def _add_commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """Add all commands to a parser, and return their parsers by name."""
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    parsers = {}
+    for name, command in COMMANDS.items():
+        parsers[name] = commands.add_parser(name, help=command.help, add_help=False)
+        parsers[name].add_argument(
+            "-h",
+            "--help",
+            nargs="?",
+            choices=("all",),
+            action=_ShowHelp,
+            help="show the help and exit; all: with every option",
+        )
+    return parsers
+
+
+def _refuse(rest: Sequence[str], parser: argparse.ArgumentParser) -> NoReturn:
+    """End with an error that names the first of the arguments that no option takes."""
+    options = [word for word in rest if word.startswith("-")]
+    option, _, _ = [*options, *rest][0].partition("=")
+    parser.error(f"unknown {option!r}{did_you_mean(option, parser._option_string_actions)}")
