@@ -19,7 +19,7 @@
 #   make notebook      run the notebooks of examples/ again and keep their outputs
 #   make clean         remove everything that the targets above made
 # PYTHON=python3.12 chooses the interpreter, PYTEST_ARGS="-k name" goes to pytest, WORKERS=1 is the
-# number of tests that run at once: by default one a core.
+# number of tests that run at once: by default one a core, and one for tests that start nodes.
 PYTHON ?= python3
 PYTEST_ARGS ?=
 WORKERS ?= auto

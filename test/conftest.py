@@ -1,6 +1,7 @@
 """What every test may use."""
 
 import gc
+import os
 import signal
 from concurrent.futures import ThreadPoolExecutor
 
@@ -16,6 +17,12 @@ settings.load_profile("hand_eye_calib")
 # A shell starts what runs in the background with Ctrl-C ignored, and children inherit that: tests
 # that send it would wait for ever.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers(config):
+    """One more than processors: tests that start nodes mostly wait."""
+    return len(os.sched_getaffinity(0)) + 1
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -145,13 +145,13 @@ class TestFloor:
         np.testing.assert_allclose(np.diag(fixed)[:3], uncertainty.FLOOR_TRANSLATION**2)
         np.testing.assert_allclose(np.diag(fixed)[3:], uncertainty.FLOOR_ROTATION**2)
         for variance, expected in ((1e6, 0.02), (0.01**2, 0.02 / np.sqrt(2)), (0.0, 0.0)):
-            found = uncertainty.open_scale_floor(by_scale, variance)
-            assert np.sqrt(found[0, 0]) == pytest.approx(expected, rel=1e-3)
+            floor = uncertainty.open_scale_floor(by_scale, variance)
+            assert np.sqrt(floor[0, 0]) == pytest.approx(expected, rel=1e-3)
 
     def test_what_is_far_away_moves_the_centre_of_a_fast_odometry(self):
-        found = np.sqrt(np.diag(uncertainty.common_mode_floor(speed_m_s=2.4)))
-        np.testing.assert_allclose(found[:3], 0.013)
-        fast = hec.calibrate(*(each.scaled(20.0) for each in streams()), checks=False)
+        sigmas = np.sqrt(np.diag(uncertainty.common_mode_floor(speed_m_s=2.4)))
+        np.testing.assert_allclose(sigmas[:3], 0.013)
+        fast = hec.calibrate(*(stream.scaled(20.0) for stream in streams()), checks=False)
         assert fast.allowance[:3].min() > 2 * uncertainty.FLOOR_TRANSLATION
 
     def test_neither_stops_nor_jumps_count_for_the_usual_speed(self):
@@ -164,10 +164,11 @@ class TestFloor:
 
     def test_exact_poses_have_none(self):
         both = hec.calibrate(*streams(), parent_kind="exact", child_kind="exact", checks=False)
-        kinds = "exact", "odometry"
-        one, none = (hec.calibrate(*streams(), child_kind=each, checks=False) for each in kinds)
+        exact_child = hec.calibrate(*streams(), child_kind="exact", checks=False)
+        odometry = hec.calibrate(*streams(), child_kind="odometry", checks=False)
         assert not both.allowance.any()
-        np.testing.assert_allclose(2.0 * one.covariance_allowance, none.covariance_allowance)
+        half = 0.5 * odometry.covariance_allowance
+        np.testing.assert_allclose(exact_child.covariance_allowance, half)
 
     @pytest.mark.parametrize("method", ["auto", "adaptive", "dnlo", "park"])
     def test_every_result_has_it_beside_the_covariance(self, method):
@@ -188,11 +189,11 @@ class TestBlocks:
 
     def variances(self, scatter):
         """Over those of the model, where answers of parts scatter so many times too much."""
-        found = np.tile(np.eye(7), (20, 1, 1))
-        found[:, 6, :6] = np.random.default_rng(4).standard_normal((20, 6)) * scatter
-        found[:, :6, 6] = found[:, 6, :6]
-        given = np.eye(6) / 20, SimpleNamespace(jumps=np.zeros(100), part_products=found)
-        return 20 * np.diag(uncertainty.widened_by_blocks(*given, slice(0, 6)))
+        products = np.tile(np.eye(7), (20, 1, 1))
+        products[:, 6, :6] = np.random.default_rng(4).standard_normal((20, 6)) * scatter
+        products[:, :6, 6] = products[:, 6, :6]
+        model = np.eye(6) / 20, SimpleNamespace(jumps=np.zeros(100), part_products=products)
+        return 20 * np.diag(uncertainty.widened_by_blocks(*model, slice(0, 6)))
 
     def test_all_directions_have_one_factor(self):
         # (16 + 1) / 2 is expected, of nine degrees of freedom.
@@ -381,8 +382,8 @@ class TestFlatGround:
         # Rotations alone do not show where x points on flat ground: the paper's two-stage methods
         # need the yaw too.
         prior = {"z": (1.85, 0.02), "yaw": (0.4, 0.001)}
-        given = {"method": method, "reference": "B10", "prior": prior, "checks": False}
-        result = calibrate(*flat_drive(noise=0.0005, mount=mount), **given)
+        options = {"method": method, "reference": "B10", "prior": prior, "checks": False}
+        result = calibrate(*flat_drive(noise=0.0005, mount=mount), **options)
         assert result.T_parent_child[2, 3] == pytest.approx(1.85, abs=0.03)
 
 

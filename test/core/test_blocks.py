@@ -60,7 +60,7 @@ SUMS = {
     "merged": (
         lambda blocks: blocks.merged(2).sums,
         lambda rows: [
-            products(np.concatenate(part)) for part in (split(rows)[:2], split(rows)[2:])
+            products(np.concatenate(chunk)) for chunk in (split(rows)[:2], split(rows)[2:])
         ],
     ),
 }
@@ -125,9 +125,9 @@ def test_the_evidence_of_a_shift_is_that_of_the_difference_of_both_answers(rows)
     blocks = Blocks.of_rows(rows, N_BLOCKS)
     shifts = blocks.shift_since(CUTS, np.zeros((4, 4)))
     for cut, shift in zip(CUTS, shifts, strict=True):
-        parts = [np.concatenate(part) for part in (split(rows)[:cut], split(rows)[cut:])]
-        answers = [least_squares(part, [0, 1, 2, 3]) for part in parts]
-        covariance = sum(np.linalg.inv(products(part)[:4, :4]) for part in parts)
+        parts = [np.concatenate(chunk) for chunk in (split(rows)[:cut], split(rows)[cut:])]
+        answers = [least_squares(chunk, [0, 1, 2, 3]) for chunk in parts]
+        covariance = sum(np.linalg.inv(products(chunk)[:4, :4]) for chunk in parts)
         units = np.sqrt(np.diag(covariance))
         expected = answer_evidence(answers[1] - answers[0], covariance)
         scale = units[:, None] * np.append(units, 1.0)

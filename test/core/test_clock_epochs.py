@@ -41,7 +41,7 @@ def test_the_offset_of_any_two_epochs_is_estimated(offset_s, options):
     assert result.time_offset_s == pytest.approx(offset_s, abs=2e-3)
     same_clock = hec.calibrate(*pair(0.0))
     np.testing.assert_allclose(result.T_parent_child, same_clock.T_parent_child, atol=2e-3)
-    codes = {found.code for found in result.findings}
+    codes = {finding.code for finding in result.findings}
     assert codes == (set() if options else {"time_offset"})
     expected = "USE" if options else "USE WITH CARE"
     assert result.verdict.value == expected
@@ -97,5 +97,5 @@ def test_a_stream_that_froze_does_not_hide_the_offset(frozen):
     result = hec.calibrate(**streams, time_offset="estimate")
     assert result.time_offset_s == pytest.approx(offset_s, abs=0.02)
     assert result.verdict.value == "DO NOT USE"
-    found = [finding for finding in result.findings if finding.code == "frozen"]
-    assert [(finding.stream, finding.severity.value) for finding in found] == [(frozen, "error")]
+    freezes = [finding for finding in result.findings if finding.code == "frozen"]
+    assert [(finding.stream, finding.severity.value) for finding in freezes] == [(frozen, "error")]

@@ -31,8 +31,8 @@ def answers():
     child = disturbed(child_of(parent), 1, 0.003, 0.003)
     whole = as_trajectory(parent), as_trajectory(child)
     halves = [
-        (as_trajectory(parent[part]), as_trajectory(child[part]))
-        for part in (slice(150), slice(150, None))
+        (as_trajectory(parent[half]), as_trajectory(child[half]))
+        for half in (slice(150), slice(150, None))
     ]
     return (
         calibrate(*whole, reference="B5"),
@@ -41,15 +41,15 @@ def answers():
     )
 
 
-def column(found, name):
+def column(cross_check, name):
     """Values (6,) of all axes."""
-    return np.array([getattr(row, name) for row in found.values()], dtype=float)
+    return np.array([getattr(row, name) for row in cross_check.values()], dtype=float)
 
 
 def contradictions(calibration, *answers):
     """Sentences of the reasons that other answers give."""
-    found = compare_answers(calibration, *answers)
-    reasons = dataclasses.replace(calibration, cross_check=found).reasons
+    cross_check = compare_answers(calibration, *answers)
+    reasons = dataclasses.replace(calibration, cross_check=cross_check).reasons
     return [reason.sentence for reason in reasons if reason.rule.partition("_")[0] in KINDS]
 
 
@@ -61,19 +61,19 @@ def moved(calibration, metres):
 
 def test_answers_to_good_data_agree_and_few_or_odd_ones_do_not_count(answers):
     calibration, others, _halves = answers
-    found = compare_answers(*answers)
+    cross_check = compare_answers(*answers)
     assert contradictions(*answers) == []
-    assert (column(found, "of_methods") < 4 * column(found, "sigma")).all()
-    assert (column(found, "of_halves") < 4 * column(found, "sigma")).all()
-    assert (column(found, "of_methods") > 0).all()
+    assert (column(cross_check, "of_methods") < 4 * column(cross_check, "sigma")).all()
+    assert (column(cross_check, "of_halves") < 4 * column(cross_check, "sigma")).all()
+    assert (column(cross_check, "of_methods") > 0).all()
     assert np.isnan(column(compare_answers(calibration, others[:2]), "of_methods")).all()
     assert contradictions(calibration, [*others, moved(others[0], 5.0)]) == []
     half = calibration.n_pairs // 2
     few = [dataclasses.replace(moved(other, 0.3), n_inliers=half) for other in others]
     assert contradictions(calibration, [*others, *few]) == []
-    kept = dataclasses.replace(calibration, cross_check=found)
+    kept = dataclasses.replace(calibration, cross_check=cross_check)
     document = json.loads(json.dumps(kept.to_dict()))
-    assert Calibration.from_dict(document).cross_check == found
+    assert Calibration.from_dict(document).cross_check == cross_check
 
 
 def test_other_methods_that_lie_elsewhere_are_named_with_axis_and_distance(answers):
@@ -86,8 +86,8 @@ def test_other_methods_that_lie_elsewhere_are_named_with_axis_and_distance(answe
 def test_halves_that_lie_apart_are_named(answers):
     calibration, others, (first, second) = answers
     halves = moved(first, -0.2), moved(second, 0.2)
-    found = compare_answers(calibration, others, halves)
-    assert column(found, "of_halves")[0] == pytest.approx(0.2, abs=0.02)
+    cross_check = compare_answers(calibration, others, halves)
+    assert column(cross_check, "of_halves")[0] == pytest.approx(0.2, abs=0.02)
     (sentence,) = contradictions(calibration, others, halves)
     assert sentence.startswith("the two halves of the recording disagree about x by")
 
@@ -96,16 +96,16 @@ def test_halves_that_lie_apart_are_named(answers):
 @pytest.mark.parametrize("axis", range(6))
 def test_halves_are_not_compared_on_an_axis_that_one_of_them_hardly_sees(answers, axis, blind):
     calibration, others, halves = answers
-    found = {}
+    differences = {}
     for times in (1.0, 20.0):
         dofs = [*halves[blind].observability_measured]
         worse = times * halves[1 - blind].observability_measured[axis].sigma
         dofs[axis] = dataclasses.replace(dofs[axis], sigma=worse)
         pair = [*halves]
         pair[blind] = dataclasses.replace(halves[blind], observability_measured=tuple(dofs))
-        found[times] = column(compare_answers(calibration, others, pair), "of_halves")
-    assert np.isfinite(found[1.0]).all()
-    assert np.flatnonzero(np.isnan(found[20.0])).tolist() == [axis]
+        differences[times] = column(compare_answers(calibration, others, pair), "of_halves")
+    assert np.isfinite(differences[1.0]).all()
+    assert np.flatnonzero(np.isnan(differences[20.0])).tolist() == [axis]
 
 
 def drifting(poses, seed):
@@ -140,10 +140,10 @@ def straight_start(seed):
 
 @pytest.mark.parametrize("seed", [100, 700])
 def test_a_straight_start_is_no_mount_that_turned_about_the_direction_of_travel(seed):
-    found = calibrate(*straight_start(seed), checks=True)
-    assert found.cross_check["yaw"].of_halves is not None
-    assert found.cross_check["roll"].of_halves is None
-    accused = {axis for reason in found.reasons if reason.rule == "halves" for axis in reason.axes}
+    result = calibrate(*straight_start(seed), checks=True)
+    assert result.cross_check["yaw"].of_halves is not None
+    assert result.cross_check["roll"].of_halves is None
+    accused = {axis for reason in result.reasons if reason.rule == "halves" for axis in reason.axes}
     assert "roll" not in accused
 
 
@@ -215,7 +215,7 @@ def on_springs(seed, degrees_per_m_s2):
     mount = se3.from_rotation_translation(se3.rotation_exp(np.array([0, 0, 0.4])), [0.6, -0.3, 0.3])
     noise = 0.003, 0.0002
     pair = disturbed(parent, seed, *noise), disturbed(child_of(parent, mount), seed + 50, *noise)
-    return [as_trajectory(each) for each in pair]
+    return [as_trajectory(poses) for poses in pair]
 
 
 @pytest.mark.parametrize("method", ["auto", "dnlo"])
@@ -233,21 +233,21 @@ def test_ramps_reveal_the_height_of_a_body_on_springs():
 
 
 def test_a_prior_holds_for_an_axis_that_no_other_reference_reveals():
-    found = calibrate(*gentle_ramps(1.5), prior={"z": (0.9, 0.02)})
-    assert found.observability[2].verdict is DofVerdict.PRIOR
-    assert found.T_parent_child[2, 3] == pytest.approx(0.9, abs=0.005)
+    result = calibrate(*gentle_ramps(1.5), prior={"z": (0.9, 0.02)})
+    assert result.observability[2].verdict is DofVerdict.PRIOR
+    assert result.T_parent_child[2, 3] == pytest.approx(0.9, abs=0.005)
 
 
 def test_an_axis_known_by_a_prior_alone_counts_with_its_sigma(answers):
     calibration, others, _ = answers
-    known = dataclasses.replace(
+    with_prior = dataclasses.replace(
         calibration,
         observability_measured=(
             DofObservability("x", DofVerdict.PRIOR, 1.0),
             *calibration.observability_measured[1:],
         ),
     )
-    assert contradictions(known, [moved(other, 0.3) for other in others]) == []
+    assert contradictions(with_prior, [moved(other, 0.3) for other in others]) == []
 
 
 @pytest.fixture(scope="module")
@@ -266,7 +266,7 @@ def test_every_solve_is_checked_and_one_from_python_for_a_sound_and_a_loose_moun
         result = calibrate(*streams, method="dnlo" if apart else "auto")
         assert ("halves" in [reason.rule for reason in result.reasons]) == apart
         assert apart or (column(result.cross_check, "of_halves") > 0).all()
-        found = hec.cross_check(calibrate(*streams, reference="B5"), *streams)
-        assert list(found) == ["x", "y", "z", "roll", "pitch", "yaw"]
-        assert apart or (column(found, "of_methods") > 0).all()
-        assert (column(found, "excess_of_halves").max() > 3) == apart
+        cross_check = hec.cross_check(calibrate(*streams, reference="B5"), *streams)
+        assert list(cross_check) == ["x", "y", "z", "roll", "pitch", "yaw"]
+        assert apart or (column(cross_check, "of_methods") > 0).all()
+        assert (column(cross_check, "excess_of_halves").max() > 3) == apart

@@ -270,8 +270,8 @@ def test_topics_are_not_guessed_against_nothing(tmp_path, capsys):
     path = bag_of(tmp_path / "bag", first, second)
     names = ["--parent-frame", "camera", "--child-frame", "lidar"]
     assert main(["calibrate", str(path), *names]) == 1
-    said = "the names do not decide which of the topics /one and /two is of camera and lidar: set"
-    assert said in capsys.readouterr().err
+    error = "the names do not decide which of the topics /one and /two is of camera and lidar: set"
+    assert error in capsys.readouterr().err
     topics = ["--parent-topic", "/two", "--child-topic", "/one"]
     document, _ = calibrated(capsys, path, *topics, *names)
     assert frames_of(document) == ("camera", "lidar")

@@ -52,15 +52,15 @@ def test_a_fifth_of_wrong_rows_hardly_changes_a_robust_regression(kind, within):
     targets[:40] += 5.0
     plain = np.linalg.lstsq(rows.reshape(-1, 2), targets.ravel(), rcond=None)[0]
     assert np.abs(plain - values).max() > 0.05
-    found, lengths = stats.robust_regression(kind, rows, targets, 20, median)
-    assert found == pytest.approx(values, abs=within)
-    np.testing.assert_allclose(lengths, np.linalg.norm(rows @ found - targets, axis=1))
+    slopes, lengths = stats.robust_regression(kind, rows, targets, 20, median)
+    assert slopes == pytest.approx(values, abs=within)
+    np.testing.assert_allclose(lengths, np.linalg.norm(rows @ slopes - targets, axis=1))
 
 
 def test_a_robust_regression_without_evidence_for_a_value_leaves_it_zero():
     rows = np.array([[[1.0, 0.0]], [[2.0, 0.0]]])
-    found, lengths = stats.robust_regression("cauchy", rows, np.array([[3.0], [6.0]]), 3, median)
-    assert found == pytest.approx([3.0, 0.0])
+    slopes, lengths = stats.robust_regression("cauchy", rows, np.array([[3.0], [6.0]]), 3, median)
+    assert slopes == pytest.approx([3.0, 0.0])
     assert lengths == pytest.approx([0.0, 0.0], abs=1e-12)
 
 

@@ -123,11 +123,11 @@ def test_the_table_has_every_option():
 @pytest.mark.parametrize("option", VALUES)
 def test_an_option_is_obeyed_or_refused(option, kind):
     method = {"method": "dnlo", "reference": "B3"}
-    beside = method if kind == "poses" and option in _OF_DNLO else {}
-    options = {**beside, option: VALUES[option]}
+    other_options = method if kind == "poses" and option in _OF_DNLO else {}
+    options = {**other_options, option: VALUES[option]}
     if option in REFUSED[kind]:
         with pytest.raises(ConfigError, match=option.replace("_", ".")):
             document(kind, **options)
         return
-    is_same = document(kind, **options) == document(kind, **beside)
+    is_same = document(kind, **options) == document(kind, **other_options)
     assert is_same == ((kind, option) in SAME)

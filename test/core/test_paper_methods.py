@@ -112,8 +112,8 @@ def test_zhuang_ends_where_the_written_out_cost_is_lowest(noisy):
     rotation, translation = split(zhuang.solve(noisy).T_parent_child)
     rotvec = se3.rotation_log(rotation)
     angle = np.linalg.norm(rotvec)
-    found = np.r_[np.tan(angle / 2) * rotvec / angle, translation]
-    np.testing.assert_allclose(minimize(cost, found, tol=1e-10).x, found, atol=1e-5)
+    parameters = np.r_[np.tan(angle / 2) * rotvec / angle, translation]
+    np.testing.assert_allclose(minimize(cost, parameters, tol=1e-10).x, parameters, atol=1e-5)
 
 
 def test_ali_minimises_the_translation_residual_over_rotations(noisy):
@@ -128,9 +128,9 @@ def test_ali_minimises_the_translation_residual_over_rotations(noisy):
     )
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     random = np.random.default_rng(1)
-    found = [minimize(cost, random.uniform(-1.5, 1.5, 6), tol=1e-12).fun for _ in range(5)]
-    assert solution.objective <= min(found) * (1 + 1e-9)
-    assert solution.objective == pytest.approx(min(found), rel=1e-6)
+    minima = [minimize(cost, random.uniform(-1.5, 1.5, 6), tol=1e-12).fun for _ in range(5)]
+    assert solution.objective <= min(minima) * (1 + 1e-9)
+    assert solution.objective == pytest.approx(min(minima), rel=1e-6)
 
 
 def test_ali_is_blind_to_the_rotation_of_the_child(noisy):

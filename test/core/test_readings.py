@@ -152,18 +152,18 @@ class TestUnclear:
     def test_both_answers_are_shown_and_none_is_to_be_used(self, arm):
         result = hec.calibrate(inverted(arm.parent), inverted(arm.child))
         assert result.verdict is hec.Verdict.DO_NOT_USE
-        (found,) = (each for each in result.findings if each.makes_unusable)
-        assert found.code == "inverse_both"
-        answers = re.findall(r"x (\S+), y (\S+), z (\S+) m", found.what)
+        (finding,) = (finding for finding in result.findings if finding.makes_unusable)
+        assert finding.code == "inverse_both"
+        answers = re.findall(r"x (\S+), y (\S+), z (\S+) m", finding.what)
         places = [[float(number) for number in answer] for answer in answers]
         np.testing.assert_allclose(places[0], result.T_parent_child[:3, 3], atol=0.1)
         np.testing.assert_allclose(places[1], arm.T_parent_child[:3, 3], atol=0.02)
-        assert abs(found.evidence["difference"]) < 20.0
+        assert abs(finding.evidence["difference"]) < 20.0
 
     @pytest.mark.parametrize("options", [NONE, BOTH])
     def test_an_option_decides(self, arm, options):
         result = hec.calibrate(inverted(arm.parent), inverted(arm.child), **options)
-        assert not any(each.makes_unusable for each in result.findings)
+        assert not any(finding.makes_unusable for finding in result.findings)
         is_right = errors(result, arm)[0] < 0.05
         assert is_right == (options == BOTH)
 
@@ -176,7 +176,7 @@ def test_right_streams_are_not_solved_twice(name, monkeypatch):
         lambda *poses: pytest.fail("compared"),
     )
     result = hec.calibrate(drive.parent, drive.child)
-    assert "inverse_both" not in {each.code for each in result.findings}
+    assert "inverse_both" not in {finding.code for finding in result.findings}
 
 
 class TestStrangers:

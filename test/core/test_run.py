@@ -36,8 +36,8 @@ def test_a_clock_offset_that_is_certain_is_used_and_said(streams):
     assert result.time_offset_s == pytest.approx(0.3, abs=0.01)
     assert result.time_offset_sigma_s > 0
     np.testing.assert_allclose(result.T_parent_child, expected, atol=0.02)
-    (said,) = (text for text in result.warnings if "solved with time_offset estimate" in text)
-    assert "the child's clock is 0.3" in said
+    (warning,) = (text for text in result.warnings if "solved with time_offset estimate" in text)
+    assert "the child's clock is 0.3" in warning
 
 
 def test_a_unit_that_is_certain_is_used_and_said(streams):
@@ -80,16 +80,17 @@ REPAIRS += [{"quaternion": "wxyz", "invert": "poses"}, {"quaternion": "yzwx"}]
 @pytest.mark.parametrize("convention", REPAIRS, ids=str)
 @pytest.mark.parametrize("stream", ["parent", "child"])
 def test_a_stream_in_another_convention_is_repaired_and_that_is_said(streams, stream, convention):
-    given = dict(zip(("parent", "child"), streams, strict=False))
-    given[stream] = written_otherwise(given[stream], convention)
-    result = hec.calibrate(**given, reference="B5")
+    trajectories = dict(zip(("parent", "child"), streams, strict=False))
+    trajectories[stream] = written_otherwise(trajectories[stream], convention)
+    result = hec.calibrate(**trajectories, reference="B5")
     np.testing.assert_allclose(result.T_parent_child, streams[2], atol=1e-9)
     assert result.verdict is Verdict.USE
-    (said,) = (text for text in result.warnings if text.startswith("repaired: "))
+    (warning,) = (text for text in result.warnings if text.startswith("repaired: "))
     done = {f"{stream}_{name}": value for name, value in convention.items()}
     usual = {name: getattr(CalibratorConfig, name) for name in done}
-    solved, undo = (", ".join(map(" ".join, each.items())) for each in (done, usual))
-    assert f"Solved with {solved}: USE; as the streams are: DO NOT USE (undo with {undo})" in said
+    solved, undo = (", ".join(map(" ".join, options.items())) for options in (done, usual))
+    sentence = f"Solved with {solved}: USE; as the streams are: DO NOT USE (undo with {undo})"
+    assert sentence in warning
 
 
 @pytest.mark.parametrize("scale", [{}, {"scale": "estimate"}])
@@ -121,8 +122,8 @@ def test_kept_pairs_are_put_right_like_poses(streams):
     snapshot = whole_snapshot(parent, child, {"reference": "B5"})
     nothing = {"buffered_parent": parent[:0], "buffered_child": child[:0]}
     kept = replace(snapshot, kept=snapshot.pose_pairs, paired_at="child", **nothing)
-    found = with_options(kept, {"child_invert": "poses"})
-    np.testing.assert_allclose(found.estimate().T_parent_child, expected, atol=1e-9)
+    repaired = with_options(kept, {"child_invert": "poses"})
+    np.testing.assert_allclose(repaired.estimate().T_parent_child, expected, atol=1e-9)
     shifted = with_options(kept, {"child_invert": "poses", "time_offset": 0.0})
     np.testing.assert_allclose(shifted.estimate().T_parent_child, expected, atol=1e-9)
 
@@ -147,8 +148,8 @@ def test_a_scale_that_was_given_is_left_by_the_noise_model_too(streams):
 
 def test_a_clock_that_was_given_as_right_is_left_by_the_noise_model_too(late):
     shifted = replace(late, buffered_child=late.buffered_child.shifted(0.04))  # 0.01 s remain
-    found = hec.calibrate(late.buffered_parent, shifted.buffered_child)
-    assert found.time_offset_s == pytest.approx(0.01, abs=0.003)
+    estimated = hec.calibrate(late.buffered_parent, shifted.buffered_child)
+    assert estimated.time_offset_s == pytest.approx(0.01, abs=0.003)
     result = hec.calibrate(late.buffered_parent, shifted.buffered_child, time_offset=0.0)
     assert (result.time_offset_s, result.time_offset_sigma_s) == (0.0, 0.0)
 
@@ -167,10 +168,10 @@ def test_good_streams_are_left_alone(streams):
     parent, child, _ = streams
     snapshot = whole_snapshot(parent, child, {"reference": "B5"})
     plain = snapshot.estimate()
-    found = review(plain, snapshot)
-    assert found.snapshot is snapshot
-    assert (found.calibration.warnings, found.options) == (plain.warnings, {})
-    assert found.calibration.findings == ()
+    outcome = review(plain, snapshot)
+    assert outcome.snapshot is snapshot
+    assert (outcome.calibration.warnings, outcome.options) == (plain.warnings, {})
+    assert outcome.calibration.findings == ()
 
 
 @pytest.mark.parametrize(
@@ -248,12 +249,12 @@ def test_a_clock_that_the_user_set_stays(late, options):
 
 def test_a_large_offset_that_nobody_asked_for_is_used_with_care(late):
     child = late.buffered_child.shifted(5.0)
-    found = run(replace(late, buffered_child=child)).calibration
-    assert found.time_offset_s == pytest.approx(-5.0, abs=0.1)
-    assert found.verdict is not Verdict.USE
-    assert {"time_offset"} == {each.code for each in found.findings}
-    given = replace(late.config, time_offset="estimate", given={"time_offset"})
-    asked = run(replace(late, buffered_child=child, config=given)).calibration
+    result = run(replace(late, buffered_child=child)).calibration
+    assert result.time_offset_s == pytest.approx(-5.0, abs=0.1)
+    assert result.verdict is not Verdict.USE
+    assert {"time_offset"} == {finding.code for finding in result.findings}
+    config = replace(late.config, time_offset="estimate", given={"time_offset"})
+    asked = run(replace(late, buffered_child=child, config=config)).calibration
     assert asked.findings == ()
 
 
@@ -290,13 +291,13 @@ def test_a_scale_that_the_noise_model_finds_unasked_is_stated(factor, severity, 
     parent = as_trajectory(disturbed(poses, 4, 0.002, 0.001))
     child = as_trajectory(disturbed(child_of(poses), 5, 0.002, 0.001)).scaled(factor)
     result = hec.calibrate(parent, child)
-    found = {each.code: each for each in result.findings}
+    findings = {finding.code: finding for finding in result.findings}
     if severity is None:
-        assert "model_scale" not in found
+        assert "model_scale" not in findings
         assert "lengths" not in result.headline
         return
-    assert found["model_scale"].severity is severity
-    assert found["model_scale"].evidence["scale"] == pytest.approx(1.0 / factor, abs=0.002)
+    assert findings["model_scale"].severity is severity
+    assert findings["model_scale"].evidence["scale"] == pytest.approx(1.0 / factor, abs=0.002)
     assert f"% {words} than the parent's" in result.headline
     is_care = severity is Severity.WARNING
     assert result.verdict is (Verdict.USE_WITH_CARE if is_care else Verdict.USE)
@@ -309,4 +310,4 @@ def test_a_scale_that_was_asked_for_is_no_finding(scale):
     child = as_trajectory(disturbed(child_of(poses), 5, 0.002, 0.001)).scaled(1.06)
     result = hec.calibrate(parent, child, scale=scale)
     assert result.scale == pytest.approx(1.0 / 1.06, abs=0.002)
-    assert "model_scale" not in {each.code for each in result.findings}
+    assert "model_scale" not in {finding.code for finding in result.findings}

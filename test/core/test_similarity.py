@@ -33,9 +33,9 @@ def pose_pairs(parent, child):
 @pytest.mark.parametrize("scale", [1e-3, 0.3048, 1.0, 3.34, 1000.0])
 @pytest.mark.parametrize("poses", [motions.wandering_poses, motions.planar_poses])
 def test_noise_free_scale_is_exact(scale, poses):
-    found = estimate_scale(pose_pairs(*streams(scale=scale, poses=poses)))
-    assert found.scale == pytest.approx(scale, rel=1e-5)
-    assert found.explains_translation
+    fit = estimate_scale(pose_pairs(*streams(scale=scale, poses=poses)))
+    assert fit.scale == pytest.approx(scale, rel=1e-5)
+    assert fit.explains_translation
 
 
 def test_most_pairs_decide_whatever_the_others_say():
@@ -44,8 +44,8 @@ def test_most_pairs_decide_whatever_the_others_say():
     wrong = random.random(len(child)) < 0.12
     poses = child.poses.copy()
     poses[wrong] = poses[wrong] @ se3.exp(random.normal(size=(int(wrong.sum()), 6)))
-    found = estimate_scale(pose_pairs(parent, dataclasses.replace(child, poses=poses)))
-    assert found.scale == pytest.approx(2.5, rel=0.01)
+    fit = estimate_scale(pose_pairs(parent, dataclasses.replace(child, poses=poses)))
+    assert fit.scale == pytest.approx(2.5, rel=0.01)
 
 
 def test_standard_deviation_is_of_the_size_of_the_errors():
@@ -77,8 +77,8 @@ def test_uncertainty_of_the_scale_enters_that_of_the_extrinsic():
     parent, child = streams(noise=0.005)
     options = {"reference": "B10", "checks": False}
     estimated = calibrate(parent, child, scale="estimate", **options)
-    given = calibrate(parent, child, scale=estimated.scale, **options)
-    assert np.trace(estimated.covariance_measured) > np.trace(given.covariance_measured)
+    with_scale = calibrate(parent, child, scale=estimated.scale, **options)
+    assert np.trace(estimated.covariance_measured) > np.trace(with_scale.covariance_measured)
 
 
 def test_a_scale_that_explains_nothing_is_refused():
@@ -112,10 +112,10 @@ def drive(seed=0, seconds=60, hz=RATES_HZ, shift_s=0.0, noise=0.0, wander=motion
 
 @pytest.mark.parametrize("shift_s", [0.0, 0.1234, -3.7, 500.0, -12345.678])
 def test_any_offset_is_found_also_without_common_time(shift_s):
-    found = estimate_time_offset(*drive(shift_s=shift_s, noise=0.0005))
-    assert found.seconds == pytest.approx(shift_s, abs=0.002)
-    assert found.correlation.is_clear
-    assert found.sigma_s < 0.002
+    offset = estimate_time_offset(*drive(shift_s=shift_s, noise=0.0005))
+    assert offset.seconds == pytest.approx(shift_s, abs=0.002)
+    assert offset.correlation.is_clear
+    assert offset.sigma_s < 0.002
 
 
 def test_a_body_that_rotates_about_one_of_its_sensors():
@@ -126,9 +126,9 @@ def test_a_body_that_rotates_about_one_of_its_sensors():
         poses[:, :3, 3] = 0.0
         return poses
 
-    found = estimate_time_offset(*drive(shift_s=0.1234, noise=0.002, wander=rotating))
-    assert found.seconds == pytest.approx(0.1234, abs=0.002)
-    assert found.sigma_s < 0.002
+    offset = estimate_time_offset(*drive(shift_s=0.1234, noise=0.002, wander=rotating))
+    assert offset.seconds == pytest.approx(0.1234, abs=0.002)
+    assert offset.sigma_s < 0.002
 
 
 @pytest.mark.statistics
@@ -151,8 +151,8 @@ def test_jumps_do_no_harm():
     random = np.random.default_rng(3)
     jumping = random.random(len(child)) < 0.05
     poses[jumping] = poses[jumping] @ se3.exp(random.normal(size=(int(jumping.sum()), 6)) * 0.5)
-    found = estimate_time_offset(parent, dataclasses.replace(child, poses=poses))
-    assert found.seconds == pytest.approx(41.0, abs=0.01)
+    offset = estimate_time_offset(parent, dataclasses.replace(child, poses=poses))
+    assert offset.seconds == pytest.approx(41.0, abs=0.01)
 
 
 def test_angular_rates_do_not_depend_on_conventions():
@@ -191,20 +191,20 @@ class TestClockRate:
         parent, child = drive(seconds=300, hz=(10.0, 10.0), noise=0.001)
         middle_ns = int(child.stamps_ns[len(child) // 2])
         slow = child.shifted(0.0, -75e-6, middle_ns)
-        found = calibrate(parent, slow)
+        result = calibrate(parent, slow)
         plain = calibrate(parent, child, checks=False)
-        assert found.clock_rate.is_used
-        assert abs(found.clock_rate.ppm - 75.0) < min(5.0, 5.0 * found.clock_rate.sigma_ppm)
-        assert "ppm slow: solved with time_offset estimate" in found.warnings[0]
-        away = se3.log(se3.inverse(plain.T_parent_child) @ found.T_parent_child)
+        assert result.clock_rate.is_used
+        assert abs(result.clock_rate.ppm - 75.0) < min(5.0, 5.0 * result.clock_rate.sigma_ppm)
+        assert "ppm slow: solved with time_offset estimate" in result.warnings[0]
+        away = se3.log(se3.inverse(plain.T_parent_child) @ result.T_parent_child)
         assert np.abs(away / np.sqrt(np.diag(plain.covariance_measured))).max() < 0.3
-        again = type(found).from_dict(found.to_dict())
-        assert again.clock_rate == found.clock_rate
+        again = type(result).from_dict(result.to_dict())
+        assert again.clock_rate == result.clock_rate
 
     def test_one_that_is_not_there_is_stated_and_not_used(self):
-        found = estimate_time_offset(*drive(shift_s=0.3, noise=0.001))
-        assert abs(found.rate.ppm) < 5.0 * found.rate.sigma_ppm
-        assert not found.rate.is_used
+        offset = estimate_time_offset(*drive(shift_s=0.3, noise=0.001))
+        assert abs(offset.rate.ppm) < 5.0 * offset.rate.sigma_ppm
+        assert not offset.rate.is_used
 
 
 class TestInTheEngine:
@@ -215,19 +215,19 @@ class TestInTheEngine:
         assert 0 < estimated.time_offset_sigma_s < 0.002
         again = type(estimated).from_dict(estimated.to_dict())
         assert again.time_offset_sigma_s == estimated.time_offset_sigma_s
-        given = calibrate(parent, child, time_offset=estimated.time_offset_s, **options)
-        np.testing.assert_array_equal(given.T_parent_child, estimated.T_parent_child)
-        assert given.time_offset_sigma_s == 0.0
-        assert np.linalg.eigvalsh(estimated.covariance_measured - given.covariance_measured)[-1] > 0
+        fixed = calibrate(parent, child, time_offset=estimated.time_offset_s, **options)
+        np.testing.assert_array_equal(fixed.T_parent_child, estimated.T_parent_child)
+        assert fixed.time_offset_sigma_s == 0.0
+        assert np.linalg.eigvalsh(estimated.covariance_measured - fixed.covariance_measured)[-1] > 0
 
     def test_long_sessions_settle_it_when_a_buffer_is_full(self):
         parent, child = drive(seconds=120, shift_s=0.2)
         calibrator = Calibrator(
             CalibratorConfig(time_offset="estimate", reference="B5"), BufferLimits(capacity=900)
         )
-        for part in range(8):
+        for eighth in range(8):
             for stream, trajectory in (("parent", parent), ("child", child)):
-                first, last = (k * len(trajectory) // 8 for k in (part, part + 1))
+                first, last = (k * len(trajectory) // 8 for k in (eighth, eighth + 1))
                 motions.feed(calibrator, stream, trajectory[first:last])
         snapshot = calibrator.snapshot()
         assert len(snapshot.kept) > 0

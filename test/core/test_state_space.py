@@ -149,9 +149,9 @@ def test_surprises_are_what_leaving_one_out_makes_of_it():
     inverse = np.linalg.inv(V)
     P = inverse - inverse @ J @ np.linalg.inv(J.T @ inverse @ J) @ J.T @ inverse
     u = (P @ r).reshape(-1, 6)
-    for i, found in enumerate(of_walk):
+    for i, surprise in enumerate(of_walk):
         own = P[6 * i : 6 * i + 6, 6 * i : 6 * i + 6]
-        assert found == pytest.approx(u[i] @ np.linalg.solve(own, u[i]), rel=1e-5)
+        assert surprise == pytest.approx(u[i] @ np.linalg.solve(own, u[i]), rel=1e-5)
     # An increment that is no evidence is judged by the same number.
     without = space_of(cut=(6,))
     again, _ = innovations(Posterior(without, LEVELS), np.zeros(N_POSES, dtype=bool))
@@ -177,8 +177,8 @@ def test_parts_add_what_a_recording_that_ends_there_would_know():
     )
     rounding = 1e-12 * np.random.default_rng(0).normal(size=(7, 7))
     np.fill_diagonal(rounding, [0, 0, 5e-10, 5e-10, 5e-10, 5e10, 0.5])
-    known = NormalEquations(rounding + rounding.T)
-    assert not known.is_complete
+    equations = NormalEquations(rounding + rounding.T)
+    assert not equations.is_complete
 
 
 @pytest.mark.parametrize("n", [1, 2, 5, 90])
@@ -206,13 +206,13 @@ def test_block_tridiagonal_algebra_is_that_of_the_dense_matrix(n):
     np.testing.assert_allclose(squares, flat.T @ inverse @ flat, rtol=1e-12, atol=1e-12)
     assert factor.log_determinant == pytest.approx(np.linalg.slogdet(matrix)[1])
     blocks = inverse.reshape(n, d, n, d)
-    found, found_below = factor.selected_inverse
-    assert found.shape == (n, d, d)
-    assert found_below.shape == (n - 1, d, d)
+    on_diagonal, below_diagonal = factor.selected_inverse
+    assert on_diagonal.shape == (n, d, d)
+    assert below_diagonal.shape == (n - 1, d, d)
     for k in range(n):
-        np.testing.assert_allclose(found[k], blocks[k, :, k], atol=1e-12)
+        np.testing.assert_allclose(on_diagonal[k], blocks[k, :, k], atol=1e-12)
     for k in range(n - 1):
-        np.testing.assert_allclose(found_below[k], blocks[k + 1, :, k], atol=1e-12)
+        np.testing.assert_allclose(below_diagonal[k], blocks[k + 1, :, k], atol=1e-12)
     with pytest.raises(np.linalg.LinAlgError):
         Factor(-diagonal, below)
 

@@ -131,20 +131,20 @@ def test_every_fault_is_named(fault):
     damage, code = FAULTS[fault]
     parent, child = drive()
     agreement = check_streams(*damage(parent, child, drive(9)[1]))
-    assert [found for found, _ in grave(agreement)] == [code]
+    assert [pair for pair, _ in grave(agreement)] == [code]
 
 
 @pytest.mark.parametrize("noise", [MIXTURE, NoiseConfig(gaussian=0.01, outliers=0.1, drift=0.05)])
 def test_strong_noise_is_no_fault_of_the_rig(noise):
     simulated = simulate_drive((1, 0), PUBLISHED_DRIVE, noise)
-    found = check_streams(simulated.parent, simulated.child)
-    assert {code for code, _ in grave(found)} <= {"jumps"}
+    result = check_streams(simulated.parent, simulated.child)
+    assert {code for code, _ in grave(result)} <= {"jumps"}
 
 
 def test_streams_that_nearly_agree_as_they_are_may_be_in_another_order():
     simulated = simulate(77, poses=500)  # hardly any roll and pitch
-    found = check_streams(simulated.parent, reordered(simulated.child))
-    assert grave(found)[0] == ("quaternion_order", "child")
+    result = check_streams(simulated.parent, reordered(simulated.child))
+    assert grave(result)[0] == ("quaternion_order", "child")
 
 
 class TestWhichStreamAndWhatToDo:
@@ -170,15 +170,16 @@ class TestWhichStreamAndWhatToDo:
         }
         assert findings["time_offset"].options["time_offset"] == pytest.approx(7.25, abs=0.002)
         assert findings["scale"].options["scale"] == pytest.approx(2.0, rel=0.005)
-        known = check_streams(
+        result = check_streams(
             parent, child.shifted(-7.25).scaled(0.5), time_offset_s=7.25, scale=2.0
         )
-        assert grave(known) == []
-        tiny = [each.options for each in check_streams(parent, child.scaled(2e5)).findings]
+        assert grave(result) == []
+        tiny = [finding.options for finding in check_streams(parent, child.scaled(2e5)).findings]
         assert {"scale": pytest.approx(5e-6, rel=0.005)} in tiny
         # The solve may have found a scale of its own beside the unit.
-        found = check_streams(parent.scaled(1000.0), child, scale=1.17).findings
-        assert [each.options for each in found if each.code == "units"] == [{"parent_scale": 0.001}]
+        result = check_streams(parent.scaled(1000.0), child, scale=1.17)
+        (units,) = (finding for finding in result.findings if finding.code == "units")
+        assert units.options == {"parent_scale": 0.001}
 
     def test_which_axes_are_swapped(self):
         parent, child = drive()
@@ -189,9 +190,9 @@ class TestWhichStreamAndWhatToDo:
     def test_left_handed_axes_and_two_mistakes_at_once(self):
         parent, child = drive()
         assert grave(check_streams(parent, mirrored(child))) == [("left_handed", "child")]
-        found = grave(check_streams(parent, reordered(child).shifted(-33.0).scaled(1000.0)))
+        findings = grave(check_streams(parent, reordered(child).shifted(-33.0).scaled(1000.0)))
         codes = "quaternion_order", "time_offset", "units"
-        assert sorted(found) == [(code, "child") for code in codes]
+        assert sorted(findings) == [(code, "child") for code in codes]
 
     def test_turning_about_one_axis_is_named_in_the_parent_frame(self):
         lying = se3.from_rotation_translation(
@@ -241,7 +242,7 @@ class TestOneStream:
                 stream, duration_s, np.zeros(6) if name == repeating else drift
             )
         assert check_frozen(**streams) == []
-        codes = {found.code for found in check_streams(**streams).findings}
+        codes = {finding.code for finding in check_streams(**streams).findings}
         assert "frozen" not in codes
 
     @pytest.mark.parametrize("repeating", ["parent", "child"])
@@ -265,14 +266,14 @@ class TestOneStream:
         poses = stream.poses.copy()
         poses[200 : 201 + int(10 * duration_s)] = poses[200]
         streams[frozen_stream] = dataclasses.replace(stream, poses=poses)
-        (found,) = check_frozen(**streams)
-        assert (found.code, found.stream, found.severity) == (
+        (finding,) = check_frozen(**streams)
+        assert (finding.code, finding.stream, finding.severity) == (
             "frozen",
             frozen_stream,
             Severity.ERROR,
         )
         share = duration_s / stream.duration_s
-        assert found.evidence["share"] == pytest.approx(share, abs=0.004)
+        assert finding.evidence["share"] == pytest.approx(share, abs=0.004)
 
     def test_only_the_part_of_a_freeze_in_which_the_car_drives_counts(self):
         parent, child = driving_car()
@@ -355,12 +356,15 @@ class TestSlowStreams:
 
     @pytest.mark.parametrize("interval_s", [1.0, 20.0])
     def test_equal_stamps_have_motions_in_common(self, interval_s):
-        parent, child = (motions.as_trajectory(each.poses[::5], 1 / interval_s) for each in drive())
+        parent, child = (
+            motions.as_trajectory(stream.poses[::5], 1 / interval_s) for stream in drive()
+        )
         assert grave(check_streams(parent, child)) == []
 
     def test_a_clock_offset_is_found_between_poses(self):
         parent, child = (
-            motions.as_trajectory(each.poses, 1.0) for each in drive(wander=motions.planar_poses)
+            motions.as_trajectory(stream.poses, 1.0)
+            for stream in drive(wander=motions.planar_poses)
         )
         assert [code for code, _ in grave(check_streams(parent, child.shifted(-3.0)))] == [
             "time_offset"
@@ -401,6 +405,8 @@ def test_a_short_lever_arm_is_zero_only_if_it_cannot_be_longer_than_2_mm():
     severities = []
     for length_m, noise in ((0.0005, 1e-4), (0.004, 1e-4), (0.016, 0.004), (0.016, 0.02)):
         X = se3.from_rotation_translation(se3.rotation_exp([0.4, -0.8, 0.3]), [length_m, 0.0, 0.0])
-        found = check_streams(*motions.noisy_pair(poses, 1, noise, noise, mount=X)).findings
-        severities.append({each.severity for each in found if each.code == "same_position"})
+        findings = check_streams(*motions.noisy_pair(poses, 1, noise, noise, mount=X)).findings
+        severities.append(
+            {finding.severity for finding in findings if finding.code == "same_position"}
+        )
     assert severities == [{Severity.ERROR}, {Severity.WARNING}, set(), set()]

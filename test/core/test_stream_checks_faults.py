@@ -38,22 +38,22 @@ def test_every_fault_is_named(fault):
     sound = drive()
     streams = fault.damage(sound.parent, sound.child, severity, np.random.default_rng(0))
     findings = check_streams(*streams).findings
-    assert {found.code for found in findings} & fault.named
-    for found in findings:
-        assert found.what
-        assert found.advice
+    assert {finding.code for finding in findings} & fault.named
+    for finding in findings:
+        assert finding.what
+        assert finding.advice
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_sound_drive_has_no_finding(seed):
-    assert [found.code for found in check_streams(*_streams(drive(seed))).findings] == []
+    assert [finding.code for finding in check_streams(*_streams(drive(seed))).findings] == []
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_drift_on_a_flat_floor_is_no_scale_of_heights(seed):
     noise = dataclasses.replace(REALISTIC, drift=0.01)
     flat = simulate_drive(seed, dataclasses.replace(HILLY_DRIVE, terrain_height=0.0), noise)
-    assert "axis_scale" not in {found.code for found in check_streams(*_streams(flat)).findings}
+    assert "axis_scale" not in {finding.code for finding in check_streams(*_streams(flat)).findings}
 
 
 def _streams(simulated):
@@ -65,9 +65,9 @@ def test_the_time_of_a_loose_mount_does_not_depend_on_noise(level):
     sound = simulate_drive(4, HILLY_DRIVE, NoiseConfig(gaussian=level))
     loosened = next(fault for fault in FAULTS if fault.code == "S8")
     streams = loosened.damage(sound.parent, sound.child, 5.0, np.random.default_rng(1))
-    (found,) = (f for f in check_streams(*streams).findings if f.code == "mount_moved")
-    assert found.evidence["at_s"] == pytest.approx(60.0, abs=3.0)
-    assert "60 s after the start" in found.what or "5" in found.what
+    (finding,) = (f for f in check_streams(*streams).findings if f.code == "mount_moved")
+    assert finding.evidence["at_s"] == pytest.approx(60.0, abs=3.0)
+    assert "60 s after the start" in finding.what or "5" in finding.what
 
 
 def rounded_pair(step_m, in_mm):
@@ -89,9 +89,9 @@ class TestGrid:
         child = drive().child
         poses = child.poses.copy()
         poses[:, :3, 3] = np.round(poses[:, :3, 3] / 0.05) * 0.05
-        (found,) = check_stream(Trajectory(child.stamps_ns, poses), "child")
-        assert (found.code, found.severity) == ("coarse_positions", Severity.ERROR)
-        assert found.evidence["step_m"] == pytest.approx(0.05)
+        (finding,) = check_stream(Trajectory(child.stamps_ns, poses), "child")
+        assert (finding.code, finding.severity) == ("coarse_positions", Severity.ERROR)
+        assert finding.evidence["step_m"] == pytest.approx(0.05)
 
     @pytest.mark.parametrize(
         ("in_mm", "options"),
@@ -106,7 +106,7 @@ class TestGrid:
     def test_millimetres_with_one_decimal_are_fine(self, in_mm, options):
         streams = rounded_pair(step_m=1e-4, in_mm=in_mm)
         result = hec.calibrate(*streams, **options)
-        assert [found.code for found in result.findings] == []
+        assert [finding.code for finding in result.findings] == []
         assert result.verdict is Verdict.USE
         np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=2e-3)
 
@@ -118,9 +118,9 @@ class TestGrid:
         option = {"parent": "parent_scale", "child": "scale"}[stream]
         streams = rounded_pair(step_m=step_m, in_mm=stream)
         result = hec.calibrate(*streams, **{option: 0.001})
-        (found,) = (found for found in result.findings if found.code == "coarse_positions")
-        assert (found.stream, found.severity) == (stream, severity)
-        assert found.what == f"the {stream} stream's positions are multiples of {step_m:g} m"
+        (finding,) = (finding for finding in result.findings if finding.code == "coarse_positions")
+        assert (finding.stream, finding.severity) == (stream, severity)
+        assert finding.what == f"the {stream} stream's positions are multiples of {step_m:g} m"
 
     def test_steady_motion_is_no_grid(self):
         poses = np.tile(np.eye(4), (300, 1, 1))
@@ -157,7 +157,7 @@ class TestOneStreamComputedFromTheOther:
 
     def found(self, parent, child):
         findings = check_streams(parent, child).findings
-        return [each.what for each in findings if each.code[:3] != "one"]
+        return [finding.what for finding in findings if finding.code[:3] != "one"]
 
     @pytest.mark.parametrize("rate_hz", [4.0, 11.0, 37.0])
     def test_at_any_rate(self, rate_hz):
@@ -182,8 +182,8 @@ class TestOneStreamComputedFromTheOther:
         poses[:, :3, :3] = se3.nearest_rotation(poses[:, :3, :3])
         slow = error_m * np.sin(np.outer(np.arange(len(poses)) / 40, [1, 0, 0, 0, 0.2, 0]))
         own = disturbed(child_of(poses) @ se3.exp(slow), 1, *(width < 1) * np.array([1e-4, 3e-5]))
-        found = self.found(Trajectory(stamps_ns, poses), Trajectory(stamps_ns, own))
-        assert found == [f"the noise of both streams is unusually alike{self.QUESTION}"]
+        sentences = self.found(Trajectory(stamps_ns, poses), Trajectory(stamps_ns, own))
+        assert sentences == [f"the noise of both streams is unusually alike{self.QUESTION}"]
 
     def test_orientations_alone(self):
         parent, child = _streams(drive())
@@ -214,7 +214,7 @@ class TestOneStreamComputedFromTheOther:
     def test_two_precise_sensors_are_no_copies(self, rate_hz, noise):
         poses = wandering_poses(600, 4, 1.0 / rate_hz, 0.8 / rate_hz)
         findings = check_streams(*noisy_pair(poses, 1, noise, noise, rate_hz=rate_hz)).findings
-        assert [found.what for found in findings] == []
+        assert [finding.what for finding in findings] == []
 
 
 def fused(parent, child, X, tau_s):
@@ -243,7 +243,7 @@ class TestParentFusedFromTheChild:
         parent = fused(truth.parent[inside], truth.child, truth.T_parent_child @ self.WRONG, tau_s)
         result = hec.calibrate(parent, truth.child)
         assert result.verdict is not Verdict.USE
-        codes = {found.code for found in result.findings}
+        codes = {finding.code for finding in result.findings}
         # Positions that are turned against orientations show the longest times.
         assert codes & {"not_independent", "worlds_turned"}
         clean = hec.calibrate(truth.parent, truth.child)
@@ -252,7 +252,7 @@ class TestParentFusedFromTheChild:
     @pytest.mark.parametrize("seed", [61, 62])
     def test_rotations_about_one_axis_show_no_other_mount(self, seed):
         flat = make("flat_agv", seed)
-        codes = [found.code for found in check_streams(flat.parent, flat.child).findings]
+        codes = [finding.code for finding in check_streams(flat.parent, flat.child).findings]
         assert codes == ["one_axis"]
 
     @pytest.mark.parametrize("kind", ["car_ins_lidar", "agv_long"])
@@ -260,10 +260,10 @@ class TestParentFusedFromTheChild:
         truth = make(kind, 901)
         copies = truth.child.poses @ se3.inverse(truth.T_parent_child @ self.WRONG)
         parent = Trajectory(truth.child.stamps_ns, disturbed(copies, 3, 0.01, 0.002))
-        (found,) = check_streams(parent, truth.child).findings
-        assert (found.code, found.severity) == ("not_independent", Severity.WARNING)
-        assert found.what.startswith("the streams drift apart by only ")
-        assert found.what.endswith(TestOneStreamComputedFromTheOther.QUESTION)
+        (finding,) = check_streams(parent, truth.child).findings
+        assert (finding.code, finding.severity) == ("not_independent", Severity.WARNING)
+        assert finding.what.startswith("the streams drift apart by only ")
+        assert finding.what.endswith(TestOneStreamComputedFromTheOther.QUESTION)
         assert check_streams(parent, truth.child, are_exact=True).findings == ()
         assert check_streams(truth.parent, truth.child).findings == ()
 
@@ -299,7 +299,7 @@ def test_a_world_that_drifts_is_no_mount_that_has_moved():
     """Seen in a short recording, it looks like a shift as well."""
     drive = simulate_drive(1, HILLY_DRIVE, NoiseConfig(gaussian=0.003))
     child = heading_drift(drive.child, 20.0, None)[: len(drive.child) // 3]
-    codes = [found.code for found in check_streams(drive.parent, child).findings]
+    codes = [finding.code for finding in check_streams(drive.parent, child).findings]
     assert codes == ["world_drift"]
 
 
@@ -337,8 +337,8 @@ def test_a_shift_between_parts_counts_with_half_of_it():
 
 
 def test_only_what_is_more_than_recordings_scatter_is_said_to_have_moved():
-    (told,) = possible_shift(products_of(parts(0, 1.5)), 1.0)[1]
-    assert "The first 40% and the last 60%" in told
+    (warning,) = possible_shift(products_of(parts(0, 1.5)), 1.0)[1]
+    assert "The first 40% and the last 60%" in warning
     scattered = np.where(np.arange(20)[:, None] < 8, 0.0, 0.3 * SHIFT)
     spread, warnings = possible_shift(products_of(scattered, sigma=1e-3), 1.0)
     assert (spread.max() > 0.0, warnings) == (True, ())
@@ -354,7 +354,7 @@ class TestGraveAgain:
         random = np.random.default_rng(5)
         parent, child = fault.damage(sound.parent, sound.child, fault.severities[severity], random)
         result = hec.calibrate(parent, child, max_pairs=400, **fault.options)
-        return [each.code for each in result.findings if each.severity.value == "error"]
+        return [finding.code for finding in result.findings if finding.severity.value == "error"]
 
     @pytest.mark.parametrize(
         ("code", "severity", "name"),
@@ -379,5 +379,5 @@ class TestGraveAgain:
         poses[first:] = se3.inverse(mirrored[0]) @ mirrored
         child = dataclasses.replace(sound.child, poses=poses)
         result = hec.calibrate(sound.parent, child, max_pairs=400)
-        assert "mount_moved" in [each.code for each in result.findings]
+        assert "mount_moved" in [finding.code for finding in result.findings]
         assert result.verdict is hec.Verdict.DO_NOT_USE

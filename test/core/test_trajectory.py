@@ -70,7 +70,7 @@ def test_shift_and_scale_keep_everything_else():
 
 
 def test_equal_trajectories_have_the_same_poses_stamps_and_frames():
-    trajectory, other = (Trajectory(STAMPS, each, "lidar") for each in (POSES, POSES.copy()))
+    trajectory, other = (Trajectory(STAMPS, poses, "lidar") for poses in (POSES, POSES.copy()))
     assert trajectory == other
     changed = other.shifted(1.0), other.scaled(2.0), other[:2], replace(other, sensor_frame="")
     assert trajectory not in [*changed, "lidar"]
@@ -86,8 +86,8 @@ def shaking(hz, times_s):
 
 
 def errors(trajectory, truth, stamps_ns, straight):
-    found = trajectory.at(stamps_ns, straight=straight)
-    return np.linalg.norm(se3.log(se3.inverse(truth) @ found), axis=1)
+    interpolated = trajectory.at(stamps_ns, straight=straight)
+    return np.linalg.norm(se3.log(se3.inverse(truth) @ interpolated), axis=1)
 
 
 def at_rest(noise, seed=0):
@@ -104,7 +104,7 @@ def test_a_shake_is_cut_far_less_than_by_a_constant_twist(hz, share):
     trajectory = as_trajectory(shaking(hz, np.arange(200) / HZ), HZ)
     stamps_ns = middles(trajectory)[REACH:-REACH]
     truth = shaking(hz, (stamps_ns - trajectory.stamps_ns[0]) * 1e-9)
-    bent, straight = (errors(trajectory, truth, stamps_ns, each) for each in (False, True))
+    bent, straight = (errors(trajectory, truth, stamps_ns, way) for way in (False, True))
     assert bent.mean() < share * straight.mean()
 
 
@@ -113,7 +113,8 @@ def test_of_white_noise_little_more_is_left_than_by_a_constant_twist():
     stamps_ns = middles(trajectory)[REACH:-REACH]
     truth = np.broadcast_to(np.eye(4), (len(stamps_ns), 4, 4))
     bent, straight = (
-        np.sqrt((errors(trajectory, truth, stamps_ns, each) ** 2).mean()) for each in (False, True)
+        np.sqrt((errors(trajectory, truth, stamps_ns, is_straight) ** 2).mean())
+        for is_straight in (False, True)
     )
     assert straight < bent < 1.05 * straight
 

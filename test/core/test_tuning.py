@@ -124,7 +124,7 @@ def numbers_of(case, tuning):
         times_ns = stamps(N_POSES)
         solution = positions.solve(times_ns, odometry, measured, with_scale, tuning)
         answer = solution.lever_arm, solution.covariance
-    return np.concatenate([np.ravel(part) for part in (*answer, solution.levels)]).tolist()
+    return np.concatenate([np.ravel(array) for array in (*answer, solution.levels)]).tolist()
 
 
 # Another value of each number, and a case that it changes.

@@ -47,40 +47,40 @@ class TestRatio:
     def test_a_child_in_another_unit_is_named_within_three_sigma(self, unit):
         factor = UNITS[unit]
         streams = moving_at(0.5), moving_at(0.5 / factor)
-        found = in_other_units(1.002 * factor, 0.001 * factor, *streams)
-        assert (found.code, found.stream) == ("units", "child")
-        assert found.options == {"scale": factor}
-        assert unit in found.what
+        finding = in_other_units(1.002 * factor, 0.001 * factor, *streams)
+        assert (finding.code, finding.stream) == ("units", "child")
+        assert finding.options == {"scale": factor}
+        assert unit in finding.what
         assert in_other_units(1.004 * factor, 0.001 * factor, *streams) is None
 
     @pytest.mark.parametrize("unit", UNITS)
     def test_a_ratio_alone_never_changes_the_parent(self, unit):
         factor = UNITS[unit]
         streams = moving_at(2.0), moving_at(2.0 * factor)
-        found = in_other_units(1.002 / factor, 0.001 / factor, *streams)
+        finding = in_other_units(1.002 / factor, 0.001 / factor, *streams)
         if unit == "millimetres":
-            assert found is None  # a child at 2 mm/s is not in metres
+            assert finding is None  # a child at 2 mm/s is not in metres
         else:
-            assert found.code == "unit_or_scale"
-            assert "parent_scale" not in found.options
-            assert f"parent_scale {factor:g}" in found.advice
+            assert finding.code == "unit_or_scale"
+            assert "parent_scale" not in finding.options
+            assert f"parent_scale {factor:g}" in finding.advice
 
     @pytest.mark.parametrize(
         ("off", "is_exact"), [(1.002, 1.0), (1.004, 1.0), (1.006, 0.0), (0.96, 0.0)]
     )
     def test_a_ratio_near_a_unit_is_a_question(self, off, is_exact):
         streams = moving_at(2.0), moving_at(0.6)
-        found = in_other_units(off / 0.3048, 0.001 / 0.3048, *streams)
-        assert (found.code, found.evidence["is_exact"]) == ("unit_or_scale", is_exact)
+        finding = in_other_units(off / 0.3048, 0.001 / 0.3048, *streams)
+        assert (finding.code, finding.evidence["is_exact"]) == ("unit_or_scale", is_exact)
 
     @pytest.mark.parametrize("unit", ["millimetres", "centimetres"])
     def test_a_parent_faster_than_sound_in_metres_is_in_that_unit(self, unit):
         factor = UNITS[unit]
-        found = in_other_units(
+        finding = in_other_units(
             1.0 / factor, 0.001 / factor, moving_at(8.0 / factor), moving_at(8.0)
         )
-        assert (found.code, found.stream) == ("units", "parent")
-        assert found.options == {"parent_scale": factor}
+        assert (finding.code, finding.stream) == ("units", "parent")
+        assert finding.options == {"parent_scale": factor}
 
     @pytest.mark.parametrize("scale", [1.05, 3.09, 3.48, 2.0, 10.0, 0.1, 0.28, 0.32])
     def test_a_scale_near_no_unit_is_a_scale(self, scale):
@@ -106,21 +106,23 @@ class TestResult:
         result = hec.calibrate(parent.scaled(1000.0), child, reference="B5")
         np.testing.assert_allclose(result.T_parent_child, expected, atol=0.01)
         assert result.verdict is hec.Verdict.USE_WITH_CARE
-        assert ("units", "parent") in {(each.code, each.stream) for each in result.findings}
+        assert ("units", "parent") in {
+            (finding.code, finding.stream) for finding in result.findings
+        }
 
     def test_a_parent_in_feet_is_asked_about(self, hand, expected):
         parent, child = hand
         parent = parent.scaled(1.0 / 0.3048)
         result = hec.calibrate(parent, child, reference="B5")
         assert result.verdict is hec.Verdict.DO_NOT_USE
-        (found,) = (each for each in result.findings if each.makes_unusable)
-        assert found.code == "unit_or_scale"
+        (finding,) = (finding for finding in result.findings if finding.makes_unusable)
+        assert finding.code == "unit_or_scale"
         assert result.scale == pytest.approx(3.2808, abs=0.01)
         answered = hec.calibrate(parent, child, reference="B5", parent_scale=0.3048)
         np.testing.assert_allclose(answered.T_parent_child, expected, atol=0.01)
-        assert not any(each.makes_unusable for each in answered.findings)
+        assert not any(finding.makes_unusable for finding in answered.findings)
         scaled = hec.calibrate(parent, child, reference="B5", scale="estimate")
-        assert not any(each.makes_unusable for each in scaled.findings)
+        assert not any(finding.makes_unusable for finding in scaled.findings)
 
     @pytest.mark.parametrize("scale", [3.24, 3.32, 39.0, 98.0, 1030.0])
     def test_a_camera_without_a_unit_leaves_the_parent_in_metres(self, hand, expected, scale):
@@ -128,8 +130,8 @@ class TestResult:
         result = hec.calibrate(parent, child.scaled(1.0 / scale), reference="B5")
         assert result.scale == pytest.approx(scale, rel=0.005)
         np.testing.assert_allclose(result.T_parent_child, expected, atol=0.02)
-        assert not any(each.makes_unusable for each in result.findings)
-        codes = {each.code for each in result.findings}
+        assert not any(finding.makes_unusable for finding in result.findings)
+        codes = {finding.code for finding in result.findings}
         assert codes == (set() if scale == 1030.0 else {"unit_or_scale"})
 
     @pytest.mark.parametrize("name", ["car_ins_lidar", "arm_target"])
@@ -190,7 +192,9 @@ def test_a_parent_in_feet_is_asked_about_where_noise_shrinks_the_scale(kind, nam
     drive = kind.make(name, seed)
     result = hec.calibrate(drive.parent.scaled(1.0 / 0.3048), drive.child)
     assert result.verdict is hec.Verdict.DO_NOT_USE
-    assert "unit_or_scale" in {each.code for each in result.findings if each.makes_unusable}
+    assert "unit_or_scale" in {
+        finding.code for finding in result.findings if finding.makes_unusable
+    }
 
 
 PLATFORMS = ("hand_vio_walk", "car_ins_lidar", "agv_ramps", "drone_gnss_vio", "arm_target")
@@ -224,8 +228,8 @@ class TestSmallUnit:
 
     def test_a_child_in_metres_is_not_asked_about(self, hand):
         parent, child = hand
-        (found,) = check_lengths(parent.scaled(1000.0), child)
-        assert (found.stream, [*found.options]) == ("parent", ["parent_scale"])
+        (finding,) = check_lengths(parent.scaled(1000.0), child)
+        assert (finding.stream, [*finding.options]) == ("parent", ["parent_scale"])
 
     @pytest.mark.parametrize(("n_poses", "step_m"), [(360, 0.1), (360, 0.17), (180, 0.17)])
     def test_noisy_poses_in_millimetres_are_not_taken_for_inverse(self, n_poses, step_m):
@@ -234,5 +238,5 @@ class TestSmallUnit:
         parent = as_trajectory(disturbed(poses, 10, 0.01, 0.002)).scaled(1000.0)
         child = as_trajectory(disturbed(poses @ X, 1, 0.01, 0.002)).scaled(1000.0)
         result = hec.calibrate(parent, child)
-        codes = [found.code for found in result.findings if found.makes_unusable]
+        codes = [finding.code for finding in result.findings if finding.makes_unusable]
         assert codes == ["lengths"]

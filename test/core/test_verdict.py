@@ -41,8 +41,8 @@ def observed(sigma_m=0.003, sigma_rad=0.001, **changes):
 
 def checked(axis, scatter, excess, kind):
     nothing = AxisScatter(sigma=0.003, of_methods=None, of_halves=None)
-    there = {f"of_{kind}": scatter, f"excess_of_{kind}": excess}
-    return dict.fromkeys(NAMES, nothing) | {axis: dataclasses.replace(nothing, **there)}
+    columns = {f"of_{kind}": scatter, f"excess_of_{kind}": excess}
+    return dict.fromkeys(NAMES, nothing) | {axis: dataclasses.replace(nothing, **columns)}
 
 
 FINDING = written_finding(
@@ -257,7 +257,9 @@ def scaled(severity):
 
 
 def test_a_scale_that_the_model_found_is_in_the_headline_and_a_large_one_is_a_reason():
-    small, large = (good(findings=(scaled(each),)) for each in (Severity.NOTE, Severity.WARNING))
+    small, large = (
+        good(findings=(scaled(severity),)) for severity in (Severity.NOTE, Severity.WARNING)
+    )
     assert (small.verdict, small.reasons) == (Verdict.USE, ())
     assert small.headline.endswith("; " + scaled(Severity.NOTE).what)
     assert large.verdict is Verdict.USE_WITH_CARE

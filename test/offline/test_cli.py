@@ -88,8 +88,8 @@ def refused(run):
     """Run a command that must end in one line on stderr, nothing on stdout; returns the line."""
 
     def call(*arguments, code=1):
-        found, out, err = run(*arguments)
-        assert (found, out) == (code, "")
+        exit_code, out, err = run(*arguments)
+        assert (exit_code, out) == (code, "")
         lines = [line for line in err.splitlines() if not line.startswith("hand_eye_calib: note: ")]
         assert len(lines) == 1, err
         assert lines[0].startswith("hand_eye_calib: error: ")
@@ -154,8 +154,8 @@ def test_calibrate_on_files_gives_what_replay_gives(run, new_bag, tmp_path):
     stamps = {"first_stamp_ns": START_NS, "last_stamp_ns": START_NS + 11_900_000_000}
     assert from_files["inputs"]["child"] == {"file": files[1], "poses": 120, **stamps}
     # two files are used whole, a stream is bounded
-    options = [each["inputs"]["options"] for each in (from_files, from_bag)]
-    assert [each.pop("max_pairs") for each in options] == [120, 5000]
+    options = [document["inputs"]["options"] for document in (from_files, from_bag)]
+    assert [document.pop("max_pairs") for document in options] == [120, 5000]
     assert options[0] == options[1]
 
 
@@ -443,9 +443,9 @@ def test_config_files_that_are_wrong_end_with_usage_error(refused, config_file, 
 
 def test_the_sample_in_the_package_gives_its_true_extrinsic(capsys):
     assert main(["calibrate", "sample:lidar.tum", "sample:camera.tum", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)["T_parent_child"]["matrix"]
+    matrix = json.loads(capsys.readouterr().out)["T_parent_child"]["matrix"]
     truth = hec.read_trajectory(Path(hec.__file__).parent / "sample" / "truth.tum").poses[0]
-    np.testing.assert_allclose(found, truth, atol=0.005)
+    np.testing.assert_allclose(matrix, truth, atol=0.005)
 
 
 # ---- the program around the commands
@@ -499,10 +499,10 @@ def test_a_reader_that_goes_away_is_no_error_and_files_are_written(tmp_path, new
     readable, writable = os.pipe()
     os.close(readable)
     process = start("replay", new_bag(), *TOPICS, "--out", tmp_path / "out", stdout=writable)
-    told = process.communicate()[1].splitlines()
+    lines = process.communicate()[1].splitlines()
     os.close(writable)
-    assert (process.returncode, len(told)) == (141, 2)
-    assert all(line.startswith("hand_eye_calib: note: wrote ") for line in told)
+    assert (process.returncode, len(lines)) == (141, 2)
+    assert all(line.startswith("hand_eye_calib: note: wrote ") for line in lines)
     assert (tmp_path / "out" / "report.html").exists()
 
 
@@ -527,8 +527,8 @@ def test_progress_is_shown_on_a_terminal_and_wiped_out(monkeypatch, capsys):
 
 
 def test_messages_name_options_as_they_are_typed(capsys):
-    told = "raise max_gap, or give prior.z; see 'max_gap' in /data/max_gap.txt and time_offset=3"
-    note(told, "give `scale` or `child_columns`, not `this`")
+    message = "raise max_gap, or give prior.z; see 'max_gap' in /data/max_gap.txt and time_offset=3"
+    note(message, "give `scale` or `child_columns`, not `this`")
     fail("keyframe.min_interval: no scale", 1)
     assert capsys.readouterr().err == (
         "hand_eye_calib: note: raise --max-gap, or give --prior z; see 'max_gap' in "

@@ -38,11 +38,11 @@ def matrix(text):
     return np.array(json.loads(text)["T_parent_child"]["matrix"])
 
 
-def write_session(directory, options, *given):
+def write_session(directory, options, *recorded):
     """The journal of a node that has heard both trajectories."""
     streams = {"parent": (PARENT, "/a"), "child": (CHILD, "/b")}
     about = {
-        stream: {"options": options, "given": given, "topic": topic, "frame": poses.sensor_frame}
+        stream: {"options": options, "given": recorded, "topic": topic, "frame": poses.sensor_frame}
         for stream, (poses, topic) in streams.items()
     }
     writer = JournalWriter(directory, about)
@@ -124,12 +124,15 @@ def test_a_path_and_a_topic_of_two_bags_together(run, bag, tmp_path):
 def parts_of(tmp_path, slices, later_s=0.0):
     """Bags of parts of the drive, all but the first so much later."""
     paths = []
-    for number, part in enumerate(slices):
+    for number, numbers in enumerate(slices):
         paths.append(tmp_path / f"part_{number}")
         moved_ns = round(later_s * 1e9) * bool(number)
         streams = {
-            topic: (dataclasses.replace(each, stamps_ns=each.stamps_ns + moved_ns)[part], ODOMETRY)
-            for topic, each in (("/a", PARENT), ("/b", CHILD))
+            topic: (
+                dataclasses.replace(trajectory, stamps_ns=trajectory.stamps_ns + moved_ns)[numbers],
+                ODOMETRY,
+            )
+            for topic, trajectory in (("/a", PARENT), ("/b", CHILD))
         }
         write_bag(paths[-1], streams)
     return paths
@@ -153,9 +156,9 @@ def test_recordings_are_not_joined_but_give_one_result(run, tmp_path, later_s, r
     paths = parts_of(tmp_path, 2 * [slice(0, 100)], later_s)
     code, out, err = run(*paths[::-1], *STREAMS, "--json", "--jobs", "1")
     assert f"are two recordings, not parts of one: {reason}" in err
-    found = json.loads(out)["together"]
-    names = {each["name"] for each in found["recordings"]}
-    assert (code, names, found["kind"]) == (0, {"part_0", "part_1"}, "agree")
+    together = json.loads(out)["together"]
+    names = {recording["name"] for recording in together["recordings"]}
+    assert (code, names, together["kind"]) == (0, {"part_0", "part_1"}, "agree")
     np.testing.assert_allclose(matrix(out), T_PARENT_CHILD, atol=5e-3)
     code, out, err = run(*paths, "--topics", "/a", "/b", "/a")
     assert (code, out) == (1, "")

@@ -133,8 +133,8 @@ def test_every_section_and_figure_is_there_verdict_first(hilly):
     figures = [attributes["id"] for attributes in page.all("figure")]
     assert figures == [f"figure-{name}" for name in FIGURES]
     assert len(page.all("svg")) == len(FIGURES)
-    scrolled = [each for each in page.all("div") if each.get("class") == "scroll"]
-    described = [each["aria-label"] for each in scrolled if each.get("role") == "img"]
+    scrolled = [division for division in page.all("div") if division.get("class") == "scroll"]
+    described = [division["aria-label"] for division in scrolled if division.get("role") == "img"]
     assert len(described) == len(FIGURES)
     assert all(re.search(r"\d", label) for label in described)
     assert [tag for tag, _ in page.elements if re.fullmatch("h[1-6]", tag)][:2] == ["h1", "h2"]
@@ -163,8 +163,8 @@ def test_numbers_are_the_calibrations(drive, request):
             for a in page.all("div")
             if a.get("aria-label", "").startswith(f"{dof.name}: ")
         )
-        known = re.fullmatch(rf"{dof.name}: ([\d.]+) (mm|cm|m|deg), (\w+)", label)
-        number, unit, verdict = known.groups()
+        match = re.fullmatch(rf"{dof.name}: ([\d.]+) (mm|cm|m|deg), (\w+)", label)
+        number, unit, verdict = match.groups()
         assert float(number) == pytest.approx(per_unit[unit] * total, rel=0.06)
         assert verdict == dof.verdict.value
     assert calibration.static_transform_command() in page.text
@@ -210,7 +210,8 @@ def partial():
 def test_results_of_positions_and_rates_have_a_page_of_what_they_show(partial, name):
     _calibration, _text, page = partial[name]
     shown = [*FIGURES]
-    shown = [each for each in shown if name != "rates" or each not in ("views", "trajectories")]
+    if name == "rates":
+        shown = [figure for figure in shown if figure not in ("views", "trajectories")]
     assert [attributes["id"] for attributes in page.all("figure")] == [
         f"figure-{figure}" for figure in shown
     ]
@@ -235,8 +236,8 @@ def test_positions_are_along_the_axes_of_the_other_sensor_and_have_their_path(pa
         assert with_sigma(value, sigma, 3).replace("+/-", "±") in page.text
     assert "The path of lidar" in page.text
     assert "computed from the poses of antenna and the result" in page.text
-    found = re.search(r"within ([\d.]+) (c?m) of each other", page.text)
-    assert float(found[1]) * {"cm": 0.01, "m": 1.0}[found[2]] < 0.5
+    match = re.search(r"within ([\d.]+) (c?m) of each other", page.text)
+    assert float(match[1]) * {"cm": 0.01, "m": 1.0}[match[2]] < 0.5
 
 
 def test_hostile_names_stay_text():
@@ -336,7 +337,7 @@ def test_what_is_installed_is_compared_axis_by_axis_and_an_axis_may_have_its_own
     assert "robot.urdf <b>" in page.text
     assert "mark: the target, 2 cm and 0.3 deg" in before.text
     assert "mark: the target, 2 cm, 0.3 deg and x 20 cm" in page.text
-    widths = [[a["style"] for a in each.all("i")] for each in (before, page)]
+    widths = [[a["style"] for a in report.all("i")] for report in (before, page)]
     assert [a == b for a, b in zip(*widths, strict=True)] == [False] + [True] * 5
     hec.save(compared, tmp_path)
     (file,) = tmp_path.glob("*.yaml")
@@ -376,10 +377,10 @@ def test_labels_names_of_files_and_what_it_means_at_a_distance(hilly):
     assert "Pose of camera/odometry in roof" in page.text
     assert "Maps coordinates of camera/odometry into roof." in page.text
     assert "vehicle: 7 <b>" in page.text[: page.text.index("Verdict")]
-    found = re.search(r"10 m from camera/odometry is misplaced by up to ([\d.]+) cm", page.text)
+    match = re.search(r"10 m from camera/odometry is misplaced by up to ([\d.]+) cm", page.text)
     J = np.hstack([np.eye(3), -se3.skew(np.array([10.0, 0.0, 0.0]))])
-    one = J @ calibration.covariance @ J.T
-    assert float(found[1]) >= 95 * np.sqrt(np.linalg.eigvalsh(one)[-1])
+    covariance = J @ calibration.covariance @ J.T
+    assert float(match[1]) >= 95 * np.sqrt(np.linalg.eigvalsh(covariance)[-1])
 
 
 # What no page may say below the verdict USE.
