@@ -316,11 +316,25 @@ class TestInput:
                 calibrate_arm(first, second).T_parent_child, expected, atol=1e-9
             )
 
-    def test_four_arrays_of_opencv_are_refused_with_the_right_call(self):
+    @pytest.mark.parametrize("shape", [(3,), (3, 1), (1, 3)])
+    @pytest.mark.parametrize("are_vectors", [False, True])
+    def test_four_arrays_of_opencv_are_taken_in_its_order(self, are_vectors, shape):
         robot, tracking, _ = arm(ON_HAND)
-        arrays = [robot[:, :3, :3], robot[:, :3, 3], tracking[:, :3, :3], tracking[:, :3, 3]]
-        with pytest.raises(InputError, match=r"\(R_gripper2base, t_gripper2base\)"):
-            calibrate_arm(*arrays)
+        expected = calibrate_arm(robot, tracking).T_parent_child
+        arrays = []
+        for Ts in (robot, tracking):
+            rotations = Ts[:, :3, :3]
+            if are_vectors:
+                rotations = se3.rotation_log(rotations).reshape(-1, *shape)
+            arrays.append(list(rotations))
+            arrays.append(list(Ts[:, :3, 3].reshape(-1, *shape)))
+        result = calibrate_arm(*arrays)
+        np.testing.assert_allclose(result.T_parent_child, expected, atol=1e-9)
+
+    def test_three_arrays_of_opencv_are_refused_with_the_right_order(self):
+        robot, tracking, _ = arm(ON_HAND)
+        with pytest.raises(InputError, match="R_gripper2base, t_gripper2base"):
+            calibrate_arm(robot[:, :3, :3], robot[:, :3, 3], tracking[:, :3, :3])
 
     @pytest.mark.parametrize("solve", [calibrate_arm, calibrate_stops])
     def test_what_is_no_pose_is_named_in_one_line(self, solve):

@@ -191,7 +191,7 @@ def _pair_of_stacks(values: Any) -> tuple[FloatArray, FloatArray] | None:
     rotations, translations = map(_numbers, values)
     if rotations is None or translations is None:
         return None
-    vectors = ((3,), (3, 1))
+    vectors = ((3,), (3, 1), (1, 3))
     if rotations.shape[1:] not in ((3, 3), *vectors) or translations.shape[1:] not in vectors:
         return None
     return rotations, translations

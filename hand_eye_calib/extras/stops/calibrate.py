@@ -36,11 +36,6 @@ _OBEYED_GROUPS = ("prior_", "target_")
 # Options that decide how inverse poses are read.
 _INVERSIONS = {"parent_invert", "child_invert"}
 
-_HOW_TO_GIVE_OPENCV = (
-    "give OpenCV's arrays as two pairs: (R_gripper2base, t_gripper2base), (R_target2cam, "
-    "t_target2cam)"
-)
-
 # A mount is the identity within so many standard deviations, or within this length (m) and angle
 # (rad).
 _IDENTITY_SIGMAS = 3.0
@@ -115,19 +110,21 @@ def calibrate_stops(
 def calibrate_arm(
     robot: Any,
     tracking: Any,
-    config: CalibratorConfig | None = None,
-    names: Mapping[str, str] | None = None,
+    config: Any = None,
+    names: Any = None,
     setup: str | None = None,
 ) -> Calibration:
     """Calibrate a camera on a robot's hand, or beside the robot with the target on the hand.
 
-    Without ``setup`` both places are tried: only one of them leaves small errors.
+    Without ``setup`` both places are tried: only one of them leaves small errors. The four arrays
+    of ``cv2.calibrateHandEye`` are taken in its order, too:
+    ``calibrate_arm(R_gripper2base, t_gripper2base, R_target2cam, t_target2cam)``.
 
     Parameters
     ----------
     robot, tracking : array-likes
         Poses of the hand in the base (parent), and of the target in the camera (child), in the
-        forms of :func:`calibrate_stops`; ``cv2.calibrateHandEye`` takes pairs (R, t).
+        forms of :func:`calibrate_stops`. To set options for arrays of OpenCV, use pairs (R, t).
     config : CalibratorConfig, optional
         As for :func:`calibrate_stops`.
     names : mapping of str to str, optional
@@ -152,8 +149,9 @@ def calibrate_arm(
     >>> hec.calibrate_arm(samples.robot, samples.tracking).n_poses
     40
     """
-    if not isinstance(names, Mapping | None):
-        raise InputError(f"calibrate_arm takes robot and tracking; {_HOW_TO_GIVE_OPENCV}")
+    if _are_arrays_of_opencv(config, names):
+        robot, tracking = (robot, tracking), (config, names)
+        config = names = None
     config = _checked(config)
     if setup is not None and setup not in SETUPS:
         raise ConfigError(f"setup must be one of {', '.join(SETUPS)}; got {shown_value(setup)}")
@@ -177,6 +175,13 @@ def calibrate_arm(
 # ------------------------------------------------------------------ options and poses
 
 
+def _are_arrays_of_opencv(config: Any, names: Any) -> bool:
+    """Return whether the options and the names of an arm are R_target2cam and t_target2cam."""
+    has_options = isinstance(config, CalibratorConfig | None)
+    has_names = isinstance(names, Mapping | None)
+    return not (has_options or has_names)
+
+
 def _checked(config: CalibratorConfig | None) -> CalibratorConfig:
     """Return the options.
 
@@ -189,8 +194,8 @@ def _checked(config: CalibratorConfig | None) -> CalibratorConfig:
     """
     if not isinstance(config, CalibratorConfig | None):
         raise InputError(
-            f"the options are a CalibratorConfig; found {type(config).__name__}. To call with "
-            f"other poses, {_HOW_TO_GIVE_OPENCV}"
+            f"the options are a CalibratorConfig; found {type(config).__name__}. Arrays of OpenCV "
+            "are R_gripper2base, t_gripper2base, R_target2cam, t_target2cam"
         )
     config = config or CalibratorConfig()
     for name in sorted(config.given - _OBEYED):
