@@ -44,7 +44,7 @@ def readme():
 
 setup(
     name=name,
-    version=manifest.findtext("version"),
+    version=manifest.findtext("version") + manifest.findtext("export/pre_release", ""),
     description=manifest.findtext("description"),
     long_description=readme(),
     long_description_content_type="text/markdown",

@@ -190,7 +190,19 @@ def test_libraries_that_the_package_runs_with_have_an_upper_bound(declared):
         assert has_bound or is_of_ros, f"{requirement.name} has no upper bound"
 
 
-def test_pip_install_gives_the_commands(source, tmp_path):
+def test_the_version_is_the_same_wherever_it_is_written(declared):
+    version = declared["version"]
+    assert re.fullmatch(r"\d+\.\d+\.\d+", MANIFEST.findtext("version"))
+    assert version.startswith(MANIFEST.findtext("version"))
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.search(r"^## (\S+)", changelog, re.MULTILINE)[1] == version
+    assert f"* {version}, " in (ROOT / "CHANGELOG.rst").read_text(encoding="utf-8")
+    for page in (ROOT / "docs" / "exports").glob("*.md"):
+        text = page.read_text(encoding="utf-8")
+        assert set(re.findall(r"by hand_eye_calib ([\w.]+?)\. ", text)) <= {version}
+
+
+def test_pip_install_gives_the_commands(declared, source, tmp_path):
     target = tmp_path / "target"
     options = "--quiet --no-deps --no-build-isolation --no-compile --disable-pip-version-check"
     pip = [sys.executable, "-m", "pip", "install", *options.split(), "--ignore-installed"]
@@ -207,7 +219,7 @@ def test_pip_install_gives_the_commands(source, tmp_path):
         assert (site / PACKAGE / kept).is_file()
     for command, said in (
         ([target / "bin" / "replay", "--help"], "usage: hand_eye_calib replay"),
-        ([sys.executable, "-m", PACKAGE, "--version"], MANIFEST.findtext("version")),
+        ([sys.executable, "-m", PACKAGE, "--version"], declared["version"]),
     ):
         assert said in run(command, env=environment, cwd=tmp_path).stdout
     assert_data_files(target)
@@ -223,7 +235,7 @@ def assert_data_files(prefix):
         assert {path.name for path in (share / folder).iterdir() if path.is_file()} == expected
 
 
-def test_colcon_lays_out_an_install_space_whose_commands_run(source, tmp_path):
+def test_colcon_lays_out_an_install_space_whose_commands_run(declared, source, tmp_path):
     colcon = [sys.executable, "-m", "colcon", "--log-base", tmp_path / "log", "build"]
     options = ["--base-paths", source, "--packages-select", PACKAGE]
     options += ["--event-handlers", "console_direct+"]
@@ -242,7 +254,7 @@ def test_colcon_lays_out_an_install_space_whose_commands_run(source, tmp_path):
     assert Path(said.splitlines()[0]).resolve().is_relative_to(prefix)
     for command in COMMANDS:
         assert f"usage: hand_eye_calib {command}" in said
-    assert MANIFEST.findtext("version") in said
+    assert declared["version"] in said
 
 
 WORKFLOWS = {
