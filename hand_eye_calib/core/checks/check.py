@@ -1,5 +1,4 @@
-"""The stream checks: can two streams be of sensors on one rigid body, and if not, which fault do
-they have?
+"""Check whether two streams can be of sensors on one rigid body, and name their fault if not.
 
 1. Check each stream alone (:mod:`~hand_eye_calib.core.checks.streams`).
 2. Correlate the angular rates (:mod:`~hand_eye_calib.core.alignment.time_offset`): do they agree at

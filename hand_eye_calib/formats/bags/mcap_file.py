@@ -52,7 +52,6 @@ class McapFile(Storage):
 
     def _checked_summary(self) -> Any:
         """Return the summary of the file; raise an error of any kind if it lacks a message."""
-
         summary: Any = make_reader(self._stream).get_summary()
         statistics = summary.statistics
         is_complete = (
@@ -72,7 +71,6 @@ class McapFile(Storage):
 
     def _scan(self, reason: Exception) -> None:
         """Count the messages of a file without an index; ``reason`` is why there is none."""
-
         schemas = {}
         times_ns = []
         for record in self._records(self.losses):
@@ -105,7 +103,6 @@ class McapFile(Storage):
 
     def _content(self, start: int) -> bytes:
         """Return the unpacked records of the chunk at a place in the file."""
-
         self._stream.seek(start + _RECORD.size)
         chunk = records.Chunk.read(ReadDataStream(self._stream))
         stream, size = stream_reader.get_chunk_data_stream(chunk, validate_crc=True)
@@ -113,7 +110,6 @@ class McapFile(Storage):
 
     def _records(self, losses: list[str]) -> Iterator[Any]:
         """Iterate over all records up to damage; append a line about the damage to ``losses``."""
-
         position = self._stream.seek(0)
         try:
             for record in StreamReader(self._stream, validate_crcs=True).records:
@@ -129,7 +125,6 @@ class McapFile(Storage):
 
     def _records_of_cut_chunk(self, position: int) -> Iterator[Any]:
         """Iterate over the records before the cut in the chunk at a position, if it is a chunk."""
-
         with self._file.open("rb") as file:
             file.seek(position)
             if file.read(_RECORD.size)[0] != Opcode.CHUNK:
@@ -151,7 +146,6 @@ def _messages_of_chunk(content: bytes, kinds: Mapping[int, MessageKind]) -> Iter
 
     The library's own iteration takes several times as long.
     """
-
     message_opcode = int(Opcode.MESSAGE)
     end = 0
     while end < len(content):

@@ -62,6 +62,7 @@ def kind_of(topic: str, name: str, encoding: str, language: str, content: bytes)
 
 
 def printable_name(name: str) -> str:
+    """Return a name as it can be printed, cut to the length of the longest name."""
     return printable(name[: files.LONGEST_NAME])
 
 
