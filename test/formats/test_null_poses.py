@@ -220,7 +220,7 @@ def test_a_live_stream_with_whole_seconds_says_so():
     state = pose_input.state(pose_input._arrived_s, may_rest=False)
     later = pose_input.state(pose_input._arrived_s + 11.0, may_rest=True)
     assert state.level is Level.ERROR
-    assert "/b: the stamps have whole seconds only: have the publisher set" in state.text
+    assert "/b: the stamps have whole seconds only: set header.stamp" in state.text
     assert state.poses_taken == 10
     assert later.level is Level.WARN
     assert "the stamps have whole seconds only" in later.text

@@ -84,7 +84,9 @@ def test_what_is_kept_is_answered_and_says_why_it_is_not_the_newest(cycle, lines
     (warning,) = cycle.result.warnings
     assert warning in text
     assert ("info", warning) in lines  # nobody has to do anything
-    assert warning.startswith("kept is the result of 100 poses, as the newest is worse: ")
+    assert warning.startswith(
+        "the result of 100 poses is kept, because the newest result is worse: "
+    )
     assert f"{moved[0, 3]:.4f}" in warning
     assert "(5.0, 10.0, 5.0) mm" in warning
     assert "120 poses" in warning
@@ -213,7 +215,7 @@ def test_what_the_halves_of_the_whole_drive_no_longer_say_is_taken_back(cycle, l
     assert "warning" in {level for level, text in lines if sentence in text}
     # The newest result is worse, and the one before is kept.
     _, text = answered(cycle, 60.0, (0.005, 0.01, 0.005), 200, cross_check=scatter(0.0))
-    assert "kept is the result of 100 poses" in text
+    assert "the result of 100 poses is kept" in text
     assert cycle.result.verdict is Verdict.USE
     taken_back = [(level, text) for level, text in lines if text.startswith("no longer found")]
     assert [level for level, _ in taken_back] == ["info"]

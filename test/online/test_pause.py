@@ -114,7 +114,7 @@ def test_messages_that_give_no_pose_are_no_sign_of_life(node, stream):
         source.accept(last_ns, lambda pose=pose: pose)
     state = state_of(node)
     assert state.inputs[stream].level is Level.WARN
-    assert "has messages, but no new pose for 8 s: their stamps stand still" in (
+    assert "has messages, but no new pose for 8 s: their stamps repeat" in (
         state.inputs[stream].text
     )
     assert (state.progress.is_paused, view_of(state).word) == (True, "PAUSED")
@@ -129,7 +129,7 @@ def test_a_publisher_that_has_gone_is_named_and_a_parked_robot_asks_for_nothing(
     assert (parked.progress.level, parked.progress.is_paused) == (Level.OK, True)
     assert parked.progress.text == (
         "Paused: no pose of parent (/parent_odom) and child (/child_odom) for 8.0 s; "
-        "go on driving, or save."
+        "continue to drive, or save."
     )
     assert (view_of(parked).word, view_of(parked).tone) == ("PAUSED", Tone.BUSY)
     node.inputs[1].publishers = ()
@@ -157,7 +157,7 @@ def test_a_node_that_accepts_no_poses_is_paused(node):
     run(node, 8.0)
     state = state_of(node)
     assert {item.level for item in state.inputs.values()} == {Level.OK}
-    assert state.progress.text == "Paused: not accepting poses; call ~/set_enabled to go on."
+    assert state.progress.text == "Paused: poses are not accepted; call ~/set_enabled to continue."
     assert (state.progress.level, view_of(state).word) == (Level.WARN, "PAUSED")
 
 

@@ -177,8 +177,8 @@ REACHED = {"done": True, "precision": "good to 4 mm"}
 @pytest.mark.parametrize(
     ("document", "now_s", "tone", "word", "sentence"),
     [
-        (None, 0.5, Tone.UNKNOWN, "NO NODE", "Nothing heard of a calibrator yet."),
-        (state(), 9.0, Tone.BAD, "SILENT", "No word from the node for 9 s."),
+        (None, 0.5, Tone.UNKNOWN, "NO NODE", "No message from a calibrator yet."),
+        (state(), 9.0, Tone.BAD, "SILENT", "No message from the node for 9 s."),
         (state(), 0.5, Tone.BUSY, "GO ON", "Go on for about 25 s"),
         (state(level=Level.WARN), 0.5, Tone.ACT, "CHANGE THE MOTION", "Go on"),
         (state(extrinsic=replace(EXTRINSIC, result=None)), 0.5, Tone.BUSY, "START", "Go on"),
@@ -211,7 +211,7 @@ REACHED = {"done": True, "precision": "good to 4 mm"}
         ),
         (state(extrinsic=replace(EXTRINSIC, **ERROR)), 0.5, Tone.BAD, "BROKEN", "Known."),
         (replace(state(), has_ended=True), 9.0, Tone.ACT, "ENDED", "The node has ended. The"),
-        (replace(mount(), has_ended=True), 0.5, Tone.ACT, "ENDED", "The node has ended: nobody"),
+        (replace(mount(), has_ended=True), 0.5, Tone.ACT, "ENDED", "The node has ended: the mount is not"),
         (
             replace(state(), has_ended=True, saved=SAVED),
             *(9.0, Tone.GOOD, "ENDED", "The node has ended. The result was saved at "),
@@ -318,7 +318,7 @@ def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
     )
     lines = {line.name: (line.tone, line.text) for line in view.watched}
     assert lines["about z"] == (Tone.BAD, "moved by 1 deg ± 0.057 deg")
-    assert lines["along x"] == (Tone.GOOD, "not moved (would see 4 mm)")
+    assert lines["along x"] == (Tone.GOOD, "not moved (detects 4 mm)")
     assert lines["along z"] == (Tone.UNKNOWN, "cannot be watched with this motion")
     assert (view.bars, view.result, view.word) == ((), (), "MOUNT MOVED")
     assert view.text == "The mount has moved. Check it, then recalibrate or acknowledge."

@@ -147,7 +147,7 @@ def test_repeated_stamps_gaps_and_rates_are_counted_and_disabled_is_said(start_n
     assert parent.longest_gap_s == pytest.approx(1.1)
     assert parent.rate_hz > 0
     assert peer.set_enabled(False).success
-    disabled = "not accepting poses: call ~/set_enabled"
+    disabled = "poses are not accepted: call ~/set_enabled"
     state(lambda each: disabled in each.extrinsic.text)
 
 

@@ -126,7 +126,7 @@ def test_result_of_a_session_that_was_reset_meanwhile_is_dropped(start_node, pee
     os.kill(solver, signal.SIGCONT)
     peer.spin_until(answer.done, "the answer of solve")
     assert not answer.result().success
-    dropped = "the session was reset during the solve: its result is dropped"
+    dropped = "the session was reset during the solve: the result is dropped"
     assert answer.result().message == dropped
     assert len(heard) == n_heard
 
@@ -149,7 +149,7 @@ def test_a_qos_that_keeps_messages_away_is_named(start_node, peer):
     start_node(*QUIET)
     statuses = peer.diagnostics()
     peer.node.create_publisher(Odometry, "parent_odom", BEST_EFFORT)
-    said = "no message on /parent_odom yet: it is published best effort, and qos_overrides ask"
+    said = "no message on /parent_odom yet: it is published best effort, but qos_overrides ask"
     peer.spin_until(
         lambda: any(each.message.startswith(said) for each in statuses.values()), "that"
     )
@@ -173,7 +173,7 @@ class TestRefusedInput:
     def test_positions_where_the_mount_is_watched(self, start_node, peer):
         node = start_node("-p monitor:=true", "-p installed:=1 0 0 0 0 0")
         peer.publisher(NavSatFix, "child_odom")
-        node.wait_for_log("a rig and monitor take poses; child has positions")
+        node.wait_for_log("a rig and the monitor need poses; child has positions")
         peer.wait_matched(peer.publisher(Odometry, "parent_odom"))
 
     def test_positions_on_both_inputs(self, start_node, peer):
@@ -203,8 +203,8 @@ class TestRefusedInput:
                 ["child_measures:=positions", "monitor:=true", "installed:=1 0 0 0 0 0"],
                 "monitor needs poses of both sensors; the parent measures auto, the child positio",
             ),
-            (["monitor:=true"], "monitor needs installed: what the mount is watched against"),
-            (["journal:=resume"], "journal resume needs output_directory: that is where the"),
+            (["monitor:=true"], "monitor needs installed, the transform to compare with"),
+            (["journal:=resume"], "journal resume needs output_directory, which contains the"),
             (["output_directory:=~nosuchuser/x"], "output_directory '~nosuchuser/x'"),
         ],
     )
@@ -263,4 +263,4 @@ class TestLoss:
             ),
             "all messages to be received or lost",
         )
-        node.wait_for_log("of the messages are lost: give the node more processor time")
+        node.wait_for_log("of the messages are lost: free processor time for the node")

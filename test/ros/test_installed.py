@@ -115,7 +115,7 @@ def test_frames_that_are_not_in_what_is_installed_are_said(start_node, peer, sta
     early, _ = status("mount", lambda each: True)
     assert early.message == "no poses yet"
     peer.feed(peer.publishers(), *drive(100))
-    mount, _ = status("mount", lambda each: "what is installed is not known" in each.message)
+    mount, _ = status("mount", lambda each: "the installed transform is unknown" in each.message)
     assert mount.level == DiagnosticStatus.WARN
     assert "no frame 'camera'" in mount.message
 
@@ -183,7 +183,7 @@ def test_what_is_installed_comes_from_tf_but_not_from_the_node_itself(monkeypatc
     heard.hear(edge("base_link", "lidar", LIDAR), own)
     assert heard.robot.complete(result()).comparison is None
     assert "no frame 'camera'" in heard.robot.problem
-    assert "what is installed is not known" in heard.robot.why_not_compared
+    assert "the installed transform is unknown" in heard.robot.why_not_compared
     heard.hear(edge("base_link", "camera", LIDAR @ X))
     assert heard.robot.complete(result()).comparison.verdict == "same"
     assert heard.robot.problem == ""
@@ -203,7 +203,7 @@ def test_the_one_axis_that_motion_does_not_show_is_that_of_what_is_installed(mon
     T = heard.robot.complete(hidden).T_parent_child
     np.testing.assert_allclose(T[:2, 3], found.T_parent_child[:2, 3], atol=1e-4)
     assert T[2, 3] == pytest.approx(9.0)
-    assert "z is that of what is installed (7 8" in heard.robot.complete(hidden).warnings[-1]
+    assert "z is that of the installed transform (7 8" in heard.robot.complete(hidden).warnings[-1]
     np.testing.assert_array_equal(heard.robot.complete(found).T_parent_child, found.T_parent_child)
 
 

@@ -73,7 +73,7 @@ def test_an_earlier_session_is_kept_aside_once_and_an_empty_one_is_not(start_nod
 
 def test_nothing_to_resume_and_a_damaged_journal_begin_a_new_session(start_node, peer, tmp_path):
     node = start_node(*QUIET, *into(tmp_path, "resume"))
-    node.wait_for_log(f"no session to resume in {tmp_path / 'journal'}: a new one begins")
+    node.wait_for_log(f"no session to resume in {tmp_path / 'journal'}: a new session begins")
     assert node.stop()[0] == 0
     (tmp_path / "journal" / "parent.tum").write_text("something else")
     node = start_node(*QUIET, *into(tmp_path, "resume"))
@@ -111,7 +111,9 @@ def test_a_disk_that_is_full_is_reported_and_the_node_goes_on(start_node, peer, 
     assert answer.success
     peer.spin_until(lambda: not peer.trigger("save").success, "the save to fail")
     assert fingerprints(tmp_path / "out") == saved
-    node.wait_for_log("cannot write the session journal in", "going on without it", "cannot save")
+    node.wait_for_log(
+        "cannot write the session journal in", "no journal until ~/reset", "cannot save"
+    )
     resource.prlimit(
         node.process.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
     )
@@ -156,8 +158,8 @@ def test_two_nodes_do_not_share_a_directory(start_node, peer, tmp_path):
     peer.trigger("solve")
     second = start_node(*QUIET, *into(used))
     assert second.wait() == 1
-    line = f"output_directory {used} is in use by another calibrator: stop that one, or choose"
-    assert second.log == f"calibrator: {line} another directory\n"
+    line = f"output_directory {used} is in use by another calibrator: stop the other calibrator, or"
+    assert second.log == f"calibrator: {line} choose another directory\n"
     first.process.kill()
     first.wait()
     third = start_node("-p solve_period:=0.2", *into(used))  # a node that was killed keeps nothing

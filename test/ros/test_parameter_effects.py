@@ -235,12 +235,12 @@ def installed_is_used(start_node, peer, tmp_path):
         "-p solve_period:=0.2", "-p installed:=1 2 3 0 0 0", *ros_harness.RELIABLE_INPUTS
     )
     peer.feed(peer.publishers(), *ros_harness.drive())
-    node.wait_for_log("installed is what 1 2 3 0 0 0 says")
+    node.wait_for_log("the installed transform is from 1 2 3 0 0 0")
 
 
 def enabled_is_used(start_node, peer, tmp_path):
     node = start_node(*QUIET, "-p enabled:=false")
-    node.wait_for_log("no poses are accepted before ~/set_enabled")
+    node.wait_for_log("poses are not accepted before ~/set_enabled")
     statuses = peer.diagnostics()
     inputs = ("parent", "child")
     peer.feed(peer.publishers(), *ros_harness.drive(10))

@@ -62,7 +62,7 @@ def test_every_option_is_a_described_parameter_changes_are_applied_or_rejected(s
     [
         ("max_pairs", "many", "max_pairs must be a whole number; got 'many'"),
         ("method", "magic", f"method must be one of {', '.join(METHODS)}; got 'magic'"),
-        ("scale", "[]", "a parameter that was given has no usable value, such as []"),
+        ("scale", "[]", "a parameter has an unusable value, such as []"),
     ],
 )
 def test_bad_value_in_the_file_is_one_line_and_code_1(start_node, tmp_path, name, value, expected):

@@ -73,8 +73,8 @@ def test_a_contradicted_prior_withdraws_the_result_until_it_is_removed(start_nod
     assert (saved.success, ": DO NOT USE: the prior on z is " in saved.message) == (True, True)
     assert load_result(directory).verdict is Verdict.DO_NOT_USE
     kept = peer.trigger("reset").message
-    assert kept.startswith("all poses forgotten, new session; prior.z ")
-    assert kept.endswith(" still set: set to '' to forget it")
+    assert kept.startswith("all poses discarded, new session; prior.z ")
+    assert kept.endswith(" still set: set to '' to remove it")
     assert (late, late_with_covariance) == ([], [])
 
     assert peer.set_parameter("prior.z", "").successful

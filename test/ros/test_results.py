@@ -105,7 +105,7 @@ def test_two_nodes_of_one_name_are_told_and_one_topic_for_two_inputs_is_refused(
     first.wait_for_log("another node is called /calibrator, too")
     refused = start_node("-r parent_odom:=/odom", "-r child_odom:=/odom", "-r __node:=third")
     assert refused.wait() == 1
-    assert refused.log.startswith("calibrator: two inputs have one topic: remap one")
+    assert refused.log.startswith("calibrator: two inputs have the same topic: remap one")
 
 
 def recording():

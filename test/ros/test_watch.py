@@ -85,7 +85,7 @@ def test_a_person_sees_the_session_from_the_first_message_to_done(
     start_node, start_watch, peer, tmp_path
 ):
     watch = start_watch("--web", "127.0.0.1:0")
-    watch.wait_for("NO NODE: Nothing heard of a calibrator yet")
+    watch.wait_for("NO NODE: No message from a calibrator yet")
     node = start_node(*QUICK, f"-p output_directory:={tmp_path / 'out'}")
     watch.wait_for("CHECK INPUT: No message on /parent_odom yet")
     publishers = peer.publishers()

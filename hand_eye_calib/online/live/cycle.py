@@ -211,7 +211,7 @@ class SolveCycle:
             if asked_s >= now_s - ANSWER_WITHIN_S:
                 continue
             del self._asked[on_solved]
-            text = f"still solving after {ANSWER_WITHIN_S:g} s (do others use the processor?)"
+            text = f"still solving after {ANSWER_WITHIN_S:g} s (is the processor busy?)"
             on_solved(False, f"{text}: the result will be in the log and on the topics")
 
     def start_if_due(self) -> None:
@@ -260,7 +260,7 @@ class SolveCycle:
     def conclude(self, answer: Answer) -> Outcome:
         """Process an answer; return whether it is good, and a line of text about it."""
         if answer.session != self._session.number:
-            return False, "the session was reset during the solve: its result is dropped"
+            return False, "the session was reset during the solve: the result is dropped"
         # Pause for the duration of the solve, so that half of the processor time stays free.
         self._rest_until_s = time.monotonic() + answer.seconds
         # Keep the largest rotation so far: the measured rotation can decrease with more poses.
@@ -327,7 +327,9 @@ class SolveCycle:
         if result is newest:
             self._solved = self._submitted, self._check_options
         else:
-            reason = f"kept is the result of {result.n_poses} poses, as the newest is worse"
+            reason = (
+                f"the result of {result.n_poses} poses is kept, because the newest result is worse"
+            )
             warning = f"{reason}: {describe(newest)}"
             self._log.info(warning, ONCE_S, key="kept")
             result = replace(result, warnings=(*result.warnings, warning))
@@ -433,7 +435,7 @@ class SolveCycle:
             joint = ": " if self.standing is Standing.REFUTED else ", but "
             return Level.WARN, f"{result.verdict.value}{joint}{self.problem}"
         if not accepts_poses:
-            return Level.WARN, "not accepting poses: call ~/set_enabled to go on"
+            return Level.WARN, "poses are not accepted: call ~/set_enabled to continue"
         if result is None:
             return Level.WARN, self._why_no_result()
         if broadcast is Broadcast.REFUSED and result.verdict is not Verdict.DO_NOT_USE:
@@ -494,14 +496,14 @@ class SolveCycle:
 def pause_of(inputs: Mapping[str, InputState], accepts_poses: bool) -> Condition:
     """Return severity and reason if no poses arrive; level OK and an empty text otherwise."""
     if not accepts_poses:
-        return Level.WARN, "Paused: not accepting poses; call ~/set_enabled to go on."
+        return Level.WARN, "Paused: poses are not accepted; call ~/set_enabled to continue."
     paused = {name: state for name, state in inputs.items() if state.is_paused}
     if not paused:
         return Level.OK, ""
     level = Level.WARN
     if len(paused) == len(inputs):
         level = max(state.level for state in paused.values())
-    remedy = "go on driving, or save" if level is Level.OK else "start its source again"
+    remedy = "continue to drive, or save" if level is Level.OK else "start its source again"
     streams = listing([f"{name} ({state.topic})" for name, state in paused.items()])
     longest_s = max(state.silent_s or 0.0 for state in paused.values())
     return level, f"Paused: no pose of {streams} for {duration(longest_s)}; {remedy}."

@@ -47,7 +47,7 @@ SILENT_AFTER_S = 2.0
 # Time (s) without a pose after which a session is paused.
 PAUSED_AFTER_S = 5.0
 
-_STAMP_IS_0 = "its stamp is 0: have its publisher set header.stamp"
+_STAMP_IS_0 = "its stamp is 0: set header.stamp in the publisher"
 
 # A stamp (ns) and its message.
 Stamped: TypeAlias = tuple[int, Any]
@@ -299,8 +299,9 @@ class PoseInput:
         if judgement.jumped_back:
             jump_s = ((last_ns or 0) - judgement.taken[0][0]) * 1e-9
             self._log.warning(
-                f"{self.topic} jumped back by {jump_s:.3f} s (a bag that loops? a clock that was "
-                "reset?): new session, earlier poses forgotten"
+                f"{self.topic} jumped back by {jump_s:.3f} s (a bag that "
+                "loops? a clock that was reset?): new session, earlier poses "
+                "discarded"
             )
             self._on_jump_back(self)
         for dropped_ns in judgement.dropped:
@@ -431,8 +432,9 @@ class PoseInput:
         """Return advice for messages without a pose or without own stamps; empty if few."""
         if null_share > MUCH_NULL:
             return (
-                f"{share(null_share)} of the messages have no pose (null, not finite or without a "
-                "fix): see whether the source loses track"
+                f"{share(null_share)} of the messages have no pose (null, not "
+                "finite or without a fix): check whether the source loses "
+                "track"
             )
         n_repeated = accepted.refused_duplicate
         n_messages = n_repeated + accepted.received
@@ -457,14 +459,15 @@ class PoseInput:
         if self.publishers is not None and len(self.publishers) > 1:
             names = listing(sorted(self.publishers))
             text = (
-                f"{self.topic} has {len(self.publishers)} publishers, {names}: poses of several "
-                "sources mix; stop all but one, or give each its own topic, and reset"
+                f"{self.topic} has {len(self.publishers)} publishers, "
+                f"{names}: poses of several sources mix; stop all but one, or "
+                "use a topic for each, and reset"
             )
             self._log.warning(text)
             return Level.WARN, text
         if lost_share < _MUCH_LOST:
             return Level.OK, f"{rate_hz:.1f} Hz"
-        advice = "give the node more processor time, or publish at a lower rate"
+        advice = "free processor time for the node, or publish at a lower rate"
         text = f"{lost_share:.1%} of the messages are lost: {advice}"
         self._log.warning(f"{self.topic}: {text}")
         return Level.WARN, f"{rate_hz:.1f} Hz; {text}"
@@ -481,15 +484,16 @@ class PoseInput:
             return ""
         without_s = steady_s - self._taken_s
         return (
-            f"{self.topic} has messages, but no new pose for {without_s:.0f} s: their stamps stand "
-            "still or are too late, or their poses are null; see to its source"
+            f"{self.topic} has messages, but no new pose for {without_s:.0f} "
+            "s: their stamps repeat or are too late, or their poses are "
+            "null; check the source"
         )
 
 
 def repeated_stamps(stamp_ns: int) -> str:
     """Return fault and remedy of a stream whose stamps repeat, such as ``stamp_ns``."""
     kind = "repeat" if stamp_ns % STAMP_UNITS["s"] else "have whole seconds only"
-    return f"the stamps {kind}: have the publisher set header.stamp for every message"
+    return f"the stamps {kind}: set header.stamp in the publisher for every message"
 
 
 def with_stamp(stamp_ns: int) -> str:

@@ -50,8 +50,8 @@ def lock_directory(directory: Path) -> int | None:
     except BlockingIOError:
         os.close(descriptor)
         raise ConfigError(
-            f"output_directory {directory} is in use by another calibrator: stop that one, or "
-            "choose another directory"
+            f"output_directory {directory} is in use by another calibrator: "
+            "stop the other calibrator, or choose another directory"
         ) from None
     except OSError:
         # Some disks have no locks.
@@ -135,8 +135,8 @@ class SessionJournal:
         """Write no more, and leave the files as they are."""
         self.error = reason
         self._log.warning(
-            f"cannot write the session journal in {self.directory}: {reason}; going on without it "
-            "until ~/reset: a crash would lose this session"
+            f"cannot write the session journal in {self.directory}: {reason}; "
+            "no journal until ~/reset, so a crash would lose this session"
         )
 
     # ------------------------------------------------------------ in the thread

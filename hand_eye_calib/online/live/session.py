@@ -98,7 +98,7 @@ class LiveSession:
         """
         is_pair = stream in STREAMS
         if measures != "poses" and not (is_pair and self._is_solved):
-            raise ConfigError(f"a rig and monitor take poses; {stream} has {measures}")
+            raise ConfigError(f"a rig and the monitor need poses; {stream} has {measures}")
         name = f"{stream}_measures"
         if not is_pair or self._measures.get(name, "poses") == measures:
             return
@@ -151,9 +151,7 @@ class LiveSession:
         self.stop_journal()
         is_resuming = is_first and options.journal == "resume"
         if is_resuming and not options.output_directory:
-            raise ConfigError(
-                "journal resume needs output_directory: that is where the session to resume is"
-            )
+            raise ConfigError("journal resume needs output_directory, which contains the session")
         if options.output_directory and options.journal != "off" and not options.monitor:
             directory = output_path(options.output_directory).resolve() / "journal"
             resumed = self._resume(directory) if is_resuming else None
@@ -185,14 +183,14 @@ class LiveSession:
             text = "off"
         elif journal is None:
             level = Level.WARN
-            text = "off: the node began without output_directory"
+            text = "off: output_directory was empty at the start"
         directory = str(journal.directory) if journal else ""
         return JournalState(level=level, text=text, directory=directory)
 
     def _resume(self, directory: Path) -> Journal | None:
         """Return the session in a directory to continue it; None if that is impossible."""
         if not has_session(directory):
-            self._log.info(f"no session to resume in {directory}: a new one begins")
+            self._log.info(f"no session to resume in {directory}: a new session begins")
             return None
         try:
             journal = read_journal(directory)
@@ -252,11 +250,11 @@ def output_path(directory: str, base: Path | None = None) -> Path:
     try:
         path = Path(directory).expanduser()
     except RuntimeError as error:
-        text = f"output_directory {directory!r}: {error}; write the whole path"
+        text = f"output_directory {directory!r}: {error}; write the absolute path"
         raise ConfigError(text) from None
     if base is not None and not path.resolve().is_relative_to(base):
         raise ConfigError(
-            f"output_directory must be {base} or below it while the node runs; got {path}: "
-            "start the node with the directory that is wanted"
+            f"output_directory must be {base} or below it while the node "
+            f"runs; got {path}: start the node with the other directory"
         )
     return path

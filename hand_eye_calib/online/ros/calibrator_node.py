@@ -62,9 +62,7 @@ class CalibratorNode(Node):
         try:
             super().__init__("calibrator", automatically_declare_parameters_from_overrides=True)
         except ValueError as error:
-            raise ConfigError(
-                f"a parameter that was given has no usable value, such as []: {error}"
-            ) from None
+            raise ConfigError(f"a parameter has an unusable value, such as []: {error}") from None
         self._log = NodeLog(self.get_logger())
         self._output_base: Path | None = None
         self._options = Parameters(self, self._follow_parameters, self._check_options)
@@ -138,7 +136,7 @@ class CalibratorNode(Node):
         """
         topics = {source.name: source.topic for source in self._inputs}
         if len(set(topics.values())) < len(topics):
-            text = "two inputs have one topic: remap one to another sensor's"
+            text = "two inputs have the same topic: remap one to the topic of another sensor"
             raise ConfigError(f"{text}: {listing([*topics.values()])}")
         self._session.topics = {name: topics[name] for name in ("parent", "child")}
         self._session.start_journal(self._options.node, is_first=True)
@@ -163,7 +161,7 @@ class CalibratorNode(Node):
         if settings:
             texts.append(f"set are {', '.join(settings)}")
         if not options.enabled:
-            texts.append("no poses are accepted before ~/set_enabled")
+            texts.append("poses are not accepted before ~/set_enabled")
         self._log.info("; ".join(texts))
 
     def _watch_mount(self) -> Any:
@@ -320,11 +318,11 @@ class CalibratorNode(Node):
 
     def _reset(self, request: Trigger.Request) -> Outcome:
         self._begin_session()
-        text = "all poses forgotten, new session"
+        text = "all poses discarded, new session"
         priors = priors_of(self._options.calibrator)
         if priors:
             settings = listing([f"prior.{axis} {value}" for axis, value in priors.items()])
-            text = f"{text}; {settings} still set: set to '' to forget it"
+            text = f"{text}; {settings} still set: set to '' to remove it"
         self._log.info(text)
         return True, text
 
@@ -342,7 +340,7 @@ class CalibratorNode(Node):
         if options.publish_tf:
             message_type()
         if options.monitor and not options.installed:
-            raise ConfigError("monitor needs installed: what the mount is watched against")
+            raise ConfigError("monitor needs installed, the transform to compare with")
         if options.monitor and options.other_children:
             raise ConfigError("monitor watches one child sensor: leave other_children at 0")
         if self._output_base is not None and options.output_directory:

@@ -131,7 +131,10 @@ class TopicInput(RosInput):
         own = {subscription.qos_profile.reliability for subscription, _ in self._subscribed}
         if own != {ReliabilityPolicy.RELIABLE} or offered != {ReliabilityPolicy.BEST_EFFORT}:
             return ""
-        return "it is published best effort, and qos_overrides ask for reliable: leave them out"
+        return (
+            "it is published best effort, but qos_overrides ask for "
+            "reliable: remove these overrides"
+        )
 
     def _subscribe(self, type_name: str) -> None:
         measures = messages.measured_as(type_name, self._wanted, self.topic)

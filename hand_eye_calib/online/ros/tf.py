@@ -52,8 +52,8 @@ def message_type(wanted_by: str = "publish_tf") -> type[Any]:
         from tf2_msgs.msg import TFMessage
     except ImportError:
         raise ConfigError(
-            f"{wanted_by} needs the message package tf2_msgs, which is not installed: install "
-            "ros-jazzy-tf2-msgs, or leave that parameter out"
+            f"{wanted_by} needs the message package tf2_msgs, which is not "
+            "installed: install ros-jazzy-tf2-msgs, or omit the parameter"
         ) from None
     return TFMessage
 
@@ -153,9 +153,9 @@ class Robot:
                 self._installed = self._read(parent_frame, child_frame)
                 self._installed_for = frames
                 self.problem = ""
-                self._log.info(f"installed is what {self._installed.origin} says")
+                self._log.info(f"the installed transform is from {self._installed.origin}")
             except HandEyeCalibError as error:
-                self._report(f"what is installed is not known: {error}")
+                self._report(f"the installed transform is unknown: {error}")
         return self._installed
 
     def complete(self, calibration: Calibration) -> Calibration:
@@ -200,7 +200,7 @@ def _with_axis_of(installed: Extrinsic, calibration: Calibration) -> Calibration
     missing = float(installed.T_parent_child[index, 3] - T[index, 3])
     # The other axes follow as far as the motion correlates them with this axis.
     T[:3, 3] += covariance[:3, index] / covariance[index, index] * missing
-    warning = f"{axis} is that of what is installed ({installed.origin})"
+    warning = f"{axis} is that of the installed transform ({installed.origin})"
     return replace(calibration, T_parent_child=T, warnings=(*calibration.warnings, warning))
 
 
@@ -255,8 +255,8 @@ class TfBroadcaster:
             self._node.destroy_publisher(self._publisher)
             self._publisher = None
             self._log.warning(
-                "the edge on /tf_static is withdrawn; listeners that have heard it keep it until "
-                "they are restarted"
+                "the edge on /tf_static is withdrawn; listeners that have "
+                "received it keep it until they restart"
             )
 
     def _decide(self, result: Calibration | None, why_not: str) -> BroadcastState:
@@ -269,11 +269,12 @@ class TfBroadcaster:
         if hidden := result.unobservable():
             return Broadcast.REFUSED, f"{axes_in_words(hidden)} not determined"
         if time.monotonic() - self._began_s < LOOK_S:
-            return Broadcast.WAITING, "the transform tree is looked at first"
+            return Broadcast.WAITING, "the transform tree is checked first"
         if reason := self._tree.what_forbids(result.mounting[0], result.child_frame):
             self._log.error(
-                f"publish_tf is refused: {reason}. Put the result into the robot's description "
-                "(extrinsic.urdf.xacro, which ~/save writes), or leave publish_tf off"
+                f"publish_tf is refused: {reason}. Copy the result into the "
+                "robot's description (extrinsic.urdf.xacro of ~/save), or "
+                "switch publish_tf off"
             )
             return Broadcast.REFUSED, reason
         return Broadcast.ON, ""

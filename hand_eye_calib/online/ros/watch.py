@@ -48,7 +48,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.usage = "%(prog)s [OPTION ...]"
     parser.epilog = EXAMPLES
-    node = "full name of the node, such as /robot1/calibrator. Default: the first that is heard"
+    node = (
+        "full name of the node, such as /robot1/calibrator. Default: the first node that publishes"
+    )
     parser.add_argument("--node", metavar="NAME", default="", help=node)
     web = f"also serve a page for browsers, at port {_PORT} of all addresses by default"
     parser.add_argument(

@@ -137,7 +137,7 @@ class Board:
         """Return the view; ``now_s`` (s) is on the clock of :meth:`take`."""
         if self._newest is None:
             name = self._wanted or "a calibrator"
-            text = f"Nothing heard of {name} yet. Is the node running, on the same ROS domain and "
+            text = f"No message from {name} yet. Is the node running, on the same ROS domain and "
             return View(self._wanted, Tone.UNKNOWN, "NO NODE", f"{text}network?")
         state, received_s = self._newest
         view = _view(state, now_s - received_s)
@@ -294,7 +294,7 @@ def _activity(state: NodeState) -> Headline:
         return Headline(Tone.GOOD, "WATCHING", sentence)
     at = state.progress
     if at is None:
-        text = "The node is there, and says nothing of a result yet."
+        text = "The node runs, and has no result yet."
         return Headline(Tone.UNKNOWN, "LISTENING", text)
     sentence = _sentence(at.text)
     # The streams are faulty, although an earlier result was good.
@@ -331,7 +331,7 @@ def _done(state: NodeState, at: ProgressState) -> Headline:
 
 def _silence(state: NodeState, silent_s: float) -> Headline:
     """Return the headline of a node that sends no states any more."""
-    text = f"No word from the node for {silent_s:.0f} s. If it has died, start it again"
+    text = f"No message from the node for {silent_s:.0f} s. If it has died, start it again"
     if state.journal and state.journal.directory:
         text += ", with journal:=resume"
     return Headline(Tone.BAD, "SILENT", f"{text}.")
@@ -343,7 +343,7 @@ def _end(state: NodeState) -> Headline:
     saved = state.saved
     text = "The node has ended"
     if state.mount is not None:
-        text += ": nobody watches the mount."
+        text += ": the mount is not monitored."
     elif saved is not None:
         text += f". The result was saved {_saved_at(saved)}."
         if saved.verdict == "DO NOT USE":
@@ -351,7 +351,7 @@ def _end(state: NodeState) -> Headline:
         else:
             tone = Tone.GOOD
     elif state.result:
-        text += ". The result is not saved: the log says why."
+        text += ". The result is not saved: the log contains the reason."
     else:
         text += ". There was no result yet."
     return Headline(tone, "ENDED", text)
@@ -450,7 +450,7 @@ def _watched(axis: str, mount: MountState) -> Line:
         text = f"moved by {amount(axis, shift)} ± {amount(axis, sigma)}"
     elif visible is not None:
         tone = Tone.GOOD
-        text = f"not moved (would see {amount(axis, visible)})"
+        text = f"not moved (detects {amount(axis, visible)})"
     elif mount.is_learning or not mount.visible_10min:
         text = "not known yet"
     return Line(tone, _NAMES[axis], text)
@@ -491,7 +491,7 @@ def _result(state: NodeState) -> Iterator[Line]:
             yield Line(Tone.BUSY, "prior", text)
     if state.progress and (comparison := state.progress.comparison):
         tone = _TONES.get(comparison.verdict, Tone.UNKNOWN)
-        yield Line(tone, "compared with what is installed", _typeset(comparison.sentence))
+        yield Line(tone, "compared with the installed transform", _typeset(comparison.sentence))
     if state.extrinsic and state.extrinsic.tf_static is not Broadcast.OFF:
         yield _broadcast(state.extrinsic, state.has_ended)
     if state.saved:
