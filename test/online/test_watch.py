@@ -211,7 +211,13 @@ REACHED = {"done": True, "precision": "good to 4 mm"}
         ),
         (state(extrinsic=replace(EXTRINSIC, **ERROR)), 0.5, Tone.BAD, "BROKEN", "Known."),
         (replace(state(), has_ended=True), 9.0, Tone.ACT, "ENDED", "The node has ended. The"),
-        (replace(mount(), has_ended=True), 0.5, Tone.ACT, "ENDED", "The node has ended: the mount is not"),
+        (
+            replace(mount(), has_ended=True),
+            0.5,
+            Tone.ACT,
+            "ENDED",
+            "The node has ended: the mount is not",
+        ),
         (
             replace(state(), has_ended=True, saved=SAVED),
             *(9.0, Tone.GOOD, "ENDED", "The node has ended. The result was saved at "),
