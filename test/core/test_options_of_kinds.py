@@ -8,13 +8,15 @@ import pytest
 from motions import as_trajectory, child_of, disturbed, wandering_poses
 
 from hand_eye_calib.core.base.config import CalibratorConfig
-from hand_eye_calib.core.base.errors import ConfigError, NotEnoughDataError
+from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.extras.fleet.together import calibrate_together
+from hand_eye_calib.extras.rig.rig import calibrate_rig
 from hand_eye_calib.extras.stops.calibrate import calibrate_stops
 
-KINDS = ("poses", "positions", "rotations", "rates", "stops")
+KINDS = ("poses", "positions", "rotations", "rates", "stops", "rig", "together")
 
 # A value of each option that is not the default and that matters for the streams below.
 VALUES = {
@@ -66,6 +68,9 @@ REFUSED = {
     | {"keyframe.min_translation", "keyframe.min_rotation", "keyframe.min_interval"}
     | {"parent_kind", "child_kind"}
     | _OF_WHOLE_POSES,
+    "rig": {"time_offset", "scale"}
+    | {name for name in VALUES if name.startswith(("parent_", "child_", "prior."))},
+    "together": set(),
 }
 
 # What a stream measures already changes nothing.
@@ -104,13 +109,43 @@ def stops():
 
 
 @cache
+def sensors():
+    """Noisy streams of three sensors of a rig."""
+    parent, child = streams("poses")
+    other = child_of(wandering_poses(240)) @ se3.exp(np.array([0.2, 0.1, 0, 0, 0, 0.3]))
+    return {
+        "lidar": parent,
+        "camera": child,
+        "rear": as_trajectory(disturbed(other, 2, 0.002, 0.001)),
+    }
+
+
+def joint_result(options):
+    """Return the result of both halves of a recording, as two recordings of one rig."""
+    fields = {}
+    prior = {}
+    for option, value in options.items():
+        if option.startswith("prior."):
+            prior[option.removeprefix("prior.")] = value
+        else:
+            fields[option.replace(".", "_")] = value
+    parent, child = streams("poses")
+    halves = [(parent[:120], child), (parent[120:], child)]
+    return calibrate_together(halves, **fields, prior=prior, checks=False)
+
+
+@cache
 def document(kind, **options):
     try:
         if kind == "stops":
             result = calibrate_stops(*stops(), CalibratorConfig.from_options(options))
+        elif kind == "rig":
+            result = calibrate_rig(sensors(), options)
+        elif kind == "together":
+            result = joint_result(options)
         else:
             result = whole_snapshot(*streams(kind), options).estimate()
-    except NotEnoughDataError as error:
+    except InputError as error:
         return str(error)
     return str(result.to_dict())
 
@@ -123,7 +158,8 @@ def test_the_table_has_every_option():
 @pytest.mark.parametrize("option", VALUES)
 def test_an_option_is_obeyed_or_refused(option, kind):
     method = {"method": "dnlo", "reference": "B3"}
-    other_options = method if kind == "poses" and option in _OF_DNLO else {}
+    has_methods = kind in ("poses", "rig", "together")
+    other_options = method if has_methods and option in _OF_DNLO else {}
     options = {**other_options, option: VALUES[option]}
     if option in REFUSED[kind]:
         with pytest.raises(ConfigError, match=option.replace("_", ".")):

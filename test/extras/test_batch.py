@@ -21,9 +21,12 @@ import numpy as np
 import pytest
 from fleet_making import always_dies, dies_once, outcome, recordings_of
 from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
+from result_making import good_calibration, written_finding
 
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.results.calibration import SolveStatus
+from hand_eye_calib.core.results.records import Severity
 from hand_eye_calib.extras.fleet import batch as batch_run
 from hand_eye_calib.extras.fleet import work as batch_work
 from hand_eye_calib.extras.fleet.batch import write_rows
@@ -33,6 +36,7 @@ from hand_eye_calib.formats import remote
 from hand_eye_calib.formats.bags.patterns import matching
 from hand_eye_calib.formats.bags.writer import write_bag
 from hand_eye_calib.formats.results import load_result
+from hand_eye_calib.offline.cli.present import exit_code
 
 pytestmark = pytest.mark.usefixtures("no_figures")
 
@@ -148,6 +152,20 @@ def test_a_defect_in_one_bag_leaves_the_others_alone(monkeypatch):
     outcome = work(Task(name="a", bags=("absent",)))
     assert outcome.row["error"] == "unexpected ZeroDivisionError: division by zero"
     assert "ZeroDivisionError" in json.loads(outcome.text)["traceback"]
+
+
+@pytest.mark.parametrize(
+    ("severity", "code", "error"),
+    [(Severity.NOTE, 1, "the solver did not converge"), (Severity.ERROR, 3, None)],
+)
+def test_a_recording_fails_as_it_does_alone(monkeypatch, severity, code, error):
+    finding = written_finding("jumps", severity, "every step is a jump")
+    failed = good_calibration(status=SolveStatus.NOT_CONVERGED, findings=(finding,))
+    recording = types.SimpleNamespace(solved=lambda _: failed, inputs={}, snapshot=None)
+    monkeypatch.setattr(batch_work, "read_recording", lambda *_: recording)
+    outcome = work(Task(name="a", bags=("a",)))
+    assert (outcome.code, outcome.row["error"]) == (code, error)
+    assert outcome.code == exit_code(failed)
 
 
 @pytest.mark.parametrize(

@@ -5,15 +5,22 @@ import json
 
 import numpy as np
 import pytest
+from result_making import written_finding
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.results.records import Severity
+from hand_eye_calib.extras.rig import command
+from hand_eye_calib.extras.rig import rig as of_rig
 from hand_eye_calib.extras.rig.command import as_lines
 from hand_eye_calib.extras.rig.page import render_rig
 from hand_eye_calib.formats.bags.writer import write_bag
 from hand_eye_calib.formats.results import save_rig
+from hand_eye_calib.offline.cli import present
 from hand_eye_calib.offline.cli.main import main
+from hand_eye_calib.offline.cli.present import gravest_code
+from hand_eye_calib.offline.cli.reading import FilesRead
 from reproduction.rig import simulated, unequal
 
 
@@ -170,10 +177,51 @@ def test_topics_of_a_bag(rig, tmp_path, capsys):
     ("words", "said"),
     [
         (["rear.txt", "--parent-format", "tum"], "--parent-format is of two files"),
-        (["front.txt"], "of one sensor, 'front.txt'"),
+        (["front.txt"], "front.txt is given twice"),
         (["rear.txt", "--installed", "0 0 0 0 0 0"], "--installed and --base-frame are of two"),
     ],
 )
 def test_the_command_refuses_options_of_two_files(files, run, words, said):
     code, _, err = run("calibrate", *files[:2], *words)
     assert (code, said in err) == (2, True)
+
+
+def not_converged(rig, findings=()):
+    """Return the rig with a first extrinsic whose solve did not converge."""
+    first, *others = rig.calibrations
+    failed = dataclasses.replace(
+        first, status=hec.SolveStatus.NOT_CONVERGED, findings=tuple(findings)
+    )
+    return dataclasses.replace(rig, calibrations=(failed, *others))
+
+
+JUMPS = written_finding("jumps", Severity.ERROR, "every step is a jump")
+
+
+@pytest.mark.parametrize(("findings", "code"), [((), 1), ((JUMPS,), 3)])
+def test_the_exit_code_is_that_of_two_sensors(files, found, run, monkeypatch, findings, code):
+    failed = not_converged(found, findings)
+    monkeypatch.setattr(of_rig, "calibrate_rig", lambda *_: failed)
+    exit_code, _, err = run("calibrate", *files)
+    assert exit_code == code == gravest_code(map(present.exit_code, failed.calibrations))
+    advice = "front: the solver did not converge; do not use this result, record more varied motion"
+    assert (advice in err) == (code == 1)
+
+
+def test_labels_details_and_warnings_of_files_are_obeyed_as_with_two_sensors(
+    rig, files, found, run, monkeypatch
+):
+    trajectories = [*trajectories_of(rig).values()]
+    monkeypatch.setattr(of_rig, "calibrate_rig", lambda *_: found)
+    monkeypatch.setattr(
+        command, "read_files", lambda *_: FilesRead(trajectories, [], ["look here"])
+    )
+    _, out, _ = run("calibrate", *files, "--json", "--label", "vehicle=7")
+    document = json.loads(out)
+    assert document["inputs"]["labels"] == {"vehicle": "7"}
+    for calibration in document["calibrations"].values():
+        assert calibration["warnings"] == ["look here"]
+    _, out, _ = run("calibrate", *files, "--verbose")
+    assert "quaternion" in out
+    assert "  Method: " in out
+    assert "Note: look here" in out

@@ -9,7 +9,7 @@ import real_data
 from fleet_making import recordings_of
 from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
 from result_making import SHIFTED_FROM as X
-from result_making import shift
+from result_making import shift, written_finding
 from result_making import shifted as result
 
 import hand_eye_calib as hec
@@ -20,7 +20,7 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import Extrinsic
 from hand_eye_calib.core.geometry.se3 import deviation
 from hand_eye_calib.core.results.calibration import DofVerdict, SolveStatus
-from hand_eye_calib.core.results.records import AXES
+from hand_eye_calib.core.results.records import AXES, Severity
 from hand_eye_calib.extras.fleet.together import together
 
 pytestmark = pytest.mark.usefixtures("no_figures")
@@ -116,6 +116,17 @@ def test_recordings_that_nobody_may_use_are_left_out():
         together(named(failed))
     with pytest.raises(InputError, match="of one pair of frames"):
         together(named(result(), result(parent_frame="imu")))
+
+
+def test_the_common_result_has_the_gravest_findings_and_all_warnings():
+    small = written_finding("jumps", Severity.NOTE, "few jumps", stream="child")
+    large = written_finding("jumps", Severity.WARNING, "many jumps", stream="child")
+    other = written_finding("jumps", Severity.NOTE, "a jump", stream="parent")
+    first = dataclasses.replace(result(0), findings=(large, other), warnings=("m", "repaired"))
+    second = dataclasses.replace(result(1), findings=(small,), warnings=("m",))
+    joint = together(named(first, second))
+    assert joint.findings == (large, other)
+    assert joint.warnings == ("m", "drive 1: repaired")
 
 
 def test_python_takes_pairs_of_trajectories():

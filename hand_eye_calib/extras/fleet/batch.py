@@ -31,7 +31,7 @@ from hand_eye_calib.offline.cli.options import (
     waiting_for,
     with_progress,
 )
-from hand_eye_calib.offline.cli.present import deliver, wrapped
+from hand_eye_calib.offline.cli.present import deliver, gravest_code, wrapped
 from hand_eye_calib.offline.cli.reporting import REPORT
 
 # Largest number of results on the terminal, the worst first; rows.csv has all.
@@ -71,8 +71,7 @@ def run_batch(arguments: argparse.Namespace) -> int:
             f"{n_alone} recordings are not compared with each other: give --vehicle with the place "
             "of the vehicle in their paths, such as 'fleet/{vehicle}/*'"
         )
-    codes = {outcome.code for outcome in done}
-    return 1 if 1 in codes else max(codes)
+    return gravest_code(outcome.code for outcome in done)
 
 
 def run_together(arguments: argparse.Namespace, groups: Sequence[Sequence[Path | str]]) -> int:

@@ -18,11 +18,18 @@ from hand_eye_calib.core.assessment.comparison import (
 from hand_eye_calib.core.assessment.covariance import combined
 from hand_eye_calib.core.base.errors import HandEyeCalibError, InputError, located
 from hand_eye_calib.core.base.plain import Document
+from hand_eye_calib.core.base.text import listing
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import turned
 from hand_eye_calib.core.geometry.trajectory import TrajectoryLike
 from hand_eye_calib.core.results.calibration import Calibration, Verdict, data_frame
-from hand_eye_calib.core.results.records import AXES, DofVerdict, SolveStatus
+from hand_eye_calib.core.results.records import (
+    AXES,
+    DofVerdict,
+    Finding,
+    SolveStatus,
+    gravest_first,
+)
 from hand_eye_calib.extras.fleet.records import Recorded, Together
 from hand_eye_calib.offline.calibrate import calibrate
 
@@ -185,7 +192,7 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
     names = [*usable]
     for index in agreement.apart:
         left_out[names[index]] = "it does not belong to the others"
-    used = [result for name, result in usable.items() if name not in left_out]
+    used = {name: result for name, result in usable.items() if name not in left_out}
     deviations = dict.fromkeys(results, np.full(6, np.nan))
     deviations |= dict(zip(names, agreement.deviations, strict=True))
     sigmas = dict.fromkeys(results, np.full(6, np.nan))
@@ -218,8 +225,24 @@ def _is_unusable(result: Calibration) -> bool:
     return bool(rules - {"nothing_known"})
 
 
-def _joint(used: Sequence[Calibration], agreement: Agreement, record: Together) -> Calibration:
-    """Return the result of recordings that belong together."""
+def _warnings_of(recordings: Mapping[str, Calibration]) -> tuple[str, ...]:
+    """Return the warnings of all recordings, with the names of those that have each of them."""
+    names: dict[str, list[str]] = {}
+    for name, result in recordings.items():
+        for warning in result.warnings:
+            names.setdefault(warning, []).append(name)
+    warnings = []
+    for warning, of_warning in names.items():
+        is_common = len(of_warning) == len(recordings)
+        warnings.append(warning if is_common else f"{listing(of_warning)}: {warning}")
+    return tuple(warnings)
+
+
+def _joint(
+    recordings: Mapping[str, Calibration], agreement: Agreement, record: Together
+) -> Calibration:
+    """Return the result of recordings that belong together, in order of time."""
+    used = [*recordings.values()]
     T = agreement.T_parent_child
     covariance = agreement.covariance.copy()
     by_prior = set()
@@ -239,7 +262,9 @@ def _joint(used: Sequence[Calibration], agreement: Agreement, record: Together) 
     )
     is_open = any(math.isinf(dof.sigma) for dof in observability)
     newest = used[-1]
-    findings = {finding.code: finding for result in used for finding in result.findings}
+    findings: dict[tuple[str, str], Finding] = {}
+    for finding in gravest_first([finding for result in used for finding in result.findings]):
+        findings.setdefault((finding.code, finding.stream), finding)
     clocks = {(result.time_offset_s, result.scale) for result in used}
     offset_s, scale = clocks.pop() if len(clocks) == 1 else (0.0, 1.0)
     return Calibration(
@@ -253,6 +278,7 @@ def _joint(used: Sequence[Calibration], agreement: Agreement, record: Together) 
         time_offset_s=offset_s,
         scale=scale,
         findings=tuple(findings.values()),
+        warnings=_warnings_of(recordings),
         parts={"together": record},
         **{name: sum(getattr(result, name) for result in used) for name in _COUNTS},
         **{name: getattr(newest, name) for name in _OF_NEWEST},

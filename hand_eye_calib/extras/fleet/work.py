@@ -216,8 +216,8 @@ def work(task: Task) -> Outcome:
             result = recording.solved(task.with_fingerprints)
             inputs = recording.inputs
             page = render(result, recording.snapshot, inputs) if task.with_report else ""
-            failure = result.status.failure or None
-            return Outcome.of(task, failure, result, inputs, page, as_given)
+            error = result.reasons[0].sentence if result.has_failed else None
+            return Outcome.of(task, error, result, inputs, page, as_given)
     except HandEyeCalibError as error:
         return Outcome.of(task, str(error))
     except Exception as error:

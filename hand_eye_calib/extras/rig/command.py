@@ -1,12 +1,11 @@
 """Rigs on the command line: calibrate three sensors or more, print and save the result."""
 
 import argparse
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from hand_eye_calib.core.base.errors import ConfigError
-from hand_eye_calib.core.results.document import transforms_of
+from hand_eye_calib.core.results.document import summary, transforms_of
 from hand_eye_calib.offline.cli.options import (
-    fail,
     note,
     options_from,
     print_result,
@@ -15,7 +14,7 @@ from hand_eye_calib.offline.cli.options import (
 )
 from hand_eye_calib.offline.cli.present import (
     allowance_lines,
-    exit_code,
+    end,
     transform_lines,
     verdict_lines,
     wrapped,
@@ -24,6 +23,7 @@ from hand_eye_calib.offline.cli.reading import read_files
 
 if TYPE_CHECKING:
     from hand_eye_calib.core.base.plain import Document
+    from hand_eye_calib.core.geometry.trajectory import Trajectory
     from hand_eye_calib.extras.rig.rig import RigCalibration
     from hand_eye_calib.formats.remote import AsGiven
 
@@ -35,35 +35,74 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     a remote bag back into plain values.
     """
     from hand_eye_calib.extras.rig import rig as of_rig
-    from hand_eye_calib.formats.results import fingerprint, save_rig
+    from hand_eye_calib.formats.results import save_rig
 
     if arguments.installed or arguments.base_frame:
         raise ConfigError("--installed and --base-frame are of two sensors, not of a rig")
-    topics = arguments.topics
-    if topics:
-        from hand_eye_calib.formats.bags.reader import PoseBag
-        from hand_eye_calib.formats.bags.sources import source_of
-        from hand_eye_calib.offline.cli.bags import read_sources, refuse_recordings
+    readings = _read_topics(arguments) if arguments.topics else _read_files(arguments)
+    sensors = _by_frame(readings)
+    inputs = as_given(readings.inputs) | {"options": options_from(arguments)}
+    if arguments.label:
+        inputs["labels"] = dict(arguments.label)
+    with waiting_for(f"solving for {len(sensors)} sensors"):
+        rig = of_rig.calibrate_rig(sensors, inputs["options"])
+    rig = rig.with_warnings(as_given(readings.warnings))
+    if arguments.out:
+        note(f"wrote {save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs)}")
+    document = rig.to_dict() | {"inputs": inputs} if arguments.json else None
+    try:
+        print_result(as_lines(rig, arguments.verbose), document)
+    finally:  # also if the reader of the printed lines has ended
+        if arguments.out:
+            from hand_eye_calib.extras.rig.page import write_rig_report
 
-        names = topics
-        sources = [*map(source_of, topics)]
-        refuse_recordings(arguments.paths, sources)
-        with PoseBag(*arguments.paths) as bag:
-            stamps = arguments.stamps or "header"
-            readings = [(source, "auto", stamps) for source in sources]
-            trajectories, notes = read_sources(bag, readings)
-            inputs: Document = {"bag": str(bag), "topics": topics}
-            if arguments.out:
-                inputs["files"] = [fingerprint(file) for file in bag.files]
-    else:
-        refuse_stamps(arguments)
-        names = [*map(str, arguments.paths)]
-        trajectories, repairs, doubts = read_files(arguments, arguments.paths, {})
-        notes = [*repairs, *doubts]
-        inputs = {"files": names}
-    note(*notes)
-    sensors = {}
-    for trajectory, name in zip(trajectories, names, strict=True):
+            write_rig_report(arguments.out, rig, readings.names)
+    return end(rig.calibrations)
+
+
+class _Readings(NamedTuple):
+    """Trajectories of a rig, their files or topics, their origin, and warnings for the results."""
+
+    trajectories: "list[Trajectory]"
+    names: list[str]
+    inputs: "Document"
+    warnings: list[str]
+
+
+def _read_topics(arguments: argparse.Namespace) -> _Readings:
+    """Read the topics of a bag."""
+    from hand_eye_calib.formats.bags.reader import PoseBag
+    from hand_eye_calib.formats.bags.sources import source_of
+    from hand_eye_calib.formats.results import fingerprint
+    from hand_eye_calib.offline.cli.bags import read_sources, refuse_recordings
+
+    topics = arguments.topics
+    sources = [*map(source_of, topics)]
+    refuse_recordings(arguments.paths, sources)
+    stamps = arguments.stamps or "header"
+    with PoseBag(*arguments.paths) as bag:
+        trajectories, repairs = read_sources(bag, [(source, "auto", stamps) for source in sources])
+        inputs: Document = {"bag": str(bag), "topics": topics}
+        if arguments.out:
+            inputs["files"] = [fingerprint(file) for file in bag.files]
+        warnings = [*bag.warnings]
+    note(*repairs)
+    return _Readings(trajectories, topics, inputs, warnings)
+
+
+def _read_files(arguments: argparse.Namespace) -> _Readings:
+    """Read a trajectory file of each sensor."""
+    refuse_stamps(arguments)
+    names = [*map(str, arguments.paths)]
+    files = read_files(arguments, arguments.paths, {})
+    note(*files.repairs)
+    return _Readings(files.trajectories, names, {"files": names}, files.warnings)
+
+
+def _by_frame(readings: _Readings) -> "dict[str, Trajectory]":
+    """Return the trajectories by the frames of their sensors, which must differ."""
+    sensors: dict[str, Trajectory] = {}
+    for trajectory, name in zip(readings.trajectories, readings.names, strict=True):
         frame = trajectory.sensor_frame or name
         if frame in sensors:
             raise ConfigError(
@@ -71,32 +110,25 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
                 "of their frames or files, which must differ"
             )
         sensors[frame] = trajectory
-    inputs = as_given(inputs) | {"options": options_from(arguments)}
-    with waiting_for(f"solving for {len(sensors)} sensors"):
-        rig = of_rig.calibrate_rig(sensors, inputs["options"])
-    if arguments.out:
-        note(f"wrote {save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs)}")
-    try:
-        print_result(as_lines(rig), rig.to_dict() | {"inputs": inputs} if arguments.json else None)
-    finally:  # also if the reader of the printed lines has ended
-        if arguments.out:
-            from hand_eye_calib.extras.rig.page import write_rig_report
-
-            write_rig_report(arguments.out, rig, names)
-    failed = [calibration for calibration in rig.calibrations if calibration.status.failure]
-    for calibration in failed:
-        fail(f"{calibration.child_frame}: {calibration.headline}", 1)
-    return 1 if failed else max(map(exit_code, rig.calibrations))
+    return sensors
 
 
-def as_lines(rig: "RigCalibration") -> list[str]:
-    """Return the lines of a rig for a terminal: extrinsics and closures."""
+def as_lines(rig: "RigCalibration", with_details: bool = False) -> list[str]:
+    """Return the lines of a rig for a terminal: extrinsics and closures.
+
+    With details, quaternions and facts about each solution are added.
+    """
     lines = [f"{rig.verdict.value}: {len(rig.sensors)} sensors", ""]
     for calibration in rig.calibrations:
         first, *others = verdict_lines(calibration)
         lines += [f"{calibration.child_frame} in {calibration.parent_frame}: {first}", *others]
-        lines += transform_lines(transforms_of(calibration)["T_parent_child"])
-        lines += [*allowance_lines(calibration), ""]
+        transform = transforms_of(calibration)["T_parent_child"]
+        lines += transform_lines(transform, calibration.out_of_reach, with_details)
+        lines += allowance_lines(calibration)
+        if with_details:
+            for name, value in summary(calibration).items():
+                lines += wrapped(f"{name}: {value}", "  ", "    ")
+        lines.append("")
     lines.append("Results for two sensors at a time")
     for closure in rig.closures:
         lines += wrapped(closure.sentence, "  ", "    ")

@@ -232,6 +232,14 @@ class RigCalibration:
     def __repr__(self) -> str:
         return f"{self.verdict.value}: {listing(self.sensors)}"
 
+    def with_warnings(self, warnings: Sequence[str]) -> RigCalibration:
+        """Return the rig with further warnings on every extrinsic."""
+        calibrations = [
+            replace(calibration, warnings=(*calibration.warnings, *warnings))
+            for calibration in self.calibrations
+        ]
+        return replace(self, calibrations=tuple(calibrations))
+
     @property
     def verdict(self) -> Verdict:
         """The gravest verdict of all extrinsics."""

@@ -3,7 +3,7 @@
 import argparse
 import shlex
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -82,10 +82,7 @@ def deliver(
             from hand_eye_calib.offline.cli.reporting import write_report
 
             write_report(arguments.out, calibration, snapshot, inputs)
-    if calibration.has_failed:
-        for reason in calibration.reasons[:1]:
-            fail(f"{reason.sentence}; do not use this result, {reason.what_to_do}")
-    return exit_code(calibration)
+    return end([calibration])
 
 
 def _with_robot(
@@ -111,6 +108,22 @@ def _with_robot(
         raise ConfigError("--base-frame needs --installed ROBOT.urdf: a description with the frame")
     T_base_parent = tree.pose(base, calibration.parent_frame)
     return replace(calibration, base_frame=base, T_base_parent=T_base_parent)
+
+
+def end(calibrations: Sequence[Calibration]) -> int:
+    """Print why solves have failed, and return the exit code of results."""
+    for calibration in calibrations:
+        if calibration.has_failed:
+            reason = calibration.reasons[0]
+            sensor = f"{calibration.child_frame}: " if len(calibrations) > 1 else ""
+            fail(f"{sensor}{reason.sentence}; do not use this result, {reason.what_to_do}")
+    return gravest_code(map(exit_code, calibrations))
+
+
+def gravest_code(codes: Iterable[int]) -> int:
+    """Return the gravest of exit codes: FAILED, NOT_ALL, GOOD."""
+    distinct = {*codes}
+    return Exit.FAILED if Exit.FAILED in distinct else max(distinct)
 
 
 def exit_code(calibration: Calibration) -> int:
