@@ -180,6 +180,54 @@ def test_files_of_other_tools(written, both_poses, tmp_path):
     assert read.frames == frames
 
 
+# ---- a file for each pose
+
+
+def write_visp(folder, stop, robot, target):
+    for name, T in (("fPe", robot), ("cPo", target)):
+        values = [*T[:3, 3], *se3.rotation_log(T[:3, :3])]
+        rows = "".join(f"  - [{value:.12g}]\n" for value in values)
+        (folder / f"pose_{name}_{stop}.yaml").write_text(f"rows: 6\ncols: 1\ndata: \n{rows}")
+
+
+def write_zivid(folder, stop, robot, target):
+    for name, T in (("robot", robot), ("camera", target)):
+        (folder / name).mkdir(exist_ok=True)
+        numbers = ", ".join(repr(float(value)) for value in T.ravel())
+        text = (
+            f"PoseState: !!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: d\n   data: [{numbers}]\n"
+        )
+        (folder / name / f"pos{stop:02d}.yaml").write_text(f"%YAML:1.0\n---\n{text}")
+
+
+def write_rows_of_matrices(folder, stop, robot, target):
+    for name, T in (("gripper", robot), ("board", target)):
+        np.savetxt(folder / f"{name}_{stop}.txt", T[:3].reshape(1, -1))
+
+
+@pytest.mark.parametrize("write", [write_visp, write_zivid, write_rows_of_matrices])
+def test_a_folder_with_a_file_for_each_pose(write, both_poses, tmp_path):
+    for stop, (robot, target) in enumerate(zip(*both_poses, strict=True)):
+        write(tmp_path, stop, robot, target)
+    read = read_arm_samples(tmp_path)
+    np.testing.assert_allclose([read.robot, read.tracking], both_poses, atol=1e-9)
+
+
+def test_a_folder_of_poses_is_calibrated(both_poses, tmp_path, capsys):
+    for stop, (robot, target) in enumerate(zip(*both_poses, strict=True)):
+        write_visp(tmp_path, stop, robot, target)
+    main(["calibrate", str(tmp_path)])
+    assert "camera in hand" in capsys.readouterr().out
+
+
+def test_a_stop_without_both_poses_is_named(both_poses, tmp_path):
+    for stop in range(4):
+        write_visp(tmp_path, stop, both_poses[0][stop], both_poses[1][stop])
+    (tmp_path / "pose_cPo_2.yaml").unlink()
+    with pytest.raises(InputError, match="each stop needs both poses; incomplete: 2"):
+        read_arm_samples(tmp_path)
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

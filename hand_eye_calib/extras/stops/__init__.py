@@ -29,7 +29,8 @@ def register() -> None:
 def _add_arguments(parser: Any) -> None:
     order = (
         "none: the poses of two files are stops without an order, paired by their rows. So are the "
-        "samples of an arm (MoveIt, easy_handeye2, OpenCV, .npz), given as the only PATH"
+        "samples of an arm (MoveIt, easy_handeye2, OpenCV, .npz, a folder with a file for each "
+        "pose), given as the only PATH"
     )
     parser.add_argument("--order", choices=("time", "none"), default="time", help=order)
     setup = (
@@ -54,12 +55,19 @@ def _are_stops(arguments: Any) -> bool:
     are_images = bool(arguments.target) and not arguments.child_topic
     if not arguments.child_topic and are_images != bool(arguments.camera):
         raise ConfigError("--target and --camera go together: a target and a camera's intrinsics")
-    are_samples = len(arguments.paths) == 1 and arguments.paths[0].suffix in _SAMPLES
+    are_samples = len(arguments.paths) == 1 and _has_samples(arguments.paths[0])
     if arguments.setup and not (are_samples or are_images):
         raise ConfigError(
             "--setup says where the camera of an arm is; it needs the samples of an arm or --target"
         )
     return are_samples or are_images or arguments.order == "none"
+
+
+def _has_samples(path: Any) -> bool:
+    """Return whether a path is that of the samples of an arm."""
+    from hand_eye_calib.extras.stops.pose_files import is_pose_folder
+
+    return path.suffix in _SAMPLES or is_pose_folder(Path(path))
 
 
 def _calibrate(arguments: Any, _: Any) -> int:

@@ -7,7 +7,8 @@ Files that are read:
 - easy_handeye and easy_handeye2;
 - pairs ``T1_0``, ``T2_0``, ... in a FileStorage of OpenCV;
 - the stacks ``robot`` and ``tracking`` of an ``.npz``;
-- the arguments of OpenCV's ``calibrateHandEye`` by their names, in any of these files.
+- the arguments of OpenCV's ``calibrateHandEye`` by their names, in any of these files;
+- a folder with a file for each pose (ViSP), see :mod:`hand_eye_calib.extras.stops.pose_files`.
 """
 
 import re
@@ -22,6 +23,7 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import InputError, located
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import pose_of, pose_stack
+from hand_eye_calib.extras.stops.pose_files import read_pose_folder
 from hand_eye_calib.formats.files import LONGEST_NAME, local_path
 from hand_eye_calib.formats.npz import read_arrays
 from hand_eye_calib.formats.yaml_files import read_yaml
@@ -93,7 +95,9 @@ class ArmSamples:
 
 
 def read_arm_samples(path: str | Path) -> ArmSamples:
-    """Read the samples of an arm; ``sample:arm.yaml`` comes with the package.
+    """Read the samples of an arm from a file, or from a folder with a file for each pose.
+
+    ``sample:arm.yaml`` comes with the package.
 
     Raises
     ------
@@ -112,6 +116,9 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     (40, 4, 4)
     """
     path = local_path(path)
+    if path.is_dir():
+        robot, tracking = read_pose_folder(path)
+        return ArmSamples(robot, tracking, {})
     is_npz = path.suffix == ".npz"
     document: Any = read_arrays(path) if is_npz else read_yaml(path, _EXPECTED)
     with located(path):

@@ -1,0 +1,106 @@
+"""Poses of an arm with a file for each pose, such as ``pose_fPe_1.yaml`` and ``pose_cPo_1.yaml``.
+
+The file contains a matrix (4 x 4 or 3 x 4), ``x y z qx qy qz qw``, or a position and a rotation
+vector (ViSP). It is text, YAML, JSON, or YAML of OpenCV (Zivid). The name contains the number of
+the stop and, if the folder has poses of both sides, a word for the side.
+"""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.errors import InputError, located
+from hand_eye_calib.core.base.text import listing
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.frames import numbers_of, pose_of, words_of
+from hand_eye_calib.formats.files import read_text
+from hand_eye_calib.formats.yaml_files import read_yaml
+
+_SUFFIXES = (".yaml", ".yml", ".json", ".txt")
+
+# Words in the names of files. ViSP names the pose of b in a ``aPb``: e is the end effector, o the
+# object.
+_ROBOT_WORDS = {"pe", "robot", "hand", "gripper", "flange", "ee", "eef", "tcp", "tool"}
+_TARGET_WORDS = {"po", "target", "marker", "board", "tag", "object", "camera", "cam", "tracking"}
+
+# Name without its suffix: words, the number of the stop.
+_NUMBERED_NAME = re.compile(r"(.*?)([0-9]{1,9})")
+
+# Numbers of a position and a rotation vector.
+_N_OF_VECTOR = 6
+
+
+def files_of_sides(folder: Path) -> tuple[dict[int, Path], dict[int, Path]]:
+    """Return the files of the robot and of the target in a folder, by the number of the stop.
+
+    Poses are in the folder, or in a folder of their own for each side. Files without a word for the
+    side are ignored.
+    """
+    robot: dict[int, Path] = {}
+    target: dict[int, Path] = {}
+    for path in sorted([*folder.glob("*"), *folder.glob("*/*")]):
+        numbered = _NUMBERED_NAME.fullmatch(path.stem)
+        if numbered is None or path.suffix not in _SUFFIXES:
+            continue
+        words = words_of(numbered[1])
+        if path.parent != folder:
+            words |= words_of(path.parent.name)
+        stop = int(numbered[2])
+        if words & _ROBOT_WORDS:
+            robot[stop] = path
+        elif words & _TARGET_WORDS:
+            target[stop] = path
+    return robot, target
+
+
+def is_pose_folder(path: Path) -> bool:
+    """Return whether a folder has files of the robot and of the target."""
+    return path.is_dir() and all(files_of_sides(path))
+
+
+def read_pose_folder(folder: Path) -> tuple[FloatArray, FloatArray]:
+    """Return the poses (N, 4, 4) of the robot and of the target in a folder.
+
+    Raises
+    ------
+    InputError
+        If a file has no pose, or a stop has not both poses.
+    """
+    robot, target = files_of_sides(folder)
+    if not (robot and target):
+        raise InputError(
+            f"{folder}: expected a file for each pose, such as robot_1.txt and target_1.txt"
+        )
+    incomplete = sorted(robot.keys() ^ target.keys())
+    if incomplete:
+        numbers = listing([str(stop) for stop in incomplete[:8]])
+        raise InputError(f"{folder}: each stop needs both poses; incomplete: {numbers}")
+    stops = sorted(robot)
+    Ts_base_hand = np.stack([_read_pose(robot[stop]) for stop in stops])
+    Ts_camera_target = np.stack([_read_pose(target[stop]) for stop in stops])
+    return Ts_base_hand, Ts_camera_target
+
+
+def _read_pose(path: Path) -> FloatArray:
+    """Return the pose (4, 4) of a file."""
+    if path.suffix == ".txt":
+        document: Any = re.split(r"[\s,;]+", read_text(path, "a pose").strip())
+    else:
+        document = read_yaml(path, "a pose")
+    with located(path):
+        values = numbers_of(_only_value(document))
+        if len(values) == _N_OF_VECTOR:
+            rotation = se3.rotation_exp(np.array(values[3:]))
+            return se3.from_rotation_translation(rotation, np.array(values[:3]))
+        return pose_of(values)
+
+
+def _only_value(document: Any) -> Any:
+    """Return the value of a document of one name, such as ``PoseState`` of Zivid."""
+    while isinstance(document, Mapping) and len(document) == 1:
+        (document,) = document.values()
+    return document
