@@ -176,8 +176,8 @@ def test_topics_of_a_bag(rig, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["rear.txt", "--parent-format", "tum"], "--parent-format is of two files"),
-        (["front.txt"], "front.txt is given twice"),
+        (["rear.txt", "--parent-format", "tum"], "--parent-format is for two files"),
+        (["front.txt"], "front.txt appears twice"),
         (["rear.txt", "--installed", "0 0 0 0 0 0"], "--installed and --base-frame are of two"),
     ],
 )
