@@ -179,8 +179,9 @@ def _add_commands(parser: argparse.ArgumentParser) -> dict[str, argparse.Argumen
             "--help",
             nargs="?",
             choices=("all",),
+            metavar="all",
             action=_ShowHelp,
-            help="show the help and exit; all: with every option",
+            help="print the help and exit; all: with every option",
         )
     return parsers
 
