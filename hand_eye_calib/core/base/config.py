@@ -83,41 +83,44 @@ def _both(default: str, doc: str, **settings: Any) -> dict[str, Any]:
 
 _TF_SOURCE = _both(
     "",
-    "Take the poses of the {0} sensor from /tf and /tf_static instead of {0}_odom: "
-    "WORLD:SENSOR, the fixed frame and the sensor's, such as odom:lidar. Empty for the topic.",
+    "Take the poses of the {0} sensor from /tf and /tf_static instead of "
+    "{0}_odom: WORLD:SENSOR, the fixed frame and the sensor's frame, such as "
+    "odom:lidar. Empty for the topic.",
     read_only=True,
     parse=text.split_frames,
 )
 _TYPE = _both(
     "auto",
-    "Message type of {}_odom; auto takes it from the publisher.",
+    "Message type of {}_odom. auto: the type of the publisher.",
     choices=POSE_TYPES,
     read_only=True,
 )
 _MEASURES = _both(
     "auto",
-    "What the {} sensor measures: poses; positions (a GNSS antenna, a prism); rotations "
-    "without positions; or angular rates. auto takes it from the message type or the columns.",
+    "Quantity that the {} sensor measures: poses; positions (a GNSS antenna, "
+    "a prism); rotations without positions; or angular rates. auto: by the "
+    "message type or the columns.",
     choices=("auto", *MEASURES),
     read_only=True,
 )
 _INVERT = _both(
     "none",
-    "Invert the {}'s poses, if they are those of the world in the sensor, or its "
-    "orientations alone.",
+    "Invert the {}'s poses or only its orientations, if they are those of the world in the sensor.",
     choices=("none", "poses", "orientations"),
 )
 _QUATERNION = _both(
     "xyzw",
-    "Order in which the {}'s quaternions were written: wxyz puts right what was read as x y z w, "
-    "yzwx values x y z w under names w x y z.",
+    "Order in which the {}'s quaternions were written. wxyz repairs values "
+    "that were read as x y z w; yzwx repairs values x y z w under the names "
+    "w x y z.",
     choices=("xyzw", "wxyz", "yzwx"),
 )
 _KIND = _both(
     "odometry",
-    "How the poses of the {} sensor were made. odometry (lidar, camera, wheels) has "
-    "constant errors that no recording shows: they are part of every standard deviation. exact "
-    "(motion capture, surveyed, an INS with RTK, simulated) has none.",
+    "Constant errors of the {} sensor's poses, which no recording reveals. "
+    "odometry (lidar, camera, wheels): every standard deviation contains an "
+    "allowance for them. exact (motion capture, surveyed, an INS with RTK, "
+    "simulated): none.",
     choices=("odometry", "exact"),
 )
 
@@ -163,16 +166,18 @@ class CalibratorConfig(OptionSet):
 
     method: str = option(
         "auto",
-        "How the extrinsic is solved; auto: adaptive, dnlo where its noise model cannot work, and "
-        "dnlo if a reference is given; dnlo rejects outliers, robust weights them down, adaptive "
-        "estimates the noise and uses no reference, the others use all motion pairs.",
+        "Method of the solve. auto: adaptive if its noise model fits, "
+        "otherwise dnlo; also dnlo if a reference is set. dnlo rejects "
+        "outliers, robust reduces their weights. adaptive estimates the "
+        "noise and needs no reference. The others use all motion pairs.",
         choices=tuple(METHODS),
     )
     reference: str = option(
         "auto",
-        "Which poses form motion pairs: A (each with the first), B<n> (each with the n-th before "
-        "it), C<n> (each with the first of its segment of n), or auto (the one with the "
-        "estimate nearest to adaptive's).",
+        "Poses that form motion pairs: A (each with the first), B<n> (each "
+        "with the n-th before it), C<n> (each with the first of its segment "
+        "of n), or auto (the reference with the estimate nearest to that of "
+        "adaptive).",
         parse=lambda name, value: value == "auto" or text.parse_reference(name, value),
     )
     backend: str = option(
@@ -197,44 +202,46 @@ class CalibratorConfig(OptionSet):
     )
     max_pairs: int = option(
         5000,
-        "Largest number of synchronised pose pairs kept; more are downsampled.",
+        "Largest number of synchronised pose pairs to keep; more are downsampled.",
         within=(10, 100_000_000),
     )
     keyframe_min_translation: float = option(
         0.0,
-        "Keep a pose pair if the parent sensor has moved this far since the last one kept, or "
-        "rotated by keyframe.min_rotation. 0 switches this off.",
+        "Keep a pose pair if the parent sensor has moved this far since the "
+        "last kept pair, or rotated by keyframe.min_rotation. 0 switches "
+        "this off.",
         unit="m",
         within=(0.0, 100.0),
     )
     keyframe_min_rotation: float = option(
         0.0,
-        "Keep a pose pair if the parent sensor has rotated by this angle since the last one kept, "
-        "or moved keyframe.min_translation. 0 switches this off.",
+        "Keep a pose pair if the parent sensor has rotated by this angle "
+        "since the last kept pair, or moved keyframe.min_translation. 0 "
+        "switches this off.",
         unit="rad",
         within=(0.0, math.pi),
     )
     keyframe_min_interval: float = option(
-        0.0, "Smallest time between pose pairs that are kept.", unit="s", within=(0.0, 60.0)
+        0.0, "Smallest time between kept pose pairs.", unit="s", within=(0.0, 60.0)
     )
     max_gap: float = option(
         0.5,
-        "Longest time between two poses of a stream across which it is interpolated.",
+        "Longest time between two poses of a stream across which the stream is interpolated.",
         unit="s",
         within=(1e-3, 60.0),
     )
     time_offset: float | str = option(
         0.0,
-        "Added to the child's stamps to get the parent's clock; estimate finds it from the angular "
-        "rates of both streams, of any size.",
+        "Added to the child's stamps to get the parent's clock. estimate: "
+        "from the angular rates of both streams, of any size.",
         unit="s",
         words=("estimate",),
         within=(-_LONGEST_OFFSET_S, _LONGEST_OFFSET_S),
     )
     scale: float | str = option(
         "none",
-        "Factor from the child's lengths to metres; estimate finds it; auto finds it and uses it "
-        "only if it clearly differs from 1.",
+        "Factor from the child's lengths to metres. estimate: from the "
+        "motion. auto: estimated, and used only if it clearly differs from 1.",
         words=("none", "auto", "estimate"),
         within=(1e-6, 1e6),
     )
@@ -259,15 +266,15 @@ class CalibratorConfig(OptionSet):
     prior_yaw: str = _PRIOR["yaw"]
     target_translation: float = option(
         0.02,
-        "Standard deviation along each axis that is good enough; the verdict and the stop rule use "
-        "it.",
+        "Standard deviation along each axis that is good enough, for the "
+        "verdict and the stop rule.",
         unit="m",
         within=(1e-6, 100.0),
     )
     target_rotation: float = option(
         0.00524,
-        "Standard deviation about each axis that is good enough, 0.3 deg unless set; the verdict "
-        "and the stop rule use it.",
+        "Standard deviation about each axis that is good enough, by default "
+        "0.3 deg, for the verdict and the stop rule.",
         unit="rad",
         within=(1e-6, math.pi),
     )
@@ -278,10 +285,10 @@ class CalibratorConfig(OptionSet):
         parse=text.parse_targets,
     )
     parent_frame: str = option(
-        "", "Name of the parent sensor's frame; empty takes it from the messages.", read_only=True
+        "", "Name of the parent sensor's frame. Empty for the name in the messages.", read_only=True
     )
     child_frame: str = option(
-        "", "Name of the child sensor's frame; empty takes it from the messages.", read_only=True
+        "", "Name of the child sensor's frame. Empty for the name in the messages.", read_only=True
     )
 
     def is_known(self, name: str) -> bool:
@@ -373,9 +380,9 @@ class NodeConfig(OptionSet):
     child_type: str = _TYPE["child"]
     other_children: int = option(
         0,
-        "Number of further child sensors, with poses on child2_odom, child3_odom and so on. "
-        "Whenever the result is saved, all sensors are also solved together, into rig/ of "
-        "output_directory, in a process of its own.",
+        "Number of further child sensors, with poses on child2_odom, "
+        "child3_odom and so on. Whenever the result is saved, a separate "
+        "process solves all sensors together, into rig/ of output_directory.",
         within=(0, MOST_OTHERS),
         read_only=True,
     )
@@ -383,14 +390,15 @@ class NodeConfig(OptionSet):
     child_tf: str = _TF_SOURCE["child"]
     output_directory: str = option(
         "",
-        "Directory of the journal and of the result files, which ~/save and the end of the node "
-        "write; empty for none.",
+        "Directory of the journal and of the result files of ~/save and of "
+        "the end of the node. Empty for none.",
     )
     journal: str = option(
         "new",
-        "Journal of the session, in journal/ of output_directory; with it a crash loses less than "
-        "a second. new: start a session and keep the previous journal aside; resume: continue the "
-        "session on disk; off: no journal.",
+        "Journal of the session, in journal/ of output_directory: a crash "
+        "then loses less than a second. new: start a session and keep the "
+        "previous journal. resume: continue the session on disk. off: no "
+        "journal.",
         choices=("new", "resume", "off"),
         read_only=True,
     )
@@ -399,29 +407,31 @@ class NodeConfig(OptionSet):
     )
     report: bool = option(
         True,
-        "Also write report.html whenever the result is saved, in a process of its own that goes on "
-        "for some seconds after the end of the node.",
+        "Also write report.html whenever the result is saved, in a separate "
+        "process that ends some seconds after the node.",
     )
     publish_tf: bool = option(
         False,
-        "Broadcast the result on /tf_static once the targets are reached; leave it off if the "
-        "robot description has this transform.",
+        "Broadcast the result on /tf_static once the targets are reached. "
+        "Keep it off if the robot description has this transform.",
     )
     installed: str = option(
         "",
-        "What the robot uses now, to compare the result with: tf (from /tf_static), a URDF, an "
-        "earlier extrinsic.yaml, a file of another program, a bag, or X Y Z ROLL PITCH YAW in m "
-        "and rad. Empty for nothing.",
+        "Installed transform, to compare the result with: tf (from "
+        "/tf_static), a URDF, an earlier extrinsic.yaml, a file of another "
+        "program, a bag, or X Y Z ROLL PITCH YAW in m and rad. Empty for "
+        "none.",
         read_only=True,
     )
     base_frame: str = option(
         "",
-        "State the child sensor's pose in this frame, too, as /tf_static has it; saved files and "
-        "publish_tf are about that edge then. Empty for none.",
+        "Also state the child sensor's pose in this frame, from /tf_static. "
+        "Saved files and publish_tf then describe this edge. Empty for none.",
         read_only=True,
     )
     monitor: bool = option(
         False,
-        "Watch the mount against installed, and raise an alarm when it has moved, instead of "
-        "calibrating; false ends that, and calibrates anew.",
+        "Monitor the mount instead of calibrating: compare the motion with "
+        "installed, and raise an alarm after a shift. false ends the monitor "
+        "and calibrates anew.",
     )
