@@ -3,13 +3,17 @@
 import numpy as np
 import pytest
 
+from hand_eye_calib.core.assessment.moved import SIGNIFICANT, find_change
 from hand_eye_calib.core.base.blocks import (
     Blocks,
     answer_evidence,
+    inverse,
     jackknife_covariance,
     shift_evidence,
     solve,
 )
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 
 N_ROWS = 37
 N_BLOCKS = 5
@@ -138,3 +142,22 @@ def test_a_shift_from_values_known_exactly_is_the_answer_since():
     table = np.array([[4.0, 0.0, 8.0], [0.0, 0.0, 0.0]])  # 4 (x - 2) = 0, nothing about y
     shift = shift_evidence(table, np.array([0.5, 7.0]), np.zeros((2, 2)))
     assert shift.tolist() == [[4.0, 0.0, 6.0], [0.0, 0.0, 0.0]]
+
+
+def test_a_shift_is_searched_for_on_an_exact_straight_line():
+    n_poses = 300
+    stamps_ns = np.arange(n_poses) * 100_000_000
+    positions = np.zeros((n_poses, 3))
+    positions[:, 1] = np.linspace(0.0, 5e5, n_poses)
+    X = se3.exp([0.3, -0.1, 0.2, 0.3, -0.5, 1.2])
+    parent = se3.from_rotation_translation(np.eye(3), positions)
+    child = se3.inverse(X) @ parent @ X
+
+    change = find_change(PosePairs(stamps_ns, parent, child), X)
+
+    assert change.log_ratio < SIGNIFICANT
+
+
+def test_inverses_of_regular_matrices_are_those_of_numpy(rows):
+    matrices = np.swapaxes(rows, 1, 2) @ rows + np.eye(5)
+    np.testing.assert_array_equal(inverse(matrices), np.linalg.inv(matrices))

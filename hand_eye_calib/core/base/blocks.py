@@ -106,8 +106,13 @@ def score(tables: FloatArray) -> FloatArray:
 
 
 def inverse(matrices: FloatArray) -> FloatArray:
-    """Inverses (..., p, p) of matrices (..., p, p)."""
-    return np.asarray(np.linalg.inv(matrices), dtype=float)
+    """Return inverses (..., p, p) of matrices (..., p, p); pseudo-inverses if one is singular."""
+    try:
+        inverses = np.linalg.inv(matrices)
+    except np.linalg.LinAlgError:
+        # Exact poses have so much evidence along some directions that the others are rounding.
+        inverses = np.linalg.pinv(matrices)
+    return np.asarray(inverses, dtype=float)
 
 
 def answer_evidence(answers: FloatArray, covariances: FloatArray) -> FloatArray:
