@@ -5,7 +5,7 @@ programs read.
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -56,11 +56,11 @@ _OfResult = TypeVar("_OfResult", bound=Result)
 
 @dataclass(frozen=True, kw_only=True)
 class Notation:
-    """A transform in the notations that people and programs use: ``maps`` names source and target.
+    """A transform in the notations that people and programs use.
 
-    Each printed number, m and deg, has a standard deviation, and the part of it that the recording
-    shows: the rest is the allowance. What is unknown is NaN, with an infinite one; an unknown
-    rotation has no quaternion.
+    ``maps`` names source and target. Each printed number (m, deg) has a standard deviation and the
+    measured part of it; the rest is the allowance. An unknown number is NaN, and its standard
+    deviation is infinite. An unknown rotation has no quaternion.
     """
 
     maps: str
@@ -75,7 +75,7 @@ class Notation:
 
 
 def document_of(result: Judged) -> Document:
-    """The document of a result; see ``Calibration.to_dict``."""
+    """Return the document of a result; see ``Calibration.to_dict``."""
     parent = result.parent_frame
     child = result.child_frame
     document: Document = {
@@ -97,16 +97,16 @@ def document_of(result: Judged) -> Document:
         document["T_method"] = {"of": of, "matrix": result.T_method}
     document["findings"] = [finding.to_dict() for finding in result.findings]
     left_out = {*_TRANSFORMS, *_COVARIANCES, *_NOT_IN_FILES, "observability_measured"}
-    for name in (each.name for each in fields(result)):
-        if name not in left_out.union(document):
-            document[name] = getattr(result, name)
-    for added in all_parts():
-        document |= added.write(result.parts.get(added.name))
+    for field in fields(result):
+        if field.name not in left_out.union(document):
+            document[field.name] = getattr(result, field.name)
+    for extra in all_parts():
+        document |= extra.write(result.parts.get(extra.name))
     return plain(document)
 
 
 def _covariances_of(result: Result) -> Document:
-    """The covariance of a document, and its two parts."""
+    """Return the covariance of a document, and its two parts."""
     of = "error xi in T_parent_child @ exp(xi)"
     child = result.child_frame
     order = ["rho_x", "rho_y", "rho_z", "phi_x", "phi_y", "phi_z"]
@@ -120,86 +120,113 @@ def _covariances_of(result: Result) -> Document:
 
 
 def _observability_of(result: Result) -> list[Document]:
-    """Rows of a document: each axis with its standard deviation and the two parts of it."""
-    parts = zip(result.sigmas_measured, result.allowance, strict=True)
-    return [
-        plain(dof)
-        | {"sigma_measured": measured, "allowance": allowance, "frame": result.parent_frame}
-        for dof, (measured, allowance) in zip(result.observability, parts, strict=True)
-    ]
+    """Return a row for each axis: its standard deviation and the two parts of it."""
+    rows = []
+    columns = zip(result.observability, result.sigmas_measured, result.allowance, strict=True)
+    for dof, measured, allowance in columns:
+        row = plain(dof) | {"sigma_measured": measured, "allowance": allowance}
+        rows.append(row | {"frame": result.parent_frame})
+    return rows
+
+
+class _Transform(NamedTuple):
+    """Transform of a result, which maps coordinates of ``source`` into ``target``.
+
+    Attributes
+    ----------
+    covariances : (2, 6, 6) array-like
+        Measured part and allowance.
+    sigmas_m : (3,) array or None
+        Measured standard deviations of the translation; None for those of the covariance.
+    is_extra : bool
+        Whether the transform belongs to a part of the result.
+    """
+
+    T: FloatArray
+    source: str
+    target: str
+    covariances: Sequence[FloatArray]
+    sigmas_m: FloatArray | None = None
+    is_extra: bool = False
 
 
 def transforms_of(result: Result) -> dict[str, Notation]:
-    """The transforms of a result by their names."""
+    """Return the transforms of a result by their names."""
     T = result.T_parent_child
     parent = result.parent_frame
     child = result.child_frame
     own = result.covariance_measured, result.covariance_allowance
-    exchanged = [inverse_covariance(T, each) for each in own]
-    known_m = result.sigmas_measured[:3]
-    hidden = {*result.unobservable()}
+    exchanged = [inverse_covariance(T, covariance) for covariance in own]
+    sigmas_m = result.sigmas_measured[:3]
     # Where the rotation is out of reach, the axes of both sensors are the same by convention.
-    of_inverse_m = known_m if {*ROTATIONS} <= {*result.out_of_reach} else None
-    rows: list[tuple[str, FloatArray, str, str, Sequence[FloatArray], FloatArray | None]] = [
-        ("T_parent_child", T, child, parent, own, known_m),
-        ("T_child_parent", result.T_child_parent, parent, child, exchanged, of_inverse_m),
-    ]
+    is_turned = not {*ROTATIONS} <= {*result.out_of_reach}
+    transforms = {
+        "T_parent_child": _Transform(T, child, parent, own, sigmas_m),
+        "T_child_parent": _Transform(
+            result.T_child_parent, parent, child, exchanged, None if is_turned else sigmas_m
+        ),
+    }
     if result.T_base_child is not None:
-        rows.append(("T_base_child", result.T_base_child, child, result.base_frame, own, None))
-    extra = extra_transforms(result)
-    for name, added in extra.items():
-        added_covariances = added.covariance, np.zeros((6, 6))
-        rows.append(
-            (name, added.T_target_source, added.source, added.target, added_covariances, None)
+        transforms["T_base_child"] = _Transform(result.T_base_child, child, result.base_frame, own)
+    for name, extra in extra_transforms(result).items():
+        covariances = extra.covariance, np.zeros((6, 6))
+        transforms[name] = _Transform(
+            extra.T_target_source, extra.source, extra.target, covariances, is_extra=True
         )
-    found = {}
-    for name, T, source, target, covariances, sigmas_m in rows:
-        measured, allowance = covariances
-        sigmas = sigmas_rpy(T, measured)
-        along, allowance_m = (
-            sigmas_in_parent(se3.rotation_of(T), each)[:3] for each in covariances
-        )
-        if sigmas_m is None:
-            is_unsure = bool(hidden) or name in extra
-            sigmas_m = np.where(is_unsure & (along > UNKNOWN_M), np.inf, along)
-        is_turn_known = not {*ROTATIONS} & hidden
-        # Near gimbal lock roll and yaw have no standard deviation and are known.
-        known = np.isfinite(sigmas) | is_turn_known
-        found[name] = Notation(
-            maps=f"coordinates of {source} into {target}",
-            translation=np.where(np.isfinite(sigmas_m), se3.translation_of(T), np.nan),
-            sigma_translation=np.hypot(sigmas_m, allowance_m),
-            sigma_measured_translation=sigmas_m,
-            quat_xyzw=se3.to_quat_xyzw(T) if is_turn_known else None,
-            rpy_deg=np.degrees(np.where(known, se3.rotation_to_rpy(se3.rotation_of(T)), np.nan)),
-            sigma_rpy_deg=np.degrees(np.hypot(sigmas, sigmas_rpy(T, allowance))),
-            sigma_measured_rpy_deg=np.degrees(sigmas),
-            matrix=T,
-        )
-    return found
+    hidden = {*result.unobservable()}
+    return {name: _notation(transform, hidden) for name, transform in transforms.items()}
+
+
+def _notation(transform: _Transform, hidden: Collection[str]) -> Notation:
+    """Return a transform in all notations; ``hidden`` are the unobservable axes of the result."""
+    T = transform.T
+    measured, allowance = transform.covariances
+    R = se3.rotation_of(T)
+    sigmas_m = transform.sigmas_m
+    if sigmas_m is None:
+        sigmas_m = sigmas_in_parent(R, measured)[:3]
+        if hidden or transform.is_extra:
+            sigmas_m = np.where(sigmas_m > UNKNOWN_M, np.inf, sigmas_m)
+    is_turn_known = not {*ROTATIONS} & {*hidden}
+    sigmas = sigmas_rpy(T, measured)
+    # Near gimbal lock roll and yaw are known, but have no standard deviation.
+    is_known = np.isfinite(sigmas) | is_turn_known
+    return Notation(
+        maps=f"coordinates of {transform.source} into {transform.target}",
+        translation=np.where(np.isfinite(sigmas_m), se3.translation_of(T), np.nan),
+        sigma_translation=np.hypot(sigmas_m, sigmas_in_parent(R, allowance)[:3]),
+        sigma_measured_translation=sigmas_m,
+        quat_xyzw=se3.to_quat_xyzw(T) if is_turn_known else None,
+        rpy_deg=np.degrees(np.where(is_known, se3.rotation_to_rpy(R), np.nan)),
+        sigma_rpy_deg=np.degrees(np.hypot(sigmas, sigmas_rpy(T, allowance))),
+        sigma_measured_rpy_deg=np.degrees(sigmas),
+        matrix=T,
+    )
 
 
 def extra_transforms(result: Result) -> dict[str, ExtraTransform]:
-    """Transforms of the parts of a result by their names."""
-    found: dict[str, ExtraTransform] = {}
+    """Return the transforms of the parts of a result by their names."""
+    transforms: dict[str, ExtraTransform] = {}
     for name, value in result.parts.items():
-        found |= part(name).transforms(value)
-    return found
+        transforms |= part(name).transforms(value)
+    return transforms
 
 
 def matrix_of(of: str, frame: str, matrix: FloatArray) -> Document:
-    """A covariance of a document, and what it is of."""
+    """Return a covariance as documents have it; ``of`` names its error."""
     return {"of": of, "frame": frame, "units": "m, rad", "matrix": matrix}
 
 
 def summary(result: Result) -> dict[str, str]:
-    """How a result was solved, as names and values."""
+    """Return how a result was solved, as names and values."""
     rate = result.clock_rate
     proof = {"yes": "", "no": "not "}
     offset = result.time_offset_s
-    method = [f"{result.method} ({result.backend})"]
+    method = f"{result.method} ({result.backend})"
+    if result.method_reason:
+        method += f"; {result.method_reason}"
     rows = {
-        "Method": "; ".join(filter(None, [*method, result.method_reason])),
+        "Method": method,
         "Reference": result.reference_reason or result.reference,
         "Poses": f"{result.n_poses:,}",
         "Motion pairs": f"{result.n_inliers:,} of {result.n_pairs:,} are inliers",
@@ -212,40 +239,44 @@ def summary(result: Result) -> dict[str, str]:
     if rate and rate.is_used:
         rows["Time offset"] += f" at {rate.at_ns * 1e-9:.3f} s; the child's clock is {rate}"
     if result.noise:
-        said = (each.removeprefix("Noise: ").rstrip(".") for each in result.noise.in_words)
-        rows["Noise"] = "; ".join(said)
+        # Documents have the first sentence with the name of the row.
+        sentences = [text.removeprefix("Noise: ").rstrip(".") for text in result.noise.in_words]
+        rows["Noise"] = "; ".join(sentences)
     return rows
 
 
 def printed_numbers(
     transform: Notation, out_of_reach: Collection[str], sign: str = "+/-"
 ) -> dict[str, str]:
-    """The printed numbers of a transform by axis: x, y, z (m), roll, pitch and yaw (deg), each with
-    its standard deviation. Axes that are out of reach of the
-    streams stand together.
+    """Return the printed numbers of a transform by axis, with their standard deviations.
+
+    The axes are x, y, z (m), roll, pitch and yaw (deg). Three axes that are out of reach of the
+    streams have one text under their joint name.
     """
-    found = {}
+    texts = {}
     for axes, values, sigmas, unit in (
         (TRANSLATIONS, transform.translation, transform.sigma_translation, "m"),
         (ROTATIONS, transform.rpy_deg, transform.sigma_rpy_deg, "deg"),
     ):
         if {*axes} & {*out_of_reach}:
-            found[listing(axes)] = "not estimated"
+            texts[listing(axes)] = "not estimated"
             continue
         for axis, value, sigma in zip(axes, values.tolist(), sigmas.tolist(), strict=True):
             if not np.isfinite(value):
-                found[axis] = "unknown"
+                texts[axis] = "unknown"
             elif not np.isfinite(sigma):  # near gimbal lock
-                found[axis] = f"{fixed(value, 2)} {unit}"
+                texts[axis] = f"{fixed(value, 2)} {unit}"
             else:
-                text = with_sigma(value, sigma, 3 if unit == "m" else 2).replace("+/-", sign)
-                found[axis] = f"{text} {unit}"
-    return found
+                number = with_sigma(value, sigma, 3 if unit == "m" else 2).replace("+/-", sign)
+                texts[axis] = f"{number} {unit}"
+    return texts
 
 
 def parts_of_sigmas(transform: Notation) -> dict[str, str]:
-    """The parts of each printed standard deviation by axis, such as "4 mm measured, 8 mm allowance
-    for constant errors"; axes without an allowance, or that are unknown, are left out.
+    """Return the parts of each printed standard deviation by axis, in words.
+
+    An example is "4 mm measured, 8 mm allowance for constant errors". Axes without an allowance and
+    unknown axes are left out.
     """
     sigmas = np.r_[transform.sigma_translation, np.radians(transform.sigma_rpy_deg)]
     measured = np.r_[
@@ -261,14 +292,12 @@ def parts_of_sigmas(transform: Notation) -> dict[str, str]:
 
 
 def allowance_in_words(result: Result) -> str:
-    """How large the allowance in the standard deviations is, in a sentence; empty without one."""
-    known = np.isfinite(result.sigmas)
+    """Return the size of the allowance in the standard deviations; empty without an allowance."""
+    allowance = np.where(np.isfinite(result.sigmas), result.allowance, 0.0)
     sizes = []
-    for axes in (TRANSLATIONS, ROTATIONS):
-        rows = [index for index, axis in enumerate(AXES) if axis in axes and known[index]]
-        largest = float(result.allowance[rows].max(initial=0.0))
+    for axis, largest in (("x", allowance[:3].max()), ("roll", allowance[3:].max())):
         if largest > 0.0:
-            sizes.append(amount(axes[0], largest))
+            sizes.append(amount(axis, float(largest)))
     if not sizes:
         return ""
     of = "" if result.measured == "positions" else "odometry "
@@ -279,21 +308,22 @@ def allowance_in_words(result: Result) -> str:
 
 
 def usable_numbers(result: Judged) -> dict[str, float | str]:
-    """The numbers of a result's ``mounting`` for commands and files that others read.
+    """Return the numbers of a result's ``mounting`` for files and commands of other programs.
 
     Returns
     -------
     dict
-        x, y, z in m and qx, qy, qz, qw; if an angle is unknown, roll, pitch and yaw in rad instead
-        of the quaternion. An axis that cannot be determined is a text that no parser takes, such as
-        MEASURE_Z_BY_HAND. Empty under DO NOT USE.
+        x, y, z (m) and qx, qy, qz, qw. If an angle is unknown, roll, pitch and yaw (rad) replace
+        the quaternion. An unknown axis has a text that no parser takes, such as MEASURE_Z_BY_HAND.
+        Empty under DO NOT USE.
     """
     if result.verdict is Verdict.DO_NOT_USE:
         return {}
     T = result.mounting[1]
     unknown = {*result.unobservable()}
     hidden = np.array([axis in unknown for axis in TRANSLATIONS])
-    if result.T_base_parent is not None:  # axes that share a direction that the motion hides
+    if result.T_base_parent is not None:
+        # Axes of the base that share a hidden direction are unknown, too.
         of_base = np.abs(se3.rotation_of(result.T_base_parent)[:, hidden])
         hidden = of_base.max(axis=1, initial=0.0) > _SHARED
     numbers: dict[str, float | str] = {
@@ -306,22 +336,26 @@ def usable_numbers(result: Judged) -> dict[str, float | str]:
 
 
 def transform_arguments(result: Judged, decimals: int) -> list[str]:
-    """The arguments of static_transform_publisher for a result's ``mounting``, with so many
-    decimals; empty under DO NOT USE.
+    """Return the arguments of static_transform_publisher for a result's ``mounting``.
+
+    The list is empty under DO NOT USE.
     """
-    told: list[str] = []
+    arguments: list[str] = []
     for name, value in usable_numbers(result).items():
-        told += [f"--{name}", value if isinstance(value, str) else fixed(value, decimals)]
-    frames = ["--frame-id", result.mounting[0], "--child-frame-id", result.child_frame]
-    return told and told + frames
+        arguments += [f"--{name}", value if isinstance(value, str) else fixed(value, decimals)]
+    if arguments:
+        arguments += ["--frame-id", result.mounting[0], "--child-frame-id", result.child_frame]
+    return arguments
 
 
 def usable_angles(result: Result) -> dict[str, float | str]:
-    """Roll, pitch and yaw of a result's ``mounting``, rad, about fixed axes, as in URDF; a text for
-    an angle that cannot be determined.
+    """Return roll, pitch and yaw of a result's ``mounting``, rad, about fixed axes, as in URDF.
+
+    An unknown angle has a text that no parser takes.
     """
     T = result.mounting[1]
-    known = np.full(3, True)  # near gimbal lock roll and yaw have no sigma and are known
+    # Near gimbal lock roll and yaw are known, but have no standard deviation.
+    known = np.full(3, True)
     if set(result.unobservable()).intersection(ROTATIONS):
         known = np.isfinite(sigmas_rpy(T, result.covariance_measured))
     angles = se3.rotation_to_rpy(se3.rotation_of(T)).tolist()
@@ -335,8 +369,12 @@ def usable_angles(result: Result) -> dict[str, float | str]:
 
 
 def result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
-    """A calibration from its document, which may have been changed by hand, or damaged; an
-    InputError that says what is wrong.
+    """Build a calibration from its document, which may be damaged or changed by hand.
+
+    Raises
+    ------
+    InputError
+        If a value is missing or wrong; the message names it.
     """
     is_document = isinstance(data, Mapping)
     form = data.get("format") if is_document else None
@@ -357,7 +395,7 @@ def result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
 
 
 def _measured_parts(data: Mapping[str, Any]) -> Document:
-    """A document of any version with the fields of a result: measured parts and allowance."""
+    """Return a document of any version with the measured parts that a result has as fields."""
     document = dict(data)
     if data["version"] == 1:
         document |= {name: data[old] for name, old in _OLD_COVARIANCES.items() if old in data}
@@ -374,8 +412,12 @@ def _measured_parts(data: Mapping[str, Any]) -> Document:
 
 
 def _result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
-    """Build a result from a document of the right format. Raises KeyError, TypeError or ValueError
-    if a value is missing or was changed.
+    """Build a result from a document of the right format.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        If a value is missing or wrong.
     """
     from hand_eye_calib.core.results.context import Comparison
 
@@ -386,22 +428,27 @@ def _result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
         T_child_parent = se3.inverse(arrays["T_parent_child"])
         arrays["T_base_parent"] = arrays["T_base_child"] @ T_child_parent
     known = {name: value for name, value in data.items() if name not in _READ_APART}
-    found = {added.name: added.read(data) for added in all_parts()}
-    parts = {name: value for name, value in found.items() if value is not None}
+    parts = {extra.name: extra.read(data) for extra in all_parts()}
+    parts = {name: value for name, value in parts.items() if value is not None}
     result: _OfResult = from_plain(of, known | arrays, Comparison=Comparison)
     result = replace(result, parts=parts, findings=_findings_of(data))
     if data["version"] == 1 and result.cross_check:
         result = replace(result, cross_check=_with_allowance(result))
-    if tuple(dof.name for dof in result.observability) != AXES:
-        raise ValueError(f"the axes of observability are not {', '.join(AXES)}")
+    _require_known_names(result)
     if data["version"] != 1:
         _require_sigmas(result, data["observability"])
+    return result
+
+
+def _require_known_names(result: Result) -> None:
+    """Raise ValueError if a result has another axis or method than this program has."""
+    if tuple(dof.name for dof in result.observability) != AXES:
+        raise ValueError(f"the axes of observability are not {', '.join(AXES)}")
     for name in ("contradictions", "target_axes", "cross_check"):
         if not {*(getattr(result, name) or {})} <= {*AXES}:
             raise ValueError(f"{name} has other axes than {', '.join(AXES)}")
     if result.method not in METHODS:
         raise ValueError(f"method {result.method} is not known")
-    return result
 
 
 def _findings_of(data: Mapping[str, Any]) -> tuple[Finding, ...]:
@@ -420,7 +467,7 @@ def _require_sigmas(result: Result, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _with_allowance(result: Result) -> CrossCheck:
-    """The cross-check of a document of version 1, whose standard deviations lack the allowance."""
+    """Return the cross-check of a document of version 1 with the allowance, which it lacks."""
     sizes = dict(zip(AXES, result.allowance.tolist(), strict=True))
     rows = dict(result.cross_check or {})
     for axis, row in rows.items():
@@ -430,14 +477,14 @@ def _with_allowance(result: Result) -> CrossCheck:
 
 
 def transform_of(data: Mapping[str, Any]) -> FloatArray:
-    """Transform (4, 4) of a document."""
+    """Return the transform (4, 4) of a document."""
     matrix = _matrix(data, 4)
     check_poses(matrix[None])
     return matrix
 
 
 def covariance_of(data: Mapping[str, Any]) -> FloatArray:
-    """Covariance (6, 6) of a document; infinite for what is unknown."""
+    """Return the covariance (6, 6) of a document; unknown variances are infinite."""
     matrix = _matrix(data, 6)
     known = np.isfinite(matrix)
     sigmas = np.sqrt(np.maximum(np.diag(matrix), 0.0))
