@@ -78,8 +78,8 @@ def assert_is_result_of_the_fleet(code, out, err):
     assert list(rows) == ["drive0", "drive1", "drive2", "gone"]
     for name, row in rows.items():
         if name != "gone":
-            found = row["calibration"]["T_parent_child"]["matrix"]
-            np.testing.assert_allclose(found, T_PARENT_CHILD, atol=1e-3)
+            matrix = row["calibration"]["T_parent_child"]["matrix"]
+            np.testing.assert_allclose(matrix, T_PARENT_CHILD, atol=1e-3)
             assert row["calibration"]["reference"] == "B5"
 
 
@@ -189,7 +189,9 @@ def some_tasks(*names, **options):
 
 
 def done_by(tasks, work, **where):
-    return {task.name: found.row["error"] for task, found in outcomes(tasks, 2, do=work, **where)}
+    return {
+        task.name: outcome.row["error"] for task, outcome in outcomes(tasks, 2, do=work, **where)
+    }
 
 
 NAMES = ("a", "b", "c", "d", "bad")
@@ -202,9 +204,9 @@ def test_what_a_worker_that_dies_had_to_do_is_done_again(tmp_path):
 
 
 def test_a_recording_of_which_workers_die_takes_no_other_along():
-    found = done_by(some_tasks(*NAMES), always_dies)
-    assert found.pop("bad") == "worker processes die of it, perhaps for lack of memory: --jobs 1"
-    assert found == dict.fromkeys(NAMES[:-1], "done")
+    errors = done_by(some_tasks(*NAMES), always_dies)
+    assert errors.pop("bad") == "worker processes die of it, perhaps for lack of memory: --jobs 1"
+    assert errors == dict.fromkeys(NAMES[:-1], "done")
 
 
 def ended(pidfd, within_s=120):
@@ -265,8 +267,8 @@ def test_rows_and_page_have_every_recording_and_the_vehicle(run, fleet, tmp_path
 
 @pytest.mark.parametrize("name", [" =cmd()", "＝1+1", "a;=cmd()"])
 def test_a_cell_cannot_become_a_formula(tmp_path, name):
-    (one,) = fleet_outcomes("truck", 1, 1)
-    write_rows(tmp_path / "rows.csv", [{**one.row, "name": name}])
+    (outcome,) = fleet_outcomes("truck", 1, 1)
+    write_rows(tmp_path / "rows.csv", [{**outcome.row, "name": name}])
     text = (tmp_path / "rows.csv").read_text()
     (row,) = csv.DictReader(text.splitlines())
     assert row["name"] == (name if name[0] == "a" else f"'{name}")
@@ -306,11 +308,11 @@ def test_bags_in_a_store_give_what_they_give_here(tmp_path, memory):
     _, local = outcomes_of(f"{tmp_path}/drive0", f"{tmp_path}/drive1")
     tasks, remotely = outcomes_of(*matching("memory://fleet/*/drive"))
     assert [task.name for task in tasks] == ["run0", "run1"]
-    for here, there, task in zip(local, remotely, tasks, strict=True):
-        assert there["error"] is None
-        assert there["calibration"] == here["calibration"]
-        assert there["inputs"]["bag"] == task.bags[0] == f"memory:///fleet/{task.name}/drive"
-        files = [file["file"] for file in there["inputs"]["files"]]
+    for here, stored, task in zip(local, remotely, tasks, strict=True):
+        assert stored["error"] is None
+        assert stored["calibration"] == here["calibration"]
+        assert stored["inputs"]["bag"] == task.bags[0] == f"memory:///fleet/{task.name}/drive"
+        files = [file["file"] for file in stored["inputs"]["files"]]
         assert all(file.startswith(task.bags[0] + "/") for file in files)
 
 
@@ -332,8 +334,8 @@ def test_a_bag_at_a_url_is_replayed_alone(run, tmp_path, memory, monkeypatch):
 
 def test_a_remote_bag_may_not_fill_the_disk(tmp_path, memory, monkeypatch):
     monkeypatch.setattr(remote.shutil, "disk_usage", lambda _: types.SimpleNamespace(free=20_000))
-    _, (found,) = outcomes_of("memory://fleet/run0/drive")
-    assert found["error"] == (
+    _, (row,) = outcomes_of("memory://fleet/run0/drive")
+    assert row["error"] == (
         "cannot read memory://fleet/run0/drive: it is larger than 1e-05 GB, half of the free space "
         f"of {tempfile.gettempdir()}; set TMPDIR to a folder with more space"
     )
@@ -355,9 +357,9 @@ def test_what_a_store_calls_its_files_does_not_leave_the_folder(monkeypatch):
 
 def test_without_fsspec_one_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "fsspec.core", None)
-    _, (found,) = outcomes_of("s3://fleet/run.mcap")
-    assert found["error"].startswith("s3://fleet/run.mcap needs a package that is not installed")
-    assert "pip install '.[fleet]'" in found["error"]
+    _, (row,) = outcomes_of("s3://fleet/run.mcap")
+    assert row["error"].startswith("s3://fleet/run.mcap needs a package that is not installed")
+    assert "pip install '.[fleet]'" in row["error"]
 
 
 @pytest.mark.parametrize(
@@ -389,10 +391,10 @@ def test_the_index_page_shows_each_vehicle(tmp_path):
 
     outcomes = [*fleet_outcomes("<b>", 6, 1, shift=(4, 5)), *fleet_outcomes("a", 2, 2)]
     outcomes.append(Outcome.of(Task(name="lost", bags=()), "no <bag>"))
-    rows = [one.row for one in outcomes]
+    rows = [outcome.row for outcome in outcomes]
     vehicles = {
-        name: together({one.row["name"]: one.calibration for one in outcomes[part]})
-        for name, part in (("<b>", slice(0, 6)), ("a", slice(6, 8)))
+        name: together({outcome.row["name"]: outcome.calibration for outcome in outcomes[members]})
+        for name, members in (("<b>", slice(0, 6)), ("a", slice(6, 8)))
     }
     with_report = {row["name"] for row in rows[:-1]}
     page = render_batch("path/fleet.yaml", rows, vehicles, with_report)
@@ -412,8 +414,8 @@ def test_the_index_page_shows_each_vehicle(tmp_path):
 def test_the_page_of_ten_thousand_recordings_stays_below_2_mb():
     from hand_eye_calib.extras.fleet.batch_page import render_batch
 
-    (one,) = fleet_outcomes("truck_17", 1, 1)
-    rows = [{**one.row, "name": f"truck_017_2026-11-23T{n:05}"} for n in range(10_000)]
+    (outcome,) = fleet_outcomes("truck_17", 1, 1)
+    rows = [{**outcome.row, "name": f"truck_017_2026-11-23T{n:05}"} for n in range(10_000)]
     page = render_batch("of/fleet/**", rows, {}, {row["name"] for row in rows})
     assert len(page.encode()) < 1_790_000  # and 50 kB of each figure of 50 recordings
     assert (len(rows_of(page)), page.count('<p class="muted">fleet: ')) == (10_000, 1)

@@ -82,15 +82,17 @@ class TestLeverArm:
         parent, child = streams
         turned = child.poses @ se3.exp(np.r_[0, 0, 0, 0.5, 1.0, -0.3])
         whole = Trajectory(child.stamps_ns, turned, "antenna")
-        found = hec.calibrate(parent, whole, child_measures="positions", checks=False)
-        assert found.T_parent_child[:3, 3] == pytest.approx(result.T_parent_child[:3, 3], abs=1e-9)
+        declared = hec.calibrate(parent, whole, child_measures="positions", checks=False)
+        assert declared.T_parent_child[:3, 3] == pytest.approx(
+            result.T_parent_child[:3, 3], abs=1e-9
+        )
 
     def test_another_clock_is_found_from_the_speeds(self):
         parent, child = recorded(poses=wandering_poses(400, seed=4, step_rad=0.02))
-        found = hec.calibrate(parent, child.shifted(-7.31))
-        assert "solved with time_offset estimate" in found.warnings[0]
-        assert found.time_offset_s == pytest.approx(7.31, abs=0.01)
-        assert np.abs(distances(found)).max() < 4.0
+        shifted = hec.calibrate(parent, child.shifted(-7.31))
+        assert "solved with time_offset estimate" in shifted.warnings[0]
+        assert shifted.time_offset_s == pytest.approx(7.31, abs=0.01)
+        assert np.abs(distances(shifted)).max() < 4.0
 
     def test_a_drone_whose_positions_are_smoothed_knows_its_height_no_better(self):
         """It tilts to accelerate, so that 5 mm per m/s^2 look like 49 mm of height."""
@@ -106,14 +108,14 @@ class TestLeverArm:
         bent = np.gradient(np.gradient(antenna, 0.1, axis=0), 0.1, axis=0)
         positions = antenna + 0.005 * bent + 0.003 * random.standard_normal(antenna.shape)
         noise = 0.001 * random.standard_normal((len(truth), 6))
-        found = hec.calibrate(
+        smoothed = hec.calibrate(
             Trajectory(stamps_ns, truth @ se3.exp(noise), "lidar"),
             Trajectory.from_positions(stamps_ns, positions, "antenna"),
             checks=False,
         )
-        assert abs(found.T_parent_child[2, 3] - LEVER_ARM[2]) > 0.02
-        assert np.abs(distances(found)).max() < 3.0
-        assert any("answer to acceleration" in text for text in found.noise.in_words)
+        assert abs(smoothed.T_parent_child[2, 3] - LEVER_ARM[2]) > 0.02
+        assert np.abs(distances(smoothed)).max() < 3.0
+        assert any("answer to acceleration" in text for text in smoothed.noise.in_words)
 
     def test_the_expected_scale_of_a_tuning_is_taken_out_of_a_finding(self, monkeypatch):
         sigmas = list(TUNING.of_positions)
@@ -123,22 +125,22 @@ class TestLeverArm:
         monkeypatch.setattr(positions, "solve", solve)
         parent, child = recorded()
         result = hec.calibrate(parent, child.scaled(1 / 1.02), checks=False)
-        (scale,) = (found for found in result.findings if found.code == "scale")
+        (scale,) = (finding for finding in result.findings if finding.code == "scale")
         assert scale.evidence["scale"] == pytest.approx(1.02, abs=0.001)
 
     def test_a_scale_is_within_its_sigma_whatever_the_worlds(self):
         parent, child = recorded(drift_rad=1e-3, noise_m=0.02, seed=1)
         small = Trajectory(parent.stamps_ns, parent.scaled(0.97).poses, "camera")
-        found = hec.calibrate(small, child, scale="estimate", target_axes="z=5cm")
-        assert found.target_axes == {"z": 0.05}
-        assert abs(found.scale - 0.97) < 4.0 * found.scale_sigma < 0.01
-        assert found.T_parent_child[:3, 3] == pytest.approx(0.97 * LEVER_ARM, abs=0.02)
+        result = hec.calibrate(small, child, scale="estimate", target_axes="z=5cm")
+        assert result.target_axes == {"z": 0.05}
+        assert abs(result.scale - 0.97) < 4.0 * result.scale_sigma < 0.01
+        assert result.T_parent_child[:3, 3] == pytest.approx(0.97 * LEVER_ARM, abs=0.02)
 
     def test_a_drift_with_the_path_is_within_sigma(self):
         parent, child, lever_arm = simulated_positions("car", seed=3)
-        found = hec.calibrate(parent, child, checks=False)
+        result = hec.calibrate(parent, child, checks=False)
         assert (
-            np.abs((found.T_parent_child[:3, 3] - lever_arm) / found.sigmas_measured[:3]).max()
+            np.abs((result.T_parent_child[:3, 3] - lever_arm) / result.sigmas_measured[:3]).max()
             < 4.0
         )
 
@@ -147,13 +149,15 @@ class TestLeverArm:
         positions = child.poses[:, :3, 3].copy()
         positions[120:180] += np.cumsum(np.random.default_rng(3).normal(0.0, 0.2, (60, 3)), axis=0)
         mixed = Trajectory.from_positions(child.stamps_ns, positions, "antenna")
-        found = hec.calibrate(parent, mixed, checks=False)
+        result = hec.calibrate(parent, mixed, checks=False)
         good = np.r_[0:115, 185:300]
         apart = Trajectory.from_positions(child.stamps_ns[good], positions[good], "antenna")
         apart = hec.calibrate(parent, apart, checks=False)
-        left_out = next(each for each in found.noise.in_words if "far less precise" in each)
+        left_out = next(
+            sentence for sentence in result.noise.in_words if "far less precise" in sentence
+        )
         assert 20 < int(left_out.partition("%")[0]) < 30
-        difference = found.T_parent_child[:3, 3] - apart.T_parent_child[:3, 3]
+        difference = result.T_parent_child[:3, 3] - apart.T_parent_child[:3, 3]
         assert np.abs(difference / apart.sigmas_measured[:3]).max() < 0.5
 
     def test_float_solutions_outages_and_a_jump_do_little(self, streams):
@@ -164,9 +168,9 @@ class TestLeverArm:
         positions[250:] += [0.4, -0.3, 0.2]
         kept = (np.arange(len(child)) % 50) > 8
         worse = Trajectory.from_positions(child.stamps_ns[kept], positions[kept], "antenna")
-        found = hec.calibrate(parent, worse)
-        assert found.T_parent_child[:3, 3] == pytest.approx(LEVER_ARM, abs=0.03)
-        assert np.abs(distances(found)).max() < 4.0
+        result = hec.calibrate(parent, worse)
+        assert result.T_parent_child[:3, 3] == pytest.approx(LEVER_ARM, abs=0.03)
+        assert np.abs(distances(result)).max() < 4.0
 
     @pytest.mark.parametrize("tilt_rad", [0.0, 0.004])
     def test_on_flat_ground_height_is_unobservable_whatever_the_noise(self, tilt_rad):
@@ -174,52 +178,52 @@ class TestLeverArm:
         tilt = tilt_rad * np.random.default_rng(0).normal(size=(400, 3))
         noisy = parent.poses @ se3.exp(np.c_[np.zeros((400, 3)), tilt])
         parent = Trajectory(parent.stamps_ns, noisy, "lidar")
-        found = hec.calibrate(parent, child)
-        assert found.unobservable() == ["z", "roll", "pitch", "yaw"]
-        assert found.status is hec.SolveStatus.UNOBSERVABLE
-        assert "z cannot be determined from this motion" in found.reasons[0].sentence
-        assert np.abs(distances(found)[:2]).max() < 4.0
-        known = hec.calibrate(parent, child, prior={"z": (1.2, 0.01)}, checks=False)
-        assert known.status is hec.SolveStatus.OK
-        assert "z of the child sensor: mostly from the prior, not the motion" in known.warnings
+        result = hec.calibrate(parent, child)
+        assert result.unobservable() == ["z", "roll", "pitch", "yaw"]
+        assert result.status is hec.SolveStatus.UNOBSERVABLE
+        assert "z cannot be determined from this motion" in result.reasons[0].sentence
+        assert np.abs(distances(result)[:2]).max() < 4.0
+        with_prior = hec.calibrate(parent, child, prior={"z": (1.2, 0.01)}, checks=False)
+        assert with_prior.status is hec.SolveStatus.OK
+        assert "z of the child sensor: mostly from the prior, not the motion" in with_prior.warnings
 
     @pytest.mark.parametrize(("kind", "travel_s"), [("odometry", 0.005), ("exact", 0.0)])
     def test_the_allowance_grows_with_the_speed_of_an_odometry(self, kind, travel_s):
         parent, child, _ = simulated_positions("car", seed=4)
-        found = hec.calibrate(parent, child, parent_kind=kind, checks=False)
+        result = hec.calibrate(parent, child, parent_kind=kind, checks=False)
         speed_m_s = usual_speed(parent.stamps_ns, parent.poses[:, :3, 3])
         assert speed_m_s > 5.0
         expected_m = np.sqrt(2.0 * 0.005**2 + (travel_s * speed_m_s) ** 2)
-        assert found.allowance[:3] == pytest.approx(expected_m, rel=0.1)
+        assert result.allowance[:3] == pytest.approx(expected_m, rel=0.1)
 
     def test_positions_of_another_body_are_not_to_be_used(self, streams):
-        found = hec.calibrate(streams[0], recorded(seed=8)[1])
-        assert found.verdict is hec.Verdict.DO_NOT_USE
+        result = hec.calibrate(streams[0], recorded(seed=8)[1])
+        assert result.verdict is hec.Verdict.DO_NOT_USE
 
     def test_positions_in_millimetres_are_named_and_mended(self, streams):
         parent, child = streams
-        found = hec.calibrate(parent, child.scaled(1000.0))
-        assert "millimetres" in found.warnings[0]
-        assert found.T_parent_child[:3, 3] == pytest.approx(LEVER_ARM, abs=0.01)
-        assert found.verdict is not hec.Verdict.DO_NOT_USE
+        result = hec.calibrate(parent, child.scaled(1000.0))
+        assert "millimetres" in result.warnings[0]
+        assert result.T_parent_child[:3, 3] == pytest.approx(LEVER_ARM, abs=0.01)
+        assert result.verdict is not hec.Verdict.DO_NOT_USE
 
     def test_longitudes_without_the_cosine_of_the_latitude_are_not_used_in_silence(self):
         odometry, antenna = recorded()
         for factor, severity in ((1.4, "warning"), (2.0, "error")):
             positions = antenna.poses[:, :3, 3] * [factor, 1.0, 1.0]
             wide = Trajectory.from_positions(antenna.stamps_ns, positions)
-            found = hec.calibrate(odometry, wide)
+            result = hec.calibrate(odometry, wide)
             assert ("unrelated", severity) in [
-                (each.code, each.severity.value) for each in found.findings
+                (finding.code, finding.severity.value) for finding in result.findings
             ]
-            assert found.verdict is hec.Verdict.DO_NOT_USE
+            assert result.verdict is hec.Verdict.DO_NOT_USE
 
     def test_the_check_says_the_same(self):
         parent, child = recorded(n_poses=320)
 
         def codes(parent, child):
             snapshot = whole_snapshot(parent, child, {})
-            return [each.code for each in check(snapshot, snapshot.estimate()).findings]
+            return [finding.code for finding in check(snapshot, snapshot.estimate()).findings]
 
         assert codes(parent, child.scaled(1000.0)) == ["units"]
         assert codes(parent, recorded(n_poses=320, seed=8)[1]) == ["unrelated"]

@@ -49,10 +49,10 @@ def test_a_mount_that_stays_raises_no_alarm():
 
 def test_the_size_of_the_chunks_changes_nothing():
     pairs = shifted(motion(300.0), 200.0, 5, np.radians(0.5))
-    (one,) = fed(pairs, chunk=7)[1]
+    (first,) = fed(pairs, chunk=7)[1]
     (other,) = fed(pairs, chunk=600)[1]
-    assert one.shift == other.shift
-    assert one.raised_ns == other.raised_ns
+    assert first.shift == other.shift
+    assert first.raised_ns == other.raised_ns
 
 
 @pytest.mark.parametrize(("axis", "size"), [(0, 0.03), (2, -0.03), (4, 0.02), (5, -0.02)])
@@ -61,8 +61,8 @@ def test_a_shift_is_found_with_its_axis_size_and_time(axis, size):
     assert len(alarms) == 1
     assert 250.0 <= alarms[0].raised_ns / SECOND_NS < 300.0
     assert abs(monitor.alarm.since_ns / SECOND_NS - 250.0) < 30.0
-    found = monitor.alarm.shift.axes.values()
-    values, sigmas = np.array([(each.difference, each.sigma) for each in found]).T
+    axes = monitor.alarm.shift.axes.values()
+    values, sigmas = np.array([(axis_shift.difference, axis_shift.sigma) for axis_shift in axes]).T
     assert np.abs((values - np.eye(6)[axis] * size) / sigmas).max() < 4.0
     assert np.argmax(np.abs(values) / sigmas) == axis
 
@@ -75,7 +75,7 @@ def test_a_shift_that_was_there_from_the_beginning_is_found_after_learning():
 def test_what_is_installed_may_be_off_by_its_own_standard_deviation():
     covariance = np.diag(np.repeat([0.02, 0.02], 3) ** 2)
     off = X @ se3.exp(np.array([0.02, -0.01, 0.015, 0.02, -0.03, 0.01]))
-    assert [len(fed(motion(600.0), each, off)[1]) for each in (covariance, EXACT)] == [0, 1]
+    assert [len(fed(motion(600.0), stated, off)[1]) for stated in (covariance, EXACT)] == [0, 1]
 
 
 def test_what_cannot_be_seen_is_said_before():

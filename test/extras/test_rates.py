@@ -91,35 +91,35 @@ class TestRates:
 
     def test_a_prior_gives_the_translation(self, streams):
         prior = {axis: (value, 0.01) for axis, value in zip("xyz", (0.4, -0.2, 0.7), strict=True)}
-        known = hec.calibrate(*streams, prior=prior, checks=False)
-        assert known.out_of_reach == ()
-        assert known.T_parent_child[:3, 3] == pytest.approx([0.4, -0.2, 0.7], abs=1e-3)
+        with_prior = hec.calibrate(*streams, prior=prior, checks=False)
+        assert with_prior.out_of_reach == ()
+        assert with_prior.T_parent_child[:3, 3] == pytest.approx([0.4, -0.2, 0.7], abs=1e-3)
 
     def test_rotations_alone_need_no_bias(self, streams):
         parent, _ = streams
         child = Trajectory(parent.stamps_ns, child_of(parent.poses), measures="rotations")
-        found = hec.calibrate(parent, child, checks=False)
-        assert found.rate_bias is None
-        assert angle_to(T_PARENT_CHILD[:3, :3], found) < np.radians(0.1)
+        result = hec.calibrate(parent, child, checks=False)
+        assert result.rate_bias is None
+        assert angle_to(T_PARENT_CHILD[:3, :3], result) < np.radians(0.1)
 
     def test_about_a_single_axis_the_angle_around_it_is_unobservable(self, streams):
         poses = planar_poses(400, seed=2)
         stamps_ns = START_NS + STEP_NS * np.arange(400)
         noise = 1e-3 * np.random.default_rng(0).normal(size=(2, 400, 6))
         parent, child = (
-            Trajectory(stamps_ns, Ts @ se3.exp(each), measures="rotations")
-            for Ts, each in zip((poses, child_of(poses)), noise, strict=True)
+            Trajectory(stamps_ns, Ts @ se3.exp(errors), measures="rotations")
+            for Ts, errors in zip((poses, child_of(poses)), noise, strict=True)
         )
-        found = hec.calibrate(parent, child)
-        assert found.unobservable() == ["x", "y", "z", "yaw"]
-        assert found.status is hec.SolveStatus.UNOBSERVABLE
-        assert "the rotation about z cannot be determined" in found.reasons[0].sentence
+        result = hec.calibrate(parent, child)
+        assert result.unobservable() == ["x", "y", "z", "yaw"]
+        assert result.status is hec.SolveStatus.UNOBSERVABLE
+        assert "the rotation about z cannot be determined" in result.reasons[0].sentence
 
     def test_a_sensor_that_stands_still_is_not_to_be_used(self, streams):
         parent, _ = streams
         _, stamps_ns, rates = smooth_streams()
-        found = hec.calibrate(parent, Trajectory.from_rates(stamps_ns, 0.0 * rates))
-        assert found.verdict is hec.Verdict.DO_NOT_USE
+        result = hec.calibrate(parent, Trajectory.from_rates(stamps_ns, 0.0 * rates))
+        assert result.verdict is hec.Verdict.DO_NOT_USE
 
     @pytest.mark.parametrize(
         "options",
@@ -143,8 +143,8 @@ class TestIntegration:
         whole = RateIntegrator().rotations(stamps_ns, rates)
         integrator = RateIntegrator()
         parts = [
-            integrator.rotations(stamps_ns[part], rates[part])
-            for part in (slice(0, 1), slice(1, 90), slice(90, None))
+            integrator.rotations(stamps_ns[chunk], rates[chunk])
+            for chunk in (slice(0, 1), slice(1, 90), slice(90, None))
         ]
         assert np.abs(np.concatenate(parts) - whole).max() < 1e-12
 
@@ -167,9 +167,9 @@ class TestFiles:
         rows = [separator.join(map(str, (1_700_000_000 + k, 0.0, 0.0, 1.0))) for k in range(3)]
         path = tmp_path / "imu.csv"
         path.write_text("\n".join([text, *rows]))
-        found = read_trajectory_file(path, "auto", stamp_unit="s").trajectory
-        assert found.measures == "rates"
-        assert np.abs(se3.rotation_log(found.poses[1, :3, :3])).max() == pytest.approx(largest)
+        trajectory = read_trajectory_file(path, "auto", stamp_unit="s").trajectory
+        assert trajectory.measures == "rates"
+        assert np.abs(se3.rotation_log(trajectory.poses[1, :3, :3])).max() == pytest.approx(largest)
 
     def test_large_rates_without_a_unit_are_degrees_and_that_is_said(self, tmp_path):
         path = tmp_path / "imu.csv"
@@ -184,8 +184,8 @@ class TestFiles:
         with pytest.raises(InputError, match="name the 4 with `columns`"):
             read_trajectory_file(path, "auto")
         for columns, measures in (("t,wx,wy,wz", "rates"), ("t,x,y,z", "positions")):
-            found = read_trajectory_file(path, "auto", columns=columns).trajectory
-            assert found.measures == measures
+            trajectory = read_trajectory_file(path, "auto", columns=columns).trajectory
+            assert trajectory.measures == measures
 
     def test_the_command(self, streams, tmp_path, capsys):
         parent, stamps_ns, rates = smooth_streams(n_poses=200)
@@ -208,16 +208,18 @@ class TestCheck:
     @staticmethod
     def codes(parent, child, **options):
         snapshot = whole_snapshot(parent, child, options)
-        found = check(snapshot, snapshot.estimate()).findings
-        return [(each.code, each.severity.value, dict(each.options)) for each in found]
+        findings = check(snapshot, snapshot.estimate()).findings
+        return [
+            (finding.code, finding.severity.value, dict(finding.options)) for finding in findings
+        ]
 
     def test_an_offset_that_a_solve_finds_is_none_and_a_long_one_an_error(self):
         parent, stamps_ns, rates = smooth_streams(n_poses=160)
         child = Trajectory.from_rates(stamps_ns, rates)
         assert self.codes(parent, child) == []
-        (found,) = self.codes(parent, child.shifted(-7.0))
-        assert (found[0], found[1]) == ("time_offset", "error")
-        assert found[2]["time_offset"] == pytest.approx(7.0 + OFFSET_S, abs=1e-3)
+        (finding,) = self.codes(parent, child.shifted(-7.0))
+        assert (finding[0], finding[1]) == ("time_offset", "error")
+        assert finding[2]["time_offset"] == pytest.approx(7.0 + OFFSET_S, abs=1e-3)
 
     def test_rates_of_another_body_or_in_another_unit_are_unrelated(self):
         parent, stamps_ns, rates = smooth_streams(n_poses=100, seed=7)
@@ -244,26 +246,28 @@ class TestCheck:
             Trajectory(np.r_[rest, parent.stamps_ns], poses, "lidar"),
             Trajectory.from_rates(np.r_[fine_ns, stamps_ns], np.r_[quiet, rates], "imu"),
         )
-        found = whole_snapshot(*streams, {}).estimate()
-        assert found.findings == ()
-        assert angle_to(T_PARENT_CHILD[:3, :3], found) < np.radians(2.0)
+        result = whole_snapshot(*streams, {}).estimate()
+        assert result.findings == ()
+        assert angle_to(T_PARENT_CHILD[:3, :3], result) < np.radians(2.0)
 
     def test_one_axis_is_a_note_and_no_rotation_an_error(self):
         stamps_ns = START_NS + STEP_NS * np.arange(150)
         turns = np.c_[np.zeros((150, 5)), np.cumsum(np.sin(np.arange(150) / 9.0)) / 20]
         noise = 1e-4 * np.random.default_rng(1).normal(size=(2, 150, 6))
-        parent, child = (Trajectory(stamps_ns, se3.exp(turns) @ se3.exp(each)) for each in noise)
+        parent, child = (
+            Trajectory(stamps_ns, se3.exp(turns) @ se3.exp(errors)) for errors in noise
+        )
         child = dataclasses.replace(child, measures="rotations")
         assert self.codes(parent, child) == [("one_axis", "note", {"prior.yaw": "VALUE+/-SIGMA"})]
-        still, also = (Trajectory(stamps_ns, se3.exp(each)) for each in noise)
-        (found,) = self.codes(still, dataclasses.replace(also, measures="rotations"))
-        assert found[:2] == ("unrelated", "error")
+        still, also = (Trajectory(stamps_ns, se3.exp(errors)) for errors in noise)
+        (finding,) = self.codes(still, dataclasses.replace(also, measures="rotations"))
+        assert finding[:2] == ("unrelated", "error")
 
     def test_a_frozen_gyroscope_is_named(self):
         parent, stamps_ns, rates = smooth_streams()
         rates[400:700] = 0.0
-        found = self.codes(parent, Trajectory.from_rates(stamps_ns, rates))
-        assert ("frozen", "error", {}) in found
+        codes = self.codes(parent, Trajectory.from_rates(stamps_ns, rates))
+        assert ("frozen", "error", {}) in codes
 
 
 def test_a_bag_with_an_imu(tmp_path, capsys):
@@ -291,10 +295,10 @@ def test_a_bag_with_an_imu(tmp_path, capsys):
     with_itself = ["--parent-topic", "/imu", "--child-topic", "/imu_again", "--child-frame", "b"]
     assert main(["check", parts[1], *with_itself, "--json"]) == 1
     document = json.loads(capsys.readouterr().out)
-    assert [each["code"] for each in document["findings"]] == ["same_frame"]
+    assert [finding["code"] for finding in document["findings"]] == ["same_frame"]
     assert document["streams"]["child"]["path_m"] is None
-    found = hec.read_trajectory(parts[1], topic="/imu")
-    assert (found.measures, len(found)) == ("rates", len(stamps_ns))
+    gyroscope = hec.read_trajectory(parts[1], topic="/imu")
+    assert (gyroscope.measures, len(gyroscope)) == ("rates", len(stamps_ns))
 
 
 class TestMessages:
@@ -319,9 +323,12 @@ class TestMessages:
 
     def test_a_place_that_is_not_on_earth_is_refused_and_named(self):
         far = ({"longitude": 1e300}, r"latitude [\d.]+ and longitude 1e\+300.*swapped")
-        for place, told in (({"latitude": 139.7}, "latitude 139.7 and longitude 25.*swapped"), far):
+        for place, message in (
+            ({"latitude": 139.7}, "latitude 139.7 and longitude 25.*swapped"),
+            far,
+        ):
             reader = MessageReader("sensor_msgs/msg/NavSatFix", "positions")
-            with pytest.raises(InputError, match=told):
+            with pytest.raises(InputError, match=message):
                 reader.columns([fix(0), fix(0, **place)], is_ros1=False)
-            with pytest.raises(InputError, match=f"^found {told}"):
+            with pytest.raises(InputError, match=f"^found {message}"):
                 reader(fix(0, **place))

@@ -38,51 +38,58 @@ def rig():
 
 
 @pytest.fixture(scope="module")
-def found(rig):
+def calibrated(rig):
     return hec.calibrate_rig(trajectories_of(rig))
 
 
-def test_extrinsics_and_closure(rig, found):
-    assert found.sensors == ("lidar", "front", "rear")
-    assert found.verdict is not hec.Verdict.DO_NOT_USE
-    for sensor, calibration in enumerate(found.calibrations, start=1):
+def test_extrinsics_and_closure(rig, calibrated):
+    assert calibrated.sensors == ("lidar", "front", "rear")
+    assert calibrated.verdict is not hec.Verdict.DO_NOT_USE
+    for sensor, calibration in enumerate(calibrated.calibrations, start=1):
         error = se3.log(se3.inverse(rig.Xs[sensor]) @ calibration.T_parent_child)
         assert error @ np.linalg.solve(calibration.covariance_measured, error) < 18.5  # one in 200
         assert (calibration.parent_frame, calibration.n_poses) == ("lidar", 500)
-    chain = found.T("lidar", "front") @ found.T("front", "rear") @ found.T("rear", "lidar")
+    chain = (
+        calibrated.T("lidar", "front")
+        @ calibrated.T("front", "rear")
+        @ calibrated.T("rear", "lidar")
+    )
     np.testing.assert_allclose(chain, np.eye(4), atol=1e-12)
-    (closure,) = found.closures
+    (closure,) = calibrated.closures
     assert closure.closes
     assert 0.0 < closure.chi2 < 16.8
     assert closure.dof == 6
-    error = se3.log(se3.inverse(rig.Xs[1]) @ rig.Xs[2] @ found.T("rear", "front"))
-    between = se3.adjoint(found.T("front", "rear")) @ np.linalg.cholesky(
-        found.covariance_measured("front", "rear")
+    error = se3.log(se3.inverse(rig.Xs[1]) @ rig.Xs[2] @ calibrated.T("rear", "front"))
+    between = se3.adjoint(calibrated.T("front", "rear")) @ np.linalg.cholesky(
+        calibrated.covariance_measured("front", "rear")
     )
     assert (np.linalg.solve(between, error) ** 2).sum() < 18.5
-    assert "front" in repr(found)
+    assert "front" in repr(calibrated)
 
 
 def test_a_sensor_of_inverse_poses_is_named_and_closes(rig):
     lidar, front, rear = trajectories_of(rig).values()
     observed = hec.Trajectory(front.stamps_ns, se3.inverse(front.poses), "tag", "front_camera")
-    found = hec.calibrate_rig({"/lidar": lidar, "tag": observed, "rear": rear})
-    assert found.sensors == ("lidar", "front_camera", "rear")
-    assert [each.child_frame for each in found.calibrations] == ["front_camera", "rear"]
-    np.testing.assert_allclose(found.T("lidar", "front_camera"), rig.Xs[1], atol=0.05)
-    (closure,) = found.closures
+    calibrated = hec.calibrate_rig({"/lidar": lidar, "tag": observed, "rear": rear})
+    assert calibrated.sensors == ("lidar", "front_camera", "rear")
+    assert [calibration.child_frame for calibration in calibrated.calibrations] == [
+        "front_camera",
+        "rear",
+    ]
+    np.testing.assert_allclose(calibrated.T("lidar", "front_camera"), rig.Xs[1], atol=0.05)
+    (closure,) = calibrated.closures
     assert closure.closes
 
 
 def test_two_good_sensors_do_not_suffer_from_a_bad_first_one():
     """Their own answer for each other decides, by what the answers with the first one close."""
     rig = simulated(3, 400, unequal(3) * [[6.0], [1.0], [1.0]])
-    found = hec.calibrate_rig(trajectories_of(rig))
-    direct = found.neighbours[0].T_parent_child
-    apart = se3.log(se3.inverse(direct) @ found.T("front", "rear"))
-    sigmas = np.sqrt(np.diag(found.neighbours[0].covariance_measured))
+    calibrated = hec.calibrate_rig(trajectories_of(rig))
+    direct = calibrated.neighbours[0].T_parent_child
+    apart = se3.log(se3.inverse(direct) @ calibrated.T("front", "rear"))
+    sigmas = np.sqrt(np.diag(calibrated.neighbours[0].covariance_measured))
     assert (np.abs(apart) < 0.5 * sigmas).all()
-    own, with_first = (found.covariance_measured(name, "rear") for name in ("front", "lidar"))
+    own, with_first = (calibrated.covariance_measured(name, "rear") for name in ("front", "lidar"))
     assert np.trace(own) < 0.5 * np.trace(with_first)
 
 
@@ -121,16 +128,19 @@ def test_the_command_prints_and_saves_all_sensors(files, capsys, tmp_path):
     np.testing.assert_allclose(hec.load("rig/rear").T_parent_child[:3, 3], translation)
 
 
-def test_a_sensor_may_have_the_name_of_a_file(found, tmp_path):
-    named = [dataclasses.replace(each, child_frame="rig.yaml") for each in found.calibrations]
-    save_rig(found.to_dict(), named, tmp_path)
+def test_a_sensor_may_have_the_name_of_a_file(calibrated, tmp_path):
+    named = [
+        dataclasses.replace(calibration, child_frame="rig.yaml")
+        for calibration in calibrated.calibrations
+    ]
+    save_rig(calibrated.to_dict(), named, tmp_path)
     assert (tmp_path / "rig.yaml").is_file()
-    assert len([each for each in tmp_path.iterdir() if each.is_dir()]) == 2
+    assert len([path for path in tmp_path.iterdir() if path.is_dir()]) == 2
 
 
-def test_a_person_sees_all_sensors_and_whether_pairs_close(found):
-    lines = as_lines(found)
-    assert lines[0] == f"{found.verdict.value}: 3 sensors"
+def test_a_person_sees_all_sensors_and_whether_pairs_close(calibrated):
+    lines = as_lines(calibrated)
+    assert lines[0] == f"{calibrated.verdict.value}: 3 sensors"
     assert [line.split(":")[0] for line in lines if " in lidar:" in line] == [
         "front in lidar",
         "rear in lidar",
@@ -138,14 +148,14 @@ def test_a_person_sees_all_sensors_and_whether_pairs_close(found):
     assert any(line.startswith("  lidar - front - rear closes: off by") for line in lines)
 
 
-def test_a_sensor_of_any_name_stays_below_the_directory(found, tmp_path):
-    first, second = found.calibrations
+def test_a_sensor_of_any_name_stays_below_the_directory(calibrated, tmp_path):
+    first, second = calibrated.calibrations
     named = [
         dataclasses.replace(first, child_frame="../$x$/a"),
         dataclasses.replace(second, child_frame=".._$x$_a"),
     ]
     odd = dataclasses.replace(
-        found, sensors=("$", "../$x$/a", ".._$x$_a"), calibrations=tuple(named)
+        calibrated, sensors=("$", "../$x$/a", ".._$x$_a"), calibrations=tuple(named)
     )
     save_rig(odd.to_dict(), named, tmp_path / "rig")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["rig"]
@@ -158,8 +168,8 @@ def test_a_sensor_of_any_name_stays_below_the_directory(found, tmp_path):
 
 def test_topics_of_a_bag(rig, tmp_path, capsys):
     streams = {}
-    for name, each in trajectories_of(rig).items():
-        named = dataclasses.replace(each, sensor_frame=f"{name}_link", world_frame="odom")
+    for name, trajectory in trajectories_of(rig).items():
+        named = dataclasses.replace(trajectory, sensor_frame=f"{name}_link", world_frame="odom")
         streams[f"/{name}/odometry"] = named, "nav_msgs/msg/Odometry"
     bag = str(tmp_path / "bag")
     write_bag(bag, streams)
@@ -174,16 +184,16 @@ def test_topics_of_a_bag(rig, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["rear.txt", "--parent-format", "tum"], "--parent-format is for two files"),
         (["front.txt"], "front.txt appears twice"),
         (["rear.txt", "--installed", "0 0 0 0 0 0"], "--installed and --base-frame are of two"),
     ],
 )
-def test_the_command_refuses_options_of_two_files(files, run, words, said):
+def test_the_command_refuses_options_of_two_files(files, run, words, message):
     code, _, err = run("calibrate", *files[:2], *words)
-    assert (code, said in err) == (2, True)
+    assert (code, message in err) == (2, True)
 
 
 def not_converged(rig, findings=()):
@@ -199,8 +209,8 @@ JUMPS = written_finding("jumps", Severity.ERROR, "every step is a jump")
 
 
 @pytest.mark.parametrize(("findings", "code"), [((), 1), ((JUMPS,), 3)])
-def test_the_exit_code_is_that_of_two_sensors(files, found, run, monkeypatch, findings, code):
-    failed = not_converged(found, findings)
+def test_the_exit_code_is_that_of_two_sensors(files, calibrated, run, monkeypatch, findings, code):
+    failed = not_converged(calibrated, findings)
     monkeypatch.setattr(of_rig, "calibrate_rig", lambda *_: failed)
     exit_code, _, err = run("calibrate", *files)
     assert exit_code == code == gravest_code(map(present.exit_code, failed.calibrations))
@@ -209,10 +219,10 @@ def test_the_exit_code_is_that_of_two_sensors(files, found, run, monkeypatch, fi
 
 
 def test_labels_details_and_warnings_of_files_are_obeyed_as_with_two_sensors(
-    rig, files, found, run, monkeypatch
+    rig, files, calibrated, run, monkeypatch
 ):
     trajectories = [*trajectories_of(rig).values()]
-    monkeypatch.setattr(of_rig, "calibrate_rig", lambda *_: found)
+    monkeypatch.setattr(of_rig, "calibrate_rig", lambda *_: calibrated)
     monkeypatch.setattr(
         command, "read_files", lambda *_: FilesRead(trajectories, [], ["look here"])
     )

@@ -37,14 +37,14 @@ def ranges(origins, directions):
     """Of rays (N, 3) that begin in the room."""
     with np.errstate(divide="ignore"):
         inverse = 1.0 / directions
-    found = np.maximum(*((corner - origins) * inverse for corner in ROOM)).min(axis=1)
+    distances = np.maximum(*((corner - origins) * inverse for corner in ROOM)).min(axis=1)
     for lower, upper in BOXES:
         first = (lower - origins) * inverse
         second = (upper - origins) * inverse
         near = np.minimum(first, second).max(axis=1)
         far = np.maximum(first, second).min(axis=1)
-        found = np.where((near < far) & (near > 0.0), np.minimum(found, near), found)
-    return found
+        distances = np.where((near < far) & (near > 0.0), np.minimum(distances, near), distances)
+    return distances
 
 
 class Body:
@@ -74,9 +74,9 @@ def scans(body, T_body_lidar, too_far, count, rng):
     for number in range(count):
         Ts = body.poses(number / RATE + since) @ T_body_lidar
         directions = np.einsum("cij,crj->cri", Ts[:, :3, :3], rays).reshape(-1, 3)
-        found = ranges(np.repeat(Ts[:, :3, 3], 16, axis=0), directions)
-        found += 0.01 * rng.standard_normal(len(found)) + np.tile(too_far, COLUMNS)
-        yield found[:, None] * rays.reshape(-1, 3), np.repeat(since, 16)
+        distances = ranges(np.repeat(Ts[:, :3, 3], 16, axis=0), directions)
+        distances += 0.01 * rng.standard_normal(len(distances)) + np.tile(too_far, COLUMNS)
+        yield distances[:, None] * rays.reshape(-1, 3), np.repeat(since, 16)
 
 
 def cloud(typestore, stamp_ns, points, times, frame, of_time="time"):
@@ -134,13 +134,13 @@ def test_two_lidars_from_their_points(tmp_path, capsys, no_figures):
     rings = np.round(180.0 + 2.0 * np.degrees(ELEVATIONS)).astype(int)
     for name, T_body_lidar, k in (("front", np.eye(4), 0), ("rear", X, 1)):
         kept = tmp_path / f"drive.{name}.odometry.npz"
-        found = np.load(kept)
+        stored = np.load(kept)
         truth = body.poses(middle_s) @ T_body_lidar
-        np.testing.assert_allclose(found["stamps_ns"], START_NS + middle_s * 1e9, atol=1e3)
-        poses = se3.from_quat_xyzw(found["poses"][:, :3], found["poses"][:, 3:])
+        np.testing.assert_allclose(stored["stamps_ns"], START_NS + middle_s * 1e9, atol=1e3)
+        poses = se3.from_quat_xyzw(stored["poses"][:, :3], stored["poses"][:, 3:])
         turns = [se3.log(se3.inverse(T[:-1]) @ T[1:])[:, 3:] for T in (poses, truth)]
         assert np.degrees(np.sqrt(np.mean((turns[0] - turns[1]) ** 2))) < 0.0135
-        assert np.std(found["too_far_m"][rings] - too_far[k]) < 0.6 * np.std(too_far[k])  # or 1
+        assert np.std(stored["too_far_m"][rings] - too_far[k]) < 0.6 * np.std(too_far[k])  # or 1
     # The second time, what is kept is read.
     before = kept.stat().st_mtime_ns
     with PoseBag(bag) as opened:

@@ -126,8 +126,13 @@ def test_noise_is_as_strong_as_published(published_folder, level, config):
 
     theirs = [list(map(rms, *sensors)) for sensors in zip(noisy, clean, strict=True)]
     ours = [
-        [rms(one.parent.poses, two.parent.poses), rms(one.child.poses, two.child.poses)]
-        for one, two in ((simulate_drive(k, noise=config), clean_drive(k)) for k in range(60))
+        [
+            rms(noisy_drive.parent.poses, two.parent.poses),
+            rms(noisy_drive.child.poses, two.child.poses),
+        ]
+        for noisy_drive, two in (
+            (simulate_drive(k, noise=config), clean_drive(k)) for k in range(60)
+        )
     ]
     medians = np.median(ours, axis=0), np.median(theirs, axis=0)
     np.testing.assert_allclose(*medians, rtol=0.25, atol=1e-9)
@@ -137,8 +142,8 @@ def test_noise_is_as_strong_as_published(published_folder, level, config):
 
 
 def test_command_writes_the_published_layout(tmp_path, run):
-    given = ["--runs", "3", "--seed", "4", "--poses", "20", "--mixture"]
-    code, output, _ = run("simulate", "--out", tmp_path / "sims", *given)
+    options_given = ["--runs", "3", "--seed", "4", "--poses", "20", "--mixture"]
+    code, output, _ = run("simulate", "--out", tmp_path / "sims", *options_given)
     assert (code, output) == (0, f"3 recordings written to {tmp_path / 'sims'}\n")
     folders = sorted((tmp_path / "sims").iterdir())
     assert [path.name for path in folders] == ["run_01", "run_02", "run_03"]
@@ -160,8 +165,8 @@ def test_command_writes_the_published_layout(tmp_path, run):
 def test_command_writes_bags(tmp_path, run, storage, name):
     from hand_eye_calib.formats.bags.reader import PoseBag
 
-    given = f"--drive hilly --poses 30 --bag {storage}".split()
-    assert run("simulate", "--out", tmp_path / "sims", *given)[0] == 0
+    arguments = f"--drive hilly --poses 30 --bag {storage}".split()
+    assert run("simulate", "--out", tmp_path / "sims", *arguments)[0] == 0
     drive = simulate_drive(
         (0, 0), dataclasses.replace(options.HILLY_DRIVE, poses=30), options.REALISTIC
     )

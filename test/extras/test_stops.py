@@ -55,14 +55,14 @@ def test_a_scara_is_told_what_is_unknown(random):
     result = calibrate_arm(robot, tracking)
     assert result.unobservable() == ["z"]
     assert result.headline.startswith("DO NOT USE: z cannot be determined from these stops")
-    known = calibrate_arm(robot, tracking, CalibratorConfig(prior_z=f"{X[2, 3]}+/-0.002"))
-    assert known.verdict is hec.Verdict.USE
+    with_prior = calibrate_arm(robot, tracking, CalibratorConfig(prior_z=f"{X[2, 3]}+/-0.002"))
+    assert with_prior.verdict is hec.Verdict.USE
 
 
 def test_inverse_poses_are_named(random):
     robot, tracking, _, _ = arm(random)
     result = calibrate_stops(robot, tracking)
-    assert [found.code for found in result.findings] == ["inverse"]
+    assert [finding.code for finding in result.findings] == ["inverse"]
     assert result.verdict is hec.Verdict.DO_NOT_USE
     assert not calibrate_stops(robot, se3.inverse(tracking)).findings
 
@@ -86,7 +86,7 @@ def test_samples_of_others(file, parent, position, within_m):
     result = calibrate_arm(samples.robot, samples.tracking)
     assert result.parent_frame == parent
     # Two of CamOdoCal's 42 stops do not fit the others.
-    assert {found.severity for found in result.findings} <= {Severity.NOTE}
+    assert {finding.severity for finding in result.findings} <= {Severity.NOTE}
     assert result.verdict is not hec.Verdict.DO_NOT_USE
     if position:
         np.testing.assert_allclose(result.T_parent_child[:3, 3], position, atol=within_m)
@@ -99,8 +99,8 @@ class TestCommand:
         (tmp_path / "samples.json").write_text(json.dumps(pairs))
         out = tmp_path / "out"
         assert main(["calibrate", str(tmp_path / "samples.json"), "--out", str(out)]) == 0
-        assert "camera in hand: maps coordinates" in (told := capsys.readouterr().out)
-        assert "target in base" in told
+        assert "camera in hand: maps coordinates" in (output := capsys.readouterr().out)
+        assert "target in base" in output
         np.testing.assert_allclose(hec.load(out).T_parent_child, X, atol=5e-3)
 
     def test_two_files_without_an_order(self, random, tmp_path, capsys):
@@ -229,7 +229,7 @@ def test_a_stop_without_both_poses_is_named(both_poses, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", "expected samples of an arm"),
         ("a: 1", "expected samples of an arm"),
@@ -242,10 +242,10 @@ def test_a_stop_without_both_poses_is_named(both_poses, tmp_path):
         ("[[" + "[.nan" + ", 1" * 15 + "], [.nan]]]", "not finite"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(text, said, tmp_path):
+def test_what_is_wrong_is_said_in_one_line(text, message, tmp_path):
     path = tmp_path / "samples.yaml"
     path.write_text(text)
-    with pytest.raises(InputError, match=said) as raised:
+    with pytest.raises(InputError, match=message) as raised:
         read_arm_samples(path)
     assert str(raised.value).startswith(str(path))
     assert "\n" not in str(raised.value)

@@ -143,7 +143,7 @@ def with_outliers(Ts, count):
 
 
 def words(result):
-    return " ".join([*(found.what for found in result.findings), *result.warnings])
+    return " ".join([*(finding.what for finding in result.findings), *result.warnings])
 
 
 @pytest.mark.parametrize("place", [ON_HAND, BESIDE])
@@ -171,7 +171,7 @@ def test_a_target_of_another_size_is_refused_with_its_scale_and_the_option(facto
     error = se3.log(se3.inverse(result.T_parent_child) @ truth)
     assert np.linalg.norm(error[:3]) < WITHIN_M
     asked = calibrate_arm(robot, scaled(tracking, factor), CalibratorConfig(scale="estimate"))
-    assert "scale" not in [found.code for found in asked.findings]
+    assert "scale" not in [finding.code for finding in asked.findings]
     assert asked.verdict is not hec.Verdict.DO_NOT_USE
 
 
@@ -299,7 +299,7 @@ class TestOptions:
         robot, tracking, _ = arm(ON_HAND)
         config = CalibratorConfig(**options)
         result = calibrate_arm(of_robot(robot), of_target(tracking), config)
-        assert [found.code for found in result.findings] == [code]
+        assert [finding.code for finding in result.findings] == [code]
         assert result.verdict is hec.Verdict.DO_NOT_USE
 
 
@@ -439,9 +439,9 @@ def test_the_options_that_a_finding_names_lead_to_the_right_answer(name, size, p
     error = se3.log(se3.inverse(result.T_parent_child) @ truth)
     assert np.linalg.norm(error[:3]) < WITHIN_M
     assert result.verdict is not hec.Verdict.DO_NOT_USE
-    found = calibrate_arm(*sides, CalibratorConfig(scale="auto"))
-    np.testing.assert_allclose(found.T_parent_child, result.T_parent_child, atol=1e-9)
-    assert found.verdict is result.verdict
+    automatic = calibrate_arm(*sides, CalibratorConfig(scale="auto"))
+    np.testing.assert_allclose(automatic.T_parent_child, result.T_parent_child, atol=1e-9)
+    assert automatic.verdict is result.verdict
 
 
 SETUPS = {"hand": ON_HAND, "beside": BESIDE}
@@ -470,17 +470,17 @@ def test_a_setup_that_the_stops_contradict_is_refused_alone(setup):
 
     assert obeyed.findings == ()
     assert obeyed.warnings == ()
-    assert [found.code for found in refused.findings] == ["setup"]
+    assert [finding.code for finding in refused.findings] == ["setup"]
     assert f"the stops fit a camera {SETUPS[setup]}, not one {SETUPS[other]}" in refused.headline
 
 
 def test_a_setup_decides_where_the_stops_do_not():
     robot, tracking, _ = arm(ON_HAND, n=3)
-    assert [found.code for found in calibrate_arm(robot, tracking).findings] == ["ambiguous"]
+    assert [finding.code for finding in calibrate_arm(robot, tracking).findings] == ["ambiguous"]
     for setup in SETUPS:
         result = calibrate_arm(robot, tracking, setup=setup)
         assert result.setup == setup
-        assert "ambiguous" not in [found.code for found in result.findings]
+        assert "ambiguous" not in [finding.code for finding in result.findings]
 
 
 def test_an_unknown_setup_is_refused():
@@ -520,9 +520,9 @@ def test_stops_that_were_left_out_are_counted_and_named(place, count, severity, 
 
     result = calibrate_arm(robot, with_outliers(tracking, count))
 
-    (found,) = result.findings
-    assert (found.code, found.severity) == ("outliers", severity)
-    assert found.evidence == {"count": count, "n_stops": 40}
+    (finding,) = result.findings
+    assert (finding.code, finding.severity) == ("outliers", severity)
+    assert finding.evidence == {"count": count, "n_stops": 40}
     assert f"{count} of 40 stops do not fit the others and were left out: 1" in result.headline
     assert result.verdict is verdict
     error = se3.log(se3.inverse(result.T_parent_child) @ truth)

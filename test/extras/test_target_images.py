@@ -134,9 +134,9 @@ def test_aprilgrid_has_the_frame_of_kalibr():
     Ts = views(3, [0.1, 0.07, 0.0], rng)
     target = Target.parse(f"aprilgrid:{columns}x{rows}:{size}:{gap}")
     images = [rendered(picture, T, rng) for T in Ts]
-    found = poses_of_target(images, target, Camera(MATRIX, np.zeros(5), False))
-    off = se3.log(Ts[found.images] @ T_picture_target @ se3.inverse(found.Ts_camera_target))
-    assert found.images == [0, 1, 2]
+    tracking = poses_of_target(images, target, Camera(MATRIX, np.zeros(5), False))
+    off = se3.log(Ts[tracking.images] @ T_picture_target @ se3.inverse(tracking.Ts_camera_target))
+    assert tracking.images == [0, 1, 2]
     assert np.abs(off[:, :3]).max() < 5e-3
     assert np.degrees(np.abs(off[:, 3:]).max()) < 0.4
 
@@ -183,20 +183,20 @@ def test_the_images_of_a_bag_are_poses_of_the_camera(tmp_path, capsys, no_figure
     bag = write_messages(tmp_path / "bag", messages)
     board = "charuco:7x5:0.05:0.037:5X5_100"
     with pytest.warns(UserWarning, match="seen in 16 of 16 images, its corners to 0[.]"):
-        found = hec.read_trajectory(bag, topic=f"/eye/image_raw?{board}")
-    off = se3.log(Ts @ found.poses)
+        trajectory = hec.read_trajectory(bag, topic=f"/eye/image_raw?{board}")
+    off = se3.log(Ts @ trajectory.poses)
     assert np.median(np.abs(off[:, :3])) < 1e-3
     assert np.degrees(np.median(np.abs(off[:, 3:]))) < 0.1
-    assert (found.world_frame, found.sensor_frame) == ("target", "eye")
+    assert (trajectory.world_frame, trajectory.sensor_frame) == ("target", "eye")
     (tmp_path / "camera.yaml").write_text(CAMERA_INFO)
     with PoseBag(bag) as opened:
         of_file = f"/eye/image_raw/compressed?{board}@{tmp_path / 'camera.yaml'}"
-        np.testing.assert_array_equal(opened.trajectory(of_file)[0].poses, found.poses)
-        for topic, said in (
+        np.testing.assert_array_equal(opened.trajectory(of_file)[0].poses, trajectory.poses)
+        for topic, message in (
             ("/eye/image_raw", "name the target in the images"),
             (f"/hand?{board}", "has no images"),
         ):
-            with pytest.raises(InputError, match=said):
+            with pytest.raises(InputError, match=message):
                 opened.trajectory(topic)
     topics = ["--parent-topic", "/hand", "--child-topic", "/eye/image_raw", "--target", board]
     assert main(["calibrate", str(bag), *topics, "--out", str(tmp_path / "out")]) == 0
@@ -211,8 +211,8 @@ def test_images_without_the_target_are_left_out():
     empty = np.full((960, 1280), 200, dtype=np.uint8)
     target = Target.parse("charuco:7x5:0.05:0.037:5X5_100")
     camera = Camera(MATRIX, np.zeros(5), False)
-    found = poses_of_target([empty, rendered(charuco_picture(), T, rng)], target, camera)
-    assert found.images == [1]
+    tracking = poses_of_target([empty, rendered(charuco_picture(), T, rng)], target, camera)
+    assert tracking.images == [1]
     with pytest.raises(InputError, match="none of 1 images"):
         poses_of_target([empty], target, camera)
 

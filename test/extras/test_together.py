@@ -29,8 +29,8 @@ pytestmark = pytest.mark.usefixtures("no_figures")
 def named(*results):
     """Results by name, in the order of time."""
     return {
-        f"drive {number}": dataclasses.replace(each, stamp_ns=number)
-        for number, each in enumerate(results, start=1)
+        f"drive {number}": dataclasses.replace(result, stamp_ns=number)
+        for number, result in enumerate(results, start=1)
     }
 
 
@@ -78,8 +78,8 @@ def test_what_all_have_from_one_measurement_by_hand_is_no_better_together():
         for dof in result().observability_measured
     )
     wide = result().covariance_measured + 0.01 * np.outer(*2 * [np.r_[X[2, :3], np.zeros(3)]])
-    each = dataclasses.replace(result(), observability_measured=axes, covariance_measured=wide)
-    joint = together(named(each, each, each))
+    same = dataclasses.replace(result(), observability_measured=axes, covariance_measured=wide)
+    joint = together(named(same, same, same))
     assert joint.observability[2].verdict is DofVerdict.PRIOR
     assert joint.sigmas_measured[2] == pytest.approx(0.1, rel=0.05)
 
@@ -95,9 +95,13 @@ def test_what_all_have_from_one_measurement_by_hand_is_no_better_together():
 )
 def test_what_does_not_belong_is_named_and_left_out(shifts, kind, left_out, verdict, tmp_path):
     moved = shift("yaw", np.radians(2.0)) + shift("x", 0.05)
-    joint = together(named(*(result(each * moved, seed=i) for i, each in enumerate(shifts))))
+    joint = together(
+        named(*(result(displacement * moved, seed=i) for i, displacement in enumerate(shifts)))
+    )
     assert joint.together.kind == kind
-    assert {each.name for each in joint.together.recordings if each.left_out} == left_out
+    assert {
+        recording.name for recording in joint.together.recordings if recording.left_out
+    } == left_out
     assert joint.verdict is verdict
     if kind in ("one off", "agree"):
         assert np.abs(deviation(joint.T_parent_child, X)[:3]).max() < 0.01
@@ -111,7 +115,7 @@ def test_what_does_not_belong_is_named_and_left_out(shifts, kind, left_out, verd
 def test_recordings_that_nobody_may_use_are_left_out():
     failed = result(status=SolveStatus.NOT_CONVERGED)
     joint = together(named(result(), failed))
-    assert [bool(each.left_out) for each in joint.together.recordings] == [False, True]
+    assert [bool(recording.left_out) for recording in joint.together.recordings] == [False, True]
     with pytest.raises(InputError, match="no recording can be used: drive 1: DO NOT USE"):
         together(named(failed))
     with pytest.raises(InputError, match="of one pair of frames"):
@@ -133,7 +137,7 @@ def test_python_takes_pairs_of_trajectories():
     pairs = [pair(seed) for seed in range(2)]
     joint = hec.calibrate_together(pairs, ["monday", "tuesday"], method="park", checks=False)
     np.testing.assert_allclose(joint.T_parent_child, T_PARENT_CHILD, atol=3e-3)
-    assert [each.name for each in joint.together.recordings] == ["monday", "tuesday"]
+    assert [recording.name for recording in joint.together.recordings] == ["monday", "tuesday"]
     assert (joint.parent_frame, joint.child_frame) == ("lidar", "camera")
     named = {"a": pairs[0], "b": pairs[1], "c": (pairs[0][0][:5], pairs[0][1][:5])}
     table = hec.calibrate_many(named, checks=False)
@@ -179,12 +183,12 @@ def test_honest_results_agree_with_the_chance_that_is_stated(count, unknown_z):
 )
 def test_which_one_is_off_and_since_when(apart, kind, unknown_z):
     for seed in range(10):
-        found = agreement_of(*results_of(seed, 8, unknown_z, apart))
-        assert (found.kind, list(found.apart)) == (kind, apart)
-        assert found.deviations[apart, 5] == pytest.approx(0.06, abs=0.02)
-        assert np.isnan(found.deviations[0, 2]) == unknown_z
-        assert found.p_value < 1e-6
-        assert "the rotation about z by " in found.sentence("abcdefgh")
+        agreement = agreement_of(*results_of(seed, 8, unknown_z, apart))
+        assert (agreement.kind, list(agreement.apart)) == (kind, apart)
+        assert agreement.deviations[apart, 5] == pytest.approx(0.06, abs=0.02)
+        assert np.isnan(agreement.deviations[0, 2]) == unknown_z
+        assert agreement.p_value < 1e-6
+        assert "the rotation about z by " in agreement.sentence("abcdefgh")
 
 
 def test_results_that_all_scatter_more_than_stated_accuse_none():
@@ -198,34 +202,35 @@ def test_results_that_all_scatter_more_than_stated_accuse_none():
 
 def test_a_single_result_and_one_that_knows_nothing():
     Ts, covariances = results_of(3, 2)
-    found = agreement_of(Ts[:1], covariances[:1])
-    assert (found.kind, found.dof, found.p_value) == ("single", 0, 1.0)
-    np.testing.assert_allclose(found.T_parent_child, Ts[0])
+    agreement = agreement_of(Ts[:1], covariances[:1])
+    assert (agreement.kind, agreement.dof, agreement.p_value) == ("single", 0, 1.0)
+    np.testing.assert_allclose(agreement.T_parent_child, Ts[0])
     covariances[1] = np.diag([np.inf] * 6)
-    found = agreement_of(Ts, covariances)
-    assert (found.kind, found.dof) == ("agree", 0)
-    np.testing.assert_allclose(found.T_parent_child, Ts[0], atol=1e-9)
-    assert np.isnan(found.deviations[1]).all()
+    agreement = agreement_of(Ts, covariances)
+    assert (agreement.kind, agreement.dof) == ("agree", 0)
+    np.testing.assert_allclose(agreement.T_parent_child, Ts[0], atol=1e-9)
+    assert np.isnan(agreement.deviations[1]).all()
 
 
 # ---- results against what is installed, and recordings against each other
 
 
 def values(difference):
-    return np.array([each.difference for each in difference.axes.values()])
+    return np.array([axis.difference for axis in difference.axes.values()])
 
 
 def axes(difference, verdict):
-    return [axis for axis, each in difference.axes.items() if each.verdict == verdict]
+    return [axis for axis, row in difference.axes.items() if row.verdict == verdict]
 
 
 def test_results_that_scatter_by_their_sigmas_are_the_same_and_the_power_is_told():
-    found = compare([result(seed=1), result(seed=2), result(seed=3)])
-    assert (found.verdict, found.moved) == ("same", ())
-    one = found.differences[0]
-    assert one.sentence == "same: a change of 5.4 cm or 0.8 deg would have been seen"
+    comparison = compare([result(seed=1), result(seed=2), result(seed=3)])
+    assert (comparison.verdict, comparison.moved) == ("same", ())
+    pair_difference = comparison.differences[0]
+    assert pair_difference.sentence == "same: a change of 5.4 cm or 0.8 deg would have been seen"
     np.testing.assert_allclose(
-        values(one), deviation(result(seed=2).T_parent_child, result(seed=1).T_parent_child)
+        values(pair_difference),
+        deviation(result(seed=2).T_parent_child, result(seed=1).T_parent_child),
     )
 
 
@@ -239,21 +244,23 @@ def test_chance_makes_a_change_less_than_once_in_a_hundred():
 @pytest.mark.parametrize("axis", AXES)
 def test_a_change_of_the_size_that_is_said_to_be_seen_is_seen(axis):
     seen = compare([result(), result()]).differences[0].axes[axis].visible
-    found = [
+    differences = [
         compare([result(seed=i), result(shift(axis, seen), seed=100 + i)]).differences[0]
         for i in range(20)
     ]
-    named = [each.axes[axis].verdict == "moved" for each in found]
+    named = [difference.axes[axis].verdict == "moved" for difference in differences]
     assert np.mean(named) >= 0.9  # sigmas are taken larger than stated
 
 
 def test_an_unknown_axis_is_neither_the_same_nor_moved():
     flat = result(shift("z", 0.5), hidden="z", status=SolveStatus.UNOBSERVABLE)
-    found = compare([flat], Extrinsic(X, "drawing")).differences[0]
-    assert found.verdict == "cannot tell"
-    assert axes(found, "cannot tell") == ["z"]
-    assert np.isinf(found.axes["z"].sigma)
-    assert found.sentence.startswith("cannot tell about z; x, y, roll, pitch and yaw the same: ")
+    difference = compare([flat], Extrinsic(X, "drawing")).differences[0]
+    assert difference.verdict == "cannot tell"
+    assert axes(difference, "cannot tell") == ["z"]
+    assert np.isinf(difference.axes["z"].sigma)
+    assert difference.sentence.startswith(
+        "cannot tell about z; x, y, roll, pitch and yaw the same: "
+    )
 
 
 def test_what_no_recording_shows_counts_against_a_drawing_not_against_a_recording():
@@ -262,17 +269,17 @@ def test_what_no_recording_shows_counts_against_a_drawing_not_against_a_recordin
     second = result(shift("yaw", np.radians(0.6)), covariance_allowance=floor)
     assert compare([second], Extrinsic(X, "drawing")).verdict == "same"
     assert compare([first, second]).verdict == "moved"
-    known = Extrinsic(X, "earlier result", first.covariance_measured, is_calibration=True)
-    assert axes(compare([second], known).differences[0], "moved") == ["yaw"]
+    stated = Extrinsic(X, "earlier result", first.covariance_measured, is_calibration=True)
+    assert axes(compare([second], stated).differences[0], "moved") == ["yaw"]
 
 
 def test_what_a_flight_alone_is_off_by_is_no_move():
     """Its truth is 15 mm off in y: of other flights of the same rig it is not."""
     flight = real_data.euroc("vio_stereo", "v2_01")
     published = Extrinsic(real_data.EUROC_TRUTH, "published")
-    found = compare([hec.calibrate(flight.parent, flight.child)], published).differences[0]
-    assert found.axes["y"].difference == pytest.approx(0.015, abs=0.002)
-    assert found.verdict == "same"
+    difference = compare([hec.calibrate(flight.parent, flight.child)], published).differences[0]
+    assert difference.axes["y"].difference == pytest.approx(0.015, abs=0.002)
+    assert difference.verdict == "same"
 
 
 @pytest.mark.parametrize("sigma_z", [0.002, 0.05], ids=["in hand", "vehicle"])
@@ -307,12 +314,12 @@ def test_an_axis_is_the_same_by_its_own_target():
 )
 def test_which_one_moved(have_moved, named, sentence):
     moved = shift("pitch", np.radians(0.6))
-    found = compare(
-        [result(int(each) * moved, seed=i) for i, each in enumerate(have_moved)],
+    comparison = compare(
+        [result(int(has_moved) * moved, seed=i) for i, has_moved in enumerate(have_moved)],
         names=[f"drive {i + 1}" for i in range(len(have_moved))],
     )
-    assert found.moved == named
-    assert found.sentence.startswith(sentence)
+    assert comparison.moved == named
+    assert comparison.sentence.startswith(sentence)
 
 
 def test_files_and_python_speak_of_the_same(tmp_path):
@@ -371,8 +378,8 @@ def saved(tmp_path, monkeypatch):
     ],
 )
 def test_the_exit_code_is_the_verdict(saved, run, words, code, text):
-    found, out, err = run("compare", *words)
-    assert (found, err) == (code, "")
+    exit_code, out, err = run("compare", *words)
+    assert (exit_code, err) == (code, "")
     assert text in out
 
 
@@ -398,8 +405,8 @@ def test_json_has_it_all(saved, run):
     ],
 )
 def test_what_cannot_be_compared_is_one_line(saved, run, words, code, text):
-    found, out, err = run("compare", *words)
-    assert (found, out, err.count("\n")) == (code, "", 1)
+    exit_code, out, err = run("compare", *words)
+    assert (exit_code, out, err.count("\n")) == (code, "", 1)
     assert text in err
     assert len(err) < 400
 

@@ -72,11 +72,11 @@ def read(path):
     try:
         with PoseBag(path) as bag:
             poses = bag_making.poses_of(bag, *bag.select())
-            found = poses, bag.warnings
+            outcome = poses, bag.warnings
     except InputError as error:
-        found = None, [str(error)]
-    assert "\n" not in "".join(found[1])
-    return found
+        outcome = None, [str(error)]
+    assert "\n" not in "".join(outcome[1])
+    return outcome
 
 
 def replay(path, capsys):
@@ -114,8 +114,8 @@ def test_cut_off_anywhere(bag, capsys):
         if document is not None:
             assert any("lost" in warning for warning in document["warnings"])
             if document["verdict"] != "DO_NOT_USE":
-                found = document["T_parent_child"]["matrix"]
-                np.testing.assert_allclose(found, T_PARENT_CHILD, atol=1e-6)
+                matrix = document["T_parent_child"]["matrix"]
+                np.testing.assert_allclose(matrix, T_PARENT_CHILD, atol=1e-6)
     assert outcomes == ({"refused", "recovered"} if path.suffix == ".mcap" else {"refused"})
 
 
@@ -123,8 +123,8 @@ def test_a_bit_flipped_anywhere(bag, capsys):
     data, path = bag
     path.write_bytes(data)
     whole, _ = read(path)
-    found = replay(path, capsys)["T_parent_child"]["matrix"]
-    np.testing.assert_allclose(found, T_PARENT_CHILD, atol=1e-9)
+    matrix = replay(path, capsys)["T_parent_child"]["matrix"]
+    np.testing.assert_allclose(matrix, T_PARENT_CHILD, atol=1e-9)
     harmed = 0
     bits = np.random.default_rng(3).integers(0, 8, PLACES).tolist()
     for place, bit in zip(places(len(data), seed=2), bits, strict=True):
@@ -137,8 +137,8 @@ def test_a_bit_flipped_anywhere(bag, capsys):
         harmed += 1
         document = replay(path, capsys)
         if document is not None and not document["warnings"]:
-            found = document["T_parent_child"]["matrix"]
-            np.testing.assert_allclose(found, T_PARENT_CHILD, atol=UNNOTICED, err_msg=str(place))
+            matrix = document["T_parent_child"]["matrix"]
+            np.testing.assert_allclose(matrix, T_PARENT_CHILD, atol=UNNOTICED, err_msg=str(place))
     assert harmed >= 10
 
 
@@ -240,8 +240,8 @@ def test_paths_that_are_no_bag(tmp_path):
         (tmp_path / f"empty.{suffix}").touch()
         (tmp_path / f"text.{suffix}").write_text("this is not a bag\n" * 100)
         for kind in ("empty", "text"):
-            said = f"{kind}.{suffix}: it is truncated, damaged or of an unsupported kind"
-            messages[f"{kind}.{suffix}"] = said
+            message = f"{kind}.{suffix}: it is truncated, damaged or of an unsupported kind"
+            messages[f"{kind}.{suffix}"] = message
     for name, message in messages.items():
         assert re.search(message, *read(tmp_path / name)[1]), name
 
@@ -281,7 +281,9 @@ def with_message(path, kind, data):
     plugin = rosbag2.StoragePlugin[kind.upper()]
     with rosbag2.Writer(path, version=9, storage_plugin=plugin) as writer:
         write_streams(writer, STREAMS, kind)
-        connection = next(each for each in writer.connections if each.topic == "/a")
+        connection = next(
+            connection for connection in writer.connections if connection.topic == "/a"
+        )
         writer.write(connection, int(STREAMS["/a"][0].stamps_ns[-1]) + 1, data)
     return path
 
@@ -293,7 +295,9 @@ def rosbag1_bomb(path):
     writer.set_compression(rosbag1.Writer.CompressionFormat.LZ4)
     with writer:
         write_streams(writer, STREAMS, "rosbag1")
-        connection = next(each for each in writer.connections if each.topic == "/a")
+        connection = next(
+            connection for connection in writer.connections if connection.topic == "/a"
+        )
         last_ns = int(STREAMS["/a"][0].stamps_ns[-1])
         writer.write(connection, last_ns + 1, memoryview(np.zeros(700 * MIB, dtype=np.uint8)))
     return path

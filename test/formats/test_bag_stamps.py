@@ -80,8 +80,8 @@ def test_header_stamps_of_0_are_named_and_the_recorders_times_are_taken_if_asked
 @pytest.mark.parametrize("storage", STORAGES)
 def test_whole_seconds_are_named(tmp_path, storage):
     path = bag_of(bag_path(tmp_path, storage), storage, ODOMETRY, whole_seconds)
-    said = r"/b: the header stamps have whole seconds only: 300 poses have 15 stamps"
-    with pytest.raises(InputError, match=said):
+    message = r"/b: the header stamps have whole seconds only: 300 poses have 15 stamps"
+    with pytest.raises(InputError, match=message):
         read(path, "/b")
     rows, _ = read(path, "/b", stamps={"child": "receive"})
     assert rows.stamps_ns.tolist() == STAMPS_NS.tolist()

@@ -64,10 +64,10 @@ def test_poses_come_back_in_the_order_of_time_with_exact_stamps_and_frames(new_b
         ("parent", PARENT, ("map", "lidar")),
         ("child", CHILD, ("odom", None)),
     ):
-        found = [pose for pose in poses if pose.stream == stream]
-        assert [pose.stamp_ns for pose in found] == source.stamps_ns.tolist()
-        assert {(pose.world_frame, pose.sensor_frame) for pose in found} == {frames}
-        values = [pose.pose for pose in found]
+        of_stream = [pose for pose in poses if pose.stream == stream]
+        assert [pose.stamp_ns for pose in of_stream] == source.stamps_ns.tolist()
+        assert {(pose.world_frame, pose.sensor_frame) for pose in of_stream} == {frames}
+        values = [pose.pose for pose in of_stream]
         quats_xyzw = se3.to_quat_xyzw(source.poses)
         np.testing.assert_array_equal(values, np.c_[source.poses[:, :3, 3], quats_xyzw])
 
@@ -200,11 +200,11 @@ def test_a_chain_of_moving_and_static_transforms(tmp_path, storage):
     assert_same_motion(other, PARENT.stamps_ns, PARENT.poses @ MOUNT)
     backwards = hec.read_trajectory(path, topic="lidar:odom")
     assert_same_motion(backwards, PARENT.stamps_ns, se3.inverse(PARENT.poses @ MOUNT))
-    said = (
+    message = (
         r"transform lidar:rear: it does not move, because all of its transforms are static; it has "
         r"base:lidar \(static\), base:rear \(static\), map:odom"
     )
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         hec.read_trajectory(path, topic="lidar:rear")
 
 
@@ -267,8 +267,8 @@ def test_a_path_whose_poses_have_no_stamps_is_refused(tmp_path):
 @pytest.mark.parametrize("storage", STORAGES)
 def test_the_parts_of_a_drive_are_read_in_the_order_of_time(new_bag, storage):
     paths = []
-    for number, part in enumerate([slice(80, 120), slice(0, 40), slice(40, 80)]):
-        streams = {"/a": (PARENT[part], ODOMETRY), "/b": (PARENT[part], ODOMETRY)}
+    for number, rows in enumerate([slice(80, 120), slice(0, 40), slice(40, 80)]):
+        streams = {"/a": (PARENT[rows], ODOMETRY), "/b": (PARENT[rows], ODOMETRY)}
         paths.append(new_bag(storage, streams, f"part{number}"))
     with PoseBag(*paths) as bag:
         poses = poses_of(bag)
@@ -329,14 +329,14 @@ def test_a_stamp_that_jumps_against_the_bags_own_time_is_left_out(tmp_path):
     poses = zip(PARENT.stamps_ns, stamps_ns, PARENT.poses, strict=True)
     messages = []
     for bag_ns, stamp_ns, matrix in poses:
-        one = Trajectory(np.array([stamp_ns]), matrix[None])
-        ((_, message),) = stamped_messages(JAZZY.types, one, ODOMETRY, is_ros1=False)
+        jumping = Trajectory(np.array([stamp_ns]), matrix[None])
+        ((_, message),) = stamped_messages(JAZZY.types, jumping, ODOMETRY, is_ros1=False)
         messages.append((bag_ns, "/a", ODOMETRY, lambda _, message=message: message))
     path = write_messages(tmp_path / "bag", messages)
     with pytest.warns(UserWarning, match="/a: 1 poses were left out: their stamps jump away from"):
-        found = hec.read_trajectory(path, topic="/a")
+        trajectory = hec.read_trajectory(path, topic="/a")
     rest = np.arange(120) != 30
-    assert_same_motion(found, PARENT.stamps_ns[rest], PARENT.poses[rest])
+    assert_same_motion(trajectory, PARENT.stamps_ns[rest], PARENT.poses[rest])
 
 
 # ---- writing, and bags of others
@@ -361,8 +361,8 @@ def test_bags_of_other_programs_read_or_are_refused_in_one_line():
         try:
             with PoseBag(path) as bag:
                 counts = {topic.name: topic.count for topic in bag.topics.values()}
-                found = sum(len(run.messages) for run in bag.runs([*counts]))
-                assert found == sum(counts.values())
+                n_messages = sum(len(run.messages) for run in bag.runs([*counts]))
+                assert n_messages == sum(counts.values())
         except InputError as error:
             refused[path.name] = str(error)
     assert refused.keys() == {"empty-file.bag"}

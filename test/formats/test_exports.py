@@ -72,42 +72,42 @@ def document(text):
 
 def matrix_of(name, text):
     """The pose (4, 4) in a file, taken out of it by hand."""
-    found = document(text)
+    fields = document(text)
     if name == "autoware":
-        ((_, children),) = found.items()
+        ((_, children),) = fields.items()
         ((_, values),) = children.items()
         rotation = Rotation.from_euler("xyz", [values[key] for key in ("roll", "pitch", "yaw")])
         return [values[key] for key in "xyz"], rotation
     if name in ("fast_lio", "fast_livo2"):
-        section = found.get("mapping") or found["extrin_calib"]
+        section = fields.get("mapping") or fields["extrin_calib"]
         keys = ("Pcl", "Rcl") if "Pcl" in section else ("extrinsic_T", "extrinsic_R")
         return section[keys[0]], section[keys[1]]
     if name == "lio_sam":
-        assert found["lio_sam"]["extrinsicRPY"] == found["lio_sam"]["extrinsicRot"]
-        return found["lio_sam"]["extrinsicTrans"], found["lio_sam"]["extrinsicRot"]
+        assert fields["lio_sam"]["extrinsicRPY"] == fields["lio_sam"]["extrinsicRot"]
+        return fields["lio_sam"]["extrinsicTrans"], fields["lio_sam"]["extrinsicRot"]
     if name == "dlio":
-        ((_, values),) = found["dlio"]["extrinsics"].items()
+        ((_, values),) = fields["dlio"]["extrinsics"].items()
         return values["t"], values["R"]
     if name in ("kalibr", "openvins"):
-        ((_, camera),) = found.items()
-        T = np.array(next(each for key, each in camera.items() if key.startswith("T_")))
+        ((_, camera),) = fields.items()
+        T = np.array(next(matrix for key, matrix in camera.items() if key.startswith("T_")))
         return T[:3, 3], T[:3, :3].ravel()
     if name in ("vins", "orbslam3", "opencv"):
-        T = np.array(next(each["data"] for each in found.values() if isinstance(each, dict)))
+        T = np.array(next(block["data"] for block in fields.values() if isinstance(block, dict)))
         return T.reshape(4, 4)[:3, 3], T.reshape(4, 4)[:3, :3].ravel()
     if name in ("apollo", "easy_handeye2"):
-        pose = found["transform"]
+        pose = fields["transform"]
         rotation = Rotation.from_quat([pose["rotation"][key] for key in "xyzw"])
         return [pose["translation"][key] for key in "xyz"], rotation
     if name == "glim":
         values = json.loads(text)["sensors"]["T_lidar_imu"]
         return values[:3], Rotation.from_quat(values[3:])
     if name == "msa":
-        ((_, entry),) = found.items()
+        ((_, entry),) = fields.items()
         return entry["value"][:3], Rotation.from_quat(entry["value"][3:])
     if name == "kitti":
         lines = dict(line.split(":", 1) for line in text.splitlines())
-        return [float(each) for each in lines["T"].split()], [*map(float, lines["R"].split())]
+        return [float(number) for number in lines["T"].split()], [*map(float, lines["R"].split())]
     if name == "nuscenes":
         (record,) = json.loads(text)
         return record["translation"], Rotation.from_quat(np.roll(record["rotation"], -1))
@@ -137,11 +137,11 @@ def test_a_file_maps_a_point_as_it_says_and_reads_back(name, parent, child, is_d
     assert "Assumed" not in text
 
     (tmp_path / "foreign.yaml").write_text(text)
-    found = open_installed(str(tmp_path / "foreign.yaml"))(parent, child)
-    np.testing.assert_allclose(found.T_parent_child, calibration.T_parent_child, atol=1e-9)
+    installed = open_installed(str(tmp_path / "foreign.yaml"))(parent, child)
+    np.testing.assert_allclose(installed.T_parent_child, calibration.T_parent_child, atol=1e-9)
     if name not in ("opencv", "numpy"):  # which name nothing
-        found = open_installed(str(tmp_path / "foreign.yaml"))(child, parent)
-        np.testing.assert_allclose(found.T_parent_child, calibration.T_child_parent, atol=1e-9)
+        installed = open_installed(str(tmp_path / "foreign.yaml"))(child, parent)
+        np.testing.assert_allclose(installed.T_parent_child, calibration.T_child_parent, atol=1e-9)
 
 
 def test_every_format_is_tried():
@@ -166,10 +166,10 @@ def test_every_format_is_tried():
     ],
 )
 def test_the_sign_of_a_time_offset_is_that_of_the_program(name, parent, child, key, expected_s):
-    found = document(result(parent, child).export(name))
-    for part in key:
-        found = found[part]
-    assert found == pytest.approx(expected_s)
+    value = document(result(parent, child).export(name))
+    for name_of_level in key:
+        value = value[name_of_level]
+    assert value == pytest.approx(expected_s)
 
 
 def test_px4_has_its_own_axes_and_a_delay():
@@ -198,10 +198,10 @@ def test_an_axis_that_is_not_known_is_refused():
 
 def test_what_the_names_do_not_say_is_assumed_and_said():
     text = result("a", "b").export("fast_lio")
-    said = (
+    assumption = (
         "Assumed, because the names of the frames do not contain it: a is the imu, b is the lidar."
     )
-    assert said in text
+    assert assumption in text
     for frame in ("CAM_FRONT", "frontCamera", "camera_base_link"):
         assert role_of(frame) == "camera"
     assert (role_of("base_link"), role_of("odom")) == ("base", "")
@@ -236,8 +236,8 @@ def test_of_several_cameras_the_named_one_is_read(tmp_path):
     path.write_text(
         yaml.safe_dump({"cam0": {"T_cam_imu": identity}, "cam1": {"T_cam_imu": moved.tolist()}})
     )
-    found = open_installed(str(path))("imu", "cam1").T_parent_child
-    np.testing.assert_allclose(found, se3.inverse(moved))
+    T_parent_child = open_installed(str(path))("imu", "cam1").T_parent_child
+    np.testing.assert_allclose(T_parent_child, se3.inverse(moved))
     with pytest.raises(InputError, match="it has several extrinsics, and the names"):
         open_installed(str(path))("imu", "lidar")
 
@@ -321,7 +321,7 @@ def shown(page):
         time_offset_sigma_s=0.0002,
     )
     text, count = SHOWN.subn(
-        lambda found: f"{found[1]}{calibration.export(found[2])}```", page.read_text()
+        lambda match: f"{match[1]}{calibration.export(match[2])}```", page.read_text()
     )
     assert count == 1
     return text

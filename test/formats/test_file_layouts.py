@@ -83,8 +83,8 @@ def sexagesimal(degrees, sides, form="{d} {m} {s:.9f}"):
         size = abs(value)
         whole = int(size)
         minutes = int((size - whole) * 60)
-        part = (size - whole) * 3600 - 60 * minutes
-        text = form.format(d=whole, m=minutes, s=part)
+        seconds = (size - whole) * 3600 - 60 * minutes
+        text = form.format(d=whole, m=minutes, s=seconds)
         if sides:
             text += sides[int(value < 0)]
         elif value < 0:
@@ -129,7 +129,7 @@ LAYOUTS = {
     "commas in names": text_of(SECONDS, COVARIANCE[:, :1], P, Q, separator=",",
                                head=NAMES.replace("x,", "cov[0,1],x,", 1)),
     "quoted names": text_of(SECONDS, P, Q, head=QUOTED.replace("x, east", "x"), separator=","),
-    "all quoted": text_of(*([f'"{each:.12g}"' for each in column] for column in
+    "all quoted": text_of(*([f'"{number:.12g}"' for number in column] for column in
                             [*P.T, *Q.T]), SECONDS, head="x,y,z,qx,qy,qz,qw,t\n", separator=","),
     "byte order mark and CRLF": ("\ufeff" + text_of(SECONDS, P, Q, head=NAMES, separator=","))
     .replace("\n", "\r\n"),
@@ -147,7 +147,7 @@ LAYOUTS = {
     "decimal commas and tabs": with_comma(text_of(SECONDS, P, Q, separator="\t")),
     "decimal commas and semicolons": with_comma(text_of(SECONDS, P, Q, separator=";",
                                                         head=NAMES.replace(",", ";"))),
-    "decimal commas in quotes": text_of(*([f'"{with_comma(f"{each:.12g}")}"' for each in column]
+    "decimal commas in quotes": text_of(*([f'"{with_comma(f"{number:.12g}")}"' for number in column]
                                           for column in [*P.T, *Q.T]), SECONDS, separator=",",
                                         head="x,y,z,qx,qy,qz,qw,t\n"),
     # More columns behind.
@@ -422,11 +422,11 @@ def test_arrays_with_nan_and_transposed_matrices():
     poses[5] = np.nan
     times = TRUTH.stamps_ns / 1e9
     with pytest.warns(UserWarning, match="1 of 60 poses"):
-        found = hec.read_trajectory(poses, times=times)
-    np.testing.assert_allclose(found.poses, np.delete(TRUTH.poses, 5, axis=0), atol=1e-12)
+        trajectory = hec.read_trajectory(poses, times=times)
+    np.testing.assert_allclose(trajectory.poses, np.delete(TRUTH.poses, 5, axis=0), atol=1e-12)
     with pytest.warns(UserWarning, match="matrices are transposed"):
-        found = hec.read_trajectory(np.swapaxes(TRUTH.poses, 1, 2), times=times)
-    np.testing.assert_allclose(found.poses, TRUTH.poses, atol=1e-12)
+        trajectory = hec.read_trajectory(np.swapaxes(TRUTH.poses, 1, 2), times=times)
+    np.testing.assert_allclose(trajectory.poses, TRUTH.poses, atol=1e-12)
     poses = TRUTH.poses.copy()
     poses[:, 3, 3] = 2.0
     with pytest.raises(InputError, match="the last row of a matrix is not 0 0 0 1"):

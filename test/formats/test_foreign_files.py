@@ -34,7 +34,7 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def dates(form):
-    return [datetime.fromtimestamp(each, UTC).strftime(form) for each in SECONDS]
+    return [datetime.fromtimestamp(seconds, UTC).strftime(form) for seconds in SECONDS]
 
 
 def joined(rows, separator=" "):
@@ -43,18 +43,18 @@ def joined(rows, separator=" "):
 
 def of_nmea(damaged=3):
     """After a logger's own stamps, one sentence with a wrong checksum."""
-    lat, lon = ([100 * (each // 1) + each % 1 * 60 for each in deg] for deg in (LAT, LON))
+    lat, lon = ([100 * (angle // 1) + angle % 1 * 60 for angle in deg] for deg in (LAT, LON))
     texts = [
         f"GPRMC,{clock[:-4]},A,,,,,,,{day},,|GNGGA,{clock[:-4]},{lat[k]:014.9f},N,"
         f"{lon[k]:015.9f},E,4,12,0.8,{HEIGHT[k] - 45.0:.6f},M,45.0,M,,"
         for k, (clock, day) in enumerate(zip(dates("%H%M%S.%f"), dates("%d%m%y"), strict=True))
     ]
     texts.insert(damaged, texts[damaged].replace(".", ".9"))
-    lines = [each for text in texts for each in text.split("|")]
-    checks = [reduce(xor, each.encode()) for each in lines]
+    lines = [sentence for text in texts for sentence in text.split("|")]
+    checks = [reduce(xor, sentence.encode()) for sentence in lines]
     checks[2 * damaged + 1] ^= 1
     rows = zip(lines, checks, strict=True)
-    return "".join(f"12:00:00 ${each}*{check:02X}\r\n" for each, check in rows)
+    return "".join(f"12:00:00 ${sentence}*{check:02X}\r\n" for sentence, check in rows)
 
 
 def of_gpx():
@@ -71,9 +71,9 @@ def of_rtklib(weeks=False):
     times = dates("%Y/%m/%d %H:%M:%S.%f")
     if weeks:
         since = SECONDS - 315_964_800
-        times = [f"{int(each // 604_800)} {each % 604_800:.3f}" for each in since]
+        times = [f"{int(second // 604_800)} {second % 604_800:.3f}" for second in since]
     head = "% program   : RTKPOST\n%  GPST   latitude(deg) longitude(deg)  height(m)   Q  ns\n"
-    degrees = ([f"{each:.12f}" for each in values] for values in (LAT, LON))
+    degrees = ([f"{value:.12f}" for value in values] for values in (LAT, LON))
     rows = zip(times, *degrees, HEIGHT, [1] * N, [9] * N, strict=True)
     return head + joined(rows)
 
@@ -113,7 +113,11 @@ def of_vicon(turn="RX,RY,RZ", units="rad,rad,rad", bodies=("drone:drone",)):
     names = ("," * (turn.count(",") + 4)).join(bodies)
     n = len(bodies)
     head = f"Objects\n10\n,,{names}\nFrame,Sub Frame{f',{turn},TX,TY,TZ' * n}\n"
-    poses = [each for k in range(n) for each in (Q if "RW" in turn else VECTORS, P * 1e3 * (k + 1))]
+    poses = [
+        component
+        for k in range(n)
+        for component in (Q if "RW" in turn else VECTORS, P * 1e3 * (k + 1))
+    ]
     return of_rows(f"{head},{f',{units},mm,mm,mm' * n}\n", range(N), [0] * N, *poses)
 
 
@@ -143,27 +147,27 @@ def of_lio_sam():
 
 def of_rows(header, *values, separator=","):
     """Numbers below a header, each value (N, ...) one or several columns."""
-    columns = [np.reshape(each, (N, -1)).tolist() for each in values]
-    rows = ([cell for part in row for cell in part] for row in zip(*columns, strict=True))
+    columns = [np.reshape(array, (N, -1)).tolist() for array in values]
+    rows = ([cell for cells in row for cell in cells] for row in zip(*columns, strict=True))
     return header + joined(rows, separator)
 
 
 def of_echo(frames="odom,base"):
     """As ros2 topic echo --csv writes TransformStamped, or PoseStamped."""
-    stamps = (f"{each // 10**9},{each % 10**9}" for each in TRUTH.stamps_ns.tolist())
+    stamps = (f"{stamp_ns // 10**9},{stamp_ns % 10**9}" for stamp_ns in TRUTH.stamps_ns.tolist())
     return joined(([stamp, frames, *p, *q] for stamp, p, q in zip(stamps, P, Q, strict=True)), ",")
 
 
 def of_nuscenes():
     values = zip((STAMPS // 1000).tolist(), WXYZ.tolist(), P.tolist(), strict=True)
     keys = ("timestamp", "rotation", "translation")
-    return json.dumps([dict(zip(keys, each, strict=True)) for each in values][::-1], indent=1)
+    return json.dumps([dict(zip(keys, row, strict=True)) for row in values][::-1], indent=1)
 
 
 STAMPS = TRUTH.stamps_ns
 WXYZ = Q[:, [3, 0, 1, 2]]
 POSE = "tx,ty,tz,qx,qy,qz,qw\n"
-DATES = [f"{each}Z" for each in dates("%Y-%m-%dT%H:%M:%S.%f")]
+DATES = [f"{date}Z" for date in dates("%Y-%m-%dT%H:%M:%S.%f")]
 MATRICES = TRUTH.poses.reshape(N, 16)
 WITH_UNITS = "# by hand\n# time [{0}],x [{1}],y [{1}],z [{1}],q_w,q_x,q_y,q_z\n"
 EUROC = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y,p_RS_R_z,q_RS_w [],q_RS_x,q_RS_y,q_RS_z\n"
@@ -236,8 +240,8 @@ def test_every_format_and_unit_gives_the_same_poses_and_the_same_answer(tmp_path
     path = tmp_path / "anything.txt"
     path.write_bytes(text.encode())
     (tmp_path / "times.txt").write_text("\n".join(map(repr, SECONDS.tolist())))
-    found = read_trajectory_file(path, AUTO)
-    trajectory = found.trajectory
+    file = read_trajectory_file(path, AUTO)
+    trajectory = file.trajectory
     start_ns = TRUTH.stamps_ns[0] if name.startswith("vicon") else 0
     np.testing.assert_allclose(trajectory.stamps_ns, TRUTH.stamps_ns - start_ns, atol=2000, rtol=0)
     expected = TRUTH.poses.copy()
@@ -245,7 +249,7 @@ def test_every_format_and_unit_gives_the_same_poses_and_the_same_answer(tmp_path
         expected[:, :3, :3] = np.eye(3)
         expected[:, :3, 3] = P - P[0]
     np.testing.assert_allclose(trajectory.poses, expected, atol=2e-6)
-    assert note in " ".join(found.guesses)
+    assert note in " ".join(file.guesses)
     assert trajectory.measures == ("positions" if name in [*FORMATS][-5:] else "poses")
     if trajectory.measures == "poses":
         child = Trajectory(trajectory.stamps_ns, TRUTH.poses @ MOUNT)
@@ -257,10 +261,10 @@ def test_arrays_and_graphs(tmp_path):
     rows = of_rows("", ["VERTEX_SE3:QUAT"] * N, range(N), P, Q, separator=" ")
     (tmp_path / "a.g2o").write_text(f"{rows}EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 1\n")
     for name in ("a.npy", "a.g2o"):
-        found = read_trajectory_file(tmp_path / name, AUTO)
-        np.testing.assert_allclose(found.trajectory.poses, TRUTH.poses, atol=1e-12)
-    assert found.trajectory.stamps_ns[1] == 1_000_000_000
-    assert "numbers of its vertices are taken for seconds" in found.guesses[0]
+        file = read_trajectory_file(tmp_path / name, AUTO)
+        np.testing.assert_allclose(file.trajectory.poses, TRUTH.poses, atol=1e-12)
+    assert file.trajectory.stamps_ns[1] == 1_000_000_000
+    assert "numbers of its vertices are taken for seconds" in file.guesses[0]
 
 
 def test_poses_without_stamps_are_paired_by_row_or_by_the_names_of_images(tmp_path, capsys):
@@ -334,10 +338,10 @@ def test_a_log_of_px4(tmp_path, topics):
         with pytest.raises((MissingDependencyError, InputError), match=message):
             read_trajectory_file(tmp_path / "log.ulg", AUTO)
         return
-    found = read_trajectory_file(tmp_path / "log.ulg", AUTO).trajectory
-    known = TRUTH if "vehicle_odometry" in topics else TRUTH[1:]
-    np.testing.assert_allclose(found.poses, known.poses, atol=1e-5)
-    assert (found.stamps_ns == known.stamps_ns).all()
+    trajectory = read_trajectory_file(tmp_path / "log.ulg", AUTO).trajectory
+    expected = TRUTH if "vehicle_odometry" in topics else TRUTH[1:]
+    np.testing.assert_allclose(trajectory.poses, expected.poses, atol=1e-5)
+    assert (trajectory.stamps_ns == expected.stamps_ns).all()
 
 
 @pytest.mark.parametrize(
@@ -388,18 +392,18 @@ def test_what_cannot_be_read_is_told_in_one_sentence(tmp_path, content, message)
 @pytest.mark.parametrize("is_short", [True, False])
 def test_poses_of_an_ins_turn_with_the_heading(tmp_path, is_short):
     (tmp_path / "log").write_text(of_novatel(is_short))
-    found = read_trajectory_file(tmp_path / "log", AUTO).trajectory
-    np.testing.assert_allclose(found.stamps_ns, STAMPS, atol=1_000_000)
-    np.testing.assert_allclose(found.poses[:, :3, 3], P - P[0], atol=1e-4)
-    np.testing.assert_allclose(found.poses[:, :3, :3], TRUTH.poses[:, :3, :3], atol=1e-4)
+    trajectory = read_trajectory_file(tmp_path / "log", AUTO).trajectory
+    np.testing.assert_allclose(trajectory.stamps_ns, STAMPS, atol=1_000_000)
+    np.testing.assert_allclose(trajectory.poses[:, :3, 3], P - P[0], atol=1e-4)
+    np.testing.assert_allclose(trajectory.poses[:, :3, :3], TRUTH.poses[:, :3, :3], atol=1e-4)
 
 
 def test_of_several_bodies_one_is_named(tmp_path):
     (tmp_path / "vicon.csv").write_text(of_vicon(bodies=("drone:drone", "cart:cart")))
     with pytest.raises(InputError, match="several segments: drone:drone, cart:cart; name one"):
         read_trajectory_file(tmp_path / "vicon.csv", AUTO)
-    found = read_trajectory_file(tmp_path / "vicon.csv", AUTO, columns="cart:cart").trajectory
-    np.testing.assert_allclose(found.poses[:, :3, 3], 2 * P, atol=1e-9)
+    trajectory = read_trajectory_file(tmp_path / "vicon.csv", AUTO, columns="cart:cart").trajectory
+    np.testing.assert_allclose(trajectory.poses[:, :3, 3], 2 * P, atol=1e-9)
 
 
 def test_a_take_of_many_markers_needs_memory_for_its_poses_alone(tmp_path):

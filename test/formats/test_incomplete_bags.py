@@ -42,9 +42,9 @@ def killed_recording(folder, journal_mode, kept_in_file):
             database.execute(f"INSERT INTO messages VALUES ({marks})", row)
     killed = folder / "killed"
     killed.mkdir()
-    for part in file.parent.iterdir():
-        if part.name.startswith(file.name) and not part.name.endswith("-shm"):
-            shutil.copyfile(part, killed / part.name)
+    for path in file.parent.iterdir():
+        if path.name.startswith(file.name) and not path.name.endswith("-shm"):
+            shutil.copyfile(path, killed / path.name)
     database.close()
     return killed
 

@@ -115,8 +115,8 @@ def test_transforms_lose_the_leading_slash_of_old_frames(encoding, drawn):
 
     kind = MessageKind("/tf", TF, encoding, ("MSG", TF_DEFINITION))
     data, _ = serialized(encoding, TF, make)
-    found = Run(kind, [data], np.zeros(1)).transforms()
-    for (_, fields), (stamp_ns, world, sensor, values) in zip(found, drawn, strict=True):
+    transforms = Run(kind, [data], np.zeros(1)).transforms()
+    for (_, fields), (stamp_ns, world, sensor, values) in zip(transforms, drawn, strict=True):
         frames = printable(world).lstrip("/"), printable(sensor).lstrip("/")
         assert fields[:3] == (stamp_ns, *frames)
         np.testing.assert_array_equal([*fields.position, *fields.quat_xyzw], values)

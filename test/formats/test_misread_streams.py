@@ -95,8 +95,12 @@ MISREAD = {
 }
 
 
-def errors(found):
-    return {(each.code, each.stream) for each in found.findings if each.severity.value == "error"}
+def errors(result):
+    return {
+        (finding.code, finding.stream)
+        for finding in result.findings
+        if finding.severity.value == "error"
+    }
 
 
 @pytest.mark.parametrize("stream", ["parent", "child"])
@@ -106,10 +110,10 @@ def test_what_a_stream_is_in_truth_is_named(kind, path, stream):
     spoil, code = MISREAD[kind]
     parent, child = pair(path)
     if stream == "parent":
-        found = check_streams(spoil(parent), child)
+        result = check_streams(spoil(parent), child)
     else:
-        found = check_streams(parent, spoil(child))
-    assert errors(found) == {(code, stream)}
+        result = check_streams(parent, spoil(child))
+    assert errors(result) == {(code, stream)}
 
 
 @pytest.mark.parametrize("path", PATHS)
@@ -141,14 +145,14 @@ def test_rotations_before_translations_are_read_by_rows_or_by_columns(tmp_path, 
     rows = np.c_[truth.stamps_ns / 1e9, written.reshape(-1, 9), truth.poses[:, :3, 3]].tolist()
     file = tmp_path / "poses.txt"
     file.write_text("\n".join(" ".join(map(repr, row)) for row in rows))
-    found, guesses = read(file)
+    trajectory, guesses = read(file)
     # The motion of what is held in hand does not tell, and the order is said.
     is_by_columns = by_columns and path == "car"
     order = "column by column" if is_by_columns else "row by row"
     assert f"read {order}" in guesses
     expected = rotations if is_by_columns or not by_columns else written
-    np.testing.assert_allclose(found.poses[:, :3, :3], expected, atol=1e-9)
-    np.testing.assert_allclose(found.poses[:, :3, 3], truth.poses[:, :3, 3], atol=1e-9)
+    np.testing.assert_allclose(trajectory.poses[:, :3, :3], expected, atol=1e-9)
+    np.testing.assert_allclose(trajectory.poses[:, :3, 3], truth.poses[:, :3, 3], atol=1e-9)
 
 
 FRAMES = {
@@ -169,10 +173,12 @@ def test_orientations_of_positions_from_the_centre_of_the_earth(tmp_path, frame)
     positions = truth.poses[:, :3, 3] @ axes.T + HANNOVER_M
     spoiled = with_poses(truth, to_file(axes) @ truth.poses[:, :3, :3], positions)
     write_trajectory(tmp_path / "ecef.tum", spoiled)
-    found, guesses = read(tmp_path / "ecef.tum")
+    trajectory, guesses = read(tmp_path / "ecef.tum")
     assert words in guesses
     # Up of a place turns by 1 m / 6,378 km on the way to the next.
-    np.testing.assert_allclose(found.poses[:, :3, :3], axes @ truth.poses[:, :3, :3], atol=2e-4)
+    np.testing.assert_allclose(
+        trajectory.poses[:, :3, :3], axes @ truth.poses[:, :3, :3], atol=2e-4
+    )
 
 
 def test_axes_of_places_are_those_of_their_latitude():

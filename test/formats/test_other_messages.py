@@ -74,7 +74,7 @@ def messages():
     types = {"/twist": TWIST, "/fix": FIX, "/imu": IMU, "/px4": PX4, "/array": ARRAY, "/geo": GEO}
     types |= {"/ins": INS, "/twists": f"{TWIST[:-7]}WithCovarianceStamped"}
     types |= {"/bodies": BODIES, "/named": NAMED_ARRAY, "/gps": GPS}
-    found = {key: [] for key in types.items()}
+    written = {key: [] for key in types.items()}
     zero = made("Vector3", 0.0, 0.0, 0.0)
     nine = np.zeros(9)
     nothing = np.zeros(3, "f4")
@@ -84,7 +84,7 @@ def messages():
         twist = made("Twist", made("Vector3", *twists[k, :3]), made("Vector3", *twists[k, 3:]))
         pose = made("Pose", made("Point", *P[k]), quaternion)
         point = made(POINT, lat[k], lon[k], height[k])
-        each = {
+        fields = {
             TWIST: (head, twist),
             types["/twists"]: (head, made("TwistWithCovariance", twist, np.zeros(36))),
             FIX: (head, status, lat[k], lon[k], height[k], nine, 0),
@@ -97,9 +97,9 @@ def messages():
             GPS: (head, lat[k], lon[k], height[k]),
             INS: (head, lat[k], lon[k], height[k], rpy[k, 0], -rpy[k, 1], 90.0 - rpy[k, 2]),
         }
-        for key in found:
-            found[key].append(made(key[1], *each[key[1]]))
-    return found
+        for key in written:
+            written[key].append(made(key[1], *fields[key[1]]))
+    return written
 
 
 @pytest.fixture(scope="module")
@@ -146,17 +146,17 @@ def from_start(poses):
     ],
 )  # fmt: skip
 def test_the_poses_are_those_of_the_truth(bag, source, within):
-    found = read_bag_trajectory(bag, source)
-    assert found.measures == "poses"
-    np.testing.assert_allclose(found.stamps_ns, TRUTH.stamps_ns, atol=1000, rtol=0)
-    np.testing.assert_allclose(from_start(found.poses), from_start(TRUTH.poses), atol=within)
+    trajectory = read_bag_trajectory(bag, source)
+    assert trajectory.measures == "poses"
+    np.testing.assert_allclose(trajectory.stamps_ns, TRUTH.stamps_ns, atol=1000, rtol=0)
+    np.testing.assert_allclose(from_start(trajectory.poses), from_start(TRUTH.poses), atol=within)
 
 
 def foxglove(kind, k):
     """A message of Foxglove's as plain values."""
-    lat, lon, height = (float(each[k]) for each in GEODETIC)
+    lat, lon, height = (float(column[k]) for column in GEODETIC)
     sec, nsec = divmod(int(TRUTH.stamps_ns[k]), 10**9)
-    place, turn = (dict(zip("xyzw", each[k].tolist(), strict=False)) for each in (P, Q))
+    place, turn = (dict(zip("xyzw", array[k].tolist(), strict=False)) for array in (P, Q))
     pose = {"position": place, "orientation": turn}
     frames = {"parent_frame_id": "map", "child_frame_id": "base"}
     moving = {"timestamp": {"sec": sec, "nsec": nsec}} | frames
@@ -209,14 +209,14 @@ def test_messages_of_foxglove(tmp_path, kind, write):
     write(tmp_path / "poses.mcap", kind)
     source = "map:base" if kind == "FrameTransforms" else "/pose"
     with PoseBag(tmp_path / "poses.mcap") as bag:
-        found, _ = bag.trajectory(TfSource.parse(source) if ":" in source else source)
+        trajectory, _ = bag.trajectory(TfSource.parse(source) if ":" in source else source)
         assert bag.topics["/pose"].type == f"foxglove.{kind}"
-    assert (found.stamps_ns == TRUTH.stamps_ns).all()
+    assert (trajectory.stamps_ns == TRUTH.stamps_ns).all()
     if kind == "LocationFix":
-        assert found.measures == "positions"
-        np.testing.assert_allclose(found.poses[:, :3, 3], P - P[0], atol=1e-5)
+        assert trajectory.measures == "positions"
+        np.testing.assert_allclose(trajectory.poses[:, :3, 3], P - P[0], atol=1e-5)
     else:
-        np.testing.assert_allclose(found.poses, TRUTH.poses, atol=1e-12)
+        np.testing.assert_allclose(trajectory.poses, TRUTH.poses, atol=1e-12)
 
 
 def test_json_without_what_its_type_has_is_named(tmp_path):
@@ -229,17 +229,17 @@ def test_json_without_what_its_type_has_is_named(tmp_path):
 def test_values_that_are_not_finite_are_left_out(tmp_path):
     in_json(tmp_path / "poses.mcap", "PoseInFrame", (b'"x": -', b'"x": -Infinity, "X": '))
     with PoseBag(tmp_path / "poses.mcap") as opened:
-        found, _ = opened.trajectory("/pose")
-        assert f"{len(P) - len(found)} of {len(P)} poses (79%) were left" in opened.warnings[0]
-    assert (found.stamps_ns == TRUTH.stamps_ns[(P[:, 0] >= 0) & (Q[:, 0] >= 0)]).all()
+        trajectory, _ = opened.trajectory("/pose")
+        assert f"{len(P) - len(trajectory)} of {len(P)} poses (79%) were left" in opened.warnings[0]
+    assert (trajectory.stamps_ns == TRUTH.stamps_ns[(P[:, 0] >= 0) & (Q[:, 0] >= 0)]).all()
 
 
 def test_fields_of_a_place_are_positions(bag):
     fields = "t=header.stamp,x=poses.0.position.x,y=poses.0.position.y,z=poses.0.position.z"
     for source in (f"/array?{fields}", "/gps"):
-        found = read_bag_trajectory(bag, source)
-        assert found.measures == "positions"
-        np.testing.assert_allclose(from_start(found.poses)[:, :3, 3], P - P[0], atol=1e-5)
+        trajectory = read_bag_trajectory(bag, source)
+        assert trajectory.measures == "positions"
+        np.testing.assert_allclose(from_start(trajectory.poses)[:, :3, 3], P - P[0], atol=1e-5)
 
 
 @pytest.mark.parametrize(

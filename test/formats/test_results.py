@@ -170,14 +170,14 @@ def test_a_file_with_an_unknown_axis_is_read_by_the_commands(tmp_path, capsys, w
         save_result(calibration(status=SolveStatus.UNOBSERVABLE), tmp_path / name)
     paths = [str(tmp_path / name) for name in ("one", "two")]
     code = main([words[0], *paths[: 1 if words[0] == "info" else 2], *words[1:]])
-    told = capsys.readouterr()
-    assert (code, told.err) == (0 if words[0] == "info" else 3, "")
+    output = capsys.readouterr()
+    assert (code, output.err) == (0 if words[0] == "info" else 3, "")
     if "--json" not in words:
-        assert re.search(r"z +unknown", told.out)
+        assert re.search(r"z +unknown", output.out)
     elif words[0] == "info":
-        assert json.loads(told.out)["T_parent_child"]["translation"][2] is None
+        assert json.loads(output.out)["T_parent_child"]["translation"][2] is None
     else:
-        (difference,) = json.loads(told.out)["differences"]
+        (difference,) = json.loads(output.out)["differences"]
         assert difference["axes"]["z"]["verdict"] == "cannot tell"
 
 
@@ -229,7 +229,9 @@ def test_the_launch_file_compiles_and_publishes_the_extrinsic(tmp_path):
     tree = ast.parse(text)
     calls = {node.func.id: node for node in ast.walk(tree) if isinstance(node, ast.Call)}
     assert set(calls) == {"LaunchDescription", "Node"}
-    (transforms,) = (ast.literal_eval(one.value) for one in tree.body if hasattr(one, "value"))
+    (transforms,) = (
+        ast.literal_eval(statement.value) for statement in tree.body if hasattr(statement, "value")
+    )
     assert f"# {written.headline}\n" in text
     node = {keyword.arg: ast.unparse(keyword.value) for keyword in calls["Node"].keywords}
     program = {"package": "'tf2_ros'", "executable": "'static_transform_publisher'"}
@@ -363,9 +365,11 @@ def test_every_sigma_of_a_document_has_the_allowance_and_its_parts_beside_it():
         if row["sigma"] is not None:
             parts = np.hypot(row["sigma_measured"], row["allowance"])
             assert row["sigma"] == pytest.approx(parts, rel=1e-12)
-    parts = (document[f"covariance_{part}"]["matrix"] for part in ("measured", "allowance"))
+    parts = (document[f"covariance_{name}"]["matrix"] for name in ("measured", "allowance"))
     finite = np.array(document["covariance"]["matrix"][0], dtype=float)
-    np.testing.assert_allclose(finite, np.sum([part[0] for part in parts], axis=0), rtol=1e-12)
+    np.testing.assert_allclose(
+        finite, np.sum([columns[0] for columns in parts], axis=0), rtol=1e-12
+    )
 
 
 def of_version_1(document):

@@ -28,7 +28,7 @@ def moving(parent, child, period_ms, n_poses, start_ms=0):
 
 
 def in_order(*edges):
-    return sorted((each for edge in edges for each in edge), key=lambda each: each[0].stamp_ns)
+    return sorted((pose for edge in edges for pose in edge), key=lambda pose: pose[0].stamp_ns)
 
 
 def live(events, source, max_gap_s=0.5):
@@ -51,10 +51,8 @@ STEPS = wandering_poses(80)
 def test_a_moving_edge_and_a_mount(events, expected):
     _, poses = live(events, "odom:lidar")
     assert [pose.stamp_ns for pose in poses] == [10 * MS * k for k in range(80)]
-    found = se3.from_quat_xyzw(
-        [pose.position for pose in poses], [pose.quat_xyzw for pose in poses]
-    )
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    Ts = se3.from_quat_xyzw([pose.position for pose in poses], [pose.quat_xyzw for pose in poses])
+    np.testing.assert_allclose(Ts, expected, atol=1e-12)
 
 
 def test_two_moving_edges_at_the_stamps_of_the_slower():

@@ -47,9 +47,9 @@ def rows(stamps, order="xyzw", separator=","):
     ]
 
 
-def assert_is_the_trajectory(found, stamps_ns=TRAJECTORY.stamps_ns):
-    np.testing.assert_array_equal(found.stamps_ns, stamps_ns)
-    np.testing.assert_allclose(found.poses, TRAJECTORY.poses, atol=1e-12)
+def assert_is_the_trajectory(trajectory, stamps_ns=TRAJECTORY.stamps_ns):
+    np.testing.assert_array_equal(trajectory.stamps_ns, stamps_ns)
+    np.testing.assert_allclose(trajectory.poses, TRAJECTORY.poses, atol=1e-12)
 
 
 # ---- tum, and what holds for all
@@ -133,19 +133,23 @@ def test_kitti_has_its_stamps_in_a_file_of_their_own(file):
     poses = file(lines, "poses.txt")
     times = file([seconds(stamp) for stamp in TRAJECTORY.stamps_ns], "times.txt")
     assert_is_the_trajectory(hec.read_trajectory(poses, "kitti", times=times))
-    said = r"poses\.txt: the poses have no stamps; name their column t, set `times`, or pair"
-    with pytest.raises(InputError, match=said):
+    message = r"poses\.txt: the poses have no stamps; name their column t, set `times`, or pair"
+    with pytest.raises(InputError, match=message):
         hec.read_trajectory(poses, "kitti")
-    one = file(["0.0"], "one.txt")
+    one_stamp = file(["0.0"], "one.txt")
     short = file(["0.0", "0.1"], "short.txt")
-    for path, beside, message in (
+    for path, other_times, message in (
         (poses, short, r"30 poses, but .*short\.txt has 2 stamps"),
         (poses, file(["x"], "odd.txt"), r"odd\.txt, line 1: .* found 'x' for the timestamp"),
-        (file([" ".join(["2"] * 12)], "s.txt"), one, "s.txt, line 1: the 3x3 part is not a rot"),
-        (file(["1 2"], "pair.txt"), one, r"line 1: expected 12 numbers.* found 2"),
+        (
+            file([" ".join(["2"] * 12)], "s.txt"),
+            one_stamp,
+            "s.txt, line 1: the 3x3 part is not a rot",
+        ),
+        (file(["1 2"], "pair.txt"), one_stamp, r"line 1: expected 12 numbers.* found 2"),
     ):
         with pytest.raises(InputError, match=message):
-            hec.read_trajectory(path, "kitti", times=beside)
+            hec.read_trajectory(path, "kitti", times=other_times)
 
 
 def test_exports_of_messages_have_stamps_in_two_columns_and_quoted_tuples(file):
@@ -161,8 +165,8 @@ def test_exports_of_messages_have_stamps_in_two_columns_and_quoted_tuples(file):
 
 def test_without_a_header_the_columns_must_be_named(file):
     path = file(rows(TRAJECTORY.stamps_ns, "wxyz", " "))
-    said = "so their order is unknown; name the 8 with `columns`, such as"
-    with pytest.raises(InputError, match=said):
+    message = "so their order is unknown; name the 8 with `columns`, such as"
+    with pytest.raises(InputError, match=message):
         hec.read_trajectory(path, "csv")
     assert_is_the_trajectory(hec.read_trajectory(path, "csv", columns=WXYZ))
     with pytest.raises(InputError, match=r"line 1: expected 9 columns: .*; found 8"):
@@ -193,7 +197,9 @@ def test_units_of_stamps_are_recognised_named_or_taken_from_the_header(file, uni
     relative_ns = stamps_ns - stamps_ns[0]
 
     def in_unit(values_ns):
-        return [f"{each // ns}" if ns < 10**9 else f"{each / ns:.1f}" for each in values_ns]
+        return [
+            f"{value_ns // ns}" if ns < 10**9 else f"{value_ns / ns:.1f}" for value_ns in values_ns
+        ]
 
     absolute = file(rows(in_unit(stamps_ns.tolist()), separator=" "))
     assert_is_the_trajectory(hec.read_trajectory(absolute), stamps_ns)
@@ -203,9 +209,9 @@ def test_units_of_stamps_are_recognised_named_or_taken_from_the_header(file, uni
     for name in (f"time [{unit}]", f"t_{unit}", f"timestamp ({unit})"):
         named = file([f"{name},{XYZW[2:]}", *rows(relative)])
         assert_is_the_trajectory(hec.read_trajectory(named, "csv"), relative_ns)
-    said = r"unclear; read as \w+, the poses are .* s apart; set `stamp_unit`"
+    message = r"unclear; read as \w+, the poses are .* s apart; set `stamp_unit`"
     if unit != "s":
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=message):
             hec.read_trajectory(path)
 
 
@@ -213,11 +219,11 @@ def test_stamps_out_of_order_are_refused_or_repaired_with_a_warning(file):
     order = [*range(10), 9, 12, 11, 10, *range(13, 30), 3]
     lines = rows(TRAJECTORY.stamps_ns)
     path = file([XYZW, *(lines[index] for index in order)])
-    said = r"line 12: timestamps must increase, .*; 4 such lines; sort .* `repair`"
-    with pytest.raises(InputError, match=said):
+    message = r"line 12: timestamps must increase, .*; 4 such lines; sort .* `repair`"
+    with pytest.raises(InputError, match=message):
         hec.read_trajectory(path, "csv")
-    said = "decrease at 3 of 32 poses; the poses were sorted; dropped 2 with a repeated stamp"
-    with pytest.warns(UserWarning, match=said):
+    message = "decrease at 3 of 32 poses; the poses were sorted; dropped 2 with a repeated stamp"
+    with pytest.warns(UserWarning, match=message):
         assert_is_the_trajectory(hec.read_trajectory(path, "csv", repair=True))
 
 

@@ -41,7 +41,7 @@ def read(path, **options):
 
 
 @pytest.mark.parametrize(
-    ("truth", "said"),
+    ("truth", "sentence"),
     [
         (driven(), "the motion then has a steady direction"),
         *(
@@ -53,23 +53,25 @@ def read(path, **options):
         ),
     ],
 )
-def test_motion_or_start_tell_the_order(tmp_path, truth, said):
+def test_motion_or_start_tell_the_order(tmp_path, truth, sentence):
     for name, separator in (("poses.txt", " "), ("poses.csv", ",")):
         for order in (SCALAR_FIRST, SCALAR_LAST):
             trajectory, guesses = read(write_unnamed(tmp_path / name, truth, order, separator))
             np.testing.assert_allclose(trajectory.poses, truth.poses, atol=1e-12)
             guesses = [text for text in guesses if "is read as format" not in text]
             assert len(guesses) == (order == SCALAR_FIRST)
-            assert all("read with the scalar first" in text and said in text for text in guesses)
+            assert all(
+                "read with the scalar first" in text and sentence in text for text in guesses
+            )
 
 
 def test_an_order_that_nothing_tells_is_said(tmp_path):
     truth = as_trajectory(se3.exp(np.array([1.0, 2.0, 3.0, 1.0, 0.5, -1.0])) @ wandering_poses(200))
-    said = "does not name its columns or the order of the quaternion; read with the scalar"
+    sentence = "does not name its columns or the order of the quaternion; read with the scalar"
     for name, separator, is_said in (("a.csv", ",", 1), ("a.txt", " ", 0)):
         trajectory, guesses = read(write_unnamed(tmp_path / name, truth, SCALAR_LAST, separator))
         np.testing.assert_allclose(trajectory.poses, truth.poses, atol=1e-12)
-        assert sum(said in text for text in guesses) == is_said
+        assert sum(sentence in text for text in guesses) == is_said
 
 
 def test_only_auto_guesses(tmp_path):
@@ -111,8 +113,10 @@ def test_roll_pitch_and_yaw_in_degrees_or_radians(tmp_path, header, unit, is_sai
     expected = se3.from_rotation_translation(se3.rotation_from_rpy(rpy.T), positions.T)
     np.testing.assert_allclose(trajectory.poses, expected, atol=1e-12)
     word = "deg" if unit > 1 else "rad"
-    said = [text for text in guesses if f"roll, pitch, yaw read in {word}, the largest" in text]
-    assert (len(said), len(guesses)) == (is_said, 1 + is_said)
+    sentences = [
+        text for text in guesses if f"roll, pitch, yaw read in {word}, the largest" in text
+    ]
+    assert (len(sentences), len(guesses)) == (is_said, 1 + is_said)
 
 
 def test_small_angles_in_degrees_are_read_by_the_name_of_their_unit(tmp_path):
@@ -247,8 +251,8 @@ def test_the_example_of_the_epsg_for_metres_east_north_and_up_of_a_place():
     lat, lon = np.radians([53 + 48 / 60 + 33.820 / 3600, 2 + 7 / 60 + 46.380 / 3600])
     origin = LocalOrigin()
     origin.geodetic = *np.radians([55.0, 5.0]), 200.0
-    found = origin.local(np.array([lat]), np.array([lon]), np.array([73.0]))
-    np.testing.assert_allclose(found, [[-189013.869, -128642.040, -4220.171]], atol=1e-3)
+    local = origin.local(np.array([lat]), np.array([lon]), np.array([73.0]))
+    np.testing.assert_allclose(local, [[-189013.869, -128642.040, -4220.171]], atol=1e-3)
 
 
 def test_published_files_need_no_options():
@@ -257,10 +261,10 @@ def test_published_files_need_no_options():
     """
     folder = data_folder() / "zxl19"
     for path in sorted(folder.glob("bag*/[ILV]*_FCPE.mat")):
-        found = read_trajectory_file(path, AUTO, repair=True).trajectory
+        trajectory = read_trajectory_file(path, AUTO, repair=True).trajectory
         columns = "t,x,y,z,qw,qx,qy,qz"
         named = read_trajectory_file(path, "csv", columns=columns, repair=True).trajectory
-        np.testing.assert_array_equal(found.poses, named.poses)
+        np.testing.assert_array_equal(trajectory.poses, named.poses)
     ins, _ = read(folder / "raw_bag1" / "bag1-novatel_data-inspvax.csv")
     theirs = read_trajectory_file(folder / "bag1" / "INS_FCPE.mat", AUTO).trajectory
     # Their sensor has x to the right and y forward; their roll and pitch are exchanged.
@@ -270,6 +274,7 @@ def test_published_files_need_no_options():
     assert np.degrees(np.abs(turned - turned[0])).max() < 0.06
     # A UTM grid is some 0.9996 of the ground's scale.
     lengths = [
-        np.linalg.norm(np.diff(one.poses[:, :2, 3], axis=0), axis=1) for one in (ins, theirs)
+        np.linalg.norm(np.diff(trajectory.poses[:, :2, 3], axis=0), axis=1)
+        for trajectory in (ins, theirs)
     ]
     np.testing.assert_allclose(lengths[0].sum(), lengths[1].sum(), rtol=6e-4)

@@ -30,9 +30,9 @@ def rows(*names):
     return np.column_stack([columns[name] for name in names])
 
 
-def assert_same(found, tolerance_ns=STEP_NS):
-    assert np.abs(found.stamps_ns - TRAJECTORY.stamps_ns).max() <= tolerance_ns
-    np.testing.assert_allclose(found.poses, TRAJECTORY.poses, atol=1e-12)
+def assert_same(trajectory, tolerance_ns=STEP_NS):
+    assert np.abs(trajectory.stamps_ns - TRAJECTORY.stamps_ns).max() <= tolerance_ns
+    np.testing.assert_allclose(trajectory.poses, TRAJECTORY.poses, atol=1e-12)
 
 
 class TestReading:
@@ -115,8 +115,8 @@ class TestTables:
         stamp_ns = hec.read_trajectory(POSES[:1], times=[1_700_000_000.123456]).stamps_ns[0]
         assert abs(int(stamp_ns) - exact) <= Fraction(1, 2)
         for factor in (1, 10**3, 10**6, 10**9):
-            found = hec.read_trajectory(POSES[:1], times=[1_700_000_000 * factor])
-            assert found.stamps_ns == [1_700_000_000 * 10**9]
+            trajectory = hec.read_trajectory(POSES[:1], times=[1_700_000_000 * factor])
+            assert trajectory.stamps_ns == [1_700_000_000 * 10**9]
         assert hec.read_trajectory(POSES[:1], times=[5], stamp_unit="ms").stamps_ns == [5_000_000]
 
 
@@ -125,15 +125,15 @@ class TestShowing:
         result = hec.calibrate(as_trajectory(POSES), as_trajectory(child_of(POSES)))
         assert len(repr(result)) < 600
         assert len(repr(TRAJECTORY)) < 100
-        for each in (result, hec.Calibration.from_dict(result.to_dict())):
-            figure = hec.plot(each)
+        for source in (result, hec.Calibration.from_dict(result.to_dict())):
+            figure = hec.plot(source)
             seen = [(panel.get_xlabel(), panel.get_ylabel()) for panel in figure.axes]
             assert seen == [("x (m)", "y (m)"), ("x (m)", "z (m)"), ("y (m)", "z (m)")]
             (ellipse,) = figure.axes[0].patches
             np.testing.assert_allclose(ellipse.get_center(), result.translation[:2], atol=1e-9)
             assert figure._repr_png_().startswith(b"\x89PNG")
             panels = figure.subplots(1, 3)
-            assert each.plot(ax=panels) is figure
+            assert source.plot(ax=panels) is figure
             assert panels[0].patches
         hidden = tuple(
             dataclasses.replace(dof, sigma=np.inf) if dof.name == "z" else dof

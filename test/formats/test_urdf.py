@@ -36,9 +36,9 @@ def urdf(tmp_path):
 
 
 def test_frames_through_the_base(urdf):
-    found = read_urdf(urdf).pose("lidar", "camera")
-    np.testing.assert_allclose(found[:3, 3], [-0.5, 0, -1])
-    np.testing.assert_allclose(se3.rotation_to_rpy(found[:3, :3]), [0, 0.1, 0], atol=1e-12)
+    T_lidar_camera = read_urdf(urdf).pose("lidar", "camera")
+    np.testing.assert_allclose(T_lidar_camera[:3, 3], [-0.5, 0, -1])
+    np.testing.assert_allclose(se3.rotation_to_rpy(T_lidar_camera[:3, :3]), [0, 0.1, 0], atol=1e-12)
 
 
 def test_a_chain_of_thousands_of_joints_takes_no_time(tmp_path):
@@ -99,8 +99,8 @@ class TestBag:
         bag = self.bag(
             tmp_path, ("base", "lidar", T), ("base", "camera", T), ("base", "camera", T @ T)
         )
-        found = open_installed(str(bag))("lidar", "camera")
-        np.testing.assert_allclose(found.T_parent_child, T, atol=1e-12)
+        installed = open_installed(str(bag))("lidar", "camera")
+        np.testing.assert_allclose(installed.T_parent_child, T, atol=1e-12)
         with pytest.raises(InputError, match="no frame 'radar' in the bag's transforms"):
             open_installed(str(bag))("lidar", "radar")
 
