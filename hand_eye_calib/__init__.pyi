@@ -17,6 +17,7 @@ from hand_eye_calib.extras.rig.rig import calibrate_rig as calibrate_rig
 from hand_eye_calib.extras.simulation.drive import simulate as simulate
 from hand_eye_calib.extras.stops.calibrate import calibrate_arm as calibrate_arm
 from hand_eye_calib.extras.stops.calibrate import calibrate_stops as calibrate_stops
+from hand_eye_calib.extras.stops.robot_angles import robot_poses as robot_poses
 from hand_eye_calib.extras.stops.samples import read_arm_samples as read_arm_samples
 from hand_eye_calib.formats.results import load as load
 from hand_eye_calib.formats.results import save as save

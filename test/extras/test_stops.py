@@ -9,7 +9,7 @@ from sigmas import assert_nees, nees
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import CalibratorConfig
-from hand_eye_calib.core.base.errors import InputError, NotEnoughDataError
+from hand_eye_calib.core.base.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.core.checks.findings import Severity
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.stops.calibrate import calibrate_arm, calibrate_stops
@@ -178,6 +178,63 @@ def test_files_of_other_tools(written, both_poses, tmp_path):
     np.testing.assert_allclose(read.tracking, both_poses[1], atol=1e-12)
     frames = {"hand": "tool0", "camera": "camera"} if written is easy_handeye2 else {}
     assert read.frames == frames
+
+
+# ---- angles of robots
+
+# Half of the square root of 2.
+HALF_ROOT = 0.5**0.5
+
+
+def about(axis, angle_deg):
+    """Return the rotation (3, 3) about an axis."""
+    return se3.rotation_exp(np.radians(angle_deg) * np.eye(3)["xyz".index(axis)])
+
+
+@pytest.mark.parametrize(
+    ("robot", "angles", "expected"),
+    [
+        ("abb", [HALF_ROOT, 0, 0, HALF_ROOT], about("z", 90)),
+        ("fanuc", [10, 20, 30], about("z", 30) @ about("y", 20) @ about("x", 10)),
+        ("kawasaki", [10, 20, 30], about("z", 10) @ about("y", 20) @ about("z", 30)),
+        ("kuka", [10, 20, 30], about("z", 10) @ about("y", 20) @ about("x", 30)),
+        ("ur", [0, np.pi / 2, 0], about("y", 90)),
+        ("yaskawa", [10, 20, 30], about("z", 30) @ about("y", 20) @ about("x", 10)),
+    ],
+)
+def test_angles_of_robots(robot, angles, expected):
+    poses = hec.robot_poses([[1.0, 2.0, 3.0, *angles]], robot)
+    np.testing.assert_allclose(poses[0, :3, :3], expected, atol=1e-12)
+    np.testing.assert_allclose(poses[0, :3, 3], [1.0, 2.0, 3.0])
+
+
+def test_an_unknown_robot_or_a_wrong_number_of_values_is_refused():
+    with pytest.raises(ConfigError, match="must be one of abb, fanuc"):
+        hec.robot_poses([[0.0] * 6], "r2d2")
+    with pytest.raises(InputError, match="a pose of abb has 7 numbers; found 6"):
+        hec.robot_poses([[0.0] * 6], "abb")
+
+
+def test_the_file_of_a_hand_has_the_angles_of_its_robot(both_poses, tmp_path, capsys):
+    Ts_base_hand = both_poses[0]
+    T_hand_camera = se3.exp(np.array([0.05, 0.02, 0.1, 0.3, -0.2, 1.0]))
+    T_base_target = se3.exp(np.array([0.5, 0.1, 0.0, 0.1, 0.2, 0.3]))
+    abc_deg = np.degrees(se3.rotation_to_rpy(Ts_base_hand[:, :3, :3]))[:, ::-1]
+    hand = tmp_path / "hand.csv"
+    rows = np.c_[Ts_base_hand[:, :3, 3], abc_deg]
+    np.savetxt(hand, rows, delimiter=",", header="X,Y,Z,A,B,C", comments="")
+    camera = tmp_path / "camera.npy"
+    np.save(camera, se3.inverse(T_base_target) @ Ts_base_hand @ T_hand_camera)
+    command = ["calibrate", str(hand), str(camera), "--order", "none"]
+    assert main([*command, "--parent-angles", "kuka", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(result["T_parent_child"]["matrix"], T_hand_camera, atol=1e-6)
+
+
+def test_angles_of_a_robot_are_refused_for_samples(tmp_path, capsys):
+    command = ["calibrate", str(tmp_path / "samples.yaml"), "--parent-angles", "kuka"]
+    assert main(command) == 2
+    assert "--parent-angles" in capsys.readouterr().err
 
 
 # ---- a file for each pose

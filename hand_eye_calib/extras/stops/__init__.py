@@ -23,6 +23,7 @@ def register() -> None:
     PUBLIC_NAMES["calibrate_arm"] = "hand_eye_calib.extras.stops.calibrate"
     PUBLIC_NAMES["calibrate_stops"] = "hand_eye_calib.extras.stops.calibrate"
     PUBLIC_NAMES["read_arm_samples"] = "hand_eye_calib.extras.stops.samples"
+    PUBLIC_NAMES["robot_poses"] = "hand_eye_calib.extras.stops.robot_angles"
     ROUTES["stops"] = Route(_add_arguments, _are_stops, _calibrate)
 
 
@@ -38,6 +39,11 @@ def _add_arguments(parser: Any) -> None:
         "hand. Default: as the samples fit"
     )
     parser.add_argument("--setup", choices=("hand", "beside"), help=setup)
+    angles = (
+        "convention of the angles in the file of the hand, the first PATH, with a pose on each "
+        "line: abb, fanuc, kawasaki, kuka, ur or yaskawa"
+    )
+    parser.add_argument("--parent-angles", metavar="ROBOT", help=angles)
     add = parser.add_argument_group("images of a target").add_argument
     target = (
         "what the images of --child-topic show, or those of a folder, the second PATH, one for "
@@ -59,6 +65,12 @@ def _are_stops(arguments: Any) -> bool:
     if arguments.setup and not (are_samples or are_images):
         raise ConfigError(
             "--setup says where the camera of an arm is; it needs the samples of an arm or --target"
+        )
+    are_two_files = arguments.order == "none" and not are_samples
+    if arguments.parent_angles and not (are_two_files or are_images):
+        raise ConfigError(
+            "--parent-angles is the convention of a robot; it needs two files and --order none, or "
+            "--target"
         )
     return are_samples or are_images or arguments.order == "none"
 

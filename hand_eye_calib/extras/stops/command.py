@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.base.option import Options
@@ -17,6 +19,7 @@ from hand_eye_calib.core.base.registry import TARGET_IMAGES
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.extras.stops.calibrate import calibrate_arm, calibrate_stops
+from hand_eye_calib.extras.stops.robot_angles import read_robot_poses
 from hand_eye_calib.extras.stops.samples import read_arm_samples
 from hand_eye_calib.offline.cli.options import (
     FILE_OPTIONS,
@@ -52,7 +55,11 @@ def _from_two_files(
     arguments: Namespace, config: CalibratorConfig, options: Options
 ) -> tuple[Calibration, Document]:
     """Calibrate two sensors from the rows of two files."""
-    parent, child = _read(arguments, arguments.paths, options)
+    if arguments.parent_angles:
+        parent = _robot(arguments)
+        (child,) = _read(arguments, arguments.paths[1:], options)
+    else:
+        parent, child = _read(arguments, arguments.paths, options)
     _require_equal(arguments.paths, len(parent), len(child))
     config = _measuring(config, {"parent": parent, "child": child})
     result = calibrate_stops(parent.poses, child.poses, config)
@@ -68,7 +75,10 @@ def _from_images(
     if not folder.is_dir():
         raise ConfigError("--target takes the poses of a hand and images: FILE FOLDER")
     images = target_images.images_in(folder)
-    (hand,) = _read(arguments, [hand_path], options)
+    if arguments.parent_angles:
+        hand = _robot(arguments)
+    else:
+        (hand,) = _read(arguments, [hand_path], options)
     _require_equal(arguments.paths, len(hand), len(images))
     config = _measuring(config, {"parent": hand})
     target = target_images.Target.parse(arguments.target)
@@ -90,6 +100,12 @@ def _read(
     files = read_files(arguments, paths, options)
     note(*files.repairs, *files.warnings)
     return files.trajectories
+
+
+def _robot(arguments: Namespace) -> Trajectory:
+    """Read the poses of the hand in the convention of its robot."""
+    poses = read_robot_poses(Path(arguments.paths[0]), arguments.parent_angles)
+    return Trajectory(np.arange(len(poses)), poses)
 
 
 def _require_equal(paths: Sequence[str | Path], n_parent: int, n_child: int) -> None:
