@@ -374,8 +374,7 @@ def _with_outliers(workspace: Workspace, fit: Fit, rounds: int, with_spikes: boo
     tuning = problem.tuning
     for _ in range(rounds):
         if problem.is_noisy(fit):
-            posterior = workspace.posterior(fit)
-            fit = fit.corrected(problem.streams, posterior.states_after(posterior.normal.step))
+            fit = fit.corrected(problem.streams, _states_of(workspace, fit))
         of_walk, of_white = innovations(workspace.posterior(fit), fit.outliers.spikes)
         detected = judged(fit.outliers, of_walk, of_white, tuning, with_spikes)
         change = detected.differs_by(fit.outliers)
@@ -389,6 +388,16 @@ def _with_outliers(workspace: Workspace, fit: Fit, rounds: int, with_spikes: boo
         is_heavy = np.mean(normal**2) > tuning.heavy_kurtosis * np.mean(normal) ** 2
         fit = replace(fit, has_heavy_tails=bool(is_heavy))
     return fit
+
+
+def _states_of(workspace: Workspace, fit: Fit) -> FloatArray:
+    """Return the expected states (N, d) after the next step of a fit.
+
+    No caller needs a reference to the posterior then: two posteriors of a long recording would fill
+    the memory.
+    """
+    posterior = workspace.posterior(fit)
+    return posterior.states_after(posterior.normal.step)
 
 
 def tails(workspace: Workspace, fit: Fit) -> Fit:
@@ -527,15 +536,21 @@ def polish(workspace: Workspace, fit: Fit) -> Fit:
     """Follow X until it settles, with derivatives at poses without their errors."""
     problem = workspace.problem
     for _ in range(problem.tuning.max_rounds - 1):
-        posterior = workspace.posterior(fit)
         if is_settled(workspace, fit):
             break
-        if fit.has_heavy_tails and "tails" not in problem.without:
-            fit = replace(fit, weights=tail_weights(posterior, problem.tuning))
-        step = posterior.normal.step
-        moved = fit.moved(step, problem.columns)
-        fit = moved.corrected(problem.streams, posterior.states_after(step))
+        fit = _polished(workspace, fit)
     return fit
+
+
+def _polished(workspace: Workspace, fit: Fit) -> Fit:
+    """Take one step of all parameters, and take the expected errors out of the poses."""
+    problem = workspace.problem
+    posterior = workspace.posterior(fit)
+    if fit.has_heavy_tails and "tails" not in problem.without:
+        fit = replace(fit, weights=tail_weights(posterior, problem.tuning))
+    step = posterior.normal.step
+    moved = fit.moved(step, problem.columns)
+    return moved.corrected(problem.streams, posterior.states_after(step))
 
 
 def is_settled(workspace: Workspace, fit: Fit) -> bool:

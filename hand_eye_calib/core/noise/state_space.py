@@ -237,9 +237,7 @@ class Posterior:
         self.evidence = np.where(space.cut, 0.0, 1.0 / space.walk_factors)
         self._walk_precisions = self.evidence[:, None, None] * self.walk_precision
         self.groups = self._groups(n_white + len(space.walk_bases))
-        diagonal, below = self._precision_blocks(0, len(space.cut))
-        np.einsum("nii->ni", diagonal)[:] *= 1.0 + _RAISED
-        self.factor = Factor(diagonal, below)
+        self.factor = self._factorised()
         self.log_determinant = self._log_determinant(white_log_determinants[~is_free])
         weighted, self.whitened = self.forward_half(space.columns)
         products = multiplied(space.columns, weighted) - multiplied(self.whitened, self.whitened)
@@ -259,6 +257,12 @@ class Posterior:
             state += size
             level += 2
         return groups
+
+    def _factorised(self) -> Factor:
+        """Return the factor of P. The blocks of P, as large as the factor, are not stored."""
+        diagonal, below = self._precision_blocks(0, len(self.space.cut))
+        np.einsum("nii->ni", diagonal)[:] *= 1.0 + _RAISED
+        return Factor(diagonal, below)
 
     def _log_determinant(self, white_log_determinants: FloatArray) -> float:
         """Return log|V| from the log determinants of P, Pi and W."""
