@@ -1,5 +1,6 @@
-"""The result of a calibration: the extrinsic, its covariance, and what to know before using it."""
+"""The result of a calibration: extrinsic, covariance and verdict."""
 
+import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,8 +27,12 @@ __all__ = ["Calibration", "DofObservability", "DofVerdict", "SolveStatus", "Verd
 
 
 def data_frame(rows: Sequence[Mapping[str, Any]], index: str) -> "pd.DataFrame":
-    """A DataFrame of rows with equal names, one of which is the index; a MissingDependencyError
-    without pandas.
+    """Return a DataFrame of rows with equal names, one of which is the index.
+
+    Raises
+    ------
+    MissingDependencyError
+        Without pandas.
     """
     pandas = required("pandas", "a table", "notebook")
     return pandas.DataFrame(rows).set_index(index)
@@ -35,11 +40,10 @@ def data_frame(rows: Sequence[Mapping[str, Any]], index: str) -> "pd.DataFrame":
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Calibration(Judged):
-    """An extrinsic with its quality: the values of
-    :class:`~hand_eye_calib.core.results.result.Result`, and what follows from them.
+    """An extrinsic with its quality.
 
-    :attr:`verdict` says whether it may be used, and :attr:`reasons` why not. Two are equal if their
-    documents are.
+    It has the values of :class:`~hand_eye_calib.core.results.result.Result`. :attr:`verdict` and
+    :attr:`reasons` follow from these values. Two results are equal if their documents are equal.
 
     Examples
     --------
@@ -70,8 +74,10 @@ class Calibration(Judged):
         )
 
     def to_frame(self) -> "pd.DataFrame":
-        """DataFrame with a row for each of x, y, z, roll, pitch, yaw: the printed number, its
-        standard deviation with the allowance (m, rad), and the verdict.
+        """Return a DataFrame with a row for each of x, y, z, roll, pitch, yaw.
+
+        A row has the printed number, its standard deviation with the allowance (m, rad), and the
+        verdict on the axis.
 
         Raises
         ------
@@ -82,24 +88,31 @@ class Calibration(Judged):
         rows = zip(self.observability, values, self.sigmas_printed, strict=True)
         table = []
         for dof, value, sigma in rows:
-            row = {"axis": dof.name, "value": value, "sigma": sigma}
-            table.append(row | {"unit": AXIS_UNITS[dof.name], "verdict": dof.verdict.value})
+            row = {
+                "axis": dof.name,
+                "value": value,
+                "sigma": sigma,
+                "unit": AXIS_UNITS[dof.name],
+                "verdict": dof.verdict.value,
+            }
+            table.append(row)
         return data_frame(table, "axis")
 
     def inverse(self) -> "Calibration":
-        """The result with the roles of both sensors exchanged: the pose of the parent sensor in the
-        child sensor's frame. What was compared with it is left out.
+        """Return the pose of the parent sensor in the child sensor's frame, as a result.
+
+        Comparisons with other answers and with what is installed are left out.
         """
         T = self.T_parent_child
         covariance = inverse_covariance(T, self.covariance_measured)
         sigmas = sigmas_in_parent(se3.rotation_of(self.T_child_parent), covariance)
         if self.unobservable():
             sigmas[sigmas > document.UNKNOWN_M] = np.inf
-        known = (DofVerdict.UNOBSERVABLE, DofVerdict.OBSERVED)
-        observability = tuple(
-            DofObservability(axis, known[bool(np.isfinite(sigma))], sigma)
-            for axis, sigma in zip(AXES, sigmas.tolist(), strict=True)
-        )
+        observability = []
+        for axis, sigma in zip(AXES, sigmas.tolist(), strict=True):
+            is_known = math.isfinite(sigma)
+            verdict = DofVerdict.OBSERVED if is_known else DofVerdict.UNOBSERVABLE
+            observability.append(DofObservability(axis, verdict, sigma))
         return replace(
             self,
             T_parent_child=self.T_child_parent,
@@ -107,7 +120,7 @@ class Calibration(Judged):
             T_base_parent=None,
             covariance_measured=covariance,
             covariance_allowance=inverse_covariance(T, self.covariance_allowance),
-            observability_measured=observability,
+            observability_measured=tuple(observability),
             parent_frame=self.child_frame,
             child_frame=self.parent_frame,
             parts={name: part(name).invert(value) for name, value in self.parts.items()},
@@ -141,16 +154,18 @@ class Calibration(Judged):
         return RESULT_METHODS["report"](self, path)
 
     def static_transform_command(self) -> str:
-        """Shell command that publishes the child's pose as a static transform, in the frame that it
-        is mounted on; empty if the verdict is DO NOT USE. For an axis that the motion does not
-        determine it has a word that static_transform_publisher refuses.
+        """Return the shell command that publishes the child's pose as a static transform.
+
+        The pose is in the frame that the child is mounted on. An unknown axis has a word that
+        static_transform_publisher refuses. The command is empty if the verdict is DO NOT USE.
         """
-        told = document.transform_arguments(self, 9)
-        command = f"ros2 run tf2_ros static_transform_publisher {shlex.join(told)}"
-        return command if told else ""
+        arguments = document.transform_arguments(self, 9)
+        if not arguments:
+            return ""
+        return f"ros2 run tf2_ros static_transform_publisher {shlex.join(arguments)}"
 
     def export(self, format: str) -> str:
-        """The extrinsic as a file of another program.
+        """Return the extrinsic as a file of another program.
 
         Parameters
         ----------
@@ -162,16 +177,16 @@ class Calibration(Judged):
         Returns
         -------
         str
-            The text of the file. A comment says by the frames' names what the numbers map. Where
-            the format has the sensors the other way round, the transform is inverted, and so is
-            the sign of the time offset.
+            The text of the file. A comment names source and target frame of the numbers. If the
+            format has the sensors in the other order, the transform and the sign of the time
+            offset are inverted.
 
         Raises
         ------
         ConfigError
             For an unknown format.
         InputError
-            Under DO NOT USE, and if an axis is not known that the format has.
+            Under DO NOT USE, and if an axis of the format is unknown.
 
         Examples
         --------
@@ -180,20 +195,21 @@ class Calibration(Judged):
         return RESULT_METHODS["export"](self, format)
 
     def to_dict(self) -> Document:
-        """Everything but the residuals as plain numbers, strings, lists and mappings, ready for
-        JSON or YAML. None for what is infinite, and for each printed number of an axis that is
-        not known; only a ``matrix`` has a number there, so that it can be read back.
+        """Return the result without its residuals in plain values, for JSON or YAML.
+
+        Infinite numbers, and printed numbers of unknown axes, are None. Only a ``matrix`` has
+        numbers for unknown axes, so that it can be read back.
         """
         return document.document_of(self)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Build from the mapping that :meth:`to_dict` gave; other keys are ignored.
+        """Build from the mapping that :meth:`to_dict` returned; other keys are ignored.
 
         Raises
         ------
         InputError
-            If ``data`` is no calibration, is of another version or lacks something; the message
-            says what.
+            If ``data`` is no calibration, is of another version or lacks a value; the message
+            names the value.
         """
         return document.result_from(cls, data)

@@ -10,8 +10,9 @@ from hand_eye_calib.core.base.registry import RESULT_PARTS
 
 
 class ExtraTransform(NamedTuple):
-    """A transform of a part: maps coordinates of ``source`` into ``target``; ``covariance`` (6, 6)
-    is that of its error in the source's frame.
+    """A transform of a part, which maps coordinates of ``source`` into ``target``.
+
+    ``covariance`` (6, 6) is that of the error of the transform, in the source's frame.
     """
 
     T_target_source: FloatArray
@@ -85,15 +86,15 @@ class Part:
         return self._details(value, result) if self._details else []
 
     def headline(self, value: Any) -> str:
-        """Return what the first line of a usable result says of the part; empty for nothing."""
+        """Return a note on the part for the headline of a usable result; empty without a note."""
         return ""
 
 
 @cache
 def part(name: str) -> Part:
     """Return a part by its name."""
-    found: Part = RESULT_PARTS[name]()
-    return found
+    part_of_name: Part = RESULT_PARTS[name]()
+    return part_of_name
 
 
 def all_parts() -> Iterator[Part]:

@@ -1,8 +1,7 @@
-"""Parts of a calibration: how the solve ended, how well each axis is known, residuals, findings,
-noise, clock, other answers.
+"""Records of a calibration: status, observability, residuals, findings, noise, clock, cross-check.
 
-All are plain values under names, so that :mod:`hand_eye_calib.core.base.plain` reads and writes
-them.
+All records have plain values under names, which :mod:`hand_eye_calib.core.base.plain` reads and
+writes.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -28,10 +27,10 @@ AXES = (*TRANSLATIONS, *ROTATIONS)
 
 
 class SolveStatus(str, Enum):
-    """How a solve ended. Only an OK result may be used as it is.
+    """How a solve ended.
 
-    Of an UNOBSERVABLE one the other directions may be used. NOT_CONVERGED and CONTRADICTED (a prior
-    contradicts the motion) are failures.
+    A result that is OK may be used. The observable directions of an UNOBSERVABLE result may be
+    used. NOT_CONVERGED and CONTRADICTED (a prior contradicts the motion) are failures.
 
     Examples
     --------
@@ -46,10 +45,12 @@ class SolveStatus(str, Enum):
 
     @property
     def failure(self) -> str:
-        """Why nothing of a result may be used; empty unless the solve failed."""
+        """Reason why the solve failed; empty if it did not."""
         if self is SolveStatus.NOT_CONVERGED:
             return "the solver did not converge"
-        return "a prior contradicts the motion" if self is SolveStatus.CONTRADICTED else ""
+        if self is SolveStatus.CONTRADICTED:
+            return "a prior contradicts the motion"
+        return ""
 
 
 class DofVerdict(str, Enum):
@@ -63,8 +64,7 @@ class DofVerdict(str, Enum):
 
 @dataclass(frozen=True)
 class DofObservability:
-    """Observability of one degree of freedom of the child sensor's pose, along or about an axis of
-    the parent sensor's frame.
+    """Observability of the child sensor's pose along or about an axis of the parent sensor.
 
     Attributes
     ----------
@@ -72,8 +72,8 @@ class DofObservability:
         x, y, z (translation) or roll, pitch, yaw (rotation about x, y, z).
     verdict : DofVerdict
     sigma : float
-        One standard deviation, in m or rad; ``inf`` if unobservable. It contains the allowance for
-        constant errors in ``observability``, not in ``observability_measured``.
+        One standard deviation, m or rad; ``inf`` if unobservable. Rows of ``observability`` contain
+        the allowance for constant errors; rows of ``observability_measured`` do not.
     """
 
     name: str
@@ -82,7 +82,7 @@ class DofObservability:
 
 
 def by_hand(axis: str) -> str:
-    """What stands in files and commands for an axis that is not known; no parser takes it."""
+    """Return the text that files and commands have for an unknown axis; no parser takes it."""
     return f"MEASURE_{axis.upper()}_BY_HAND"
 
 
@@ -137,8 +137,8 @@ class Residuals(Columns):
 class Severity(str, Enum):
     """How much a finding matters.
 
-    With an error, a result from these streams as they are is unusable. With a warning it may be
-    used with care. A note is good to know.
+    An error makes results from these streams unusable. With a warning a result may be used with
+    care. A note forbids nothing.
     """
 
     NOTE = "note"
@@ -276,16 +276,25 @@ def has_error(findings: Iterable[Finding]) -> bool:
 
 
 def gravest_first(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """The findings by severity, errors first, otherwise in their order."""
+    """Return findings by severity, errors first; equal ones stay in their order."""
     order = list(Severity)
     return tuple(sorted(findings, key=lambda finding: -order.index(finding.severity)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class CorrelatedError:
-    """A time-correlated error: what it is fixed to (``kind``: body or world, or path), its part of
-    the poses or the path, its standard deviation per axis (m, rad or a share) and its correlation
-    time.
+    """A time-correlated error of the trajectories.
+
+    Attributes
+    ----------
+    kind : str
+        body, world or path: the frame in which the error is constant for a while.
+    part : str
+        Part of the poses or of the path that has the error.
+    sigma : float
+        Standard deviation per axis: m, rad, or a share of the path.
+    tau_s : float
+        Correlation time, s.
     """
 
     kind: str
@@ -296,10 +305,10 @@ class CorrelatedError:
 
 @dataclass(frozen=True, kw_only=True)
 class Noise:
-    """Noise of the trajectories as the adaptive estimator found it.
+    """Noise of the trajectories, estimated by the adaptive estimator.
 
-    Standard deviations are per axis, of both sensors together: of a single pose (``white``), and
-    of the drift from pose to pose.
+    Standard deviations are per axis, of both sensors together: ``white`` ones of a single pose,
+    ``drift`` ones of the drift from pose to pose.
     """
 
     in_words: tuple[str, ...]
@@ -314,7 +323,7 @@ class Noise:
 
 @dataclass(frozen=True, kw_only=True)
 class ClockRate:
-    """By how much the time offset changes with time, in parts per million.
+    """Rate at which the time offset changes, in parts per million.
 
     Attributes
     ----------
@@ -322,9 +331,9 @@ class ClockRate:
         Microseconds to add to the child's stamps for each second after ``at_ns``, and one standard
         deviation. Positive if the child's clock is slow.
     at_ns : int
-        Stamp of the child's clock at which the time offset holds.
+        Stamp of the child's clock at which the time offset is valid.
     is_used : bool
-        Whether the child's stamps were freed of it: it stands out of its standard deviation.
+        Whether the child's stamps were corrected: the rate is significant.
     """
 
     ppm: float
@@ -334,18 +343,17 @@ class ClockRate:
 
     @property
     def used(self) -> float:
-        """Seconds for each second that the child's stamps were freed of."""
+        """Correction of the child's stamps, seconds for each second."""
         return 1e-6 * self.ppm if self.is_used else 0.0
 
     def __str__(self) -> str:
-        return (
-            f"{abs(self.ppm):.1f} +/- {self.sigma_ppm:.2g} ppm {'slow' if self.ppm > 0 else 'fast'}"
-        )
+        direction = "slow" if self.ppm > 0 else "fast"
+        return f"{abs(self.ppm):.1f} +/- {self.sigma_ppm:.2g} ppm {direction}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class AxisScatter:
-    """Scatter of other answers about a result on one axis, m or rad; None where it is not known.
+    """Scatter of other answers about a result on one axis, m or rad; None if unknown.
 
     Attributes
     ----------

@@ -66,5 +66,7 @@ def _lines(comparison: "Comparison", result: "Calibration") -> Iterator[str]:
         yield title
         yield f"  {'':<6}{'difference':>12}{'+/-':>10}{'seen from':>12}"
         for axis, row in difference.axes.items():
-            sizes = [amount(axis, size) for size in (row.difference, row.sigma, row.visible)]
-            yield f"  {axis:<6}{sizes[0]:>12}{sizes[1]:>10}{sizes[2]:>12}  {row.verdict}"
+            size = amount(axis, row.difference)
+            sigma = amount(axis, row.sigma)
+            visible = amount(axis, row.visible)
+            yield f"  {axis:<6}{size:>12}{sigma:>10}{visible:>12}  {row.verdict}"

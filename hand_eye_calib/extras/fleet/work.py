@@ -170,15 +170,8 @@ class Outcome(NamedTuple):
         bags = [remote.public(bag) for bag in task.bags]
         document = as_given(result.to_dict()) if result else None
         whole = row | {"bags": bags, "calibration": document, "inputs": as_given(inputs), **more}
-        row |= dict.fromkeys(("start", "duration_s", "verdict", "headline"))
-        row["bags"] = " ".join(bags)
-        streams = [inputs[stream] for stream in STREAMS if stream in inputs]
-        starts = [stream["first_stamp_ns"] for stream in streams]
-        if starts and None not in starts:
-            date = datetime.fromtimestamp(max(starts) // 1_000_000_000, UTC)
-            row["start"] = date.isoformat(timespec="seconds")
-            end_ns = min(stream["last_stamp_ns"] for stream in streams)
-            row["duration_s"] = (end_ns - max(starts)) * 1e-9
+        row |= _times_of([inputs[stream] for stream in STREAMS if stream in inputs])
+        row |= {"verdict": None, "headline": None, "bags": " ".join(bags)}
         if document and result:
             row |= row_of_result(document) | {"warnings": "; ".join(document["warnings"])}
             row["findings"] = " ".join(finding.code for finding in result.findings)
@@ -199,6 +192,20 @@ class Outcome(NamedTuple):
     def verdict(self) -> str:
         """Verdict of the result, or "failed"."""
         return "failed" if self.row["error"] else str(self.row["verdict"])
+
+
+def _times_of(streams: Sequence[Mapping[str, Any]]) -> Row:
+    """Return start and duration of the time that all streams share; None if unknown."""
+    starts_ns = [stream["first_stamp_ns"] for stream in streams]
+    if not starts_ns or None in starts_ns:
+        return {"start": None, "duration_s": None}
+    start_ns = max(starts_ns)
+    end_ns = min(stream["last_stamp_ns"] for stream in streams)
+    date = datetime.fromtimestamp(start_ns // 1_000_000_000, UTC)
+    return {
+        "start": date.isoformat(timespec="seconds"),
+        "duration_s": (end_ns - start_ns) * 1e-9,
+    }
 
 
 # Function that does a task.
