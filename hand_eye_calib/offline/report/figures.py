@@ -67,6 +67,8 @@ class Look(NamedTuple):
         Smallest distance that counts for the length of axes, m.
     distance_m : float
         Distance of the object whose error is stated, m.
+    near_m : float
+        The same for the camera of an arm, m.
     bar_decades : float
         Powers of ten that a bar covers.
     bar_above : float
@@ -82,6 +84,7 @@ class Look(NamedTuple):
     axis: float = 0.22
     least_m: float = 0.05
     distance_m: float = 10.0
+    near_m: float = 0.5
     bar_decades: float = 4.0
     bar_above: float = 1.0
     points: int = 1000

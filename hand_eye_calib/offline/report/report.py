@@ -171,15 +171,20 @@ def _at_distance(calibration: Calibration) -> str:
     """State the error of an object at a distance; empty if a standard deviation is unknown."""
     if not np.isfinite(calibration.sigmas).all():
         return ""
+    # Stops are those of an arm: its objects are near, and no odometry has errors.
+    are_stops = calibration.reference == "stops"
+    distance_m = LOOK.near_m if are_stops else LOOK.distance_m
+    errors = "one standard deviation"
+    if not are_stops:
+        errors += ", constant odometry errors included"
     variances = []
-    for point in LOOK.distance_m * np.eye(3):
+    for point in distance_m * np.eye(3):
         J = np.hstack([np.eye(3), -se3.skew(point)])
         variances.append(np.linalg.eigvalsh(J @ calibration.covariance @ J.T)[-1])
     child = printable(calibration.child_frame)
     return (
-        f"An object {LOOK.distance_m:.0f} m from {child} is misplaced by up to "
-        f"{text.length(float(np.sqrt(max(variances))))} (one standard deviation, constant odometry "
-        "errors included)."
+        f"An object {distance_m:g} m from {child} is misplaced by up to "
+        f"{text.length(float(np.sqrt(max(variances))))} ({errors})."
     )
 
 
