@@ -137,7 +137,7 @@ class TestMethods:
                 options = dict(method=name, reference="B1", backend=backend)
                 hec.calibrate(parent, child, checks=False, **options)
             else:
-                with pytest.raises(ConfigError, match=f"method {name} has no {backend} backend"):
+                with pytest.raises(ConfigError, match=f"method {name} has no backend {backend}"):
                     hec.calibrate(parent, child, method=name, reference="B1", backend=backend)
 
 
