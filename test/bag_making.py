@@ -31,7 +31,7 @@ def bag_path(folder, storage, name="bag"):
 
 def storage_file(path):
     """The file that holds the messages of a bag."""
-    files = (part for part in path.iterdir() if part.suffix in (".mcap", ".db3"))
+    files = (file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
     return path if path.is_file() else next(files)
 
 

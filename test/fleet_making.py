@@ -60,7 +60,7 @@ def recordings_of(seed, count, unknown_z=False):
 def outcome(name, vehicle, T, covariance, day=0):
     """What a batch keeps of a recording."""
     sigmas = np.sqrt(np.diag(covariance)).tolist()
-    found = calibration(
+    result = calibration(
         T_parent_child=T,
         covariance_measured=covariance,
         status=SolveStatus.OK,
@@ -70,4 +70,4 @@ def outcome(name, vehicle, T, covariance, day=0):
     )
     stamps = {"first_stamp_ns": day * DAY_NS + 1, "last_stamp_ns": day * DAY_NS + 10**10 + 1}
     task = Task(name=name, bags=(f"bags/{name}",), vehicle=vehicle)
-    return Outcome.of(task, None, found, {"parent": stamps, "child": stamps})
+    return Outcome.of(task, None, result, {"parent": stamps, "child": stamps})

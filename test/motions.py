@@ -74,7 +74,7 @@ def as_trajectory(poses, rate_hz=10.0, start_ns=1_700_000_000_000_000_000, **fra
 def noisy_pair(poses, seed, *noise, rate_hz=10.0, mount=T_PARENT_CHILD):
     """Both trajectories, each with white noise (m, rad) of its own."""
     both = enumerate((poses, child_of(poses, mount)), start=seed)
-    return [as_trajectory(disturbed(each, own, *noise), rate_hz) for own, each in both]
+    return [as_trajectory(disturbed(poses, own, *noise), rate_hz) for own, poses in both]
 
 
 def write_pair(folder, parent, child):
@@ -105,11 +105,11 @@ def geodetic(positions, origin):
     place = LocalOrigin()
     place.geodetic = *np.radians(origin[:2]), origin[2]
     per_radian_m = 6.37e6 * np.array([np.cos(place.geodetic[0]), 1.0, 0.0]) + [0, 0, 1]
-    found = np.tile(place.geodetic, (len(positions), 1))
+    points = np.tile(place.geodetic, (len(positions), 1))
     for _ in range(10):  # each leaves less than a hundredth of the error
-        missing = (positions - place.local(*found.T)) / per_radian_m
-        found += missing[:, [1, 0, 2]]
-    return *np.degrees(found[:, :2].T), found[:, 2]
+        missing = (positions - place.local(*points.T)) / per_radian_m
+        points += missing[:, [1, 0, 2]]
+    return *np.degrees(points[:, :2].T), points[:, 2]
 
 
 def read_trajectory_file(path, format="tum", **options):

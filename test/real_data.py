@@ -105,7 +105,7 @@ def eye_to_hand():
     if not path.exists():
         pytest.skip(f"{path} is absent")
     rows = np.array(json.loads(path.read_text(encoding="utf-8")), dtype=float)
-    return tuple(se3.inverse(rows[:, part].reshape(-1, 4, 4)) for part in range(2))
+    return tuple(se3.inverse(rows[:, stream].reshape(-1, 4, 4)) for stream in range(2))
 
 
 def thinned(stream, interval_s):
@@ -175,6 +175,6 @@ def all_recordings():
 
 def _of_rig(folder, rig, name, offset_s=0.0, scale=1.0, which="whole"):
     """A recording of :mod:`reproduction.recordings` with what is known about it."""
-    rigs = {found.name: found for found in rigs_of(data_folder(), folder)}
+    rigs = {rig.name: rig for rig in rigs_of(data_folder(), folder)}
     recording = rigs[rig].recordings[which]
     return Recording(name, recording.parent, recording.child, offset_s, scale)

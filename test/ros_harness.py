@@ -190,8 +190,8 @@ class NodeProcess:
         }
         log_file.touch()
         if not fresh:
-            given = arguments, log_file, environment, before
-            self.process = _Forked(target=_run_node, args=given)
+            arguments_of_node = arguments, log_file, environment, before
+            self.process = _Forked(target=_run_node, args=arguments_of_node)
             self.process.start()
             return
         with log_file.open("wb") as log:
@@ -277,14 +277,14 @@ class Peer:
 
     def wait_matched(self, *publishers):
         self.spin_until(
-            lambda: all(each.get_subscription_count() for each in publishers),
+            lambda: all(publisher.get_subscription_count() for publisher in publishers),
             "the node to subscribe",
         )
 
     def wait_left(self, *publishers):
         """Wait until a node that has ended is forgotten: what is published before that is lost."""
         self.spin_until(
-            lambda: not any(each.get_subscription_count() for each in publishers),
+            lambda: not any(publisher.get_subscription_count() for publisher in publishers),
             "the node to leave",
         )
 
@@ -306,7 +306,7 @@ class Peer:
         newest = {}
 
         def take(array):
-            newest.update({each.name: each for each in array.status})
+            newest.update({status.name: status for status in array.status})
 
         self.node.create_subscription(DiagnosticArray, "/diagnostics", take, 10)
         return newest

@@ -18,7 +18,7 @@ def assert_errors_over_sigmas(ratios, low, high):
     _assert_within(np.sqrt(np.mean(np.square(ratios))), low, high, "errors over sigmas")
 
 
-def _assert_within(found, low, high, quantity):
-    size = "large" if found < low else "small"
-    text = f"sigmas are too {size}: {quantity} {found:.2f}, expected {low:g} to {high:g}"
-    assert low < found < high, text
+def _assert_within(average, low, high, quantity):
+    size = "large" if average < low else "small"
+    text = f"sigmas are too {size}: {quantity} {average:.2f}, expected {low:g} to {high:g}"
+    assert low < average < high, text

@@ -133,8 +133,8 @@ def exercise(run, format, seed, folder):
     assert all(letter.isprintable() or letter == "\n" for letter in out + err)
     assert code not in (1, 2) or ": error: " in err or out
     assert max(map(len, err.splitlines()), default=0) <= LONGEST_LINE
-    there = {path.name: path.read_bytes() for path in folder.iterdir()}
-    assert there == files
+    contents = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert contents == files
     for path in folder.iterdir():
         path.unlink()
     return code

@@ -34,17 +34,17 @@ CONFINED = dict.fromkeys(ROS_LIBRARIES, ROS) | {
 
 def breaches(package_root):
     """One line per import that takes a confined library out of its place, or the public API."""
-    found = []
+    messages = []
     for path in sorted(package_root.rglob("*.py")):
         relative = path.relative_to(package_root).as_posix()
         for name in imports_of(path, package_root):
             top, *rest = name.split(".")
             homes = CONFINED.get(top)
             if homes and not relative.startswith(homes):
-                found.append(f"{relative}: {top} may be imported only in {', '.join(homes)}")
+                messages.append(f"{relative}: {top} may be imported only in {', '.join(homes)}")
             if top == PACKAGE and not (rest and (package_root / rest[0]).is_dir()):
-                found.append(f"{relative}: the package must not import its own public API")
-    return found
+                messages.append(f"{relative}: the package must not import its own public API")
+    return messages
 
 
 def test_libraries_stay_in_their_places_and_nothing_imports_the_public_api():
@@ -93,13 +93,13 @@ def modules_in_texts(path):
 
 
 def test_no_text_names_a_module_of_a_layer_above():
-    found = {
+    pairs = {
         (path.relative_to(SOURCE).parts[0], layer)
         for path in SOURCE.glob("*/**/*.py")
         for layer in modules_in_texts(path)
     }
-    assert ("online", "online") in found  # code of the solving process
-    assert [(own, layer) for own, layer in sorted(found) if layer not in BELOW[own]] == []
+    assert ("online", "online") in pairs  # code of the solving process
+    assert [(own, layer) for own, layer in sorted(pairs) if layer not in BELOW[own]] == []
 
 
 def file_imports(package_root):
@@ -148,14 +148,14 @@ def repeated_defaults(package_root):
         for field in dataclasses.fields(options):
             defaults |= {field.name: field.default, f"{field.name}_s": field.default}
     homes = {inspect.getsourcefile(options) for options in (CalibratorConfig, NoiseConfig)}
-    found = []
+    repeated = []
     for path in sorted(package_root.rglob("*.py")):
         if str(path) in homes:
             continue
         for name, default, line in _written_defaults(path):
             if default and defaults.get(name) == default:
-                found.append(f"{path.relative_to(package_root)}:{line}: {name} = {default!r}")
-    return found
+                repeated.append(f"{path.relative_to(package_root)}:{line}: {name} = {default!r}")
+    return repeated
 
 
 def _written_defaults(path):

@@ -51,17 +51,17 @@ def test_a_row_that_falls_short_is_a_failure(measured, failures):
 
 
 def test_baseline_covers_both_sources_with_equal_ratios():
-    known = json.loads((BENCHMARKS / "baseline.json").read_text(encoding="utf-8"))
-    assert known["published"].keys() == known["simulated"].keys()
+    baseline = json.loads((BENCHMARKS / "baseline.json").read_text(encoding="utf-8"))
+    assert baseline["published"].keys() == baseline["simulated"].keys()
     ratios = {"dnlo ipopt / dnlo fast, 443", "opencv, the fastest / dnlo fast, 2338"}
-    assert ratios <= known["published"].keys()
+    assert ratios <= baseline["published"].keys()
 
 
 def test_simulated_drives_have_a_known_answer_and_as_many_pairs_as_asked_for():
     drive = data.simulated_drive(data.SHORT + 5)
     assert len(drive.pairs) == data.SHORT
-    found = Method("dnlo").solve(drive.pairs).T_parent_child
-    np.testing.assert_allclose(found, drive.T_parent_child, atol=0.05)
+    T_parent_child = Method("dnlo").solve(drive.pairs).T_parent_child
+    np.testing.assert_allclose(T_parent_child, drive.T_parent_child, atol=0.05)
 
 
 @pytest.mark.parametrize("method", rows.OPENCV_METHODS)
@@ -69,5 +69,5 @@ def test_opencv_is_given_what_it_expects(method):
     cv2 = pytest.importorskip("cv2", reason="opencv-python-headless is not installed")
     Ts_pw_p = se3.exp(np.random.default_rng(3).normal(size=(12, 6)))
     T_cw_pw = se3.exp(np.array([3.0, -2.0, 1.0, 0.5, 0.2, -2.0]))
-    found = rows.opencv(cv2, method, Ts_pw_p, T_cw_pw @ Ts_pw_p @ data.T_PARENT_CHILD)
-    np.testing.assert_allclose(found, data.T_PARENT_CHILD, atol=1e-6)
+    T_parent_child = rows.opencv(cv2, method, Ts_pw_p, T_cw_pw @ Ts_pw_p @ data.T_PARENT_CHILD)
+    np.testing.assert_allclose(T_parent_child, data.T_PARENT_CHILD, atol=1e-6)

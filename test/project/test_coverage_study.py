@@ -123,19 +123,19 @@ def test_cycle_of_true_answers_closes_and_its_covariance_counts_each_answer():
 
 
 def _calibration(T_parent_child, covariance, scale):
-    known = {"T_parent_child": T_parent_child, "covariance_measured": covariance, "scale": scale}
-    return calibration(**known, status=SolveStatus.OK, observability_measured=())
+    fields = {"T_parent_child": T_parent_child, "covariance_measured": covariance, "scale": scale}
+    return calibration(**fields, status=SolveStatus.OK, observability_measured=())
 
 
 def test_coverage_with_the_floor_is_told_apart():
     observability = tuple(DofObservability(axis, DofVerdict.OBSERVED, 0.001) for axis in AXES)
-    found = _calibration(np.eye(4), 1e-6 * np.eye(6), 1.0)
-    found = dataclasses.replace(
-        found, observability_measured=observability, covariance_allowance=1e-4 * np.eye(6)
+    result = _calibration(np.eye(4), 1e-6 * np.eye(6), 1.0)
+    result = dataclasses.replace(
+        result, observability_measured=observability, covariance_allowance=1e-4 * np.eye(6)
     )
     T_truth = np.eye(4)
     T_truth[0, 3] = 0.01
-    cases = truth_cases(found, Truth.within(T_truth, 0.0, 0.0))
+    cases = truth_cases(result, Truth.within(T_truth, 0.0, 0.0))
     assert (cases["covers"]["x"], cases["covers_floor"]["x"]) == (0.0, 1.0)
     assert cases["covers"]["y"] == cases["covers_floor"]["y"] == 1.0
 
@@ -143,10 +143,10 @@ def test_coverage_with_the_floor_is_told_apart():
 def test_one_class_from_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(study, "CLASSES", ("hand_white", "flat_agv"))
     rows = study.measure(study.tasks_of("dnlo", range(2), [], None), ["dnlo"], 1)
-    found = {one.name: one for one in rows}
-    assert 0.3 < found["hand_white"].value("bound") < 3.0
-    assert found["flat_agv"].value("refused") == 1.0
-    assert set(found["all classes"].cases["bound"]) == {"hand_white/0", "hand_white/1"}
+    row_of = {row.name: row for row in rows}
+    assert 0.3 < row_of["hand_white"].value("bound") < 3.0
+    assert row_of["flat_agv"].value("refused") == 1.0
+    assert set(row_of["all classes"].cases["bound"]) == {"hand_white/0", "hand_white/1"}
     assert [*study.in_parallel(max, [(1, 2), (3, 4, 5)], 2)] == [2, 5]  # rows differ in arguments
     monkeypatch.delenv("HAND_EYE_CALIB_DATA", raising=False)
     monkeypatch.setattr(study, "measure", lambda *_: rows)

@@ -35,15 +35,15 @@ def pages():
 def blocks(name):
     """Commands and Python of a page in their order."""
     text = (DOCS / name).read_text(encoding="utf-8")
-    found = []
+    commands = []
     for language, block in re.findall(r"^```(bash|python)\n(.*?)^```", text, re.DOTALL | re.M):
         if language == "python":
-            found += [("python", block)] if "import hand_eye_calib" in text else []
+            commands += [("python", block)] if "import hand_eye_calib" in text else []
         else:
             lines = block.replace("\\\n", " ").splitlines()
             ours = (line for line in lines if line.startswith("hand_eye_calib "))
-            found += [("command", line) for line in ours if not ELSEWHERE.search(line)]
-    return found
+            commands += [("command", line) for line in ours if not ELSEWHERE.search(line)]
+    return commands
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +71,9 @@ def test_page_runs(name, folder, capsys):
             continue
         command, *arguments = shlex.split(text, comments=True)[1:]
         code = main([command, *arguments])
-        said = capsys.readouterr()
-        assert code in FINE.get(command, (0, 3)), f"{text}\n{said.out}\n{said.err}"
-        assert "error:" not in said.err
+        output = capsys.readouterr()
+        assert code in FINE.get(command, (0, 3)), f"{text}\n{output.out}\n{output.err}"
+        assert "error:" not in output.err
 
 
 def test_commands_of_the_pages_are_found():
@@ -108,6 +108,6 @@ def test_every_public_name_is_on_the_reference_page():
     text = (DOCS / "python.md").read_text(encoding="utf-8")
     described = set(re.findall(r"^::: (\S+)$", text, re.MULTILINE))
     public = {getattr(hec, name) for name in hec.__all__}
-    homes = {f"{each.__module__}.{each.__name__}" for each in public}
+    homes = {f"{public_name.__module__}.{public_name.__name__}" for public_name in public}
     missing = {home for home in homes - described if home.rpartition(".")[0] not in described}
     assert missing == set()

@@ -73,14 +73,14 @@ def test_best_reference_is_by_mean_over_levels_and_by_median_in_the_mixture():
         names = {"dataset": dataset, "level": level, "method": "dnl", "reference": reference}
         return [names | dict.fromkeys(METRICS, 0.0) | {"e_at": error} for error in errors]
 
-    found = []
+    rows = []
     for reference in REFERENCES:
         levels = ((1.0, 1.0), (5.0, 7.0)) if reference == "B10" else ((0.0, 0.0), (9.0, 9.0))
         mixture = [1.0, 1.0, 90.0] if reference == "C5" else [2.0, 2.0, 2.0]
         for level, errors in zip((0.0, 0.002), levels, strict=True):
-            found += entries("noise", level, reference, errors)
-        found += entries("mixture", None, reference, mixture)
-    table = results.Table(pd.DataFrame(found).astype({"level": float}))
+            rows += entries("noise", level, reference, errors)
+        rows += entries("mixture", None, reference, mixture)
+    table = results.Table(pd.DataFrame(rows).astype({"level": float}))
     assert table.levels("noise", "dnl") == (0.0, 0.002)
     assert table.best_reference("noise", "dnl") == "B10"
     assert table.score("noise", "dnl", "B10") == 3.5
@@ -106,8 +106,8 @@ WITHOUT_OBJECTIVE = {**OFF, "published_objective": None}
     ],
 )
 def test_every_row_that_differs_says_why(changes, why):
-    (said,) = table_of([A_ROW | changes])["why"]
-    assert (why in said) if why else said == ""
+    (reason,) = table_of([A_ROW | changes])["why"]
+    assert (why in reason) if why else reason == ""
 
 
 def test_comparison_counts_lists_and_explains(tmp_path):
@@ -128,22 +128,24 @@ def tasks_of(cells):
 
 def test_what_is_kept_is_not_solved_again_and_processes_do_not_matter(tmp_path, rows):
     path = tmp_path / "new" / "solved.jsonl"
-    found = runner.kept(path, solve_cell, tasks_of(CELLS[:2]), 2)
-    assert [row for name in tasks_of(CELLS[:2]) for row in found[name]] == rows[: -len(rows) // 3]
+    kept_rows = runner.kept(path, solve_cell, tasks_of(CELLS[:2]), 2)
+    assert [row for name in tasks_of(CELLS[:2]) for row in kept_rows[name]] == rows[
+        : -len(rows) // 3
+    ]
     # What was kept shows in a mark that no solver makes; a line that was cut off is solved again.
     first, second = path.read_text().splitlines()[1:]
     path.write_text(f"\n{first.replace('run_01', 'kept')}\n{second[:-5]}")
-    found = runner.kept(path, solve_cell, tasks_of(CELLS), 1)
-    marked = {name for name, some in found.items() if any(row["run"] == "kept" for row in some)}
+    kept_rows = runner.kept(path, solve_cell, tasks_of(CELLS), 1)
+    marked = {name for name, some in kept_rows.items() if any(row["run"] == "kept" for row in some)}
     assert marked == {CELLS[0].method}
-    assert len(found) == len(CELLS)
+    assert len(kept_rows) == len(CELLS)
 
 
 def test_everything_in_the_article_is_there():
     names = {f"figS{number}" for number in range(1, 6)}
     names |= {f"tableS{number}" for number in range(1, 13)}
     names |= {"fig3", "fig4", "fig5", "table1", "table2"}
-    assert names <= {each.name for each in GROUPS["all"]}
+    assert names <= {item.name for item in GROUPS["all"]}
     assert set(EXPERIMENTS) - {"faults"} <= set(GROUPS)
 
 
@@ -159,7 +161,7 @@ def test_a_text_is_put_between_the_marks_of_its_study(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "message"),
     [
         (["table1", "--data", "simulated"], 2, "KITTI"),
         (["fig3"], 2, "--data-folder"),
@@ -167,9 +169,13 @@ def test_a_text_is_put_between_the_marks_of_its_study(tmp_path):
         (["fig3", "--data", "simulated", "--runs", "1"], 2, "--runs"),
     ],
 )
-def test_misuse_is_told_in_one_line(tmp_path, capsys, arguments, code, said):
-    arguments = ["--out", str(tmp_path / "out"), *(each.format(tmp=tmp_path) for each in arguments)]
+def test_misuse_is_told_in_one_line(tmp_path, capsys, arguments, code, message):
+    arguments = [
+        "--out",
+        str(tmp_path / "out"),
+        *(argument.format(tmp=tmp_path) for argument in arguments),
+    ]
     assert main(arguments) == code
     captured = capsys.readouterr()
     assert (captured.out, captured.err.count("\n")) == ("", 1)
-    assert said in captured.err
+    assert message in captured.err

@@ -66,12 +66,12 @@ DECLARED_AS = {
 @pytest.fixture(scope="module")
 def declared():
     """What setup.py passes to setup()."""
-    given = {}
+    arguments = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)
-        patch.setattr("setuptools.setup", given.update)
+        patch.setattr("setuptools.setup", arguments.update)
         runpy.run_path("setup.py")
-    return given
+    return arguments
 
 
 def run(command, **options):
@@ -170,7 +170,9 @@ def test_oldest_versions_are_pinned_at_the_declared_lower_bounds(declared):
     bounded = [Requirement(text) for text in requirements if ">=" in text]
     assert len(bounded) > 6
     for requirement in bounded:
-        (bound,) = [each.version for each in requirement.specifier if each.operator == ">="]
+        (bound,) = [
+            specifier.version for specifier in requirement.specifier if specifier.operator == ">="
+        ]
         pin = pins[requirement.name]
         assert pin == bound or pin.startswith(bound + "."), (
             f"{requirement.name}: pinned {pin}, lower bound {bound}"
@@ -186,7 +188,7 @@ def test_libraries_that_the_package_runs_with_have_an_upper_bound(declared):
     assert len(of_users) > 15
     for requirement in map(Requirement, of_users):
         is_of_ros = requirement.name.startswith("ros-jazzy-")
-        has_bound = any(each.operator == "<" for each in requirement.specifier)
+        has_bound = any(specifier.operator == "<" for specifier in requirement.specifier)
         assert has_bound or is_of_ros, f"{requirement.name} has no upper bound"
 
 
@@ -217,11 +219,11 @@ def test_pip_install_gives_the_commands(declared, source, tmp_path):
     templates = "offline/report/templates/report.html", "formats/templates/extrinsic.urdf.xacro.in"
     for kept in (*templates, "extras/rig/rig.html", "formats/layouts.yaml", "sample/lidar.tum"):
         assert (site / PACKAGE / kept).is_file()
-    for command, said in (
+    for command, expected in (
         ([target / "bin" / "replay", "--help"], "usage: hand_eye_calib replay"),
         ([sys.executable, "-m", PACKAGE, "--version"], declared["version"]),
     ):
-        assert said in run(command, env=environment, cwd=tmp_path).stdout
+        assert expected in run(command, env=environment, cwd=tmp_path).stdout
     assert_data_files(target)
 
 
@@ -250,11 +252,11 @@ def test_colcon_lays_out_an_install_space_whose_commands_run(declared, source, t
     (tmp_path / "each.py").write_text(EACH)
     program = f"source install/setup.bash && {sys.executable} each.py '{folder}'/*"
     program += f" && '{folder}/{PACKAGE}' --version"
-    said = run(["bash", "-c", program], env=clean_environment(), cwd=tmp_path).stdout
-    assert Path(said.splitlines()[0]).resolve().is_relative_to(prefix)
+    output = run(["bash", "-c", program], env=clean_environment(), cwd=tmp_path).stdout
+    assert Path(output.splitlines()[0]).resolve().is_relative_to(prefix)
     for command in COMMANDS:
-        assert f"usage: hand_eye_calib {command}" in said
-    assert declared["version"] in said
+        assert f"usage: hand_eye_calib {command}" in output
+    assert declared["version"] in output
 
 
 WORKFLOWS = {
@@ -266,9 +268,9 @@ WORKFLOWS = {
 def lines(jobs):
     """What the steps of jobs run, with the values of their matrices."""
     steps = [step for job in jobs.values() for step in job["steps"]]
-    found = [line for step in steps for line in step.get("run", "").splitlines()]
+    steps_run = [line for step in steps for line in step.get("run", "").splitlines()]
     matrices = [job.get("strategy", {}).get("matrix", {}) for job in jobs.values()]
-    return found + [line for matrix in matrices for line in matrix.get("command", [])]
+    return steps_run + [line for matrix in matrices for line in matrix.get("command", [])]
 
 
 def test_commands_exist_jobs_end_and_leave_no_credentials():
@@ -276,9 +278,9 @@ def test_commands_exist_jobs_end_and_leave_no_credentials():
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     targets = re.findall(r"^([a-z-]+)[a-z -]*:", makefile, re.MULTILINE)
     for jobs in WORKFLOWS.values():
-        said = "\n".join(lines(jobs))
-        assert set(re.findall(r"\bmake ([a-z-]+)", said)) <= set(targets)
-        for script in re.findall(r"\S*\.ci/[a-z]+", said):
+        text = "\n".join(lines(jobs))
+        assert set(re.findall(r"\bmake ([a-z-]+)", text)) <= set(targets)
+        for script in re.findall(r"\S*\.ci/[a-z]+", text):
             assert os.access(ROOT / script.removeprefix("src/hand_eye_calib/"), os.X_OK)
         for job in jobs.values():
             assert 5 <= job["timeout-minutes"] <= 120
@@ -304,11 +306,11 @@ NODE_PAGE = (ROOT / "docs" / "node.md").read_text(encoding="utf-8")
 
 def test_rviz_shows_the_latched_extrinsic_with_its_covariance():
     rviz = yaml.safe_load((CONFIG / "calibrator.rviz").read_text())["Visualization Manager"]
-    (extrinsic,) = (each for each in rviz["Displays"] if each["Name"] == "Extrinsic")
+    (extrinsic,) = (display for display in rviz["Displays"] if display["Name"] == "Extrinsic")
     assert extrinsic["Topic"]["Value"] == "/calibrator/extrinsic_with_covariance"
     assert extrinsic["Topic"]["Durability Policy"] == "Transient Local"
     assert extrinsic["Covariance"]["Position"]["Value"] is True
-    (markers,) = (each for each in rviz["Displays"] if each["Name"] == "Result")
+    (markers,) = (display for display in rviz["Displays"] if display["Name"] == "Result")
     assert markers["Topic"]["Value"] == "/calibrator/markers"
     assert "`~/extrinsic_with_covariance`" in NODE_PAGE
     assert "`~/markers`" in NODE_PAGE
@@ -317,19 +319,19 @@ def test_rviz_shows_the_latched_extrinsic_with_its_covariance():
 def test_foxglove_shows_what_the_node_publishes_and_serves_each_panel_once():
     layout = json.loads((CONFIG / "foxglove_layout.json").read_text())
     panels = layout["configById"]
-    services = [each["serviceName"] for each in panels.values() if "serviceName" in each]
+    services = [panel["serviceName"] for panel in panels.values() if "serviceName" in panel]
     assert sorted(services) == [f"/calibrator/{name}" for name in ("reset", "save", "solve")]
     for name in services:
         assert f"`~/{name.rpartition('/')[2]}`" in NODE_PAGE
     topics = ["/calibrator/extrinsic_with_covariance", "/calibrator/markers"]
     assert list(panels["3D!extrinsic"]["topics"]) == topics
-    values = [path["value"] for each in panels.values() for path in each.get("paths", ())]
+    values = [path["value"] for panel in panels.values() for path in panel.get("paths", ())]
     keys = set(re.findall(r'key=="([a-z.]+)"', " ".join(values)))
     assert keys == {*(f"sigma.{axis}" for axis in AXES), "target.x", "target.roll"}
 
-    def placed(part):
-        if isinstance(part, str):
-            return [part]
-        return [*placed(part["first"]), *placed(part["second"])]
+    def placed(panel):
+        if isinstance(panel, str):
+            return [panel]
+        return [*placed(panel["first"]), *placed(panel["second"])]
 
     assert sorted(placed(layout["layout"])) == sorted(panels)

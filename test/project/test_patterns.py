@@ -81,8 +81,8 @@ def alphabet(pattern):
             case (sre.CATEGORY, category):
                 characters.update(of_class.get(category, ""))
             case tuple() | list() | sre.SubPattern():
-                for part in item:
-                    visit(part)
+                for child in item:
+                    visit(child)
 
     visit(sre.parse(pattern))
     return sorted(characters, key=lambda character: (character.isalpha(), character))[:_ALPHABET]
@@ -111,11 +111,11 @@ def applied(pattern, flags, functions, text):
 
 
 @contextmanager
-def processor_time(seconds, what):
+def processor_time(seconds, pattern):
     """Fail if the block takes more processor time."""
 
     def stop(*_):
-        raise AssertionError(f"{what}: more than {seconds:g} s for {_LENGTH} characters")
+        raise AssertionError(f"{pattern}: more than {seconds:g} s for {_LENGTH} characters")
 
     before = signal.signal(signal.SIGVTALRM, stop)
     signal.setitimer(signal.ITIMER_VIRTUAL, seconds)

@@ -38,42 +38,46 @@ class TestOptionsOfCalibrate:
         assert set(fields) >= PRIOR_FIELDS
         keywords = self.keywords()
         assert set(keywords) == set(fields) - PRIOR_FIELDS | {"prior", "progress", "checks"}
-        assert {each.default for each in keywords.values()} == {None}
+        assert {keyword.default for keyword in keywords.values()} == {None}
         for name in fields.keys() - PRIOR_FIELDS:
             meta = fields[name].metadata
-            told = keywords[name].annotation
+            annotation = keywords[name].annotation
             words = meta["choices"] or meta["words"]
             expected = Literal[words] if words else fields[name].type
             expected = float | expected if meta["words"] else expected
-            assert told == expected | None, name
+            assert annotation == expected | None, name
 
     def test_each_has_the_effect_of_its_option(self, monkeypatch):
         """Every keyword reaches the configuration that is solved with."""
         seen = []
         monkeypatch.setattr(
             "hand_eye_calib.offline.calibrate.whole_snapshot",
-            lambda *given: seen.append(whole_snapshot(*given).config),
+            lambda *streams: seen.append(whole_snapshot(*streams).config),
         )
         solved = SimpleNamespace(calibration=result_making.calibration(), snapshot=None)
         monkeypatch.setattr("hand_eye_calib.offline.calibrate.run", lambda *_, **__: solved)
         numbers = ["threshold", "min_inlier_fraction", "max_gap", "scale", "parent_scale"]
-        numbers += [f"keyframe_min_{each}" for each in ("translation", "rotation", "interval")]
+        numbers += [
+            f"keyframe_min_{quantity}" for quantity in ("translation", "rotation", "interval")
+        ]
         numbers += ["target_translation", "target_rotation"]
-        given = {name: 0.0625 * k for k, name in enumerate(numbers, 1)}
-        given |= dict(method="dnl", reference="C7", backend="ipopt", min_pairs=4, max_pairs=77)
-        given |= dict(time_offset="estimate", target_axes="z=0.1")
-        given |= dict(parent_invert="poses", child_invert="orientations")
-        given |= dict(parent_measures="rates", child_measures="rotations")
-        given |= dict(parent_frame="lidar", child_frame="camera")
+        numbers_given = {name: 0.0625 * k for k, name in enumerate(numbers, 1)}
+        numbers_given |= dict(
+            method="dnl", reference="C7", backend="ipopt", min_pairs=4, max_pairs=77
+        )
+        numbers_given |= dict(time_offset="estimate", target_axes="z=0.1")
+        numbers_given |= dict(parent_invert="poses", child_invert="orientations")
+        numbers_given |= dict(parent_measures="rates", child_measures="rotations")
+        numbers_given |= dict(parent_frame="lidar", child_frame="camera")
         for stream in ("parent", "child"):
-            given |= {f"{stream}_quaternion": "wxyz", f"{stream}_kind": "exact"}
-        assert set(given) | {"prior", "progress", "checks"} == set(self.keywords())
-        hec.calibrate(*streams(), **given, prior={"z": (1.85, 0.02)})
+            numbers_given |= {f"{stream}_quaternion": "wxyz", f"{stream}_kind": "exact"}
+        assert set(numbers_given) | {"prior", "progress", "checks"} == set(self.keywords())
+        hec.calibrate(*streams(), **numbers_given, prior={"z": (1.85, 0.02)})
         (config,) = seen
-        assert {name: getattr(config, name) for name in given} == given
+        assert {name: getattr(config, name) for name in numbers_given} == numbers_given
         assert config.prior() == {"z": (1.85, 0.02)}
         default = CalibratorConfig()
-        assert all(getattr(default, name) != value for name, value in given.items())
+        assert all(getattr(default, name) != value for name, value in numbers_given.items())
 
     def test_all_poses_are_used_unless_limited(self):
         parent, child = streams(60)
@@ -85,27 +89,27 @@ class TestOptionsOfCalibrate:
         long = hec.Trajectory(np.arange(1_000_000), poses)
         snapshot = whole_snapshot(long, long, {})
         assert snapshot.config.max_pairs == 100_000
-        said = " ".join(snapshot.warnings)
-        assert "100,000 pose pairs are used at most" in said
+        warnings = " ".join(snapshot.warnings)
+        assert "100,000 pose pairs are used at most" in warnings
         assert whole_snapshot(long, long, {"max_pairs": 2_000_000}).config.max_pairs == 2_000_000
 
     def test_progress_is_told_and_changes_nothing(self):
         parent, child = streams()
-        told = []
-        tell = lambda share, step: told.append((share, step))  # noqa: E731
+        reports = []
+        tell = lambda share, step: reports.append((share, step))  # noqa: E731
         result = hec.calibrate(parent, child, reference="B1", progress=tell)
         steps = ["solving", "checking the streams", "done"]
-        assert [step for _, step in told] == steps
-        assert sorted(told) == told
-        assert (told[0][0], told[-1][0]) == (0.0, 1.0)
+        assert [step for _, step in reports] == steps
+        assert sorted(reports) == reports
+        assert (reports[0][0], reports[-1][0]) == (0.0, 1.0)
         again = hec.calibrate(parent, child, reference="B1")
         np.testing.assert_array_equal(result.T_parent_child, again.T_parent_child)
 
 
 class TestPrior:
     def test_values_come_through_to_the_last_bit(self):
-        known = {"x": (np.float64(1 / 3), 1e-7), "yaw": (-2.0e-12, np.pi / 7)}
-        assert CalibratorConfig(**prior_fields(known)).prior() == known
+        priors = {"x": (np.float64(1 / 3), 1e-7), "yaw": (-2.0e-12, np.pi / 7)}
+        assert CalibratorConfig(**prior_fields(priors)).prior() == priors
 
     @pytest.mark.parametrize(
         ("prior", "message"),
@@ -175,9 +179,9 @@ class TestResiduals:
         late = motions.child_of(motions.smooth_poses(times_s + 0.05))
         child = motions.as_trajectory(motions.disturbed(late, 2, 1e-4, 1e-4), 20.0).scaled(0.95)
         exact = hec.calibrate(parent, child, method="adaptive", time_offset=0.05, scale=1 / 0.95)
-        found = hec.calibrate(parent, child, method="adaptive", checks=False)
-        assert found.time_offset_s == pytest.approx(0.05, abs=1e-3)
-        rms = [np.sqrt((r.residuals().translation ** 2).mean()) for r in (exact, found)]
+        result = hec.calibrate(parent, child, method="adaptive", checks=False)
+        assert result.time_offset_s == pytest.approx(0.05, abs=1e-3)
+        rms = [np.sqrt((r.residuals().translation ** 2).mean()) for r in (exact, result)]
         # Without the time offset it would be fifteen times as much.
         assert rms[1] == pytest.approx(rms[0], rel=0.2)
 

@@ -41,13 +41,13 @@ def names(tmp_path_factory):
 
 @pytest.mark.parametrize("name", hec.__all__)
 def test_the_examples_of(name, names, no_figures):
-    found = doctest.DocTestParser().get_doctest(
+    examples = doctest.DocTestParser().get_doctest(
         getattr(hec, name).__doc__, dict(names), name, None, 0
     )
-    assert found.examples, f"{name} has no Examples section"
-    told = []
-    doctest.DocTestRunner(optionflags=FLAGS).run(found, out=told.append)
-    assert not told, "".join(told)
+    assert examples.examples, f"{name} has no Examples section"
+    failures = []
+    doctest.DocTestRunner(optionflags=FLAGS).run(examples, out=failures.append)
+    assert not failures, "".join(failures)
 
 
 def test_the_help_of_calibrate_has_every_option_with_its_default():
@@ -58,13 +58,13 @@ def test_the_help_of_calibrate_has_every_option_with_its_default():
 
 
 def test_the_roles_may_be_exchanged(names):
-    there = names["result"]
+    result = names["result"]
     back = hec.calibrate("camera.tum", "lidar.tum")
-    apart = se3.log(se3.inverse(there.inverse().T_parent_child) @ back.T_parent_child)
+    apart = se3.log(se3.inverse(result.inverse().T_parent_child) @ back.T_parent_child)
     assert (np.abs(apart) < 0.5 * np.sqrt(np.diag(back.covariance))).all()
-    np.testing.assert_allclose(there.inverse().sigmas, back.sigmas, rtol=0.6)
-    np.testing.assert_allclose(there.inverse().inverse().sigmas, there.sigmas, rtol=1e-6)
-    assert (there == "another", there == there.inverse()) == (False, False)
+    np.testing.assert_allclose(result.inverse().sigmas, back.sigmas, rtol=0.6)
+    np.testing.assert_allclose(result.inverse().inverse().sigmas, result.sigmas, rtol=1e-6)
+    assert (result == "another", result == result.inverse()) == (False, False)
 
 
 EXAMPLES = ROOT / "examples"

@@ -69,8 +69,8 @@ def allowed(field):
         return ", ".join(f"`{choice}`" for choice in meta["choices"])
     words = [f"`{word}`" for word in meta["words"]]
     if meta["within"]:
-        least, most = meta["within"]
-        return " or ".join([*words, f"{least:g} to {most:g}"])
+        low, high = meta["within"]
+        return " or ".join([*words, f"{low:g} to {high:g}"])
     if words:
         return " or ".join(words)
     if meta["parse"]:
@@ -108,16 +108,18 @@ def limits_table():
             section = line.removeprefix("# ---- ")
         elif line.startswith("#:"):
             text.append(line.removeprefix("#:").strip())
-        elif found := re.match(r"([A-Z][A-Z_]*) = ", line):
-            what = " ".join(text).rstrip(".")
-            lines.append(f"| {section} | {what} | {readable(what, getattr(files, found[1]))} |")
+        elif match := re.match(r"([A-Z][A-Z_]*) = ", line):
+            meaning = " ".join(text).rstrip(".")
+            lines.append(
+                f"| {section} | {meaning} | {readable(meaning, getattr(files, match[1]))} |"
+            )
             text = []
     return "\n".join(lines)
 
 
-def readable(what, value):
+def readable(meaning, value):
     """A limit with its unit: bytes in MiB."""
-    if what.startswith("Bytes") and value % (1 << 20) == 0:
+    if meaning.startswith("Bytes") and value % (1 << 20) == 0:
         return f"{value >> 20:,} MiB"
     return f"{value:,}" if isinstance(value, int) else f"{value:g}"
 
@@ -163,7 +165,9 @@ def commands(text):
 
 
 @pytest.mark.parametrize(
-    "words", sorted({found for text in PAGES.values() for found in commands(text)}), ids=" ".join
+    "words",
+    sorted({command for text in PAGES.values() for command in commands(text)}),
+    ids=" ".join,
 )
 def test_command_parses(words):
     name, *arguments = words
@@ -244,10 +248,10 @@ def links():
 @pytest.mark.parametrize(("page", "target"), sorted(set(links())))
 def test_relative_link_leads_somewhere(page, target):
     path, _, anchor = target.partition("#")
-    found = (ROOT / page).parent / path if path else ROOT / page
-    assert found.exists()
+    file = (ROOT / page).parent / path if path else ROOT / page
+    assert file.exists()
     if anchor:
-        assert anchor in anchors(found.read_text(encoding="utf-8"))
+        assert anchor in anchors(file.read_text(encoding="utf-8"))
 
 
 def test_every_package_has_its_line():

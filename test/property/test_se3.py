@@ -80,10 +80,12 @@ def test_conversions_agree_with_scipy(direction, angle):
         rtol=0,
     )
     assert se3.rotation_exp(rotation.as_rotvec()) == pytest.approx(rotation.as_matrix(), abs=1e-14)
-    found = se3.to_quat_xyzw(rotation.as_matrix())
+    quat_xyzw = se3.to_quat_xyzw(rotation.as_matrix())
     expected = Rotation.from_matrix(rotation.as_matrix()).as_quat()
-    assert found[3] >= 0.0
-    np.testing.assert_allclose(found * np.sign(found @ expected), expected, atol=1e-14, rtol=0)
+    assert quat_xyzw[3] >= 0.0
+    np.testing.assert_allclose(
+        quat_xyzw * np.sign(quat_xyzw @ expected), expected, atol=1e-14, rtol=0
+    )
 
 
 @given(
@@ -96,18 +98,18 @@ def test_roll_pitch_yaw_agree_with_scipy_up_to_gimbal_lock(roll, pitch, yaw):
 
     rotation = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
     assert se3.rotation_from_rpy([roll, pitch, yaw]) == pytest.approx(rotation, abs=1e-14)
-    found = se3.rotation_to_rpy(rotation)
-    np.testing.assert_allclose(se3.rotation_from_rpy(found), rotation, atol=1e-14, rtol=0)
+    rpy = se3.rotation_to_rpy(rotation)
+    np.testing.assert_allclose(se3.rotation_from_rpy(rpy), rotation, atol=1e-14, rtol=0)
     if abs(pitch) < 1.51:
         # Half a turn may come out with either sign; near gimbal lock the digits of roll and yaw go.
         np.testing.assert_allclose(
-            np.exp(1j * found),
+            np.exp(1j * rpy),
             np.exp(1j * np.array([roll, pitch, yaw])),
             atol=1e-14 / np.cos(pitch),
             rtol=0,
         )
     else:
-        assert found[2] == 0.0
+        assert rpy[2] == 0.0
 
 
 def test_a_quaternion_of_length_zero_is_refused():

@@ -50,8 +50,8 @@ def drive(seed):
     """Poses (N_POSES, 4, 4) of a body that moves up to 2 m and turns up to 0.8 rad per axis from
     pose to pose.
     """
-    most = np.repeat([2.0, 0.8], 3)
-    return walked(se3.exp(np.random.default_rng(seed).uniform(-most, most, (N_POSES - 1, 6))))
+    largest = np.repeat([2.0, 0.8], 3)
+    return walked(se3.exp(np.random.default_rng(seed).uniform(-largest, largest, (N_POSES - 1, 6))))
 
 
 def trajectories(seed, T_parent_child, noise=0.0):
@@ -170,15 +170,15 @@ def test_order_of_the_pairs_does_not_matter(method, seed, truth, order):
 @given(seed=seeds, truth=transforms)
 def test_each_cost_is_lowest_at_its_own_method(seed, truth):
     pairs = motion_pairs(*trajectories(seed, truth, noise=0.03), "B1")
-    found = {method: Method(method).solve(pairs) for method in PAPER_METHODS}
-    for solution in found.values():
-        assert found["dnl"].objective <= pair_costs(pairs, solution.T_parent_child).sum() * (
+    solutions = {method: Method(method).solve(pairs) for method in PAPER_METHODS}
+    for solution in solutions.values():
+        assert solutions["dnl"].objective <= pair_costs(pairs, solution.T_parent_child).sum() * (
             1 + 1e-9
         )
-        assert found["dnlo"].objective <= np.minimum(
+        assert solutions["dnlo"].objective <= np.minimum(
             pair_costs(pairs, solution.T_parent_child), 0.01
-        ).sum() * (1 + 1e-9) or (found["dnlo"].weights.sum() < (len(pairs) + 1) / 2)
-    assert found["ali"].objective <= found["park"].objective * (1 + 1e-9)
+        ).sum() * (1 + 1e-9) or (solutions["dnlo"].weights.sum() < (len(pairs) + 1) / 2)
+    assert solutions["ali"].objective <= solutions["park"].objective * (1 + 1e-9)
 
 
 def degenerate_motions(seed):

@@ -34,7 +34,7 @@ def tables(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tables")
     with pytest.MonkeyPatch.context() as patch:
         names = ("table1", "table2", "s-tables")
-        both = [each for name in names for each in command.GROUPS[name]]
+        both = [experiment for name in names for experiment in command.GROUPS[name]]
         patch.setitem(command.GROUPS, "s-tables", both)
         return made("s-tables", folder, 1)[0], folder
 
@@ -87,9 +87,12 @@ def few_levels(monkeypatch):
 
     some = [
         dataclasses.replace(
-            each, cells=[one for one in each.cells if one.level in LEVELS.get(one.dataset, (None,))]
+            experiment,
+            cells=[
+                cell for cell in experiment.cells if cell.level in LEVELS.get(cell.dataset, (None,))
+            ],
         )
-        for each in command.GROUPS["all"]
+        for experiment in command.GROUPS["all"]
     ]
     monkeypatch.setitem(command.GROUPS, "all", some)
 

@@ -42,8 +42,8 @@ class TestThreeDevicesWithoutACommonClock:
             assert result.time_offset_sigma_s < 0.002
 
     def test_translations(self, results):
-        known = [(0.940, -0.403, 1.002), (0.914, -0.113, 0.254), (0.434, 0.072, -0.213)]
-        for expected, result in zip(known, results, strict=True):
+        translations = [(0.940, -0.403, 1.002), (0.914, -0.113, 0.254), (0.434, 0.072, -0.213)]
+        for expected, result in zip(translations, results, strict=True):
             np.testing.assert_allclose(result.T_parent_child[:3, 3], expected, atol=0.02)
 
     def test_the_cycle_closes(self, results):
@@ -207,8 +207,8 @@ def test_streams_of_1_hz_have_no_error(rig):
     child = child[inside]
     parent = Trajectory(child.stamps_ns, recording.parent.at(child.stamps_ns))
     for faster in (parent, recording.parent):
-        found = calibrate(faster, child).findings
-        assert [each.code for each in found if each.severity == "error"] == []
+        findings = calibrate(faster, child).findings
+        assert [finding.code for finding in findings if finding.severity == "error"] == []
 
 
 @pytest.mark.parametrize("start_s", [68.8, 262.8, 424.9])
@@ -216,7 +216,7 @@ def test_fifty_seconds_of_a_farm_robot_are_not_forbidden(start_s):
     """Both worlds drift against each other, and short halves disagree by degrees."""
     nav, velodyne = shrimp_sensors(real_data.data_folder())
     start_ns = int(velodyne.stamps_ns[0] + start_s * 1e9)
-    pair = (between(each, start_ns, start_ns + 50 * 10**9) for each in (nav, velodyne))
+    pair = (between(stream, start_ns, start_ns + 50 * 10**9) for stream in (nav, velodyne))
     assert calibrate(*pair).verdict is not Verdict.DO_NOT_USE
 
 

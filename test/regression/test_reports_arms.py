@@ -44,7 +44,7 @@ def off(document, truth):
 
 def told(document):
     """Everything that the result tells in words."""
-    findings = [found["what"] for found in document["findings"]]
+    findings = [finding["what"] for finding in document["findings"]]
     return " ".join([*findings, *document["warnings"]])
 
 

@@ -36,8 +36,8 @@ def matrix_of(truth):
 
 
 def assert_near(document, truth, within_m=WITHIN_M, within_deg=WITHIN_DEG):
-    found = np.array(document["T_parent_child"]["matrix"])
-    error = se3.log(se3.inverse(truth) @ found)
+    T_parent_child = np.array(document["T_parent_child"]["matrix"])
+    error = se3.log(se3.inverse(truth) @ T_parent_child)
     assert np.abs(error[:3]).max() < within_m
     assert np.degrees(np.abs(error[3:]).max()) < within_deg
 
@@ -87,8 +87,8 @@ def test_null_poses_are_left_out_and_counted(bag, capsys, name, n_null):
     code, document, _ = calibrated(capsys, bag(name))
     assert (code, document["verdict"]) == (0, "USE")
     assert_near(document, matrix_of(TRUTH))
-    said = f"/camera/odometry: {n_null} of 1,192 poses"
-    assert [text for text in document["warnings"] if text.startswith(said)]
+    sentence = f"/camera/odometry: {n_null} of 1,192 poses"
+    assert [text for text in document["warnings"] if text.startswith(sentence)]
 
 
 def test_header_stamps_of_0_are_said_and_receive_times_taken_if_asked(bag, capsys):

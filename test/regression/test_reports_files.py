@@ -77,8 +77,8 @@ def test_motions_in_place_of_poses_are_named(run_files):
 
 @pytest.mark.parametrize(("parent", "child", "cause"), CAUSES)
 def test_the_cause_is_one_line(run_files, parent, child, cause):
-    code, document, said = run_files(parent, child)
+    code, document, output = run_files(parent, child)
     assert (code, document) == (1, None)
-    *_, last = said.splitlines()
+    *_, last = output.splitlines()
     assert cause in last
     assert child in last

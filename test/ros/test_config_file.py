@@ -19,7 +19,7 @@ HEADER = """\
 # Options in comments are not set here: what is set counts as known, even if it is the default.
 """
 CONVENTIONS = [
-    f"{each}_{kind}" for each in ("parent", "child") for kind in ("invert", "quaternion")
+    f"{stream}_{kind}" for stream in ("parent", "child") for kind in ("invert", "quaternion")
 ]
 ONLY_SHOWN = ("time_offset", "scale", "parent_scale", *CONVENTIONS)
 

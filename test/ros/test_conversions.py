@@ -148,12 +148,12 @@ def test_a_result_that_is_too_uncertain_withdraws_the_one_before():
         calibration(np.eye(6), observability_measured=dofs([0.01] * 6, hidden))
         for hidden in ((), NAMES)
     )
-    for each in (unsure, sure, unsure, unsure):  # the last is not new
-        topics.publish(each)
+    for sent_result in (unsure, sure, unsure, unsure):  # the last is not new
+        topics.publish(sent_result)
     markers, *made = made
     # A subscriber that is there deletes what it has drawn.
     assert (markers.name, len(markers.sent)) == ("~/markers", 3)
-    assert [(each.name, len(each.sent)) for each in made] == [
+    assert [(topic.name, len(topic.sent)) for topic in made] == [
         ("~/extrinsic", 1),
         ("~/extrinsic_with_covariance", 2),
         ("~/extrinsic", 0),

@@ -69,8 +69,8 @@ def test_demo_recovers_the_truth_offline_and_live_and_replaces_an_earlier_demo(
     assert main(["replay", str(tmp_path / "demo_bag"), *topics, "--json"]) == 0
     replayed = np.array(json.loads(capsys.readouterr().out)["T_parent_child"]["matrix"])
     assert numbers(offline)[:3] == pytest.approx(replayed[:3, 3], abs=1e-4)
-    left = ["demo_bag", "mine.txt", "node.log", "report.html"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == left
+    remaining = ["demo_bag", "mine.txt", "node.log", "report.html"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == remaining
 
 
 def test_demo_without_ros_says_what_to_install_and_with_it_why_it_does_not_start(tmp_path):
@@ -88,7 +88,7 @@ def test_demo_without_ros_says_what_to_install_and_with_it_why_it_does_not_start
     bad = run("-m", "hand_eye_calib", *command, domain="one")
     assert "error: cannot start ROS: " in bad.stderr.splitlines()[-1]
     assert "ROS_DOMAIN_ID is not an integral number" in bad.stderr.splitlines()[-1]
-    assert [(each.returncode, each.stdout) for each in (without, bad)] == [(1, "")] * 2
+    assert [(process.returncode, process.stdout) for process in (without, bad)] == [(1, "")] * 2
 
 
 def test_player_does_not_wait_for_ever(domain, monkeypatch):

@@ -24,16 +24,16 @@ def state(peer):
     """``state(condition)``: the first state that meets a condition, among those still to come."""
     heard = []
     peer.node.create_subscription(
-        String, "calibrator/progress", lambda each: heard.append(state_of(each.data)), LATCHED
+        String, "calibrator/progress", lambda message: heard.append(state_of(message.data)), LATCHED
     )
 
-    def wait(condition, what="such a state"):
+    def wait(condition, description="such a state"):
         start = len(heard)
 
         def met():
-            return next((each for each in heard[start:] if condition(each)), None)
+            return next((document for document in heard[start:] if condition(document)), None)
 
-        peer.spin_until(met, what)
+        peer.spin_until(met, description)
         return met()
 
     wait.heard = heard
@@ -44,16 +44,16 @@ def test_nothing_is_ok_before_a_valid_result_and_the_inputs_that_are_missing_are
     start_node, peer, state
 ):
     start_node()
-    first = state(lambda each: True)
+    first = state(lambda document: True)
     assert tuple(name for name, _ in first.parts()) == PARTS
-    assert {part.level for _, part in first.parts()} == {Level.WARN}
+    assert {status.level for _, status in first.parts()} == {Level.WARN}
     assert first.inputs["parent"].text == "no message on /parent_odom yet: 0 publishers"
     peer.feed(peer.publishers(), *drive(8))  # too few
     # An input that delivers is no fault, whatever the result.
-    found = state(lambda each: each.inputs["parent"].text.endswith("Hz"))
-    assert found.inputs["parent"].level is Level.OK
-    state(lambda each: "synchronised pose pairs are needed" in each.extrinsic.text)
-    assert Level.OK not in {each.extrinsic.level for each in state.heard}
+    document = state(lambda document: document.inputs["parent"].text.endswith("Hz"))
+    assert document.inputs["parent"].level is Level.OK
+    state(lambda document: "synchronised pose pairs are needed" in document.extrinsic.text)
+    assert Level.OK not in {document.extrinsic.level for document in state.heard}
 
 
 def test_diagnostics_have_the_same_and_tell_two_nodes_apart(start_node, peer):
@@ -64,13 +64,13 @@ def test_diagnostics_have_the_same_and_tell_two_nodes_apart(start_node, peer):
     topic = "/robot1/calibrator/progress"
     peer.node.create_subscription(String, topic, states.append, LATCHED)
     peer.spin_until(lambda: states and len(statuses) == 2 * len(PARTS), "both nodes")
-    names = [f"{node}: {part}" for node in ("/robot1/calibrator", "/other") for part in PARTS]
+    names = [f"{node}: {name}" for node in ("/robot1/calibrator", "/other") for name in PARTS]
     assert set(statuses) == set(names)
-    said = statuses["/robot1/calibrator: progress"]
+    progress = statuses["/robot1/calibrator: progress"]
     document = json.loads(states[-1].data)
-    assert said.message == document["progress"]["text"]
-    values = values_of(said)
-    assert (said.level, said.hardware_id) == (DiagnosticStatus.WARN, "hand_eye_calib")
+    assert progress.message == document["progress"]["text"]
+    values = values_of(progress)
+    assert (progress.level, progress.hardware_id) == (DiagnosticStatus.WARN, "hand_eye_calib")
     z = [values[f"{name}.z"] for name in ("sigma", "target")]
     assert (values["done"], *z) == ("false", "unknown", "0.03")
 
@@ -85,11 +85,14 @@ def test_a_good_drive_is_ok_with_all_its_figures(start_node, peer, state, tmp_pa
     ):
         for stamp_ns, T in zip(stamps_ns, Ts, strict=True):
             publisher.publish(message(publisher.msg_type, int(stamp_ns) - late_ns, T, frame))
-    said = "the streams do not overlap in time (120 parent and 120 child poses"
-    apart = state(lambda each: said in each.extrinsic.text).extrinsic  # a solve may come before
+    sentence = "the streams do not overlap in time (120 parent and 120 child poses"
+    # A solve may come before.
+    apart = state(lambda document: sentence in document.extrinsic.text).extrinsic
     assert (apart.level, "set time_offset" in apart.text) == (Level.WARN, True)
     assert peer.set_parameter("time_offset", 20.0).successful
-    good = state(lambda each: each.extrinsic.level is Level.OK and each.extrinsic.n_poses == 120)
+    good = state(
+        lambda document: document.extrinsic.level is Level.OK and document.extrinsic.n_poses == 120
+    )
     assert good.extrinsic.text.startswith("USE: good to ")
     assert all(angle > 20 for angle in good.extrinsic.rotation_deg.values())
     result = good.extrinsic.result
@@ -104,16 +107,16 @@ def test_bad_input_is_an_error_by_topic_and_reason(start_node, peer, state):
     publishers = peer.publishers()
     stamps_ns, Ts_pw_p, Ts_cw_c = drive()
     peer.feed(publishers, stamps_ns, Ts_pw_p, Ts_cw_c)
-    state(lambda each: each.extrinsic.level is Level.OK)
+    state(lambda document: document.extrinsic.level is Level.OK)
     # Both silent with a result: the robot is parked. One of them: something is broken.
-    silent = state(lambda each: "silent for" in each.inputs["child"].text)
+    silent = state(lambda document: "silent for" in document.inputs["child"].text)
     assert silent.inputs["child"].level is Level.OK
 
     later_ns = itertools.count(int(stamps_ns[-1]), 10**8)
 
-    def only_the_parent_goes_on(each):
+    def only_the_parent_goes_on(document):
         stamp_ns = next(later_ns)
-        child = each.inputs["child"]
+        child = document.inputs["child"]
         publishers[0].publish(message(publishers[0].msg_type, stamp_ns, Ts_pw_p[-1], "lidar"))
         return child.level is Level.WARN and "silent for" in child.text
 
@@ -122,7 +125,7 @@ def test_bad_input_is_an_error_by_topic_and_reason(start_node, peer, state):
         publishers[1].publish(
             message(publishers[1].msg_type, int(stamp_ns) + 12 * 10**9, Ts_cw_c[0], "other_camera")
         )
-    child = state(lambda each: each.inputs["child"].level is Level.ERROR).inputs["child"]
+    child = state(lambda document: document.inputs["child"].level is Level.ERROR).inputs["child"]
     assert (
         "/child_odom: the child stream's sensor frame changed from 'camera' to 'other_camera'"
         in child.text
@@ -130,8 +133,8 @@ def test_bad_input_is_an_error_by_topic_and_reason(start_node, peer, state):
     assert child.refused["unusable"] == 8
     for stamp_ns in (0, next(later_ns)):
         publishers[0].publish(message(publishers[0].msg_type, stamp_ns, Ts_pw_p[0], "lidar"))
-    found = state(lambda each: each.inputs["parent"].refused.get("corrupt stamp") == 1)
-    assert found.inputs["parent"].level is Level.ERROR
+    newest = state(lambda document: document.inputs["parent"].refused.get("corrupt stamp") == 1)
+    assert newest.inputs["parent"].level is Level.ERROR
 
 
 def test_repeated_stamps_gaps_and_rates_are_counted_and_disabled_is_said(start_node, peer, state):
@@ -141,14 +144,14 @@ def test_repeated_stamps_gaps_and_rates_are_counted_and_disabled_is_said(start_n
     kept = np.r_[0:20, 30:60, 60:60]
     peer.feed(publishers, stamps_ns[kept], Ts_pw_p[kept], Ts_cw_c[kept])
     peer.feed(publishers, stamps_ns[55:60], Ts_pw_p[55:60], Ts_cw_c[55:60])
-    parent = state(lambda each: each.inputs["parent"].refused["repeated stamp"] == 5)
+    parent = state(lambda document: document.inputs["parent"].refused["repeated stamp"] == 5)
     parent = parent.inputs["parent"]
     assert (parent.messages, parent.poses_taken) == (55, 50)
     assert parent.longest_gap_s == pytest.approx(1.1)
     assert parent.rate_hz > 0
     assert peer.set_enabled(False).success
     disabled = "poses are not accepted: call ~/set_enabled"
-    state(lambda each: disabled in each.extrinsic.text)
+    state(lambda document: disabled in document.extrinsic.text)
 
 
 def test_a_dead_publisher_pauses_the_session_and_a_second_one_is_named(start_node, peer, state):
@@ -156,36 +159,38 @@ def test_a_dead_publisher_pauses_the_session_and_a_second_one_is_named(start_nod
     publishers = peer.publishers()
     stamps_ns, Ts_pw_p, Ts_cw_c = drive(200)
     peer.feed(publishers, stamps_ns, Ts_pw_p, Ts_cw_c)
-    state(lambda each: each.extrinsic.result and not each.progress.is_paused)
+    state(lambda document: document.extrinsic.result and not document.progress.is_paused)
     second = peer.publisher(publishers[1].msg_type, "child_odom")
-    found = state(lambda each: each.inputs["child"].publishers == 2).inputs["child"]
-    assert found.level is Level.WARN
-    assert "/child_odom has 2 publishers, /peer and /peer: poses of several sources" in found.text
+    child = state(lambda document: document.inputs["child"].publishers == 2).inputs["child"]
+    assert child.level is Level.WARN
+    assert "/child_odom has 2 publishers, /peer and /peer: poses of several sources" in child.text
     for publisher in (publishers[1], second):
         peer.node.destroy_publisher(publisher)
 
     later_ns = itertools.count(int(stamps_ns[-1]) + 10**8, 10**8)
 
-    def only_the_parent_goes_on(each):
+    def only_the_parent_goes_on(document):
         made = message(publishers[0].msg_type, next(later_ns), Ts_pw_p[-1], "lidar")
         publishers[0].publish(made)
-        return each.progress.is_paused
+        return document.progress.is_paused
 
-    found = state(only_the_parent_goes_on, "the pause")
-    assert found.progress.level is Level.WARN
-    assert found.progress.text.startswith("Paused: no pose of child (/child_odom) for ")
+    child = state(only_the_parent_goes_on, "the pause")
+    assert child.progress.level is Level.WARN
+    assert child.progress.text.startswith("Paused: no pose of child (/child_odom) for ")
     gone = "it has no publisher any more"
-    found = state(lambda each: gone in each.inputs["child"].text, "the end of the publisher")
-    assert (found.inputs["child"].publishers, found.inputs["child"].level) == (0, Level.WARN)
+    child = state(
+        lambda document: gone in document.inputs["child"].text, "the end of the publisher"
+    )
+    assert (child.inputs["child"].publishers, child.inputs["child"].level) == (0, Level.WARN)
 
 
 def test_too_little_driving_is_said_also_where_time_does_not_run(start_node, peer, state):
     start_node("-p use_sim_time:=true", "-p solve_period:=0.2", *RELIABLE_INPUTS)
     peer.feed(peer.publishers(), *drive())
-    found = state(lambda each: each.extrinsic.result)
-    assert (found.checks.level, found.checks.age_s) == (Level.WARN, None)
-    said = "not checked yet: that takes 20 s of motion with rotations of 30 deg"
-    assert found.checks.text == said
+    newest = state(lambda document: document.extrinsic.result)
+    assert (newest.checks.level, newest.checks.age_s) == (Level.WARN, None)
+    sentence = "not checked yet: that takes 20 s of motion with rotations of 30 deg"
+    assert newest.checks.text == sentence
 
 
 def in_millimetres(trajectory):
@@ -198,14 +203,14 @@ class TestStreamChecks:
     """What the checks find is said while one still drives."""
 
     @pytest.mark.parametrize(
-        ("damage", "said"),
+        ("damage", "sentence"),
         [
             (inverted, "the child stream seems to hold inverse poses"),
             (in_millimetres, "solved with scale 0.001"),
         ],
     )
     def test_faulty_streams_that_can_be_repaired_are_named_and_solved_with(
-        self, start_node, peer, state, damage, said
+        self, start_node, peer, state, damage, sentence
     ):
         node = start_node("-p solve_period:=0.5", *RELIABLE_INPUTS)
         stamps_ns, Ts_pw_p, Ts_cw_c = drive(250, sigma_rad=7e-4)
@@ -214,14 +219,16 @@ class TestStreamChecks:
         child = damage(Trajectory(stamps_ns, Ts_cw_c)).poses
         peer.feed(peer.publishers(), stamps_ns, Ts_pw_p, child)
 
-        def is_told(each):
-            result = each.extrinsic.result
-            is_whole = each.extrinsic.n_poses == len(stamps_ns)  # solves come before the last pose
-            return result and is_whole and any(said in text for text in result.warnings)
+        def is_told(document):
+            result = document.extrinsic.result
+            is_whole = document.extrinsic.n_poses == len(
+                stamps_ns
+            )  # solves come before the last pose
+            return result and is_whole and any(sentence in text for text in result.warnings)
 
-        found = state(is_told)
-        assert (found.checks.level, found.extrinsic.result.verdict) == (Level.OK, "USE")
-        node.wait_for_log(said)
+        newest = state(is_told)
+        assert (newest.checks.level, newest.extrinsic.result.verdict) == (Level.OK, "USE")
+        node.wait_for_log(sentence)
 
     def test_what_helps_is_a_parameter_and_what_is_mended_is_no_longer_said(
         self, start_node, peer, state, tmp_path
@@ -233,14 +240,16 @@ class TestStreamChecks:
         stamps_ns, Ts_pw_p, Ts_cw_c = drive(250, sigma_rad=7e-4)
         Ts_cw_c[:, :3, 3] *= 1000.0
         peer.feed(peer.publishers(), stamps_ns, Ts_pw_p, Ts_cw_c)
-        state(lambda each: each.checks.text.endswith(": set scale to 0.001"))
+        state(lambda document: document.checks.text.endswith(": set scale to 0.001"))
         assert peer.trigger("save").success
         assert load_result(tmp_path).headline.startswith("DO NOT USE: the child's lengths must be")
         assert peer.set_parameter("scale", 0.001).successful
-        found = state(
-            lambda each: each.checks.level is Level.OK and each.extrinsic.level is Level.OK
+        newest = state(
+            lambda document: (
+                document.checks.level is Level.OK and document.extrinsic.level is Level.OK
+            )
         )
-        assert found.checks.text == "both streams can be of one rigid body"
+        assert newest.checks.text == "both streams can be of one rigid body"
         log = node.wait_for_log("no longer found: the child's lengths must be")
         assert log.count("set scale to 0.001") == 1
 
@@ -248,6 +257,8 @@ class TestStreamChecks:
         # A solve of the first few poses may say what they do not determine.
         node = start_node("-p solve_period:=0.5", "-p min_pairs:=240", *RELIABLE_INPUTS)
         peer.feed(peer.publishers(), *drive(250, sigma_rad=7e-4))
-        found = state(lambda each: each.checks.level is Level.OK)
-        assert not [each for each in found.checks.findings if not each.startswith("note")]
+        newest = state(lambda document: document.checks.level is Level.OK)
+        assert not [
+            sentence for sentence in newest.checks.findings if not sentence.startswith("note")
+        ]
         assert "[WARN]" not in node.log

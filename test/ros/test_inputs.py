@@ -90,8 +90,8 @@ def test_solves_at_once_have_answers_and_a_reset_forgets_poses_and_result(start_
     assert answer.success
     assert "camera in lidar: xyz = (" in answer.message
     answers = [peer.ask(Trigger, "solve") for _ in range(5)]
-    peer.spin_until(lambda: all(each.done() for each in answers), "all answers")
-    assert all(each.result().success for each in answers)
+    peer.spin_until(lambda: all(answer.done() for answer in answers), "all answers")
+    assert all(answer.result().success for answer in answers)
     assert peer.trigger("reset").success
     late = peer.listen(TransformStamped, "extrinsic")
     peer.spin_until(lambda: peer.node.count_publishers("/calibrator/extrinsic") == 1, "one topic")
@@ -118,7 +118,7 @@ def test_result_of_a_session_that_was_reset_meanwhile_is_dropped(start_node, pee
     wait_until("false")  # requests may have been repeated
     n_heard = len(heard)
     tasks = Path(f"/proc/{node.process.pid}/task").glob("*/children")
-    (solver,) = map(int, " ".join(each.read_text() for each in tasks).split())
+    (solver,) = map(int, " ".join(task.read_text() for task in tasks).split())
     os.kill(solver, signal.SIGSTOP)
     answer = peer.ask(Trigger, "solve")
     wait_until("true")  # two services share no order
@@ -149,9 +149,9 @@ def test_a_qos_that_keeps_messages_away_is_named(start_node, peer):
     start_node(*QUIET)
     statuses = peer.diagnostics()
     peer.node.create_publisher(Odometry, "parent_odom", BEST_EFFORT)
-    said = "no message on /parent_odom yet: it is published best effort, but qos_overrides ask"
+    sentence = "no message on /parent_odom yet: it is published best effort, but qos_overrides ask"
     peer.spin_until(
-        lambda: any(each.message.startswith(said) for each in statuses.values()), "that"
+        lambda: any(status.message.startswith(sentence) for status in statuses.values()), "that"
     )
 
 
@@ -211,7 +211,7 @@ class TestRefusedInput:
     def test_parameters_that_cannot_go_together_end_the_start_in_one_line(
         self, start_node, arguments, text
     ):
-        node = start_node(*(f"-p {each}" for each in arguments))
+        node = start_node(*(f"-p {argument}" for argument in arguments))
         assert node.wait() == 1
         assert node.log.startswith(f"calibrator: {text}")
         assert node.log.count("\n") == 1
@@ -226,7 +226,7 @@ class TestLoss:
         qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
         topics = "/lidar/odom", "child_odom"
         publishers = [peer.node.create_publisher(Odometry, topic, qos) for topic in topics]
-        made = [message(Odometry, START_NS, each[0], "lidar") for each in drive(1)[1:]]
+        made = [message(Odometry, START_NS, stream[0], "lidar") for stream in drive(1)[1:]]
         n_sent = 0
         calls = itertools.count()
 
@@ -235,9 +235,9 @@ class TestLoss:
             nonlocal n_sent
             for number in range(n_sent, n_sent + count):
                 stamp = conversions.to_time(START_NS + 2_500_000 * number)
-                for publisher, each in zip(publishers, made, strict=True):
-                    each.header.stamp = stamp
-                    publisher.publish(each)
+                for publisher, pose in zip(publishers, made, strict=True):
+                    pose.header.stamp = stamp
+                    publisher.publish(pose)
             n_sent += count
 
         def told():
@@ -246,10 +246,12 @@ class TestLoss:
             """
             if next(calls) % 50 == 0:
                 send(1)
-            values = [values_of(each) for name, each in statuses.items() if name.endswith(" input")]
-            if len(values) < 2 or any(each["lost"] == "unknown" for each in values):
+            values = [
+                values_of(status) for name, status in statuses.items() if name.endswith(" input")
+            ]
+            if len(values) < 2 or any(row["lost"] == "unknown" for row in values):
                 return []
-            return [[int(each[key]) for key in ("messages", "lost")] for each in values]
+            return [[int(row[key]) for key in ("messages", "lost")] for row in values]
 
         peer.spin_until(told, "both inputs to receive")
         n_before = n_sent  # of these, an unknown number went out before the subscriptions

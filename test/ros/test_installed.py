@@ -31,9 +31,9 @@ def status(peer):
     """``status(part, condition)``: the first status of a part that meets a condition."""
     statuses = peer.diagnostics()
 
-    def wait(part, condition):
-        name = f"/calibrator: {part}"
-        peer.spin_until(lambda: name in statuses and condition(statuses[name]), f"such a {part}")
+    def wait(name, condition):
+        name = f"/calibrator: {name}"
+        peer.spin_until(lambda: name in statuses and condition(statuses[name]), f"such a {name}")
         return statuses[name], values_of(statuses[name])
 
     return wait
@@ -53,8 +53,8 @@ def test_a_result_is_compared_with_what_is_installed(start_node, peer, status, t
     )  # fmt: skip
     peer.solve(peer.publishers(), *noisy(*drive(400)))
 
-    def is_told(each):
-        of = values_of(each)
+    def is_told(status):
+        of = values_of(status)
         # Not the one of an early solve, of a few poses.
         return of.get("comparison.verdict") == "moved" and float(of["comparison.sigma.z"]) < 0.02
 
@@ -78,19 +78,19 @@ def test_the_monitor_learns_then_is_quiet_and_raises_an_alarm_when_the_mount_mov
     publishers = peer.publishers()
     stamps_ns, Ts_pw_p, Ts_cw_c = noisy(*drive(2600))
     peer.feed(publishers, stamps_ns[:1800], Ts_pw_p[:1800], Ts_cw_c[:1800])
-    quiet, values = status("mount", lambda each: "has not moved" in each.message)
+    quiet, values = status("mount", lambda status: "has not moved" in status.message)
     assert quiet.level == DiagnosticStatus.OK
     assert all(float(values[f"visible_10min.{axis}"]) < 0.02 for axis in ("x", "y", "z", "yaw"))
     knocked = se3.exp(np.array([0, 0, 0, 0, 0, np.radians(1.0)]))
     peer.feed(publishers, stamps_ns[1800:2400], Ts_pw_p[1800:2400], Ts_cw_c[1800:2400] @ knocked)
-    alarm, values = status("mount", lambda each: each.level == DiagnosticStatus.ERROR)
+    alarm, values = status("mount", lambda status: status.level == DiagnosticStatus.ERROR)
     assert alarm.message.startswith("the mount has moved: ")
     since_s = (int(values["since_ns"]) - stamps_ns[1800]) * 1e-9
     assert abs(since_s) < 10.0
     node.wait_for_log("the mount has moved: ")
     assert peer.trigger("reset").success
     peer.feed(publishers, stamps_ns[2400:], Ts_pw_p[2400:], Ts_cw_c[2400:])
-    again, _ = status("mount", lambda each: "learning the noise" in each.message)
+    again, _ = status("mount", lambda status: "learning the noise" in status.message)
     assert again.level == DiagnosticStatus.OK
     assert "extrinsic" not in node.log
     assert not (tmp_path / "journal").exists()
@@ -112,10 +112,12 @@ def test_frames_that_are_not_in_what_is_installed_are_said(start_node, peer, sta
         '<parent link="base"/><child link="lidar"/></joint></robot>'
     )
     start_node("-p monitor:=true", f"-p installed:={tmp_path / 'robot.urdf'}", *RELIABLE_INPUTS)
-    early, _ = status("mount", lambda each: True)
+    early, _ = status("mount", lambda status: True)
     assert early.message == "no poses yet"
     peer.feed(peer.publishers(), *drive(100))
-    mount, _ = status("mount", lambda each: "the installed transform is unknown" in each.message)
+    mount, _ = status(
+        "mount", lambda status: "the installed transform is unknown" in status.message
+    )
     assert mount.level == DiagnosticStatus.WARN
     assert "no frame 'camera'" in mount.message
 
@@ -169,9 +171,9 @@ def test_the_base_frame_comes_from_tf(monkeypatch):
     assert early.base_frame == ""
     assert "base_frame base_link is not known from /tf_static" in heard.lines[-1]
     heard.hear(edge("base_link", "mast", LIDAR), edge("mast", "lidar", np.eye(4)))
-    found = heard.robot.complete(result())
-    np.testing.assert_allclose(found.T_base_child, LIDAR @ X, atol=1e-12)
-    broadcast = to_transform(found, is_mounting=True)
+    mounting = heard.robot.complete(result())
+    np.testing.assert_allclose(mounting.T_base_child, LIDAR @ X, atol=1e-12)
+    broadcast = to_transform(mounting, is_mounting=True)
     assert (broadcast.header.frame_id, broadcast.child_frame_id) == ("base_link", "camera")
     assert broadcast.transform.translation.x == pytest.approx((LIDAR @ X)[0, 3])
 
@@ -190,21 +192,23 @@ def test_what_is_installed_comes_from_tf_but_not_from_the_node_itself(monkeypatc
 
 
 def test_the_one_axis_that_motion_does_not_show_is_that_of_what_is_installed(monkeypatch):
-    found = result()
-    dofs = [*found.observability_measured]
+    known_pose = result()
+    dofs = [*known_pose.observability_measured]
     dofs[2] = DofObservability("z", DofVerdict.UNOBSERVABLE, np.inf)
     covariance = np.eye(6) * 1e-6
-    R = found.T_parent_child[:3, :3]
+    R = known_pose.T_parent_child[:3, :3]
     covariance[:3, :3] += 9.0 * np.outer(R[2], R[2])
     hidden = dataclasses.replace(
-        found, observability_measured=tuple(dofs), covariance_measured=covariance
+        known_pose, observability_measured=tuple(dofs), covariance_measured=covariance
     )
     heard = Heard(monkeypatch, installed="7 8 9 0 0 0")
     T = heard.robot.complete(hidden).T_parent_child
-    np.testing.assert_allclose(T[:2, 3], found.T_parent_child[:2, 3], atol=1e-4)
+    np.testing.assert_allclose(T[:2, 3], known_pose.T_parent_child[:2, 3], atol=1e-4)
     assert T[2, 3] == pytest.approx(9.0)
     assert "z is that of the installed transform (7 8" in heard.robot.complete(hidden).warnings[-1]
-    np.testing.assert_array_equal(heard.robot.complete(found).T_parent_child, found.T_parent_child)
+    np.testing.assert_array_equal(
+        heard.robot.complete(known_pose).T_parent_child, known_pose.T_parent_child
+    )
 
 
 def test_an_unusable_transform_is_said(monkeypatch):

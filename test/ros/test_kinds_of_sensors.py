@@ -35,9 +35,9 @@ def test_an_antenna_as_child_and_its_origin_after_a_restart(start_node, peer, tm
     rows = [*zip(stamps_ns, Ts_pw_p, fixes(stamps_ns, Ts_cw_c[:, :3, 3]), strict=True)]
     publishers = peer.publishers(Odometry, NavSatFix)
 
-    def feed(part):
+    def feed(chunk):
         peer.wait_matched(*publishers)
-        for stamp_ns, T, fix in part:
+        for stamp_ns, T, fix in chunk:
             publishers[0].publish(message(Odometry, stamp_ns, T, "lidar"))
             publishers[1].publish(fix)
 
@@ -57,11 +57,11 @@ def test_an_antenna_as_child_and_its_origin_after_a_restart(start_node, peer, tm
     node.wait_for_log("session resumed")
     feed(rows[80:])
     peer.spin_until(lambda: count_poses(journal) == 312, "all poses in the journal")
-    found = peer.listen(TransformStamped, "extrinsic")
+    transforms = peer.listen(TransformStamped, "extrinsic")
     assert peer.trigger("solve").success
-    peer.spin_until(lambda: found, "the lever arm")
-    assert found[-1].child_frame_id == "antenna"
-    assert matrix(found[-1])[:3, 3] == pytest.approx(T_PARENT_CHILD[:3, 3], abs=0.01)
+    peer.spin_until(lambda: transforms, "the lever arm")
+    assert transforms[-1].child_frame_id == "antenna"
+    assert matrix(transforms[-1])[:3, 3] == pytest.approx(T_PARENT_CHILD[:3, 3], abs=0.01)
     assert read_journal(journal).about["child"]["origin"] == origin
     assert "Traceback" not in node.log
 
@@ -89,14 +89,14 @@ def test_an_imu_as_child(start_node, peer):
     for stamp_ns, T, imu in zip(stamps_ns, Ts_pw_p, imu_messages(stamps_ns, Ts_cw_c), strict=True):
         publishers[0].publish(message(Odometry, stamp_ns, T, "lidar"))
         publishers[1].publish(imu)
-    found = peer.listen(TransformStamped, "extrinsic")
+    transforms = peer.listen(TransformStamped, "extrinsic")
     with_covariance = peer.listen(PoseWithCovarianceStamped, "extrinsic_with_covariance")
     peer.spin_until(
-        lambda: found and ns_of(found[-1].header.stamp) >= stamps_ns[-2],
+        lambda: transforms and ns_of(transforms[-1].header.stamp) >= stamps_ns[-2],
         "a result with the last poses",
     )
-    assert found[-1].child_frame_id == "imu_link"
-    T = matrix(found[-1])
+    assert transforms[-1].child_frame_id == "imu_link"
+    T = matrix(transforms[-1])
     assert T[:3, 3].tolist() == [0.0, 0.0, 0.0]
     assert float(se3.rotation_angle(T[:3, :3].T @ T_PARENT_CHILD[:3, :3])) < np.radians(3.0)
     peer.spin_until(lambda: with_covariance, "the pose with covariance")

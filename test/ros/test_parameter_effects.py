@@ -48,14 +48,14 @@ CHANGES = {
     "time_offset": (0.03, {}),
     "scale": (2, {}),
     "parent_scale": (1.5, {}),
-    **{f"{each}_invert": ("poses", {}) for each in STREAMS},
-    **{f"{each}_quaternion": ("wxyz", {}) for each in STREAMS},
-    **{f"{each}_kind": ("exact", {}) for each in STREAMS},
+    **{f"{stream}_invert": ("poses", {}) for stream in STREAMS},
+    **{f"{stream}_quaternion": ("wxyz", {}) for stream in STREAMS},
+    **{f"{stream}_kind": ("exact", {}) for stream in STREAMS},
     "target.translation": (1e-5, {}),
     "target.rotation": (1e-5, {}),
     "target.axes": ("yaw=1e-5", {}),
-    **{f"prior.{each}": ("1+/-0.001", {}) for each in "xyz"},
-    **{f"prior.{each}": ("10deg+/-0.01deg", {}) for each in ("roll", "pitch", "yaw")},
+    **{f"prior.{axis}": ("1+/-0.001", {}) for axis in "xyz"},
+    **{f"prior.{axis}": ("10deg+/-0.01deg", {}) for axis in ("roll", "pitch", "yaw")},
 }
 
 
@@ -94,17 +94,17 @@ def fed(tmp_path_factory):
 @pytest.mark.parametrize("name", CHANGES)
 def test_a_change_while_the_node_runs_changes_the_answer_and_back(fed, name):
     value, beforehand = CHANGES[name]
-    defaults = {each: fed.parameter(each) for each in (name, *beforehand)}
-    for each, other in beforehand.items():
-        assert fed.set_parameter(each, other).successful
+    defaults = {parameter: fed.parameter(parameter) for parameter in (name, *beforehand)}
+    for parameter, other in beforehand.items():
+        assert fed.set_parameter(parameter, other).successful
     before = fed.trigger("solve").message if beforehand else fed.with_defaults
     assert fed.set_parameter(name, value).successful
     after = fed.trigger("solve").message
     assert after != before
     assert fed.set_parameter(name, defaults[name]).successful
     assert fed.trigger("solve").message == before
-    for each in beforehand:
-        assert fed.set_parameter(each, defaults[each]).successful
+    for parameter in beforehand:
+        assert fed.set_parameter(parameter, defaults[parameter]).successful
 
 
 def frame_is_used(start_node, peer, tmp_path, stream, text):
@@ -173,8 +173,8 @@ def others_are_solved_together(start_node, peer, tmp_path):
     assert peer.trigger("save").message.endswith("rig/ follows")
     node.wait_for_log("rig/report.html\n", may_have_ended=True)
     for name, T in (("camera", ros_harness.T_PARENT_CHILD), ("rear", T_PARENT_REAR)):
-        found = hec.load(tmp_path / "out/rig" / name)
-        np.testing.assert_allclose(found.T_parent_child, T, atol=1e-3)
+        loaded = hec.load(tmp_path / "out/rig" / name)
+        np.testing.assert_allclose(loaded.T_parent_child, T, atol=1e-3)
     assert not (tmp_path / "out/report.html").exists()
 
 
@@ -182,7 +182,7 @@ def report_is_used(start_node, peer, tmp_path):
     """The report follows after the end of the node; a replay of the journal makes it again."""
     out = tmp_path / "out"
     node = start_node(*QUIET, "-p report:=true", f"-p output_directory:={out}", "-p scale:=none")
-    with_a_gap = (each[np.r_[0:60, 75:120]] for each in ros_harness.drive())
+    with_a_gap = (poses[np.r_[0:60, 75:120]] for poses in ros_harness.drive())
     answer, _ = peer.solve(peer.publishers(), *with_a_gap)
     assert answer.success
     code, _ = node.stop()
@@ -251,7 +251,7 @@ def enabled_is_used(start_node, peer, tmp_path):
             for name in inputs
             if statuses
         ]
-        return [(each["messages"], each["poses_taken"]) for each in values] == [("10", "0")] * 2
+        return [(row["messages"], row["poses_taken"]) for row in values] == [("10", "0")] * 2
 
     peer.spin_until(ignored, "messages that are not taken")
     assert peer.set_enabled(True).success
@@ -263,7 +263,7 @@ def monitor_is_used(start_node, peer, tmp_path):
     statuses = peer.diagnostics()
     peer.spin_until(lambda: statuses, "diagnostics")
     assert list(statuses) == [
-        f"/calibrator: {part}" for part in ("mount", "parent input", "child input")
+        f"/calibrator: {name}" for name in ("mount", "parent input", "child input")
     ]
     # Its page has a button that ends the watch, and calibrates anew.
     assert peer.set_parameter("monitor", False).successful
@@ -271,13 +271,13 @@ def monitor_is_used(start_node, peer, tmp_path):
     peer.spin_until(lambda: "/calibrator: extrinsic" in statuses, "the state of a calibration")
 
 
-TF = [(f"{each}_tf", "odom:lidar", "/tf") for each in STREAMS]
+TF = [(f"{stream}_tf", "odom:lidar", "/tf") for stream in STREAMS]
 TF.append(("base_frame", "base_link", "/tf_static"))
 EFFECTS = {
     "parent_frame": partial(frame_is_used, stream="parent", text="camera in chosen: "),
     "child_frame": partial(frame_is_used, stream="child", text="chosen in lidar: "),
-    **{f"{each}_type": partial(type_is_used, stream=each) for each in STREAMS},
-    **{f"{each}_measures": partial(measures_is_used, stream=each) for each in STREAMS},
+    **{f"{stream}_type": partial(type_is_used, stream=stream) for stream in STREAMS},
+    **{f"{stream}_measures": partial(measures_is_used, stream=stream) for stream in STREAMS},
     **{name: partial(tf_is_used, name=name, value=value, topic=topic) for name, value, topic in TF},
     "solve_period": solve_period_is_used,
     "output_directory": output_directory_is_used,
@@ -324,8 +324,8 @@ GIVEN = {name: (str(value), value) for name, (value, _) in CHANGES.items()} | {
     "output_directory": ("{folder}/out", "{folder}/out"),
     "journal": ("off", "off"),
     "publish_tf": ("true", True),
-    **{f"{each}_measures": ("poses", "poses") for each in STREAMS},
-    **{f"{each}_tf": (f"odom:{each}", f"odom:{each}") for each in STREAMS},
+    **{f"{stream}_measures": ("poses", "poses") for stream in STREAMS},
+    **{f"{stream}_tf": (f"odom:{stream}", f"odom:{stream}") for stream in STREAMS},
     "other_children": ("2", 2),
     "report": ("false", False),
     "installed": ("1 0 0 0 0 0", "1 0 0 0 0 0"),
@@ -357,10 +357,12 @@ LAUNCHER = [sys.executable, "-c", LAUNCH, str(ROOT / "launch" / "calibrator.laun
 
 def environment(prefix, **more):
     """The environment in which launch finds the package."""
-    found = os.environ | {"ROS_LOG_DIR": str(prefix / "ros_log"), "PYTHONUNBUFFERED": "1"} | more
+    variables = (
+        os.environ | {"ROS_LOG_DIR": str(prefix / "ros_log"), "PYTHONUNBUFFERED": "1"} | more
+    )
     for name, path in (("AMENT_PREFIX_PATH", prefix), ("PYTHONPATH", ROOT)):
-        found[name] = os.pathsep.join(filter(None, [str(path), os.environ.get(name, "")]))
-    return found
+        variables[name] = os.pathsep.join(filter(None, [str(path), os.environ.get(name, "")]))
+    return variables
 
 
 @pytest.fixture
@@ -409,10 +411,10 @@ def start_launch(prefix, domain, tmp_path):
 
 @pytest.mark.parametrize("names", TOGETHER, ids=["most", "monitor"])
 def test_every_parameter_is_an_argument_and_arrives(start_launch, peer, tmp_path, names):
-    given = {name: GIVEN[name] for name in names}
-    texts = {name: text.format(folder=tmp_path) for name, (text, _) in given.items()}
+    options = {name: GIVEN[name] for name in names}
+    texts = {name: text.format(folder=tmp_path) for name, (text, _) in options.items()}
     start_launch(*(f"{name}:={text}" for name, text in texts.items()))
-    for name, (_, value) in given.items():
+    for name, (_, value) in options.items():
         expected = value.format(folder=tmp_path) if isinstance(value, str) else value
         assert peer.parameter(name) == expected, name
 
@@ -430,19 +432,19 @@ TYPES = [f"{stream}_type:=nav_msgs/msg/Odometry" for stream in ("parent", "child
 
 
 @pytest.mark.parametrize(
-    ("argument", "told"),
+    ("argument", "message"),
     [
         ("respawn:=yes", "respawn must be true or false; got 'yes'"),
         ("min_pairs:=3.5", "min_pairs must be a whole number; got '3.5'"),
         ("method:=magic", "method must be one of "),
     ],
 )
-def test_a_value_that_is_not_allowed_is_refused_with_its_name(prefix, argument, told):
+def test_a_value_that_is_not_allowed_is_refused_with_its_name(prefix, argument, message):
     """The node is not started."""
     options = dict(capture_output=True, text=True, timeout=ros_harness.PATIENCE_S)
     done = subprocess.run([*LAUNCHER, argument], env=environment(prefix), **options)
     assert done.returncode == 1
-    assert told in done.stdout + done.stderr
+    assert message in done.stdout + done.stderr
 
 
 def test_name_namespace_topics_and_log_level(start_launch, peer):

@@ -103,7 +103,7 @@ def test_unknown_names_in_the_file_are_warned_about(start_node, tmp_path):
 )
 def test_a_wrong_start_is_one_line(start_node, tmp_path, arguments, code, text):
     (tmp_path / "broken.yaml").write_text("a: [1\n b: {")
-    node = start_node(*(each.format(folder=tmp_path) for each in arguments))
+    node = start_node(*(argument.format(folder=tmp_path) for argument in arguments))
     assert node.wait() == code
     assert text.format(folder=tmp_path) in node.log
     assert node.log.count("\n") == 1

@@ -49,16 +49,20 @@ def test_a_contradicted_prior_withdraws_the_result_until_it_is_removed(start_nod
     assert matrix(early)[2, 3] == pytest.approx(WRONG_Z, abs=0.02)  # of the prior alone
 
     peer.feed(publishers, stamps_ns[100:], Ts_pw_p[100:], Ts_cw_c[100:])
-    said = "the prior on z is"
-    peer.spin_until(lambda: said in statuses["/calibrator: extrinsic"].message, "the contradiction")
-    peer.spin_until(lambda: said in statuses["/calibrator: progress"].message, "the same advice")
+    sentence = "the prior on z is"
+    peer.spin_until(
+        lambda: sentence in statuses["/calibrator: extrinsic"].message, "the contradiction"
+    )
+    peer.spin_until(
+        lambda: sentence in statuses["/calibrator: progress"].message, "the same advice"
+    )
     answer = peer.trigger("solve")
     assert (answer.success, answer.message.startswith("DO NOT USE: the prior on z")) == (
         False,
         True,
     )
-    for part in ("extrinsic", "progress"):
-        status = statuses[f"/calibrator: {part}"]
+    for name in ("extrinsic", "progress"):
+        status = statuses[f"/calibrator: {name}"]
         assert status.level == status.WARN
         assert status.message.endswith("check value, unit and sign of prior.z, or remove it")
     values = values_of(statuses["/calibrator: extrinsic"])

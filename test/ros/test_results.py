@@ -21,9 +21,11 @@ FRAMES = ["-p parent_frame:=lidar", "-p child_frame:=camera"]
 def test_extrinsic_of_a_noise_free_drive_comes_by_itself(start_node, peer):
     node = start_node("-p solve_period:=0.2", *RELIABLE_INPUTS)
     extrinsics = peer.listen(TransformStamped, "extrinsic")
-    told = []
+    documents = []
     poses = peer.listen(PoseWithCovarianceStamped, "extrinsic_with_covariance")
-    peer.node.create_subscription(String, "calibrator/progress", told.append, conversions.LISTENING)
+    peer.node.create_subscription(
+        String, "calibrator/progress", documents.append, conversions.LISTENING
+    )
     peer.feed(peer.publishers(), *drive())
     last_ns = drive()[0][-1]
     stamp_ns = lambda: ns_of(extrinsics[-1].header.stamp)  # noqa: E731
@@ -31,8 +33,8 @@ def test_extrinsic_of_a_noise_free_drive_comes_by_itself(start_node, peer):
     np.testing.assert_allclose(matrix(extrinsics[-1]), T_PARENT_CHILD, atol=1e-3)
     assert (extrinsics[-1].header.frame_id, extrinsics[-1].child_frame_id) == ("lidar", "camera")
     # Each result is told at once, with the state.
-    values = [f'"x": {each.transform.translation.x},' for each in extrinsics]
-    peer.spin_until(lambda: all(each in str(told) for each in values), "the states")
+    values = [f'"x": {transform.transform.translation.x},' for transform in extrinsics]
+    peer.spin_until(lambda: all(value in str(documents) for value in values), "the states")
     assert poses[-1].header.frame_id == "lidar"
     covariance = np.reshape(poses[-1].pose.covariance, (6, 6))
     assert np.isfinite(covariance).all()
@@ -47,14 +49,14 @@ def test_extrinsic_of_a_noise_free_drive_comes_by_itself(start_node, peer):
 
 
 @pytest.mark.parametrize(
-    ("given", "said", "is_used"),
+    ("options", "sentence", "is_used"),
     [([], "solved with time_offset estimate", True),
      (["-p time_offset:=0.0"], "the child's clock is 0.3", False)],
 )  # fmt: skip
 def test_a_clock_offset_that_is_certain_is_used_unless_the_clock_is_set_as_right(
-    start_node, peer, given, said, is_used
+    start_node, peer, options, sentence, is_used
 ):
-    node = start_node("-p solve_period:=0.2", *given, *RELIABLE_INPUTS)
+    node = start_node("-p solve_period:=0.2", *options, *RELIABLE_INPUTS)
     extrinsics = peer.listen(TransformStamped, "extrinsic")
     stamps_ns, Ts_pw_p, Ts_cw_c = drive(260)
     peer.feed(peer.publishers(), stamps_ns[3:], Ts_pw_p[:-3], Ts_cw_c[3:])
@@ -62,7 +64,7 @@ def test_a_clock_offset_that_is_certain_is_used_unless_the_clock_is_set_as_right
     def is_right():
         return extrinsics and np.allclose(matrix(extrinsics[-1]), T_PARENT_CHILD, atol=0.01)
 
-    log = node.wait_for_log(said)
+    log = node.wait_for_log(sentence)
     if is_used:
         peer.spin_until(is_right, "a result with the clock offset")
     assert ("solved with time_offset" in log) == is_used
@@ -95,8 +97,8 @@ def test_topic_of_another_type_is_named_with_the_types_that_work(start_node, pee
         "/child_odom: it has type nav_msgs/msg/Odometry; expected geometry_msgs/msg/PoseStamped: ",
     )
     statuses = peer.diagnostics()
-    said = "no message on /child_odom yet: it has type nav_msgs/msg/Odometry; expected"
-    peer.spin_until(lambda: said in str(statuses.get("/calibrator: child input")), "the status")
+    sentence = "no message on /child_odom yet: it has type nav_msgs/msg/Odometry; expected"
+    peer.spin_until(lambda: sentence in str(statuses.get("/calibrator: child input")), "the status")
 
 
 def test_two_nodes_of_one_name_are_told_and_one_topic_for_two_inputs_is_refused(start_node):
@@ -127,8 +129,8 @@ def test_a_recording_through_the_node_equals_the_engine_fed_directly(start_node,
             quat_xyzw = se3.to_quat_xyzw(T_world_sensor).tolist()
             engine.add_pose(stream, int(stamp_ns), T_world_sensor[:3, 3].tolist(), quat_xyzw)
     offline = engine.estimate()
-    given = [f"-p {name}:={value}" for name, value in options.items()]
-    start_node("-p solve_period:=1000.0", *given, *RELIABLE_INPUTS)
+    arguments = [f"-p {name}:={value}" for name, value in options.items()]
+    start_node("-p solve_period:=1000.0", *arguments, *RELIABLE_INPUTS)
     answer, extrinsic = peer.solve(peer.publishers(), stamps_ns, *Ts_w)
     np.testing.assert_allclose(matrix(extrinsic), offline.T_parent_child, rtol=0, atol=1e-9)
     assert ns_of(extrinsic.header.stamp) == offline.stamp_ns

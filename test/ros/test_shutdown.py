@@ -89,8 +89,8 @@ def test_a_solving_process_that_hangs_is_noticed_and_the_node_goes_on(start_node
     pid = node.process.pid
     os.kill(int(Path(f"/proc/{pid}/task/{pid}/children").read_text()), signal.SIGSTOP)
     answer = peer.trigger("solve")
-    what = "the solving process had no answer after 5 s and was killed"
-    assert (answer.success, what in answer.message) == (False, True)
-    node.wait_for_log(what, "it was started again")
+    sentence = "the solving process had no answer after 5 s and was killed"
+    assert (answer.success, sentence in answer.message) == (False, True)
+    node.wait_for_log(sentence, "it was started again")
     answer, _ = peer.solve(peer.publishers(), *drive())
     assert answer.success

@@ -39,8 +39,8 @@ def test_a_frame_has_one_parent_and_the_tree_no_circle(edges, why):
     tree = RobotTree(None, None)
     for parent, child in edges:
         tree.add(parent, child)
-    found = tree.what_forbids("lidar", "camera")
-    assert why in found if why else found == ""
+    reason = tree.what_forbids("lidar", "camera")
+    assert why in reason if why else reason == ""
 
 
 @pytest.fixture(scope="module")
@@ -91,31 +91,31 @@ class TestNode:
         heard = listen()
         extrinsics = peer.listen(TransformStamped, "extrinsic")
         states = peer.listen(String, "progress")
-        said = peer.diagnostics()
+        statuses = peer.diagnostics()
         start_node(
             "-p publish_tf:=true", "-p solve_period:=1000.0", f"-p output_directory:={tmp_path}",
             *RELIABLE_INPUTS,
         )  # fmt: skip
 
-        def edges(found):
-            return [each for each in found if each.child_frame_id == "camera"]
+        def edges(transforms):
+            return [transform for transform in transforms if transform.child_frame_id == "camera"]
 
-        def state(part="extrinsic", key="tf_static"):
-            return values_of(said[f"/calibrator: {part}"])[key]
+        def state(name="extrinsic", key="tf_static"):
+            return values_of(statuses[f"/calibrator: {name}"])[key]
 
         def fault():
-            newest = said.get("/calibrator: progress")
+            newest = statuses.get("/calibrator: progress")
             is_faulty = newest is not None and values_of(newest)["is_faulty"] == "true"
             return newest.message if is_faulty else ""
 
         publishers = peer.publishers()
         poses = drive(450)
-        peer.solve(publishers, *(part[:400] for part in poses))
+        peer.solve(publishers, *(half[:400] for half in poses))
         early = "the goal is not reached"
-        is_early = lambda: said and state(key="tf_static_reason") == early  # noqa: E731
+        is_early = lambda: statuses and state(key="tf_static_reason") == early  # noqa: E731
         peer.spin_until(is_early, "the state", fault)
         assert state() == "not_yet"
-        peer.solve(publishers, *(part[400:] for part in poses))
+        peer.solve(publishers, *(half[400:] for half in poses))
         peer.spin_until(lambda: state("progress", "done") == "true", "the goal", fault)
         # Nothing comes in any more: the two results that reached the goal suffice.
         peer.spin_until(lambda: edges(heard), "the edge")
@@ -130,11 +130,11 @@ class TestNode:
         saved = load_result(tmp_path)
         assert saved.T_parent_child == pytest.approx(T)
         assert f"{saved.n_poses} poses" in answer
-        told = json.loads(states[-1].data)
-        assert [told["extrinsic"]["result"]["pose"][axis] for axis in "xyz"] == pytest.approx(
+        document = json.loads(states[-1].data)
+        assert [document["extrinsic"]["result"]["pose"][axis] for axis in "xyz"] == pytest.approx(
             T[:3, 3].tolist()
         )
-        assert (told["progress"]["progress"]["done"], saved.goal.done) == (True, True)
+        assert (document["progress"]["progress"]["done"], saved.goal.done) == (True, True)
         assert peer.trigger("reset").success
         late = listen()
         peer.spin_until(lambda: late, "the robot's edge")
@@ -158,8 +158,8 @@ class TestNode:
         robot(("base_link", child))
         self.frames_of_new_listener(peer, listen, child)
         broadcaster.update(calibration, "")
-        told, why = broadcaster.state
-        assert told is Broadcast.REFUSED
+        standing, why = broadcaster.state
+        assert standing is Broadcast.REFUSED
         assert why.startswith(f"{child} has the parent base_link on /tf_static")
         assert f"publish_tf is refused: {child} has the parent" in capfd.readouterr().err
 
@@ -197,5 +197,5 @@ class TestNode:
     @staticmethod
     def frames_of_new_listener(peer, listen, until):
         heard = listen()
-        peer.spin_until(lambda: until in {each.child_frame_id for each in heard}, until)
-        return {each.child_frame_id for each in heard}
+        peer.spin_until(lambda: until in {transform.child_frame_id for transform in heard}, until)
+        return {transform.child_frame_id for transform in heard}

@@ -90,7 +90,10 @@ def test_a_person_sees_the_session_from_the_first_message_to_done(
     watch.wait_for("CHECK INPUT: No message on /parent_odom yet")
     publishers = peer.publishers()
     poses = drive(180, 300_000_000, sigma_rad=7e-4)
-    parts = [[part[start:end] for part in poses] for start, end in ((0, 90), (90, 130), (130, 180))]
+    parts = [
+        [poses_of_stream[start:end] for poses_of_stream in poses]
+        for start, end in ((0, 90), (90, 130), (130, 180))
+    ]
     peer.solve(publishers, *parts[0])  # 27 s of motion are not enough
     watch.wait_for("▶ GO ON: ")
     peer.solve(publishers, *parts[1])  # and one result is none
