@@ -75,8 +75,8 @@ _PAPER = [
     Artefact("conclusions", _EVERYTHING, conclusions.write),
     Artefact("findings", _EVERYTHING, findings.write),
 ]
-GROUPS = {each.name: [each] for each in _PAPER} | {
-    "s-figures": [each for each in _FIGURES if each.name.startswith("figS")],
+GROUPS = {artefact.name: [artefact] for artefact in _PAPER} | {
+    "s-figures": [artefact for artefact in _FIGURES if artefact.name.startswith("figS")],
     "s-tables": _VARIANTS,
     "certificate": [Artefact("certificate", [], certificate.write)],
     "all": _PAPER,
@@ -135,7 +135,9 @@ def made(
     """
     wanted = GROUPS[identifier]
     artefacts = [
-        one for one in wanted if all(cell.dataset in source.datasets for cell in one.cells)
+        artefact
+        for artefact in wanted
+        if all(cell.dataset in source.datasets for cell in artefact.cells)
     ]
     if not artefacts:
         raise ConfigError(f"{identifier} is about the KITTI drives: use --data published")
@@ -145,7 +147,9 @@ def made(
     todo = dict.fromkeys(cell for artefact in artefacts for cell in artefact.cells)
     solved = in_parallel(solve_cell, [(source, cell) for cell in todo], jobs)
     results = Results(source, table_of([row for rows in solved for row in rows]), out, jobs)
-    return results, {each.name: each.write(each.name, results) for each in artefacts}
+    return results, {
+        artefact.name: artefact.write(artefact.name, results) for artefact in artefacts
+    }
 
 
 def said(results: Results, files: dict[str, list[Path]]) -> str:

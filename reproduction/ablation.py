@@ -81,7 +81,7 @@ def _real_case(rig: Rig, parent: Any, child: Any) -> Case:
     snapshot = whole_snapshot(parent, child, options).resolved
     pairs = snapshot.pose_pairs
     pairs = pairs.child_scaled(settle_scale(pairs, snapshot.config.scale)[0])
-    family = next((each for each in _FAMILIES if each in rig.name), rig.name)
+    family = next((family for family in _FAMILIES if family in rig.name), rig.name)
     is_clock_free = snapshot.time_offset is not None
     return Case(family, pairs, is_clock_free, rig.truth.T_parent_child, rig.truth.sigmas)
 
@@ -108,7 +108,7 @@ def outcome(case: Case, options: dict[str, Any]) -> Outcome | None:
     """
     poses = case.poses
     try:
-        found = estimator.solve(
+        solution = estimator.solve(
             poses.stamps_ns,
             poses.Ts_pw_p,
             poses.Ts_cw_c,
@@ -117,17 +117,19 @@ def outcome(case: Case, options: dict[str, Any]) -> Outcome | None:
         )
     except (np.linalg.LinAlgError, ValueError):
         return None
-    off = deviation(found.T_parent_child, case.T_parent_child)
-    to_parent = np.kron(np.eye(2), found.T_parent_child[:3, :3])
-    variances = np.diag(to_parent @ found.cov_parent_child_in_child @ to_parent.T)
-    known = np.isfinite(case.sigmas)
-    squares = np.where(known, off**2 + 0.25 * np.where(known, case.sigmas, 0.0) ** 2, 0.0)
+    off = deviation(solution.T_parent_child, case.T_parent_child)
+    to_parent = np.kron(np.eye(2), solution.T_parent_child[:3, :3])
+    variances = np.diag(to_parent @ solution.cov_parent_child_in_child @ to_parent.T)
+    is_determined = np.isfinite(case.sigmas)
+    squares = np.where(
+        is_determined, off**2 + 0.25 * np.where(is_determined, case.sigmas, 0.0) ** 2, 0.0
+    )
     sizes = [
-        np.sqrt(squares[part].sum()) if known[part].any() else np.nan
-        for part in (slice(0, 3), slice(3, 6))
+        np.sqrt(squares[axes].sum()) if is_determined[axes].any() else np.nan
+        for axes in (slice(0, 3), slice(3, 6))
     ]
-    in_sigmas = np.abs(off) / np.sqrt(variances + np.where(known, case.sigmas, np.inf) ** 2)
-    return Outcome(np.array(sizes), in_sigmas[known])
+    in_sigmas = np.abs(off) / np.sqrt(variances + np.where(is_determined, case.sigmas, np.inf) ** 2)
+    return Outcome(np.array(sizes), in_sigmas[is_determined])
 
 
 def table(cases: Sequence[Case]) -> str:
@@ -138,32 +140,36 @@ def table(cases: Sequence[Case]) -> str:
     rows = [_row("nothing", cases, whole, whole, 0.0)]
     for name, options in VARIANTS.items():
         started = time.process_time()
-        found = [outcome(case, options) for case in cases]
-        rows.append(_row(name, cases, found, whole, time.process_time() - started))
+        outcomes = [outcome(case, options) for case in cases]
+        rows.append(_row(name, cases, outcomes, whole, time.process_time() - started))
     return markdown_table(rows)
 
 
 def _row(
     name: str,
     cases: Sequence[Case],
-    found: Sequence[Outcome | None],
+    outcomes: Sequence[Outcome | None],
     whole: Sequence[Outcome | None],
     seconds: float,
 ) -> dict[str, str]:
     logs: dict[str, list[FloatArray]] = {}
     inside = []
-    for case, one, reference in zip(cases, found, whole, strict=True):
+    for case, outcome_of_case, reference in zip(cases, outcomes, whole, strict=True):
         if reference is None or np.nanmax(reference.errors) < _ROUNDING:
             continue
-        ratios = np.full(2, _FAILED) if one is None else one.errors / reference.errors
+        ratios = (
+            np.full(2, _FAILED)
+            if outcome_of_case is None
+            else outcome_of_case.errors / reference.errors
+        )
         logs.setdefault(case.family, []).append(np.log(np.maximum(ratios, 1e-3)))
-        inside += [] if one is None else [*(one.in_sigmas < 1.645)]
-    means = {family: np.mean(each, axis=0) for family, each in logs.items()}
-    by_family = [float(np.nanmean(each)) for each in means.values()]
+        inside += [] if outcome_of_case is None else [*(outcome_of_case.in_sigmas < 1.645)]
+    means = {family: np.mean(ratios_of_family, axis=0) for family, ratios_of_family in logs.items()}
+    by_family = [float(np.nanmean(mean)) for mean in means.values()]
     others = sorted(by_family)[:-1]
     return {
         "Without": name,
-        **{family: " ".join(f"{np.exp(x):.2f}" for x in each) for family, each in means.items()},
+        **{family: " ".join(f"{np.exp(x):.2f}" for x in mean) for family, mean in means.items()},
         "All": f"{np.exp(np.mean(by_family)):.3f}",
         "All but its best": f"{np.exp(np.mean(others)):.3f}",
         "In 90 %": f"{100 * np.mean(inside):.0f} %",

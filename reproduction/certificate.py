@@ -35,8 +35,8 @@ def write(name: str, results: Results) -> list[Path]:
         for dataset in datasets
         for level in LEVELS.get(dataset, (None,))
     ]
-    found = in_parallel(prove_level, tasks, results.jobs)
-    proofs = pd.DataFrame([proof for several in found for proof in several])
+    proofs_of_levels = in_parallel(prove_level, tasks, results.jobs)
+    proofs = pd.DataFrame([proof for several in proofs_of_levels for proof in several])
     table = proofs.groupby(["data sets", "answer"], sort=False).agg(
         **{
             "answers": ("proved", "size"),

@@ -48,8 +48,8 @@ class Shown:
 
     def scores(self, dataset: str) -> dict[str, float]:
         """Scores of the best variants by method."""
-        found = self.best[dataset].items()
-        return {method: self.table.score(dataset, method, name) for method, name in found}
+        references = self.best[dataset].items()
+        return {method: self.table.score(dataset, method, name) for method, name in references}
 
     def drift(self, method: str) -> list[float]:
         """Mean e_at with the largest drift, by reference, that of A first."""
@@ -76,19 +76,19 @@ RULES: list[Callable[[Shown], Found]] = []
 def write(name: str, results: Results) -> list[Path]:
     """Write ``NAME.md`` and ``NAME.csv``; returns the paths."""
     shown = Shown(results)
-    found = []
+    rows = []
     for rule in RULES:
         holds, in_part, evidence = rule(shown)
         verdict = "Holds" if holds else "Holds in part" if in_part else "Does not hold"
         claim = " ".join((rule.__doc__ or "").split())
-        found.append({"claim": claim, "verdict": verdict, "evidence": evidence})
+        rows.append({"claim": claim, "verdict": verdict, "evidence": evidence})
     blocks = [
-        f"**{number}. {each['claim']}**\n\n*{each['verdict']}.* {each['evidence']}"
-        for number, each in enumerate(found, start=1)
+        f"**{number}. {row['claim']}**\n\n*{row['verdict']}.* {row['evidence']}"
+        for number, row in enumerate(rows, start=1)
     ]
     return [
         write_text(results.out / f"{name}.md", "# The paper's conclusions, checked", *blocks),
-        write_csv(results.out / f"{name}.csv", found),
+        write_csv(results.out / f"{name}.csv", rows),
     ]
 
 
@@ -105,8 +105,8 @@ def _without_noise(shown: Shown) -> Found:
     counts = (rows["e_at"] > _NOISE_FREE).groupby(rows["method"]).sum().to_dict()
     exact = sum(counts[method] == 0 for method in _AS_PUBLISHED)
     n_rows = len(rows) // len(counts)
-    said = f"Rows of {n_rows} with e_at above 1e-6 m: {_listed(counts)}."
-    return exact == len(_AS_PUBLISHED), exact, said
+    evidence = f"Rows of {n_rows} with e_at above 1e-6 m: {_listed(counts)}."
+    return exact == len(_AS_PUBLISHED), exact, evidence
 
 
 @RULES.append
@@ -137,13 +137,13 @@ def _smallest_motions_first(shown: Shown) -> Found:
     """
     orders = {name: shown.table.ranking(name, "dnlo") for name in ("outliers", "drift")}
     monotone = [
-        [one for one in order if one[0] != "C"] == ["B1", "B5", "B10", "A"]
+        [name for name in order if name[0] != "C"] == ["B1", "B5", "B10", "A"]
         and order.index("C5") < order.index("C10")
         for order in orders.values()
     ]
     first = all(order[0] == "B1" for order in orders.values())
-    said = "; ".join(f"{name}: {' < '.join(order)}" for name, order in orders.items())
-    return all(monotone) and first, any(monotone), f"{said}."
+    evidence = "; ".join(f"{name}: {' < '.join(order)}" for name, order in orders.items())
+    return all(monotone) and first, any(monotone), f"{evidence}."
 
 
 @RULES.append
@@ -159,15 +159,15 @@ def _drift_of_dnlo(shown: Shown) -> Found:
 @RULES.append
 def _components(shown: Shown) -> Found:
     """The motions are heavily partial to x, y and yaw (4.2.1, Figure 4)."""
-    found = components(shown.results.source.cases("noise", 0.0))
+    spreads = components(shown.results.source.cases("noise", 0.0))
     x, y, z, roll, pitch, yaw = (
-        np.array([found[name][reference].centre for reference in REFERENCES])
+        np.array([spreads[name][reference].centre for reference in REFERENCES])
         for name in ("x", "y", "z", "roll", "pitch", "yaw")
     )
     height = (z / np.minimum(x, y)).max()
     tilt = (np.maximum(roll, pitch) / yaw).max()
-    said = f"Medians: z at most {height:.2f} of x and y, roll and pitch {tilt:.2f} of yaw."
-    return height < 0.5 and tilt < 0.5, False, said
+    evidence = f"Medians: z at most {height:.2f} of x and y, roll and pitch {tilt:.2f} of yaw."
+    return height < 0.5 and tilt < 0.5, False, evidence
 
 
 @RULES.append
@@ -176,10 +176,10 @@ def _relative_errors(shown: Shown) -> Found:
     (DNLO; 4.2.1).
     """
     scores = {metric: shown.dnlo("mixture", metric) for metric in METRICS}
-    best = {metric: min(found, key=lambda x: found[x]) for metric, found in scores.items()}
-    said = "; ".join(f"{metric}: {_listed(scores[metric], '.3f')}" for metric in METRICS[:3])
+    best = {metric: min(values, key=lambda x: values[x]) for metric, values in scores.items()}
+    evidence = "; ".join(f"{metric}: {_listed(scores[metric], '.3f')}" for metric in METRICS[:3])
     relative = best["e_rt"] == best["e_rR"] == "B1"
-    return relative and best["e_at"] != "B1", best["e_at"] != "B1", f"Medians of {said}."
+    return relative and best["e_at"] != "B1", best["e_at"] != "B1", f"Medians of {evidence}."
 
 
 @RULES.append
@@ -190,8 +190,8 @@ def _no_criterion(shown: Shown) -> Found:
         for method in _AS_PUBLISHED
     }
     holds = all(by_relative != by_absolute for by_relative, by_absolute in picks.values())
-    said = _listed({method: " / ".join(names) for method, names in picks.items()})
-    return holds, False, f"Mixed noise, smallest median e_rt / smallest e_at: {said}."
+    evidence = _listed({method: " / ".join(names) for method, names in picks.items()})
+    return holds, False, f"Mixed noise, smallest median e_rt / smallest e_at: {evidence}."
 
 
 @RULES.append
@@ -214,8 +214,8 @@ def _dnlo_with_outliers(shown: Shown) -> Found:
     """With outliers DNLO clearly outperforms the others (4.2.2)."""
     scores = shown.scores("outliers")
     others = [score for method, score in scores.items() if method != "dnlo"]
-    said = f"Mean e_at of the best variants (m): {_listed(scores, '.4f')}."
-    return scores["dnlo"] < 0.5 * min(others), False, said
+    evidence = f"Mean e_at of the best variants (m): {_listed(scores, '.4f')}."
+    return scores["dnlo"] < 0.5 * min(others), False, evidence
 
 
 @RULES.append
@@ -229,11 +229,11 @@ def _ali_with_outliers(shown: Shown) -> Found:
         for best in [shown.table.best_reference("outliers", method)]
     )
     whose = {"as published": published, "properly": proper, "DNL": dnl}
-    said = ", ".join(f"{name} {e[0]:.3f} m, {e[1]:.1f} deg" for name, e in whose.items())
+    evidence = ", ".join(f"{name} {e[0]:.3f} m, {e[1]:.1f} deg" for name, e in whose.items())
     return (
         all(ours > 0.8 * theirs for ours, theirs in zip(proper, published, strict=True)),
         any(ours > 1.2 * other for ours, other in zip(proper, dnl, strict=True)),
-        f"Mean errors of the best variants: {said}.",
+        f"Mean errors of the best variants: {evidence}.",
     )
 
 
@@ -252,9 +252,9 @@ def _drift_of_all(shown: Shown) -> Found:
     the methods (4.2.2).
     """
     errors = {method: shown.drift(method)[1:] for method in _AS_PUBLISHED}
-    factors = {method: max(each) / min(each) for method, each in errors.items()}
-    said = f"At 0.05, worst of the others over best: {_listed(factors, '.1f')}."
-    return max(factors.values()) < 2, min(factors.values()) < 2, said
+    factors = {method: max(values) / min(values) for method, values in errors.items()}
+    evidence = f"At 0.05, worst of the others over best: {_listed(factors, '.1f')}."
+    return max(factors.values()) < 2, min(factors.values()) < 2, evidence
 
 
 @RULES.append
@@ -286,8 +286,8 @@ def _zhuang_on_the_short_drive(shown: Shown) -> Found:
     _, variant = best["e_rt (m)"].idxmin()
     holds = best["e_rt (m)"].idxmin()[0] == best[_AT].idxmax()[0] == "zhuang"
     dnl = rows.loc[("dnl", "B1"), "e_rt (m)"]
-    said = f"Zhuang {variant}: e_rt {zhuang['e_rt (m)']:.3f} m, e_at {zhuang[_AT]:.3f} m"
-    return holds, False, f"{said}; DNL B1: e_rt {dnl:.3f} m."
+    evidence = f"Zhuang {variant}: e_rt {zhuang['e_rt (m)']:.3f} m, e_at {zhuang[_AT]:.3f} m"
+    return holds, False, f"{evidence}; DNL B1: e_rt {dnl:.3f} m."
 
 
 @RULES.append
@@ -295,8 +295,8 @@ def _short_drive(shown: Shown) -> Found:
     """On the short drive all other methods are best with B5 or B10 (5.2, Table 1)."""
     best = {name: shown.variants("kitti_short", name) for name in (_AT, _RECTIFIED)}
     references = {name for method, name in best[_AT].items() if method != "zhuang"}
-    said = f"{_listed(best[_AT])}; by the rectified truth {_listed(best[_RECTIFIED])}."
-    return references <= {"B5", "B10"}, False, said
+    evidence = f"{_listed(best[_AT])}; by the rectified truth {_listed(best[_RECTIFIED])}."
+    return references <= {"B5", "B10"}, False, evidence
 
 
 @RULES.append
@@ -309,8 +309,10 @@ def _long_drive(shown: Shown) -> Found:
     middle = all(name in ("B5", "C5", "C10") for name in best.values())
     holds = middle and best["dnlo"] == "C5" and dnlo["B5"] > dnlo["C5"]
     rectified = _listed(shown.variants("kitti_long", _RECTIFIED))
-    said = f"{_listed(best)}; DNLO C5 {dnlo['C5']:.3f} m, B5 {dnlo['B5']:.3f} m; by the rectified"
-    return holds, middle, f"{said} truth {rectified}."
+    evidence = (
+        f"{_listed(best)}; DNLO C5 {dnlo['C5']:.3f} m, B5 {dnlo['B5']:.3f} m; by the rectified"
+    )
+    return holds, middle, f"{evidence} truth {rectified}."
 
 
 @RULES.append
@@ -333,7 +335,7 @@ def _usual_reference(shown: Shown) -> Found:
 @RULES.append
 def _reference_against_method(shown: Shown) -> Found:
     """The choice of the reference matters more than the choice of the method (5.2, 6)."""
-    said = []
+    evidence = []
     holds = []
     for dataset in (*SIMULATED, *KITTI):
         of = shown.drives[dataset][_AT] if dataset in KITTI else None
@@ -347,6 +349,6 @@ def _reference_against_method(shown: Shown) -> Found:
             np.median(errors.max(axis=axis) / errors.min(axis=axis)) for axis in (1, 0)
         )
         holds.append(by_reference > by_method)
-        said.append(f"{dataset} {by_reference:.1f} against {by_method:.1f}")
+        evidence.append(f"{dataset} {by_reference:.1f} against {by_method:.1f}")
     about = "Worst e_at over best, across references against across methods (medians)"
-    return all(holds), sum(holds) > len(holds) / 2, f"{about}: {', '.join(said)}."
+    return all(holds), sum(holds) > len(holds) / 2, f"{about}: {', '.join(evidence)}."

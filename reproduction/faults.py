@@ -98,8 +98,8 @@ def run(arguments: argparse.Namespace) -> str:
     out = arguments.out
     todo = clean_cases(folder) if arguments.clean else cases(folder)
     tasks = {case.key: (case, folder) for case in todo}
-    found = kept(out / "faults.jsonl", _plain_outcome, tasks, arguments.jobs)
-    text = report([Outcome(**each) for each in found.values()], folder)
+    records = kept(out / "faults.jsonl", _plain_outcome, tasks, arguments.jobs)
+    text = report([Outcome(**record) for record in records.values()], folder)
     if arguments.page is not None:
         put_into_page(arguments.page, "faults", text)
     return text
@@ -165,25 +165,28 @@ def _of_clean(case: Case, folder: Path | None) -> Outcome:
 
 
 def _named(findings: Iterable[Any]) -> list[str]:
-    return [("note:" if found.severity is Severity.NOTE else "") + found.code for found in findings]
+    return [
+        ("note:" if finding.severity is Severity.NOTE else "") + finding.code
+        for finding in findings
+    ]
 
 
 def _judged(key: str, result: Calibration, T_parent_child: FloatArray | None) -> Outcome:
-    known = Outcome(
+    outcome = Outcome(
         key=key,
         verdict=result.verdict.value,
         findings=_named(result.findings),
         rules=[reason.rule for reason in result.reasons],
     )
     if T_parent_child is None:
-        return known
+        return outcome
     xi = se3.log(se3.inverse(T_parent_child) @ result.T_parent_child)
     rotation = T_parent_child[:3, :3]
     along = np.concatenate([rotation @ xi[:3], rotation @ xi[3:]])
     seen = np.isfinite(result.sigmas)
     ratios = np.abs(along[seen]) / np.maximum(result.sigmas[seen], 1e-9)
     return replace(
-        known,
+        outcome,
         metres=float(np.linalg.norm(along[:3][seen[:3]])),
         degrees=float(np.degrees(np.linalg.norm(xi[3:]))),
         z=float(ratios.max(initial=0.0)),
@@ -201,12 +204,12 @@ def _sound(name: str, method: MethodName, folder: Path | None) -> _Sound:
         return drive.parent, drive.child, drive.T_parent_child, {}
     rig = next(rig for rig in real_rigs(folder or Path())[0] if rig.name == name)
     (recording,) = rig.recordings.values()
-    found = check_streams(recording.parent, recording.child)
+    checked = check_streams(recording.parent, recording.child)
     parent = recording.parent
     child = recording.child
-    offset = next(f for f in found.findings if f.code == "time_offset")
+    offset = next(f for f in checked.findings if f.code == "time_offset")
     child = child.shifted(float(offset.options["time_offset"]))
-    fit = found.fit
+    fit = checked.fit
     child = child.scaled(fit.scale if fit else 1.0)
     result = calibrate(parent, child, method=method, max_pairs=_MAX_PAIRS)
     return parent, child, result.T_parent_child, {}
@@ -218,12 +221,12 @@ def _sound(name: str, method: MethodName, folder: Path | None) -> _Sound:
 def report(outcomes: Sequence[Outcome], folder: Path | None) -> str:
     """Text of the page."""
     by_fault: dict[str, list[Outcome]] = {}
-    for found in outcomes:
-        by_fault.setdefault(found.key.split()[0], []).append(found)
+    for outcome in outcomes:
+        by_fault.setdefault(outcome.key.split()[0], []).append(outcome)
     clean = by_fault.pop(_CLEAN, [])
     sound = by_fault.pop(_SOUND, [])
     faulty = list(chain.from_iterable(by_fault.values()))
-    unsafe = [found for found in faulty if found.verdict == "USE" and found.z > _LIMIT_Z]
+    unsafe = [outcome for outcome in faulty if outcome.verdict == "USE" and outcome.z > _LIMIT_Z]
     parts = []
     if faulty:
         parts += [
@@ -235,8 +238,9 @@ def report(outcomes: Sequence[Outcome], folder: Path | None) -> str:
             f"{len(unsafe)} of them are more than {_LIMIT_Z:g} standard deviations off and called "
             f"USE{':' if unsafe else '.'}\n"
             + "\n".join(
-                f"- {one.key}: z {one.z:.1f}, {1e3 * one.metres:.0f} mm, {one.degrees:.2f} deg"
-                for one in unsafe
+                f"- {outcome.key}: z {outcome.z:.1f}, {1e3 * outcome.metres:.0f} mm, "
+                f"{outcome.degrees:.2f} deg"
+                for outcome in unsafe
             ),
             f"Without a fault, these recordings end in {counted(f.verdict for f in sound)}; z is "
             f"at most {max((f.z for f in sound), default=0.0):.1f}.",
@@ -250,20 +254,20 @@ def report(outcomes: Sequence[Outcome], folder: Path | None) -> str:
     return "\n\n".join(parts)
 
 
-def _row(fault: Fault, found: Sequence[Outcome]) -> dict[str, str]:
+def _row(fault: Fault, outcomes: Sequence[Outcome]) -> dict[str, str]:
     named = (
         code.removeprefix("note:")
-        for one in found
-        for code in dict.fromkeys(one.findings)
+        for outcome in outcomes
+        for code in dict.fromkeys(outcome.findings)
         if not code.endswith(("gaps", "one_axis"))
     )
-    answered = [one for one in found if math.isfinite(one.z)]
+    answered = [outcome for outcome in outcomes if math.isfinite(outcome.z)]
     return {
         "": fault.code,
         "fault": fault.what,
         "findings": counted(named, most=3) or "none",
-        "verdicts": counted(_SHORT.get(one.verdict, one.verdict) for one in found),
-        "largest z": f"{max(one.z for one in answered):.1f}" if answered else "",
+        "verdicts": counted(_SHORT.get(outcome.verdict, outcome.verdict) for outcome in outcomes),
+        "largest z": f"{max(outcome.z for outcome in answered):.1f}" if answered else "",
     }
 
 
@@ -271,25 +275,26 @@ def _clean_text(outcomes: Sequence[Outcome], folder: Path | None) -> str:
     """How clean recordings end, and what was found in them that is not there."""
     kinds: dict[str, list[Outcome]] = {}
     wrong: dict[str, list[str]] = {}
-    for found in outcomes:
-        name = found.key.split(" ", 2)[2].rpartition(" ")[0]
-        known = clean_recordings.known_in(name, folder)
-        codes = [c for c in found.findings if not c.startswith("note:") and c not in known]
-        kinds.setdefault(clean_recordings.kind_of(name), []).append(found)
+    for outcome in outcomes:
+        name = outcome.key.split(" ", 2)[2].rpartition(" ")[0]
+        known_codes = clean_recordings.known_in(name, folder)
+        codes = [c for c in outcome.findings if not c.startswith("note:") and c not in known_codes]
+        kinds.setdefault(clean_recordings.kind_of(name), []).append(outcome)
         wrong.setdefault(clean_recordings.kind_of(name), []).extend(codes[:1])
     n_wrong = sum(map(len, wrong.values()))
-    n_own = sum(not set(found.rules) - _PHYSICAL for found in outcomes)
+    n_own = sum(not set(outcome.rules) - _PHYSICAL for outcome in outcomes)
     rows = [
         {
             "clean recordings": kind,
-            "solved": len(found),
+            "solved": len(group),
             "wrong findings": counted(wrong[kind]) or "none",
-            "verdict": counted(_SHORT.get(one.verdict, one.verdict) for one in found),
-            "reasons": counted(rule for one in found for rule in dict.fromkeys(one.rules)),
-            "largest z": f"{max((one.z for one in found if one.z == one.z), default=0.0):.1f}",
+            "verdict": counted(_SHORT.get(outcome.verdict, outcome.verdict) for outcome in group),
+            "reasons": counted(rule for outcome in group for rule in dict.fromkeys(outcome.rules)),
+            "largest z": f"{max((o.z for o in group if o.z == o.z), default=0.0):.1f}",
         }
-        for kind, found in kinds.items()
-        if wrong[kind] or any(set(one.rules) - _PHYSICAL or one.z > _LIMIT_Z for one in found)
+        for kind, group in kinds.items()
+        if wrong[kind]
+        or any(set(outcome.rules) - _PHYSICAL or outcome.z > _LIMIT_Z for outcome in group)
     ]
     return (
         f"Wrong findings in {n_wrong} of {len(outcomes)} clean recordings, solved with the default "

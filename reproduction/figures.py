@@ -151,7 +151,7 @@ def _compare(
     compared = numbers.copy()
     theirs = _numbers(choices, results.theirs)
     parts = ["centre", "low", "high"]
-    published = [f"published_{part}" for part in parts]
+    published = [f"published_{statistic}" for statistic in parts]
     compared[published] = theirs[parts]
     compared["agrees"] = agree(numbers[parts].to_numpy(), theirs[parts].to_numpy()).all(axis=1)
     rows = dict(list(results.rows.groupby(["dataset", "method", "reference"])))
@@ -183,7 +183,7 @@ def write_components(name: str, results: Results) -> list[Path]:
     """Figure 4: the absolute components of the parent's relative motions on the drives without
     noise; returns the paths.
     """
-    found = components(results.source.cases("noise", 0.0))
+    summaries = components(results.source.cases("noise", 0.0))
     number, where = _where("4", results)
     table = pd.DataFrame(
         {
@@ -195,7 +195,7 @@ def write_components(name: str, results: Results) -> list[Path]:
             "upper_quartile": summary.high,
             "motions": summary.n,
         }
-        for component, of_component in found.items()
+        for component, of_component in summaries.items()
         for reference, summary in of_component.items()
     )
     return [
@@ -203,7 +203,7 @@ def write_components(name: str, results: Results) -> list[Path]:
             f"{number}. Components of the relative motions of {where} without noise",
             "Median, quartiles, whiskers to 1.5 interquartile ranges. Of the parent sensor; "
             "angles are ZYX Euler angles.",
-            {f"|{component}|": found[component] for component in _COMPONENTS},
+            {f"|{component}|": summaries[component] for component in _COMPONENTS},
             results.out / name,
         ),
         write_csv(results.out / f"{name}.csv", table),
@@ -214,11 +214,11 @@ def components(cases: Sequence[Case]) -> dict[str, dict[str, Summary]]:
     """Summaries of the absolute components (m, deg) of all relative motions, by component and
     reference.
     """
-    found: dict[str, dict[str, Summary]] = {component: {} for component in _COMPONENTS}
+    summaries: dict[str, dict[str, Summary]] = {component: {} for component in _COMPONENTS}
     for reference in REFERENCES:
         motions = np.concatenate([case.pairs(reference).Ts_parenti_parentj for case in cases])
         angles = Rotation.from_matrix(motions[:, :3, :3]).as_euler("ZYX", degrees=True)[:, ::-1]
         values = np.abs(np.hstack([motions[:, :3, 3], angles])).T
         for component, of_component in zip(_COMPONENTS, values, strict=True):
-            found[component][reference] = quartile_summary(of_component)
-    return found
+            summaries[component][reference] = quartile_summary(of_component)
+    return summaries

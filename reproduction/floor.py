@@ -35,13 +35,13 @@ def axes(case: Case) -> Iterator[dict[str, object]]:
     in the floor besides its sizes.
     """
     parent = case.streams[0]
-    found = answer(*case.streams, case.options)
-    if found is None:
+    result = answer(*case.streams, case.options)
+    if result is None:
         return
     speed_m_s = usual_speed(parent.stamps_ns, parent.poses[:, :3, 3])
-    stated = found.sigmas_measured**2
-    whole = found.sigmas**2
-    error = deviation(found.T_parent_child, case.T_parent_child)
+    stated = result.sigmas_measured**2
+    whole = result.sigmas**2
+    error = deviation(result.T_parent_child, case.T_parent_child)
     for k in np.flatnonzero(np.isfinite(stated) & np.isfinite(case.sigmas)):
         yield {
             "family": case.family,
@@ -55,46 +55,48 @@ def axes(case: Case) -> Iterator[dict[str, object]]:
         }
 
 
-def _variances(found: pd.DataFrame, sizes: tuple[float, float, float]) -> FloatArray:
+def _variances(axis_rows: pd.DataFrame, sizes: tuple[float, float, float]) -> FloatArray:
     """Stated variances with a floor of these sizes."""
     translation, rotation, travel_s = sizes
-    of_speed = translation**2 + (travel_s * found["speed"]) ** 2
-    fixed = np.where(found["turns"], rotation**2, of_speed)
-    return np.asarray(found["stated"] + found["rest"] + fixed)
+    of_speed = translation**2 + (travel_s * axis_rows["speed"]) ** 2
+    fixed = np.where(axis_rows["turns"], rotation**2, of_speed)
+    return np.asarray(axis_rows["stated"] + axis_rows["rest"] + fixed)
 
 
-def chosen(found: pd.DataFrame) -> tuple[float, float, float]:
+def chosen(axis_rows: pd.DataFrame) -> tuple[float, float, float]:
     """The likeliest sizes of the floor."""
 
     def loss(sizes: tuple[float, float, float]) -> float:
-        variances = _variances(found, sizes) + found["truth"]
-        far = np.minimum(found["error"] ** 2 / variances, _FARTHEST**2)
-        return float((np.log(variances) + far).groupby(found["family"]).mean().mean())
+        variances = _variances(axis_rows, sizes) + axis_rows["truth"]
+        far = np.minimum(axis_rows["error"] ** 2 / variances, _FARTHEST**2)
+        return float((np.log(variances) + far).groupby(axis_rows["family"]).mean().mean())
 
     return min(product(*_SIZES), key=loss)
 
 
-def _row(name: str, found: pd.DataFrame, sizes: str = "") -> dict[str, object]:
-    far = np.abs(found["error"])
-    row: dict[str, object] = {"Family": name, "Axes": len(found), "Chosen without it": sizes}
+def _row(name: str, axis_rows: pd.DataFrame, sizes: str = "") -> dict[str, object]:
+    far = np.abs(axis_rows["error"])
+    row: dict[str, object] = {"Family": name, "Axes": len(axis_rows), "Chosen without it": sizes}
     for title, of in (("Covers then", "then"), ("As it is", "whole"), ("No floor", "stated")):
-        inside = [far < _REACH * np.sqrt(found[of] + more) for more in (found["truth"], 0.0)]
-        row[title] = ", ".join(f"{100 * np.mean(each):.0f} %" for each in inside)
-    floor = np.sqrt(found["whole"] - found["stated"])[~found["turns"]]
-    largest = (far / np.sqrt(found["whole"] + found["truth"])).max()
+        inside = [
+            far < _REACH * np.sqrt(axis_rows[of] + more) for more in (axis_rows["truth"], 0.0)
+        ]
+        row[title] = ", ".join(f"{100 * np.mean(shares):.0f} %" for shares in inside)
+    floor = np.sqrt(axis_rows["whole"] - axis_rows["stated"])[~axis_rows["turns"]]
+    largest = (far / np.sqrt(axis_rows["whole"] + axis_rows["truth"])).max()
     return row | {"Mean floor (mm)": f"{1e3 * floor.mean():.1f}", "Largest z": f"{largest:.1f}"}
 
 
-def table(found: pd.DataFrame) -> str:
+def table(axis_rows: pd.DataFrame) -> str:
     """A row for every family, its floor chosen on the others; and one for all."""
     rows = []
-    for family in found["family"].unique():
-        is_left_out = found["family"] == family
-        metres, radians, travel_s = sizes = chosen(found[~is_left_out])
-        found.loc[is_left_out, "then"] = _variances(found[is_left_out], sizes)
-        told = f"{1e3 * metres:g} mm, {np.degrees(radians):.2f} deg, {1e3 * travel_s:g} ms"
-        rows.append(_row(family, found[is_left_out], told))
-    return markdown_table([*rows, _row("all", found)])
+    for family in axis_rows["family"].unique():
+        is_left_out = axis_rows["family"] == family
+        metres, radians, travel_s = sizes = chosen(axis_rows[~is_left_out])
+        axis_rows.loc[is_left_out, "then"] = _variances(axis_rows[is_left_out], sizes)
+        words = f"{1e3 * metres:g} mm, {np.degrees(radians):.2f} deg, {1e3 * travel_s:g} ms"
+        rows.append(_row(family, axis_rows[is_left_out], words))
+    return markdown_table([*rows, _row("all", axis_rows)])
 
 
 def main() -> None:
@@ -106,8 +108,8 @@ def main() -> None:
     seed = seed_of(None)
     asked = ("time_offset", "scale", "prior")
     cases = real_cases(folder, arguments.pieces, np.random.default_rng(seed), asked)
-    found = pd.DataFrame([row for case in cases for row in axes(case)])
-    show(arguments.page, {"floor": f"Seed {seed}.\n\n{table(found)}"})
+    axis_rows = pd.DataFrame([row for case in cases for row in axes(case)])
+    show(arguments.page, {"floor": f"Seed {seed}.\n\n{table(axis_rows)}"})
 
 
 if __name__ == "__main__":

@@ -67,11 +67,11 @@ def closure(
     Ts_a: FloatArray, X: FloatArray, Z: FloatArray, Ts_b: FloatArray
 ) -> tuple[float, float]:
     """Root mean squares of the angles (deg) and distances (mm) between ``A X`` and ``Z B``."""
-    left = Ts_a @ X
+    from_left = Ts_a @ X
     right = Z @ Ts_b
-    turned = np.swapaxes(left[:, :3, :3], 1, 2) @ right[:, :3, :3]
+    turned = np.swapaxes(from_left[:, :3, :3], 1, 2) @ right[:, :3, :3]
     angle_deg = np.degrees(np.sqrt(np.mean(se3.rotation_angle(turned) ** 2)))
-    apart = np.sum((left[:, :3, 3] - right[:, :3, 3]) ** 2, axis=1)
+    apart = np.sum((from_left[:, :3, 3] - right[:, :3, 3]) ** 2, axis=1)
     return float(angle_deg), 1e3 * float(np.sqrt(np.mean(apart)))
 
 
@@ -110,7 +110,7 @@ def ethz(folder: Path) -> Iterator[Row]:
     for seed, beginning in enumerate(_DIGESTS):
         order = list(range(len(pairs)))
         random.Random(seed).shuffle(order)
-        held, fitted = ([pairs[k] for k in sorted(part)] for part in (order[:16], order[16:48]))
+        held, fitted = ([pairs[k] for k in sorted(stops)] for stops in (order[:16], order[16:48]))
         name = hashlib.sha256("\n".join(pair[0] for pair in fitted).encode()).hexdigest()
         same += name.startswith(beginning)
         A = hand[[i for _, i, _ in fitted]]
@@ -166,11 +166,11 @@ def moveit(folder: Path) -> Iterator[Row]:
 
 def wise(folder: Path) -> Iterator[Row]:
     """Eight cameras that see sixteen tags: X of the tags and Z of the cameras in one solve."""
-    found = sorted((folder / "independent" / "wise_8_cameras").glob("*_A.csv"))
-    keys = [tuple(int(x) for x in re.findall(r"\d+", path.name)) for path in found]
+    files = sorted((folder / "independent" / "wise_8_cameras").glob("*_A.csv"))
+    keys = [tuple(int(x) for x in re.findall(r"\d+", path.name)) for path in files]
     tags, cameras = (sorted({key[side] for key in keys}) for side in (0, 1))
     parts = []
-    for path, (tag, camera) in zip(found, keys, strict=True):
+    for path, (tag, camera) in zip(files, keys, strict=True):
         A, B = (_poses_wxyz(path.with_name(path.name.replace("_A", side))) for side in ("_A", "_B"))
         which = np.full(len(A), tags.index(tag)), np.full(len(A), cameras.index(camera))
         parts.append((A, B, *which))
@@ -181,10 +181,10 @@ def wise(folder: Path) -> Iterator[Row]:
     sigmas_m = np.sqrt(np.diag(fit.covariance)).reshape(-1, 6)[len(tags) :, :3].mean(axis=1)
     ours = f"{seconds:.1f} s, sigma {1e3 * sigmas_m.min():.1f}-{1e3 * sigmas_m.max():.1f} mm"
     figure = f"{len(stops)} stops, {len(cameras)} cameras, {len(tags)} tags in one solve"
-    yield Row("Wise et al.", figure, ours, "none readable", f"{len(found)} pairs of files")
+    yield Row("Wise et al.", figure, ours, "none readable", f"{len(files)} pairs of files")
     chi2 = []
     for camera in range(len(cameras)):
-        own = [part for part in parts if part[3][0] == camera and len(part[0]) >= _MIN_STOPS]
+        own = [stops for stops in parts if stops[3][0] == camera and len(stops[0]) >= _MIN_STOPS]
         fits = [solve(Stops.of_one(A, B)) for A, B, _, _ in own]
         fits = [fit for fit in fits if not fit.undetermined().size]
         if len(fits) > 1:
@@ -228,7 +228,7 @@ def shrimp(folder: Path, n_segments: int) -> Iterator[Row]:
         verdicts = []
         for _ in range(n_segments):
             first = generator.integers(start_ns, end_ns - seconds * 10**9)
-            pair = (between(each, first, first + seconds * 10**9) for each in (nav, velodyne))
+            pair = (between(stream, first, first + seconds * 10**9) for stream in (nav, velodyne))
             result = hec.calibrate(*pair)
             relative = se3.inverse(truth) @ result.T_parent_child
             errors.append(np.r_[relative[:3, 3], np.degrees(se3.rotation_log(relative[:3, :3]))])
@@ -243,7 +243,7 @@ def shrimp(folder: Path, n_segments: int) -> Iterator[Row]:
             f"mean errors, {n_segments} random segments of {seconds} s (x y z m, about x y z deg)",
             f"{ours}; 90 % intervals: truth {covers[0]:.0%}, scatter {covers[1]:.0%}",
             " ".join(f"{value:.3f}" for value in published),
-            ", ".join(f"{verdicts.count(each)} {each}" for each in sorted(set(verdicts))),
+            ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in sorted(set(verdicts))),
         )
 
 

@@ -262,9 +262,9 @@ def draw_components(
                 _draw_box(ax, place, summary, colour)
             ax.set_title(name)
             _coloured_ticks(ax, summaries, colours, fontweight="bold")
-        for row, unit, least in zip(axes, ("m", "deg"), (3e-4, 3e-2), strict=True):
+        for row, unit, lowest in zip(axes, ("m", "deg"), (3e-4, 3e-2), strict=True):
             row[0].set_ylabel(unit)
             row[0].set_yscale("log")
             _write_plainly(row[0])
-            row[0].set_ylim(bottom=least)
+            row[0].set_ylim(bottom=lowest)
         return _save(figure, stem)

@@ -260,13 +260,13 @@ def distance(kind: str, result: Calibration, truth: FloatArray) -> float:
     """Largest error of a known axis over its standard deviation with the allowance."""
     if kind == "positions":
         errors = result.T_parent_child[:3, 3] - truth
-        part = slice(0, 3)
+        axes = slice(0, 3)
     else:
         errors = se3.rotation_log(truth @ result.T_parent_child[:3, :3].T)
-        part = slice(3, 6)
-    totals = result.sigmas[part]
-    known = np.isfinite(totals)
-    return float(np.abs(errors[known] / totals[known]).max(initial=0.0))
+        axes = slice(3, 6)
+    totals = result.sigmas[axes]
+    is_determined = np.isfinite(totals)
+    return float(np.abs(errors[is_determined] / totals[is_determined]).max(initial=0.0))
 
 
 def rows(kind: str, seeds: Sequence[int]) -> Iterator[dict[str, object]]:
@@ -282,8 +282,10 @@ def rows(kind: str, seeds: Sequence[int]) -> Iterator[dict[str, object]]:
                 recording = make(platform, fault, seed)
                 result = hec.calibrate(recording.parent, recording.child, **WIDE)
                 verdicts[result.verdict.value] += 1
-                serious = [one for one in result.findings if one.severity is not Severity.NOTE]
-                codes.update({one.code for one in serious})
+                serious = [
+                    finding for finding in result.findings if finding.severity is not Severity.NOTE
+                ]
+                codes.update({finding.code for finding in serious})
                 if result.verdict is not hec.Verdict.DO_NOT_USE:
                     distances.append(distance(kind, result, recording.truth))
                     far += result.verdict is hec.Verdict.USE and distances[-1] > FAR_SIGMAS

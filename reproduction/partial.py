@@ -136,13 +136,13 @@ def position_rows(n_seeds: int) -> Iterator[dict[str, object]]:
             result = hec.calibrate(parent, child)
             errors.append(result.T_parent_child[:3, 3] - lever_arm)
             stated.append(result.sigmas_measured[:3])
-        known = np.isfinite(stated)
+        is_determined = np.isfinite(stated)
         yield {
             "Machine": name,
             "Recordings": n_seeds,
             "Median error x, y, z (cm)": triple(np.median(np.abs(errors), axis=0), 100.0),
             "Median sigma x, y, z (cm)": triple(np.median(stated, axis=0), 100.0),
-            "Covers": _covers((np.array(errors) / np.array(stated))[known]),
+            "Covers": _covers((np.array(errors) / np.array(stated))[is_determined]),
         }
 
 

@@ -136,15 +136,15 @@ def find_folder(folder: str | Path) -> str:
     if it is none.
     """
     inside = Path(folder) / "valimaki2023"
-    found = inside if inside.is_dir() else Path(folder)
-    names = ["kitti_tests", "simulation_tests", results_folder(found).name]
-    missing = [name for name in names if not (found / name).is_dir()]
+    found_in = inside if inside.is_dir() else Path(folder)
+    names = ["kitti_tests", "simulation_tests", results_folder(found_in).name]
+    missing = [name for name in names if not (found_in / name).is_dir()]
     if missing:
         raise InputError(
-            f"{found}: expected the published data, a clone of "
+            f"{found_in}: expected the published data, a clone of "
             f"github.com/tau-alma/trajectory_calibration_experiments; it has no {missing[0]}"
         )
-    return str(found.resolve())
+    return str(found_in.resolve())
 
 
 def results_folder(folder: Path) -> Path:

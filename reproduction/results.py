@@ -73,8 +73,8 @@ class Table:
 
     def levels(self, dataset: str, method: str) -> tuple[float | None, ...]:
         """Levels of a data set, ascending; (None,) for the mixture."""
-        found = {key[1] for key in self._errors if (key[0], key[2]) == (dataset, method)}
-        return tuple(sorted(found, key=lambda level: level or 0.0))
+        of_dataset = {key[1] for key in self._errors if (key[0], key[2]) == (dataset, method)}
+        return tuple(sorted(of_dataset, key=lambda level: level or 0.0))
 
     def summary(
         self, dataset: str, level: float | None, method: str, reference: str, metric: str
@@ -88,8 +88,8 @@ class Table:
         the mixture, the median.
         """
         levels = self.levels(dataset, method)
-        found = [self.summary(dataset, level, method, reference, metric) for level in levels]
-        return float(np.mean([summary.centre for summary in found]))
+        summaries = [self.summary(dataset, level, method, reference, metric) for level in levels]
+        return float(np.mean([summary.centre for summary in summaries]))
 
     def ranking(self, dataset: str, method: str, metric: str = "e_at") -> list[str]:
         """References from the smallest score to the largest."""

@@ -86,22 +86,22 @@ class Outcome(NamedTuple):
 def outcome(rig: Rig) -> Outcome:
     """Calibrate a rig, all its extrinsics against the truth."""
     names = [f"s{index}" for index in range(len(rig.Xs))]
-    found = calibrate_rig(trajectories_of(rig, names))
+    calibration = calibrate_rig(trajectories_of(rig, names))
     errors = {}
     own = []
     for first, second in combinations(range(len(names)), 2):
         back = se3.inverse(rig.Xs[second]) @ rig.Xs[first]
-        errors[first, second] = se3.log(back @ found.T(names[first], names[second]))
-        own.append(np.diag(found.covariance_measured(names[first], names[second])))
+        errors[first, second] = se3.log(back @ calibration.T(names[first], names[second]))
+        own.append(np.diag(calibration.covariance_measured(names[first], names[second])))
     pairwise = [
-        se3.log(se3.inverse(rig.Xs[at + 1]) @ rig.Xs[at] @ each.T_parent_child)
-        for at, each in enumerate(found.neighbours, start=1)
+        se3.log(se3.inverse(rig.Xs[at + 1]) @ rig.Xs[at] @ neighbour.T_parent_child)
+        for at, neighbour in enumerate(calibration.neighbours, start=1)
     ]
     return Outcome(
         np.array([*errors.values()]) / np.sqrt(own),
         np.array([errors[at, at + 1] for at in range(1, len(names) - 1)]) ** 2,
         np.array(pairwise) ** 2,
-        max(each.translation_m for each in found.closures),
+        max(closure.translation_m for closure in calibration.closures),
     )
 
 
@@ -118,21 +118,22 @@ def simulated_table(repeats: int, n_poses: int) -> str:
     for name, errors_of in (("alike", alike), ("unequal", unequal)):
         for n_sensors in (3, 5):
             errors = errors_of(n_sensors)
-            found = [outcome(simulated(seed, n_poses, errors)) for seed in range(repeats)]
-            rows.append({"Sensors": name, "S": n_sensors, **_row(found)})
+            outcomes = [outcome(simulated(seed, n_poses, errors)) for seed in range(repeats)]
+            rows.append({"Sensors": name, "S": n_sensors, **_row(outcomes)})
     return markdown_table(rows)
 
 
-def _row(found: Sequence[Outcome]) -> dict[str, str]:
+def _row(outcomes: Sequence[Outcome]) -> dict[str, str]:
     squares, pairwise = (
-        np.array([getattr(each, name) for each in found]).mean(axis=0)
+        np.array([getattr(draw, name) for draw in outcomes]).mean(axis=0)
         for name in ("squares", "pairwise_squares")
     )
-    inside = np.mean([np.abs(each.in_sigmas) < QUANTILE_90 for each in found])
+    misclosures_m = [draw.closes_m for draw in outcomes]
+    inside = np.mean([np.abs(draw.in_sigmas) < QUANTILE_90 for draw in outcomes])
     return {
         "Neighbours: error / own answer": f"{np.sqrt(np.mean(squares / pairwise)):.2f}",
         "Within 90 % interval": f"{100 * inside:.0f} %",
-        "Answers miss closing by (mm)": f"{1e3 * np.median([each.closes_m for each in found]):.2f}",
+        "Answers miss closing by (mm)": f"{1e3 * np.median(misclosures_m):.2f}",
     }
 
 

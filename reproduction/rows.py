@@ -89,7 +89,7 @@ def _solve(case: Case, method: str, reference: str) -> dict[str, Any]:
     pairs = case.pairs(reference)
     solve = ali_as_published.solve if method == ALI_AS_PUBLISHED else Method(method).solve
     solution = solve(pairs)
-    found = errors(pairs, solution.T_parent_child, case.T_parent_child)
+    errors_of_solution = errors(pairs, solution.T_parent_child, case.T_parent_child)
     row = {
         "dataset": case.dataset,
         "level": case.level,
@@ -98,7 +98,7 @@ def _solve(case: Case, method: str, reference: str) -> dict[str, Any]:
         "reference": reference,
         "converged": solution.converged,
         "T_parent_child": solution.T_parent_child.ravel().tolist(),
-        **dict(zip(METRICS, in_m_and_deg(found), strict=True)),
+        **dict(zip(METRICS, in_m_and_deg(errors_of_solution), strict=True)),
         "objective": solution.objective,
     }
     result = case.results.get((published_name(method), reference))
@@ -126,8 +126,8 @@ def _objective(method: str, pairs: MotionPairs, T_parent_child: FloatArray) -> f
     if method == "dnl":
         return float(costs.sum())
     options = CalibratorConfig()
-    least = options.min_inlier_fraction * len(pairs)
-    return float(dnlo.truncate(costs, options.threshold, least)[1])
+    fewest = options.min_inlier_fraction * len(pairs)
+    return float(dnlo.truncate(costs, options.threshold, fewest)[1])
 
 
 def table_of(rows: Sequence[dict[str, Any]]) -> pd.DataFrame:

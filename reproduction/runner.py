@@ -28,8 +28,8 @@ def in_parallel(
         os.environ.setdefault(name, "1")
     spawning = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(jobs, len(tasks)), spawning) as executor:
-        for each in [executor.submit(function, *task) for task in tasks]:
-            yield each.result()
+        for future in [executor.submit(function, *task) for task in tasks]:
+            yield future.result()
 
 
 def kept(
@@ -39,14 +39,14 @@ def kept(
     earlier runs. What the file has is not solved again: remove it after a change of the code.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    found: dict[str, Any] = {}
+    outcomes: dict[str, Any] = {}
     for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
         with contextlib.suppress(ValueError):  # a line that was cut off
-            found |= json.loads(line)
-    missing = [name for name in tasks if name not in found]
+            outcomes |= json.loads(line)
+    missing = [name for name in tasks if name not in outcomes]
     results = in_parallel(function, [tasks[name] for name in missing], jobs)
     with path.open("a", encoding="utf-8") as file:
         for name, result in zip(missing, results, strict=True):
-            found[name] = result
+            outcomes[name] = result
             print("", json.dumps({name: result}), sep="\n", end="", file=file, flush=True)
-    return found
+    return outcomes

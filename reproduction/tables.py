@@ -67,16 +67,16 @@ def with_rectified(rows: pd.DataFrame) -> pd.DataFrame:
     is gained over the method's B1 variant.
     """
     truth = RECTIFIED[rows["dataset"].iloc[0]]
-    found = rows.set_index(["method", "reference"])
-    errors = [absolute_errors(np.reshape(T, (4, 4)), truth) for T in found["T_parent_child"]]
-    found[list(_RECTIFIED)] = np.array(errors) * [1.0, 180.0 / np.pi]
-    found = found.rename(columns=dict(zip(METRICS, _ERRORS, strict=True)))
+    indexed = rows.set_index(["method", "reference"])
+    errors = [absolute_errors(np.reshape(T, (4, 4)), truth) for T in indexed["T_parent_child"]]
+    indexed[list(_RECTIFIED)] = np.array(errors) * [1.0, 180.0 / np.pi]
+    indexed = indexed.rename(columns=dict(zip(METRICS, _ERRORS, strict=True)))
     absolute = [*_ERRORS[2:], *_RECTIFIED]
-    of_b1 = found.xs("B1", level="reference")[absolute].reindex(found.index, level="method")
-    gains = of_b1 - found[absolute]
-    gains[found.index.get_level_values("reference") == "B1"] = np.nan
-    found[[*_GAINS, *_RECTIFIED_GAINS]] = gains
-    return found
+    of_b1 = indexed.xs("B1", level="reference")[absolute].reindex(indexed.index, level="method")
+    gains = of_b1 - indexed[absolute]
+    gains[indexed.index.get_level_values("reference") == "B1"] = np.nan
+    indexed[[*_GAINS, *_RECTIFIED_GAINS]] = gains
+    return indexed
 
 
 def best_variants(rows: pd.DataFrame, by: str = _ERRORS[2]) -> pd.DataFrame:

@@ -43,9 +43,9 @@ def put_into_page(page: Path, name: str, text: str) -> None:
     """
     begin = f"<!-- {name}: begin -->\n"
     end = f"<!-- {name}: end -->"
-    before, found, rest = page.read_text(encoding="utf-8").partition(begin)
+    before, marker, rest = page.read_text(encoding="utf-8").partition(begin)
     _, closed, after = rest.partition(end)
-    if not (found and closed):
+    if not (marker and closed):
         raise InputError(f"{page} has no lines {begin.strip()} and {end} to put the tables into")
     body = re.sub(r"\A# .*\n+", "", text).strip()
     page.write_text(f"{before}{begin}\n{body}\n\n{end}{after}", encoding="utf-8")
@@ -61,12 +61,12 @@ def study_parser(
         allow_abbrev=False,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    given = os.environ.get("HAND_EYE_CALIB_DATA")
+    folder = os.environ.get("HAND_EYE_CALIB_DATA")
     parser.add_argument(
         "--data-folder",
         metavar="DIR",
         type=Path,
-        default=Path(given) if given else None,
+        default=Path(folder) if folder else None,
         help="folder of the real recordings (valimaki2023, euroc_vio, ...); without it, simulated "
         "ones only. Default: $HAND_EYE_CALIB_DATA",
     )
@@ -74,9 +74,9 @@ def study_parser(
     return parser
 
 
-def seed_of(given: int | None) -> int:
+def seed_of(seed: int | None) -> int:
     """The seed that is given, or another one at every run."""
-    return int(np.random.SeedSequence().generate_state(1)[0]) if given is None else given
+    return int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed
 
 
 def show(page: Path | None, tables: Mapping[str, str]) -> None:
@@ -87,10 +87,10 @@ def show(page: Path | None, tables: Mapping[str, str]) -> None:
             put_into_page(page, name, text)
 
 
-def percent(part: int, whole: int) -> str:
+def percent(count: int, whole: int) -> str:
     """Such as "4328 of 4332 (99.91 %)", rounded down: only all is 100 %."""
-    share = int(1e4 * part / whole) / 100 if whole else 0.0
-    return f"{part} of {whole} ({share:.2f} %)"
+    share = int(1e4 * count / whole) / 100 if whole else 0.0
+    return f"{count} of {whole} ({share:.2f} %)"
 
 
 def counted(words: Iterable[str], most: int | None = None) -> str:

@@ -114,16 +114,16 @@ def _latents(side: Side, dt: float) -> list[_Latent]:
     Ts = side.Ts
     G = side.to_error
     nowhere = np.zeros((len(Ts) - 1, 6, 6))
-    found = [
-        _Latent(_phi(dt, part.tau_s), part.sigma**2, G @ directions(part, Ts), nowhere)
-        for part in errors.slow
+    latents = [
+        _Latent(_phi(dt, process.tau_s), process.sigma**2, G @ directions(process, Ts), nowhere)
+        for process in errors.slow
     ]
     if errors.scale is not None:
         sigma, tau_s = errors.scale
         columns = scale_columns(se3.inverse(Ts[:-1]) @ Ts[1:]) @ G.T
         nowhere = np.zeros((len(Ts), 6, 1))
-        found.append(_Latent(_phi(dt, tau_s), np.array([sigma**2]), nowhere, columns[:, :, None]))
-    return found
+        latents.append(_Latent(_phi(dt, tau_s), np.array([sigma**2]), nowhere, columns[:, :, None]))
+    return latents
 
 
 def _phi(dt: float, tau_s: float) -> float:
@@ -157,7 +157,7 @@ def _drifting(
 def _stationary(count: int, latents: list[_Latent]) -> _StateSpace:
     """States (latents) alone, none of them in the increments."""
     nothing = np.zeros(0)
-    phi = np.concatenate([nothing, *(0.0 * one.variances + one.phi for one in latents)])
+    phi = np.concatenate([nothing, *(0.0 * latent.variances + latent.phi for latent in latents)])
     variances = np.concatenate([nothing, *(latent.variances for latent in latents)])
     return _StateSpace(
         np.concatenate([np.zeros((count, 6, 0)), *(latent.in_pose for latent in latents)], axis=2),

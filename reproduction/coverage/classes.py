@@ -105,8 +105,8 @@ def _world(rng: np.random.Generator) -> FloatArray:
 def _slow(
     errors: SensorErrors, tau_s: float, metres: float, degrees: float, in_world: bool = False
 ) -> SensorErrors:
-    part = GaussMarkov(tau_s, sigmas(metres, degrees), in_world)
-    return replace(errors, slow=(*errors.slow, part))
+    process = GaussMarkov(tau_s, sigmas(metres, degrees), in_world)
+    return replace(errors, slow=(*errors.slow, process))
 
 
 def _white(metres: float, degrees: float) -> SensorErrors:

@@ -82,16 +82,16 @@ def pooled(table: str, name: str, method: str, rows: Iterable[Row]) -> Row:
     """All cases of the rows of a table as one row."""
     cases: dict[str, dict[str, float]] = {}
     for row in (row for row in rows if (row.table, row.method) == (table, method)):
-        for kind, found in row.cases.items():
+        for kind, figures in row.cases.items():
             cases.setdefault(kind, {}).update(
-                {f"{row.name}/{key}": value for key, value in found.items()}
+                {f"{row.name}/{key}": value for key, value in figures.items()}
             )
     return Row(table, name, method, cases)
 
 
 def _groups(cases: Mapping[str, float]) -> list[FloatArray]:
     """Values by what their keys have before the last slash."""
-    found: dict[str, list[float]] = {}
+    groups: dict[str, list[float]] = {}
     for key, value in cases.items():
-        found.setdefault(key.rpartition("/")[0], []).append(value)
-    return [np.array(values) for values in found.values()]
+        groups.setdefault(key.rpartition("/")[0], []).append(value)
+    return [np.array(values) for values in groups.values()]

@@ -93,8 +93,8 @@ def _slow(
     in_world: bool,
 ) -> SensorErrors:
     sigma = sigmas(_between(rng, *metres), _between(rng, 0.03, 0.3))
-    part = GaussMarkov(_between(rng, *tau_s), sigma, in_world)
-    return replace(errors, slow=(*errors.slow, part))
+    process = GaussMarkov(_between(rng, *tau_s), sigma, in_world)
+    return replace(errors, slow=(*errors.slow, process))
 
 
 def _between(rng: np.random.Generator, low: float, high: float) -> float:

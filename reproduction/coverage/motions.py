@@ -168,9 +168,9 @@ def drone(rng: np.random.Generator, duration_s: float) -> Motion:
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     yaw = 1.2 * _waves(rng, times, 1, (0.02, 0.2))[:, 0]
     ahead = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=-1)
-    left = np.cross(up, ahead)
-    left /= np.linalg.norm(left, axis=1, keepdims=True)
-    rotations = np.stack([np.cross(left, up), left, up], axis=-1)
+    leftward = np.cross(up, ahead)
+    leftward /= np.linalg.norm(leftward, axis=1, keepdims=True)
+    rotations = np.stack([np.cross(leftward, up), leftward, up], axis=-1)
     return Motion(se3.from_rotation_translation(rotations, positions))
 
 

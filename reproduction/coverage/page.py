@@ -83,7 +83,7 @@ def page(rows: Sequence[Row], absent: Sequence[str], seeds: range) -> str:
         "## Goals",
         "Missed goals are bold.",
         markdown_table(
-            {"goal": goal.text} | {one: reached(goal, rows, one) for one in methods}
+            {"goal": goal.text} | {method: reached(goal, rows, method) for method in methods}
             for goal in GOALS
         ),
     ]
@@ -107,17 +107,17 @@ def _is_shown(row: Row, first: str) -> bool:
 
 def reached(goal: Goal, rows: Sequence[Row], method: str) -> str:
     """The value that is farthest from its range, bold outside of it; empty without any."""
-    found = {
+    values = {
         row.name: row.value(goal.kind)
         for row in rows
         if (row.table, row.method) == (goal.table, method) and re.match(goal.names, row.name)
     }
-    found = {name: value for name, value in found.items() if np.isfinite(value)}
-    if not found:
+    values = {name: value for name, value in values.items() if np.isfinite(value)}
+    if not values:
         return ""
-    name = max(found, key=lambda name: max(goal.low - found[name], found[name] - goal.high))
-    said = f"{found[name]:.3g}" + (f" ({name})" if len(found) > 1 else "")
-    return said if goal.low <= found[name] <= goal.high else f"**{said}**"
+    name = max(values, key=lambda name: max(goal.low - values[name], values[name] - goal.high))
+    text = f"{values[name]:.3g}" + (f" ({name})" if len(values) > 1 else "")
+    return text if goal.low <= values[name] <= goal.high else f"**{text}**"
 
 
 def _shown(row: Row, columns: Sequence[str], first: str) -> dict[str, str]:

@@ -48,63 +48,63 @@ def _name_of(rig: Rig, name: str) -> str:
     return f"{rig.name} {name}".removesuffix(" whole")
 
 
-def _row(table: str, name: str, method: str, found: Mapping[str, Mapping[str, float]]) -> Row:
+def _row(table: str, name: str, method: str, cases: Mapping[str, Mapping[str, float]]) -> Row:
     """A row from the measures of each case."""
-    cases: dict[str, dict[str, float]] = {}
-    for case, measures in found.items():
+    by_kind: dict[str, dict[str, float]] = {}
+    for case, measures in cases.items():
         for kind, value in measures.items():
-            cases.setdefault(kind, {})[case] = value
-    return Row(table, name, method, cases)
+            by_kind.setdefault(kind, {})[case] = value
+    return Row(table, name, method, by_kind)
 
 
 def class_row(name: str, method: str, seeds: range) -> Row:
     """Errors over the bound, NEES and coverage of a simulated class."""
-    found = {}
+    cases = {}
     for seed in seeds:
         recording = classes.make(name, seed)
-        one = answer(recording.parent, recording.child, METHODS[method])
-        found[f"{seed}"] = _class_case(name, recording, one)
-    return _row("simulated", name, method, found)
+        result = answer(recording.parent, recording.child, METHODS[method])
+        cases[f"{seed}"] = _class_case(name, recording, result)
+    return _row("simulated", name, method, cases)
 
 
 def _class_case(
-    name: str, recording: classes.Simulated, found: Calibration | None
+    name: str, recording: classes.Simulated, result: Calibration | None
 ) -> dict[str, float]:
     if name in classes.REFUSED:
-        return {"refused": float(found is None or bool(found.unobservable()))}
-    if found is None:
+        return {"refused": float(result is None or bool(result.unobservable()))}
+    if result is None:
         return {}
-    xi = se3.log(se3.inverse(found.T_parent_child) @ recording.T_parent_child)
+    xi = se3.log(se3.inverse(result.T_parent_child) @ recording.T_parent_child)
     bound = recording.bound()
     case = {
         "bound": _squared(xi, bound),
         "bound_t": _squared(xi[:3], bound[:3, :3]),
         "bound_r": _squared(xi[3:], bound[3:, 3:]),
     }
-    if np.isfinite(found.covariance_measured).all():
-        case["nees"] = _squared(xi, found.covariance_measured)
-    return case | _covers(xi, found)
+    if np.isfinite(result.covariance_measured).all():
+        case["nees"] = _squared(xi, result.covariance_measured)
+    return case | _covers(xi, result)
 
 
-def _covers(xi: FloatArray, found: Calibration) -> dict[str, float]:
+def _covers(xi: FloatArray, result: Calibration) -> dict[str, float]:
     """The share of the components in their intervals, if there are any."""
-    if not np.isfinite(found.covariance_measured).all():
+    if not np.isfinite(result.covariance_measured).all():
         return {}
-    within = np.abs(xi) < _REACH * np.sqrt(np.diag(found.covariance_measured))
+    within = np.abs(xi) < _REACH * np.sqrt(np.diag(result.covariance_measured))
     return {"covers": float(within.mean())}
 
 
 def level_row(folder: Path, dataset: str, level: float | None, method: str) -> Row:
     """Errors on the published trajectories of a level."""
-    found = {}
+    cases = {}
     for case in load_simulated(folder, [dataset], None if level is None else [level]):
-        one = answer(case.parent, case.child, METHODS[method])
-        if one is not None:
-            xi = se3.log(se3.inverse(one.T_parent_child) @ case.T_parent_child)
-            e_at, e_aR = absolute_errors(one.T_parent_child, case.T_parent_child)
+        result = answer(case.parent, case.child, METHODS[method])
+        if result is not None:
+            xi = se3.log(se3.inverse(result.T_parent_child) @ case.T_parent_child)
+            e_at, e_aR = absolute_errors(result.T_parent_child, case.T_parent_child)
             sizes = {"mm": 1e3 * e_at, "deg": float(np.degrees(e_aR))}
-            found[case.name] = sizes | _covers(xi, one)
-    return _row("levels", " ".join(path_to(dataset, level)), method, found)
+            cases[case.name] = sizes | _covers(xi, result)
+    return _row("levels", " ".join(path_to(dataset, level)), method, cases)
 
 
 def _squared(xi: FloatArray, covariance: FloatArray) -> float:
@@ -113,33 +113,33 @@ def _squared(xi: FloatArray, covariance: FloatArray) -> float:
 
 def truth_row(rig: Rig, name: str, method: str) -> Row:
     """Error of a real recording against the known answer, over the axes that both know."""
-    found = _of_rig(rig, name, method)
+    result = _of_rig(rig, name, method)
     assert rig.truth is not None
-    cases = {} if found is None else truth_cases(found, rig.truth)
+    cases = {} if result is None else truth_cases(result, rig.truth)
     return Row("known answer", _name_of(rig, name), method, cases)
 
 
-def truth_cases(found: Calibration, truth: Truth) -> dict[str, dict[str, float]]:
+def truth_cases(result: Calibration, truth: Truth) -> dict[str, dict[str, float]]:
     """Error of an answer over the axes that both know, and whether its intervals cover the truth:
     without the common-mode floor, with it, and with the uncertainty of the truth.
     """
-    known = np.isfinite(truth.sigmas) & _knows(found)
-    error = deviation(found.T_parent_child, truth.T_parent_child)
+    is_comparable = np.isfinite(truth.sigmas) & _knows(result)
+    error = deviation(result.T_parent_child, truth.T_parent_child)
     # A rotation whose axis is not known to the truth has no small rotation vector.
     if not np.isfinite(truth.sigmas[3:]).all():
-        error[3:] = _angle_differences(found.T_parent_child, truth.T_parent_child)
-    sigmas = np.where(known, found.sigmas_measured, 1.0)
-    with_floor = np.where(known, found.sigmas, 1.0)
-    apart = np.where(known, np.abs(error), 0.0)
-    of_truth = np.where(known, truth.sigmas, 0.0)
+        error[3:] = _angle_differences(result.T_parent_child, truth.T_parent_child)
+    sigmas = np.where(is_comparable, result.sigmas_measured, 1.0)
+    with_floor = np.where(is_comparable, result.sigmas, 1.0)
+    apart = np.where(is_comparable, np.abs(error), 0.0)
+    of_truth = np.where(is_comparable, truth.sigmas, 0.0)
     cases = {
         "mm": {"": 1e3 * float(np.linalg.norm(apart[:3]))},
         "z": {"": float(np.max(apart / sigmas))},
-        "covers": _by_axis(apart < _REACH * sigmas, known),
-        "covers_floor": _by_axis(apart < _REACH * with_floor, known),
-        "covers_truth": _by_axis(apart < _REACH * np.hypot(sigmas, of_truth), known),
+        "covers": _by_axis(apart < _REACH * sigmas, is_comparable),
+        "covers_floor": _by_axis(apart < _REACH * with_floor, is_comparable),
+        "covers_truth": _by_axis(apart < _REACH * np.hypot(sigmas, of_truth), is_comparable),
     }
-    if known[3:].any():
+    if is_comparable[3:].any():
         cases["deg"] = {"": float(np.degrees(np.linalg.norm(apart[3:])))}
     return cases
 
@@ -150,25 +150,25 @@ def _angle_differences(T: FloatArray, T_truth: FloatArray) -> FloatArray:
     return (angles + np.pi) % (2.0 * np.pi) - np.pi
 
 
-def _knows(found: Calibration) -> BoolArray:
-    return np.array([dof.verdict in _KNOWN for dof in found.observability])
+def _knows(result: Calibration) -> BoolArray:
+    return np.array([dof.verdict in _KNOWN for dof in result.observability])
 
 
-def _by_axis(values: BoolArray, known: BoolArray) -> dict[str, float]:
-    return {axis: float(values[k]) for k, axis in enumerate(AXES) if known[k]}
+def _by_axis(values: BoolArray, is_comparable: BoolArray) -> dict[str, float]:
+    return {axis: float(values[k]) for k, axis in enumerate(AXES) if is_comparable[k]}
 
 
 def refused_row(rig: Rig, name: str, method: str) -> Row:
     """Whether a recording that leaves something open is refused: no answer, or not an OK one."""
-    found = _of_rig(rig, name, method)
-    is_refused = found is None or found.status is not SolveStatus.OK
+    result = _of_rig(rig, name, method)
+    is_refused = result is None or result.status is not SolveStatus.OK
     return Row("refused", _name_of(rig, name), method, {"refused": {"": float(is_refused)}})
 
 
 def scatter_row(rig: Rig, method: str) -> Row:
     """Scatter between the recordings of a rig over their stated sigmas."""
-    found = [_of_rig(rig, name, method) for name in rig.recordings]
-    return Row("rig", rig.name, method, {"scatter": _scatter_cases(found)})
+    answers = [_of_rig(rig, name, method) for name in rig.recordings]
+    return Row("rig", rig.name, method, {"scatter": _scatter_cases(answers)})
 
 
 def parts_row(rig: Rig, name: str, method: str) -> Row:
@@ -179,7 +179,7 @@ def parts_row(rig: Rig, name: str, method: str) -> Row:
         assert whole is not None
         parts = rig.recordings[name].parts(count, whole.time_offset_s)
         options = {**rig.options, **METHODS[method]}
-        answers = [answer(part.parent, part.child, options) for part in parts]
+        answers = [answer(recording.parent, recording.child, options) for recording in parts]
         cases |= {f"{label} {key}": value for key, value in _scatter_cases(answers).items()}
     return Row("parts", _name_of(rig, name), method, {"scatter": cases})
 
@@ -188,30 +188,30 @@ def _scatter_cases(answers: Sequence[Calibration | None]) -> dict[str, float]:
     """Squared scatter over mean stated variance of each axis that all answers observe, once per
     degree of freedom.
     """
-    good = [one for one in answers if one is not None]
+    good = [result for result in answers if result is not None]
     if len(good) < len(answers) or len(good) < 2:
         return {}
-    known = np.logical_and.reduce([_knows(one) for one in good])
-    sigmas = np.array([one.sigmas_measured for one in good])
-    off = np.array([deviation(one.T_parent_child, good[0].T_parent_child) for one in good])
-    stated = (np.where(known, sigmas, 1.0) ** 2).mean(axis=0)
+    is_comparable = np.logical_and.reduce([_knows(result) for result in good])
+    sigmas = np.array([result.sigmas_measured for result in good])
+    off = np.array([deviation(result.T_parent_child, good[0].T_parent_child) for result in good])
+    stated = (np.where(is_comparable, sigmas, 1.0) ** 2).mean(axis=0)
     ratios = off.var(axis=0, ddof=1) / stated
     return {
         f"{axis}/{freedom}": float(ratios[k])
         for k, axis in enumerate(AXES)
-        if known[k]
+        if is_comparable[k]
         for freedom in range(len(good) - 1)
     }
 
 
 def cycle_row(rigs: Mapping[str, Rig], method: str) -> Row:
     """How far three pairwise answers miss closing, and that over their stated covariances."""
-    found = [_of_rig(rigs[name], "whole", method) for name in CYCLE]
-    good = [one for one in found if one is not None]
-    if len(good) < len(found):
+    results = [_of_rig(rigs[name], "whole", method) for name in CYCLE]
+    good = [result for result in results if result is not None]
+    if len(good) < len(results):
         return Row("cycle", "tango", method, {})
     xi, covariance = misclosure(good)
-    metres, radians = (float(np.linalg.norm(part)) for part in (xi[:3], xi[3:]))
+    metres, radians = (float(np.linalg.norm(axes)) for axes in (xi[:3], xi[3:]))
     sizes = {"mm": 1e3 * metres, "deg": float(np.degrees(radians))}
     cases = {
         kind: {"": value} for kind, value in (sizes | {"chi2": _squared(xi, covariance)}).items()
@@ -226,13 +226,13 @@ def misclosure(answers: list[Calibration]) -> tuple[FloatArray, FloatArray]:
     closed = np.eye(4)
     covariance = np.zeros((6, 6))
     scale = 1.0
-    for one in answers:
-        T = one.T_parent_child.copy()
+    for result in answers:
+        T = result.T_parent_child.copy()
         T[:3, 3] *= scale
         stretch = np.repeat([scale, 1.0], 3)
         moved = se3.adjoint(se3.inverse(T))
         covariance = moved @ covariance @ moved.T
-        covariance += one.covariance_measured * np.outer(stretch, stretch)
+        covariance += result.covariance_measured * np.outer(stretch, stretch)
         closed = closed @ T
-        scale *= one.scale
+        scale *= result.scale
     return se3.log(closed), covariance

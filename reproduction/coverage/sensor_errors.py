@@ -84,8 +84,8 @@ def mixture_information(share: float, factor: float, dimensions: int = 6) -> flo
     seen = density > 1e-300
     weight = r[seen] ** (dimensions - 1)
     total = np.sum(weight * density[seen])
-    found = np.sum(weight * slope[seen] ** 2 / density[seen])
-    return float(found / total / dimensions)
+    information = np.sum(weight * slope[seen] ** 2 / density[seen])
+    return float(information / total / dimensions)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,8 +144,8 @@ def draw(
     increments = np.sqrt(variances) * walk_rng.standard_normal((len(steps), 6))
     increments += _scale_errors(errors, steps, dt, scale_rng)
     white, covariances = _white(errors, twists, dt, tail_rng, white_rng)
-    for part in errors.slow:
-        white = white + _slow(part, Ts, dt, slow_rng)
+    for process in errors.slow:
+        white = white + _slow(process, Ts, dt, slow_rng)
     poses = _integrated(Ts[0], steps @ se3.exp(increments)) @ se3.exp(white)
     return DrawnErrors(poses, covariances, variances[:, :, None] * np.eye(6))
 
@@ -159,13 +159,17 @@ def _white(
 ) -> tuple[FloatArray, FloatArray]:
     """White errors (N, 6) and their inverse Fisher information (N, 6, 6)."""
     factors = np.ones(len(twists))
-    known = np.ones(len(twists))
+    factors_known = np.ones(len(twists))
     if errors.tail is not None:
         factors = errors.tail.draw(tail_rng, len(twists), dt)
-        known = factors**2 if errors.tail.kind == "bursts" else known / errors.tail.information()
+        factors_known = (
+            factors**2
+            if errors.tail.kind == "bursts"
+            else factors_known / errors.tail.information()
+        )
     drawn = factors[:, None] * errors.white * rng.standard_normal((len(twists), 6))
     drawn += errors.jitter_s * twists * rng.standard_normal((len(twists), 1))
-    covariances = known[:, None, None] * np.diag(errors.white**2)
+    covariances = factors_known[:, None, None] * np.diag(errors.white**2)
     return drawn, covariances + errors.jitter_s**2 * twists[:, :, None] * twists[:, None, :]
 
 
@@ -212,14 +216,14 @@ def _markov(count: int, columns: int, phi: float, rng: np.random.Generator) -> F
     return values
 
 
-def _slow(part: GaussMarkov, Ts: FloatArray, dt: float, rng: np.random.Generator) -> FloatArray:
-    values = part.sigma * _markov(len(Ts), 6, np.exp(-dt / part.tau_s), rng)
-    return np.einsum("nij,nj->ni", directions(part, Ts), values)
+def _slow(process: GaussMarkov, Ts: FloatArray, dt: float, rng: np.random.Generator) -> FloatArray:
+    values = process.sigma * _markov(len(Ts), 6, np.exp(-dt / process.tau_s), rng)
+    return np.einsum("nij,nj->ni", directions(process, Ts), values)
 
 
-def directions(part: GaussMarkov, Ts: FloatArray) -> FloatArray:
+def directions(process: GaussMarkov, Ts: FloatArray) -> FloatArray:
     """Matrices (N, 6, 6) from a process to errors in the sensor's frame."""
     matrices = np.tile(np.eye(6), (len(Ts), 1, 1))
-    if part.in_world:
+    if process.in_world:
         matrices[:, :3, :3] = matrices[:, 3:, 3:] = np.swapaxes(Ts[:, :3, :3], 1, 2)
     return matrices

@@ -46,57 +46,59 @@ _90_PERCENT = 1.645
 def solved(cases: list[Case], package: Path, options: dict[str, Any]) -> list[Any]:
     """Answers of the version of the package in a folder."""
     with tempfile.TemporaryDirectory() as folder:
-        given, found = (str(Path(folder) / name) for name in ("given", "found"))
+        cases_file, answers_file = (str(Path(folder) / name) for name in ("given", "found"))
         asked = [
-            ([(each.stamps_ns, each.poses) for each in case.streams], case.options | options)
+            ([(stream.stamps_ns, stream.poses) for stream in case.streams], case.options | options)
             for case in cases
         ]
-        Path(given).write_bytes(pickle.dumps(asked))
+        Path(cases_file).write_bytes(pickle.dumps(asked))
         environment = os.environ | {"PYTHONPATH": str(package)}
-        command = [sys.executable, "-c", _SOLVE, given, found]
+        command = [sys.executable, "-c", _SOLVE, cases_file, answers_file]
         subprocess.run(command, check=True, env=environment, cwd=folder)
-        return list(pickle.loads(Path(found).read_bytes()))
+        return list(pickle.loads(Path(answers_file).read_bytes()))
 
 
-def _sizes(case: Case, answer: Any, known: BoolArray) -> FloatArray:
+def _sizes(case: Case, answer: Any, is_determined: BoolArray) -> FloatArray:
     """Errors of translation and rotation; half of what the truth is not known to counts."""
-    known = known & np.isfinite(case.sigmas)
+    is_determined = is_determined & np.isfinite(case.sigmas)
     squares = np.where(
-        known, deviation(answer[0], case.T_parent_child) ** 2 + 0.25 * case.sigmas**2, 0.0
+        is_determined, deviation(answer[0], case.T_parent_child) ** 2 + 0.25 * case.sigmas**2, 0.0
     )
     parts = slice(0, 3), slice(3, 6)
-    return np.array([np.sqrt(squares[p].sum()) if known[p].any() else np.nan for p in parts])
+    return np.array(
+        [np.sqrt(squares[p].sum()) if is_determined[p].any() else np.nan for p in parts]
+    )
 
 
-def row(cases: list[Case], found: list[Any], others: dict[str, list[Any]]) -> dict[str, str]:
+def row(cases: list[Case], own_answers: list[Any], others: dict[str, list[Any]]) -> dict[str, str]:
     """Figures of the recordings of one family."""
     cells = {"recordings": str(len(cases))}
     for name, answers in others.items():
         logs = [
-            np.log(_sizes(case, one, one[3]) / _sizes(case, other, one[3]))
-            for case, one, other in zip(cases, found, answers, strict=True)
-            if one is not None and other is not None
+            np.log(_sizes(case, answer, answer[3]) / _sizes(case, other, answer[3]))
+            for case, answer, other in zip(cases, own_answers, answers, strict=True)
+            if answer is not None and other is not None
         ]
         ratios = np.exp(np.nanmean(logs, axis=0)) if logs else [np.nan] * 2
         cells[f"over {name}"] = " ".join(f"{ratio:.2f}" for ratio in ratios)
     inside: list[list[bool]] = [[], []]
     squares = []
     nees = []
-    for case, one in zip(cases, found, strict=True):
-        if one is None:
+    for case, answer in zip(cases, own_answers, strict=True):
+        if answer is None:
             continue
-        to_parent = np.kron(np.eye(2), one[0][:3, :3])
-        off = deviation(one[0], case.T_parent_child)
-        told = one[3] & np.isfinite(case.sigmas)
-        for index, covariance in enumerate(one[1:3]):
+        to_parent = np.kron(np.eye(2), answer[0][:3, :3])
+        off = deviation(answer[0], case.T_parent_child)
+        is_comparable = answer[3] & np.isfinite(case.sigmas)
+        for index, covariance in enumerate(answer[1:3]):
             variances = np.diag(to_parent @ covariance @ to_parent.T) + case.sigmas**2
-            inside[index] += [*(np.abs(off) < _90_PERCENT * np.sqrt(variances))[told]]
-        if case.bound is not None and one[3].all():
+            inside[index] += [*(np.abs(off) < _90_PERCENT * np.sqrt(variances))[is_comparable]]
+        if case.bound is not None and answer[3].all():
             xi = to_parent.T @ off
             squares.append(xi @ np.linalg.solve(case.bound, xi))
-            nees.append(xi @ np.linalg.solve(one[1], xi))
+            nees.append(xi @ np.linalg.solve(answer[1], xi))
     cells["in 90 %"], cells["with floor"] = (
-        f"{100 * np.mean(each):.0f} %" if each else "" for each in inside
+        f"{100 * np.mean(values):.0f} %" if values else "" for values in inside
     )
     if squares:
         cells["over bound"] = f"{np.sqrt(np.median(squares) / MEDIAN_6):.2f}"
@@ -106,7 +108,7 @@ def row(cases: list[Case], found: list[Any], others: dict[str, list[Any]]) -> di
 
 def table(cases: list[Case], package: Path, against: Path) -> str:
     """A row for every family, and one for all."""
-    found = solved(cases, package, {})
+    own_answers = solved(cases, package, {})
     others = {
         "its default": solved(cases, against, {}),
         "its adaptive": solved(cases, against, {"method": "adaptive"}),
@@ -119,9 +121,11 @@ def table(cases: list[Case], package: Path, against: Path) -> str:
             {"family": family}
             | row(
                 [cases[i] for i in which],
-                [found[i] for i in which],
+                [own_answers[i] for i in which],
                 {name: [answers[i] for i in which] for name, answers in others.items()},
             )
         )
-    columns = [*dict.fromkeys(name for each in rows for name in each)]
-    return markdown_table([{name: each.get(name, "") for name in columns} for each in rows])
+    columns = [*dict.fromkeys(name for cells_of_row in rows for name in cells_of_row)]
+    return markdown_table(
+        [{name: cells_of_row.get(name, "") for name in columns} for cells_of_row in rows]
+    )

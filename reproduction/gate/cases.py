@@ -69,11 +69,11 @@ def real_cases(
         family = rig.name if "kitti" in rig.name else rig.name.split("_")[0]
         for name, recording in rig.recordings.items():
             streams = recording.parent, recording.child
-            for number, part in enumerate([streams, *_pieces(recording, pieces, rng)]):
+            for number, streams_of_case in enumerate([streams, *_pieces(recording, pieces, rng)]):
                 yield Case(
                     family=family,
                     name=f"{rig.name} {name} {number}",
-                    streams=part,
+                    streams=streams_of_case,
                     options=options,
                     T_parent_child=rig.truth.T_parent_child,
                     sigmas=rig.truth.sigmas,

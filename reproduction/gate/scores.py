@@ -71,7 +71,7 @@ def score(case: Case) -> Score:
         bound = to_parent @ case.bound @ to_parent.T
         covariance = to_parent @ result.covariance_measured @ to_parent.T
         parts = tuple(
-            np.sqrt(_squared(errors[part], bound[part, part]) / MEDIAN_3) for part in _PARTS
+            np.sqrt(_squared(errors[axes], bound[axes, axes]) / MEDIAN_3) for axes in _PARTS
         )
         over_bound = _squared(errors, bound)
         nees = _squared(errors, covariance)
@@ -106,7 +106,7 @@ def _sizes(errors: FloatArray, truth_sigmas: FloatArray) -> tuple[float, ...]:
     known_sigmas = np.where(np.isfinite(truth_sigmas), truth_sigmas, 0.0)
     squares = errors**2 + 0.25 * known_sigmas**2
     return tuple(
-        unit * float(np.sqrt(squares[part].sum()))
-        for part, unit in zip(_PARTS, _UNITS, strict=True)
-        if np.isfinite(truth_sigmas[part]).any()
+        unit * float(np.sqrt(squares[axes].sum()))
+        for axes, unit in zip(_PARTS, _UNITS, strict=True)
+        if np.isfinite(truth_sigmas[axes]).any()
     )

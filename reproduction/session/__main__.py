@@ -50,8 +50,10 @@ def _stop(arguments: argparse.Namespace) -> str:
     ):
         tasks = {recorded.name: (recorded,) for recorded in recordings}
         path = arguments.rows / f"stop_{name}.jsonl"
-        found = kept(path, stop.stops, tasks, arguments.jobs).values()
-        tables.append(stop.table([stop.Stop(**each) for plain in found for each in plain], name))
+        records = kept(path, stop.stops, tasks, arguments.jobs).values()
+        tables.append(
+            stop.table([stop.Stop(**fields) for plain in records for fields in plain], name)
+        )
     return "\n\n".join(["Simulated:", tables[0], "Real, cut off in the same way:", tables[1]])
 
 
@@ -63,8 +65,8 @@ def _together(arguments: argparse.Namespace) -> str:
     simulated = kept(path, together.simulated, tasks, jobs)
     rigs = [rig for rig in _rigs(arguments) if not rig.is_refused and len(rig.recordings) > 1]
     recorded = {f"{rig.name} {name}": (rig, name) for rig in rigs for name in rig.recordings}
-    found = kept(arguments.rows / "together_real.jsonl", together.real, recorded, jobs)
-    return together.tables([*together.rigs_of(simulated, rigs, found)], arguments.first_seed)
+    rigs_solved = kept(arguments.rows / "together_real.jsonl", together.real, recorded, jobs)
+    return together.tables([*together.rigs_of(simulated, rigs, rigs_solved)], arguments.first_seed)
 
 
 def _alarms(arguments: argparse.Namespace) -> str:
@@ -74,8 +76,8 @@ def _alarms(arguments: argparse.Namespace) -> str:
 
 def _delays(arguments: argparse.Namespace) -> str:
     tasks = [(kind, seed) for kind in mount.SHIFTED for seed in range(arguments.seeds)]
-    found = in_parallel(mount.delays, tasks, arguments.jobs)
-    return mount.delay_table([each for several in found for each in several])
+    delays_of_tasks = in_parallel(mount.delays, tasks, arguments.jobs)
+    return mount.delay_table([delay for several in delays_of_tasks for delay in several])
 
 
 STUDIES: dict[str, Callable[[argparse.Namespace], str]] = {

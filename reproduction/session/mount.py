@@ -97,25 +97,25 @@ def false_alarms(name: str, hours: float) -> Watched:
     return Watched(name, hours, int(monitor.alarm is not None), monitor.visible(600.0))
 
 
-def alarm_table(found: Sequence[Watched]) -> str:
+def alarm_table(watched: Sequence[Watched]) -> str:
     """A row for every motion."""
     groups: dict[str, list[Watched]] = {}
-    for each in found:
-        groups.setdefault(each.name.partition("_")[0], []).append(each)
+    for drive in watched:
+        groups.setdefault(drive.name.partition("_")[0], []).append(drive)
     rows = []
     for name, group in groups.items():
-        visible = np.max([each.visible for each in group], axis=0)
+        visible = np.max([drive.visible for drive in group], axis=0)
         rows.append(
             {
                 "recordings": f"{name} ({len(group)})",
-                "hours": f"{sum(each.hours for each in group):g}",
-                "alarms": sum(each.alarms for each in group),
+                "hours": f"{sum(drive.hours for drive in group):g}",
+                "alarms": sum(drive.alarms for drive in group),
                 "x, y, z (cm)": triple(visible[:3], 100.0, ".2g"),
                 "about x, y, z (deg)": triple(np.degrees(visible[3:]), form=".2g"),
             }
         )
-    hours = sum(each.hours for each in found)
-    alarms = sum(each.alarms for each in found)
+    hours = sum(drive.hours for drive in watched)
+    alarms = sum(drive.alarms for drive in watched)
     return (
         f"{alarms} alarms in {hours:g} h of motion without a shift. The last columns: which shift "
         f"ten minutes of any of them would show nine times out of ten.\n\n{markdown_table(rows)}"
@@ -134,14 +134,14 @@ def delays(kind: str, seed: int) -> list[Delay]:
         for _ in _fed(before, pairs):
             pass
     rng = np.random.default_rng(seed)
-    found = []
+    delays_of_kind = []
     for size, shift in SHIFTS.items():
         axis = int(rng.integers(3)) + (3 if size.endswith("deg") else 0)
         xi = np.kron(np.eye(2), X[:3, :3].T) @ (np.eye(6)[axis] * shift)
         announced = float(before.visible(600.0)[axis] / shift)
         seconds = _seconds_until_seen(copy.deepcopy(before), parts[n_before:], xi)
-        found.append(Delay(kind, size, seconds, announced))
-    return found
+        delays_of_kind.append(Delay(kind, size, seconds, announced))
+    return delays_of_kind
 
 
 def _seconds_until_seen(monitor: MountMonitor, parts: list[PosePairs], xi: FloatArray) -> float:
@@ -154,26 +154,26 @@ def _seconds_until_seen(monitor: MountMonitor, parts: list[PosePairs], xi: Float
     return float("inf")
 
 
-def delay_table(found: Sequence[Delay]) -> str:
+def delay_table(delays_measured: Sequence[Delay]) -> str:
     """A row for every motion and shift."""
     rows = []
-    for kind, size in dict.fromkeys((each.kind, each.size) for each in found):
-        some = [each for each in found if (each.kind, each.size) == (kind, size)]
-        said, others = (
-            np.array([each.seconds for each in some if (each.announced <= 1.0) == is_said])
+    for kind, size in dict.fromkeys((delay.kind, delay.size) for delay in delays_measured):
+        some = [delay for delay in delays_measured if (delay.kind, delay.size) == (kind, size)]
+        announced, others = (
+            np.array([delay.seconds for delay in some if (delay.announced <= 1.0) == is_said])
             for is_said in (True, False)
         )
-        told = ["-", "-"]
-        if len(said):
-            quantiles = np.quantile(said, [0.5, 0.9], method="higher")
-            told = [f"{value:.0f}" if np.isfinite(value) else "> 1800" for value in quantiles]
+        words = ["-", "-"]
+        if len(announced):
+            quantiles = np.quantile(announced, [0.5, 0.9], method="higher")
+            words = [f"{value:.0f}" if np.isfinite(value) else "> 1800" for value in quantiles]
         rows.append(
             {
                 "motion": kind,
                 "shift": size,
-                "said to be seen": f"{len(said)} of {len(some)}",
-                "median (s)": told[0],
-                "90 % (s)": told[1],
+                "said to be seen": f"{len(announced)} of {len(some)}",
+                "median (s)": words[0],
+                "90 % (s)": words[1],
                 "others seen": f"{int(np.isfinite(others).sum())} of {len(others)}",
             }
         )

@@ -101,8 +101,8 @@ def real(rigs: Sequence[Rig]) -> Iterator[Recorded]:
 
 def stops(recorded: Recorded) -> list[dict[str, Any]]:
     """Plain values of a :class:`Stop` for every factor of the target."""
-    found = list(_steps(recorded))
-    return [vars(_stopped(recorded, found, factor)) for factor in FACTORS]
+    steps = list(_steps(recorded))
+    return [vars(_stopped(recorded, steps, factor)) for factor in FACTORS]
 
 
 def _steps(recorded: Recorded) -> Iterator[Step]:
@@ -112,7 +112,7 @@ def _steps(recorded: Recorded) -> Iterator[Step]:
     options |= {name.replace("_", ".", 1): value for name, value in of_axes.items()}
     options = {"max_pairs": CalibratorConfig.max_pairs, **options}
     streams = recorded.recording.parent, recorded.recording.child
-    of_parent, of_child = (each.stamps_ns[[0, -1]] for each in streams)
+    of_parent, of_child = (stream.stamps_ns[[0, -1]] for stream in streams)
     # Clocks of their own: the child's part is the same share of its recording.
     if abs(of_child[0] - of_parent[0]) < 10 * 10**9:
         of_child = of_parent
@@ -147,7 +147,7 @@ def _stopped(recorded: Recorded, steps: Sequence[Step], factor: float) -> Stop:
         worst.append(_worst(step.error, recorded.truth.sigmas, factor))
         if progress.done:
             # From here on all errors stay within their targets.
-            first = max((i + 1 for i, each in enumerate(worst) if each > 1.0), default=0)
+            first = max((i + 1 for i, ratio in enumerate(worst) if ratio > 1.0), default=0)
             earliest_s = steps[first].end_s if first < len(worst) else np.nan
             return Stop(recorded.kind, factor, False, True, worst[-1], step.end_s, earliest_s)
     return Stop(recorded.kind, factor, is_stuck)

@@ -54,10 +54,10 @@ def simulated(name: str, seed: int) -> dict[str, Any]:
     own = {}
     for number in range(_RECORDINGS):
         made = simulate(kind, (33, seed, number, sorted(CLASSES).index(name)), X)
-        found = calibrate(made.parent, made.child, checks=False)
+        result = calibrate(made.parent, made.child, checks=False)
         moved = se3.exp(scatter * rng.standard_normal(6))
-        found = dataclasses.replace(found, T_parent_child=found.T_parent_child @ moved)
-        results[str(number)] = found.to_dict()
+        result = dataclasses.replace(result, T_parent_child=result.T_parent_child @ moved)
+        results[str(number)] = result.to_dict()
         own[str(number)] = (X @ moved).tolist()
     return {"results": results, "truth": X.tolist(), "own": own}
 
@@ -69,11 +69,13 @@ def real(rig: Rig, name: str) -> dict[str, Any]:
 
 
 def rigs_of(
-    solved: Mapping[str, Mapping[str, Any]], rigs: Iterable[Rig], found: Mapping[str, Any]
+    solved: Mapping[str, Mapping[str, Any]], rigs: Iterable[Rig], records: Mapping[str, Any]
 ) -> Iterator[Recorded]:
     """The rigs from what was solved: simulated ones by their names, recordings by ``RIG NAME``."""
     for name, plain in solved.items():
-        results = {key: Calibration.from_dict(each) for key, each in plain["results"].items()}
+        results = {
+            key: Calibration.from_dict(document) for key, document in plain["results"].items()
+        }
         exact = Truth.within(np.array(plain["truth"]), 0.0, 0.0)
         own = {key: Truth.within(np.array(T), 0.0, 0.0) for key, T in plain["own"].items()}
         yield Recorded(f"simulated {name.split()[0]}", results, exact, own)
@@ -81,12 +83,12 @@ def rigs_of(
     truth = None
     for rig in rigs:
         results = {
-            name: Calibration.from_dict(found[f"{rig.name} {name}"]) for name in rig.recordings
+            name: Calibration.from_dict(records[f"{rig.name} {name}"]) for name in rig.recordings
         }
         yield Recorded(rig.name, results, rig.truth)
         if rig.name.startswith("euroc"):
             truth = rig.truth
-            euroc |= {f"{rig.name} {name}": each for name, each in results.items()}
+            euroc |= {f"{rig.name} {name}": result for name, result in results.items()}
     if euroc:
         yield Recorded("euroc, both", euroc, truth)
 
@@ -94,21 +96,21 @@ def rigs_of(
 def tables(rigs: Sequence[Recorded], seed: int) -> str:
     """Errors and coverage by rig; and what is told of recordings that belong, and that do not."""
     rng = np.random.default_rng((34, seed))
-    kinds = dict.fromkeys(each.rig for each in rigs if each.truth)
-    rows = [_row(kind, [each for each in rigs if each.rig == kind]) for kind in kinds]
+    kinds = dict.fromkeys(rig.rig for rig in rigs if rig.truth)
+    rows = [_row(kind, [rig for rig in rigs if rig.rig == kind]) for kind in kinds]
     named = wrong = cases = accused = several = moved = pairs = 0
-    for each in rigs:
-        whole = [each.results] if len(each.results) > 3 else []
-        for some in (*whole, *_subsets(each.results, 3)[:2]):
-            said = together(some).parts["together"]
+    for rig in rigs:
+        whole = [rig.results] if len(rig.results) > 3 else []
+        for some in (*whole, *_subsets(rig.results, 3)[:2]):
+            agreement = together(some).parts["together"]
             several += 1
-            accused += said is not None and said.kind in ("one off", "moved")
+            accused += agreement is not None and agreement.kind in ("one off", "moved")
             foreign = str(rng.choice([*some]))
             out = _left_out(dict(some) | {foreign: _knocked(some[foreign], rng)})
             cases = cases + 1
             named = named + (out == {foreign})
             wrong += bool(out - {foreign})
-        for couple in combinations(each.results.values(), 2):
+        for couple in combinations(rig.results.values(), 2):
             pairs = pairs + 1
             moved = moved + (compare(couple).verdict == "moved")
     return (
@@ -128,35 +130,35 @@ def _row(kind: str, rigs: Sequence[Recorded]) -> dict[str, object]:
     for count, title in ((1, "one"), (3, "three"), (6, "six")):
         errors: list[list[float]] = []
         inside: list[bool] = []
-        for each in rigs:
-            assert each.truth is not None
-            for some in _subsets(each.results, count):
+        for rig in rigs:
+            assert rig.truth is not None
+            for some in _subsets(rig.results, count):
                 joint = together(some) if count > 1 else next(iter(some.values()))
-                known = np.isfinite(each.truth.sigmas) & np.isfinite(joint.sigmas_measured)
-                error = deviation(joint.T_parent_child, each.truth.T_parent_child)
+                is_comparable = np.isfinite(rig.truth.sigmas) & np.isfinite(joint.sigmas_measured)
+                error = deviation(joint.T_parent_child, rig.truth.T_parent_child)
                 # One recording shows its own mount only: its interval is of that.
-                of = each.own.get(min(some), each.truth) if count == 1 else each.truth
+                of = rig.own.get(min(some), rig.truth) if count == 1 else rig.truth
                 apart = deviation(joint.T_parent_child, of.T_parent_child)
                 stated = joint.sigmas_measured if "simulated" in kind else joint.sigmas
-                sigmas = np.hypot(stated, each.truth.sigmas)
-                inside.extend((np.abs(apart) < _NORMAL_90 * sigmas)[known])
-                parts = np.split(error * known, 2)
-                errors.append([float(np.linalg.norm(part)) for part in parts])
-        told = ("-", "-")
+                sigmas = np.hypot(stated, rig.truth.sigmas)
+                inside.extend((np.abs(apart) < _NORMAL_90 * sigmas)[is_comparable])
+                parts = np.split(error * is_comparable, 2)
+                errors.append([float(np.linalg.norm(axes)) for axes in parts])
+        words = ("-", "-")
         if errors:
             metres, radians = np.median(errors, axis=0)
-            told = (
+            words = (
                 f"{1e3 * metres:.1f} mm, {np.degrees(radians):.3f} deg",
                 f"{100 * np.mean(inside):.0f} %",
             )
-        row |= {f"error of {title}": told[0], f"90 % covers, {title}": told[1]}
+        row |= {f"error of {title}": words[0], f"90 % covers, {title}": words[1]}
     return row
 
 
 def _left_out(results: Mapping[str, Calibration]) -> set[str]:
-    said = together(results).parts["together"]
-    assert said is not None
-    return {each.name for each in said.recordings if each.left_out}
+    agreement = together(results).parts["together"]
+    assert agreement is not None
+    return {recording.name for recording in agreement.recordings if recording.left_out}
 
 
 def _knocked(result: Calibration, rng: np.random.Generator) -> Calibration:
