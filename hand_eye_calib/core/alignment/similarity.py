@@ -317,7 +317,7 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     vectors = np.append(np.reshape(rotations, (-1, 9)), np.zeros((len(forms), 1)), axis=1)
     products = se3.times(reduced, vectors)
     scales = -products[:, 9] / np.maximum((vectors * products).sum(axis=1), 1e-300)
-    # Opposite or no motion: a bad candidate, but one for every form.
+    # Bad candidates, of opposite or no motion, stay with scale 1: rows still match the forms.
     scales[(scales <= 1e-3) | (scales >= 1e9)] = 1.0
     translations = -se3.times(to_translation, scales[:, None] * vectors + np.eye(10)[9])
     Ts = se3.from_rotation_translation(np.array(rotations), translations)

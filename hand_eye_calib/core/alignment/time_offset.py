@@ -348,11 +348,11 @@ class TimeOffset:
     rate: ClockRate | None = None
 
     def steadied(self, child: Trajectory) -> Trajectory:
-        """Return the child's poses with the clock rate, if it is used, removed from the stamps."""
+        """Return the child without the clock rate in its stamps; unchanged without a rate."""
         return child.shifted(0.0, self.rate.used, self.rate.at_ns) if self.rate else child
 
     def largest_s(self, duration_s: float) -> float:
-        """Return the largest size (s) of the offset in a recording, with a rate that is used."""
+        """Return a bound (s) of the offset over a recording: its size plus half the drift."""
         changed_s = 0.5 * self.rate.used * duration_s if self.rate else 0.0
         return abs(self.seconds) + abs(changed_s)
 

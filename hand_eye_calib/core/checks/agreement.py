@@ -254,6 +254,7 @@ def rotation_gain(slow: Regression, axes: FloatArray, inverse: bool = False) -> 
     limits = LIMITS["rotation_gain"]
     noise = np.maximum(limits.sigmas * sigmas, BIASES * biases)
     ratios = np.abs(gains) / np.maximum(noise, limits.note)
+    # Axes with little rotation are skipped: noise biases their gains.
     ratios = np.where(biases < biases[0] / _LITTLE**2, ratios, 0.0)
     k = int(np.argmax(ratios))
     if ratios[k] < 1.0:

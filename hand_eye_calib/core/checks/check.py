@@ -337,7 +337,7 @@ def _explained(
     start: FloatArray | None,
     is_frozen: bool,
 ) -> tuple[Explanation | None, list[Finding]]:
-    """The explanation that holds, if there is one, and findings."""
+    """Return the explanation that holds, or None, and the findings about the streams."""
     try:
         explanation = hypotheses.explain(streams, correlation.is_clear, start)
     except NotEnoughDataError as error:
@@ -350,7 +350,8 @@ def _explained(
             pairs = streams.synchronised
             found = agreement.check_coordinates(pairs, _motions(pairs, _MAX_MOTIONS))
             return None, found or [*explanation.findings]
-    if is_frozen:  # nothing is said about its rates
+    # The angular rates of a frozen stream are no evidence.
+    if is_frozen:
         return None, []
     if correlation.variation < time_offset.MIN_VARIATION:
         return None, [finding("no_turning")]
@@ -360,8 +361,9 @@ def _explained(
 def _check_sizes(
     streams: StreamPair, explanation: Explanation, timed: SimilarityFit | None, known: float
 ) -> tuple[list[Finding], SimilarityFit]:
-    """Findings about the scale, beside the one that is known, and the axes of rotation of streams
-    that agree, and the fit with the scale. ``timed`` is the fit with the time offset.
+    """Return findings about scale and hidden axes of streams that agree, and the fit with scale.
+
+    ``timed`` is the fit with the time offset, ``known`` the known factor of the child's lengths.
     """
     pose_pairs = streams.synchronised
     motions = _motions(pose_pairs, hypotheses.MAX_PAIRS)
@@ -394,8 +396,9 @@ def _check_agreeing(
     offset_s: float,
     is_one_axis: bool,
 ) -> list[Finding]:
-    """What else there is to say of streams that agree as they are, on one clock, and of the same
-    streams as they were given.
+    """Return the findings about streams that agree: copies, faults that bias X, and fusion.
+
+    ``right`` are the corrected streams on one clock, ``given`` the streams as they were given.
     """
     of_fit = fit.T_parent_child, fit.sigmas[:6]
     best = min(filter(None, (of_fit, about.known)), key=lambda extrinsic: extrinsic[1][:3].max())
@@ -412,9 +415,10 @@ def _check_agreeing(
 def check_parts(
     parent: Trajectory, child: Trajectory, max_gap_s: float, lever_arm_m: float = 0.0
 ) -> list[Finding]:
-    """Check two streams on one clock, at least one of which has only positions, rotations or rates.
-    These findings are about each stream by itself and need no solve. ``lever_arm_m`` is the least
-    distance of the sensors, if a solve has shown it.
+    """Check two streams on one clock of which at least one has no full poses.
+
+    The findings need no solve. ``lever_arm_m`` is the smallest distance of the sensors (m) by a
+    solve; 0 without one.
     """
     if not (parent.has_positions and child.has_positions):
         parent = parent.scaled(0.0)
@@ -429,9 +433,7 @@ def check_parts(
 
 
 def can_check(parent: Trajectory, child: Trajectory) -> bool:
-    """Whether two streams last so long, and rotate so far, that the checks mean something: to be
-    asked during a session.
-    """
+    """Return whether two streams of a live session are long enough and rotate enough to check."""
     return min(stream.duration_s for stream in (parent, child)) >= MIN_DURATION_S and any(
         se3.rotation_angle(stream.poses[0, :3, :3].T @ se3.rotation_of(stream.poses)).max()
         >= MIN_ROTATION_RAD
@@ -440,7 +442,7 @@ def can_check(parent: Trajectory, child: Trajectory) -> bool:
 
 
 def check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
-    """A finding if the clocks differ by more than ``known_s``, which the child's stamps have."""
+    """Return the finding about a clock offset beyond ``known_s`` (added before), or none."""
     values = offset_values(found.seconds, known_s) | {"sigma_s": found.sigma_s}
     values["beyond"] = f" beyond the {known_s:.4f} s that were added" if known_s else ""
     values["options"] = {"time_offset": values["total_s"]}
@@ -449,7 +451,7 @@ def check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
 
 
 def offset_values(offset_s: float, known_s: float = 0.0) -> dict[str, Any]:
-    """What findings say of the child's clock, which is off by this beside what is known."""
+    """Return the values of a finding about the child's clock: ``offset_s`` beyond ``known_s``."""
     values: dict[str, Any] = {"offset_s": offset_s, "size_s": abs(offset_s)}
     values["direction"] = "behind" if offset_s > 0 else "ahead of"
     return values | {"total_s": round(known_s + offset_s, 4)}
@@ -549,14 +551,14 @@ def _parent_or_child(
 
 
 def _motions(pose_pairs: PosePairs, most: int) -> MotionPairs:
-    """Motions over 3 s, or less if there are too few of those."""
+    """Return motions over the first lag with enough motions."""
     motions = (pairs_over(pose_pairs, lag_s, most) for lag_s in hypotheses.LAGS_S)
-    # There are enough over one of the lags: the fit is over it.
+    # Streams that agree have enough motions over one of the lags: their fit is over this lag.
     return next(pairs for pairs in motions if len(pairs) >= hypotheses.MIN_PAIRS)
 
 
 def unseen(axes: Sequence[str]) -> Finding:
-    """The note that these axes cannot be determined from a motion."""
+    """Return the note that a motion does not determine these axes."""
     options = {f"prior.{axis}": "VALUE+/-SIGMA" for axis in axes}
     it = "it" if len(axes) == 1 else "them"
     return finding("one_axis", options=options, axes=axes_in_words(axes), it=it)

@@ -1,5 +1,6 @@
-"""Streams that are not what they seem: motions in place of poses, and positions in other axes than
-the orientations by any angle. They are looked for where no usual mistake explains the streams.
+"""Detection of streams with motions instead of poses, or with positions in other axes.
+
+These checks run if no usual mistake explains the streams.
 """
 
 from collections.abc import Sequence
@@ -19,29 +20,31 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 
-# Motions between two poses turn by less than this (rad); a sensor with such poses hardly moves.
+# Largest rotation (rad) between two poses. A stream of poses that rotates less hardly moves.
 _MOST_TURN_RAD = 1.0
 
-# Axes that are turned by less (rad) are those of :func:`agreement.check_coordinates`.
+# Smallest rotation (rad) between the axes of positions and orientations. Smaller ones are left to
+# :func:`agreement.check_coordinates`.
 _LEAST_TURN_RAD = 0.05
 
-# Distance (m) from the centre of the earth of places on it, and of aircraft.
+# Smallest and largest distance (m) of ground and aircraft from the centre of the earth.
 _EARTH_M = (6.3e6, 6.45e6)
 
-# Rounds of weights of the turned positions, and the smallest residual (m) of full weight.
+# Rounds of robust weights in the fit of turned positions.
 _ROUNDS = 5
+# Smallest scale (m) of the residuals in this fit.
 _LEAST_RESIDUAL_M = 1e-3
 
 
 def misreadings(streams: StreamPair, aligned: StreamPair) -> list[Finding]:
-    """What either stream is in truth, if that explains both; nothing if it does not.
+    """Return the finding about a misread stream, or none if no misreading explains both streams.
 
     Parameters
     ----------
     streams : StreamPair
-        Streams that no usual mistake explains, with the clock offset that is given.
+        Streams that no usual mistake explains, with the known clock offset.
     aligned : StreamPair
-        The same at the offset where their angular rates agree best, if they do.
+        The same streams at the offset with the best correlation of their angular rates.
     """
     for stream, given in _both_ways(streams):
         if _are_motions(given.child, given):
@@ -50,22 +53,24 @@ def misreadings(streams: StreamPair, aligned: StreamPair) -> list[Finding]:
 
 
 def earth_centred(aligned: StreamPair) -> list[Finding]:
-    """Positions from the centre of the earth with orientations in other axes. They are looked for
-    first: with such a lever arm nearly any motion of inverse poses is explained.
+    """Return the finding about positions from the centre of the earth in other axes, or none.
+
+    This check runs first: such a long lever arm explains nearly any motion of inverse poses.
     """
     ways = _both_ways(aligned)
     return _turned_positions([way for way in ways if _is_earth_centred(way[1].child)])
 
 
 def _both_ways(streams: StreamPair) -> list[tuple[str, StreamPair]]:
-    """The streams by what the second of them is: the child, and, exchanged, the parent."""
+    """Return the streams as they are and exchanged, each with the name of the second stream."""
     swapped = replace(streams, parent=streams.child, child=streams.parent)
     return [("child", streams), ("parent", swapped)]
 
 
 def _turned_positions(ways: Sequence[tuple[str, StreamPair]]) -> list[Finding]:
-    """The finding that positions of a stream are in other axes than its orientations: of the
-    stream that is explained better, as either may explain motion in a plane.
+    """Return the finding about positions in other axes than the orientations, or none.
+
+    Motion in a plane may be explained by either stream; the better explanation counts.
     """
     turns = [(stream, streams, _turn_of_positions(streams)) for stream, streams in ways]
     explained = [
@@ -89,16 +94,14 @@ def _turned_positions(ways: Sequence[tuple[str, StreamPair]]) -> list[Finding]:
 
 
 def _axis_in_words(row: FloatArray) -> str:
-    """The axis of the file that a row of a rotation by right angles takes, such as -x."""
+    """Return the axis of the file, such as -x, that a row of a rotation by right angles takes."""
     column = int(np.argmax(np.abs(row)))
     sign = "-" if row[column] < 0 else ""
     return f"{sign}{'xyz'[column]}"
 
 
 def _are_motions(child: Trajectory, streams: StreamPair) -> bool:
-    """Whether the child's poses are motions since the pose before, of this or of the other
-    direction.
-    """
+    """Return whether the child's poses are motions from pose to pose, or their inverses."""
     if len(child) < 2 or se3.rotation_angle(se3.rotation_of(child.poses)).max() > _MOST_TURN_RAD:
         return False
     ways = (child.poses[1:], se3.inverse(child.poses[1:]))
@@ -107,7 +110,7 @@ def _are_motions(child: Trajectory, streams: StreamPair) -> bool:
 
 
 def _unexplained(streams: StreamPair) -> float:
-    """The least share of the motion that stays unexplained over one of the lags."""
+    """Return the smallest unexplained share of the motion over all lags."""
     shares = [1.0]
     for lag_s in LAGS_S:
         with suppress(NotEnoughDataError):
@@ -123,8 +126,9 @@ class _Turn(NamedTuple):
 
 
 def _turn_of_positions(streams: StreamPair) -> _Turn | None:
-    """From the axes of the child's positions to those of its orientations, if that explains the
-    streams.
+    """Return the rotation from the axes of the child's positions to those of its orientations.
+
+    None if no rotation explains the streams.
     """
     child = streams.child
     for lag_s in LAGS_S:
@@ -141,15 +145,16 @@ def _turn_of_positions(streams: StreamPair) -> _Turn | None:
 
 
 def _is_earth_centred(stream: Trajectory) -> bool:
-    """Whether positions count from the centre of the earth."""
+    """Return whether all positions are as far from the origin as places on the earth."""
     distances = np.linalg.norm(se3.translation_of(stream.poses), axis=1)
     least, most = _EARTH_M
     return bool(((distances > least) & (distances < most)).all())
 
 
 def _fitted_turn(streams: StreamPair, lag_s: float) -> FloatArray:
-    """Rotation W (3, 3) from the axes of the child's positions to those of its orientations, by
-    robust least squares of ``R_X R_ci' W d = (R_A - I) t_X + t_A`` for displacements d over a time.
+    """Return the rotation W (3, 3) from the axes of the child's positions to its orientations.
+
+    Robust least squares of ``R_X R_ci' W d = (R_A - I) t_X + t_A`` for displacements d over a lag.
     """
     pairs = streams.pairs(lag_s, MAX_PAIRS)
     poses: PosePairs = streams.synchronised
@@ -169,5 +174,5 @@ def _fitted_turn(streams: StreamPair, lag_s: float) -> FloatArray:
 
 
 def _rotation_between(parent: FloatArray, child: FloatArray) -> FloatArray:
-    """Rotation R_X with ``parent = R_X child`` for rotation vectors (K, 3)."""
+    """Return the rotation R_X with ``parent = R_X child`` for rotation vectors (K, 3)."""
     return se3.nearest_rotation(parent.T @ child)

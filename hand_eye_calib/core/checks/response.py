@@ -1,21 +1,24 @@
-"""How the child's motion follows the parent's, beyond an extrinsic and a scale: one linear
-regression, with a column for each thing that may be wrong.
+"""Linear regression of the child's motion on the parent's, with columns for possible faults.
 
-Two sensors on one rigid body feel the same motion at the same time. With motions A, B of parent and
-child over a span, in the parent's axes (B turned by X), and chords a, b,
+Model: two sensors on one rigid body move together. A and B are the motions of parent and child over
+a span, both in the parent's axes (B rotated by X); a and b are their displacements:
 
-    b - a - (R_A - I) t = ...,        Log(R_B R_A') = ...
+    b - a - (R_A - I) t = columns,        Log(R_B R_A') = columns.
 
-where the dots are columns: a small rotation of X, a scale, and one group of columns per fault. All
-groups are in one table of products, summed over blocks of time: to fit a group is to solve a small
-part of it, and the jackknife over the blocks gives standard deviations. Motions over some seconds
-show gains, scales by axis, worlds that are turned or that move; those over a second show delays and
-smoothing, which change a motion of angular frequency f by ``1 - i f d - f^2 c``: -d times the
-velocity and c times the acceleration at both ends. These come from poses around the ends, not from
-those themselves: white noise has no part in both sides. Noise of a column makes its value smaller,
-unless it is probed with what the other stream shows of it (an instrumental variable): so are lever
-arms and delays. Noise that accumulates makes the stream that a column comes from look less smooth
-than it is, never smoother. So columns of the child alone show that the child is smoothed.
+The columns are a small rotation of X, a scale, and one group per fault. One table has the products
+of all columns, summed over blocks of time. A group is fitted by solving a part of the table, and
+the jackknife over the blocks estimates the standard deviations.
+
+Motions over some seconds reveal gains, scales by axis, and worlds that are turned or moving.
+Motions over a second reveal delays d and smoothing c. They change a motion of angular frequency f
+by the factor ``1 - i f d - f^2 c``: by -d times the velocity and c times the acceleration at both
+ends. Velocities and accelerations are differences of poses around the ends, without the poses at
+the ends: otherwise both sides would contain the same white noise.
+
+Noise of a column makes its coefficient smaller. Lever arms and delays therefore have instrumental
+variables: the same columns, computed from the other stream. Accumulating noise makes the stream of
+a column look less smooth, never smoother. Columns of the child alone can therefore show that the
+child is smoothed.
 """
 
 from collections.abc import Mapping
@@ -30,16 +33,17 @@ from hand_eye_calib.core.base.stats import median, robust_sigma, robust_weights
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs
 
-# Step (s) of the differences that velocities and accelerations come from; an interval of the poses
-# if that is longer. Stamps may be off by this share of a step.
+# Shortest step (s) of the differences for velocities and accelerations; at least one interval.
 _STEP_S = 0.05
+# Largest deviation of stamps from regular steps (share of a step).
 TOLERANCE = 0.3
 
-# Residuals of this many standard deviations have a quarter of the weight.
+# Residual, in standard deviations, whose weight is a quarter.
 _TUNING = 3.0
+# Rounds of robust weights.
 _ROUNDS = 4
 
-# Scales by axis stand in place of the scale.
+# Column of the base that a group replaces: scales by axis contain the scale.
 _INSTEAD = {"axes_child": "scale", "axes_parent": "scale"}
 
 _Columns: TypeAlias = Mapping[str, FloatArray]
@@ -47,10 +51,22 @@ _Where: TypeAlias = Mapping[str, list[int]]
 
 
 class Regression:
-    """Robust linear regression of rows (K, 6, p + 1) of displacements and rotations, the values
-    last, in ``units`` (6, 1), on groups of the p columns: by name, where they are; those of
-    ``base`` in every fit. Rows are in order of time. What is left is to be orthogonal to the
-    ``probes``, a table like that of the rows: of columns without their noise, if there are such.
+    """Robust linear regression on named groups of columns.
+
+    Parameters
+    ----------
+    rows : (K, 6, p + 1) array
+        Columns of displacements (m) and rotations (rad), in order of time; the last column is the
+        target.
+    probes : (K, 6, p + 1) array
+        Instrumental variables: residuals are made orthogonal to them. Equal to ``rows`` where no
+        column without noise exists.
+    units : (6, 1) array
+        Standard deviations that the rows are divided by.
+    where : mapping
+        Indices of the columns of each group.
+    *base : str
+        Groups that are part of every fit.
     """
 
     def __init__(
@@ -79,23 +95,24 @@ class Regression:
         self._blocks = Blocks.of_rows(weighted, BLOCKS, probes)
 
     def _columns(self, group: str = "", *beside: str) -> list[int]:
-        """Columns that a group is fitted beside."""
+        """Return the columns that are fitted together with a group."""
         base = (name for name in self._base if name != _INSTEAD.get(group))
         return [column for name in (*base, *beside) for column in self._where[name]]
 
     def biases(self, group: str) -> FloatArray:
-        """Errors (m,) that noise in the columns of a group can cause in its values. The noise is
-        taken to be as large as that of the rows.
+        """Return the bias (m,) that noise of the columns can cause in the values of a group.
+
+        The noise is assumed to be as large as the noise of the rows.
         """
         at = self._where[group]
         return np.asarray(self._sigma**2 * self._weight / np.maximum(self._squares[at, at], 1e-300))
 
     def displaced(self, group: str) -> FloatArray:
-        """Root mean square (m,) of the displacements that each value of a group makes, per unit."""
+        """Return the root mean square displacement (m,) that one unit of each value causes."""
         return np.asarray(self._displaced[self._where[group]])
 
     def share(self, group: str, *beside: str) -> float:
-        """The share of the squared residuals that a group takes away."""
+        """Return the share of the squared residuals that a group explains."""
         before = self._columns(group, *beside)
         costs = []
         for columns in (before, [*before, *self._where[group]]):
@@ -105,12 +122,14 @@ class Regression:
         return 1.0 - costs[1] / max(costs[0], 1e-300)
 
     def fit(self, group: str, *beside: str) -> tuple[FloatArray, FloatArray]:
-        """What a group of m columns is fitted with, beside the base or what is left of it, and
-        ``beside`` other groups: values and standard deviations (m,), by the jackknife over blocks.
+        """Return the values (m,) of a group of m columns, and their standard deviations (m,).
+
+        The base and the groups ``beside`` are fitted together with the group. The standard
+        deviations are those of the jackknife over blocks.
         """
         before = self._columns(group, *beside)
         columns = [*before, *self._where[group]]
-        # Without each block, and without each two: errors may last longer than one.
+        # Without one block, and without two: errors may last longer than one block.
         covariances = [
             blocks.jackknife(columns) for blocks in (self._blocks, self._blocks.merged(BLOCKS // 2))
         ]
@@ -119,8 +138,10 @@ class Regression:
 
 
 class _Stream:
-    """Motions of a stream over a span, in the parent's axes: ``turned`` (3, 3) by X or not at all.
-    Displacements are seen from the pose half-way, whose errors are not those of the ends.
+    """Motions of a stream over a span, in the parent's axes.
+
+    ``turned`` (3, 3) rotates the stream's axes to the parent's. Displacements are in the axes of
+    the pose half-way: its errors are independent of the errors at the ends.
     """
 
     def __init__(self, poses: FloatArray, pairs: MotionPairs, turned: FloatArray) -> None:
@@ -138,13 +159,15 @@ class _Stream:
         self.moved = se3.times(self.from_world, self.displaced)
 
     def back(self, vectors: FloatArray) -> FloatArray:
-        """Vectors (N, 3) of the poses at the start less those at the end, in axes of the start."""
+        """Return vectors (N, 3) at the start minus those at the end, in the axes of the start."""
         start, _, end = (vectors[rows] for rows in self.rows)
         return start - se3.times(self.rotations, end)
 
     def derivatives(self, step: int, h: float) -> tuple[FloatArray, ...]:
-        """Velocity and acceleration (N, 3) of all poses in their world, angular velocity and
-        acceleration in the parent's axes, by differences over steps of ``h`` seconds.
+        """Return derivatives (N, 3) of all poses, by differences over steps of ``h`` seconds.
+
+        They are velocity and acceleration in the stream's world, and angular velocity and angular
+        acceleration in the parent's axes.
         """
         p = se3.translation_of(self._poses)
         n = len(self._poses)
@@ -170,19 +193,24 @@ def response(
     T_parent_child: FloatArray,
     moved_at_ns: int | None = None,
 ) -> tuple[Regression, FloatArray]:
-    """Regression of motions over some seconds, and the principal axes of the rotations (columns,
-    parent's frame).
+    """Return the regression of motions over some seconds, and the principal axes of rotation.
 
-    Groups: ``turned_child``, ``turned_parent``, ``turned_both``: positions turned against
-    orientations, a rotation vector in the stream's world, of both in the parent's; ``axes_child``,
-    ``axes_parent``: factors, less 1, of the coordinates of a stream's positions; ``drift``:
-    velocity and angular rate of the child's world; ``gain``: factors, less 1, of the child's
-    rotations about the principal axes; ``moved``: lever arm and rotation of X after a time, if one
-    is given.
+    The axes are the columns of a (3, 3) array, in the parent sensor's frame.
+
+    Notes
+    -----
+    Groups of columns:
+
+    - ``turned_child``, ``turned_parent``, ``turned_both``: rotation vector between positions and
+      orientations, in the stream's world; for both streams in the parent's world.
+    - ``axes_child``, ``axes_parent``: factors, less 1, of the coordinates of the positions.
+    - ``drift``: velocity and angular rate of the child's world.
+    - ``gain``: factors, less 1, of the child's rotations about the principal axes.
+    - ``moved``: change of lever arm and rotation of X after ``moved_at_ns``, if given.
     """
     parent = _Stream(pose_pairs.Ts_pw_p, motions, np.eye(3))
     child = _Stream(pose_pairs.Ts_cw_c, motions, se3.rotation_of(T_parent_child))
-    # What the other stream makes of the displacements of each.
+    # Displacements of each stream in its world, predicted from the other stream.
     arm = se3.times(parent.chords, se3.translation_of(T_parent_child))
     p_seen = se3.times(np.swapaxes(parent.from_world, 1, 2), child.moved - arm)
     c_seen = se3.times(np.swapaxes(child.from_world, 1, 2), parent.moved + arm)
@@ -217,12 +245,17 @@ def response(
 def delays(
     pose_pairs: PosePairs, motions: MotionPairs, T_parent_child: FloatArray
 ) -> Regression | None:
-    """Regression of motions over about a second; None if too few poses follow each other.
+    """Return the regression of motions over about a second; None if too few poses are regular.
 
-    Groups: ``late_child``, ``late_parent``: positions are late against the orientations of their
-    stream (s), by velocities that the other stream shows; ``late_axes_child``,
-    ``late_axes_parent``: those by coordinate; ``positions_child``, ``positions_parent``,
-    ``orientations_child``, ``orientations_parent``: smoothed (s^2).
+    Notes
+    -----
+    Groups of columns:
+
+    - ``late_child``, ``late_parent``: delay (s) of the positions against the orientations of the
+      stream. The instrumental variables are velocities of the other stream.
+    - ``late_axes_child``, ``late_axes_parent``: the same delay by coordinate.
+    - ``positions_child``, ``positions_parent``, ``orientations_child``, ``orientations_parent``:
+      smoothing (s^2).
     """
     stamps_ns = pose_pairs.stamps_ns
     interval_s = median(np.diff(stamps_ns)) * 1e-9
@@ -239,7 +272,8 @@ def delays(
     X = T_parent_child
     Ts_parent = pose_pairs.Ts_pw_p
     Ts_child = pose_pairs.Ts_cw_c
-    as_seen = Ts_child @ se3.inverse(X), Ts_parent @ X  # by the other stream
+    # Poses of each sensor, computed from the other stream.
+    as_seen = Ts_child @ se3.inverse(X), Ts_parent @ X
     own, seen = (
         (_Stream(of_parent, motions, np.eye(3)), _Stream(of_child, motions, se3.rotation_of(X)))
         for of_parent, of_child in ((Ts_parent, Ts_child), as_seen)
@@ -252,7 +286,10 @@ def delays(
 def _of_filters(
     parent: _Stream, child: _Stream, arm: FloatArray, step: int, h: float
 ) -> dict[str, FloatArray]:
-    """Columns of delays and smoothing, and of a ``late`` child as a whole; ``arm`` (3,) to it."""
+    """Return columns of delays and smoothing, and of a delay of all poses of the child ("late").
+
+    ``arm`` (3,) is the lever arm to the child sensor, m.
+    """
     groups = {}
     for name, sign, stream in (("child", -1.0, child), ("parent", 1.0, parent)):
         velocity, acceleration, rate, bend = stream.derivatives(step, h)
@@ -275,7 +312,7 @@ def _of_filters(
 
 
 def _of_mount(parent: _Stream, child: _Stream) -> dict[str, FloatArray]:
-    """Columns of X, and of the scale."""
+    """Return the columns of lever arm and rotation of X, and of the scale."""
     return {
         "lever": _rows(parent.chords),
         "rotation": _rows(se3.skew(child.moved), child.rotations - np.eye(3)),
@@ -284,7 +321,7 @@ def _of_mount(parent: _Stream, child: _Stream) -> dict[str, FloatArray]:
 
 
 def _rows(of_t: FloatArray, of_r: FloatArray | None = None) -> FloatArray:
-    """Columns (K, 6, m) from those of displacements and of rotations: (K, 3, m), or one (K, 3)."""
+    """Join columns of displacements and of rotations, (K, 3, m) or (K, 3) each, to (K, 6, m)."""
     both = np.concatenate([of_t, np.zeros_like(of_t) if of_r is None else of_r], axis=1)
     return both.reshape(len(of_t), 6, -1)
 
@@ -292,7 +329,7 @@ def _rows(of_t: FloatArray, of_r: FloatArray | None = None) -> FloatArray:
 def _regression(
     parent: _Stream, child: _Stream, X: FloatArray, groups: _Columns, probes: _Columns, *base: str
 ) -> Regression:
-    """Regression on groups of columns, and on those of X and the scale."""
+    """Return the regression on groups of columns, and on the columns of X and the scale."""
     displaced = child.moved - parent.moved
     turned = se3.rotation_log(child.rotations @ np.swapaxes(parent.rotations, 1, 2))
     unexplained = displaced - se3.times(parent.chords, se3.translation_of(X))
