@@ -292,6 +292,53 @@ def test_a_stop_without_both_poses_is_named(both_poses, tmp_path):
         read_arm_samples(tmp_path)
 
 
+# ---- arguments of OpenCV in a FileStorage
+
+ARGUMENTS = ("R_gripper2base", "t_gripper2base", "R_target2cam", "t_target2cam")
+
+
+def opencv_matrix(values):
+    rows = np.atleast_2d(values)
+    numbers = ", ".join(repr(float(value)) for value in rows.ravel())
+    size = f"rows: {len(rows)}\n      cols: 3"
+    return f"!!opencv-matrix\n      {size}\n      dt: d\n      data: [{numbers}]"
+
+
+def one_matrix(name, stack):
+    return f"{name}: {opencv_matrix(stack.reshape(-1, 3))}\n"
+
+
+def a_matrix_for_each_stop(name, stack):
+    return f"{name}:\n" + "".join(f"   - {opencv_matrix(values)}\n" for values in stack)
+
+
+def a_name_for_each_stop(name, stack):
+    items = [f"{name}_{stop}: {opencv_matrix(values)}\n" for stop, values in enumerate(stack)]
+    return "".join(items)
+
+
+@pytest.mark.parametrize("are_vectors", [False, True])
+@pytest.mark.parametrize("write", [one_matrix, a_matrix_for_each_stop, a_name_for_each_stop])
+def test_arguments_of_opencv_in_a_file_storage(write, are_vectors, both_poses, tmp_path):
+    stacks = []
+    for Ts in both_poses:
+        rotations = Ts[:, :3, :3]
+        stacks += [se3.rotation_log(rotations) if are_vectors else rotations, Ts[:, :3, 3]]
+    text = "".join(write(name, stack) for name, stack in zip(ARGUMENTS, stacks, strict=True))
+    path = tmp_path / "samples.yaml"
+    path.write_text(f"%YAML:1.0\n---\n{text}")
+    read = read_arm_samples(path)
+    np.testing.assert_allclose([read.robot, read.tracking], both_poses, atol=1e-9)
+
+
+def test_a_file_storage_with_too_few_numbers_is_refused(tmp_path):
+    path = tmp_path / "samples.yaml"
+    text = "".join(one_matrix(name, np.eye(3)[:1]) for name in ARGUMENTS)
+    path.write_text(text.replace("1.0, 0.0, 0.0]", "1.0, 0.0]"))
+    with pytest.raises(InputError, match="rotations of 2 numbers and translations of 2"):
+        read_arm_samples(path)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

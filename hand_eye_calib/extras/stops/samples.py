@@ -22,7 +22,7 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import InputError, located
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.frames import pose_of, pose_stack
+from hand_eye_calib.core.geometry.frames import numbers_of, pose_of, pose_stack
 from hand_eye_calib.extras.stops.pose_files import read_pose_folder
 from hand_eye_calib.formats.files import LONGEST_NAME, local_path
 from hand_eye_calib.formats.npz import read_arrays
@@ -47,6 +47,8 @@ _EXPECTED = (
 
 # Argument of OpenCV's solvers: the quantity, and the frames that it leads from and to.
 _OPENCV_NAME = re.compile(r"([a-z]+)_([a-z]+)2([a-z]+)")
+# Name of a value of one stop, such as R_gripper2base_0.
+_NUMBERED_NAME = re.compile(r"(.*[a-z])_?([0-9]{1,9})")
 _QUANTITIES = {
     "r": "rotation",
     "rvec": "rotation",
@@ -187,8 +189,8 @@ def _opencv_samples(document: Mapping[str, Any]) -> ArmSamples | None:
     """Return the samples of OpenCV's arguments, such as R_gripper2base; None if there are none."""
     # Rotation and translation by the frames that they lead from and to.
     transforms: dict[tuple[str, str], dict[str, Any]] = {}
-    for name, value in document.items():
-        match = _OPENCV_NAME.fullmatch(str(name)[:LONGEST_NAME].lower())
+    for name, value in _with_stacks(document).items():
+        match = _OPENCV_NAME.fullmatch(name)
         if match is None or match[1] not in _QUANTITIES:
             continue
         frames = _OPENCV_FRAMES.get(match[2], ""), _OPENCV_FRAMES.get(match[3], "")
@@ -207,7 +209,54 @@ def _opencv_poses(
     for frames in ((source, target), (target, source)):
         transform = transforms.get(frames, {})
         if {"rotation", "translation"} <= transform.keys():
-            pair = transform["rotation"], transform["translation"]
+            pair = _arrays_of(transform["rotation"], transform["translation"])
             Ts = pose_stack(pair, f"{frames[0]} in {frames[1]}")
             return Ts if frames == (source, target) else se3.inverse(Ts)
     return None
+
+
+def _with_stacks(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a document by names in lower case, with the values of numbered names as lists."""
+    values: dict[str, Any] = {}
+    stacks: dict[str, dict[int, Any]] = {}
+    for key, value in document.items():
+        name = str(key)[:LONGEST_NAME].lower()
+        numbered = _NUMBERED_NAME.fullmatch(name)
+        if numbered is None:
+            values[name] = value
+        else:
+            stacks.setdefault(numbered[1], {})[int(numbered[2])] = value
+    for name, stack in stacks.items():
+        values.setdefault(name, [stack[number] for number in sorted(stack)])
+    return values
+
+
+def _arrays_of(rotations: Any, translations: Any) -> tuple[Any, Any]:
+    """Return rotations and translations of a FileStorage of OpenCV as arrays; others unchanged.
+
+    A FileStorage has one matrix of all stops, or a list with a matrix for each stop.
+    """
+    if not (_are_matrices(rotations) and _are_matrices(translations)):
+        return rotations, translations
+    positions = _numbers_of_matrices(translations)
+    angles = _numbers_of_matrices(rotations)
+    n_stops = len(positions) // 3
+    if len(positions) % 3 or len(angles) not in (3 * n_stops, 9 * n_stops):
+        raise InputError(
+            f"rotations of {len(angles)} numbers and translations of {len(positions)}; each stop "
+            "needs 9 or 3 numbers of a rotation and 3 of a translation"
+        )
+    shape = (3, 3) if len(angles) == 9 * n_stops else (3,)
+    return angles.reshape(n_stops, *shape), positions.reshape(n_stops, 3)
+
+
+def _are_matrices(value: Any) -> bool:
+    """Return whether a value is a matrix of a FileStorage, or a list of them."""
+    matrices = value if isinstance(value, list) else [value]
+    return all(isinstance(matrix, Mapping) for matrix in matrices)
+
+
+def _numbers_of_matrices(value: Any) -> FloatArray:
+    """Return the numbers of one or several matrices of a FileStorage."""
+    matrices = value if isinstance(value, list) else [value]
+    return np.concatenate([[], *map(numbers_of, matrices)])
