@@ -179,7 +179,7 @@ def keep_earlier_results(directory: str | Path) -> str:
         If a file cannot be copied.
     """
     previous = Path(directory, "previous")
-    paths = [Path(directory, name) for name in (*_NAMES, "report.html")]
+    paths = [Path(directory, name) for name in (*_NAMES, RIG_NAME, "report.html")]
     copies = {previous / path.name: read_bytes(path) for path in paths if path.exists()}
     if not copies:
         return ""

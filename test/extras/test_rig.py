@@ -235,3 +235,13 @@ def test_labels_details_and_warnings_of_files_are_obeyed_as_with_two_sensors(
     assert "quaternion" in out
     assert "  Method: " in out
     assert "Note: look here" in out
+    assert out.count("ros2 run tf2_ros static_transform_publisher") == 2
+
+
+def test_the_files_of_an_earlier_run_are_kept(files, calibrated, run, monkeypatch, tmp_path):
+    monkeypatch.setattr(of_rig, "calibrate_rig", lambda *_: calibrated)
+    run("calibrate", *files, "--out", "rig")
+    earlier = (tmp_path / "rig/rig.yaml").read_bytes()
+    _, _, err = run("calibrate", *files, "--out", "rig", "--label", "vehicle=7")
+    assert (tmp_path / "rig/previous/rig.yaml").read_bytes() == earlier
+    assert "the earlier files are in rig/previous" in err

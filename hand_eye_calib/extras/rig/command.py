@@ -15,6 +15,7 @@ from hand_eye_calib.offline.cli.options import (
 from hand_eye_calib.offline.cli.present import (
     allowance_lines,
     end,
+    publish_lines,
     transform_lines,
     verdict_lines,
     wrapped,
@@ -35,7 +36,7 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     a remote bag back into plain values.
     """
     from hand_eye_calib.extras.rig import rig as of_rig
-    from hand_eye_calib.formats.results import save_rig
+    from hand_eye_calib.formats.results import keep_earlier_results, save_rig
 
     if arguments.installed or arguments.base_frame:
         raise ConfigError("--installed and --base-frame are of two sensors, not of a rig")
@@ -48,7 +49,8 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         rig = of_rig.calibrate_rig(sensors, inputs["options"])
     rig = rig.with_warnings(as_given(readings.warnings))
     if arguments.out:
-        note(f"wrote {save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs)}")
+        kept = keep_earlier_results(arguments.out)
+        note(f"wrote {save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs)}{kept}")
     document = rig.to_dict() | {"inputs": inputs} if arguments.json else None
     try:
         print_result(as_lines(rig, arguments.verbose), document)
@@ -125,6 +127,7 @@ def as_lines(rig: "RigCalibration", with_details: bool = False) -> list[str]:
         transform = transforms_of(calibration)["T_parent_child"]
         lines += transform_lines(transform, calibration.out_of_reach, with_details)
         lines += allowance_lines(calibration)
+        lines += [f"  {line}" for line in publish_lines(calibration)]
         if with_details:
             for name, value in summary(calibration).items():
                 lines += wrapped(f"{name}: {value}", "  ", "    ")

@@ -150,12 +150,7 @@ def as_lines(
     lines = [*verdict_lines(calibration), *_extrinsic_lines(calibration, with_details)]
     if steps:
         lines += ["Next", *(f"  {step}" for step in steps)]
-    if command := calibration.static_transform_command():
-        by_hand = [
-            number for number in usable_numbers(calibration).values() if isinstance(number, str)
-        ]
-        condition = f", after you have replaced {listing(by_hand)}" if by_hand else ""
-        lines += [f"To publish it ({calibration.verdict.value}{condition})", f"  {command}"]
+    lines += publish_lines(calibration)
     details = []
     for name, value in calibration.parts.items():
         details += part(name).details(value, calibration)
@@ -170,6 +165,16 @@ def as_lines(
     for detail in details:
         lines += wrapped(detail, "  ", "    ")
     return lines
+
+
+def publish_lines(calibration: Calibration) -> list[str]:
+    """Return the command that publishes an extrinsic; no lines if it must not be used."""
+    command = calibration.static_transform_command()
+    if not command:
+        return []
+    by_hand = [number for number in usable_numbers(calibration).values() if isinstance(number, str)]
+    condition = f", after you have replaced {listing(by_hand)}" if by_hand else ""
+    return [f"To publish it ({calibration.verdict.value}{condition})", f"  {command}"]
 
 
 def _extrinsic_lines(calibration: Calibration, with_details: bool) -> list[str]:
