@@ -10,7 +10,11 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.option import option_name
 from hand_eye_calib.core.base.text import AXIS_UNITS, Prior, shown_value
-from hand_eye_calib.core.engine.cross_check import compare_answers, other_answers
+from hand_eye_calib.core.engine.cross_check import (
+    answers_of_halves,
+    answers_of_whole,
+    compare_answers,
+)
 from hand_eye_calib.core.engine.run import Progress, run
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry.trajectory import Trajectory, TrajectoryLike
@@ -177,7 +181,7 @@ def cross_check(
     child: Trajectory,
     config: CalibratorConfig | None = None,
 ) -> CrossCheck:
-    """Compare a result with DNLO at other references and with both halves of its recording.
+    """Compare a result with robust least squares, on the whole recording and on both halves.
 
     Every solve with method or reference auto includes this comparison.
 
@@ -207,4 +211,6 @@ def cross_check(
     config = config or snapshot.config
     config.require_poses("a cross-check")
     settled = replace(snapshot, config=replace(config, time_offset=calibration.time_offset_s))
-    return compare_answers(calibration, *other_answers(calibration, config, settled.pose_pairs))
+    others = answers_of_whole(calibration, settled.pose_pairs)
+    halves = answers_of_halves(calibration, settled.pose_pairs)
+    return compare_answers(calibration, others, halves)

@@ -1,4 +1,6 @@
-"""The robust least squares."""
+"""Robust least squares, as a method and as a second opinion."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from motions import (
 from sigmas import assert_nees, nees
 
 import hand_eye_calib as hec
+from hand_eye_calib.core.assessment.second_opinion import excess_covariance, second_opinions
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.core.solvers.robust import solve, solve_best_stride
@@ -83,3 +86,77 @@ class TestMethod:
         assert result.reference_reason.startswith(f"{result.reference}: ")
         errors = np.abs(se3.deviation(result.T_parent_child, T_PARENT_CHILD))
         assert (errors < 4.0 * result.sigmas_measured).all()
+
+
+class TestSecondOpinions:
+    def test_answers_that_agree_add_almost_nothing(self):
+        answer, opinions = answer_and_opinions(seed=2)
+        assert added_sigmas(answer, opinions).max() < 0.5 * answer.sigmas.max()
+
+    @pytest.mark.parametrize("axis", range(6))
+    def test_difference_is_added_on_its_axis(self, axis):
+        answer, opinions = answer_and_opinions(seed=2)
+        step = np.zeros(6)
+        step[axis] = 0.1
+        far = replace(answer, T_parent_child=shifted_in_parent(answer.T_parent_child, step))
+        expected = np.zeros(6)
+        expected[axis] = 0.1
+        np.testing.assert_allclose(added_sigmas(far, opinions), expected, atol=0.01)
+
+    def test_answers_that_are_less_certain_add_nothing(self):
+        answer, opinions = answer_and_opinions(seed=2)
+        T_far = shifted_in_parent(answer.T_parent_child, np.full(6, 0.1))
+        certain = replace(
+            answer,
+            T_parent_child=T_far,
+            observability=tuple(
+                replace(dof, sigma=0.1 * dof.sigma) for dof in answer.observability
+            ),
+        )
+        assert added_sigmas(certain, opinions).max() == 0.0
+
+    def test_unobservable_axis_has_none(self):
+        parent = planar_poses(300)
+        child = child_of(parent, np.eye(4))
+        high = se3.from_rotation_translation(np.eye(3), [0.0, 0.0, 5.0])
+        opinions = second_opinions(parent, child, high)
+        answer = replace(opinions[-1], T_parent_child=high)
+        assert added_sigmas(answer, opinions)[2] == 0.0
+
+    def test_few_poses_have_an_opinion(self):
+        parent, child = noisy_poses(4)
+        (opinion,) = second_opinions(parent[:15], child[:15], T_PARENT_CHILD)
+        assert np.isfinite(opinion.cov_parent_child_in_child).all()
+
+    def test_sigmas_of_a_result_contain_the_excess(self, monkeypatch):
+        streams = noisy_pair(wandering_poses(N_POSES, 6), 6, SIGMA_M, SIGMA_RAD)
+        usual = hec.calibrate(*streams, method="adaptive")
+        path = "hand_eye_calib.core.engine.estimation.excess_covariance"
+        monkeypatch.setattr(path, lambda *_: 0.05**2 * np.eye(6))
+        widened = hec.calibrate(*streams, method="adaptive")
+        np.testing.assert_allclose(
+            widened.sigmas_measured, np.hypot(usual.sigmas_measured, 0.05), rtol=0.1
+        )
+        # The comparison states the standard deviation without second opinions.
+        assert widened.cross_check["x"].sigma < 0.05 < widened.sigmas[0]
+
+
+def answer_and_opinions(seed):
+    """An assessed answer, and second opinions from the same poses."""
+    parent, child = noisy_poses(seed)
+    opinions = second_opinions(parent, child, T_PARENT_CHILD)
+    return min(opinions, key=lambda opinion: opinion.sigmas.sum()), opinions
+
+
+def shifted_in_parent(T, step):
+    """Transform after a translation and a rotation (6,) along and about the parent's axes."""
+    shifted = T.copy()
+    shifted[:3, 3] += step[:3]
+    shifted[:3, :3] = se3.rotation_exp(step[3:]) @ T[:3, :3]
+    return shifted
+
+
+def added_sigmas(answer, opinions):
+    """Standard deviations (6,) along and about the parent's axes that opinions add."""
+    excess = excess_covariance(answer, opinions)
+    return se3.sigmas_in_parent(answer.T_parent_child[:3, :3], excess)

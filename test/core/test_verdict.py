@@ -104,8 +104,8 @@ def test_a_finding_explains_why_the_solver_did_not_converge():
     [
         (
             "methods",
-            "other methods and references disagree about the rotation about z by 0.57 deg; this "
-            "result claims +/- 0.057 deg",
+            "robust least squares disagrees about the rotation about z by 0.57 deg; without this "
+            "second opinion, the result claims +/- 0.17 deg",
         ),
         (
             "floor",

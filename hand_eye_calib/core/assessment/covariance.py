@@ -107,6 +107,11 @@ class Assessment:
     contradictions: Mapping[str, float] = field(default_factory=dict)
     from_motion: FloatArray = field(default_factory=lambda: np.eye(6))
 
+    @property
+    def sigmas(self) -> FloatArray:
+        """Standard deviations (6,) along and about the parent's axes; infinite if unobservable."""
+        return np.array([dof.sigma for dof in self.observability])
+
     def allowance(self, of_motion: FloatArray) -> FloatArray:
         """Return the allowance (6, 6) of the result from that of the estimate from motion."""
         return self.from_motion @ of_motion @ self.from_motion.T

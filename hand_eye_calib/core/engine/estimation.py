@@ -15,6 +15,7 @@ from hand_eye_calib.core.assessment import covariance
 from hand_eye_calib.core.assessment.moved import possible_shift
 from hand_eye_calib.core.assessment.prior import fuse, widened
 from hand_eye_calib.core.assessment.rocking import rocking_axis
+from hand_eye_calib.core.assessment.second_opinion import excess_covariance, second_opinions
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.config import CalibratorConfig, require_backend
 from hand_eye_calib.core.base.errors import NotEnoughDataError
@@ -31,7 +32,7 @@ from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, Sol
 from hand_eye_calib.core.results.records import Residuals
 from hand_eye_calib.core.solvers.all_pairs import Solution
 from hand_eye_calib.core.solvers.registry import Method
-from hand_eye_calib.core.solvers.robust import BestStride
+from hand_eye_calib.core.solvers.robust import Stride
 
 # Largest share of the increments that may be jumps without a warning. With jumps at a tenth of the
 # poses of both trajectories, a fifth of the increments are jumps.
@@ -74,7 +75,11 @@ class Solved:
     time_offset : TimeOffset or None
         The time offset, if it was estimated.
     floor : (6, 6) array
-        Common-mode covariance; zeros for an answer that is only compared with a result.
+        Common-mode covariance.
+    opinions : tuple of Assessment
+        Second opinions on an answer of the noise model.
+    excess : (6, 6) array
+        Covariance that the noise model misses, by the second opinions.
     """
 
     solution: Solution | AdaptiveSolution
@@ -95,12 +100,16 @@ class Solved:
     scale_fit: SimilarityFit | None = None
     time_offset: TimeOffset | None = None
     floor: FloatArray = field(default_factory=_no_spread)
+    opinions: tuple[covariance.Assessment, ...] = ()
+    excess: FloatArray = field(default_factory=_no_spread)
 
     def calibration(self, unseen: Collection[str] = ()) -> Calibration:
         """Return the result without frame names. The axes ``unseen`` become unobservable."""
         config = self.config
         solution = self.solution
         assessment = self.assessment
+        if self.excess.any():
+            assessment = widened(assessment, self.excess)
         if unseen:
             assessment = covariance.without_axes(assessment, unseen)
         fused = fuse(assessment, config.prior())
@@ -222,7 +231,6 @@ def solve_poses(
     pose_pairs: PosePairs,
     config: CalibratorConfig,
     time_offset: TimeOffset | None = None,
-    is_beside: bool = False,
 ) -> Solved:
     """Solve and assess synchronised poses.
 
@@ -233,8 +241,6 @@ def solve_poses(
         With a time offset in seconds, which the poses have already.
     time_offset : TimeOffset, optional
         That time offset, if it was estimated.
-    is_beside : bool
-        Solve only for a comparison with a result: without a floor and without a proof.
 
     Raises
     ------
@@ -249,7 +255,7 @@ def solve_poses(
     if config.method in ("auto", "adaptive"):
         solved = _solve_stream(scaled, config, is_clock_free=time_offset is not None)
     else:
-        solved = _solve_pairs(scaled, config, is_beside=is_beside)
+        solved = _solve_pairs(scaled, config)
     spread = _no_spread()
     if scale_fit:
         by_log_scale = scale_fit.sensitivity[:, 0]
@@ -264,15 +270,19 @@ def solve_poses(
     assessment = solved.assessment
     if spread.any():
         assessment = widened(assessment, spread)
-    solved = replace(
-        solved, config=config, scale=scale, scale_fit=scale_fit, time_offset=time_offset
-    )
-    if is_beside:
-        return replace(solved, assessment=assessment)
     axis = rocking_axis(pose_pairs)
     if axis is not None:
         assessment = covariance.without_direction(assessment, axis)
-    return replace(solved, assessment=assessment, floor=floor_of(solved, pose_pairs, config))
+    return replace(
+        solved,
+        assessment=assessment,
+        config=config,
+        scale=scale,
+        scale_fit=scale_fit,
+        time_offset=time_offset,
+        floor=floor_of(solved, pose_pairs, config),
+        excess=excess_covariance(assessment, solved.opinions),
+    )
 
 
 def floor_of(solved: Solved, pose_pairs: PosePairs, config: CalibratorConfig) -> FloatArray:
@@ -356,6 +366,7 @@ def _of_model(
     return Solved(
         solution=solution,
         assessment=covariance.assess_adaptive(pose_pairs, solution),
+        opinions=second_opinions(pose_pairs.Ts_pw_p, Ts_cw_c, solution.T_parent_child),
         method="adaptive",
         reference="increments",
         pairs=motion_pairs(pose_pairs.Ts_pw_p, Ts_cw_c, "B1"),
@@ -372,7 +383,6 @@ def _solve_pairs(
     pose_pairs: PosePairs,
     config: CalibratorConfig,
     adaptive: AdaptiveSolution | None = None,
-    is_beside: bool = False,
 ) -> Solved:
     """Solve and assess the motion pairs of one reference with a method of the paper.
 
@@ -382,15 +392,13 @@ def _solve_pairs(
     config : CalibratorConfig
     adaptive : AdaptiveSolution, optional
         Solution of the adaptive estimator, which the choice of the reference ``auto`` needs.
-    is_beside : bool
-        Leave out the proof.
     """
     method = Method(config.method, config.threshold, config.min_inlier_fraction, config.backend)
     reference = config.reference
     reason = ""
     spread = _no_spread()
     warnings: tuple[str, ...] = ()
-    best: BestStride | None = None
+    best: Stride | None = None
     if reference == "auto" and method.solve_best_stride:
         best = method.solve_best_stride(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c)
         reference = best.reference
@@ -421,7 +429,7 @@ def _solve_pairs(
         stamps_ns=pose_pairs.stamps_ns,
         config=config,
         reference_reason=reason,
-        proved_global="not tried" if is_beside else method.proved_global(pairs, solution),
+        proved_global=method.proved_global(pairs, solution),
         spread=spread,
         warnings=warnings,
     )

@@ -358,19 +358,20 @@ class AxisScatter:
     Attributes
     ----------
     sigma : float or None
-        The result's standard deviation, with the allowance; None if the axis is unobservable.
+        The result's standard deviation, with the allowance and without second opinions; None if
+        the axis is unobservable.
     of_methods : float or None
-        Robust standard deviation of other methods and references about the result.
+        Robust standard deviation of answers of robust least squares about the result.
     of_halves : float or None
         Standard deviation that follows from the difference between both halves of the recording.
     excess_of_methods, excess_of_halves : float or None
-        The same in joint standard deviations, which contain the allowance; those of
-        the halves also the result's own if the halves are solved with another method.
+        The same in joint standard deviations, which contain the allowance; those of the halves also
+        the result's own if it is of the noise model.
     excess_over_own : float or None
-        Distance of other methods and references in the result's own standard deviations, over those
-        that are not much less certain.
+        Distance of these answers in the result's own standard deviations, over those that are not
+        much less certain.
     is_confirmed : bool
-        False if the result determines the axis and no other method or reference does.
+        False if the result determines the axis and no other answer does.
     """
 
     sigma: float | None

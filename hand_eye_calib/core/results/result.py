@@ -95,8 +95,8 @@ class Result:
     findings : tuple of Finding
         What the stream checks found.
     cross_check : CrossCheck or None
-        Per axis, the scatter of the answers of other methods and references and of both halves of
-        the recording about this one; None without that cross-check.
+        Per axis, the scatter about this one of answers of robust least squares, over other numbers
+        of poses and from both halves of the recording; None without a cross-check.
     warnings : tuple of str
         What a person should know before using the result.
     recording : object

@@ -129,15 +129,17 @@ _KINDS = dict.fromkeys(
 )
 _NO_FAULT = " (a limit of the recording; no fault was found)"
 
-# Other answers, and what to do if they disagree.
+# Other answers, what they contradict, and what to do.
 _OTHERS = {
     "halves": (
-        "the two halves of the recording",
+        "the two halves of the recording disagree",
+        "this result claims",
         "check that both mounts are tight and record again; what the halves agree on holds",
     ),
     "methods": (
-        "other methods and references",
-        "use their scatter as the standard deviation, or record longer with more varied motion",
+        "robust least squares disagrees",
+        "without this second opinion, the result claims",
+        "compare with a drawing or a tape measure, or record longer with more varied motion",
     ),
 }
 
@@ -309,11 +311,14 @@ def _contradiction(kind: str, result: Result) -> Iterator[Ground]:
             distances[axis.name] = (
                 f"about {axes_in_words([axis.name])} by {amount(axis.name, scatter)}"
             )
-            sigmas.append(f"+/- {amount(axis.name, axis.total)}")
+            claimed = axis.total
+            if kind == "methods" and row.sigma:
+                claimed = row.sigma
+            sigmas.append(f"+/- {amount(axis.name, claimed)}")
     if distances:
-        who, advice = _OTHERS[kind]
-        disagree = f"{who} disagree {listing([*distances.values()])}"
-        yield Ground(f"{disagree}; this result claims {listing(sigmas)}", advice, tuple(distances))
+        who, claims, advice = _OTHERS[kind]
+        disagree = f"{who} {listing([*distances.values()])}"
+        yield Ground(f"{disagree}; {claims} {listing(sigmas)}", advice, tuple(distances))
 
 
 def _scatter_of(kind: str, row: AxisScatter, axis: "_Axis") -> tuple[float, bool]:
@@ -328,7 +333,7 @@ def _scatter_of(kind: str, row: AxisScatter, axis: "_Axis") -> tuple[float, bool
         over_own = row.excess_over_own
     if scatter is None and over_own is not None:
         # Too few answers have a scatter, but they are about as certain as the result.
-        scatter = over_own * axis.total
+        scatter = over_own * (row.sigma or axis.total)
     if scatter is None:
         return 0.0, False
     of_target = scatter / axis.target
@@ -532,7 +537,7 @@ _OWN_RULES = (
     Rule(
         "methods",
         _CARE,
-        f"other methods and references {_APART}; or those about as certain by "
+        f"answers of robust least squares {_APART}; or those about as certain by "
         f"{CONTRADICTED_SIGMAS:g} of the result's own and {CONTRADICTED_TARGETS:g} targets",
         partial(_contradiction, "methods"),
     ),

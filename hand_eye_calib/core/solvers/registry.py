@@ -37,7 +37,7 @@ class _Solver(NamedTuple):
 
     solve: Callable[..., Solution]
     solve_near: Callable[..., Solution] | None = None
-    solve_best_stride: Callable[[FloatArray, FloatArray], robust.BestStride] | None = None
+    solve_best_stride: Callable[[FloatArray, FloatArray], robust.Stride] | None = None
 
 
 # Taylor's method has the same solution as Park's.
@@ -84,7 +84,7 @@ class Method:
         require_backend(self.name, self.backend)
 
     @property
-    def solve_best_stride(self) -> Callable[[FloatArray, FloatArray], robust.BestStride] | None:
+    def solve_best_stride(self) -> Callable[[FloatArray, FloatArray], robust.Stride] | None:
         """Solver that chooses the reference ``auto`` itself; None if the method has none."""
         return _SOLVERS[self.name].solve_best_stride
 

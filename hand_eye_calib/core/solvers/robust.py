@@ -35,7 +35,7 @@ _CAUCHY_UNIT = 2.385
 _MAX_STEPS = 100
 _FREE_SCALE_STEPS = 50
 
-# A step below this share of a standard deviation of the answer ends the iteration.
+# A step below this share of a standard deviation of the answer usually ends the iteration.
 _STEP_TOLERANCE = 1e-5
 
 # Rotations about the common axis of all motions that are tried as starts: flat ground leaves that
@@ -82,9 +82,12 @@ class RobustSolution(Solution):
     unseen: FloatArray
 
 
-def solve(pairs: MotionPairs, T_start: FloatArray | None = None) -> RobustSolution:
+def solve(
+    pairs: MotionPairs, T_start: FloatArray | None = None, tolerance: float = _STEP_TOLERANCE
+) -> RobustSolution:
     """Solve A X = X B for K >= 1 pairs, from a start (4, 4) if one is given.
 
+    A step below a tolerance, in standard deviations of the answer, ends the iteration.
     ``objective`` is the sum of the Cauchy costs of both parts, in units of their scales.
     """
     T_parent_child = _start(pairs) if T_start is None else T_start
@@ -97,7 +100,7 @@ def solve(pairs: MotionPairs, T_start: FloatArray | None = None) -> RobustSoluti
         hessian, scores = _normal_equations(parts, scales, _weights(parts, scales))
         step = -_inverse(hessian) @ scores.sum(axis=(0, 1))
         T_parent_child = se3.retracted(T_parent_child, step)
-        if step @ hessian @ step < _STEP_TOLERANCE**2:
+        if step @ hessian @ step < tolerance**2:
             converged = True
             break
     parts = _parts(pairs, T_parent_child)
@@ -113,7 +116,7 @@ def solve(pairs: MotionPairs, T_start: FloatArray | None = None) -> RobustSoluti
     )
 
 
-class BestStride(NamedTuple):
+class Stride(NamedTuple):
     """Motions over one number of poses, and their solution.
 
     Attributes
@@ -129,24 +132,37 @@ class BestStride(NamedTuple):
     solution: RobustSolution
 
 
-def solve_best_stride(Ts_pw_p: FloatArray, Ts_cw_c: FloatArray) -> BestStride:
-    """Solve with motions over several numbers of poses; return the solution with the smallest
-    covariance.
+def solve_strides(
+    Ts_pw_p: FloatArray,
+    Ts_cw_c: FloatArray,
+    T_start: FloatArray | None = None,
+    tolerance: float = _STEP_TOLERANCE,
+) -> list[Stride]:
+    """Solve with motions over several numbers of poses, each by itself.
 
     Parameters
     ----------
     Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
         Synchronised poses of both sensors, in order of time.
+    T_start : (4, 4) array, optional
+    tolerance : float
+        As for :func:`solve`.
     """
-    candidates = []
-    for stride in _STRIDES:
-        if stride == 1 or _MIN_MOTIONS * stride < len(Ts_pw_p):
-            reference = f"B{stride}"
+    strides = []
+    for n_poses in _STRIDES:
+        if n_poses == 1 or _MIN_MOTIONS * n_poses < len(Ts_pw_p):
+            reference = f"B{n_poses}"
             pairs = motion_pairs(Ts_pw_p, Ts_cw_c, reference)
-            every = max(stride // _MOTIONS_PER_STRIDE, -(-len(pairs) // _MOST_MOTIONS), 1)
+            every = max(n_poses // _MOTIONS_PER_STRIDE, -(-len(pairs) // _MOST_MOTIONS), 1)
             pairs = pairs[::every]
-            candidates.append(BestStride(reference, pairs, solve(pairs)))
-    return min(candidates, key=lambda candidate: _log_volume(candidate.solution))
+            strides.append(Stride(reference, pairs, solve(pairs, T_start, tolerance)))
+    return strides
+
+
+def solve_best_stride(Ts_pw_p: FloatArray, Ts_cw_c: FloatArray) -> Stride:
+    """Return the stride with the smallest covariance, see :func:`solve_strides`."""
+    strides = solve_strides(Ts_pw_p, Ts_cw_c)
+    return min(strides, key=lambda stride: _log_volume(stride.solution))
 
 
 @dataclass(frozen=True)

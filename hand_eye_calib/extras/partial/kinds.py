@@ -28,7 +28,7 @@ _OF_POSES: dict[str, tuple[object, ...]] = {
     "backend": ("fast",),
 }
 
-# Positions have no cross-check by DNLO: its options keep their defaults.
+# Positions have no cross-check: its options keep their defaults.
 _OF_POSITIONS: dict[str, tuple[object, ...]] = {
     **_OF_POSES,
     "threshold": (CalibratorConfig.threshold,),

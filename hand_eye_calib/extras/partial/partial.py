@@ -257,7 +257,7 @@ def estimate_rotation(
         On one clock: the time offset of the options is applied already. Positions are ignored.
     config : CalibratorConfig
     cross_check : bool
-        Whether to compare the result with DNLO's answers from the same rotations.
+        Whether to compare the result with robust least squares of the same rotations.
     """
     stamps_ns = pose_pairs.stamps_ns
     Ts_pw_p = _rotations_of(pose_pairs.Ts_pw_p)
