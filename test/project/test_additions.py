@@ -60,13 +60,13 @@ REFERENCE = [
         "    n_poses = len(Ts_pw_p)\n    if kind",
         f"    n_poses = len(Ts_pw_p)\n{TRAVELLED}    if kind",
     ),
-    ("core/base/config.py", "C<n> (each with the first of its segment of n)", "C<n>, D<n> (n cm)"),
+    ("core/base/config.py", "C<n> (each with", "D<n> (n cm apart), C<n> (each with"),
 ]
 
 # What a solver needs besides its own file.
 SOLVER = [
     ("core/solvers/registry.py", "    dnlo,\n", "    dnlo,\n    horaud,\n"),
-    ("core/solvers/registry.py", '    "ali":', '    "horaud": horaud.solve,\n    "ali":'),
+    ("core/solvers/registry.py", '    "ali":', '    "horaud": _Solver(horaud.solve),\n    "ali":'),
     ("core/base/config.py", '"zhuang", "ali")', '"zhuang", "ali", "horaud")'),
     ("offline/calibrate.py", '"ali", "adaptive"', '"ali", "horaud", "adaptive"'),
 ]
