@@ -87,7 +87,7 @@ def test_a_batch_on_all_cores_goes_on_where_it_stopped(run, fleet, tmp_path, mon
     out_dir = tmp_path / "out"
     code, out, err = run(*fleet, "--out", out_dir, "--json", "--jobs", "2")
     assert_is_result_of_the_fleet(code, out, err)
-    assert "note: 3 recordings are not compared with each other: give --vehicle with the" in err
+    assert "note: 3 recordings are not compared with each other: set --vehicle to the" in err
     assert re.search(r"note: [1-4] of 4: drive[0-2]: USE", err)  # a line for each in a pipe
     saved = load_result(out_dir / "drive1")
     np.testing.assert_allclose(saved.T_parent_child, T_PARENT_CHILD, atol=1e-3)
@@ -205,7 +205,10 @@ def test_what_a_worker_that_dies_had_to_do_is_done_again(tmp_path):
 
 def test_a_recording_of_which_workers_die_takes_no_other_along():
     errors = done_by(some_tasks(*NAMES), always_dies)
-    assert errors.pop("bad") == "worker processes die of it, perhaps for lack of memory: --jobs 1"
+    assert (
+        errors.pop("bad")
+        == "worker processes crash on it, perhaps for lack of memory: use --jobs 1"
+    )
     assert errors == dict.fromkeys(NAMES[:-1], "done")
 
 

@@ -178,9 +178,9 @@ def test_topics_of_a_bag(rig, tmp_path, capsys):
     assert document["sensors"] == ["lidar_link", "front_link", "rear_link"]
     assert document["inputs"]["topics"] == list(streams)
     assert main(["replay", bag, "--list", "--topics", *streams]) == 2
-    assert "--topics and --list do not go together" in capsys.readouterr().err
+    assert "--topics cannot be combined with --list" in capsys.readouterr().err
     assert main(["replay", bag, "--topics", "/lidar/odometry", "/lidar/odometry"]) == 2
-    assert "of one sensor, 'lidar_link'" in capsys.readouterr().err
+    assert "have the sensor name 'lidar_link'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -188,7 +188,7 @@ def test_topics_of_a_bag(rig, tmp_path, capsys):
     [
         (["rear.txt", "--parent-format", "tum"], "--parent-format is for two files"),
         (["front.txt"], "front.txt appears twice"),
-        (["rear.txt", "--installed", "0 0 0 0 0 0"], "--installed and --base-frame are of two"),
+        (["rear.txt", "--installed", "0 0 0 0 0 0"], "--installed and --base-frame apply to two"),
     ],
 )
 def test_the_command_refuses_options_of_two_files(files, run, words, message):

@@ -111,7 +111,7 @@ def test_thirty_images_calibrate_a_hand(tmp_path, capsys, no_figures):
     paths = [str(tmp_path / "hand.tum"), str(folder), "--camera", str(tmp_path / "camera.yaml")]
     target = ["--target", "charuco:7x5:0.05:0.037:5X5_100"]
     assert main(["calibrate", *paths, *target, "--out", str(tmp_path / "out")]) == 0
-    assert "seen in 30 of 30 images" in capsys.readouterr().err
+    assert "visible in 30 of 30 images" in capsys.readouterr().err
     off = se3.log(se3.inverse(X) @ hec.load(tmp_path / "out").T_parent_child)
     assert np.linalg.norm(off[:3]) < 1e-3
     assert np.degrees(np.linalg.norm(off[3:])) < 0.1
@@ -182,7 +182,9 @@ def test_the_images_of_a_bag_are_poses_of_the_camera(tmp_path, capsys, no_figure
         messages += image_messages(stamp_ns, rendered(picture, T, rng))
     bag = write_messages(tmp_path / "bag", messages)
     board = "charuco:7x5:0.05:0.037:5X5_100"
-    with pytest.warns(UserWarning, match="seen in 16 of 16 images, its corners to 0[.]"):
+    with pytest.warns(
+        UserWarning, match="visible in 16 of 16 images, with corner residuals of 0[.]"
+    ):
         trajectory = hec.read_trajectory(bag, topic=f"/eye/image_raw?{board}")
     off = se3.log(Ts @ trajectory.poses)
     assert np.median(np.abs(off[:, :3])) < 1e-3
@@ -194,7 +196,7 @@ def test_the_images_of_a_bag_are_poses_of_the_camera(tmp_path, capsys, no_figure
         np.testing.assert_array_equal(opened.trajectory(of_file)[0].poses, trajectory.poses)
         for topic, message in (
             ("/eye/image_raw", "name the target in the images"),
-            (f"/hand?{board}", "has no images"),
+            (f"/hand?{board}", "contains no images"),
         ):
             with pytest.raises(InputError, match=message):
                 opened.trajectory(topic)

@@ -264,7 +264,7 @@ def test_arrays_and_graphs(tmp_path):
         file = read_trajectory_file(tmp_path / name, AUTO)
         np.testing.assert_allclose(file.trajectory.poses, TRUTH.poses, atol=1e-12)
     assert file.trajectory.stamps_ns[1] == 1_000_000_000
-    assert "numbers of its vertices are taken for seconds" in file.guesses[0]
+    assert "numbers of its vertices are used as seconds" in file.guesses[0]
 
 
 def test_poses_without_stamps_are_paired_by_row_or_by_the_names_of_images(tmp_path, capsys):
@@ -333,7 +333,7 @@ def of_ulog(*topics):
 def test_a_log_of_px4(tmp_path, topics):
     """Odometry before positions and attitudes; without pyulog one sentence."""
     (tmp_path / "log.ulg").write_bytes(of_ulog(*topics))
-    message = r"'\.\[px4\]'|without vehicle_odometry or vehicle_local_position$"
+    message = r"'\.\[px4\]'|not contain vehicle_odometry or vehicle_local_position$"
     if not importlib.util.find_spec("pyulog") or topics == ["vehicle_attitude"]:
         with pytest.raises((MissingDependencyError, InputError), match=message):
             read_trajectory_file(tmp_path / "log.ulg", AUTO)
@@ -361,22 +361,22 @@ def test_a_log_of_px4(tmp_path, topics):
         (b"source_timestamp,destination_timestamp,x,y,z,yaw\n1,2,0,0,0,0\n", "chain"),
         (b'<?xml version="1.0"?>\n<kml></kml>', "export the track as GPX"),
         (b"FMT, 128, 89, FMT, BBnNZ, Type\n", "a log of ArduPilot; export"),
-        (b"#BESTPOSA,COM1,0,9.5,FINE,1,2,0,0,0;SOL_COMPUTED,1,2*1\n", "without INSPVA"),
+        (b"#BESTPOSA,COM1,0,9.5,FINE,1,2,0,0,0;SOL_COMPUTED,1,2*1\n", "neither INSPVA"),
         (b"header {\n  stamp {\n", "messages as text; record"),
         (b"3.04           OBSERVATION DATA    RINEX VERSION / TYPE\n", "positions with RTKLIB"),
-        (b"SQLite format 3\0", "a bag ends in .db3"),
+        (b"SQLite format 3\0", "a bag must end in .db3"),
         (b"# Frame list\n#   FRAME_ID, RIG_ID, RIG_FROM_WORLD\n1 1 1 0 0 0 0 0\n", "images.txt"),
         (b"# Cameras\n# Number\n#   CAMERA_ID, MODEL, WIDTH\n1 PINHOLE 9\n", "images.txt"),
         (b"ply\nformat ascii 1.0\nelement vertex 1\n", "points, no trajectory; record the odom"),
         (b"# .PCD v0.7\nFIELDS x y z\nSIZE 4\nDATA ascii\n1 2 3\n", "points, no trajectory"),
-        (b"header:\n  stamp:\n    sec: 1\n", "YAML, no trajectory; record messages as a bag"),
-        (of_echo("a,b,c").encode(), "messages without poses"),
+        (b"header:\n  stamp:\n    sec: 1\n", "YAML without a trajectory; record"),
+        (of_echo("a,b,c").encode(), "--csv without poses"),
         (b"$GPRMC,123519,A,,,,,,,230394,,*6A\n", "expected GGA sentences with a fix"),
         (re.sub(r"\*..", "", of_nmea()).replace("RMC", "ZDA").encode(), "the date in RMC"),
         (b"%  GPST  latitude(d'\") longitude(d'\")\n1 2 3\n", "set out-solformat to llh, degrees"),
         (of_motive().replace("X,Y,Z,W", "X,Y,Z,").encode(), "rotation type Quaternion"),
         (b"Trajectories\n100\n,,a:b\nFrame,Sub Frame,X,Y,Z\n,,mm,mm,mm\n", "not markers"),
-        (b'{"frames":' * 100_000, "JSON that is not read"),
+        (b'{"frames":' * 100_000, "JSON of an unsupported kind"),
         (b"Format Version,1\nTime (Seconds)\n", "Motive|list index"),
     ],
 )

@@ -372,7 +372,7 @@ def parsed(options):
         (["info", "a", "b"], "unknown 'b'"),
         (["chek", "bag"], "did you mean check?"),
         (["info"], "the following arguments are required: RESULT"),
-        (["replay", "bag", "--vehicle", "a"], "--dask and --vehicle are for --batch"),
+        (["replay", "bag", "--vehicle", "a"], "--dask and --vehicle need --batch"),
         (["replay", "bag", "--batch", "fleet"], "--batch cannot be combined with PATH or --list"),
         (["replay", "--batch", "none*"], "no bag matches none*"),
         (["watch", "--web", "high"], "expected PORT or HOST:PORT, got 'high'"),

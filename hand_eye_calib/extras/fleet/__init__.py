@@ -21,7 +21,7 @@ def register() -> None:
     PUBLIC_NAMES["calibrate_many"] = "hand_eye_calib.extras.fleet.together"
     PUBLIC_NAMES["calibrate_together"] = "hand_eye_calib.extras.fleet.together"
     COMMANDS["compare"] = Command(
-        "compare results with what is installed, or with each other", _compare
+        "compare results with the installed transform, or with each other", _compare
     )
     RESULT_PARTS["together"] = _together
     EXTRA_RULES["recordings_differ"] = ExtraRule(
@@ -54,21 +54,21 @@ def _add_arguments(parser: Any) -> None:
     batch = "bags, folders of bags, or patterns of bags in quotes, such as 'fleet/*/drive'"
     add("--batch", metavar="BAG", nargs="+", help=batch)
     vehicle = (
-        "the vehicle's name, or its place in the paths of --batch, such as 'fleet/{vehicle}/*': "
-        "recordings of one vehicle are put together"
+        "the vehicle's name, or its position in the paths of --batch, such "
+        "as 'fleet/{vehicle}/*': recordings of one vehicle become one result"
     )
     add("--vehicle", metavar="PATTERN", help=vehicle)
-    no_report = "no page for each recording: they take most time"
+    no_report = "omit the page of each recording, which takes most of the time"
     add("--no-report", action="store_true", help=no_report)
     jobs = "number of worker processes. Default: one for each core"
     add("--jobs", metavar="N", type=at_least(1), help=jobs)
-    dask = "use a Dask cluster instead: address of its scheduler, tcp://..."
+    dask = "use a Dask cluster in place of local processes: address of its scheduler, tcp://..."
     add("--dask", metavar="ADDRESS", help=dask)
 
 
 def _is_batch(arguments: Any) -> bool:
     if not arguments.batch and (arguments.dask or arguments.vehicle):
-        raise ConfigError("--dask and --vehicle are for --batch")
+        raise ConfigError("--dask and --vehicle need --batch")
     return bool(arguments.batch)
 
 

@@ -68,8 +68,9 @@ def run_batch(arguments: argparse.Namespace) -> int:
     n_alone = sum(bool(outcome.row["verdict"] and not outcome.row["vehicle"]) for outcome in done)
     if n_alone > 1:
         note(
-            f"{n_alone} recordings are not compared with each other: give --vehicle with the place "
-            "of the vehicle in their paths, such as 'fleet/{vehicle}/*'"
+            f"{n_alone} recordings are not compared with each other: set "
+            "--vehicle to the position of the vehicle in their paths, such "
+            "as 'fleet/{vehicle}/*'"
         )
     return gravest_code(outcome.code for outcome in done)
 

@@ -25,11 +25,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.usage = "%(prog)s [OPTION ...] RESULT ..."
     parser.epilog = _EPILOG
-    results = "extrinsic.yaml, or the directory that holds it; without --with two or more"
+    results = "extrinsic.yaml, or the directory that contains it; two or more without --with"
     parser.add_argument("results", metavar="RESULT", nargs="+", help=results)
     installed = (
-        "what is installed: a URDF, an earlier extrinsic.yaml, a file of another program (as of "
-        'info --as), a bag with /tf_static, or "X Y Z ROLL PITCH YAW" in m and rad'
+        "installed transform: a URDF, an earlier extrinsic.yaml, a file of "
+        "another program (formats of info --as), a bag with /tf_static, or "
+        '"X Y Z ROLL PITCH YAW" in m and rad'
     )
     parser.add_argument("--with", dest="installed", metavar="SOURCE", help=installed)
     add_json_argument(parser)
@@ -43,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
     results = [load_result(path) for path in arguments.results]
     for path, result in zip(arguments.results, results, strict=True):
         if result.status.failure:
-            raise InputError(f"{path}: {result.status.failure}; there is nothing to compare")
+            raise InputError(f"{path}: {result.status.failure}; it cannot be compared")
     installed = None
     if arguments.installed:
         from hand_eye_calib.formats.installed import open_installed

@@ -64,11 +64,11 @@ RULES = {
 
 # Advice by kind of agreement.
 _ADVICE = {
-    "differ": "record once more: then the one that is off shows",
-    "moved": "calibrate from the recordings since then alone",
-    "one off": "find out what was different in that recording; it is left out",
-    "scatter": "look for what changes from recording to recording; the standard deviations contain "
-    "the scatter",
+    "differ": "record once more: three recordings reveal which one is off",
+    "moved": "calibrate only from the recordings after the change",
+    "one off": "find the cause in that recording, which is left out",
+    "scatter": "find the cause of the differences between recordings; the "
+    "standard deviations contain the scatter",
 }
 
 

@@ -268,7 +268,7 @@ def outcomes(
         unfinished = [task for task in group if task.name in lost]
         if dask or len(group) == 1:
             for task in unfinished:
-                reason = "worker processes die of it, perhaps for lack of memory: --jobs 1"
+                reason = "worker processes crash on it, perhaps for lack of memory: use --jobs 1"
                 if dask:
                     reason = f"the cluster lost it: {lost[task.name]}"
                 yield task, Outcome.of(task, reason)

@@ -508,7 +508,7 @@ class MountWatch:
             is_hidden = visible > SEEN_TARGETS * np.array(self._session.calibrator.config.targets)
             if is_hidden.any():
                 hidden = axes_in_words([AXES[index] for index in np.flatnonzero(is_hidden)])
-                text += f"; {hidden} cannot be watched here"
+                text += f"; {hidden} cannot be monitored with this motion"
         visible = np.where(visible < change.UNKNOWN_FROM, visible, np.nan)
         shift = alarm.shift.axes if alarm else {}
         return MountState(

@@ -24,8 +24,9 @@ def _session_rig(directory: Path, session: Any) -> None:
 
 def _add_arguments(parser: Any) -> None:
     topics = (
-        "poses of three sensors or more, or frames as odom:lidar: all are solved together, in the "
-        "frame of the first"
+        "topics with poses of three sensors or more, or frames such as "
+        "odom:lidar: all are solved together, in the frame of the first "
+        "sensor"
     )
     parser.add_argument("--topics", metavar="TOPIC", nargs="+", help=topics)
 
@@ -35,7 +36,7 @@ def _is_rig(arguments: Any) -> bool:
         for name in ("parent_topic", "child_topic", "batch", "list"):
             if getattr(arguments, name, None):
                 flag = name.replace("_", "-")
-                raise ConfigError(f"--topics and --{flag} do not go together")
+                raise ConfigError(f"--topics cannot be combined with --{flag}")
         return True
     if len(arguments.paths) < 3 or arguments.command == "replay":
         return False

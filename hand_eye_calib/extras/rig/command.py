@@ -39,7 +39,7 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     from hand_eye_calib.formats.results import keep_earlier_results, save_rig
 
     if arguments.installed or arguments.base_frame:
-        raise ConfigError("--installed and --base-frame are of two sensors, not of a rig")
+        raise ConfigError("--installed and --base-frame apply to two sensors, not to a rig")
     readings = _read_topics(arguments) if arguments.topics else _read_files(arguments)
     sensors = _by_frame(readings)
     inputs = as_given(readings.inputs) | {"options": options_from(arguments)}
@@ -108,8 +108,8 @@ def _by_frame(readings: _Readings) -> "dict[str, Trajectory]":
         frame = trajectory.sensor_frame or name
         if frame in sensors:
             raise ConfigError(
-                f"two trajectories of the rig are of one sensor, {frame!r}: sensors have the names "
-                "of their frames or files, which must differ"
+                f"two trajectories of the rig have the sensor name {frame!r}: "
+                "the names of their frames or files must differ"
             )
         sensors[frame] = trajectory
     return sensors

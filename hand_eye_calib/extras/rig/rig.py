@@ -117,22 +117,22 @@ def _require_rig(trajectories: Mapping[str, Trajectory], options: Mapping[str, A
     """Raise InputError or ConfigError if a rig cannot have these trajectories or options."""
     if len(trajectories) < 3:
         raise InputError(
-            f"a rig has at least three sensors; found {len(trajectories)}: two are calibrated as "
-            "parent and child"
+            f"a rig needs at least three sensors; found {len(trajectories)}: "
+            "calibrate two sensors as parent and child"
         )
     for name, trajectory in trajectories.items():
         if trajectory.measures != "poses":
             raise InputError(
-                f"{name} measures {trajectory.measures} only: a rig takes sensors with poses; "
-                "calibrate this one with one of the others"
+                f"{name} measures {trajectory.measures} only, but a rig needs "
+                "poses: calibrate this sensor with one of the others"
             )
     for name, value in options.items():
         if name.startswith(_OF_ONE_PAIR):
-            raise ConfigError(f"{name} is of two sensors; it cannot be given for a rig")
+            raise ConfigError(f"{name} applies to two sensors; omit it for a rig")
         if name in ("time_offset", "scale") and not isinstance(value, str):
             raise ConfigError(
-                f"{name} {value} does not say which sensor of the rig it is for; give {name} "
-                "estimate, or correct the trajectories before"
+                f"{name} {value} does not name a sensor of the rig; set "
+                f"{name} estimate, or correct the trajectories before"
             )
 
 

@@ -48,7 +48,7 @@ _MOTIVE_UNITS = {"Meters": "m", "Centimeters": "cm", "Millimeters": "mm"}
 _GPS_EPOCH_S = 315_964_800
 _WEEK_S = 604_800
 _DAY_S = 86_400
-_NUMBERED = "the file has no times: the numbers of its {} are taken for seconds, to pair by them"
+_NUMBERED = "the file has no times: the numbers of its {} are used as seconds, to pair the poses"
 
 
 class _Rows(NamedTuple):
@@ -214,7 +214,7 @@ def _of_novatel(data: bytes, _: str | None) -> _Rows:
         week = 5 if line[0] == "#" else 1
         rows.append((_of_week(header[week], header[week + 1]), *cells[2:4], height, *angles))
     if not rows:
-        raise ValueError("a log of NovAtel without INSPVA or INSPVAX: log one of them")
+        raise ValueError("the log of NovAtel contains neither INSPVA nor INSPVAX: log one of them")
     return _Rows((*_PLACE, "roll [deg]", "pitch [deg]", "heading [deg]"), rows, [GPS_TIME])
 
 
@@ -262,8 +262,8 @@ def _of_json(data: bytes, _: str | None) -> _Rows:
         return _Rows(("t [us]", *POSITION, "qw", "qx", "qy", "qz"), sorted(rows))
     if "transform_matrix" not in names:
         raise ValueError(
-            "JSON that is not read; expected transforms.json of nerfstudio, ego_pose.json of "
-            "nuScenes, or csv"
+            "it is JSON of an unsupported kind; expected transforms.json of "
+            "nerfstudio, ego_pose.json of nuScenes, or csv"
         )
     Ts_world_camera = np.array([item["transform_matrix"] for item in frames], dtype=float)
     Ts_world_camera[:, :3, :3] = se3.rotation_of(Ts_world_camera) @ _FLIP
@@ -298,7 +298,7 @@ def _of_motive(data: bytes, choice: str | None) -> _Rows:
     last = next((row for row, cells in enumerate(head) if "Time (Seconds)" in cells), 0)
     kinds = next((row for row in range(1, last) if "Rigid Body" in head[row]), None)
     if kinds is None:
-        raise ValueError("Motive without rigid bodies: export them")
+        raise ValueError("it contains no rigid bodies of Motive: export them")
     places_of_bodies: dict[str, dict[str, int]] = {}
     columns = zip(head[kinds], head[kinds + 1], head[last - 1], head[last], strict=False)
     for place, (kind, body, part, axis) in enumerate(columns):
@@ -308,7 +308,7 @@ def _of_motive(data: bytes, choice: str | None) -> _Rows:
     body = _chosen(places_of_bodies, choice, "rigid bodies")
     place_of = places_of_bodies[body]
     if not place_of.keys() >= {*_POSE}:
-        raise ValueError("Motive with Euler angles: export with rotation type Quaternion")
+        raise ValueError("it contains Euler angles of Motive: export with rotation type Quaternion")
     properties = dict(zip(head[0][::2], head[0][1::2], strict=False))
     unit = _MOTIVE_UNITS[properties.get("Length Units", "Meters")]
     places = [head[last].index("Time (Seconds)"), *(place_of[name] for name in _POSE)]
@@ -324,7 +324,9 @@ def _of_vicon(data: bytes, choice: str | None) -> _Rows:
     _, (rate, *_), names, columns, units = islice(lines, 5)
     rate_hz = float(rate)
     if "RX" not in columns:
-        raise ValueError("Vicon without segments: export Segments or Objects (global), not markers")
+        raise ValueError(
+            "it contains no segments of Vicon: export Segments or Objects (global), not markers"
+        )
     starts = {names[at] or "object": at for at, name in enumerate(columns) if name == "RX"}
     body = _chosen(starts, choice, "segments")
     start = starts[body]
@@ -375,7 +377,9 @@ def _of_ulog(data: bytes, _: str | None) -> _Rows:
         stamps_us, Ts = _logged_poses({logged.name: logged.data for logged in first_instances})
     except Exception as error:  # of many kinds, at damaged logs
         reason = "" if isinstance(error, KeyError) else f", {type(error).__name__}: {error}"
-        raise ValueError(f"a log of PX4 without {' or '.join(topics[:2])}{reason}") from None
+        raise ValueError(
+            f"the log of PX4 does not contain {' or '.join(topics[:2])}{reason}"
+        ) from None
     flip = np.diag([*np.diag(_FLIP), 1.0])
     poses = _as_rows(flip @ Ts @ flip).tolist()
     rows = [(stamp_us, *pose) for stamp_us, pose in zip(stamps_us.tolist(), poses, strict=True)]
@@ -444,7 +448,7 @@ def _of_echo(data: bytes, _: str | None) -> _Rows:
     messages = [line.split(",") for line in _lines(data) if line]
     start = _POSE_CELL.get(len(messages[0]))
     if start is None:
-        raise ValueError("messages without poses, as of ros2 topic echo --csv; record a bag")
+        raise ValueError("messages of ros2 topic echo --csv without poses; record a bag")
     rows = ([*cells[:2], *cells[start : start + 7]] for cells in messages)
     return _Rows(("secs", "nsecs", *_POSE), rows)
 
@@ -454,17 +458,20 @@ def _of_echo(data: bytes, _: str | None) -> _Rows:
 PROGRAMS: dict[bytes, _Reader | str] = {
     rb"\Asource_timestamp,destination_timestamp": "motions between images, no poses; chain them",
     rb"<gpx[\s>]": _of_gpx,
-    rb"\A<": "XML, no trajectory that is read; export the track as GPX, or poses as csv",
-    rb"\AFMT, \d": "a log of ArduPilot; export positions and attitudes as csv, or record a bag",
-    rb"\A\w+ \{\s": "messages as text; record them as a bag",
-    rb"\A[^\n]*RINEX VERSION": "observations of satellites; compute positions with RTKLIB",
-    rb"\ASQLite format 3": "a database; a bag ends in .db3, and COLMAP exports its model as text",
-    rb"\A(#.*\n)+#\s+(FRAME_ID, RIG|CAMERA_ID, MOD|POINT3D)": "no poses; give images.txt of COLMAP",
+    rb"\A<": "it is XML of an unsupported kind; export the track as GPX, or poses as csv",
+    rb"\AFMT, \d": "it is a log of ArduPilot; export positions and attitudes as "
+    "csv, or record a bag",
+    rb"\A\w+ \{\s": "it contains messages as text; record them as a bag",
+    rb"\A[^\n]*RINEX VERSION": "it contains observations of satellites; compute positions "
+    "with RTKLIB",
+    rb"\ASQLite format 3": "it is a database; a bag must end in .db3, and COLMAP can "
+    "export its model as text",
+    rb"\A(#.*\n)+#\s+(FRAME_ID, RIG|CAMERA_ID, MOD|POINT3D)": "no poses; pass images.txt of COLMAP",
     rb"\A(# \.PCD|VERSION 0?\.7)[^\0]*?\nFIELDS .*\broll\b": _of_pcd,
     rb"\A(ply\r?\n|# \.PCD|VERSION 0?\.7)": "points, no trajectory; record the odometry as a bag",
     rb"\A[#%][A-Z\d]+A,[^;\n]*;": _of_novatel,
-    rb"\A(%YAML|---\s|[A-Za-z]\w*: *\n[ -])": "YAML, no trajectory; record messages as a bag; "
-    "samples of an arm are a recording of their own",
+    rb"\A(%YAML|---\s|[A-Za-z]\w*: *\n[ -])": "YAML without a trajectory; record a bag, or "
+    "pass the samples of an arm alone",
     rb"\A\x93NUMPY": _of_numpy,
     rb"\AULog\x01\x12\x35": _of_ulog,
     rb"\A(\{|\[\s*[\[{\"\d-])": _of_json,

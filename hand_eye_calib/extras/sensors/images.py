@@ -42,7 +42,7 @@ def read_images(bag: PoseBag, stream: str, topic: str, text: str) -> "ImageReadi
     target = Target.parse(name)
     type_ = bag.type_of(topic)
     if type_ not in messages.IMAGE_TYPES:
-        raise InputError(f"{topic} is of type {type_}, which has no images of a target")
+        raise InputError(f"{topic} has type {type_}, which contains no images")
     if file:
         return ImageReading(stream, topic, target, read_camera(file))
     candidates = [str(folder / "camera_info") for folder in PurePosixPath(topic).parents]
@@ -50,8 +50,8 @@ def read_images(bag: PoseBag, stream: str, topic: str, text: str) -> "ImageReadi
     run = next(bag.runs([info]), None)
     if run is None:
         raise InputError(
-            f"no camera_info beside {topic} in {bag}; name a file of the intrinsics: with "
-            f"--camera, or {topic}?{name}@FILE"
+            f"no camera_info beside {topic} in {bag}; set a file of the "
+            f"intrinsics with --camera, or {topic}?{name}@FILE"
         )
     camera = camera_of(next(run.decoded()), "image_rect" in topic, info)
     return ImageReading(stream, topic, target, camera)

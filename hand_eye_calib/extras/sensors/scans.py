@@ -233,7 +233,7 @@ class ScanReading(Reading):
         text = f"odometry from {len(stored['poses'])} scans"
         if stored["n_failed"]:
             text += f", {stored['n_failed']} of which could not be registered"
-        self.notes.append(f"{text}; it is kept in {self._path}")
+        self.notes.append(f"{text}; it is stored in {self._path}")
         frame = str(stored["frame"])
         table = PoseTable.of(stored["stamps_ns"], stored["poses"], "scans", frame)
         return table.recorded(self.stream, stored["bag_ns"])
@@ -243,8 +243,9 @@ class ScanReading(Reading):
         n_failed = sum(self._has_failed)
         if 2 * n_failed >= len(self._bag_ns):
             raise InputError(
-                f"{self.name}: of {len(self._bag_ns)} scans with points, {n_failed} could not be "
-                "registered; use the odometry of a lidar SLAM"
+                f"{self.name}: {n_failed} of {len(self._bag_ns)} scans with "
+                "points could not be registered; use the odometry of a lidar "
+                "SLAM"
             )
         self._register_finely(-1)
         self._stored = {

@@ -221,7 +221,7 @@ def image_in(data: Any, where: object) -> Any:
     except cv2.error:
         raise InputError(f"{where} has more than {_MOST_PIXELS:,} pixels, or is damaged") from None
     if image is None:
-        raise InputError(f"{where} is not an image that can be read")
+        raise InputError(f"{where} is not a readable image")
     return image
 
 
@@ -276,8 +276,9 @@ class TargetPoses:
         rms_px = np.median(self.rms_px)
         shift_m, turn_rad = np.median(self.sigmas, axis=0)
         return (
-            f"the target is seen in {len(self.images)} of {self.n_images} images, its corners to "
-            f"{rms_px:.2f} pixels (rms): {length(shift_m)} and {angle(turn_rad)} of a pose"
+            f"the target is visible in {len(self.images)} of {self.n_images} "
+            f"images, with corner residuals of {rms_px:.2f} pixels (rms): "
+            f"{length(shift_m)} and {angle(turn_rad)} of a pose"
         )
 
 
@@ -347,8 +348,9 @@ class TargetFinder:
         if not self._poses:
             target = self._target
             raise InputError(
-                f"none of {self._n_images} images shows at least {_FEWEST_CORNERS} corners of the "
-                f"target {target.kind} {target.columns}x{target.rows} of {target.dictionary}"
+                f"none of {self._n_images} images contains at least "
+                f"{_FEWEST_CORNERS} corners of the target {target.kind} "
+                f"{target.columns}x{target.rows} of {target.dictionary}"
             )
         Ts, rms_px, sigmas = map(np.array, zip(*self._poses.values(), strict=True))
         return TargetPoses(Ts, [*self._poses], rms_px, sigmas, self._n_images)

@@ -42,8 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.usage = "%(prog)s [OPTION ...]"
     parser.epilog = "examples:\n  hand_eye_calib demo\n  hand_eye_calib demo --out demo_2"
     out = (
-        "directory for the bag, the node's log and report.html; those of an earlier demo are "
-        "replaced. Default: demo_output"
+        "directory for the bag, the node's log and report.html; files of an "
+        "earlier demo are replaced. Default: demo_output"
     )
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path("demo_output"), help=out)
 

@@ -123,6 +123,6 @@ def _make_empty(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     if any(folder.iterdir()):
         raise InputError(
-            f"{folder} is not empty, and nothing in it is overwritten; remove it or choose another "
-            "with --out"
+            f"{folder} is not empty, and no file in it is overwritten; remove "
+            "it, or choose another folder with --out"
         )
