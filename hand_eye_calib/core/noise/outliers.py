@@ -40,6 +40,9 @@ _SMALLEST_JUMP = 1e-6
 _RAISED_SHARE = 1e-9
 _RAISED_VARIANCE = 1e-18
 
+# Number of poses whose chi-squares are computed at once.
+_PART = 10_000
+
 
 @dataclass(frozen=True)
 class Outliers:
@@ -137,12 +140,19 @@ def chi_squares(
     Their covariances are prior minus posterior (n, 6, 6); the sum of both for a value whose own
     data are left out.
     """
-    covariances = prior - posterior
-    covariances[left_out] = prior[left_out] + posterior[left_out]
-    # On the diagonal alone: the prior of jitter along one velocity is singular itself.
-    covariances += (_RAISED_SHARE * prior + _RAISED_VARIANCE) * np.eye(6)
-    weighted = np.linalg.solve(covariances, values[:, :, None])[:, :, 0]
-    return np.asarray((values * weighted).sum(axis=1))
+    squares = np.empty(len(values))
+    # In parts: temporary arrays of a long recording would need as much memory as its posterior.
+    for start in range(0, len(values), _PART):
+        part = slice(start, start + _PART)
+        are_left_out = left_out[part]
+        prior_part = prior[part]
+        covariances = prior_part - posterior[part]
+        covariances[are_left_out] = prior_part[are_left_out] + posterior[part][are_left_out]
+        # On the diagonal alone: the prior of jitter along one velocity is singular itself.
+        covariances += (_RAISED_SHARE * prior_part + _RAISED_VARIANCE) * np.eye(6)
+        weighted = np.linalg.solve(covariances, values[part, :, None])[:, :, 0]
+        squares[part] = (values[part] * weighted).sum(axis=1)
+    return squares
 
 
 def judged(
