@@ -62,17 +62,24 @@ def _are_stops(arguments: Any) -> bool:
     if not arguments.child_topic and are_images != bool(arguments.camera):
         raise ConfigError("--target and --camera go together: a target and a camera's intrinsics")
     are_samples = len(arguments.paths) == 1 and _has_samples(arguments.paths[0])
-    if arguments.setup and not (are_samples or are_images):
+    are_stops = are_samples or are_images or arguments.order == "none"
+    is_arm = are_samples or are_images
+    has_hand_file = are_stops and not are_samples
+    _refuse_without_arm(arguments, is_arm, has_hand_file)
+    return are_stops
+
+
+def _refuse_without_arm(arguments: Any, is_arm: bool, has_hand_file: bool) -> None:
+    """Refuse options of an arm, and of the file of its hand, if there is none."""
+    if arguments.setup and not is_arm:
         raise ConfigError(
             "--setup says where the camera of an arm is; it needs the samples of an arm or --target"
         )
-    are_two_files = arguments.order == "none" and not are_samples
-    if arguments.parent_angles and not (are_two_files or are_images):
+    if arguments.parent_angles and not has_hand_file:
         raise ConfigError(
             "--parent-angles is the convention of a robot; it needs two files and --order none, or "
             "--target"
         )
-    return are_samples or are_images or arguments.order == "none"
 
 
 def _has_samples(path: Any) -> bool:
