@@ -222,7 +222,7 @@ def _print_results(done: Sequence[Outcome], vehicles: Mapping[str, Calibration])
     for outcome in in_order[:_MOST_LINES]:
         row = outcome.row
         text = f"failed: {row['error']}" if row["error"] else row["headline"]
-        print("\n".join(wrapped(f"{row['name']}: {text}", "", "  ")))
+        _print_line(row["name"], text)
     if len(done) > _MOST_LINES:
         print(f"{len(done) - _MOST_LINES} more, none with a worse verdict")
     counts = Counter(outcome.verdict for outcome in in_order)
@@ -235,4 +235,9 @@ def _print_results(done: Sequence[Outcome], vehicles: Mapping[str, Calibration])
         together = result.parts.get("together")
         if together and not is_in_headline(result):
             text = f"{text}. {together.sentence}"
-        print("\n".join(wrapped(f"{name}: {text}", "", "  ")))
+        _print_line(name, text)
+
+
+def _print_line(name: str, text: str) -> None:
+    """Print the result of a recording or of a vehicle after its name."""
+    print("\n".join(wrapped(f"{name}: {text}", "", "  ")))

@@ -482,13 +482,7 @@ def _result(state: NodeState) -> Iterator[Line]:
     if result:
         for warning in result.warnings:
             yield Line(Tone.ACT, "note", _typeset(warning))
-    contradicted = state.extrinsic.contradicted if state.extrinsic else ()
-    for axis, prior in _priors_of(state):
-        text = f"{axis} = {prior.replace('+/-', ' ± ')}"
-        if axis in contradicted:
-            yield Line(Tone.BAD, "prior", f"{text}: contradicts the motion")
-        else:
-            yield Line(Tone.BUSY, "prior", text)
+    yield from _prior_lines(state)
     if state.progress and (comparison := state.progress.comparison):
         tone = _TONES.get(comparison.verdict, Tone.UNKNOWN)
         yield Line(tone, "compared with the installed transform", _typeset(comparison.sentence))
@@ -497,6 +491,17 @@ def _result(state: NodeState) -> Iterator[Line]:
     if state.saved:
         tone = Tone.BAD if state.saved.verdict == "DO NOT USE" else Tone.GOOD
         yield Line(tone, "saved", f"{_saved_at(state.saved)}: {state.saved.text}")
+
+
+def _prior_lines(state: NodeState) -> Iterator[Line]:
+    """Yield a line for each prior that is set."""
+    contradicted = state.extrinsic.contradicted if state.extrinsic else ()
+    for axis, prior in _priors_of(state):
+        text = f"{axis} = {prior.replace('+/-', ' ± ')}"
+        if axis in contradicted:
+            yield Line(Tone.BAD, "prior", f"{text}: contradicts the motion")
+        else:
+            yield Line(Tone.BUSY, "prior", text)
 
 
 def _broadcast(extrinsic: ExtrinsicState, has_ended: bool) -> Line:
