@@ -348,7 +348,7 @@ def test_a_file_storage_with_too_few_numbers_is_refused(tmp_path):
         ("[[1, 2]]", "sample 1: expected a pose"),
         ("[{x: 1, y: 2}]", "expected samples of an arm"),
         ("[{robot: {}, tracking: {}}]", "translation and rotation"),
-        (json.dumps([[np.eye(4).tolist(), (2 * np.eye(4)).tolist()]]), "the rotation is not one"),
+        (json.dumps([[np.eye(4).tolist(), (2 * np.eye(4)).tolist()]]), "not a rotation matrix"),
         (json.dumps([[[0] * 7, [0] * 7]]), "a quaternion of length 0"),
         ("[[" + "[.nan" + ", 1" * 15 + "], [.nan]]]", "not finite"),
     ],

@@ -213,7 +213,7 @@ def test_what_the_names_do_not_say_is_assumed_and_said():
     ("text", "message"),
     [
         ("mapping: {extrinsic_T: [1, 2], extrinsic_R: [1]}", "expected a pose: 12 or 16"),
-        ("cam0: {T_cam_imu: [[1,0,0,0],[0,2,0,0],[0,0,1,0],[0,0,0,1]]}", "rotation is not one"),
+        ("cam0: {T_cam_imu: [[1,0,0,0],[0,2,0,0],[0,0,1,0],[0,0,0,1]]}", "not a rotation matrix"),
         ("param set EKF2_EV_POS_X 0.1", "have a position and no rotation"),
         ("some: text", "expected a calibration: extrinsic.yaml"),
         ("[1, 2, 3]", "expected a calibration"),

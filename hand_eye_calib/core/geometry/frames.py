@@ -1,6 +1,6 @@
-"""Poses from outside, and the tree of frames.
+"""Checks of poses that files and users supply, and the tree of frames.
 
-The tree serves robot descriptions, ``/tf`` and ``/tf_static``.
+Robot descriptions, ``/tf`` and ``/tf_static`` become a tree of frames.
 """
 
 import math
@@ -22,34 +22,36 @@ from hand_eye_calib.core.geometry.trajectory import (
     far_position,
 )
 
-# Tolerance of the elements of a rotation matrix.
+# Largest deviation of the elements of a matrix from the nearest rotation.
 _ROTATION_WITHIN = 1e-2
 
-# Last row of a matrix.
+# Last row of every transform.
 _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 # Largest deviation of the last row of a transform from 0 0 0 1.
 LAST_ROW_WITHIN = 1e-6
 
-# Words in the name of a fixed frame: a map, the start of an odometry.
+# Words in the name of a fixed frame, such as a map or the origin of an odometry.
 _WORLDS = {"map", "odom", "odometry", "world", "earth", "ecef", "enu", "ned", "utm", "global"}
 _WORLDS |= {"origin", "init", "mocap", "vicon", "optitrack", "inertial"}
 # Words in the name of a frame that a camera observes.
 _TARGETS = {"aruco", "marker", "tag", "apriltag", "charuco", "target", "board", "chessboard"}
 _TARGETS |= {"checkerboard", "pattern", "fiducial", "aprilgrid"}
 
-# Largest number of edges in a message.
+# Largest number of edges of a tree that a message lists.
 _MOST_LISTED = 50
 
 
 def are_null(poses: FloatArray) -> BoolArray:
-    """Return a mask (N,) of rows x y z qx qy qz qw (N, 7) without a pose.
+    """Return a mask (N,) of the rows x y z qx qy qz qw (N, 7) that are no pose.
 
-    A value is not finite, or the quaternion is zero: trackers publish both when they are lost.
+    These rows have a value that is not finite, or a quaternion of zeros. Trackers publish both
+    when they are lost.
     """
     is_null = (poses[:, 3:] == 0.0).all(axis=1)
+    # One sum is faster than a check of every row: it is finite if all values are.
     with np.errstate(invalid="ignore", over="ignore"):
         total = poses.sum()
-    if not np.isfinite(total):  # faster than a check of every row
+    if not np.isfinite(total):
         is_null |= ~np.isfinite(poses).all(axis=1)
     return np.asarray(is_null, dtype=bool)
 
@@ -89,7 +91,7 @@ def checked_pose(position: ArrayLike, quat_xyzw: ArrayLike) -> FloatArray:
 
 
 def pose_of(*values: Any) -> FloatArray:
-    """Return the pose (4, 4) that values of a file stand for.
+    """Return the pose (4, 4) that values of a file describe.
 
     Parameters
     ----------
@@ -130,7 +132,7 @@ def pose_of(*values: Any) -> FloatArray:
 
 
 def pose_stack(values: Any, what: str) -> FloatArray:
-    """Return the poses (N, 4, 4) that arrays stand for, checked.
+    """Return the poses (N, 4, 4) that arrays describe, checked.
 
     Parameters
     ----------
@@ -154,16 +156,16 @@ def pose_stack(values: Any, what: str) -> FloatArray:
 
 
 def _rigid(Ts: FloatArray, what: str = "") -> FloatArray:
-    """Return matrices (N, 4, 4) with exact rotations.
+    """Return transforms (N, 4, 4) with each rotation replaced by the nearest exact one.
 
-    Raises InputError at the first matrix without a rotation, or with another last row than 0 0 0 1.
+    Raises InputError at the first matrix that has no rotation, or whose last row is not 0 0 0 1.
     The message names the row of ``what``, if given.
     """
     rotations = se3.nearest_rotation(se3.rotation_of(Ts))
     deviations = np.abs(rotations - se3.rotation_of(Ts)).max(axis=(1, 2), initial=0.0)
     if (deviations > _ROTATION_WITHIN).any():
         row = int(np.argmax(deviations > _ROTATION_WITHIN))
-        raise InputError(_place(what, row) + "the rotation is not one")
+        raise InputError(_place(what, row) + "the 3x3 part is not a rotation matrix")
     deviations = np.abs(Ts[:, 3] - _LAST_ROW).max(axis=1, initial=0.0)
     if (deviations > LAST_ROW_WITHIN).any():
         row = int(np.argmax(deviations > LAST_ROW_WITHIN))
@@ -177,7 +179,7 @@ def _place(what: str, row: int) -> str:
 
 
 def _numbers(values: Any) -> FloatArray | None:
-    """Return values as an array; None if they are no numbers, or rows of different lengths."""
+    """Return values as an array; None if they are not numbers, or are rows of unequal lengths."""
     try:
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError):
@@ -185,7 +187,7 @@ def _numbers(values: Any) -> FloatArray | None:
 
 
 def _pair_of_stacks(values: Any) -> tuple[FloatArray, FloatArray] | None:
-    """Return rotations and translations if the values are such a pair."""
+    """Return rotations and translations if the values are a pair of them, otherwise None."""
     if not isinstance(values, tuple | list) or len(values) != 2:
         return None
     rotations, translations = map(_numbers, values)
@@ -240,7 +242,7 @@ def wrong_last_row(T: FloatArray) -> str:
 def numbers_of(value: Any) -> list[float]:
     """Return the numbers of nested lists, a message, OpenCV's matrix or a text, in their order.
 
-    The list is empty if there is anything else.
+    Values of any other kind give an empty list.
     """
     if isinstance(value, Mapping):
         position = value.get("translation", value.get("position"))
@@ -291,15 +293,15 @@ class StreamFrames:
         """Name of the sensor's frame if the poses have to be inverted.
 
         Transforms camera -> marker of a fixed marker are inverse poses of the camera, so the frames
-        change their roles. If inverse poses have the frames odom -> base_link, the sensor is
-        base_link: a frame with the name of a world is no sensor.
+        exchange their roles. Inverse poses with the frames odom -> base_link do not: their sensor
+        remains base_link, because a frame with the name of a world is no sensor.
         """
         is_named_otherwise = self.option not in ("", self.sensor)
         if not self.world or is_named_otherwise:
             return self.name
-        is_world = bool(words_of(self.world) & _WORLDS)
+        has_name_of_world = bool(words_of(self.world) & _WORLDS)
         is_target = bool(words_of(self.sensor) & _TARGETS)
-        return self.name if is_world and not is_target else self.world
+        return self.name if has_name_of_world and not is_target else self.world
 
 
 @dataclass(frozen=True)
@@ -325,7 +327,17 @@ class Extrinsic:
 
 @dataclass
 class Edge:
-    """Parent of a frame, whether the frame is fixed to it, and the pose (4, 4) in it if known."""
+    """Edge from a frame to its parent.
+
+    Attributes
+    ----------
+    parent : str
+        Name of the parent frame.
+    is_static : bool
+        Whether the frame is fixed to its parent.
+    pose : (4, 4) array, optional
+        ``T_parent_frame``; None if unknown.
+    """
 
     parent: str
     is_static: bool = True
@@ -353,7 +365,7 @@ class FrameTree:
     def add(
         self, parent: str, frame: str, pose: FloatArray | None = None, is_static: bool = True
     ) -> Edge:
-        """Add an edge, or its newest pose. An edge that has moved once is not static.
+        """Add an edge, or replace its pose. An edge that was once not static remains so.
 
         Raises
         ------
@@ -386,21 +398,21 @@ class FrameTree:
         Raises
         ------
         InputError
-            If a frame is missing, or both frames are not fixed to each other.
+            If a frame is missing, or an edge between both frames moves and is not in ``moving``.
         """
         up, down = self.route(frame, of)
         T_frame_of = np.eye(4)
         moving = moving or {}
         for step in up + down:
             edge = self.edges[step]
-            T = moving.get(step, edge.pose)
-            if T is None or not (edge.is_static or moving):
+            T_above_step = moving.get(step, edge.pose)
+            if T_above_step is None or not (edge.is_static or moving):
                 raise InputError(f"{frame} and {of} are not fixed to each other: {step} moves")
-            T_frame_of = T_frame_of @ (se3.inverse(T) if step in up else T)
+            T_frame_of = T_frame_of @ (se3.inverse(T_above_step) if step in up else T_above_step)
         return T_frame_of
 
     def route(self, frame: str, of: str) -> tuple[list[str], list[str]]:
-        """Return the frames whose edges lead up from ``frame``, and down to ``of``.
+        """Return the path from ``frame`` to ``of``: the frames below the edges up, and down.
 
         Raises
         ------

@@ -18,9 +18,9 @@ class RateIntegrator:
         self._rotation = np.eye(3)
 
     def rotations(self, stamps_ns: IntArray, rates: FloatArray) -> FloatArray:
-        """Return the orientations of the sensor in its own first axes.
+        """Return the orientations of the sensor, relative to its orientation at the first rate.
 
-        A step back in time is a rotation back.
+        A step back in time rotates back.
 
         Parameters
         ----------
@@ -41,5 +41,6 @@ class RateIntegrator:
         steps = se3.rotation_exp(means * intervals_s[:, None])
         rotations = self._rotation @ se3.chained(steps)[1:]
         self._last = stamps_ns[-1:].copy(), rates[-1:].copy()
-        self._rotation = se3.nearest_rotation(rotations[-1])  # rounding adds up over hours
+        # Rounding errors would add up over hours: make the last orientation an exact rotation.
+        self._rotation = se3.nearest_rotation(rotations[-1])
         return rotations

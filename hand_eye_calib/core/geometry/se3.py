@@ -118,7 +118,7 @@ def to_rows(transforms: ArrayLike) -> FloatArray:
 def rotation_from_rpy(rpy: ArrayLike) -> FloatArray:
     """Return rotations (..., 3, 3) of roll, pitch and yaw (..., 3), rad.
 
-    They are about the fixed axes x, y and z in this order (REP 103, URDF).
+    The angles are about the fixed axes x, y and z in this order (REP 103, URDF).
     """
     roll, pitch, yaw = _about_axes(np.asarray(rpy, dtype=float))
     return yaw @ pitch @ roll
@@ -146,9 +146,10 @@ def rotation_to_rpy(rotation: ArrayLike) -> FloatArray:
 
 
 def in_other_order(rotations: FloatArray) -> FloatArray:
-    """Return rotations (N, 3, 3) whose roll, pitch and yaw are about turning axes.
+    """Return rotations (N, 3, 3) with their roll, pitch and yaw taken about turning axes.
 
-    The rotations given were read as if these angles were about fixed axes.
+    The angles of ``rotations`` (N, 3, 3) were read as if about fixed axes; their source meant
+    turning axes, in the order x, y, z.
     """
     roll, pitch, yaw = _about_axes(rotation_to_rpy(rotations))
     return roll @ pitch @ yaw
@@ -185,12 +186,13 @@ def quat_log(quat_xyzw: FloatArray) -> FloatArray:
 def _scaled_quats(rotations: FloatArray) -> FloatArray:
     """Return quaternions (N, 4) of any length, scalar last and not negative.
 
-    All coefficients of a rotation (N, 3, 3) follow from the largest one, so that no digits are lost
-    (S. W. Shepperd, *Quaternion from rotation matrix*, 1978).
+    All coefficients of a rotation (N, 3, 3) follow from its largest coefficient, so that no digits
+    are lost (S. W. Shepperd, *Quaternion from rotation matrix*, 1978).
     """
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotations.reshape(-1, 9).T
     trace = r00 + r11 + r22
     quats = np.stack([r21 - r12, r02 - r20, r10 - r01, 1.0 + trace], axis=1)
+    # The scalar is the largest coefficient where the trace is positive; else one of the vector.
     large = np.flatnonzero(trace < 0.0)
     if large.size:
         R = rotations[large]
@@ -244,9 +246,10 @@ def inverse(transforms: ArrayLike) -> FloatArray:
 
 
 def retracted(transform: FloatArray, step: FloatArray) -> FloatArray:
-    """Return a transform (4, 4) after a small step (rho, phi) in its own axes.
+    """Return a transform (4, 4) after a small step (rho, phi) in the axes of its source frame.
 
-    To first order this is ``transform @ exp(step)``: both parts are applied on their own.
+    The step equals ``transform @ exp(step)`` to first order. Translation and rotation are applied
+    separately.
     """
     rotation = rotation_of(transform)
     return from_rotation_translation(
@@ -370,12 +373,12 @@ def interpolate(start: FloatArray, end: FloatArray, fraction: ArrayLike) -> Floa
 
 
 def chained(steps: FloatArray) -> FloatArray:
-    """Return the products (N + 1, k, k) of the first 0, 1, ..., N of the steps (N, k, k).
+    """Return the products (N + 1, k, k) of the first 0, 1, ..., N steps, out of N in all.
 
-    The steps are rotations or transforms.
+    The steps (N, k, k) are rotations or transforms.
     """
     products = np.concatenate([np.eye(steps.shape[-1])[None], steps])
-    # After each pass the products are of twice as many steps.
+    # Each pass doubles the number of steps in a product, until all products are complete.
     span = 1
     while span < len(products):
         products[span:] = products[:-span] @ products[span:]
@@ -390,9 +393,9 @@ def put_right(Ts: FloatArray, invert: str = "none", quaternion: str = "xyzw") ->
     ----------
     Ts : (N, 4, 4) array
     invert : {"none", "poses", "orientations"}
-        What the source writes of the world in the sensor, instead of the sensor in the world.
+        Part to invert: the source writes this part as the world in the sensor's frame.
     quaternion : {"xyzw", "wxyz", "yzwx"}
-        Order of the quaternions that were read as x y z w.
+        True meaning of the four numbers that were read as x y z w.
     """
     if quaternion != "xyzw":
         quats = np.roll(to_quat_xyzw(Ts), -quaternion.index("x"), axis=-1)
@@ -410,25 +413,25 @@ def xyz_rpy(T_target_source: FloatArray) -> FloatArray:
     return np.r_[translation_of(T_target_source), rotation_to_rpy(rotation_of(T_target_source))]
 
 
-# ------------------------------------------------------------------- their uncertainty
+# ------------------------------------------------------------- uncertainty of transforms
 
-# Standard deviation (rad) above which an angle is unknown: the derivative is not valid that far.
+# Standard deviation (rad) above which an angle is unknown: linearisation is not valid that far.
 _UNKNOWN_ANGLE = 0.3
 
-# Roll and yaw cannot be separated if the cosine of the pitch is below this many standard deviations
-# of the rotation: their own standard deviations would be 10 deg and more, and far from normal.
+# Gimbal lock: roll and yaw are inseparable if the cosine of the pitch is below this many standard
+# deviations of the rotation. Roll and yaw would have sigmas above 10 deg, and be far from normal.
 _LOCKED_SIGMAS = 5.0
-# The same limit for exact rotations.
+# Gimbal lock of exact rotations: smallest cosine of the pitch.
 _LOCKED_COSINE = 1e-4
 
 
 def turned(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
     """Rotate covariances (..., 6, 6) of (rho, phi) by rotations (..., 3, 3).
 
-    The result is along and about the parent's axes, as ROS messages carry covariances (REP 103):
-    an error xi = (rho, phi) in ``T_parent_child @ exp(xi)`` moves the child's origin by ``R rho``,
-    to first order, and rotates the child by ``R phi`` about the parent's axes through this origin.
-    There is no lever arm.
+    The rotated covariance is along and about the parent's axes, the convention of ROS messages
+    (REP 103). An error xi = (rho, phi) in ``T_parent_child @ exp(xi)`` moves the child's origin by
+    ``R rho``, to first order. It rotates the child by ``R phi`` about axes through the child's
+    origin, parallel to the parent's: no lever arm enters.
     """
     both = block_diagonal(rotation)
     return np.asarray(both @ covariance @ np.swapaxes(both, -1, -2))
@@ -444,7 +447,7 @@ def block_diagonal(rotation: FloatArray) -> FloatArray:
 def sigmas_in_parent(rotation_parent_child: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return standard deviations (6,) along and about the parent's axes.
 
-    They are infinite if the covariance (6, 6) in the child's frame is.
+    They are infinite if the covariance (6, 6) in the child's frame is not finite.
     """
     if not np.isfinite(covariance).all():
         return np.full(6, np.inf)
@@ -459,7 +462,7 @@ def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArra
     ----------
     T_target_source : (4, 4) array
     covariance : (6, 6) array
-        Of xi = (rho, phi) in ``T_target_source @ exp(xi)``, m and rad.
+        Covariance of xi = (rho, phi) in ``T_target_source @ exp(xi)``, m and rad.
 
     Returns
     -------
@@ -484,9 +487,10 @@ def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArra
     )
     sigmas = np.sqrt(np.maximum(np.diag(jacobian @ covariance @ jacobian.T), 0.0))
     sigmas[sigmas > _UNKNOWN_ANGLE] = np.inf
-    of_rotation = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance), 0.0))
-    largest = np.max(of_rotation[of_rotation <= _UNKNOWN_ANGLE], initial=0.0)
-    if np.hypot(rotation[0, 0], rotation[1, 0]) < max(_LOCKED_SIGMAS * largest, _LOCKED_COSINE):
+    principal = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance), 0.0))
+    largest = np.max(principal[principal <= _UNKNOWN_ANGLE], initial=0.0)
+    cosine_of_pitch = np.hypot(rotation[0, 0], rotation[1, 0])
+    if cosine_of_pitch < max(_LOCKED_SIGMAS * largest, _LOCKED_COSINE):
         sigmas[[0, 2]] = np.inf
     return sigmas
 
@@ -520,7 +524,7 @@ def absolute_errors(
 def deviation(T_parent_child: FloatArray, T_reference: FloatArray) -> FloatArray:
     """Return deviations (..., 6) of transforms (..., 4, 4) from a reference (4, 4).
 
-    They are along (m) and about (rad) the axes of the parent sensor's frame.
+    The deviations are along (m) and about (rad) the axes of the parent sensor's frame.
     """
     rotation = rotation_log(rotation_of(T_parent_child) @ rotation_of(T_reference).T)
     translation = translation_of(T_parent_child) - translation_of(T_reference)

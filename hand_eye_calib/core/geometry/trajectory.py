@@ -1,12 +1,12 @@
 """Trajectories: stamped poses of one sensor in a fixed frame of its own.
 
-Interpolation at a fraction s of an interval h adds the change of the twist to the geodesic:
+Poses are interpolated at a fraction s of an interval of h seconds by
 
-    T(s) = T_i exp(s xi_i) exp(-m s (1 - s) h^2 / 2 * bend(s)),    xi_i = Log(T_i^-1 T_i+1)
+    T(s) = T_i exp(s xi_i) exp(-m s (1 - s) h^2 / 2 * bend(s)),    xi_i = Log(T_i^-1 T_i+1).
 
-with the second derivative ``bend`` of the motion, by the change of the twist at both ends, and the
-share m of this change that is motion rather than noise, see :func:`corners`. For m = 0 this is the
-geodesic of SE(3) of Välimäki et al. 2023.
+``bend`` is the second derivative of the pose, from the change of the twist at both ends. m is the
+share of this change that is motion rather than noise, see :func:`corner_corrections`. With m = 0
+the formula is the geodesic of SE(3) of Välimäki et al. 2023.
 """
 
 from dataclasses import dataclass, fields
@@ -24,13 +24,14 @@ from hand_eye_calib.core.base.registry import MEASURES
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.geometry import se3
 
-# Tolerance of the length of a quaternion: beyond, it is wrong and not just rounded (bound of tf2).
+# Largest deviation of a quaternion's length from 1; a larger one is no rounding (bound of tf2).
 QUATERNION_NORM_TOLERANCE = 1e-2
 
-# Largest coordinate of a position (m): above those from the Earth's centre in millimetres.
+# Largest coordinate of a position, in m. Distances from the Earth's centre that are written in
+# millimetres, 6.4e9, are still accepted.
 FARTHEST_M = 1e10
 
-# Tolerance of rotation matrices: a file with six digits passes, a scaled matrix does not.
+# Largest element of R'R - I: a rotation matrix written with six digits passes, a scaled one fails.
 ROTATION_TOLERANCE = 1e-3
 
 # Number of intervals on either side of an interval that distinguish motion from noise.
@@ -38,26 +39,26 @@ _NEARBY = 4
 # Number of poses before and after a stamp that interpolation uses.
 REACH = _NEARBY + 2
 
-# Steps have this share of the extent of the positions when their directions are compared. There
-# must be a fifth of this number of steps.
+# The directions of motion are those of steps of this fraction (1 / 50) of the extent of the
+# positions. There must be at least a fifth of this number of steps.
 _STEPS_IN_EXTENT = 50
 
-# Least scatter of the direction of motion in a wrong convention.
+# Smallest scatter of the direction of motion that makes a convention look wrong.
 STEADY = 0.05
-# Least ratio of this scatter to that in the right convention.
+# Smallest ratio of the scatter in a wrong convention to the scatter in the right one.
 CLEARLY = 4.0
 
-# Correlation of neighbouring changes of white noise.
+# Correlation of neighbouring second differences of white noise.
 _CORRELATION = -2.0 / 3.0
-# Variance of the mean of two neighbouring changes of white noise, over that of one.
-_LEFT_IN_THE_MEAN = 1.0 / 6.0
+# Variance of the mean of two neighbouring second differences of white noise, over that of one.
+_VARIANCE_OF_MEAN = 1.0 / 6.0
 
 
 def scatter_of_direction(poses: FloatArray) -> float:
     """Return the scatter of the direction of motion of poses (N, 4, 4) in the sensor's axes.
 
-    It is 0 if the direction is always the same, as on vehicles, and 1 if the sensor moves in all
-    directions, or if there are too few steps.
+    The scatter is 0 if the direction is always the same, as on vehicles. It is 1 if the sensor
+    moves in all directions, or if there are too few steps.
     """
     positions = se3.translation_of(poses)
     rotations = se3.rotation_of(poses)
@@ -67,7 +68,7 @@ def scatter_of_direction(poses: FloatArray) -> float:
     rows = np.flatnonzero(np.diff(n_steps_before, prepend=-1.0))
     steps = np.diff(positions[rows], axis=0)
     lengths = np.linalg.norm(steps, axis=1)
-    # Noise of the positions adds up to a path while a sensor stands still.
+    # While a sensor stands still, noise of the positions adds up to a path without a direction.
     is_step = lengths > step_m / 3
     if is_step.sum() < _STEPS_IN_EXTENT / 5:
         return 1.0
@@ -76,16 +77,19 @@ def scatter_of_direction(poses: FloatArray) -> float:
     return 1.0 - float(np.linalg.norm(in_sensor.mean(axis=0)))
 
 
-# Largest difference (m, or entries of rotations) of poses that are equal to rounding.
+# Largest difference of the elements (m, or 1) of two poses that count as equal.
 _SAME_POSE = 1e-6
 
-# Range of stamps (ns).
+# Smallest and largest stamp, ns.
 _STAMPS_NS = np.iinfo(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
 class WithArrays:
-    """Base of dataclasses with ``eq=False`` that are equal if all fields are, arrays included."""
+    """Base of dataclasses with arrays: two are equal if all their fields are equal.
+
+    Subclasses are declared with ``eq=False``.
+    """
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, type(self)) and all(map(_equal, self.columns, other.columns))
@@ -101,7 +105,7 @@ def _equal(value: Any, other: Any) -> bool:
 
 
 class Columns(WithArrays):
-    """Base of dataclasses whose arrays have equally many rows. The first field is an array."""
+    """Base of dataclasses with arrays of equally many rows; the first field is an array."""
 
     def __len__(self) -> int:
         return len(self.columns[0])
@@ -156,7 +160,7 @@ class Trajectory(Columns):
     world_frame: str = ""
     measures: str = "poses"
 
-    # The trajectory that this one is a shifted copy of: both have the same bends.
+    # Trajectory of which this one is a copy with shifted stamps: they share the results of _steps.
     _unshifted: ClassVar[Self | None] = None
 
     def __post_init__(self) -> None:
@@ -338,10 +342,10 @@ class Trajectory(Columns):
         steps : (N - 1, 6) array
             Twists from each pose to the next.
         changes : (N, 6) array
-            Second derivatives at the poses, zero at both ends.
+            Changes of the twist at the poses (m/s^2, rad/s^2); zero at the first and last pose.
         shares : (N - 1, 6) array
-            Share of motion in the changes at both ends of each interval, for translation and
-            rotation on their own: the weight that makes the mean change most precise.
+            Share of motion in the mean change of the two ends of each interval. It is the weight
+            that makes this mean most precise, one for translation and one for rotation.
         """
         if self._unshifted is not None:
             return self._unshifted._steps
@@ -357,16 +361,16 @@ class Trajectory(Columns):
             powers = _sums_nearby(0.5 * (squares[1:] + squares[:-1]))
             correlation = products / np.maximum(powers, 1e-300)
             motion = np.clip((correlation - _CORRELATION) / (1.0 - _CORRELATION), 0.0, 1.0)
-            noise = (1.0 - motion) * _LEFT_IN_THE_MEAN
+            noise = (1.0 - motion) * _VARIANCE_OF_MEAN
             shares[:, part] = (motion / (motion + noise))[:, None]
         return steps, changes, shares
 
     def at(
         self, stamps_ns: IntArray, extrapolate: bool = False, straight: bool = False
     ) -> FloatArray:
-        """Interpolate poses (M, 4, 4) at other stamps, see :func:`corners`.
+        """Interpolate poses (M, 4, 4) at other stamps, see :func:`corner_corrections`.
 
-        The pose at a stamp of the trajectory is returned unchanged, bit by bit.
+        Poses at stamps of the trajectory itself are returned unchanged, bit by bit.
 
         Parameters
         ----------
@@ -405,8 +409,10 @@ class Trajectory(Columns):
         poses[is_between] = poses[is_between] @ se3.exp(twists)
         is_bent = is_between & ~is_outside
         if is_bent.any() and not straight:
-            bends = corners(self.stamps_ns, changes, shares, before[is_bent], fraction[is_bent])
-            poses[is_bent] = poses[is_bent] @ se3.exp(bends)
+            corrections = corner_corrections(
+                self.stamps_ns, changes, shares, start=before[is_bent], fraction=fraction[is_bent]
+            )
+            poses[is_bent] = poses[is_bent] @ se3.exp(corrections)
         return poses
 
 
@@ -461,34 +467,35 @@ def check_poses(poses: FloatArray) -> None:
         )
 
 
-def corners(
+def corner_corrections(
     stamps_ns: IntArray,
     changes: FloatArray,
     shares: FloatArray,
     start: IntArray,
     fraction: FloatArray,
 ) -> FloatArray:
-    """Return the twists from a constant twist to the motion.
+    """Return the corrections of poses that were interpolated with a constant twist.
 
     A constant twist between two poses cuts the corners of a motion: a vibration of angular
     frequency f, sampled every h seconds, shrinks by (f h)^2 / 12. The changes of the twist at both
-    poses correct this, as far as the changes are motion and not noise. White noise of standard
-    deviation s causes changes of variance 6 s^2 with a covariance of -4 s^2 between neighbours. A
-    well sampled motion causes equal changes. The share of motion follows from the poses nearby. The
-    standard deviation of white noise halfway between two poses shrinks to 0.71 (a constant twist)
-    to 0.80 of that of one pose.
+    poses correct this loss, as far as they are motion and not noise.
+
+    White noise of standard deviation s causes changes of variance 6 s^2, with a covariance of
+    -4 s^2 between neighbours. A well sampled motion causes equal changes. The share of motion is
+    estimated from the correlation of the changes nearby. Halfway between two poses, the standard
+    deviation of white noise is 0.71 (constant twist) to 0.80 of its value at a pose.
 
     Parameters
     ----------
     stamps_ns : (N,) int64 array
     changes : (N, 6) array
-        Changes of the twist per second, squared, at the poses.
+        Changes of the twist at the poses, m/s^2 and rad/s^2.
     shares : (N - 1, 6) array
         Share of motion in the changes.
     start : (M,) int array
-        Index of the pose before each result.
+        Index of the pose before each interpolated pose.
     fraction : (M,) array
-        Of the interval to the next pose.
+        Fraction of the interval from this pose to the next.
 
     Returns
     -------
@@ -498,21 +505,23 @@ def corners(
     at_start = changes[start]
     at_end = changes[start + 1]
     bend = ((2.0 - fraction)[:, None] * at_start + (1.0 + fraction)[:, None] * at_end) / 3.0
-    missing = 0.5 * fraction * (1.0 - fraction) * (np.diff(stamps_ns)[start] * 1e-9) ** 2
-    return -missing[:, None] * shares[start] * bend
+    interval_s = np.diff(stamps_ns)[start] * 1e-9
+    # Double integral of a constant second derivative that vanishes at both ends of the interval.
+    half_square_s2 = 0.5 * fraction * (1.0 - fraction) * interval_s**2
+    return -half_square_s2[:, None] * shares[start] * bend
 
 
 def repetitions(trajectory: Trajectory, least_s: float) -> list[tuple[int, int]]:
-    """Return the first and last stamp (ns) of each time in which a stream repeats its pose.
+    """Return the first and last stamp (ns) of each period in which a stream repeats one pose.
 
     Parameters
     ----------
     trajectory : Trajectory
     least_s : float
-        Shortest such time, in seconds.
+        Shortest period that is returned, in seconds.
     """
     is_same = np.abs(np.diff(trajectory.poses, axis=0)).max(axis=(1, 2)) < _SAME_POSE
     edges = np.flatnonzero(np.diff(np.r_[False, is_same, False].astype(int)))
-    times_ns = trajectory.stamps_ns[edges].reshape(-1, 2)
-    is_long = times_ns[:, 1] - times_ns[:, 0] >= least_s * 1e9
-    return [(from_ns, until_ns) for from_ns, until_ns in times_ns[is_long].tolist()]
+    periods_ns = trajectory.stamps_ns[edges].reshape(-1, 2)
+    is_long = np.diff(periods_ns, axis=1)[:, 0] >= least_s * 1e9
+    return [(from_ns, until_ns) for from_ns, until_ns in periods_ns[is_long].tolist()]
