@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.geometry import se3
@@ -48,16 +49,44 @@ def test_a_fault_of_a_part_of_the_poses_is_named_and_never_to_be_used(kind, faul
     assert result.verdict is hec.Verdict.DO_NOT_USE
 
 
+# Faults of a path, and the code of the finding on machines that move in other ways.
+OF_THE_PATH = [
+    ("low-passed 200 ms", "smoothed_positions", ["hand", "agv"]),
+    ("smoothed 250 ms", "smoothed_positions", ["car", "drone_slam", "agv"]),
+    ("constant height", "axis_scale", ["hand", "agv"]),
+    ("height in feet", "axis_scale", ["excavator"]),
+    ("height 300 ms late", "axis_lag", ["hand", "car"]),
+]
+
+
 @pytest.mark.parametrize(
-    ("fault", "platform", "code"),
-    [
-        ("low-passed 200 ms", "hand", "smoothed_positions"),
-        ("constant height", "hand", "axis_scale"),
-        ("height 300 ms late", "hand", "axis_lag"),
-    ],
+    ("fault", "code", "platform"),
+    [(fault, code, platform) for fault, code, names in OF_THE_PATH for platform in names],
 )
-def test_a_fault_that_a_lively_motion_shows_is_named(fault, platform, code):
-    assert code in codes(solved("positions", fault, platform))
+def test_a_fault_of_the_path_is_named_and_its_error_is_within_sigma(fault, code, platform):
+    result = solved("positions", fault, platform)
+    assert code in [*codes(result), *codes(result, "warning")]
+    assert result.verdict is not hec.Verdict.USE
+    truth = part_faults.positions(platform, fault, SEED).truth
+    assert part_faults.distance("positions", result, truth) < 2.5
+
+
+def test_positions_too_few_to_detect_smoothing_are_to_be_used_with_care():
+    recording = part_faults.positions("drone", "clean", SEED)
+    short = recording.child[: len(recording.child) // 16]
+    result = hec.calibrate(recording.parent, short, **part_faults.WIDE)
+    assert "unchecked" in codes(result, "warning")
+    assert result.verdict is not hec.Verdict.USE
+
+
+def test_the_covariance_contains_smoothing_that_is_too_weak_for_a_finding():
+    recording = part_faults.positions("drone_slam", "clean", SEED)
+    path = recording.child.poses[:, :3, 3]
+    smoothed = gaussian_filter1d(path, 2.0, axis=0, mode="nearest")  # 0.1 s, 5e-3 s^2
+    child = Trajectory.from_positions(recording.child.stamps_ns, smoothed, "antenna", "map")
+    result = hec.calibrate(recording.parent, child, **part_faults.WIDE)
+    assert codes(result) == []
+    assert part_faults.distance("positions", result, recording.truth) < 2.5
 
 
 @pytest.mark.parametrize("platform", ["drone", "excavator"])
@@ -72,12 +101,17 @@ def test_rates_about_left_handed_axes_are_named(fault):
     assert "left_handed" in codes(solved("rates", fault, "drone"))
 
 
-@pytest.mark.parametrize(
-    ("kind", "platform"),
-    [("positions", "drone"), ("positions", "excavator"), ("rates", "drone"), ("rates", "hand")],
-)
-def test_clean_streams_have_no_finding_and_say_what_cannot_be_seen(kind, platform):
-    result = solved(kind, "clean", platform)
+@pytest.mark.parametrize("platform", part_faults.PLATFORMS)
+def test_clean_positions_have_no_finding_and_may_be_used(platform):
+    result = solved("positions", "clean", platform)
+    assert codes(result) == []
+    assert codes(result, "warning") == []
+    assert result.verdict is hec.Verdict.USE
+
+
+@pytest.mark.parametrize("platform", ["drone", "hand"])
+def test_clean_rates_have_no_finding_and_say_what_cannot_be_seen(platform):
+    result = solved("rates", "clean", platform)
     assert codes(result) == []
     assert codes(result, "warning") == []
     assert "part_of_poses" in [reason.rule for reason in result.reasons]

@@ -188,7 +188,11 @@ def assess_rotation(Ts_pw_p: FloatArray, solution: AdaptiveSolution) -> Assessme
 
 
 def assess_lever_arm(
-    Ts: FloatArray, solution: ModelSolution, T: FloatArray, covariance: FloatArray
+    Ts: FloatArray,
+    solution: ModelSolution,
+    T: FloatArray,
+    covariance: FloatArray,
+    of_faults: FloatArray,
 ) -> Assessment:
     """Assess a lever arm in the frame of a sensor with poses.
 
@@ -201,9 +205,11 @@ def assess_lever_arm(
         The lever arm with the identity for the rotation, which is unknown.
     covariance : (3, 3) array
         Of the lever arm under the noise model.
+    of_faults : (3, 3) array
+        Covariance that possible faults of the positions add.
     """
     whole = np.zeros((6, 6))
-    whole[:3, :3] = widened_by_blocks(covariance, solution, slice(0, 3))
+    whole[:3, :3] = widened_by_blocks(covariance, solution, slice(0, 3)) + of_faults
     # Bound the white rotation noise per axis by the differences between steps about the two axes
     # with the smoothest rotation. Positions do not reveal it otherwise: noise of the orientation
     # would look like a small motion that does not move the lever arm.

@@ -286,7 +286,7 @@ class _Deviation(NamedTuple):
     sigma: float
 
 
-def _largest_deviation(values: FloatArray, sigmas: FloatArray) -> _Deviation:
+def largest_deviation(values: FloatArray, sigmas: FloatArray) -> _Deviation:
     """Return the most significant deviation among three values (3,) that should be equal."""
     largest = _Deviation(0, 0.0, 1.0)
     weights = 1.0 / np.maximum(sigmas, 1e-9) ** 2
@@ -313,7 +313,7 @@ def axis_gain(slow: Regression, columns_of: str, stream: str = "") -> Finding | 
         The stream that the finding names, if it is the other one. Its factor is the inverse.
     """
     group = f"axes_{columns_of}"
-    gain = _largest_deviation(*slow.fit(group))
+    gain = largest_deviation(*slow.fit(group))
     of_noise = slow.biases(group)[gain.axis]
     of_drift = _DRIFT**2 * of_noise / slow.biases("scale")[0]
     if abs(gain.size) < BIASES * (of_noise + of_drift):
@@ -469,7 +469,7 @@ def delay_suspects(
             share=fast.share(of_all, *smoothing),
         )
         # The other stream's coordinate cannot be early: negative delays are skipped.
-        deviation = _largest_deviation(*fast.fit(of_axes, *smoothing))
+        deviation = largest_deviation(*fast.fit(of_axes, *smoothing))
         late_axis = _Delay(
             code="axis_lag",
             part=f"{'xyz'[deviation.axis]} coordinates",

@@ -441,10 +441,6 @@ def _targets(axes: Sequence["_Axis"]) -> str:
 
 # Faults that no check of positions or rotations alone detects, and what to do.
 _UNSEEN = {
-    "positions": (
-        "delays and smoothing of positions cannot be seen",
-        "compare with a tape measure, or with a recording at another speed",
-    ),
     "rotations": (
         "smoothing and slow drift of rotations alone cannot be seen",
         "compare with another recording",

@@ -46,10 +46,6 @@ _OF_ROTATIONS: dict[str, tuple[object, ...]] = {
 # offset better than speeds do.
 _LEAST_CHANGE_OF_POSITIONS_S = 0.05
 
-# Share of the squared residuals that a fault must explain to be reported, if the positions are on
-# another path than the poses.
-_NAMES_UNRELATED = 0.6
-
 # Every solve estimates time offsets below this (s).
 _FOUND_BY_SOLVE_S = 0.25
 
@@ -107,9 +103,9 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
     if len(hidden) == 3 or any(found.code == "unrelated" for found in findings):
         findings += _check_clock(parent, child, known_s, snapshot)
     codes = {found.code for found in findings}
-    if calibration and len(hidden) < 3 and "time_offset" not in codes:
-        least_share = _NAMES_UNRELATED if "unrelated" in codes else 0.0
-        findings += check_solved(parent, child, calibration, config, least_share)
+    is_unrelated = "unrelated" in codes
+    if calibration and (len(hidden) < 3 or is_unrelated) and "time_offset" not in codes:
+        findings += check_solved(parent, child, calibration, config, is_unrelated)
     if hidden and not any(found.makes_unusable for found in findings):
         findings.append(checking.unseen(hidden))
     # Lengths in another unit come first: they cause the findings of the solve.

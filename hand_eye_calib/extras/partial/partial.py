@@ -29,6 +29,7 @@ from hand_eye_calib.core.noise import increments
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, motion_pairs
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.core.results.records import Residuals
+from hand_eye_calib.extras.partial import columns
 from hand_eye_calib.extras.partial import positions as of_positions
 from hand_eye_calib.extras.partial.rate_bias import RateBias
 
@@ -85,6 +86,12 @@ class _Paths:
             self.poses, self.positions, solution.lever_arm, solution.scale
         )
 
+    def open_covariance(self, solution: of_positions.LeverArmSolution) -> FloatArray:
+        """Return the covariance (3, 3) of the lever arm that possible faults leave open."""
+        scaled = solution.scale * self.positions
+        fitted = columns.fit(self.stamps_ns, self.poses, scaled, solution.lever_arm)
+        return fitted.open_covariance if fitted else np.zeros((3, 3))
+
     def child_scale(self, scale: float) -> float:
         """Return the scale of the child for a scale of the positions."""
         return scale if self.is_child else 1.0 / scale
@@ -126,7 +133,9 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
             "paths"
         ) from None
     T = se3.from_rotation_translation(np.eye(3), sign * solution.lever_arm)
-    assessment = covariance.assess_lever_arm(paths.poses, solution, T, solution.covariance)
+    assessment = covariance.assess_lever_arm(
+        paths.poses, solution, T, solution.covariance, paths.open_covariance(solution)
+    )
     fused = fuse(assessment, config.prior())
     findings = _check_path(solution, fused, paths, "scale" in config.given)
     offset_s = float(config.time_offset)

@@ -1,6 +1,7 @@
 """Sentences of the findings about streams of positions, rotations or angular rates."""
 
 from hand_eye_calib.core.checks.words import UNRELATED_ADVICE, FindingWords
+from hand_eye_calib.core.results.records import Severity
 
 WORDS = {
     "unrelated_positions": FindingWords(
@@ -36,6 +37,11 @@ WORDS = {
         "{share:.0%} of {whose} positions lie on straight lines between their neighbours: they are "
         "interpolated between few measured ones",
         "give the positions as they were measured",
+    ),
+    "unchecked": FindingWords(
+        "{whose} positions are too few to detect delays and smoothing",
+        "record longer, or at a higher rate",
+        severity=Severity.WARNING,
     ),
     "mirrored_positions": FindingWords(
         "{whose} positions are in left-handed axes",
