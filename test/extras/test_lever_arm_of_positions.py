@@ -239,7 +239,7 @@ class TestLeverArm:
         fixes = Trajectory.from_positions(child.stamps_ns[kept], child.poses[kept, :3, 3])
         assert "gaps" in codes(parent, fixes)
         flat = recorded(drift_rad=0.0, poses=planar_poses(200, seed=3))
-        assert codes(*flat) == ["one_axis"]
+        assert codes(*flat) == ["unchecked", "one_axis"]
 
 
 def test_the_command_with_latitude_and_longitude(streams, result, tmp_path, capsys):

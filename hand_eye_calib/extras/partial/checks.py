@@ -18,7 +18,7 @@ import numpy as np
 
 from hand_eye_calib.core.assessment.covariance import BLOCKS
 from hand_eye_calib.core.assessment.moved import find_change
-from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.stats import median, robust_sigma
 from hand_eye_calib.core.base.text import angle, length
@@ -40,6 +40,7 @@ from hand_eye_calib.core.noise.increments import without_rate_bias
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs, pairs_over, synchronise
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.extras.partial.columns import PositionFit, fit
+from hand_eye_calib.extras.partial.positions import solve, unexplained_share
 
 # A lever arm is zero if each axis is below this distance (m) or below ``_ZERO_SIGMAS``.
 _ZERO_M = 0.005
@@ -95,8 +96,8 @@ _MIRRORED = 0.5
 # motion is about one axis, a reflection only changes the sign of the noise about the others.
 _UNMIRRORED = 0.1
 
-# Scale factor of a coordinate below which its sign is wrong.
-_MIRRORED_FACTOR = -0.5
+# Share of a mirrored path below which a lever arm explains the path.
+_MIRRORED_PATH = 0.1
 
 # Index pairs of the planes between two principal axes.
 _PLANES = ((0, 1), (0, 2), (1, 2))
@@ -183,9 +184,22 @@ def _check_moving(
         return _as_errors(no_lever_arm) or _copied(copied, residual_m=fitted.residual_m)
     if findings := [*interpolated, *no_lever_arm]:
         return findings
+    if is_unrelated and _is_mirrored(pairs.stamps_ns, poses, positions):
+        return [finding("mirrored_positions", stream)]
     if not fitted:
-        return [finding("unchecked", stream)]
+        return [] if is_unrelated else [finding("unchecked", stream)]
     return check_positions(fitted, stream, is_unrelated)
+
+
+def _is_mirrored(stamps_ns: IntArray, poses: FloatArray, positions: FloatArray) -> bool:
+    """Return whether a lever arm explains positions only if one coordinate has the other sign."""
+    mirrored = positions * [1.0, 1.0, -1.0]
+    try:
+        solution = solve(stamps_ns, poses, mirrored)
+    except np.linalg.LinAlgError:
+        return False
+    share = unexplained_share(poses, mirrored, solution.lever_arm, solution.scale)
+    return share < _MIRRORED_PATH
 
 
 def _is_copied(fitted: PositionFit, positions: FloatArray) -> bool:
@@ -329,19 +343,16 @@ def _smoothing(fitted: PositionFit, stream: str) -> _Suspect:
 def _scale_of_axis(fitted: PositionFit, stream: str) -> _Suspect:
     """Return how clear it is that a coordinate has another scale than the others.
 
-    Drift of the odometry along a coordinate that hardly changes shrinks its factor. A coordinate
-    that does not change at all was not measured.
+    Drift and noise of the odometry along a coordinate that hardly changes shrink its factor. A
+    coordinate that does not change at all was not measured.
     """
     axis, size, sigma = largest_deviation(*fitted.estimate("scales"))
-    squares = fitted.spreads_m**2
-    of_drift = _DRIFT**2 * squares.sum() / squares[axis]
-    if abs(size) < agreement.BIASES * of_drift and not fitted.is_constant[axis]:
+    noise = 3.0 * fitted.residual_m**2 * (1.0 - fitted.explained_share)
+    spurious = (_DRIFT * fitted.path_m) ** 2 + noise
+    shrinks = agreement.BIASES * spurious / fitted.spreads_m[axis] ** 2
+    if abs(size) < shrinks and not fitted.is_constant[axis]:
         return _Suspect(0.0, None)
     factor = 1.0 + size
-    if factor < _MIRRORED_FACTOR:
-        found = graded("axis_scale", stream, size, sigma, axis="", factor=factor, sigma=sigma)
-        mirrored = finding("mirrored_positions", stream) if found else None
-        return _Suspect(abs(size) / sigma, mirrored)
     values = {"axis": "xyz"[axis], "factor": factor, "sigma": sigma}
     return _Suspect(abs(size) / sigma, graded("axis_scale", stream, size, sigma, **values))
 

@@ -34,7 +34,7 @@ _SHORTEST_WINDOW_S = 4.0
 _LEAST_POSITIONS = 12
 # Windows of a recording that has enough of them, and fewest windows.
 _ENOUGH_WINDOWS = 16
-_LEAST_WINDOWS = 8
+_LEAST_WINDOWS = 6
 
 # Step (s) of the differences that accelerations come from; one interval if that is longer.
 _STEP_S = 0.2
@@ -141,8 +141,10 @@ class PositionFit:
         Usual residual with a lever arm and without a fault, m.
     is_constant : (3,) bool array
         Coordinates that are the same in all measured positions.
+    path_m : float
+        Root mean square distance from the mean of a window.
     spreads_m : (3,) array
-        Root mean square distance along each coordinate from the mean of a window.
+        The same along each coordinate, without what the other columns explain.
     speeds_m_s : (3,) array
         Root mean square speed along each coordinate.
     acceleration_m_s2 : float
@@ -153,6 +155,7 @@ class PositionFit:
     places: dict[str, list[int]]
     residual_m: float
     is_constant: BoolArray
+    path_m: float
     spreads_m: FloatArray
     speeds_m_s: FloatArray
     acceleration_m_s2: float
@@ -234,12 +237,15 @@ def fit(
         weights = robust_weights("cauchy", squares / usual / _HALF_WEIGHT**2) / usual
     blocks = Blocks(weights[:, None, None] * products)
     blocks = blocks.merged(min(len(products), _MOST_BLOCKS))
+    information = blocks.total[:-1, :-1] + _prior()[:-1, :-1]
+    own = 1.0 / np.abs(np.diag(np.linalg.inv(information)))
     return PositionFit(
         blocks=Blocks(blocks.sums + _prior() / len(blocks.sums)),
         places=places,
         residual_m=float(np.sqrt(usual)),
         is_constant=np.ptp(positions, axis=0) < _CONSTANT_M,
-        spreads_m=_root_mean_square(windows.path, windows.is_used),
+        path_m=float(np.linalg.norm(_root_mean_square(windows.path, windows.is_used))),
+        spreads_m=np.sqrt(own[places["scales"]] / (weights @ counts / 3.0)),
         speeds_m_s=_root_mean_square(windows.velocities, windows.is_used),
         acceleration_m_s2=float(
             np.linalg.norm(_root_mean_square(windows.accelerations, windows.is_used))
