@@ -565,7 +565,7 @@ _OWN_RULES = (
     Rule(
         "part_of_poses",
         _CARE,
-        "a stream has only positions, rotations or rates, which have few checks",
+        "the streams have only rotations or rates, which have few checks",
         _part_of_poses,
     ),
 )
