@@ -137,7 +137,7 @@ def check_solved(
         has_rates = "rates" in (parent.measures, child.measures)
         return _check_turning(pairs, calibration, stream, priors, has_rates)
     measured = {"parent": parent, "child": child}[stream]
-    interpolated = check_interpolated(measured.poses[:, :3, 3], stream)
+    interpolated = check_interpolated(se3.translation_of(measured.poses), stream)
     return _check_moving(pairs, calibration, stream, priors, is_unrelated, interpolated)
 
 
@@ -168,15 +168,15 @@ def _check_moving(
     interpolated: list[Finding],
 ) -> list[Finding]:
     """Check positions; return the findings of the first check that has any."""
-    lever_arm = calibration.T_parent_child[:3, 3]
+    lever_arm = se3.translation_of(calibration.T_parent_child)
     sigmas = calibration.sigmas_measured[:3]
     if stream == "child":
         poses = pairs.Ts_pw_p
-        positions = pairs.Ts_cw_c[:, :3, 3]
+        positions = se3.translation_of(pairs.Ts_cw_c)
         fitted = fit(pairs.stamps_ns, poses, positions, lever_arm)
     else:
         poses = pairs.Ts_cw_c
-        positions = pairs.Ts_pw_p[:, :3, 3]
+        positions = se3.translation_of(pairs.Ts_pw_p)
         fitted = fit(pairs.stamps_ns, poses, positions, -lever_arm)
     no_lever_arm = [] if is_unrelated else check_position(lever_arm, sigmas, priors)
     if fitted and _is_copied(fitted, positions):
