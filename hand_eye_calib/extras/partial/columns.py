@@ -18,7 +18,7 @@ noise of both is independent, so that neither noise nor drift looks like smoothi
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -316,7 +316,7 @@ def _windows(
     usual_s = 4 * step * interval_s
     is_used = np.abs(spans_s - usual_s) < _TOLERANCE * usual_s
 
-    def split(values: FloatArray) -> FloatArray:
+    def split(values: Any) -> Any:
         return values[: n_windows * size].reshape(n_windows, size, *values.shape[1:])
 
     used = split(is_used)
