@@ -53,7 +53,9 @@ def text_of(format):
         rows = [[*row[:3], row[6], *row[3:6]] for row in rows]
     separator = " " if format == "tum" else ","
     lines = [separator.join(map(str, row)) for row in np.c_[stamps, rows].tolist()]
-    return "\n".join(["t,x,y,z,qx,qy,qz,qw"] * (format == "csv") + lines), stamps
+    if format == "csv":
+        lines.insert(0, "t,x,y,z,qx,qy,qz,qw")
+    return "\n".join(lines), stamps
 
 
 @functools.cache
@@ -121,7 +123,7 @@ def exercise(run, format, seed, folder):
         write_trajectory(folder / "child", CHILD)
         files |= {"child": (folder / "child").read_bytes()}
         guess = [] if chance.random() < 0.5 else ["--parent-format", format]
-        times = ["--parent-times", folder / "times"] * (format == "kitti")
+        times = ["--parent-times", folder / "times"] if format == "kitti" else []
         command = ["calibrate", folder / "parent", folder / "child", *guess, *times, *SOLVE]
     else:
         path = folder if format == "journal" else folder / next(iter(files))

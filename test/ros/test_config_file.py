@@ -42,7 +42,8 @@ def expected_file():
         indent = " " * (6 if outer else 4)
         comment = textwrap.wrap(comment_of(field), width=120 - len(indent) - 2)
         lines += [f"{indent}# {line}" for line in comment]
-        lines.append(f"{indent}{'# ' * (key in ONLY_SHOWN)}{key}: {value_of(field)}")
+        mark = "# " if key in ONLY_SHOWN else ""
+        lines.append(f"{indent}{mark}{key}: {value_of(field)}")
     return "\n".join(lines) + "\n"
 
 
