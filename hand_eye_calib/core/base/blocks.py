@@ -1,8 +1,9 @@
-"""Evidence of blocks of time, added up: of all blocks, of all but one, before and since a time.
+"""Least squares from sums over blocks of time.
 
-The evidence of a block on p unknowns x, which minimise the squares of ``W^(1/2) (J x - y)``, is the
-table of products ``[J y]' W [J y]`` (p + 1, p + 1). Its first p rows ``[H S]`` are the information
-and the score. Tables add over blocks. So the answer of any set of blocks is one small solve away.
+The p unknowns x minimise the squares of ``W^(1/2) (J x - y)``. The evidence of a block is its table
+of products ``[J y]' W [J y]`` (p + 1, p + 1). The first p rows ``[H S]`` are the information and
+the score. Tables add over blocks, so any set of blocks (all, all but one, before or since a time)
+is solved from the sum of its tables.
 """
 
 from collections.abc import Sequence
@@ -78,7 +79,7 @@ class Blocks:
     def shift_since(self, cuts: IntArray, prior: FloatArray) -> FloatArray:
         """Evidence (C, p, p + 1) of a shift of the unknowns at each cut, whatever they were before.
 
-        ``prior`` (p, p) is information that holds besides about the unknowns before.
+        ``prior`` (p, p) is added to the information about the unknowns before the cut.
         """
         before = self.before(cuts)
         covariances = inverse(information(before) + prior)
@@ -90,7 +91,7 @@ class Blocks:
         return solve(self.total, columns)
 
     def jackknife(self, columns: Sequence[int]) -> FloatArray:
-        """Covariance (k, k) of :meth:`solve` by the answers without each block."""
+        """Jackknife covariance (k, k) of :meth:`solve`, from the answers without each block."""
         return jackknife_covariance(solve(self.without(), columns))
 
 

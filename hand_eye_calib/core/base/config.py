@@ -75,7 +75,7 @@ def require_backend(method: str, backend: str) -> None:
 
 
 def _both(default: str, doc: str, **settings: Any) -> dict[str, Any]:
-    """An option of each stream, whose name takes the place of {} in its meaning."""
+    """Return an option for each stream; {} in ``doc`` is replaced by the name of the stream."""
     return {
         stream: option(default, doc.format(stream), **settings) for stream in ("parent", "child")
     }
@@ -333,7 +333,8 @@ class CalibratorConfig(OptionSet):
         Raises
         ------
         ConfigError
-            If a sensor does not. The message begins with ``what``.
+            If a sensor measures anything else. ``what`` names the request at the start of the
+            message.
         """
         if self.measured != "poses":
             raise ConfigError(

@@ -12,8 +12,9 @@ from typing import Any
 
 
 def printable(text: str) -> str:
-    r"""Escape control characters, such as ``\x1b`` and line ends: a name out of a file must not
-    change what a terminal or a log shows.
+    r"""Escape control characters, such as ``\x1b`` and line ends.
+
+    Names from files may contain such characters, which would disturb a terminal or a log.
     """
     if text.isprintable():
         return text
@@ -52,16 +53,16 @@ class NoPoseError(InputError):
 
 
 class NotEnoughDataError(InputError):
-    """There is too little data to solve; what there is can be used."""
+    """Too little data to solve; the data themselves are valid."""
 
 
 class MissingDependencyError(HandEyeCalibError, ImportError):
-    """An optional package is needed for what was asked and is not installed."""
+    """An optional package that this request needs is not installed."""
 
 
 @contextmanager
 def located(where: object) -> Iterator[None]:
-    """Begins the errors that are raised in the block with where it was, such as a path."""
+    """Put a place, such as a path, before the messages of errors that the block raises."""
     try:
         yield
     except HandEyeCalibError as error:
@@ -69,12 +70,12 @@ def located(where: object) -> Iterator[None]:
 
 
 def installing(extra: str) -> str:
-    """The command that installs an extra of this package, which is on no index."""
+    """Return the command that installs an extra; the package itself is on no package index."""
     return f"pip install '.[{extra}]' in the source folder of hand_eye_calib"
 
 
 def required(module: str, purpose: str, extra: str) -> Any:
-    """A module that few need, of an extra; a MissingDependencyError if it is not installed."""
+    """Import a module of an extra; raise MissingDependencyError if it is not installed."""
     try:
         return import_module(module)
     except ImportError:

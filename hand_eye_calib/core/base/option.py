@@ -1,4 +1,4 @@
-"""What an option is: a dataclass field that knows its name, unit, range, default and meaning."""
+"""Options: dataclass fields with a name, unit, range, default and meaning."""
 
 import contextlib
 import dataclasses
@@ -14,7 +14,7 @@ OptionValue: TypeAlias = bool | int | float | str
 Options: TypeAlias = Mapping[str, Any]
 OptionField: TypeAlias = dataclasses.Field[Any]
 
-# Whole numbers are smaller: those of parameters of ROS have 64 bits.
+# Whole numbers must be smaller in size: parameters of ROS have 64 bits.
 _LARGEST_INT = 1 << 63
 
 _GROUPS = ("keyframe", "prior", "target")
@@ -37,7 +37,7 @@ def option(
     read_only: bool = False,
     parse: Callable[[str, str], object] | None = None,
 ) -> Any:
-    """Make a dataclass field with everything there is to know about an option.
+    """Make a dataclass field that describes an option completely.
 
     Parameters
     ----------
@@ -59,8 +59,9 @@ def option(
 
 
 def option_name(field: OptionField) -> str:
-    """Public name of an option: the ROS parameter, the YAML key. Those of a group have a dot, as in
-    ``keyframe.min_translation``.
+    """Return the public name of an option: the name of the ROS parameter and the YAML key.
+
+    Options of a group have a dot in their names, as in ``keyframe.min_translation``.
     """
     group, _, name = field.name.partition("_")
     return f"{group}.{name}" if group in _GROUPS else field.name
@@ -81,13 +82,13 @@ def _of_python(value: object) -> object:
 
 
 def check_value(field: OptionField, value: object) -> OptionValue:
-    """Check a value of an option and give it the option's own type.
+    """Check a value of an option and convert it to the option's type.
 
     Raises
     ------
     ConfigError
-        If the value has the wrong type, is out of range or is not among the choices; one line that
-        says what is allowed.
+        If the value has the wrong type, is out of range or is not among the choices. The message
+        is one line and states the allowed values.
     """
     meta = field.metadata
     name = option_name(field)

@@ -1,4 +1,4 @@
-"""Plain data: what JSON and YAML know, and nothing of NumPy; values of any type from it."""
+"""Conversion between values of the package and plain data, the types of JSON and YAML."""
 
 import json
 import math
@@ -15,15 +15,16 @@ from numpy.typing import NDArray
 # A mapping of JSON or YAML: names to values that any program reads.
 Document: TypeAlias = dict[str, Any]
 
-# No number of a file is as large: the products of some are still finite.
+# Numbers of a file must be smaller, so that products of several of them are finite.
 _LARGEST = 1e50
 
 
 def plain(value: Any) -> Any:
-    """A value with all that it holds as mappings, lists, texts, bools and numbers.
+    """Convert a value and its contents to mappings, lists, texts, bools and numbers.
 
-    A dataclass becomes a mapping of its fields, numbers and arrays of NumPy those of Python, an
-    enum its value without spaces. Infinity and NaN, which JSON does not have, become None.
+    A dataclass becomes a mapping of its fields. Numbers and arrays of NumPy become numbers and
+    lists. An enum becomes its value, with underscores for spaces. Infinity and NaN, which JSON does
+    not have, become None.
     """
     if isinstance(value, Enum):
         value = value.value.replace(" ", "_") if isinstance(value.value, str) else value.value
@@ -41,8 +42,9 @@ def plain(value: Any) -> Any:
 
 
 def from_plain(kind: Any, value: Any, **names: type) -> Any:
-    """A value of a type from what :func:`plain` made of it. Keys that a dataclass does not have are
-    ignored; a float that is None is infinite.
+    """Convert plain data back to a type: the inverse of :func:`plain`.
+
+    Keys without a field in the dataclass are ignored. A float that is None becomes infinite.
 
     Parameters
     ----------
@@ -58,7 +60,7 @@ def from_plain(kind: Any, value: Any, **names: type) -> Any:
     KeyError
         If a dataclass lacks a field.
     TypeError, ValueError
-        If the value is not of that type, or a number far too large.
+        If the value has another type, or a number is far too large.
     """
     args = get_args(kind)
     if get_origin(kind) in (Union, types.UnionType):
@@ -88,7 +90,7 @@ def from_plain(kind: Any, value: Any, **names: type) -> Any:
     return _of_type(kind, value)
 
 
-# Finding them takes longer than all else.
+# Cached: resolving type hints takes longer than the rest of a conversion.
 _hints = cache(get_type_hints)
 
 

@@ -37,9 +37,10 @@ def trusted_environment() -> dict[str, str]:
 
 @contextmanager
 def starting_trusted() -> Iterator[None]:
-    """Give processes that are started here that environment, and put this one's back at the end.
+    """Start processes in the block with the environment of :func:`trusted_environment`.
 
-    For ``multiprocessing``, which takes no environment.
+    At the end the environment of this process is restored. ``multiprocessing`` needs this, because
+    it accepts no environment.
     """
     settings = _settings()
     before = {name: os.environ.get(name) for name in settings}

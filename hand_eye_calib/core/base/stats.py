@@ -1,7 +1,8 @@
 """Quantiles and robust weights, once for the whole package.
 
-The quantiles of NumPy import ``numpy.ma`` in a tenth of the time of NumPy itself, and the
-distributions of SciPy take longer to import than a comparison: so both are here, in numbers.
+Quantiles are written out because NumPy's import ``numpy.ma``, which takes a tenth of the time of
+importing NumPy. Quantiles of distributions are tables, because importing SciPy's takes longer than
+a whole comparison of results.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,13 +17,13 @@ from hand_eye_calib.core.base.arrays import FloatArray
 MEDIAN_NORMAL = 0.6745
 MEDIAN_LENGTH = 1.538
 
-# What chi-square exceeds with a probability, by its degrees of freedom; and what any of six normal
-# variables exceeds once in 200 times.
+# Quantiles of chi-square: probability of a larger value -> degrees of freedom -> quantile.
 CHI2 = {
     0.5: {1: 0.455, 6: 5.348},
     0.01: {1: 6.63, 2: 9.21, 3: 11.34, 4: 13.28, 5: 15.09, 6: 16.81},
     0.001: {6: 22.457744},
 }
+# Limit that the largest size of six normal variables exceeds once in 200 times.
 LARGEST_OF_SIX = 3.341479
 
 # Standard normal quantile of 0.9: a value this many standard deviations above a limit exceeds the
@@ -34,7 +35,7 @@ STUDENT = 4.0
 
 _MAX_STEPS = 20
 
-# Singular values of a regression below this share of the largest are rounding.
+# Singular values of a regression below this share of the largest are rounding errors.
 _RANK_TOLERANCE = 1e-9
 
 # Smallest length of residuals that weights are relative to.
@@ -61,8 +62,10 @@ def medians(values: FloatArray) -> FloatArray:
 
 
 def quantile(values: ArrayLike, share: float) -> float:
-    """Quantile of finite values, one at least, in any shape: interpolated between the two of them
-    that are next to it, as ``numpy.quantile`` does in more time.
+    """Quantile of one or more finite values in any shape.
+
+    The quantile is interpolated linearly between two neighbouring values. The result is that of
+    ``numpy.quantile``, in less time.
     """
     flat = np.asarray(values, dtype=np.float64).ravel()
     rank = share * (len(flat) - 1)
@@ -133,7 +136,7 @@ def robust_regression(
     rounds: int,
     unit: Callable[[FloatArray], float],
 ) -> tuple[FloatArray, FloatArray]:
-    """Values x that ``rows @ x = targets`` shows, by iteratively reweighted least squares.
+    """Solve ``rows @ x = targets`` by iteratively reweighted least squares.
 
     Parameters
     ----------
@@ -162,11 +165,11 @@ def robust_regression(
 
 
 def chi_square_quantile(tail: float) -> float:
-    """What chi-square with six degrees of freedom exceeds with this probability, from 1e-30 to
-    0.99.
+    """Return the value that chi-square (6 degrees of freedom) exceeds with probability ``tail``.
 
-    It exceeds 2 h with probability ``exp(-h) (1 + h + h^2 / 2)``. The negative logarithm of that is
-    convex and grows with h: Newton's method converges from above, in ten steps or fewer.
+    ``tail`` is from 1e-30 to 0.99. Chi-square exceeds 2 h with probability
+    ``exp(-h) (1 + h + h^2 / 2)``. The negative logarithm of this probability is convex and grows
+    with h. Newton's method therefore converges from above, in ten steps or fewer.
     """
     half = 10.0 - 2.0 * np.log(tail)
     for _ in range(_MAX_STEPS):

@@ -93,8 +93,9 @@ def two_digits(value: float) -> str:
 
 
 def with_sigma(value: float | None, sigma: float | None, least_decimals: int = 2) -> str:
-    """A number and its standard deviation, with two digits of the latter and so many decimals at
-    least; None where one is not known.
+    """Return a number and its standard deviation; "unknown" if one of them is not known.
+
+    The standard deviation has two digits, and both numbers have at least ``least_decimals``.
     """
     if value is None or sigma is None or not math.isfinite(sigma):
         return "unknown"
@@ -136,12 +137,12 @@ def share(value: float) -> str:
     return f"{value:.1%}" if value < 0.1 else f"{value:.0%}"
 
 
-# Share of messages without a pose from which on the source is worth a look.
+# Above this share of messages without a pose, the source of the messages deserves a check.
 MUCH_NULL = 0.1
 
 
 def without_poses(n_null: int, n_all: int) -> str:
-    """How many poses of a stream were left out because they are null, and what to do if many."""
+    """Return how many null poses of a stream were skipped, and what to do if there are many."""
     counts = f"{n_null:,} of {n_all:,} poses ({share(n_null / n_all)}) were left out"
     text = f"{counts}: their quaternion is 0, or a value is not finite or absent"
     if n_null > MUCH_NULL * n_all:
@@ -186,11 +187,11 @@ AXIS_UNITS = dict.fromkeys(("x", "y", "z"), "m") | dict.fromkeys(("roll", "pitch
 _IN_SI = {"m": {"m": 1.0, "cm": 0.01, "mm": 0.001}, "rad": {"rad": 1.0, "deg": math.pi / 180}}
 _QUANTITY = re.compile(r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)(m|cm|mm|rad|deg)?")
 
-# Largest length (m) and angle (rad) that a user may give: its square is far from an overflow.
+# Lengths (m) and angles (rad) of a user must not be larger, so that their squares do not overflow.
 _LARGEST = 1e6
 
-# Longest length (m) of a prior that may have no unit: sensors are seldom farther apart, and 22 of
-# centimetres must not become 22 m.
+# Longest length (m) of a prior without a unit. Sensors are seldom farther apart, and 22 that was
+# meant in centimetres must not be read as 22 m.
 _LONGEST_WITHOUT_UNIT_M = 5.0
 
 # Prior on the pose of the child sensor in the parent sensor's frame. For each of x, y, z (m), roll,
@@ -199,7 +200,7 @@ Prior: TypeAlias = Mapping[str, tuple[float, float] | str]
 
 
 def shortened(text: str, most: int = _MOST_SHOWN) -> str:
-    """A text for a message, which must not grow with it."""
+    """Return the text, cut to ``most`` characters so that a message with it remains short."""
     return text if len(text) <= most else f"{text[:most]}..."
 
 
@@ -264,8 +265,9 @@ def prior_as_typed(axis: str, value: str, sigma: str) -> str:
 
 
 def parse_pose(name: str, text: str) -> tuple[float, ...]:
-    """The six numbers of ``X Y Z ROLL PITCH YAW``, in m and rad; units may be given, as in
-    ``40cm 0 1.85 0 0 -90deg``.
+    """Return the six numbers of ``X Y Z ROLL PITCH YAW``, in m and rad.
+
+    The text may contain units, as in ``40cm 0 1.85 0 0 -90deg``.
 
     Raises
     ------
@@ -276,8 +278,9 @@ def parse_pose(name: str, text: str) -> tuple[float, ...]:
 
 
 def parse_targets(name: str, text: str) -> dict[str, float]:
-    """Targets of single axes: ``z=10cm yaw=0.5deg``, metres and radians without a unit, as axis
-    name to standard deviation in m or rad.
+    """Return the targets of single axes: axis name to standard deviation in m or rad.
+
+    The text is such as ``z=10cm yaw=0.5deg``; numbers without a unit are metres and radians.
 
     Raises
     ------
@@ -303,7 +306,10 @@ def parse_targets(name: str, text: str) -> dict[str, float]:
 def quantities(
     name: str, units: Sequence[str], words: Sequence[str], form: str, above: float = -math.inf
 ) -> list[float]:
-    """Numbers in ``units``, m or rad, from words that may name others; ``form`` is in messages."""
+    """Return numbers in ``units`` (m or rad) from words that may contain other units.
+
+    Error messages quote ``form``, the expected form of the text.
+    """
     if len(words) != len(units):
         raise ConfigError(f"{name} must be {form}; got {shown_value(' '.join(words))}")
     found = []
@@ -327,8 +333,9 @@ def quantities(
 
 
 def parse_reference(name: str, text: str) -> tuple[str, int]:
-    """Kind, "A", "B" or "C", and step, 1 for "A", of which poses form motion pairs; a ConfigError
-    for anything else.
+    """Return kind ("A", "B" or "C") and step (1 for "A") of a reference for motion pairs.
+
+    Any other text raises ConfigError.
     """
     if not re.fullmatch("A|B[1-9][0-9]{0,8}|C([2-9]|[1-9][0-9]{1,8})", text):
         raise ConfigError(
