@@ -115,7 +115,8 @@ class Storage(ABC):
     def blocks(self, topics: Collection[str]) -> Iterator[list[Message]]:
         """Iterate over blocks of messages of some topics in the order of bag time.
 
-        Overlapping chunks of mcap follow each other.
+        If chunks of an mcap file overlap, they are read one after the other, so this order is only
+        within each chunk.
         """
         kinds = {key: kind for key, kind in self._kinds.items() if kind.topic in topics}
         if not kinds:

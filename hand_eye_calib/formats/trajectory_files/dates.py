@@ -162,8 +162,8 @@ def stamp_of(names: Sequence[str], cells: Sequence[str], unit: str = "") -> Deci
         Quantities of the cells, such as ("date", "t"); see columns.stamp_columns.
     cells : sequence of str
     unit : str, optional
-        Unit of the second of a week, if the column names it. Otherwise a number that is no second
-        of this week or of the next is in milliseconds.
+        Unit of the seconds in a GPS week, if the column names it. Without a name, a number that is
+        too large for seconds of this week or the next is in milliseconds.
 
     Returns
     -------

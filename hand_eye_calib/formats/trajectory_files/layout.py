@@ -233,7 +233,10 @@ def _without_last(cells: Sequence[str]) -> list[str]:
 
 
 def _joining(widths: Sequence[int]) -> _Merge:
-    """Return a function that joins neighbouring cells of a row; each width is a number of cells."""
+    """Return a function that joins neighbouring cells of a row into columns.
+
+    ``widths`` are the numbers of cells in the columns; columns of width 0 have no cell.
+    """
     ends = np.cumsum([width for width in widths if width]).tolist()
     spans = list(zip([0, *ends[:-1]], ends, strict=True))
 
