@@ -314,20 +314,12 @@ def _read_config(path: Path) -> Options:
         if is_ros_parameter and re.split("[./]", node.rstrip("."))[-1] not in _NODES:
             other_nodes.append(f"/{node.strip('/.')}")
         elif option in OPTION_FIELDS:
-            try:
-                options |= [_named(option, value)]
-            except ConfigError as error:
-                # In quotes the name keeps the spelling of the file.
-                text = str(error).replace(option, repr(option), 1)
-                raise ConfigError(f"{path}: {text}") from None
+            options |= [_named_in_file(path, option, value)]
         elif option in _NODE_OPTIONS or option.partition(".")[0] in _ROS_OPTIONS:
             ignored.append(repr(option))
         elif value is not None or not option.endswith(_OF_ROS):
-            names = sorted(OPTION_FIELDS)
-            raise ConfigError(
-                f"{path}: unknown option {option!r}{did_you_mean(option, names)}; "
-                f"known are {', '.join(map(repr, names))}"
-            )
+            # The section of the parameters may be empty: then it is no option.
+            raise _unknown_option(path, option)
     if other_nodes and not (options or ignored):
         nodes = ", ".join(dict.fromkeys(other_nodes))
         raise ConfigError(
@@ -336,6 +328,25 @@ def _read_config(path: Path) -> Options:
     if ignored:
         note(f"{path}: only the node uses {', '.join(ignored)}; ignored here")
     return options
+
+
+def _named_in_file(path: Path, option: str, value: object) -> tuple[str, OptionValue]:
+    """Return the name and the checked value of an option; an error names the file."""
+    try:
+        return _named(option, value)
+    except ConfigError as error:
+        # In quotes the name keeps the spelling of the file.
+        text = str(error).replace(option, repr(option), 1)
+        raise ConfigError(f"{path}: {text}") from None
+
+
+def _unknown_option(path: Path, option: str) -> ConfigError:
+    """Return the error about an option of a file that does not exist."""
+    names = sorted(OPTION_FIELDS)
+    return ConfigError(
+        f"{path}: unknown option {option!r}{did_you_mean(option, names)}; "
+        f"known are {', '.join(map(repr, names))}"
+    )
 
 
 def _flat(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.option import Options
@@ -24,6 +24,9 @@ from hand_eye_calib.offline.cli.options import (
     waiting_for,
     with_progress,
 )
+
+if TYPE_CHECKING:
+    from hand_eye_calib.formats.trajectory_files.reading import FileOptions
 
 _BAG_SUFFIXES = (".bag", ".db3", ".mcap", ".zstd")
 
@@ -76,21 +79,14 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
     ConfigError
         If only some are bags, there is only one file, or a path is given twice.
     """
-    for path, count in Counter(map(str, paths)).items():
-        if count > 1:
-            raise ConfigError(f"{path} appears twice: pass the file of each sensor")
+    _refuse_twice(paths)
     bags = [path for path in paths if isinstance(path, str)]
     local_bags = [path for path in paths if isinstance(path, Path) and _looks_like_bag(path)]
     n_bags = len(bags) + len(local_bags)
     if n_bags == len(paths) or (len(paths) == 1 and not Path(paths[0]).is_file()):
         return True
-    for folder in local_bags:
-        if folder.is_dir() and not any(map(_looks_like_file_of_bag, folder.iterdir())):
-            raise ConfigError(
-                f"{folder} is a folder without a bag: pass a trajectory file "
-                "of each sensor, or a bag"
-            )
     if n_bags:
+        _refuse_folders_without_bag(local_bags)
         raise ConfigError(
             f"{[*bags, *local_bags][0]} is a bag, and another path is not: "
             "pass two trajectory files, or the parts of one bag"
@@ -100,6 +96,23 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
             f"{paths[0]} is one trajectory file: pass those of two sensors, PARENT CHILD, or a bag"
         )
     return False
+
+
+def _refuse_twice(paths: Sequence[Path | str]) -> None:
+    """Raise ConfigError if a path appears twice."""
+    for path, count in Counter(map(str, paths)).items():
+        if count > 1:
+            raise ConfigError(f"{path} appears twice: pass the file of each sensor")
+
+
+def _refuse_folders_without_bag(folders: Sequence[Path]) -> None:
+    """Raise ConfigError if a folder contains no file of a bag."""
+    for folder in folders:
+        if folder.is_dir() and not any(map(_looks_like_file_of_bag, folder.iterdir())):
+            raise ConfigError(
+                f"{folder} is a folder without a bag: pass a trajectory file "
+                "of each sensor, or a bag"
+            )
 
 
 def _looks_like_file_of_bag(path: Path) -> bool:
@@ -152,23 +165,14 @@ def read_files(arguments: Namespace, paths: Sequence[Path | str], options: Optio
     options : dict
         Kind of data of each sensor, "parent_measures" and "child_measures".
     """
-    from hand_eye_calib.formats.trajectory_files.reading import FileOptions, read_trajectory_files
+    from hand_eye_calib.formats.trajectory_files.reading import read_trajectory_files
 
     streams = STREAMS[: len(paths)] if len(paths) < 3 else [""] * len(paths)
-    for name in (f"{stream}_{name}" for stream in STREAMS for name in FILE_OPTIONS):
-        if len(paths) > 2 and getattr(arguments, name):
-            raise ConfigError(
-                f"--{flag(name)} is for two files; a rig needs the option for all files"
-            )
+    if len(paths) > 2:
+        _refuse_options_of_two_files(arguments)
     files = []
     for path, stream in zip(paths, streams, strict=True):
-        settings: dict[str, Any] = {"format": "auto"}
-        for name in (*FILE_OPTIONS, "pair_by"):
-            value = getattr(arguments, f"{stream}_{name}", None) or getattr(arguments, name)
-            if value:
-                settings[name] = value
-        measures = options.get(f"{stream}_measures", "auto")
-        files.append((Path(path), FileOptions(**settings, measures=measures, repair=True)))
+        files.append((Path(path), _options_of_file(arguments, stream, options)))
     with waiting_for(f"reading {' and '.join(map(str, paths))}"):
         readings = read_trajectory_files(files)
     repairs: list[str] = []
@@ -181,3 +185,25 @@ def read_files(arguments: Namespace, paths: Sequence[Path | str], options: Optio
                 text = re.sub(f"`({'|'.join(FILE_OPTIONS)})`", rf"`{stream}_\1`", text)
             note(text.replace(str(path), path.name))
     return FilesRead([reading.trajectory for reading in readings], repairs, warnings)
+
+
+def _refuse_options_of_two_files(arguments: Namespace) -> None:
+    """Raise ConfigError if an option of the parent's or the child's file is set."""
+    for name in (f"{stream}_{name}" for stream in STREAMS for name in FILE_OPTIONS):
+        if getattr(arguments, name):
+            raise ConfigError(
+                f"--{flag(name)} is for two files; a rig needs the option for all files"
+            )
+
+
+def _options_of_file(arguments: Namespace, stream: str, options: Options) -> "FileOptions":
+    """Return how to read the file of a stream; ``stream`` is empty with three files or more."""
+    from hand_eye_calib.formats.trajectory_files.reading import FileOptions
+
+    settings: dict[str, Any] = {"format": "auto"}
+    for name in (*FILE_OPTIONS, "pair_by"):
+        value = getattr(arguments, f"{stream}_{name}", None) or getattr(arguments, name)
+        if value:
+            settings[name] = value
+    measures = options.get(f"{stream}_measures", "auto")
+    return FileOptions(**settings, measures=measures, repair=True)
