@@ -90,7 +90,6 @@ def check_value(field: OptionField, value: object) -> OptionValue:
         If the value has the wrong type, is out of range or is not among the choices. The message
         is one line and states the allowed values.
     """
-    meta = field.metadata
     name = option_name(field)
     words = field.metadata["words"]
     value = _of_python(value)
@@ -98,14 +97,7 @@ def check_value(field: OptionField, value: object) -> OptionValue:
         raise ConfigError(f"{name}: the number is too large")
     kind: type = float if words else type(field.default)
     if isinstance(value, str) and (value in words or kind is str):
-        if meta["choices"] is not None and value not in meta["choices"]:
-            raise ConfigError(
-                f"{name} must be one of {', '.join(meta['choices'])}; got {shown_value(value)}"
-                f"{did_you_mean(value, meta['choices'])}"
-            )
-        if meta["parse"] is not None and value:
-            meta["parse"](name, value)
-        return frame_name(value) if name.endswith("_frame") else value
+        return _checked_text(field, value)
     if words and isinstance(value, str):
         with contextlib.suppress(ValueError):
             value = float(value)
@@ -116,12 +108,34 @@ def check_value(field: OptionField, value: object) -> OptionValue:
         raise ConfigError(
             f"{name} must be {expected}; got {shown_value(value)}{did_you_mean(str(value), words)}"
         )
+    return _checked_number(field, value)
+
+
+def _checked_text(field: OptionField, text: str) -> str:
+    """Check the text of an option against its choices and its form."""
+    name = option_name(field)
+    choices = field.metadata["choices"]
+    if choices is not None and text not in choices:
+        raise ConfigError(
+            f"{name} must be one of {', '.join(choices)}; got {shown_value(text)}"
+            f"{did_you_mean(text, choices)}"
+        )
+    parse = field.metadata["parse"]
+    if parse is not None and text:
+        parse(name, text)
+    return frame_name(text) if name.endswith("_frame") else text
+
+
+def _checked_number(field: OptionField, value: float) -> float:
+    """Check the number of an option against its range."""
+    name = option_name(field)
     if not math.isfinite(value):
         raise ConfigError(f"{name} must be a finite number; got {value}")
-    least, most = meta["within"] or (value, value)
+    least, most = field.metadata["within"] or (value, value)
     if not least <= value <= most:
         bound = f"at least {least}" if value < least else f"at most {most}"
-        raise ConfigError(f"{name} must be {' '.join([bound, meta['unit']]).rstrip()}; got {value}")
+        unit = field.metadata["unit"]
+        raise ConfigError(f"{name} must be {' '.join([bound, unit]).rstrip()}; got {value}")
     return value
 
 

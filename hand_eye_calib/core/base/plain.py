@@ -62,32 +62,52 @@ def from_plain(kind: Any, value: Any, **names: type) -> Any:
     TypeError, ValueError
         If the value has another type, or a number is far too large.
     """
-    args = get_args(kind)
-    if get_origin(kind) in (Union, types.UnionType):
-        if value is None:
-            return None
-        wanted = [each for each in args if each is not types.NoneType]
-        fitting = [each for each in wanted if get_origin(each) or is_dataclass(each)]
-        fitting = fitting or [each for each in wanted if isinstance(value, each)]
-        return from_plain((fitting or wanted)[0], value)
+    origin = get_origin(kind)
+    if origin in (Union, types.UnionType):
+        return _one_of(get_args(kind), value)
     if is_dataclass(kind):
         return _record(kind, _of_type(Mapping, value), names)
-    if isinstance(get_origin(kind), type) and issubclass(get_origin(kind), Mapping):
-        return {key: from_plain(args[1], each) for key, each in _of_type(Mapping, value).items()}
-    if get_origin(kind) is tuple:
-        if isinstance(value, str):
-            raise TypeError("found a text in place of a list")
-        return tuple(from_plain(args[0], each) for each in _of_type(Sequence, value))
-    if get_origin(kind) in (np.ndarray, NDArray):  # which is an alias from NumPy 2.5 on
-        return _of_type(np.ndarray, value)
+    if origin is not None:
+        return _collection(kind, value)
     if kind is float:
         return _number(value)
     if issubclass(kind, Enum):
-        by_plain = {plain(each): each for each in kind}
-        return by_plain[value] if value in by_plain else kind(value)
+        return _member(kind, value)
     if isinstance(value, bool) and kind is not bool:
         raise TypeError(f"a {kind.__name__} is true or false")
     return _of_type(kind, value)
+
+
+def _one_of(kinds: Sequence[Any], value: Any) -> Any:
+    """Convert plain data to the first of several types that can take it; None stays None."""
+    if value is None:
+        return None
+    wanted = [kind for kind in kinds if kind is not types.NoneType]
+    fitting = [kind for kind in wanted if get_origin(kind) or is_dataclass(kind)]
+    fitting = fitting or [kind for kind in wanted if isinstance(value, kind)]
+    return from_plain((fitting or wanted)[0], value)
+
+
+def _collection(kind: Any, value: Any) -> Any:
+    """Convert plain data to a mapping, a tuple or an array."""
+    origin = get_origin(kind)
+    args = get_args(kind)
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        items = _of_type(Mapping, value).items()
+        return {key: from_plain(args[1], item) for key, item in items}
+    if origin is tuple:
+        if isinstance(value, str):
+            raise TypeError("found a text in place of a list")
+        return tuple(from_plain(args[0], item) for item in _of_type(Sequence, value))
+    # NDArray is an alias from NumPy 2.5 on; before, its origin is the array.
+    assert origin in (np.ndarray, NDArray), kind
+    return _of_type(np.ndarray, value)
+
+
+def _member(kind: type[Enum], value: Any) -> Enum:
+    """Return the member of an enum by its plain data, or else by its value."""
+    by_plain = {plain(member): member for member in kind}
+    return by_plain[value] if value in by_plain else kind(value)
 
 
 # Cached: resolving type hints takes longer than the rest of a conversion.
