@@ -57,11 +57,7 @@ def compare(
     >>> hec.compare([result], installed=result).verdict
     'same'
     """
-    if not names:
-        names = [f"result {number}" for number in range(1, len(results) + 1)]
-    by_name = dict(zip(names, results, strict=False))
-    if len(by_name) < len(results):
-        raise InputError(f"expected {len(results)} different names, found {len(by_name)}")
+    by_name = _by_name(results, names)
     require_same_frames(each for each in (*results, installed) if isinstance(each, Calibration))
     couples: list[tuple[_Named, tuple[str, Calibration]]] = [*combinations(by_name.items(), 2)]
     if installed is not None:
@@ -73,18 +69,27 @@ def compare(
     moved_names = tuple(
         difference.second for difference in differences if difference.verdict == Change.MOVED
     )
+    others = "another" if installed is None else "what is installed"
+    sentence = f"{verdict}: none of {len(results)} differs from {others}"
     if installed is not None and len(differences) == 1:
         sentence = differences[0].sentence
     elif moved_names and installed is None:
         moved_names, sentence = _who_moved([*by_name], results, differences)
     elif moved_names:
         sentence = f"moved: {listing(moved_names)} of {len(results)}"
-    else:
-        others = "another" if installed is None else "what is installed"
-        sentence = f"{verdict}: none of {len(results)} differs from {others}"
     return Comparison(
         sentence=sentence, verdict=verdict, moved=moved_names, differences=differences
     )
+
+
+def _by_name(results: Sequence[Calibration], names: Sequence[str] | None) -> dict[str, Calibration]:
+    """Return results by their names, or by their numbers without names."""
+    if not names:
+        names = [f"result {number}" for number in range(1, len(results) + 1)]
+    by_name = dict(zip(names, results, strict=False))
+    if len(by_name) < len(results):
+        raise InputError(f"expected {len(results)} different names, found {len(by_name)}")
+    return by_name
 
 
 def _who_moved(

@@ -15,7 +15,7 @@ from hand_eye_calib.core.assessment.comparison import (
     by_axis,
     require_same_frames,
 )
-from hand_eye_calib.core.assessment.covariance import combined
+from hand_eye_calib.core.assessment.covariance import Assessment, combined
 from hand_eye_calib.core.base.errors import HandEyeCalibError, InputError, located
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.text import listing
@@ -243,6 +243,34 @@ def _joint(
 ) -> Calibration:
     """Return the result of recordings that belong together, in order of time."""
     used = [*recordings.values()]
+    assessed = _assessed(used, agreement)
+    is_open = any(math.isinf(dof.sigma) for dof in assessed.observability)
+    newest = used[-1]
+    clocks = {(result.time_offset_s, result.scale) for result in used}
+    offset_s, scale = clocks.pop() if len(clocks) == 1 else (0.0, 1.0)
+    return Calibration(
+        T_parent_child=agreement.T_parent_child,
+        covariance_measured=assessed.cov_parent_child_in_child,
+        covariance_allowance=np.mean([result.covariance_allowance for result in used], axis=0),
+        observability_measured=assessed.observability,
+        status=SolveStatus.UNOBSERVABLE if is_open else SolveStatus.OK,
+        objective=agreement.chi2,
+        method=Counter(result.method for result in used).most_common(1)[0][0],
+        time_offset_s=offset_s,
+        scale=scale,
+        findings=_gravest_of_each(used),
+        warnings=_warnings_of(recordings),
+        parts={"together": record},
+        **{name: sum(getattr(result, name) for result in used) for name in _COUNTS},
+        **{name: getattr(newest, name) for name in _OF_NEWEST},
+    )
+
+
+def _assessed(used: Sequence[Calibration], agreement: Agreement) -> Assessment:
+    """Assess the common result of recordings.
+
+    An axis that all recordings have from one measurement by hand is no more certain than that.
+    """
     T = agreement.T_parent_child
     covariance = agreement.covariance.copy()
     by_prior = set()
@@ -250,7 +278,6 @@ def _joint(
         dofs = [result.observability_measured[axis] for result in used]
         finite = [dof for dof in dofs if math.isfinite(dof.sigma)]
         if finite and all(dof.verdict is DofVerdict.PRIOR for dof in finite):
-            # The recordings share one measurement by hand.
             by_prior.add(name)
             variance = min(dof.sigma for dof in finite) ** 2
             covariance[axis, axis] = max(covariance[axis, axis], variance)
@@ -260,26 +287,12 @@ def _joint(
         replace(dof, verdict=DofVerdict.PRIOR) if dof.name in by_prior else dof
         for dof in assessed.observability
     )
-    is_open = any(math.isinf(dof.sigma) for dof in observability)
-    newest = used[-1]
+    return replace(assessed, observability=observability)
+
+
+def _gravest_of_each(used: Sequence[Calibration]) -> tuple[Finding, ...]:
+    """Return the gravest finding of each code and stream."""
     findings: dict[tuple[str, str], Finding] = {}
     for finding in gravest_first([finding for result in used for finding in result.findings]):
         findings.setdefault((finding.code, finding.stream), finding)
-    clocks = {(result.time_offset_s, result.scale) for result in used}
-    offset_s, scale = clocks.pop() if len(clocks) == 1 else (0.0, 1.0)
-    return Calibration(
-        T_parent_child=T,
-        covariance_measured=assessed.cov_parent_child_in_child,
-        covariance_allowance=np.mean([result.covariance_allowance for result in used], axis=0),
-        observability_measured=observability,
-        status=SolveStatus.UNOBSERVABLE if is_open else SolveStatus.OK,
-        objective=agreement.chi2,
-        method=Counter(result.method for result in used).most_common(1)[0][0],
-        time_offset_s=offset_s,
-        scale=scale,
-        findings=tuple(findings.values()),
-        warnings=_warnings_of(recordings),
-        parts={"together": record},
-        **{name: sum(getattr(result, name) for result in used) for name in _COUNTS},
-        **{name: getattr(newest, name) for name in _OF_NEWEST},
-    )
+    return tuple(findings.values())

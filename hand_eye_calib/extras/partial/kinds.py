@@ -3,7 +3,7 @@
 The streams are positions beside poses, or rotations or angular rates of both sensors.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -94,11 +94,9 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
     findings = [*calibration.findings] if calibration else []
     known_s = float(snapshot.resolved.config.time_offset)
     parent, child = snapshot.streams
-    if not len(snapshot.kept):  # stored pairs may have gaps that the streams do not have
-        scale = calibration.scale if calibration else config.given_scale
-        aligned = child.scaled(scale).shifted(known_s)
-        lever_arm_m = _least_lever_arm(calibration) if calibration else 0.0
-        findings += checking.check_parts(parent, aligned, config.max_gap, lever_arm_m)
+    # Stored pairs may have gaps that the streams do not have.
+    if not len(snapshot.kept):
+        findings += _check_aligned(snapshot, calibration, known_s)
     hidden = calibration.hidden if calibration else []
     if len(hidden) == 3 or any(found.code == "unrelated" for found in findings):
         findings += _check_clock(parent, child, known_s, snapshot)
@@ -110,11 +108,27 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
         findings.append(checking.unseen(hidden))
     # Lengths in another unit come first: they cause the findings of the solve.
     findings.sort(key=lambda found: found.code != "lengths")
+    return CheckResult(gravest_first(_without_repetitions(findings)))
+
+
+def _check_aligned(
+    snapshot: Snapshot, calibration: Calibration | None, known_s: float
+) -> list[Finding]:
+    """Check both streams in one unit and on one clock."""
+    parent, child = snapshot.streams
+    scale = calibration.scale if calibration else snapshot.config.given_scale
+    aligned = child.scaled(scale).shifted(known_s)
+    lever_arm_m = _least_lever_arm(calibration) if calibration else 0.0
+    return checking.check_parts(parent, aligned, snapshot.config.max_gap, lever_arm_m)
+
+
+def _without_repetitions(findings: Sequence[Finding]) -> list[Finding]:
+    """Return the findings without those that are equal to one before."""
     different: list[Finding] = []
     for found in findings:
         if found not in different:
             different.append(found)
-    return CheckResult(gravest_first(different))
+    return different
 
 
 def _least_lever_arm(calibration: Calibration) -> float:
