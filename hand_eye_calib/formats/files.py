@@ -37,7 +37,7 @@ BLOCK_BYTES = 4 << 20
 
 #: Bytes of the largest YAML file.
 LARGEST_YAML = 1 << 20
-#: Whole numbers are smaller than this: they have 64 bits, as in messages and other programs.
+#: Whole numbers must be smaller than this: they fit into a signed integer of 64 bits.
 LARGEST_INT = 1 << 63
 #: Largest number of levels of nesting.
 DEEPEST_YAML = 32

@@ -54,14 +54,14 @@ _SHARE_OF_ROTATION = 0.5
 # is known of these axes. The verdicts name the unknown axes.
 UNKNOWN_SIGMAS = np.repeat([3.0, np.pi], 3)
 
-# Smallest variance (m^2 or rad^2) of a divisor: noise-free data have none.
+# Smallest variance (m^2 or rad^2) that is divided by: the variance of noise-free data is zero.
 ROUNDING_VARIANCE = 1e-24
 
 # Information below this share of the largest is rounding.
 _RANK_TOLERANCE = 1e-12
 
-# The motion reveals a direction if the rotations move it with this many times the power of the
-# rotation errors. Below, noise alone looks like such motion.
+# The motion reveals a direction of the lever arm if the rotations displace it with this many times
+# the power of the rotation errors. Below, noise alone looks like such a displacement.
 _MIN_SIGNAL_TO_NOISE = 3.0
 
 # A direction must also move by this share of the direction that moves most. Otherwise all rotation
@@ -344,8 +344,8 @@ def without_axes(assessment: Assessment, axes: Collection[str]) -> Assessment:
 
 def without_direction(assessment: Assessment, axis: FloatArray) -> Assessment:
     """Return an assessment in which a lever arm along an axis (3,) of the parent is unknown."""
-    # If a translation is unobservable already, its direction is the same: a second direction would
-    # hide another axis.
+    # An unobservable translation has this axis as its direction already. The same direction, added
+    # again with other rounding, would make a second axis unobservable.
     if any(dof.verdict is DofVerdict.UNOBSERVABLE for dof in assessment.observability[:3]):
         return assessment
     in_child = se3.rotation_of(assessment.T_parent_child).T @ axis

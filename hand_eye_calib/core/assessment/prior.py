@@ -129,7 +129,7 @@ def _whitened(
     root : (6, 6) array
         From coordinates of unit variance to deviations (rho, phi).
     inverse_root : (6, 6) array
-        Back.
+        From deviations to coordinates of unit variance.
     targets : (6,) array
         Result without a prior, in these coordinates: the translation along unknown directions is
         zero.

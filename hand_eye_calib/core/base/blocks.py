@@ -69,11 +69,11 @@ class Blocks:
         return self.total - self.sums
 
     def before(self, cuts: IntArray) -> FloatArray:
-        """Sums (C, ...) of the blocks before each cut, at least 1."""
+        """Sums (C, ...) of the blocks before each cut (C,); a cut is at least 1."""
         return np.asarray(np.cumsum(self.sums, axis=0)[cuts - 1])
 
     def since(self, cuts: IntArray) -> FloatArray:
-        """Sums (C, ...) of the blocks since each cut, at most B - 1."""
+        """Sums (C, ...) of the blocks since each cut (C,); a cut is at most B - 1."""
         return np.asarray(np.cumsum(self.sums[::-1], axis=0)[::-1][cuts])
 
     def shift_since(self, cuts: IntArray, prior: FloatArray) -> FloatArray:

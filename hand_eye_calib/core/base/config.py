@@ -66,7 +66,7 @@ METHODS = {
 
 
 def require_backend(method: str, backend: str) -> None:
-    """Check that a method has a backend; otherwise a ConfigError names those that have."""
+    """Raise ConfigError if a method lacks a backend; the message lists the methods that have it."""
     if backend not in METHODS[method].backends:
         able = [name for name, record in METHODS.items() if backend in record.backends]
         raise ConfigError(

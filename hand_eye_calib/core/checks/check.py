@@ -190,11 +190,12 @@ def _check_explained(
     lengths = check_lengths(
         right.parent, right.child, least_lever_arm(fit.T_parent_child, fit.sigmas[:3])
     )
-    # It is open whether both streams are inverse: the streams as they are may be right.
+    # Both streams may be inverse, or neither: both readings fit, and the check cannot decide.
     of_reading = explanation.findings if explanation.may_be_upright else ()
     readings = explanation.readings
     if of_reading and lengths:
-        # In one reading, the distance of the sensors is the distance of the worlds.
+        # If both are inverse, the distance of the sensors is that of the worlds: judge the lengths
+        # of the streams as they are.
         lengths = check_lengths(streams.parent, streams.child)
     if readings and lengths:
         # Noise and shape decide between the readings only if the unit of length is known.
@@ -359,11 +360,12 @@ def _explained(
 
 
 def _check_sizes(
-    streams: StreamPair, explanation: Explanation, timed: SimilarityFit | None, known: float
+    streams: StreamPair, explanation: Explanation, timed: SimilarityFit | None, known_scale: float
 ) -> tuple[list[Finding], SimilarityFit]:
     """Return findings about scale and hidden axes of streams that agree, and the fit with scale.
 
-    ``timed`` is the fit with the time offset, ``known`` the known factor of the child's lengths.
+    ``timed`` is the fit with the time offset. The child's lengths in ``streams`` are those of its
+    source times ``known_scale``.
     """
     pose_pairs = streams.synchronised
     motions = _motions(pose_pairs, hypotheses.MAX_PAIRS)
@@ -373,19 +375,29 @@ def _check_sizes(
     findings: list[Finding | None] = [unseen(hidden)] if hidden else []
     if not (explanation.same_unit or fit.is_in_one_unit):
         with suppress(NotEnoughDataError):
-            of_both = [each for each in (fit, timed) if each and each.scale_sigma > 0.0]
-            fit = similarity.estimate_scale(pose_pairs, of_both)
+            fits_of_scale = [each for each in (fit, timed) if each and each.scale_sigma > 0.0]
+            fit = similarity.estimate_scale(pose_pairs, fits_of_scale)
             if fit.has_own_unit:
-                total = known * fit.scale
-                sigma = known * fit.scale_sigma
-                values: dict[str, Any] = {"scale": total, "sigma": sigma}
-                values["options"] = {"scale": float(f"{total:.4g}")}
-                differs = graded("scale", "child", fit.scale - 1.0, **values)
-                as_given = streams.parent, streams.child.scaled(1.0 / known)
-                sigma_and_bias = float(np.hypot(fit.scale_sigma, fit.scale_bias))
-                unit = in_other_units(fit.scale, sigma_and_bias, *as_given, known)
-                findings.append(unit or differs)
+                findings.append(_own_unit(streams, fit, known_scale))
     return [*filter(None, findings)], fit
+
+
+def _own_unit(streams: StreamPair, fit: SimilarityFit, known_scale: float) -> Finding | None:
+    """Return the finding about a child in another unit of length, or else of another scale."""
+    child_as_given = streams.child.scaled(1.0 / known_scale)
+    sigma_and_bias = float(np.hypot(fit.scale_sigma, fit.scale_bias))
+    unit = in_other_units(fit.scale, sigma_and_bias, streams.parent, child_as_given, known_scale)
+    if unit:
+        return unit
+    total_scale = known_scale * fit.scale
+    return graded(
+        "scale",
+        "child",
+        fit.scale - 1.0,
+        scale=total_scale,
+        sigma=known_scale * fit.scale_sigma,
+        options={"scale": float(f"{total_scale:.4g}")},
+    )
 
 
 def _check_agreeing(
@@ -553,7 +565,7 @@ def _parent_or_child(
 def _motions(pose_pairs: PosePairs, most: int) -> MotionPairs:
     """Return motions over the first lag with enough motions."""
     motions = (pairs_over(pose_pairs, lag_s, most) for lag_s in hypotheses.LAGS_S)
-    # Streams that agree have enough motions over one of the lags: their fit is over this lag.
+    # There is such a lag: streams that agree were fitted over it.
     return next(pairs for pairs in motions if len(pairs) >= hypotheses.MIN_PAIRS)
 
 

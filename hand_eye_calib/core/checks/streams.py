@@ -148,32 +148,39 @@ def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> li
 
 
 def _interleaved(trajectory: Trajectory) -> float:
-    """Distance of the two levels (m), if two sensors take turns in a stream: positions that are
-    rougher from one pose to the next than over several; otherwise 0.
+    """Return the distance (m) of two levels between which the positions of a stream alternate.
+
+    Two sensors on one topic take turns. Neighbouring poses then differ more than poses that are
+    one period apart. The result is 0 for a stream of one sensor.
     """
     positions = se3.translation_of(trajectory.poses)
     stamps_ns = trajectory.stamps_ns
     repeats = np.abs(np.diff(positions, axis=0)).max(axis=1) < _SAME
     if len(positions) < (_TURNS + 2) * _MAX_PERIOD or repeats.mean() > _MAX_REPEATS:
         return 0.0
-    off = []  # the line between the poses so many before and after
+    # Deviations of each position from the line between the positions ``lag`` before and after.
+    deviations = []
     for lag in range(1, _MAX_PERIOD + 1):
         before = positions[: -2 * lag]
         after = positions[2 * lag :]
         elapsed = (stamps_ns[2 * lag :] - stamps_ns[: -2 * lag]).astype(float)
         share = (stamps_ns[lag:-lag] - stamps_ns[: -2 * lag]) / elapsed
-        off.append(positions[lag:-lag] - before - share[:, None] * (after - before))
-    rough = [median(np.linalg.norm(vectors, axis=1)) for vectors in off]
-    period = 2 + int(np.argmin(rough[1:]))
-    if rough[0] < max(_ALTERNATES * rough[period - 1], _LEAST_LEVELS_M):
+        deviations.append(positions[lag:-lag] - before - share[:, None] * (after - before))
+    roughness_m = [median(np.linalg.norm(vectors, axis=1)) for vectors in deviations]
+    # Positions that alternate are rough from pose to pose, and smooth over whole periods.
+    period = 2 + int(np.argmin(roughness_m[1:]))
+    if roughness_m[0] < max(_ALTERNATES * roughness_m[period - 1], _LEAST_LEVELS_M):
         return 0.0
-    for vectors in (off[0], np.einsum("kji,kj->ki", trajectory.poses[1:-1, :3, :3], off[0])):
+    in_world = deviations[0]
+    in_sensor = np.einsum("kji,kj->ki", trajectory.poses[1:-1, :3, :3], in_world)
+    # The levels repeat with the period, in the axes of the world or in those of the sensor.
+    for vectors in (in_world, in_sensor):
         n_windows = len(vectors) // (_TURNS * period)
         windows = vectors[: n_windows * _TURNS * period].reshape(n_windows, _TURNS, period, 3)
         levels = (windows.mean(axis=1) ** 2).sum(axis=-1).mean(axis=-1)
         total = (windows**2).sum(axis=-1).mean(axis=(1, 2))
         if median(levels / np.maximum(total, 1e-300)) >= _STEADY_SHARE:
-            return rough[0]
+            return roughness_m[0]
     return 0.0
 
 

@@ -313,7 +313,7 @@ class Calibrator:
         return self.snapshot().estimate()
 
     def adopt(self, offset: TimeOffset | None) -> None:
-        """Store the time offset of a resolved snapshot, so that it is not estimated again."""
+        """Store the time offset that was estimated for a snapshot, to estimate it only once."""
         self._proposed_offset = offset or self._proposed_offset
 
     def _make_pairs(self, is_full: bool) -> None:

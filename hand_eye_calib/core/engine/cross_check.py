@@ -55,8 +55,8 @@ _ROUNDING = 1e-9
 def cross_checked(solved: Solved, config: CalibratorConfig, pose_pairs: PosePairs) -> Calibration:
     """Return the result of a solve with its cross-check.
 
-    An axis that no other answer determines becomes weak. A prior on such an axis replaces the
-    estimate from motion.
+    An axis that no other solve and no half of the recording determines becomes weak. A prior on
+    such an axis replaces the estimate from motion.
 
     Parameters
     ----------

@@ -373,7 +373,7 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
 
 
 def _checked(calibration: Calibration, snapshot: Snapshot) -> Attempt:
-    """Return the attempt of a result, with the check of its streams."""
+    """Return an attempt: a result, and the check of the streams with this result."""
     result = check(snapshot, calibration)
     return Attempt(replace(calibration, findings=result.findings), snapshot, result)
 

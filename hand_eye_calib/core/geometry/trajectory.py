@@ -506,7 +506,8 @@ def corner_corrections(
     at_end = changes[start + 1]
     bend = ((2.0 - fraction)[:, None] * at_start + (1.0 + fraction)[:, None] * at_end) / 3.0
     interval_s = np.diff(stamps_ns)[start] * 1e-9
-    # Double integral of a constant second derivative that vanishes at both ends of the interval.
+    # Double integral of a constant second derivative; the integral is zero at both ends of the
+    # interval.
     half_square_s2 = 0.5 * fraction * (1.0 - fraction) * interval_s**2
     return -half_square_s2[:, None] * shares[start] * bend
 

@@ -436,7 +436,10 @@ def lasting(workspace: Workspace, fit: Fit) -> Fit:
     faint_levels = levels - 0.2
 
     def without_faint(levels: FloatArray, information: FloatArray) -> reml.Reduced:
-        """Drop processes below their faint level that make no difference."""
+        """Drop processes that are below their faint level and carry little information.
+
+        None if all remain.
+        """
         nonlocal free, prior, faint_levels
         matters = np.diag(information)[VARIANCES] > tuning.least_information
         matters |= (levels >= faint_levels)[VARIANCES]

@@ -33,11 +33,11 @@ class Tuning:
     # rotation shifts positions in a way that the model of one increment does not follow. In
     # recordings of thousands of poses the walk fitted was a tenth of the true one.
     longest_gap: int = 60
-    # Prior mean of the level of the jitter of stamps (s^2): 1 ms.
+    # Prior mean of the log variance of the jitter of stamps (s^2): the variance of 1 ms.
     jitter: float = -14.0
     # Prior precision of the levels of time constants.
     tau_precision: float = 0.3
-    # Bounds of white noise at the start, as shares of the whole.
+    # Bounds of the starting value of white noise, as shares of all noise.
     first_white: tuple[float, float] = (0.05, 0.5)
     # Steps of the child count as noise until their squared differences from their neighbours
     # exceed the noise variance by this factor.
@@ -137,16 +137,16 @@ class Tuning:
     any_scale: float = 1.0
     # Time (s) over which accelerations are taken.
     accelerating_s: float = 0.2
-    # Accelerations over more than this multiple of that time, because of a gap, are left out.
+    # Accelerations across a gap, over more than this multiple of `accelerating_s`, are left out.
     near: float = 2.5
-    # A jump is a step of the walk with this many times the variance that it needs.
+    # At a jump, the variance of the walk is this many times the variance that explains its step.
     jump_factor: float = 10.0
     # Number of neighbouring positions over which the quality of a position is measured.
     neighbours: int = 11
     # Positions whose squared errors exceed those of the best quarter of the recording by this
     # factor are left out: they would hardly count, and their errors last.
     worse: float = 16.0
-    # Poses of the windows that are aligned by themselves for the start.
+    # Poses of a window. For the starting values, each window is aligned alone.
     window: int = 200
 
 

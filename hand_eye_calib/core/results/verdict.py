@@ -217,7 +217,10 @@ class Judged(Result):
 
 
 def _is_notable(finding: Finding) -> bool:
-    """Whether a headline names a finding that is no reason: it changes what the numbers mean."""
+    """Whether the headline names a finding that does not lower the verdict.
+
+    Such a finding changes the meaning of the numbers.
+    """
     return finding.code in ("model_scale", "outliers") and finding.severity is Severity.NOTE
 
 

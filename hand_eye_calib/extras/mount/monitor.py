@@ -141,8 +141,10 @@ class Alarm:
 
     Attributes
     ----------
-    since_ns, raised_ns : int
-        Stamps of the parent's clock: of the shift, about, and of its detection.
+    since_ns : int
+        Approximate time of the shift, on the parent's clock.
+    raised_ns : int
+        Time of its detection, on the parent's clock.
     shift : Moved
     log_ratio : float
     """

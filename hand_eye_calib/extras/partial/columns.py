@@ -48,7 +48,7 @@ _CONSTANT_M = 1e-6
 _ROUNDS = 4
 _HALF_WEIGHT = 2.0
 
-# Most blocks of the jackknife.
+# Largest number of blocks of the jackknife.
 _MOST_BLOCKS = 16
 
 

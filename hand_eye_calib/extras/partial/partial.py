@@ -208,6 +208,7 @@ def _check_path(
     axes = fused.observability[:3]
     is_observed = any(dof.verdict is not DofVerdict.UNOBSERVABLE for dof in axes)
     is_near = is_observed and share < _UNRELATED_PATH
+    # Does a unit or a scale explain the path?
     with contextlib.suppress(np.linalg.LinAlgError):
         scaled = paths.solve(True)
         unexplained = paths.unexplained_share(scaled)

@@ -478,7 +478,7 @@ PROGRAMS: dict[bytes, _Reader | str] = {
     rb"\$[A-Z]{2}(GGA|RMC),": _of_nmea,
     rb"\A\d{9,10},\d{1,9},(?=[^,\n]*[A-Za-z/])[^,\n]*,": _of_echo,
     rb"(?m)^%\s+(GPST|UTC|JST)\b.*(latitude|ecef|baseline)": _of_rtklib,
-    # Emlid writes no header; metres have fewer digits.
+    # Emlid writes no header. Degrees have nine decimals or more, metres have four.
     rb"\A\d{4}/\d\d/\d\d +\S+( +-?\d+\.\d{9,}){2} ": _of_rtklib,
     rb"\A\d{4}/\d\d/\d\d +\S+ +-?\d+\.\d{4} ": "RTKLIB without degrees: set its format to llh",
     rb"\A#.*\n(#.*\n)*#\s+IMAGE_ID, QW": _of_colmap,

@@ -83,7 +83,7 @@ def _refuse_without_arm(arguments: Any, is_arm: bool, has_hand_file: bool) -> No
 
 
 def _has_samples(path: Any) -> bool:
-    """Return whether a path is that of the samples of an arm."""
+    """Return whether a path is a file or a folder with the samples of an arm."""
     from hand_eye_calib.extras.stops.pose_files import is_pose_folder
 
     return path.suffix in _SAMPLES or is_pose_folder(Path(path))

@@ -254,8 +254,8 @@ def _check_reading(reading: Reading, setup: str | None) -> list[Finding]:
 def _is_copy(fit: RobotWorld) -> bool:
     """Return whether both mounts are the identity.
 
-    No camera is at the origin of a hand or a base, with the same axes, while a target is at the
-    origin of the other.
+    Both sides then hold the same poses: camera and target cannot both be exactly at the origins of
+    hand and base.
     """
     offsets = np.r_[se3.log(fit.Ts_parent_child[0]), se3.log(fit.Ts_world_world[0])]
     sigmas = np.sqrt(np.diag(fit.covariance))

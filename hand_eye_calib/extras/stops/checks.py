@@ -196,7 +196,7 @@ def _objective(sample: StopPoses, fit: RoughFit) -> float:
 def _check_conventions(
     poses: StopPoses, mistakes: Mistakes, rivals: Sequence[Mistakes]
 ) -> list[Finding]:
-    """Return findings of mistakes that no option repairs for certain."""
+    """Return findings of mistakes that cannot be repaired with certainty."""
     findings = []
     if mistakes.is_inverse and not poses.is_arm:
         findings.append(finding("inverse_stops", "child", options={"child_invert": "poses"}))

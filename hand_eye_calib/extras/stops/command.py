@@ -143,7 +143,7 @@ def _refuse_ignored(arguments: Namespace) -> None:
 
 
 def _measuring(config: CalibratorConfig, streams: Mapping[str, Trajectory]) -> CalibratorConfig:
-    """Return the options with what the files measure, unless the user set it."""
+    """Set what each stream measures to what its file contains, unless the user set an option."""
     for stream, trajectory in streams.items():
         if trajectory.measures not in ("poses", "rotations"):
             raise ConfigError(

@@ -46,7 +46,7 @@ class StopPoses:
         Poses of the parent sensor in its world, and of the child sensor in its own world. For an
         arm: poses of the hand in the base, and of the target in the camera.
     is_arm : bool
-        Whether the camera may be on the hand or beside the robot.
+        True for an arm: both setups are tried, a camera on the hand and beside the robot.
     has_positions : bool
         False if only the rotations are known.
     """

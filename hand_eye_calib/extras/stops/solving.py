@@ -225,7 +225,7 @@ def _with_user_values(issue: Finding, config: CalibratorConfig) -> Finding:
 
 
 def _options_of(repairs: Sequence[Finding], config: CalibratorConfig) -> dict[str, Any]:
-    """Return the options of all repairs, multiplied by a factor that the user set."""
+    """Return the options of all repairs; parent_scale is multiplied by the factor of the user."""
     options: dict[str, Any] = {}
     for repair in repairs:
         options |= repair.options

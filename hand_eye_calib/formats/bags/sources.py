@@ -32,8 +32,9 @@ from hand_eye_calib.formats.transforms import TfSource, TfStream
 
 Source = str | TfSource
 
-# A stamp is wrong if its delay against bag time is this much (s) farther from both neighbours than
-# they are from each other, beyond the usual step. Computers delay messages for less.
+# The delay of a message is its stamp against bag time. A stamp is wrong if its delay differs from
+# the delays of both neighbours by this much (s) more than these differ from each other, after the
+# usual step is subtracted. Messages are delayed by less on a busy computer.
 _JUMP_S = 0.5
 # Stamps cannot be used if this share of them is 0, or repeats another stamp.
 _MOSTLY = 0.5

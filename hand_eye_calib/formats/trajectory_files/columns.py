@@ -159,11 +159,12 @@ def named_columns(names: Sequence[str]) -> tuple[dict[str, list[int]], list[str]
         aliases = text.split()
         places = [place for place, name in enumerate(plain) if name in aliases]
         if not places:
-            # The longest known end of a path counts: position_x rather than x.
+            # The last part of a path counts, such as position_x of pose.position_x. Short names are
+            # too common as a part, but for those of _ENDS.
             ends = tuple(f"_{end}" for end in aliases if "_" in end or end in _ENDS)
             places = [place for place, name in enumerate(plain) if name.endswith(ends)]
         if quantity in ROTATION_VECTOR:
-            # Brief names in degrees are rather angles, whose order no name states.
+            # rx, ry and rz in degrees are Euler angles of an unknown order, not a rotation vector.
             is_angle = [is_brief(name) and unit == "deg" for name, unit in split]
             places = [place for place in places if not is_angle[place]]
         if places:

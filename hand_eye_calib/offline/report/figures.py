@@ -363,7 +363,7 @@ def _residuals(calibration: Calibration, residuals: Residuals) -> Drawn:
 
 
 def _draw_residuals(panel: Axes, times: FloatArray, values: FloatArray, is_out: BoolArray) -> None:
-    """Draw the sizes (K,) of residuals, above zero, and mark the rejected ones."""
+    """Draw the sizes (K,) of residuals, all positive, and mark the rejected ones."""
     dots = np.flatnonzero(~is_out)
     crosses = np.flatnonzero(is_out)
     dots = dots[_downsample(len(dots))]

@@ -56,7 +56,7 @@ def to_transform(calibration: Calibration, is_mounting: bool = False) -> Transfo
     ----------
     calibration : Calibration
     is_mounting : bool
-        Whether ``header.frame_id`` is the frame on which the child sensor is mounted instead.
+        Replace the parent sensor's frame by the frame on which the child sensor is mounted.
     """
     frame = calibration.parent_frame
     T = calibration.T_parent_child

@@ -187,7 +187,7 @@ class Robot:
 
 
 def _with_axis_of(installed: Extrinsic, calibration: Calibration) -> Calibration:
-    """Return a result with the installed value on its only unobservable axis of translation."""
+    """Return a result whose only unobservable axis of translation has the installed value."""
     hidden = calibration.unobservable()
     if len(hidden) != 1:
         return calibration

@@ -167,6 +167,7 @@ def _display(address: str) -> Iterator[Callable[[View, bool], None]]:
             before = printed.copy()
             printed.clear()
             for line in lines(view):
+                # A line is printed again only if more than its numbers has changed.
                 key = re.sub(r"[\d.]+", "", line)
                 printed.add(key)
                 if key not in before:
