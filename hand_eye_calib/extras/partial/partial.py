@@ -210,7 +210,7 @@ def _check_path(
     is_near = is_observed and share < _UNRELATED_PATH
     # Does a unit or a scale explain the path?
     with contextlib.suppress(np.linalg.LinAlgError):
-        scaled = paths.solve(True)
+        scaled = paths.solve(with_scale=True)
         unexplained = paths.unexplained_share(scaled)
         unit = _check_units(scaled, paths)
         if unit and not is_near and unexplained < _UNRELATED_PATH:
