@@ -56,15 +56,13 @@ VALUES = {
 }
 
 # Options that a kind of streams refuses: of methods of the paper, of lengths, of orientations.
-_OF_WHOLE_POSES = {"method", "reference", "backend"}
+_OF_WHOLE_POSES = {"method", "reference", "backend", "threshold", "min_inlier_fraction"}
 REFUSED = {
     "poses": set(),
-    "positions": {"threshold", "min_inlier_fraction", "parent_measures"}
-    | {"child_invert", "child_quaternion"}
-    | _OF_WHOLE_POSES,
+    "positions": {"parent_measures", "child_invert", "child_quaternion"} | _OF_WHOLE_POSES,
     "rotations": {"scale", "parent_scale"} | _OF_WHOLE_POSES,
     "rates": {"scale", "parent_scale", "child_invert", "child_quaternion"} | _OF_WHOLE_POSES,
-    "stops": {"threshold", "min_inlier_fraction", "max_pairs", "max_gap", "time_offset"}
+    "stops": {"max_pairs", "max_gap", "time_offset"}
     | {"keyframe.min_translation", "keyframe.min_rotation", "keyframe.min_interval"}
     | {"parent_kind", "child_kind"}
     | _OF_WHOLE_POSES,

@@ -26,11 +26,6 @@ _OF_POSES: dict[str, tuple[object, ...]] = {
     "method": ("auto", "adaptive"),
     "reference": ("auto",),
     "backend": ("fast",),
-}
-
-# Positions have no cross-check: its options keep their defaults.
-_OF_POSITIONS: dict[str, tuple[object, ...]] = {
-    **_OF_POSES,
     "threshold": (CalibratorConfig.threshold,),
     "min_inlier_fraction": (CalibratorConfig.min_inlier_fraction,),
 }
@@ -157,7 +152,7 @@ POSITIONS = Kind(
     solve=_solve_positions,
     check=check,
     least_clock_change_s=_LEAST_CHANGE_OF_POSITIONS_S,
-    allowed=_OF_POSITIONS,
+    allowed=_OF_POSES,
     is_timed_by_speed=True,
 )
 
