@@ -21,7 +21,8 @@ _DURATIONS = ((90.0, "s", 1), (5_400.0, "min", 60), (math.inf, "h", 3600))
 # Largest number of decimals.
 _MOST_DECIMALS = 6
 
-_ABOUT = {"roll": "x", "pitch": "y", "yaw": "z"}
+#: Direction of the axis of each rotation, by the name of its angle.
+ABOUT = {"roll": "x", "pitch": "y", "yaw": "z"}
 
 
 def length(metres: float) -> str:
@@ -61,7 +62,7 @@ def amount_beside(axis: str, value: float, other: float) -> str:
 
 def change(axis: str, value: float, sigma: float) -> str:
     """A difference along or about an axis (m, rad) with its sign and standard deviation."""
-    unit, factor = ("deg", math.degrees(1.0)) if axis in _ABOUT else ("cm", 100.0)
+    unit, factor = ("deg", math.degrees(1.0)) if axis in ABOUT else ("cm", 100.0)
     text = with_sigma(factor * value, factor * sigma, 1).replace("+/-", "±")
     if not math.isfinite(sigma):
         return text
@@ -75,8 +76,8 @@ def capital(text: str) -> str:
 
 def axes_in_words(axes: Sequence[str]) -> str:
     """Name axes as in "x and the rotation about z" for x and yaw."""
-    names = [axis for axis in axes if axis not in _ABOUT]
-    about = [_ABOUT[axis] for axis in axes if axis in _ABOUT]
+    names = [axis for axis in axes if axis not in ABOUT]
+    about = [ABOUT[axis] for axis in axes if axis in ABOUT]
     if about:
         rotations = "rotation" if len(about) == 1 else "rotations"
         names.append(f"the {rotations} about {listing(about)}")

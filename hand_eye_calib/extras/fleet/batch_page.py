@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from hand_eye_calib.core.base.errors import printable
 from hand_eye_calib.core.base.plain import Document
-from hand_eye_calib.core.base.text import counted, listing, with_sigma
+from hand_eye_calib.core.base.text import ABOUT, counted, listing, with_sigma
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.extras.fleet.together import row_of_result
 from hand_eye_calib.offline.report.figures import (
@@ -31,14 +31,6 @@ from hand_eye_calib.offline.report.figures import (
 from hand_eye_calib.offline.report.report import TONES, page
 
 _AXES = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}
-_TITLES = {
-    "x": "x",
-    "y": "y",
-    "z": "z",
-    "roll": "about x",
-    "pitch": "about y",
-    "yaw": "about z",
-}
 _GRAVITY = ("bad", "warn", "good")
 # Height of the figure of a vehicle, inches.
 _HEIGHT = 3.9
@@ -115,7 +107,7 @@ def _trend(result: Calibration, number: int) -> Drawn:
         values, sigmas = factor * np.where(np.isfinite(points), points, np.nan).T
         band = factor * LOOK.sigmas * sigma
         is_determined = np.isfinite(band)
-        title = _TITLES[axis]
+        title = f"about {ABOUT[axis]}" if axis in ABOUT else axis
         title += f", {unit}" if is_determined else ": not determined"
         panel.set_title(title, loc="left")
         panel.axhline(0, color=GRID, lw=0.8)

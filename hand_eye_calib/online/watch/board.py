@@ -14,7 +14,15 @@ from typing import Any, NamedTuple
 from hand_eye_calib.core.base.errors import printable
 from hand_eye_calib.core.base.plain import from_plain
 from hand_eye_calib.core.base.stats import LARGEST_OF_SIX
-from hand_eye_calib.core.base.text import amount, capital, change, duration, fixed, two_digits
+from hand_eye_calib.core.base.text import (
+    ABOUT,
+    amount,
+    capital,
+    change,
+    duration,
+    fixed,
+    two_digits,
+)
 from hand_eye_calib.core.results.records import AXES, ROTATIONS
 from hand_eye_calib.online.live.progress import AxisProgress
 from hand_eye_calib.online.live.state import (
@@ -45,14 +53,8 @@ CHANGE_MOTION = "CHANGE THE MOTION"
 DONE = "DONE"
 
 # Names of the axes.
-_NAMES = {
-    "x": "along x",
-    "y": "along y",
-    "z": "along z",
-    "roll": "about x",
-    "pitch": "about y",
-    "yaw": "about z",
-}
+_NAMES = {axis: f"along {axis}" for axis in "xyz"}
+_NAMES |= {axis: f"about {direction}" for axis, direction in ABOUT.items()}
 # Meaning of the axes on a vehicle (REP 103).
 _ON_A_VEHICLE = {
     "x": "forward",
