@@ -78,4 +78,4 @@ def excess_covariance(answer: Assessment, opinions: Sequence[Assessment]) -> Flo
         is_comparable = opinion.sigmas < _COMPARABLE * sigmas
         excesses.append(np.where(is_comparable, np.maximum(difference**2 - expected, 0.0), 0.0))
     variances = medians(np.array(excesses).T)
-    return se3.turned(answer.T_parent_child[:3, :3].T, np.diag(variances))
+    return se3.turned(se3.rotation_of(answer.T_parent_child).T, np.diag(variances))

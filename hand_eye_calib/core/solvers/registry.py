@@ -45,7 +45,7 @@ _SOLVERS = {
     "dnlo": _Solver(dnlo.solve),
     "dnl": _Solver(all_pairs.solve_dnl),
     "park": _Solver(all_pairs.solve_park),
-    "taylor": _Solver(all_pairs.solve_park),  # the same solution as park
+    "taylor": _Solver(all_pairs.solve_park),
     "zhuang": _Solver(zhuang.solve),
     "ali": _Solver(all_pairs.solve_ali),
     "robust": _Solver(robust.solve, robust.solve, robust.solve_best_stride),

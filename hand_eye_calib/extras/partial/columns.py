@@ -310,7 +310,8 @@ def _windows(
     if n_windows < _LEAST_WINDOWS:
         return None
     step = max(round(_STEP_S / interval_s), 1)
-    predicted = se3.times(poses[:, :3, :3], lever_arm) + poses[:, :3, 3]
+    rotations = se3.rotation_of(poses)
+    predicted = se3.times(rotations, lever_arm) + se3.translation_of(poses)
     spans_s, velocities, accelerations = _derivatives(stamps_s, predicted, step)
     measured_accelerations = _derivatives(stamps_s, positions, step)[2]
     usual_s = 4 * step * interval_s
@@ -332,7 +333,7 @@ def _windows(
     path = se3.times(to_world, path)
     return _Windows(
         is_used=used,
-        rotations=to_world @ split(poses[:, :3, :3])[enough],
+        rotations=to_world @ split(rotations)[enough],
         path=path,
         residuals=measured - path,
         velocities=se3.times(to_world, split(velocities)[enough]),

@@ -40,7 +40,7 @@ TUM format:
   {TRUTH_FILE}  the true extrinsic, one pose: the child sensor in the parent sensor's frame
   bag, bag.bag   with --bag: topics {PARENT_TOPIC} and {CHILD_TOPIC} (nav_msgs/msg/Odometry)"""
 
-# The help of at most a screen.
+# Short help that fits on one screen.
 _BRIEF = f"""\
 most used options:
   --out DIR         directory to make; it must be empty or not exist

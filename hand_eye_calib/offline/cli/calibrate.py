@@ -35,7 +35,7 @@ examples:
   hand_eye_calib replay my_bag --topics /lidar/odometry /front/vio odom:rear --out rig
   hand_eye_calib replay live/journal --out result"""
 
-# The help of at most a screen.
+# Short help that fits on one screen.
 _BRIEF = """\
 PATH:
   lidar.tum camera.tum          trajectory files of parent and child: TUM, KITTI, EuRoC, CSV

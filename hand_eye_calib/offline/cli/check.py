@@ -27,7 +27,7 @@ examples:
   hand_eye_calib check lidar.txt camera.txt
   hand_eye_calib check lidar.txt gnss.csv"""
 
-# The help of at most a screen.
+# Short help that fits on one screen.
 _BRIEF = f"""\
 PATH:
   my_bag                   a bag of ROS 2 or ROS 1 with two pose topics

@@ -6,7 +6,7 @@ import textwrap
 
 from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig
 
-# The help of at most a screen.
+# Short help that fits on one screen.
 _BRIEF = """\
 examples:
   hand_eye_calib calibrator --ros-args -r parent_odom:=/lidar/odometry -r child_odom:=/camera/odom
