@@ -111,7 +111,7 @@ def test_replay_finds_the_extrinsic_and_says_it_in_both_directions(run, new_bag,
     rows = re.findall(r"^  [xyz] +(\S+) \+/- \d\S* m ", out, flags=re.MULTILINE)
     truth = np.concatenate([TRUTH[:3, 3], se3.inverse(TRUTH)[:3, 3]])
     np.testing.assert_allclose(np.array(rows, dtype=float), truth, atol=1e-3)
-    assert re.search(r"  yaw +\S+ \+/- \d\S* deg \(.* measured, ", out)
+    assert re.search(r"  yaw +\S+ \+/- \d\S* deg  \(.* measured, ", out)
     assert "\nNext\n" not in out
     assert "\nTo publish it (USE)\n  ros2 run tf2_ros static_transform_publisher" in out
 

@@ -119,13 +119,25 @@ def test_one_sigma_is_stated_on_the_terminal_in_python_and_in_documents():
     assert result.sigmas_measured[0] == pytest.approx(measured_m)
     assert result.allowance[0] == pytest.approx(allowance_m)
     assert "x 0.3 +/- 0.0091" in repr(result)
-    assert "  x 0.3000 +/- 0.0091 m (4.3 mm measured, 8 mm allowance for constant errors)" in (
-        as_lines(result, with_details=True)
-    )
-    explained = "includes an allowance of up to 8 mm and 0.057 deg for constant odometry errors"
-    assert f"  +/- is 1 sigma; it {explained}" in as_lines(result)
+    lines = as_lines(result)
+    assert "  x        0.3000 +/- 0.0091 m  (4.3 mm measured, 8 mm allowance)" in lines
+    assert any("the allowance is for constant odometry errors" in line for line in lines)
+    assert any("--parent-kind or --child-kind exact" in line for line in lines)
 
 
 def test_the_axis_of_a_sigma_with_only_a_measured_part_has_no_parts_printed():
     result = calibration(np.eye(3), (0.1, 0.1, 0.1))
     assert not any("allowance" in line for line in as_lines(result, with_details=True))
+
+
+def test_an_axis_with_a_negligible_allowance_has_no_parts_printed():
+    measured = np.diag(np.full(6, 0.02**2))
+    allowance = np.diag([0.0, 0.0, 1e-14, 0.0, 0.0, 0.0])
+    result = made(
+        T_parent_child=transform(np.eye(3)),
+        covariance_measured=measured,
+        covariance_allowance=allowance,
+        status=SolveStatus.OK,
+        observability_measured=dofs([0.02] * 6),
+    )
+    assert "  z          0.100 +/- 0.020 m" in as_lines(result)

@@ -15,7 +15,7 @@ from motions import child_of, disturbed, wandering_poses, write_pair
 pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
 
-from matplotlib.lines import Line2D
+from matplotlib.lines import AxLine
 from result_making import NAMES, calibration, dofs, written_finding
 
 import hand_eye_calib as hec
@@ -337,8 +337,9 @@ def test_what_is_installed_is_compared_axis_by_axis_and_an_axis_may_have_its_own
     assert "robot.urdf <b>" in page.text
     assert "mark: the target, 2 cm and 0.3 deg" in before.text
     assert "mark: the target, 2 cm, 0.3 deg and x 20 cm" in page.text
+    # Each axis has a bar of the standard deviation and one of its measured part, but z is unknown.
     widths = [[a["style"] for a in report.all("i")] for report in (before, page)]
-    assert [a == b for a, b in zip(*widths, strict=True)] == [False] + [True] * 5
+    assert [a == b for a, b in zip(*widths, strict=True)] == [False] * 2 + [True] * 9
     hec.save(compared, tmp_path)
     (file,) = tmp_path.glob("*.yaml")
     stated = yaml.safe_load(file.read_text())["comparison"]
@@ -419,17 +420,33 @@ def test_an_unknown_axis_is_a_line_along_that_axis(unknown):
         covariance_measured=covariance,
         observability_measured=dofs(sigmas, unknown),
     )
+    place = dict(zip("xyz", result.translation, strict=True))
     for panel, axes in zip(hec.plot(result).axes, _VIEWS, strict=True):
-        place = dict(zip("xyz", result.translation, strict=True))
-        spans = {
-            axis: [
-                line for line in panel.lines if len({*data(line)}) == 2 and line.get_ls() == "--"
-            ]
-            for axis, data in ((axes[0], Line2D.get_xdata), (axes[1], Line2D.get_ydata))
-        }
-        assert {axis for axis, lines in spans.items() if lines} == {*axes} & {unknown}
-        for axis, lines in spans.items():
-            other = axes.replace(axis, "")
-            for line in lines:
-                across = line.get_ydata() if axis == axes[0] else line.get_xdata()
-                np.testing.assert_allclose(across, place[other])
+        lines = dashed_lines(panel)
+        assert len(lines) == (unknown in axes)
+        for line in lines:
+            assert line.get_xy1() == tuple(place[axis] for axis in axes)
+            assert line.get_slope() == (0.0 if unknown == axes[0] else np.inf)
+
+
+def dashed_lines(panel):
+    return [line for line in panel.lines if isinstance(line, AxLine)]
+
+
+def test_an_unknown_direction_between_axes_is_drawn_as_it_is():
+    direction = np.array([0.6, 0.0, 0.8])
+    in_parent = np.diag(np.full(3, 1e-6)) + 9.0 * np.outer(direction, direction)
+    covariance = np.diag(np.full(6, 1e-6))
+    T = se3.exp(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
+    covariance[:3, :3] = T[:3, :3].T @ in_parent @ T[:3, :3]
+    result = calibration(
+        T_parent_child=T,
+        covariance_measured=covariance,
+        observability_measured=dofs([np.inf, 1e-3, np.inf, 1e-3, 1e-3, 1e-3]),
+    )
+    slopes = {}
+    for panel, axes in zip(hec.plot(result).axes, _VIEWS, strict=True):
+        slopes[axes] = [line.get_slope() for line in dashed_lines(panel)]
+    assert slopes["xy"] == pytest.approx([0.0], abs=1e-6)
+    assert slopes["xz"] == pytest.approx([0.8 / 0.6])
+    assert slopes["yz"] == [np.inf]

@@ -35,6 +35,9 @@ _FORMAT = "hand_eye_calib/extrinsic"
 _VERSION = 2
 _READABLE = (1, 2)
 
+# Share of a standard deviation below which an allowance changes none of its two digits.
+_NEGLIGIBLE_SHARE = 0.01
+
 # Fields that a document has under other names, as matrices; and those that files do not have.
 _TRANSFORMS = ("T_parent_child", "T_method", "T_base_parent")
 _COVARIANCES = ("covariance_measured", "covariance_allowance")
@@ -275,8 +278,8 @@ def printed_numbers(
 def parts_of_sigmas(transform: Notation) -> dict[str, str]:
     """Return the parts of each printed standard deviation by axis, in words.
 
-    An example is "4 mm measured, 8 mm allowance for constant errors". Axes without an allowance and
-    unknown axes are left out.
+    An example is "4 mm measured, 8 mm allowance". Axes with a negligible allowance and unknown axes
+    are left out.
     """
     sigmas = np.r_[transform.sigma_translation, np.radians(transform.sigma_rpy_deg)]
     measured = np.r_[
@@ -284,24 +287,25 @@ def parts_of_sigmas(transform: Notation) -> dict[str, str]:
     ]
     parts = {}
     for axis, sigma, of_recording in zip(AXES, sigmas.tolist(), measured.tolist(), strict=True):
-        if math.isfinite(sigma) and sigma > of_recording:
-            rest = amount(axis, math.sqrt(sigma**2 - of_recording**2))
+        if not math.isfinite(sigma):
+            continue
+        allowance = math.sqrt(max(sigma**2 - of_recording**2, 0.0))
+        if allowance > _NEGLIGIBLE_SHARE * sigma:
             recorded = amount(axis, of_recording)
-            parts[axis] = f"{recorded} measured, {rest} allowance for constant errors"
+            parts[axis] = f"{recorded} measured, {amount(axis, allowance)} allowance"
     return parts
 
 
 def allowance_in_words(result: Result) -> str:
-    """Return the size of the allowance in the standard deviations; empty without an allowance."""
-    allowance = np.where(np.isfinite(result.sigmas), result.allowance, 0.0)
-    sizes = []
-    for axis, largest in (("x", allowance[:3].max()), ("roll", allowance[3:].max())):
-        if largest > 0.0:
-            sizes.append(amount(axis, float(largest)))
-    if not sizes:
+    """Explain the allowance in the standard deviations; empty without an allowance."""
+    is_known = np.isfinite(result.sigmas)
+    if not result.allowance[is_known].any():
         return ""
     of = "" if result.measured == "positions" else "odometry "
-    return f"includes an allowance of up to {listing(sizes)} for constant {of}errors"
+    return (
+        f"the allowance is for constant {of}errors, which no recording reveals; a sensor without "
+        "them, such as motion capture, needs parent_kind or child_kind exact"
+    )
 
 
 # ------------------------------------------------------------------------ for robots

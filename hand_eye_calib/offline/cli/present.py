@@ -195,7 +195,10 @@ def _extrinsic_lines(calibration: Calibration, with_details: bool) -> list[str]:
             continue
         out_of_reach = () if name in extra else calibration.out_of_reach
         lines.append(f"{source} in {target}: maps coordinates of {source} into {target}")
-        lines += transform_lines(transforms[name], out_of_reach, with_details)
+        if name == "T_parent_child" or with_details:
+            lines += transform_lines(transforms[name], out_of_reach, with_details)
+        else:
+            lines += compact_lines(transforms[name], out_of_reach)
         if name == "T_parent_child":
             lines += allowance_lines(calibration)
     return lines
@@ -254,23 +257,33 @@ def next_steps(
 
 
 def allowance_lines(calibration: Calibration) -> list[str]:
-    """Return a line on the allowance that the printed standard deviations contain, if any."""
+    """Return lines on the allowance that the printed standard deviations contain, if any."""
     words = allowance_in_words(calibration)
-    return [f"  +/- is 1 sigma; it {words}"] if words else []
+    return wrapped(f"+/- is 1 sigma; {words}", "  ", "  ") if words else []
 
 
 def transform_lines(
-    transform: "Notation", out_of_reach: Sequence[str] = (), with_details: bool = False
+    transform: "Notation", out_of_reach: Sequence[str] = (), with_quaternion: bool = False
 ) -> Iterator[str]:
-    """Yield a row for each axis: the translation along it and an angle, with standard deviations.
+    """Yield a row for each number of a transform, with the parts of its standard deviation."""
+    parts = parts_of_sigmas(transform)
+    for axis, number in printed_numbers(transform, out_of_reach).items():
+        if "," in axis:  # a text about three axes
+            yield f"  {axis} are {number}"
+        else:
+            explained = f"  ({parts[axis]})" if axis in parts else ""
+            yield f"  {axis:<5} {number:>22}{explained}"
+    if with_quaternion:
+        quaternion = "unknown"
+        if transform.quat_xyzw is not None:
+            coefficients = zip("xyzw", transform.quat_xyzw, strict=True)
+            quaternion = " ".join(f"{name} {value:.6f}" for name, value in coefficients)
+        yield f"  quaternion {quaternion}"
 
-    With details, there is a row for each number with the parts of its standard deviation, and a row
-    with the quaternion.
-    """
+
+def compact_lines(transform: "Notation", out_of_reach: Sequence[str] = ()) -> Iterator[str]:
+    """Yield a row for each axis: the translation along it and an angle."""
     numbers = printed_numbers(transform, out_of_reach)
-    if with_details:
-        yield from _detailed_lines(transform, numbers)
-        return
     translations = _column(numbers, TRANSLATIONS, 1)
     rotations = _column(numbers, ROTATIONS, 5)
     for translation, rotation in zip(translations, rotations, strict=True):
@@ -282,17 +295,3 @@ def _column(numbers: Mapping[str, str], axes: Sequence[str], width: int) -> list
     if text := numbers.get(listing(axes)):
         return ["", f"{listing(axes)} are {text}", ""]
     return [f"{axis:<{width}} {numbers[axis]:>24}" for axis in axes]
-
-
-def _detailed_lines(transform: "Notation", numbers: Mapping[str, str]) -> Iterator[str]:
-    """Yield a row for each number with the parts of its standard deviation, and the quaternion."""
-    parts = parts_of_sigmas(transform)
-    for axis, number in numbers.items():
-        details = f" ({parts[axis]})" if axis in parts else ""
-        verb = " are" if "," in axis else ""
-        yield f"  {axis}{verb} {number}{details}"
-    quaternion = "unknown"
-    if transform.quat_xyzw is not None:
-        coefficients = zip("xyzw", transform.quat_xyzw, strict=True)
-        quaternion = " ".join(f"{name} {value:.6f}" for name, value in coefficients)
-    yield f"  quaternion {quaternion}"

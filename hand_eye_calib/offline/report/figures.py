@@ -9,6 +9,7 @@ display nor global state.
 """
 
 import io
+import math
 import re
 import warnings
 from collections.abc import Iterator, Sequence
@@ -27,7 +28,9 @@ from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.errors import printable
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.text import amount, angle, length, listing, share
+from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.core.results.document import UNKNOWN_M
 from hand_eye_calib.core.results.records import Residuals
 from hand_eye_calib.offline.report.evidence import Evidence, StreamView
 
@@ -73,6 +76,8 @@ class Look(NamedTuple):
         Powers of ten that a bar covers.
     bar_above : float
         Powers of ten of a bar above its target.
+    end_on : float
+        Share of an unknown direction in a view below which its line is not drawn.
     points : int
         Most points of a line, and most single dots.
     vehicles : int
@@ -87,6 +92,7 @@ class Look(NamedTuple):
     near_m: float = 0.5
     bar_decades: float = 4.0
     bar_above: float = 1.0
+    end_on: float = 0.1
     points: int = 1000
     vehicles: int = 4
 
@@ -475,23 +481,42 @@ def draw_views(panels: Sequence[Axes], *calibrations: Calibration) -> None:
 def _draw_uncertainty(
     panel: Axes, T: FloatArray, calibration: Calibration, rows: Sequence[int]
 ) -> None:
-    """Draw the ellipse of the child's position, or a line along each unknown axis.
+    """Draw the ellipse of the child's position, or a line along each unknown direction.
 
     ``T`` are two rows of the child's pose, ``rows`` the axes of the view.
     """
     x, y = T[:, 3]
-    is_known = np.isfinite(calibration.sigmas[rows])
-    if not is_known[0]:
-        panel.axhline(y, color=CHILD, ls="--", lw=1.0)
-    if not is_known[1]:
-        panel.axvline(x, color=CHILD, ls="--", lw=1.0)
-    if not is_known.all():
+    covariance, unknown = _spread_of_position(calibration)
+    is_unknown = False
+    for across, up in unknown[:, rows]:
+        if math.hypot(across, up) > LOOK.end_on:
+            is_unknown = True
+            slope = up / across if abs(across) > 1e-9 else math.inf
+            panel.axline((x, y), slope=slope, color=CHILD, ls="--", lw=1.0)
+    if is_unknown:
         return
-    R = T[:, :3]
-    variances, axes = np.linalg.eigh(R @ calibration.covariance[:3, :3] @ R.T)
+    variances, axes = np.linalg.eigh(covariance[np.ix_(rows, rows)])
     width, height = 2 * LOOK.sigmas * np.sqrt(np.maximum(variances, 0.0))
     angle_deg = float(np.degrees(np.arctan2(axes[1, 0], axes[0, 0])))
     panel.add_patch(Ellipse((x, y), width, height, angle=angle_deg, color=CHILD, alpha=0.3))
+
+
+def _spread_of_position(calibration: Calibration) -> tuple[FloatArray, FloatArray]:
+    """Return covariance and unknown directions of the child's position, in the parent's axes.
+
+    The covariance (3, 3), m^2, is without the unknown directions, which are unit vectors (K, 3).
+    """
+    sigmas_m = calibration.sigmas[:3]
+    is_unknown = ~np.isfinite(sigmas_m)
+    covariance = calibration.covariance[:3, :3]
+    if np.isfinite(covariance).all():
+        R = se3.rotation_of(calibration.T_parent_child)
+        variances, directions = np.linalg.eigh(R @ covariance @ R.T)
+        is_vague = (variances > UNKNOWN_M**2) & is_unknown.any()
+        if is_vague.any() or not is_unknown.any():
+            known = directions[:, ~is_vague]
+            return (known * variances[~is_vague]) @ known.T, directions[:, is_vague].T
+    return np.diag(np.where(is_unknown, 0.0, sigmas_m) ** 2), np.eye(3)[is_unknown]
 
 
 def _draw_sensor(

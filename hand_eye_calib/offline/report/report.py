@@ -22,6 +22,7 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
 from hand_eye_calib.core.results.document import (
     allowance_in_words,
+    parts_of_sigmas,
     printed_numbers,
     summary,
     transforms_of,
@@ -70,7 +71,9 @@ _TEMPLATES = jinja2.Environment(
 )
 _TEMPLATES.filters |= {"number": text.fixed, "printable": printable}
 _TEMPLATES.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
-_TEMPLATES.globals |= dict(amount=text.amount, change=text.change, counted=text.counted)
+_TEMPLATES.globals |= dict(
+    amount=text.amount, change=text.change, counted=text.counted, capital=text.capital
+)
 _TEMPLATES.globals["axis_names"] = _AXIS_NAMES
 
 
@@ -140,6 +143,7 @@ def render(
         kind=_kind_of_result(calibration),
         directions=[*transforms_of(calibration).values()][:2],
         numbers_of=partial(printed_numbers, out_of_reach=calibration.out_of_reach, sign="±"),
+        parts_of=parts_of_sigmas,
         axes=list(_axes(calibration)),
         allowance=allowance_in_words(calibration),
         advice=advice,
@@ -200,7 +204,11 @@ def _targets(calibration: Calibration) -> str:
 
 
 class AxisRow(NamedTuple):
-    """Row of the table of uncertainties; ``bar`` is a length in per cent."""
+    """Row of the table of uncertainties.
+
+    ``bar`` is the length of the bar of the standard deviation in per cent, ``measured`` that of its
+    measured part.
+    """
 
     name: str
     title: str
@@ -208,20 +216,24 @@ class AxisRow(NamedTuple):
     verdict: str
     words: str
     bar: float
+    measured: float
 
 
 def _axes(calibration: Calibration) -> Iterable[AxisRow]:
     """Yield the rows of the table of uncertainties, along and about the parent's axes."""
     is_bad = calibration.verdict is Verdict.DO_NOT_USE
-    for dof in calibration.observability:
+    sigmas_measured = calibration.sigmas_measured.tolist()
+    for dof, measured in zip(calibration.observability, sigmas_measured, strict=True):
         if dof.name not in calibration.out_of_reach:
+            target = target_of(dof.name, calibration)
             yield AxisRow(
                 dof.name,
                 _AXIS_NAMES[dof.name],
                 text.amount(dof.name, dof.sigma),
                 dof.verdict.value,
                 _WORDS["unobservable" if is_bad else dof.verdict.value],
-                _bar(dof.sigma / target_of(dof.name, calibration)),
+                _bar(dof.sigma / target),
+                _bar(measured / target),
             )
 
 
