@@ -279,6 +279,26 @@ def test_a_misspelt_name_is_answered_with_a_similar_one(refused, new_bag, tmp_pa
     assert f"; did you mean {PARENT_TOPIC}? The bag has" in line
 
 
+def test_a_bag_without_an_obvious_pair_is_answered_with_a_command_that_runs(run, refused, tmp_path):
+    parent, child = drive()
+    names = ("/lidar/odom", "/camera/odom", "/gnss/odom")
+    streams = {
+        name: (poses, ODOMETRY) for name, poses in zip(names, (parent, child, child), strict=True)
+    }
+    streams["/gnss/odom"] = (dataclasses.replace(child, sensor_frame="gnss"), ODOMETRY)
+    bag = tmp_path / "three bags"
+    write_bag(bag, streams)
+    line = refused("calibrate", bag)
+    message, _, command = line.partition(". Run: ")
+    assert "error: 3 topics have poses: /lidar/odom (nav_msgs/msg/Odometry, 120 mess" in message
+    program, *arguments = shlex.split(command)
+    assert program == "hand_eye_calib"
+    assert arguments[:2] == ["calibrate", str(bag)]
+    code, out, _ = run(*arguments)
+    assert code == 0
+    assert "camera in lidar" in out
+
+
 @pytest.mark.parametrize("command", [["calibrate"], ["check"], ["calibrate", "lidar.tum"]])
 def test_a_file_that_is_given_twice_is_refused(run, command):
     code, out, err = run(*command, "camera.tum", "camera.tum")

@@ -5,7 +5,7 @@ line and node print it as it is. Anything else that escapes is a defect of the p
 traceback.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
@@ -46,6 +46,20 @@ class ConfigError(HandEyeCalibError, ValueError):
 
 class InputError(HandEyeCalibError, ValueError):
     """Data that cannot be used: not finite, wrong shape, unreadable, contradictory."""
+
+
+class UnclearStreamsError(InputError):
+    """A recording has no obvious pair of streams.
+
+    Attributes
+    ----------
+    options : dict of str to str
+        Options that name the likeliest streams; empty if the recording has none.
+    """
+
+    def __init__(self, message: str, options: Mapping[str, str]) -> None:
+        super().__init__(message)
+        self.options = {**options}
 
 
 class NoPoseError(InputError):

@@ -243,6 +243,10 @@ _ROWS.append(MessageType(POINTS_TYPE, _OF_POSES))
 MESSAGE_TYPES = {row.name: row for row in _ROWS}
 #: Types with a whole pose in each message.
 POSE_TYPES = tuple(row.name for row in _ROWS if row.unpack is _pose)
+#: Types whose fields are a whole pose.
+FIELD_POSE_TYPES = tuple(
+    name for name, fields in _FIELDS.items() if "qw=" in fields or "roll" in fields
+)
 
 
 def measured_as(message_type: str, wanted: str, source: object) -> str:

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -18,27 +18,13 @@ from hand_eye_calib.core.base.registry import BAG_READINGS
 from hand_eye_calib.core.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.formats.bags import messages, roles, sources
+from hand_eye_calib.formats.bags.choice import TopicInfo, choose
 from hand_eye_calib.formats.bags.folders import losses_of, open_bags
 from hand_eye_calib.formats.bags.messages import Run
 from hand_eye_calib.formats.bags.pose_table import PoseTable
 from hand_eye_calib.formats.bags.sources import Reading, Source
 from hand_eye_calib.formats.bags.storage import MessageKind
-from hand_eye_calib.formats.files import LONGEST_NAME
 from hand_eye_calib.formats.transforms import TfSource, TfStream
-
-# A topic with fewer poses is no sensor: goals and initial poses are published once.
-_FEWEST_POSES = 3
-
-
-class TopicInfo(NamedTuple):
-    """A topic of a bag: name, message type (empty if publishers disagree), number of messages."""
-
-    name: str
-    type: str
-    count: int  # type: ignore[assignment]
-
-    def __str__(self) -> str:
-        return f"{self.name} ({self.type or 'several types'}, {self.count} messages)"
 
 
 class PoseBag:
@@ -212,9 +198,8 @@ class PoseBag:
     ) -> tuple[Source, Source]:
         """Choose the sources of the parent's and the child's poses.
 
-        Without names, the bag must have exactly two topics of poses, or of paths if there are no
-        others. The parent is the topic whose name has the word parent, base or lidar, or the first
-        by name.
+        Without names, the bag must have two obvious topics of poses, see :mod:`.choice`. The parent
+        is the topic whose name has the word parent, base or lidar, or the first by name.
 
         Parameters
         ----------
@@ -226,7 +211,7 @@ class PoseBag:
         Raises
         ------
         InputError
-            If a named source cannot be used, both are the same, or the choice is not unique.
+            If a named source cannot be used, both are the same, or there is no obvious choice.
         """
         named = [source for source in (parent, child) if source]
         for source in named:
@@ -237,7 +222,8 @@ class PoseBag:
             )
         if parent and child:
             return parent, child
-        topics = self._unique_topics(2 - len(named), named)
+        missing = [name for name, source in (("parent", parent), ("child", child)) if not source]
+        topics = self._choice(missing, named)
         if parent:
             return parent, topics[0]
         if child:
@@ -249,23 +235,14 @@ class PoseBag:
         parent_topic, child_topic = roles.parent_and_child(topics, frames, sensors)
         return parent_topic, child_topic
 
-    def _unique_topics(self, count: int, used: Collection[Source]) -> list[str]:
-        """Return the only topics of poses beside the used ones; an InputError if not ``count``."""
+    def _choice(self, missing: Sequence[str], used: Collection[Source]) -> list[str]:
+        """Return topics for the missing streams; an UnclearStreamsError without obvious ones."""
         free = [topic for topic in self.topics.values() if topic.name not in used]
-        poses = [topic for topic in free if topic.type in messages.POSE_TYPES]
-        moving = [topic for topic in poses if topic.count >= _FEWEST_POSES]
-        paths = [topic for topic in free if topic.type == messages.PATH_TYPE]
-        for topics in (poses, moving, moving + paths):
-            if len(topics) == count:
-                return [topic.name for topic in topics]
-        edges = sorted({edge for topic in self.topics for edge in self.edges_on(topic)})
-        text = (
-            "set --parent-topic and --child-topic to topics with poses, or "
-            f"to frames such as odom:lidar. {self._listing()}"
-        )
-        if edges:
-            text += f". Transforms are {', '.join(edges)[:LONGEST_NAME]}"
-        raise InputError(text)
+        moving_edges = set()
+        for topic in self._tf_topics():
+            if not topic.endswith("tf_static"):
+                moving_edges.update(self.edges_on(topic))
+        return choose(free, missing, self.sensor_frame, moving_edges)
 
     def sensor_frame(self, topic: str) -> str:
         """Return the sensor's frame in the first message of a topic of poses; empty if none."""

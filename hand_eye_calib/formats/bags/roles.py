@@ -82,7 +82,7 @@ def _match(frame: str, topic: str, sensor: str) -> float:
 
 def _parent_first(topic: str) -> tuple[int, str]:
     """Return a key that sorts the likelier parent first: by its words, then by name."""
-    words = {*re.split(r"[/_]+", topic.lower()), ""}
+    words = {*re.split(r"[/_:]+", topic.lower()), ""}
     if "child" in words:
         return _WORDS.index("child"), topic
     return min(rank for rank, word in enumerate(_WORDS) if word in words), topic

@@ -6,17 +6,24 @@ only to run it, so that a missing optional package breaks no other command.
 
 import argparse
 import os
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from hand_eye_calib.core.base.errors import ConfigError, HandEyeCalibError, installing
+from hand_eye_calib.core.base.errors import (
+    ConfigError,
+    HandEyeCalibError,
+    InputError,
+    UnclearStreamsError,
+    installing,
+)
 from hand_eye_calib.core.base.option import did_you_mean
 from hand_eye_calib.core.base.registry import COMMANDS
 from hand_eye_calib.core.base.text import shown_value
 from hand_eye_calib.formats.files import limit_memory
-from hand_eye_calib.offline.cli.options import Exit, as_typed, fail
+from hand_eye_calib.offline.cli.options import Exit, as_typed, fail, typed_options
 
 _EPILOG = """\
 examples:
@@ -164,8 +171,19 @@ def _run(argv: Sequence[str]) -> int:
     else:
         arguments.passed_on = rest
         arguments.typed = list(argv)
-        return int(module.run(arguments))
+        return _run_command(module, arguments)
     return 0
+
+
+def _run_command(module: Any, arguments: argparse.Namespace) -> int:
+    """Run a command; an error about unclear streams gets the command that names them."""
+    try:
+        return int(module.run(arguments))
+    except UnclearStreamsError as error:
+        if not error.options:
+            raise
+        typed = shlex.join(["hand_eye_calib", *arguments.typed])
+        raise InputError(f"{error}. Run: {typed} {typed_options(error.options.items())}") from None
 
 
 def _add_commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:

@@ -1,0 +1,120 @@
+"""Topics of a bag for the streams that the user has not named."""
+
+import pytest
+
+from hand_eye_calib.core.base.errors import UnclearStreamsError
+from hand_eye_calib.formats.bags.choice import TopicInfo, choose
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+POSE = "geometry_msgs/msg/PoseStamped"
+CLOUD = "sensor_msgs/msg/PointCloud2"
+IMAGE = "sensor_msgs/msg/Image"
+FIX = "sensor_msgs/msg/NavSatFix"
+IMU = "sensor_msgs/msg/Imu"
+BOTH = ("parent", "child")
+
+
+def topics(*rows):
+    return [TopicInfo(name, type_, count) for name, type_, count in rows]
+
+
+def chosen(rows, missing=BOTH, frames=None, edges=()):
+    return choose(topics(*rows), missing, lambda name: (frames or {}).get(name, ""), edges)
+
+
+LIDAR = ("/lidar/odometry", ODOMETRY, 600)
+CAMERA = ("/camera/odometry", ODOMETRY, 1800)
+
+
+@pytest.mark.parametrize(
+    ("more", "frames"),
+    [
+        (("/goal_pose", POSE, 1), {}),
+        (("/ground_truth/pose", POSE, 900), {}),
+        (("/odometry/filtered", ODOMETRY, 900), {}),
+        # Two topics of one sensor, by the name or by the frame.
+        (("/lidar/pose", POSE, 500), {}),
+        (("/slam", ODOMETRY, 500), {"/slam": "velodyne", "/lidar/odometry": "velodyne"}),
+        # Odometry of the vehicle beside that of two sensors.
+        (("/odom", ODOMETRY, 900), {"/odom": "base_link"}),
+    ],
+)
+def test_an_obvious_pair_is_taken(more, frames):
+    assert {*chosen([LIDAR, CAMERA, more], frames=frames)} == {LIDAR[0], CAMERA[0]}
+
+
+def test_an_ins_beside_odometry_is_an_obvious_pair():
+    ins = ("/novatel/inspvax", "novatel_oem7_msgs/msg/INSPVAX", 3000)
+    assert chosen([LIDAR, ins]) == [LIDAR[0], ins[0]]
+
+
+def test_the_stream_that_is_not_named_is_chosen_alone():
+    assert chosen([CAMERA, ("/goal_pose", POSE, 1)], missing=("child",)) == [CAMERA[0]]
+
+
+@pytest.mark.parametrize(
+    ("rows", "edges", "message", "options"),
+    [
+        ([], (), "the bag has no messages: record again", {}),
+        (
+            [LIDAR, CAMERA, ("/imu_link/odometry", ODOMETRY, 600)],
+            (),
+            "3 topics have poses: /lidar/odometry ",
+            {"parent_topic": "/lidar/odometry", "child_topic": "/camera/odometry"},
+        ),
+        (
+            [("/cam/image_raw", IMAGE, 900)],
+            (),
+            "no topic has poses: run visual odometry or SLAM on the images",
+            {},
+        ),
+        (
+            [("/front/points", CLOUD, 900), ("/rear/points", CLOUD, 900)],
+            (),
+            "no topic has poses; the odometry of lidars can be computed from /front/points",
+            {"parent_topic": "/front/points", "child_topic": "/rear/points"},
+        ),
+        (
+            [("/points", CLOUD, 900)],
+            (),
+            "no topic has poses: run the odometry of both sensors and record it",
+            {},
+        ),
+        (
+            [("/fix", FIX, 900), ("/imu", IMU, 9000)],
+            (),
+            "no topic has poses: GNSS and IMU need the poses of another sensor",
+            {},
+        ),
+        (
+            [LIDAR, ("/fix", FIX, 900)],
+            (),
+            "only one topic has poses, /lidar/odometry",
+            {"parent_topic": "/lidar/odometry", "child_topic": "/fix"},
+        ),
+        (
+            [LIDAR, ("/log", "std_msgs/msg/String", 5)],
+            (),
+            "/lidar/odometry (nav_msgs/msg/Odometry, 600 messages): record the odometry of the "
+            "other sensor. The bag has /lidar/odometry",
+            {},
+        ),
+        (
+            [("/tf", "tf2_msgs/msg/TFMessage", 900)],
+            ("odom:lidar", "map:camera"),
+            "no topic has poses, but transforms have: map:camera and odom:lidar",
+            {"parent_topic": "odom:lidar", "child_topic": "map:camera"},
+        ),
+        (
+            [("/tf", "tf2_msgs/msg/TFMessage", 900)],
+            ("map:odom", "odom:base_link"),
+            "no topic has poses: run the odometry or SLAM of both sensors",
+            {},
+        ),
+    ],
+)
+def test_without_an_obvious_pair_the_error_names_cause_and_options(rows, edges, message, options):
+    with pytest.raises(UnclearStreamsError) as caught:
+        chosen(rows, edges=edges)
+    assert message in str(caught.value)
+    assert caught.value.options == options
