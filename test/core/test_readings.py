@@ -11,8 +11,9 @@ from published_data import data_folder
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import CalibratorConfig
-from hand_eye_calib.core.checks import hypotheses
-from hand_eye_calib.core.checks.hypotheses import PLAIN, Hypothesis, Readings, StreamPair
+from hand_eye_calib.core.checks import hypotheses, shape
+from hand_eye_calib.core.checks.hypotheses import PLAIN, Hypothesis, Readings
+from hand_eye_calib.core.checks.stream_pair import StreamPair
 from hand_eye_calib.core.engine.readings import decide
 from hand_eye_calib.core.engine.run import review
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
@@ -215,7 +216,7 @@ def test_a_lever_arm_of_nearly_zero_is_no_evidence_about_inverse_poses(lever_m, 
     mount = se3.from_rotation_translation(np.eye(3), [lever_m, 0.0, 0.0])
     streams = StreamPair(as_trajectory(Ts_pw_p), as_trajectory(child_of(Ts_pw_p, mount)), 1.0)
     explanation = hypotheses.explain(streams, thorough=False)
-    _, arms = hypotheses._evidence_for_inverse(streams, explanation.fit)
+    _, arms = shape.evidence_for_inverse(streams, explanation.fit)
     assert (arms != 0.0) == counts
 
 

@@ -6,8 +6,8 @@ from motions import as_trajectory, child_of, disturbed, wandering_poses
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.alignment.similarity import estimate_scale
-from hand_eye_calib.core.checks.check import in_other_units
 from hand_eye_calib.core.checks.streams import check_lengths, is_too_fast, is_too_slow
+from hand_eye_calib.core.checks.units import in_other_units
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import deviation

@@ -15,8 +15,8 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.stats import median, quantile
 from hand_eye_calib.core.base.text import angle, length, listing
 from hand_eye_calib.core.checks.findings import LIMITS, Finding, Severity, finding, graded
-from hand_eye_calib.core.checks.hypotheses import MAX_ROTATION_RAD, MIN_PAIRS
 from hand_eye_calib.core.checks.response import Regression, delays, response
+from hand_eye_calib.core.checks.stream_pair import MAX_ROTATION_RAD, MIN_PAIRS
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
 from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors

@@ -27,16 +27,16 @@ from hand_eye_calib.core.base.text import axes_in_words, with_sigma
 from hand_eye_calib.core.checks import agreement, hypotheses, independence, misread
 from hand_eye_calib.core.checks.agreement import Known
 from hand_eye_calib.core.checks.findings import LIMITS, Finding, finding, graded, gravest_first
-from hand_eye_calib.core.checks.hypotheses import Explanation, Readings, StreamPair
+from hand_eye_calib.core.checks.hypotheses import Explanation, Readings
+from hand_eye_calib.core.checks.stream_pair import LAGS_S, MAX_PAIRS, MIN_PAIRS, StreamPair
 from hand_eye_calib.core.checks.streams import (
     check_flat,
     check_frozen,
     check_lengths,
     check_positions,
     check_stream,
-    is_too_fast,
-    is_too_slow,
 )
+from hand_eye_calib.core.checks.units import in_other_units
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
@@ -45,18 +45,6 @@ from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pai
 _COARSE = 0.5
 # Longest gap to interpolate across if the clocks of slow streams differ by more, in intervals.
 _SLOW_GAP = 1.5
-
-_UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches", 0.3048: "feet"}
-
-# Distance of a scale from a unit that still is the unit, in standard deviations of the scale.
-UNIT_SIGMAS = 3.0
-# The same for a scale without noise, as a share.
-_UNIT_ROUNDING = 1e-6
-# Distance of a scale from a parent's unit that is still that unit (share). Noise of the child
-# biases the scale: by 0.2 % for simulated arms, several standard deviations.
-_PARENT_UNIT_SHARE = 0.005
-# A scale this close to a unit may be that of a unit and an odometry with a scale error (share).
-_UNIT_NEAR = 0.05
 
 # Standard deviations to subtract from a lever arm for its least length.
 _LEVER_ARM_SIGMAS = 3.0
@@ -126,93 +114,158 @@ def check_streams(
     findings = check_stream(given.parent, "parent", max_gap_s)
     findings += check_stream(given.child, "child", max_gap_s)
     # Rounded positions are judged later, when the unit of length is known.
-    if any(found.makes_unusable for found in findings if found.code != _ROUNDED):
+    if _are_unusable([found for found in findings if found.code != _ROUNDED]):
         return CheckResult(gravest_first(findings))
     streams = given.shifted(time_offset_s)
     explanation = None
-    at = TimeOffset()
+    offset = TimeOffset()
     if known and not streams.is_slow:
-        explanation, at = _as_they_are(streams, known[0])
+        explanation, offset = _as_they_are(streams, known[0])
     if not explanation:
         correlation = (correlate or given.correlate)()
-        times = correlation.ratio
-        turns = graded("turns", "child", float(np.log(times)), times=times)
-        if turns and 1.0 - correlation.correlation < hypotheses.HOLDS:
-            return CheckResult(gravest_first([*findings, turns]))
-        from_known = replace(correlation, offset_s=correlation.offset_s - time_offset_s)
-        if streams.is_slow:
-            streams, from_known = _of_slow(given, streams, time_offset_s, correlation)
-        if not correlation.is_clear:
-            # Short recordings may not show the offset, and yet the streams agree at the given one.
-            from_known = replace(from_known, offset_s=0.0)
-        at = TimeOffset(from_known.offset_s, correlation=from_known)
-    aligned = streams.shifted(at.seconds)
+        if factor := _factor_of_angles(correlation):
+            return CheckResult(gravest_first([*findings, factor]))
+        streams, offset = _coarse_offset(given, streams, time_offset_s, correlation)
+    aligned = streams.shifted(offset.seconds)
     frozen = check_frozen(aligned.parent, aligned.child)
     findings += frozen
-    of_parts = check_flat(aligned.parent, aligned.child)
-    of_parts = of_parts or agreement.check_parts(aligned.synchronised)
-    if of_parts:
-        return CheckResult(gravest_first([*findings, *of_parts]))
+    incomplete = check_flat(aligned.parent, aligned.child)
+    incomplete = incomplete or agreement.check_parts(aligned.synchronised)
+    if incomplete:
+        return CheckResult(gravest_first([*findings, *incomplete]))
     if not explanation:
-        explanation, found = _explained_or_misread(streams, aligned, at, known, frozen)
-        findings += found
+        is_frozen = _are_unusable(frozen)
+        explanation, mistakes = _explained_or_misread(streams, aligned, offset, known, is_frozen)
+        findings += mistakes
     if not explanation:
         return CheckResult(gravest_first(findings))
-    about = _Given(known, scale, time_offset_s, are_exact)
-    return _check_explained(given, streams, explanation, at, findings, about)
+    arguments = _Arguments(given, known, scale, time_offset_s, are_exact)
+    return _check_explained(streams, explanation, offset, findings, arguments)
 
 
-class _Given(NamedTuple):
-    """Arguments of :func:`check_streams` beside the streams."""
+class _Arguments(NamedTuple):
+    """Arguments of :func:`check_streams`: the streams in ``given``, the child with its scale."""
 
+    given: StreamPair
     known: Known | None
     scale: float
     time_offset_s: float
     are_exact: bool
 
 
+def _are_unusable(findings: Sequence[Finding]) -> bool:
+    """Return whether a finding makes the result unusable."""
+    return any(found.makes_unusable for found in findings)
+
+
+def _factor_of_angles(correlation: Correlation) -> Finding | None:
+    """Return the finding that all rotations of the child have another size, or None."""
+    times = correlation.ratio
+    factor = graded("turns", "child", float(np.log(times)), times=times)
+    return factor if 1.0 - correlation.correlation < hypotheses.HOLDS else None
+
+
+def _coarse_offset(
+    given: StreamPair, streams: StreamPair, known_s: float, correlation: Correlation
+) -> tuple[StreamPair, TimeOffset]:
+    """Return streams to compare, and the clock offset between them by their angular rates.
+
+    Parameters
+    ----------
+    given, streams : StreamPair
+        The streams as they are, and with the known offset.
+    known_s : float
+        Known offset of the child's clock, s.
+    correlation : Correlation
+        Correlation of the angular rates of the streams as they are.
+    """
+    if streams.is_slow:
+        streams, from_known = _of_slow(given, streams, known_s, correlation)
+    else:
+        from_known = replace(correlation, offset_s=correlation.offset_s - known_s)
+    if not correlation.is_clear:
+        # Short recordings may not show the offset, and yet the streams agree at the known one.
+        from_known = replace(from_known, offset_s=0.0)
+    return streams, TimeOffset(from_known.offset_s, correlation=from_known)
+
+
 def _check_explained(
-    given: StreamPair,
     streams: StreamPair,
     explanation: Explanation,
     at: TimeOffset,
     findings: list[Finding],
-    about: _Given,
+    arguments: _Arguments,
 ) -> CheckResult:
     """Check streams that a hypothesis explains.
 
-    ``streams`` have the known time offset; ``findings`` are those of the checks before.
+    Parameters
+    ----------
+    streams : StreamPair
+        Streams with the known clock offset.
+    explanation : Explanation
+    at : TimeOffset
+        Coarse clock offset beyond the known one.
+    findings : list of Finding
+        Findings of the checks before.
+    arguments : _Arguments
     """
     right = explanation.hypothesis.undo(streams)
     offset = _fine_offset(right, at, explanation.fit)
     right = right.shifted(offset.seconds)
-    sizes, fit = _check_sizes(right, explanation, offset.fit, about.scale)
-    lengths = check_lengths(
-        right.parent, right.child, least_lever_arm(fit.T_parent_child, fit.sigmas[:3])
-    )
-    # Both streams may be inverse, or neither: both readings fit, and the check cannot decide.
+    sizes, fit = _check_sizes(right, explanation, offset.fit, arguments.scale)
+    lengths = _lengths_of_explained(streams, right, fit, explanation)
+    # Findings of an unclear reading: both streams may be inverse, or neither may be.
     of_reading = explanation.findings if explanation.may_be_upright else ()
     readings = explanation.readings
-    if of_reading and lengths:
-        # If both are inverse, the distance of the sensors is that of the worlds: judge the lengths
-        # of the streams as they are.
-        lengths = check_lengths(streams.parent, streams.child)
     if readings and lengths:
         # Noise and shape decide between the readings only if the unit of length is known.
         readings = None
         findings = [found for found in findings if found not in of_reading]
-    findings = _in_metres(findings, [*lengths, *sizes], about.scale)
-    is_sound = not any(found.makes_unusable for found in findings if found not in of_reading)
-    findings += [*lengths, *check_offset(offset, about.time_offset_s), *sizes]
+    findings = _in_metres(findings, [*lengths, *sizes], arguments.scale)
+    is_sound = not _are_unusable([found for found in findings if found not in of_reading])
+    findings += [*lengths, *check_offset(offset, arguments.time_offset_s), *sizes]
     if is_sound and not lengths:
-        if about.known and explanation.may_be_upright and not explanation.hypothesis.is_upright:
-            right = streams.shifted(offset.seconds)
-            motions = _motions(right.synchronised, hypotheses.MAX_PAIRS)
-            fit = similarity.fit_similarity(motions, start=about.known[0])
-        offset_s = about.time_offset_s + offset.seconds
+        right, fit = _preferred_reading(streams, right, explanation, fit, offset, arguments.known)
         is_one_axis = any(found.code == "one_axis" for found in sizes)
-        findings += _check_agreeing(right, given, fit, about, offset_s, is_one_axis)
+        findings += _check_agreeing(right, fit, offset, is_one_axis, arguments)
     return CheckResult(gravest_first(findings), explanation.fit, offset, readings)
+
+
+def _lengths_of_explained(
+    streams: StreamPair, right: StreamPair, fit: SimilarityFit, explanation: Explanation
+) -> list[Finding]:
+    """Return the finding about lengths that no vehicle has, or none.
+
+    ``right`` are the corrected streams, ``fit`` is their fit.
+    """
+    lever_arm_m = least_lever_arm(fit.T_parent_child, fit.sigmas[:3])
+    lengths = check_lengths(right.parent, right.child, lever_arm_m)
+    if lengths and explanation.may_be_upright and explanation.findings:
+        # If both streams are inverse, the lever arm is the distance of the worlds. The streams as
+        # they are are judged without it.
+        return check_lengths(streams.parent, streams.child)
+    return lengths
+
+
+def _preferred_reading(
+    streams: StreamPair,
+    right: StreamPair,
+    explanation: Explanation,
+    fit: SimilarityFit,
+    offset: TimeOffset,
+    known: Known | None,
+) -> tuple[StreamPair, SimilarityFit]:
+    """Return the streams in the reading of a known extrinsic, and their fit.
+
+    The streams ``right`` and ``fit`` are returned if only one reading is possible, or if the
+    explanation has the reading of the known extrinsic: the streams as they are.
+    """
+    has_other_reading = explanation.may_be_upright and not explanation.hypothesis.is_upright
+    if not known or not has_other_reading:
+        return right, fit
+    upright = streams.shifted(offset.seconds)
+    motions = _motions(upright.synchronised, MAX_PAIRS)
+    return upright, similarity.fit_similarity(motions, start=known[0])
 
 
 def least_lever_arm(T_parent_child: FloatArray, sigmas: FloatArray) -> float:
@@ -236,7 +289,7 @@ def _in_metres(
     Parameters
     ----------
     findings : sequence of Finding
-        The child's lengths were multiplied by ``scale``.
+        Findings about streams with the child's lengths multiplied by ``scale``.
     units : sequence of Finding
         Findings about the unit of a stream's lengths.
     scale : float
@@ -250,15 +303,15 @@ def _in_metres(
         "parent": float(options.get("parent_scale", 1.0)),
         "child": float(options.get("scale", scale)) / scale,
     }
-    right: list[Finding] = []
-    for found in findings:
-        if found.code != _ROUNDED:
-            right.append(found)
+    in_metres: list[Finding] = []
+    for former in findings:
+        if former.code != _ROUNDED:
+            in_metres.append(former)
             continue
-        step_m = found.evidence["step_m"] * factors[found.stream]
-        if coarse := graded(_ROUNDED, found.stream, step_m, step_m=step_m):
-            right.append(coarse)
-    return right
+        step_m = former.evidence["step_m"] * factors[former.stream]
+        if coarse := graded(_ROUNDED, former.stream, step_m, step_m=step_m):
+            in_metres.append(coarse)
+    return in_metres
 
 
 def _as_they_are(streams: StreamPair, X: FloatArray) -> tuple[Explanation | None, TimeOffset]:
@@ -269,19 +322,28 @@ def _as_they_are(streams: StreamPair, X: FloatArray) -> tuple[Explanation | None
     """
     least_s = LIMITS["time_offset"].note
     grave_s = LIMITS["time_offset"].error
-    lag_s = hypotheses.LAGS_S[1]
-    # One step of refinement suffices if the offset is below half of the size that is reported.
-    given = streams.parent, streams.child, TimeOffset(), streams.max_gap_s, 2.0 * least_s
-    offset = time_offset.offset_over(lag_s, *given, X, hypotheses.HOLDS)
+    lag_s = LAGS_S[1]
+    offset = time_offset.offset_over(
+        lag_s,
+        streams.parent,
+        streams.child,
+        TimeOffset(),
+        streams.max_gap_s,
+        # One step of refinement suffices if the offset is below half of the size that is reported.
+        2.0 * least_s,
+        X,
+        hypotheses.HOLDS,
+    )
     fit = offset.fit
-    left_s = offset.largest_s(streams.child.duration_s)
-    explains = fit and fit.is_in_one_unit and fit.unexplained < similarity.EXPLAINED
-    if fit and explains and left_s < grave_s:
-        shifted = streams.shifted(offset.seconds)
-        found = hypotheses.attributed(Explanation(hypotheses.PLAIN, fit), shifted, lag_s)
-        if not found.findings:
-            return found, offset
-    return None, TimeOffset()
+    if fit is None or not fit.is_in_one_unit or fit.unexplained >= similarity.EXPLAINED:
+        return None, TimeOffset()
+    if offset.largest_s(streams.child.duration_s) >= grave_s:
+        return None, TimeOffset()
+    shifted = streams.shifted(offset.seconds)
+    explanation = hypotheses.attributed(Explanation(hypotheses.PLAIN, fit), shifted, lag_s)
+    if explanation.findings:
+        return None, TimeOffset()
+    return explanation, offset
 
 
 def _fine_offset(right: StreamPair, at: TimeOffset, fit: SimilarityFit) -> TimeOffset:
@@ -301,35 +363,37 @@ def _of_slow(
     """Return slow streams on one clock, and the correlation of their angular rates.
 
     Poses of slow streams are too far apart to interpolate. The streams as they are, or ``moved`` by
-    the known offset, serve if they have common stamps and the coarse offset agrees with that.
+    the known offset, are used if they have common stamps and the coarse offset agrees with that.
     """
-    for at_s, found in ((known_s, moved), (0.0, streams)):
-        is_near = abs(correlation.offset_s - at_s) < _COARSE * streams.interval_s
-        if len(found.synchronised) > hypotheses.MIN_PAIRS and (is_near or not correlation.is_clear):
-            return found, replace(correlation, offset_s=0.0)
+    for offset_s, candidate in ((known_s, moved), (0.0, streams)):
+        if len(candidate.synchronised) <= MIN_PAIRS:
+            continue
+        is_near = abs(correlation.offset_s - offset_s) < _COARSE * streams.interval_s
+        if is_near or not correlation.is_clear:
+            return candidate, replace(correlation, offset_s=0.0)
     from_known = replace(correlation, offset_s=correlation.offset_s - known_s)
     return replace(moved, max_gap_s=_SLOW_GAP * streams.interval_s), from_known
 
 
 def _explained_or_misread(
-    given: StreamPair,
+    streams: StreamPair,
     aligned: StreamPair,
     at: TimeOffset,
     known: Known | None,
-    frozen: Sequence[Finding],
+    is_frozen: bool,
 ) -> tuple[Explanation | None, list[Finding]]:
     """Return the explanation that holds, or None, and the findings about misread streams.
 
-    ``given`` has the known clock offset, ``aligned`` the whole one.
+    ``streams`` have the known clock offset, ``aligned`` the whole one.
     """
     start = known[0] if known else None
-    is_frozen = any(found.makes_unusable for found in frozen)
-    if found := misread.earth_centred(aligned):
-        return None, found
-    explanation, found = _explained(aligned, at.correlation, start, is_frozen)
+    misread_positions = misread.earth_centred(aligned)
+    if misread_positions:
+        return None, misread_positions
+    explanation, findings = _explained(aligned, at.correlation, start, is_frozen)
     if not explanation:
-        found = misread.misreadings(given, aligned) or found
-    return explanation, found
+        findings = misread.misreadings(streams, aligned) or findings
+    return explanation, findings
 
 
 def _explained(
@@ -349,8 +413,8 @@ def _explained(
             return explanation, [*explanation.findings]
         if correlation.is_clear:
             pairs = streams.synchronised
-            found = agreement.check_coordinates(pairs, _motions(pairs, _MAX_MOTIONS))
-            return None, found or [*explanation.findings]
+            coordinates = agreement.check_coordinates(pairs, _motions(pairs, _MAX_MOTIONS))
+            return None, coordinates or [*explanation.findings]
     # The angular rates of a frozen stream are no evidence.
     if is_frozen:
         return None, []
@@ -368,18 +432,23 @@ def _check_sizes(
     source times ``known_scale``.
     """
     pose_pairs = streams.synchronised
-    motions = _motions(pose_pairs, hypotheses.MAX_PAIRS)
+    motions = _motions(pose_pairs, MAX_PAIRS)
     fit = explanation.fit
     chords = se3.rotation_of(motions.Ts_parenti_parentj) - np.eye(3)
     hidden = hidden_axes(lever_arm_products(chords), fit.sigma_rotation**2 * np.eye(3))
-    findings: list[Finding | None] = [unseen(hidden)] if hidden else []
-    if not (explanation.same_unit or fit.is_in_one_unit):
-        with suppress(NotEnoughDataError):
-            fits_of_scale = [each for each in (fit, timed) if each and each.scale_sigma > 0.0]
-            fit = similarity.estimate_scale(pose_pairs, fits_of_scale)
-            if fit.has_own_unit:
-                findings.append(_own_unit(streams, fit, known_scale))
-    return [*filter(None, findings)], fit
+    findings = [unseen(hidden)] if hidden else []
+    if explanation.same_unit or fit.is_in_one_unit:
+        return findings, fit
+    fits_of_scale = [fit]
+    if timed:
+        fits_of_scale.append(timed)
+    fits_of_scale = [candidate for candidate in fits_of_scale if candidate.scale_sigma > 0.0]
+    with suppress(NotEnoughDataError):
+        fit = similarity.estimate_scale(pose_pairs, fits_of_scale)
+        own_unit = _own_unit(streams, fit, known_scale) if fit.has_own_unit else None
+        if own_unit:
+            findings.append(own_unit)
+    return findings, fit
 
 
 def _own_unit(streams: StreamPair, fit: SimilarityFit, known_scale: float) -> Finding | None:
@@ -402,24 +471,27 @@ def _own_unit(streams: StreamPair, fit: SimilarityFit, known_scale: float) -> Fi
 
 def _check_agreeing(
     right: StreamPair,
-    given: StreamPair,
     fit: SimilarityFit,
-    about: _Given,
-    offset_s: float,
+    offset: TimeOffset,
     is_one_axis: bool,
+    arguments: _Arguments,
 ) -> list[Finding]:
     """Return the findings about streams that agree: copies, faults that bias X, and fusion.
 
-    ``right`` are the corrected streams on one clock, ``given`` the streams as they were given.
+    ``right`` are the corrected streams on one clock. ``is_one_axis`` says that all rotation is
+    about one axis.
     """
-    of_fit = fit.T_parent_child, fit.sigmas[:6]
-    best = min(filter(None, (of_fit, about.known)), key=lambda extrinsic: extrinsic[1][:3].max())
-    if copied := independence.check_copies(given, right, about.are_exact):
+    fitted = fit.T_parent_child, fit.sigmas[:6]
+    extrinsics = [fitted, arguments.known] if arguments.known else [fitted]
+    best = min(extrinsics, key=lambda extrinsic: extrinsic[1][:3].max())
+    copied = independence.check_copies(arguments.given, right, arguments.are_exact)
+    if copied:
         return [*copied, *agreement.check_same(*best)]
     pose_pairs = right.synchronised.child_scaled(fit.scale)
     motions = _motions(pose_pairs, _MAX_MOTIONS)
+    offset_s = arguments.time_offset_s + offset.seconds
     findings = agreement.check_agreement(pose_pairs, motions, fit.T_parent_child, best, offset_s)
-    if findings or about.are_exact:
+    if findings or arguments.are_exact:
         return findings
     return independence.check_fusion(pose_pairs, best[0], is_one_axis)
 
@@ -438,7 +510,8 @@ def check_parts(
     findings = check_positions(parent, "parent", max_gap_s)
     findings += check_positions(child, "child", max_gap_s)
     # Rounded positions stay the same while the sensor moves.
-    if any(each.makes_unusable or each.code == _ROUNDED for each in findings):
+    is_rounded = any(found.code == _ROUNDED for found in findings)
+    if is_rounded or _are_unusable(findings):
         return findings
     lengths = check_lengths(parent, child, lever_arm_m)
     return [*findings, *lengths, *check_frozen(parent, child)]
@@ -453,124 +526,57 @@ def can_check(parent: Trajectory, child: Trajectory) -> bool:
     )
 
 
-def check_offset(found: TimeOffset, known_s: float) -> list[Finding]:
+def check_offset(offset: TimeOffset, known_s: float) -> list[Finding]:
     """Return the finding about a clock offset beyond ``known_s`` (added before), or none."""
-    values = offset_values(found.seconds, known_s) | {"sigma_s": found.sigma_s}
+    values = offset_values(offset.seconds, known_s) | {"sigma_s": offset.sigma_s}
     values["beyond"] = f" beyond the {known_s:.4f} s that were added" if known_s else ""
     values["options"] = {"time_offset": values["total_s"]}
-    offset = graded("time_offset", "child", found.seconds, found.sigma_s, **values)
-    return [offset] if offset else []
+    clocks_differ = graded("time_offset", "child", offset.seconds, offset.sigma_s, **values)
+    return [clocks_differ] if clocks_differ else []
 
 
 def offset_values(offset_s: float, known_s: float = 0.0) -> dict[str, Any]:
-    """Return the values of a finding about the child's clock: ``offset_s`` beyond ``known_s``."""
+    """Return the values of the finding about a clock offset ``offset_s`` beyond ``known_s``."""
     values: dict[str, Any] = {"offset_s": offset_s, "size_s": abs(offset_s)}
     values["direction"] = "behind" if offset_s > 0 else "ahead of"
     return values | {"total_s": round(known_s + offset_s, 4)}
 
 
 def check_model_scale(scale: float, sigma: float) -> list[Finding]:
-    """Return a finding about a scale that nobody asked for and the noise model estimated.
+    """Return the finding about a scale that the noise model added to the solution, or none.
 
     Parameters
     ----------
     scale, sigma : float
-        Factor of the child's lengths, and its standard deviation; 0 if it was not estimated.
+        Factor of the child's lengths, and its standard deviation. A standard deviation of 0 means
+        that the scale was not estimated.
     """
     if sigma <= 0.0:
         return []
-    longer = 1.0 / scale - 1.0
-    of_longer = sigma / scale**2
-    found = graded(
+    excess = 1.0 / scale - 1.0
+    sigma_excess = sigma / scale**2
+    other_scale = graded(
         "model_scale",
         "child",
-        longer,
-        of_longer,
+        excess,
+        sigma_excess,
         scale=scale,
         sigma=sigma,
-        size=with_sigma(100.0 * abs(longer), 100.0 * of_longer, 1),
-        than="longer" if longer > 0.0 else "shorter",
+        size=with_sigma(100.0 * abs(excess), 100.0 * sigma_excess, 1),
+        than="longer" if excess > 0.0 else "shorter",
     )
-    return [found] if found else []
-
-
-def in_other_units(
-    scale: float, sigma: float, parent: Trajectory, child: Trajectory, known: float = 1.0
-) -> Finding | None:
-    """Return the finding that a stream's lengths are in another unit, or None.
-
-    Below 1, a scale within three standard deviations of a unit says that the child is in that unit;
-    any other is a scale of the child. Above 1 the ratio has two explanations: the parent is in that
-    unit, or the child has a scale of its own, as that of a single camera. A ratio alone never
-    changes the parent. The motion decides: a parent that would be too fast in metres is in that
-    unit, a child that would hardly move in metres has a scale of its own. Where both are plausible
-    in metres, the finding names both explanations. The result is not to be used within three
-    standard deviations or 0.5 % of a unit, and with care within 5 %. Two streams in one wrong unit
-    have no ratio; :func:`~hand_eye_calib.core.checks.streams.check_lengths` asks about them.
-
-    Parameters
-    ----------
-    scale, sigma : float
-        Factor of the child's lengths beside the known one, and its standard deviation.
-    parent, child : Trajectory
-        As they are given, without the known scale.
-    known : float
-        The known factor. The solve may have found a known factor near 1 itself.
-    """
-    # Of a factor that the solve found, the total is what the streams have.
-    totals = (scale * known, scale) if 0.5 < known < 2.0 else (scale,)
-    for total in totals:
-        values: dict[str, Any] = {"scale": total, "sigma": sigma * total / scale}
-        unit, is_exact = _unit_of(total, values["sigma"])
-        if unit and total > 1.0:
-            return _parent_or_child(unit, is_exact, values, parent, child)
-        if unit and is_exact:
-            options = {"scale": round(unit * known * scale / total, 9)}
-            values |= {"other": "parent", "unit": _UNITS[unit]}
-            return finding("units", "child", options=options, **values)
-    return None
-
-
-def _unit_of(total: float, sigma: float) -> tuple[float, bool]:
-    """Return the unit (m) whose factor, or whose inverse if it is above 1, is near this scale, or
-    0; and whether the scale is that of the unit within its standard deviation.
-    """
-    for unit in _UNITS:
-        factor = unit if total < 1.0 else 1.0 / unit
-        off = abs(total - factor)
-        share = _UNIT_ROUNDING if total < 1.0 else _PARENT_UNIT_SHARE
-        is_exact = off <= max(UNIT_SIGMAS * sigma, share * factor)
-        if is_exact or off <= _UNIT_NEAR * factor:
-            return unit, is_exact
-    return 0.0, False
-
-
-def _parent_or_child(
-    unit: float, is_exact: bool, values: dict[str, Any], parent: Trajectory, child: Trajectory
-) -> Finding | None:
-    """The finding about a child whose lengths are shorter than the parent's by a unit (m); None if
-    it has a scale of its own.
-    """
-    if is_too_fast(parent) and not is_too_fast(child):
-        options = {"parent_scale": unit}
-        values |= {"other": "child", "unit": _UNITS[unit]}
-        return finding("units", "parent", options=options, **values)
-    if is_too_slow(child) and not is_too_slow(parent):
-        return None
-    options = {"scale": float(f"{values['scale']:.4g}")}
-    values |= {"unit": _UNITS[unit], "factor": unit, "is_exact": is_exact}
-    return finding("unit_or_scale", "parent", options=options, **values)
+    return [other_scale] if other_scale else []
 
 
 def _motions(pose_pairs: PosePairs, most: int) -> MotionPairs:
-    """Return motions over the first lag with enough motions."""
-    motions = (pairs_over(pose_pairs, lag_s, most) for lag_s in hypotheses.LAGS_S)
-    # There is such a lag: streams that agree were fitted over it.
-    return next(pairs for pairs in motions if len(pairs) >= hypotheses.MIN_PAIRS)
+    """Return at most ``most`` motions over the first lag with enough motions."""
+    motions = (pairs_over(pose_pairs, lag_s, most) for lag_s in LAGS_S)
+    # Streams that agree were fitted over the first lag with enough motions, so it exists.
+    return next(pairs for pairs in motions if len(pairs) >= MIN_PAIRS)
 
 
 def unseen(axes: Sequence[str]) -> Finding:
-    """Return the note that a motion does not determine these axes."""
+    """Return the note that a motion does not determine some axes."""
     options = {f"prior.{axis}": "VALUE+/-SIGMA" for axis in axes}
-    it = "it" if len(axes) == 1 else "them"
-    return finding("one_axis", options=options, axes=axes_in_words(axes), it=it)
+    pronoun = "it" if len(axes) == 1 else "them"
+    return finding("one_axis", options=options, axes=axes_in_words(axes), it=pronoun)

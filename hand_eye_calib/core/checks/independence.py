@@ -9,7 +9,7 @@ from hand_eye_calib.core.base.blocks import Blocks, jackknife_covariance
 from hand_eye_calib.core.base.stats import median, quantile, robust_weights
 from hand_eye_calib.core.base.text import angle, length
 from hand_eye_calib.core.checks.findings import Finding, Severity, finding
-from hand_eye_calib.core.checks.hypotheses import MAX_ROTATION_RAD, MIN_PAIRS, StreamPair
+from hand_eye_calib.core.checks.stream_pair import MAX_ROTATION_RAD, MIN_PAIRS, StreamPair
 from hand_eye_calib.core.checks.streams import USUAL, coarse
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory

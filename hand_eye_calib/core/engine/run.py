@@ -21,6 +21,7 @@ from hand_eye_calib.core.base.config import METHODS, defaults_of
 from hand_eye_calib.core.base.errors import HandEyeCalibError, NotEnoughDataError
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.checks import check as checking
+from hand_eye_calib.core.checks import units
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.findings import Finding, Severity, finding, repair_message
 from hand_eye_calib.core.checks.hypotheses import HOLDS
@@ -326,7 +327,7 @@ def _as_doubt(found: Finding, calibration: Calibration) -> Finding:
     error if the scale of the check, or that of the result, is a unit's within its uncertainty.
     """
     off = abs(calibration.scale - 1.0 / found.evidence["factor"])
-    is_near = off <= checking.UNIT_SIGMAS * calibration.scale_sigma
+    is_near = off <= units.UNIT_SIGMAS * calibration.scale_sigma
     is_exact = bool(found.evidence["is_exact"]) or is_near
     severity = Severity.ERROR if is_exact else Severity.WARNING
     return replace(found, severity=severity, options={})

@@ -32,8 +32,8 @@ from hand_eye_calib.core.checks.findings import (
     graded,
     gravest_first,
 )
-from hand_eye_calib.core.checks.hypotheses import MAX_ROTATION_RAD, MIN_PAIRS
 from hand_eye_calib.core.checks.response import Regression
+from hand_eye_calib.core.checks.stream_pair import MAX_ROTATION_RAD, MIN_PAIRS
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.noise.increments import without_rate_bias

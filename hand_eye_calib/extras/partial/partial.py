@@ -18,8 +18,8 @@ from hand_eye_calib.core.assessment.prior import fuse
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import InputError
-from hand_eye_calib.core.checks.check import in_other_units
 from hand_eye_calib.core.checks.findings import Finding, Severity, finding, graded
+from hand_eye_calib.core.checks.units import in_other_units
 from hand_eye_calib.core.engine import estimation
 from hand_eye_calib.core.engine.cross_check import cross_checked
 from hand_eye_calib.core.geometry import se3
