@@ -42,8 +42,16 @@ def _rigs(arguments: argparse.Namespace) -> list[Rig]:
     return real_rigs(arguments.data_folder)[0] if arguments.data_folder else []
 
 
+_ABOUT_RULES = (
+    "Other rules on the same simulated results. The columns have, for each target, the sessions "
+    "that ended, the share whose worst axis was within its target, the largest error as a "
+    "multiple of the target, and the median of the seconds beyond the earliest end:"
+)
+
+
 def _stop(arguments: argparse.Namespace) -> str:
     tables = []
+    rules = ""
     for name, recordings in (
         ("simulated", stop.simulated(arguments.seeds)),
         ("real", stop.real(_rigs(arguments))),
@@ -51,10 +59,12 @@ def _stop(arguments: argparse.Namespace) -> str:
         tasks = {recorded.name: (recorded,) for recorded in recordings}
         path = arguments.rows / f"stop_{name}.jsonl"
         records = kept(path, stop.stops, tasks, arguments.jobs).values()
-        tables.append(
-            stop.table([stop.Stop(**fields) for plain in records for fields in plain], name)
-        )
-    return "\n\n".join(["Simulated:", tables[0], "Real, cut off in the same way:", tables[1]])
+        stops = [stop.Stop(**fields) for plain in records for fields in plain]
+        tables.append(stop.table(stops, name))
+        if name == "simulated":
+            rules = stop.rules_table(stops)
+    texts = ["Simulated:", tables[0], "Real, cut off in the same way:", tables[1]]
+    return "\n\n".join([*texts, _ABOUT_RULES, rules])
 
 
 def _together(arguments: argparse.Namespace) -> str:

@@ -1,14 +1,14 @@
-"""Is a session that is told to stop really good enough, and how much sooner might it have stopped?
+"""Is a session that has reached its goal good enough, and how much sooner might it have ended?
 
-Every recording is cut off after ever longer times; each part is calibrated, and the goal judges the
-results in turn, as in the node. Where it says "done", the error against the truth is known.
+Every recording is cut off after ever longer times. Each part is calibrated, and the goal judges the
+results in turn, as in the node. The error against the truth is known where the goal is reached.
+Other rules for the end of a session are applied to the same results.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from hand_eye_calib.core.base.errors import HandEyeCalibError
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry.se3 import deviation
 from hand_eye_calib.core.geometry.trajectory import Trajectory
-from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.core.results.calibration import Calibration, SolveStatus
 from hand_eye_calib.offline.calibrate import prior_fields
 from hand_eye_calib.online.live.goal import Goal
 from reproduction.coverage.classes import CLASSES, simulate
@@ -31,13 +31,58 @@ from reproduction.writing import markdown_table
 KINDS = {
     "hand-held": {"hand_gm_1s": 150.0, "hand_vio_walk": 150.0},
     "car": {"car_ins_lidar": 360.0, "car_two_slams": 360.0},
-    "AGV": {"agv_ramps": 360.0, "agv_long": 1200.0},
+    "AGV": {"agv_ramps": 360.0, "agv_long": 600.0},
     "drone": {"drone_gnss_vio": 180.0, "drone_two_vios": 180.0},
     "arm": {"arm_target": 180.0},
 }
 TARGET = np.r_[np.full(3, 0.02), np.full(3, 0.00524)]
 FACTORS = (0.5, 1.0, 2.0)
-_STEPS = 24
+
+# First end (s) of the parts of a recording, and their interval (s) in the first two minutes.
+_FIRST_S = 20.0
+_INTERVAL_S = 5.0
+_FINE_UNTIL_S = 120.0
+# Later interval (s), and as a share of the time.
+_LATER_INTERVAL_S = 10.0
+_LATER_SHARE = 0.06
+
+# Key of the recordings' random numbers.
+_KEY = 57
+
+
+class Rule(NamedTuple):
+    """A rule for the end of a session.
+
+    All standard deviations are below a share of their targets, at all results of a further motion.
+    This motion is a share of the motion before it, within limits (s).
+    """
+
+    of_target: float
+    of_motion: float
+    shortest_s: float
+    longest_s: float
+
+    def __str__(self) -> str:
+        shortest = f"{self.shortest_s:g} s" if self.shortest_s else "two results"
+        confirmation = f"for {shortest}"
+        if self.of_motion:
+            confirmation = f"for {self.of_motion:.0%} of the motion, {shortest}"
+            confirmation += f" to {self.longest_s:g} s" if self.longest_s < np.inf else " or more"
+        return f"{self.of_target:g} of the target, {confirmation}"
+
+
+RULES = [
+    Rule(0.7, 0.0, 0.0, 0.0),
+    Rule(1.0, 0.0, 0.0, 0.0),
+    Rule(1.0, 0.0, 20.0, 20.0),
+    Rule(1.0, 0.0, 30.0, 30.0),
+    Rule(1.0, 0.0, 60.0, 60.0),
+    Rule(1.0, 0.5, 20.0, 60.0),
+    Rule(1.0, 0.5, 20.0, 90.0),
+    Rule(1.0, 0.5, 20.0, np.inf),
+    Rule(1.0, 1.0, 20.0, 90.0),
+    Rule(1.0, 1.0, 20.0, np.inf),
+]
 
 
 class Recorded(NamedTuple):
@@ -66,6 +111,8 @@ class Stop:
     """How the session of a recording ended with a target."""
 
     kind: str
+    # Of RULES; empty for the rule of the node.
+    rule: str
     # Of the default targets.
     factor: float
     # Whether it was told that this motion will not get there, and was right.
@@ -76,6 +123,9 @@ class Stop:
     worst: float = np.nan
     seconds: float = np.nan
     earliest_s: float = np.nan
+    # Shares of the times left before the end that were within a factor of two, by their number.
+    n_times: int = 0
+    n_good_times: int = 0
 
 
 def simulated(seeds: int) -> Iterator[Recorded]:
@@ -83,8 +133,8 @@ def simulated(seeds: int) -> Iterator[Recorded]:
     for kind, classes in KINDS.items():
         for name, duration_s in classes.items():
             for seed in range(seeds * 2 // len(classes)):
-                key = (7, seed, sorted(CLASSES).index(name))
-                made = simulate(dataclasses.replace(CLASSES[name], duration_s=duration_s), key)
+                key = (_KEY, seed, sorted(CLASSES).index(name))
+                made = simulate(replace(CLASSES[name], duration_s=duration_s), key)
                 truth = Truth.within(made.T_parent_child, 0.0, 0.0)
                 yield Recorded(
                     f"{name} {seed}", kind, Recording(made.parent, made.child), truth, {}
@@ -100,9 +150,20 @@ def real(rigs: Sequence[Rig]) -> Iterator[Recorded]:
 
 
 def stops(recorded: Recorded) -> list[dict[str, Any]]:
-    """Plain values of a :class:`Stop` for every factor of the target."""
+    """Plain values of a :class:`Stop` for every factor of the target, and for every rule."""
     steps = list(_steps(recorded))
-    return [vars(_stopped(recorded, steps, factor)) for factor in FACTORS]
+    return [vars(stop) for factor in FACTORS for stop in _stops(recorded, steps, factor)]
+
+
+def _ends_s(duration_s: float) -> list[float]:
+    """Ends (s) of the parts of a recording."""
+    ends_s = [min(_FIRST_S, duration_s)]
+    while ends_s[-1] < duration_s:
+        step_s = _INTERVAL_S
+        if ends_s[-1] >= _FINE_UNTIL_S:
+            step_s = max(_LATER_INTERVAL_S, _LATER_SHARE * ends_s[-1])
+        ends_s.append(min(ends_s[-1] + step_s, duration_s))
+    return ends_s
 
 
 def _steps(recorded: Recorded) -> Iterator[Step]:
@@ -116,7 +177,9 @@ def _steps(recorded: Recorded) -> Iterator[Step]:
     # Clocks of their own: the child's part is the same share of its recording.
     if abs(of_child[0] - of_parent[0]) < 10 * 10**9:
         of_child = of_parent
-    for share in np.arange(1, _STEPS + 1) / _STEPS:
+    duration_s = float(np.ptp(of_parent) * 1e-9)
+    for end_s in _ends_s(duration_s):
+        share = end_s / duration_s
         parts = [
             _until(stream, start_ns + round(share * (end_ns - start_ns)))
             for stream, (start_ns, end_ns) in zip(streams, (of_parent, of_child), strict=True)
@@ -127,7 +190,6 @@ def _steps(recorded: Recorded) -> Iterator[Step]:
             seen = excitation(snapshot.pose_pairs)
         except (HandEyeCalibError, np.linalg.LinAlgError):
             continue
-        end_s = float(share * np.ptp(of_parent) * 1e-9)
         error = deviation(calibration.T_parent_child, recorded.truth.T_parent_child)
         yield Step(end_s, error, calibration, seen)
 
@@ -136,21 +198,69 @@ def _until(trajectory: Trajectory, stamp_ns: int) -> Trajectory:
     return trajectory[: max(int(np.searchsorted(trajectory.stamps_ns, stamp_ns, side="right")), 3)]
 
 
-def _stopped(recorded: Recorded, steps: Sequence[Step], factor: float) -> Stop:
-    """Let the goal judge the results of a recording in turn."""
+def _stops(recorded: Recorded, steps: Sequence[Step], factor: float) -> Iterator[Stop]:
+    """Let the goal, and each rule, judge the results of a recording in turn."""
     goal = Goal(factor * TARGET)
     is_stuck = False
-    worst: list[float] = []
-    for step in steps:
+    # Motion (s) and time left (s) of each result.
+    times: list[tuple[float, float]] = []
+    end = None
+    for index, step in enumerate(steps):
         progress = goal.add(step.calibration, step.seen)
         is_stuck |= progress.will_not_get_there
-        worst.append(_worst(step.error, recorded.truth.sigmas, factor))
         if progress.done:
-            # From here on all errors stay within their targets.
-            first = max((i + 1 for i, ratio in enumerate(worst) if ratio > 1.0), default=0)
-            earliest_s = steps[first].end_s if first < len(worst) else np.nan
-            return Stop(recorded.kind, factor, False, True, worst[-1], step.end_s, earliest_s)
-    return Stop(recorded.kind, factor, is_stuck)
+            end = index
+            break
+        times.append((step.seen.motion_s, progress.seconds_left))
+    stop = _stop(recorded, "", steps, factor, end)
+    if end is None:
+        yield replace(stop, is_stuck=is_stuck)
+    else:
+        end_s = steps[end].seen.motion_s
+        ratios = np.array([left_s / (end_s - motion_s) for motion_s, left_s in times])
+        n_good = int(((ratios >= 0.5) & (ratios <= 2.0)).sum())
+        yield replace(stop, n_times=len(times), n_good_times=n_good)
+    for rule in RULES:
+        yield _stop(recorded, str(rule), steps, factor, _end_of(rule, steps, factor))
+
+
+def _end_of(rule: Rule, steps: Sequence[Step], factor: float) -> int | None:
+    """Index of the part after which a rule ends the session."""
+    targets = rule.of_target * factor * TARGET
+    since_s = None
+    for index, step in enumerate(steps):
+        is_within = (step.calibration.sigmas <= targets).all()
+        if not is_within or step.calibration.status is not SolveStatus.OK:
+            since_s = None
+        elif since_s is None:
+            since_s = step.seen.motion_s
+        else:
+            share_s = rule.of_motion * since_s
+            wanted_s = min(max(share_s, rule.shortest_s), rule.longest_s)
+            if step.seen.motion_s >= since_s + wanted_s:
+                return index
+    return None
+
+
+def _stop(
+    recorded: Recorded, rule: str, steps: Sequence[Step], factor: float, end: int | None
+) -> Stop:
+    """The end of a session after a part; None for a session that goes on."""
+    if end is None:
+        return Stop(recorded.kind, rule, factor, is_stuck=False)
+    worst = [_worst(step.error, recorded.truth.sigmas, factor) for step in steps[: end + 1]]
+    # From here on all errors stay within their targets.
+    first = max((i + 1 for i, ratio in enumerate(worst) if ratio > 1.0), default=0)
+    return Stop(
+        kind=recorded.kind,
+        rule=rule,
+        factor=factor,
+        is_stuck=False,
+        is_done=True,
+        worst=worst[-1],
+        seconds=steps[end].end_s,
+        earliest_s=steps[first].end_s if first <= end else np.nan,
+    )
 
 
 def _worst(error: FloatArray, truth_sigmas: FloatArray, factor: float) -> float:
@@ -166,11 +276,27 @@ def table(stops: Sequence[Stop], which: str) -> str:
     """
     rows = []
     for factor in FACTORS:
-        of_factor = [stop for stop in stops if stop.factor == factor]
+        of_factor = [stop for stop in stops if stop.factor == factor and not stop.rule]
         kinds = {stop.kind for stop in of_factor if factor == 1.0 and which == "simulated"}
         for kind in (kind for kind in KINDS if kind in kinds):
             rows.append(_row(kind, factor, [s for s in of_factor if s.kind == kind]))
         rows.append(_row("**all**", factor, of_factor))
+    return markdown_table(rows)
+
+
+def rules_table(stops: Sequence[Stop]) -> str:
+    """A row for the rule of the node, and for each other rule."""
+    rows = []
+    for rule in dict.fromkeys(stop.rule for stop in stops):
+        row: dict[str, object] = {"rule": rule or "**of the node**"}
+        for factor in FACTORS:
+            of_rule = [stop for stop in stops if stop.rule == rule and stop.factor == factor]
+            columns = _row("", factor, of_rule)
+            ended = f"{columns['told to stop']} of {len(of_rule)}"
+            text = f"{ended}, {columns['worst axis within target']}"
+            text += f", {columns['largest error / target']}"
+            row[str(columns["target"])] = f"{text}, {columns['seconds beyond earliest']} s"
+        rows.append(row)
     return markdown_table(rows)
 
 
@@ -188,4 +314,12 @@ def _row(kind: str, factor: float, stops: Sequence[Stop]) -> dict[str, object]:
         "largest error / target": f"{worst.max():.2f}" if done else "-",
         "seconds beyond earliest": f"{np.median(beyond):.0f}" if len(beyond) else "-",
         "not getting there": sum(stop.is_stuck for stop in stops),
+        "time left within a factor of two": _share_of_times(done),
     }
+
+
+def _share_of_times(done: Sequence[Stop]) -> str:
+    n_times = sum(stop.n_times for stop in done)
+    if not n_times:
+        return "-"
+    return f"{sum(stop.n_good_times for stop in done) / n_times:.0%}"

@@ -142,7 +142,7 @@ def test_a_publisher_that_has_gone_is_named_and_a_parked_robot_asks_for_nothing(
 
 def test_a_session_that_is_done_is_not_paused(node):
     run(node, 20.0)
-    for motion_s in (40.0, 42.0, 44.0):
+    for motion_s in (20.0, 32.0, 44.0):
         with_result(node, motion_s)
     run(node, 8.0, senders=[])
     state = state_of(node, may_rest=True)

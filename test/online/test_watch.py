@@ -249,7 +249,7 @@ def test_bars_show_the_share_of_the_information_and_the_time_left():
         (INF, INF, Tone.UNKNOWN, "not seen yet", 0.0),
         (INF, 30.0, Tone.UNKNOWN, "out of reach", 0.0),  # as roll of an antenna
         (0.08, INF, Tone.ACT, "not with this motion", 0.0625),
-        (0.018, 12.0, Tone.BUSY, "nearly: 12 s left", 1.0),
+        (0.018, 0.0, Tone.GOOD, "enough", 1.0),
         (0.0, 0.0, Tone.GOOD, "enough", 1.0),
         (0.08, 300.0, Tone.ACT, "5 min left", 0.0625),
     ],

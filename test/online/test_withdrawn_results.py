@@ -140,7 +140,7 @@ FAILURES = {
 @pytest.fixture(params=[False, True], ids=["before the goal", "after the goal"])
 def with_result(session, request):
     """The session with a good result, with which it may have reached the goal."""
-    for motion_s in (40.0, 42.0, 44.0) if request.param else (40.0,):
+    for motion_s in (20.0, 32.0, 44.0) if request.param else (40.0,):
         conclude(session, motion_s, result())
     assert session.cycle.goal.progress.done == request.param
     assert session.cycle.standing is Standing.CURRENT
@@ -242,7 +242,7 @@ class TestOptions:
         session.cycle.follow(session.live.calibrator.config, before)
 
     def test_a_looser_target_judges_the_present_result_without_a_solve(self, session):
-        for motion_s in (40.0, 42.0):
+        for motion_s in (20.0, 42.0):
             conclude(session, motion_s, result(0.05))
         assert not session.cycle.goal.progress.done
         assert session.cycle.result.verdict is Verdict.USE_WITH_CARE
@@ -257,7 +257,7 @@ class TestOptions:
         assert state_of(session).progress.progress.done
 
     def test_a_stricter_target_takes_done_back(self, session):
-        for motion_s in (40.0, 42.0, 44.0):
+        for motion_s in (20.0, 32.0, 44.0):
             conclude(session, motion_s, result())
         assert session.cycle.goal.progress.done
         self.follow(session, target_axes="x=1mm")
@@ -291,7 +291,7 @@ class TestOptions:
     def test_another_option_that_makes_the_result_good_ends_the_session(
         self, session, option, poor, good
     ):
-        for motion_s in (40.0, 42.0):
+        for motion_s in (20.0, 42.0):
             conclude(session, motion_s, poor)
         assert not session.cycle.goal.progress.done
         self.follow(session, **option)

@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hand_eye_calib.core.assessment.excitation import what_is_missing
+from hand_eye_calib.core.assessment.excitation import Excitation, what_is_missing
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.option import Options
@@ -110,6 +110,8 @@ class SolveCycle:
         self._solved_at_s = 0.0
         # Motion of the session so far.
         self._motion = NO_MOTION
+        # Motion of the last minute.
+        self._newest_motion: Excitation | None = None
         # Failure of the newest solve.
         self._failure: Failure | None = None
         # Time of the first failure (steady time, s) if every solve since the result has failed.
@@ -266,6 +268,7 @@ class SolveCycle:
         # Keep the largest rotation so far: the measured rotation can decrease with more poses.
         rotation = np.maximum(self._motion.rotation, answer.motion.rotation)
         self._motion = replace(answer.motion, rotation=rotation)
+        self._newest_motion = answer.newest_motion
         self._session.calibrator.adopt(answer.time_offset)
         if answer.options:
             self._check_options = {**self._check_options, **answer.options}
@@ -322,7 +325,8 @@ class SolveCycle:
     def _take(self, newest: Calibration) -> Outcome:
         """Make a usable calibration the session's result, unless the goal keeps a better result."""
         was_done = self.goal.progress.done
-        progress = self.goal.add(newest, self._motion, self.checks.faults())
+        faults = self.checks.faults()
+        progress = self.goal.add(newest, self._motion, faults, self._newest_motion)
         result = self.goal.best or newest
         if result is newest:
             self._solved = self._submitted, self._check_options

@@ -3,38 +3,41 @@
 It has the distance to the target on each axis, the time left, the most helpful motion, and whether
 the present motion can reach the target.
 
-A single standard deviation below the target is no reason to stop, because a short recording does
-not contain the time-correlated errors yet. The rule was tuned on recordings with known truth, see
-docs/session.md.
+A session has one scale: the standard deviation of an axis, allowance included, compared with the
+target of the axis. A single standard deviation below the target is no reason to stop, because a
+short recording does not contain the time-correlated errors yet. Further motion must confirm it. The
+rule was chosen on simulated recordings with known truth, see docs/session.md.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
 
-from hand_eye_calib.core.assessment.excitation import Excitation, helpful_motion
+from hand_eye_calib.core.assessment.excitation import MIN_ROTATION, Excitation, helpful_motion
 from hand_eye_calib.core.base.arrays import FloatArray
-from hand_eye_calib.core.base.text import axes_in_words, duration
+from hand_eye_calib.core.base.text import amount, axes_in_words, duration
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.core.results.verdict import what_is_known
 from hand_eye_calib.online.live.progress import AxisProgress, Progress
 
-# Share of its target that the standard deviation of an axis must reach, allowance included.
-_SHARE = 0.7
-# Least share of the wanted variance that remains for the measured variance if the allowance takes
-# the rest.
-_LEAST_ROOM = 0.25
-# Least duration of motion (s) of the two results in a row that must reach the target.
-_MIN_MOTION_S = 30.0
-# Least duration in correlation times of the slowest time-correlated error.
-_CORRELATION_TIMES = 10.0
+# Share of the motion so far during which every result must be within the targets.
+_CONFIRMING_SHARE = 0.5
+# Shortest and longest motion (s) that confirms a result within the targets.
+_SHORTEST_CONFIRMATION_S = 20.0
+_LONGEST_CONFIRMATION_S = 90.0
+
+# Least motion (s) after which the motion may be called useless for an axis.
+_JUDGED_FROM_S = 30.0
 
 # Times left that are reported (s). They only decrease, by one step for each result. Beyond the last
 # finite step, the present motion cannot reach the target.
-_STEPS_S = np.array([0.0, 15.0, 30.0, 60.0, 120.0, 180.0, 300.0, 600.0, 1200.0, np.inf])
+_STEPS_S = np.array([0.0, 15, 30, 60, 90, 120, 180, 240, 360, 600, 900, 1200, np.inf])
+
+# A time left that is this many steps longer than the last one is a new estimate.
+_NEW_STEPS = 3
 
 # Largest ratio of standard deviations at which a newer result replaces the best result: standard
 # deviations are estimates, and the newer result has more motion.
@@ -48,30 +51,23 @@ _NO_RESULT = "No result yet: move the sensors, with rotations."
 
 @dataclass(frozen=True)
 class _Result:
-    """Result of the session, its motion, and the faults of its streams."""
+    """Standard deviations of a result without the allowance, and whether the result is usable."""
 
-    calibration: Calibration
-    motion: Excitation
-    faults: Sequence[str]
-
-    @property
-    def is_long(self) -> bool:
-        """Whether the motion is long enough to trust the standard deviations."""
-        return self.motion.motion_s >= _least_motion_s(self.calibration)
+    motion_s: float
+    sigmas_measured: FloatArray
+    is_usable: bool
 
 
 class Goal:
     """Goal of a session, compared with each new result.
 
     Once the goal is reached, it stays reached, unless a result is refuted or the options change.
-    ``best`` is the newest result that reaches the goal, unless an earlier result is clearly
-    better.
+    ``best`` is the newest result within the targets, unless an earlier result is clearly better.
 
     Parameters
     ----------
     targets : (6,) array-like
-        Target standard deviations of x, y, z (m), roll, pitch and yaw (rad). The goal is 0.7 of
-        each target.
+        Target standard deviations of x, y, z (m), roll, pitch and yaw (rad).
 
     Attributes
     ----------
@@ -86,22 +82,24 @@ class Goal:
 
     def restart(self) -> None:
         """Begin a new session."""
-        # The newest result, and the newest result with less motion.
-        self._newest: _Result | None = None
-        self._before: _Result | None = None
-        self._motion_s = -1.0
+        # Results of the newest motion, as far back as a confirmation needs them, each with more
+        # motion than the result before it.
+        self._results: list[_Result] = []
+        # Motion and faults of the newest result.
+        self._motion: Excitation | None = None
+        self._faults: Sequence[str] = ()
         self._start_over(_NO_RESULT)
 
     def _start_over(self, sentence: str) -> None:
-        """Forget the progress towards the goal; the newest and the previous result stay."""
+        """Forget the progress towards the goal; the results stay."""
         self.best: Calibration | None = None
-        self._best_information = 0.0
-        self._steps = np.full(6, len(_STEPS_S) - 1)
+        self._best_ratio = np.inf
+        self._steps = np.full(7, len(_STEPS_S) - 1)
         self.progress = self._nothing_yet(sentence)
 
     def wait(self, sentence: str) -> None:
         """Store the reason why there is no result yet; ignored once there is a result."""
-        if self._newest is None:
+        if self._motion is None:
             self.progress = self._nothing_yet(sentence)
 
     def follow(self, targets: Targets) -> None:
@@ -110,7 +108,8 @@ class Goal:
         Earlier results still confirm the next result, because the robot may be parked by now.
         """
         self._targets = np.asarray(targets, dtype=float)
-        self._start_over("Solving with the new options." if self._newest else _NO_RESULT)
+        has_result = self._motion is not None
+        self._start_over("Solving with the new options." if has_result else _NO_RESULT)
 
     def retarget(self, calibration: Calibration, targets: Targets) -> None:
         """Compare the session's result with new targets; no other option has changed.
@@ -122,11 +121,15 @@ class Goal:
         targets : (6,) array-like
         """
         self.follow(targets)
-        if self._newest is not None:
-            self.add(calibration, self._newest.motion, self._newest.faults)
+        if self._motion is not None:
+            self.add(calibration, self._motion, self._faults)
 
     def add(
-        self, calibration: Calibration, motion: Excitation, faults: Sequence[str] = ()
+        self,
+        calibration: Calibration,
+        motion: Excitation,
+        faults: Sequence[str] = (),
+        newest_motion: Excitation | None = None,
     ) -> Progress:
         """Add the next result of the session and update ``best`` and ``progress``.
 
@@ -137,121 +140,236 @@ class Goal:
             The motion of the result.
         faults : sequence of str
             Findings of the stream checks. The goal is not reached while there are any.
+        newest_motion : Excitation, optional
+            The motion of the last minute. Default: ``motion``.
         """
-        newest = _Result(calibration, motion, faults or _own_faults(calibration))
-        # Without more motion a result cannot confirm the previous result: the robot is parked.
-        if motion.motion_s > self._motion_s:
-            self._before = self._newest
-            self._motion_s = motion.motion_s
-        self._newest = newest
+        self._motion = motion
+        self._faults = faults or _own_faults(calibration)
+        self._append(calibration, motion.motion_s)
         if calibration.status is SolveStatus.CONTRADICTED:
             self._start_over(f"No usable result: {calibration.status.failure}.")
             return self.progress
-        ratios = self._ratios(calibration, calibration)
-        worst = int(np.argmax(ratios))
-        self._update_best(newest, ratios[worst])
-        is_done = self.best is not None
-        left_s = _time_left(newest, ratios)
-        is_long = motion.motion_s >= _MIN_MOTION_S
-        is_stuck = bool(not is_done and is_long and left_s[worst] > _STEPS_S[-2])
-        left_s = self._in_steps(left_s)
-        sentence = self._reason_to_stop(newest)
-        if not sentence:
-            limiting = AXES[worst] if is_stuck or ratios[worst] > 1.0 else ""
-            sentence = _advice(limiting, left_s[worst], is_stuck, motion)
-        self.progress = Progress(
-            sentence=sentence,
-            done=is_done and not newest.faults,
-            precision=what_is_known(self.best) if self.best else "",
-            is_faulty=bool(newest.faults),
-            limiting_axis="" if is_done else AXES[worst],
-            will_not_get_there=is_stuck,
-            axes=self._by_axis(calibration.sigmas, np.zeros(6) if is_done else left_s),
-        )
+        needs = self._needs(calibration)
+        self._update_best(calibration, needs)
+        if self.best is not None:
+            self.progress = self._done(self.best)
+        else:
+            self.progress = self._not_done(calibration, needs, newest_motion or motion)
         return self.progress
 
-    def _update_best(self, newest: _Result, ratio: float) -> None:
+    def _append(self, calibration: Calibration, motion_s: float) -> None:
+        """Store a result for the confirmation of later results.
+
+        Without more motion a result replaces the newest result, because the robot is parked.
+        """
+        if self._results and motion_s <= self._results[-1].motion_s:
+            motion_s = self._results.pop().motion_s
+        is_usable = not self._faults and not calibration.status.failure
+        self._results.append(_Result(motion_s, calibration.sigmas_measured, is_usable))
+        # The newest result that is old enough for the longest confirmation stays, too.
+        start_s = motion_s - _LONGEST_CONFIRMATION_S
+        while len(self._results) > 1 and self._results[1].motion_s <= start_s:
+            del self._results[0]
+
+    def _needs(self, newest: Calibration, sigmas_measured: FloatArray | None = None) -> FloatArray:
+        """Return the measured variances (6,) as multiples of the variances that the targets allow.
+
+        A target is reached at 1. Its variance includes the allowance, which no motion reduces. The
+        multiple is infinite if the allowance alone exceeds the target.
+
+        Parameters
+        ----------
+        newest : Calibration
+            Its allowance and priors count, because options may have changed in between.
+        sigmas_measured : (6,) array, optional
+            Of an earlier result. Default: those of the newest result.
+        """
+        if sigmas_measured is None:
+            sigmas_measured = newest.sigmas_measured
+        allowed = self._targets**2 - newest.allowance**2
+        needs = np.full(6, np.inf)
+        np.divide(sigmas_measured**2, allowed, out=needs, where=allowed > 0.0)
+        # Motion improves neither an axis with a prior nor one out of reach of the streams.
+        needs[np.isin(AXES, newest.out_of_reach)] = 0.0
+        needs[[dof.verdict is DofVerdict.PRIOR for dof in newest.observability]] = 0.0
+        return needs
+
+    def _update_best(self, newest: Calibration, needs: FloatArray) -> None:
         """Make the newest result the best result if it reaches the goal and is not clearly worse.
 
         Parameters
         ----------
-        newest : _Result
-        ratio : float
-            Largest ratio of :meth:`_ratios`.
+        newest : Calibration
+        needs : (6,) array
+            See :meth:`_needs`.
         """
-        calibration = newest.calibration
-        if calibration.status is not SolveStatus.OK or newest.faults or ratio > 1.0:
+        is_usable = newest.status is SolveStatus.OK and newest.verdict is not Verdict.DO_NOT_USE
+        if not is_usable or self._faults or needs.max() > 1.0:
             return
-        if calibration.verdict is Verdict.DO_NOT_USE:
+        if self.best is None and self._confirmation_s(newest) > 0.0:
             return
-        # The first result that reaches the goal must be long enough and confirmed.
-        if self.best is None and not (newest.is_long and self._is_confirmed(calibration)):
-            return
-        information = 1.0 / max(ratio, 1e-12)
-        if information * _AS_GOOD**2 >= self._best_information:
-            self.best = calibration
-            self._best_information = max(information, self._best_information)
+        ratio = float((newest.sigmas / self._targets)[needs > 0.0].max(initial=0.0))
+        if ratio <= _AS_GOOD * self._best_ratio:
+            self.best = newest
+            self._best_ratio = min(ratio, self._best_ratio)
 
-    def _is_confirmed(self, newest: Calibration) -> bool:
-        """Whether the previous result, from less motion, reaches the goal, too.
+    def _confirmation_s(self, newest: Calibration) -> float:
+        """Return the further motion (s) that confirms the newest result; 0 if it is confirmed."""
+        motion_s = self._results[-1].motion_s
+        # Motion (s) since which every result is within the targets.
+        since_s = motion_s
+        for result in reversed(self._results):
+            is_within = self._needs(newest, result.sigmas_measured).max() <= 1.0
+            if not is_within or not result.is_usable:
+                break
+            since_s = result.motion_s
+        return max(since_s + _confirmation_after(since_s) - motion_s, 0.0)
 
-        Allowance and priors are taken from the newest result, because options may have changed in
-        between.
+    def _time_left(self, newest: Calibration, needs: FloatArray) -> FloatArray:
+        """Return the times (6,) of further motion (s) until each axis is within its target.
+
+        The information of an axis, the inverse of its variance, grows at the rate of the session
+        so far or of the last minute, whichever is higher: the present motion may be a better one.
         """
-        before = self._before
-        if before is None or before.faults or not before.is_long:
-            return False
-        if before.calibration.status is SolveStatus.NOT_CONVERGED:
-            return False
-        return bool(self._ratios(before.calibration, newest).max() <= 1.0)
+        oldest = self._results[0]
+        motion_s = self._results[-1].motion_s
+        # Shares of the information that the targets need, now and before the last minute.
+        share = 1.0 / np.maximum(needs, 1.0)
+        share_before = 1.0 / np.maximum(self._needs(newest, oldest.sigmas_measured), 1.0)
+        rate = share / max(motion_s, 1e-6)
+        minute_s = motion_s - oldest.motion_s
+        if minute_s >= _SHORTEST_CONFIRMATION_S:
+            rate = np.maximum(rate, (share - share_before) / minute_s)
+        left_s = np.full(6, np.inf)
+        np.divide(1.0 - share, rate, out=left_s, where=rate > 0.0)
+        return left_s
 
-    def _ratios(self, calibration: Calibration, newest: Calibration) -> FloatArray:
-        """Ratios (6,) of the measured variances to the variances that are allowed for them.
+    def _not_done(
+        self, newest: Calibration, needs: FloatArray, newest_motion: Excitation
+    ) -> Progress:
+        """Return the progress before the goal is reached.
 
-        The wanted variance includes the allowance, which no motion reduces: the rest is allowed for
-        the measured variance. Allowance and priors are taken from the newest result.
+        Parameters
+        ----------
+        newest : Calibration
+        needs : (6,) array
+            See :meth:`_needs`.
+        newest_motion : Excitation
+            The motion of the last minute.
         """
-        wanted = _SHARE * self._targets
-        room = np.maximum(wanted**2 - newest.allowance**2, _LEAST_ROOM * wanted**2)
-        # Motion improves neither an axis with a prior nor one out of reach of the streams.
-        exempt = np.isin(AXES, newest.out_of_reach)
-        exempt |= [dof.verdict is DofVerdict.PRIOR for dof in newest.observability]
-        ratios: FloatArray = calibration.sigmas_measured**2 / room
-        ratios[exempt] = 0.0
-        return ratios
+        motion_s = self._results[-1].motion_s
+        left_s = self._time_left(newest, needs)
+        total_s = float(left_s.max())
+        if total_s > 0.0:
+            # The confirmation begins when the last axis is within its target.
+            total_s += _confirmation_after(motion_s + total_s)
+        else:
+            total_s = self._confirmation_s(newest)
+        *axes_left_s, total_s = self._in_steps(np.append(left_s, total_s))
+        axes = self._by_axis(newest.sigmas, axes_left_s)
+        progress = Progress(
+            sentence=f"Confirming, {duration(total_s)}: every axis is within its target. Go on.",
+            seconds_left=total_s,
+            is_faulty=bool(self._faults),
+            axes=axes,
+        )
+        if needs.max() > 1.0:
+            progress = self._with_advice(progress, newest, needs, newest_motion)
+        reason = self._reason_to_stop(newest)
+        return replace(progress, sentence=reason) if reason else progress
 
-    def _in_steps(self, left_s: FloatArray) -> FloatArray:
-        """Round times left (6,) to steps that decrease one by one, because estimates jump."""
+    def _with_advice(
+        self,
+        progress: Progress,
+        newest: Calibration,
+        needs: FloatArray,
+        newest_motion: Excitation,
+    ) -> Progress:
+        """Return the progress with the axis that is farthest from its target, and what helps.
+
+        An axis whose target is below the allowance counts only if all others are within theirs.
+        """
+        is_too_small = newest.allowance >= self._targets
+        reachable = np.where(is_too_small, 0.0, needs)
+        limiting = int(np.argmax(reachable if reachable.max() > 1.0 else needs))
+        axis = AXES[limiting]
+        row = progress.axes[axis]
+        if is_too_small[limiting]:
+            return replace(
+                progress,
+                sentence=_too_small_in_words(axis, row.target, newest.allowance[limiting]),
+                limiting_axis=axis,
+                will_not_get_there=True,
+                target_is_too_small=True,
+            )
+        is_right = _is_helpful(newest_motion, axis)
+        is_long = self._results[-1].motion_s >= _JUDGED_FROM_S
+        will_not_get_there = is_long and row.seconds_left == np.inf and not is_right
+        assert self._motion is not None
+        motion = helpful_motion([axis], self._motion)
+        axis_text = axes_in_words([axis])
+        if will_not_get_there:
+            sentence = f"This motion will not determine {axis_text} well enough: {motion}."
+        else:
+            if is_right:
+                motion = "this motion is right, more of it"
+            if np.isfinite(progress.seconds_left):
+                left = duration(progress.seconds_left)
+                sentence = f"Go on for about {left}: {axis_text} takes longest, {motion}."
+            else:
+                sentence = f"{axis_text} is not determined well enough yet: {motion}."
+        return replace(
+            progress,
+            sentence=sentence,
+            limiting_axis=axis,
+            will_not_get_there=will_not_get_there,
+        )
+
+    def _done(self, best: Calibration) -> Progress:
+        """Return the progress after the goal is reached, with the axes of the kept result."""
+        precision = what_is_known(best)
+        return Progress(
+            sentence=self._reason_to_stop(best) or f"Done: {precision}. Stop and save.",
+            done=not self._faults,
+            precision=precision,
+            seconds_left=0.0,
+            is_faulty=bool(self._faults),
+            axes=self._by_axis(best.sigmas, [0.0] * 6),
+        )
+
+    def _in_steps(self, left_s: FloatArray) -> list[float]:
+        """Round times left (7,), of each axis and in all, to steps that decrease one by one.
+
+        Estimates jump; only a much longer time is a new estimate.
+        """
         before = self._steps
+        far = len(_STEPS_S) - 1
         # 5 % tolerance: a time slightly above a step is rounded down to it.
         steps = np.searchsorted(_STEPS_S, 0.95 * left_s)
-        far = len(_STEPS_S) - 1
-        # To and from infinity and zero, a time may jump.
-        is_new = (before == far) | (before == 0) | (steps == far) | (steps == 0)
-        self._steps = np.where(is_new, steps, np.clip(steps, before - 1, before))
-        return _STEPS_S[self._steps]
+        is_new = (before == far) | (steps == far) | (steps == 0) | (steps >= before + _NEW_STEPS)
+        # An axis that was within its target may be beyond it again by the smallest step.
+        slower = np.clip(steps, before - 1, np.maximum(before, 1))
+        self._steps = np.where(is_new, steps, slower)
+        return [float(seconds) for seconds in _STEPS_S[self._steps]]
 
     def _nothing_yet(self, sentence: str) -> Progress:
         """Progress without a result."""
-        unknown = np.full(6, np.inf)
-        return Progress(sentence=sentence, axes=self._by_axis(unknown, unknown))
+        return Progress(sentence=sentence, axes=self._by_axis(np.full(6, np.inf), [np.inf] * 6))
 
-    def _by_axis(self, sigmas: FloatArray, left_s: FloatArray) -> dict[str, AxisProgress]:
-        """Progress by axis from standard deviations (6,) and times left (6,)."""
-        columns = zip(AXES, sigmas.tolist(), self._targets.tolist(), left_s.tolist(), strict=True)
+    def _by_axis(self, sigmas: FloatArray, left_s: Sequence[float]) -> dict[str, AxisProgress]:
+        """Progress by axis from standard deviations (6,) and times left."""
+        columns = zip(AXES, sigmas.tolist(), self._targets.tolist(), left_s, strict=True)
         return {
             axis: AxisProgress(sigma=sigma, target=target, seconds_left=seconds)
             for axis, sigma, target, seconds in columns
         }
 
-    def _reason_to_stop(self, newest: _Result) -> str:
-        """Sentence to stop if more motion is useless or not needed; empty otherwise."""
-        if newest.faults:
-            return f"Stop: the streams are faulty: {newest.faults[0]}."
-        if newest.calibration.status.failure:
-            return f"No usable result: {newest.calibration.status.failure}."
-        if self.best is not None:
-            return f"Done: {what_is_known(self.best)}. Stop and save."
+    def _reason_to_stop(self, newest: Calibration) -> str:
+        """Return the sentence to stop if the streams or the result are unusable; else empty."""
+        if self._faults:
+            return f"Stop: the streams are faulty: {self._faults[0]}."
+        if newest.status.failure:
+            return f"No usable result: {newest.status.failure}."
         return ""
 
 
@@ -264,36 +382,27 @@ def _own_faults(calibration: Calibration) -> list[str]:
     ]
 
 
-def _time_left(newest: _Result, ratios: FloatArray) -> FloatArray:
-    """Times (6,) of further motion (s) until each axis reaches its target.
+def _confirmation_after(motion_s: float) -> float:
+    """Return the motion (s) that confirms results within the targets since this motion (s)."""
+    share_s = _CONFIRMING_SHARE * motion_s
+    return min(max(share_s, _SHORTEST_CONFIRMATION_S), _LONGEST_CONFIRMATION_S)
 
-    Variances decrease with 1 / time.
+
+def _is_helpful(motion: Excitation, axis: str) -> bool:
+    """Whether the motion contains the rotation that reveals an axis and that a vehicle lacks.
+
+    That is a rotation across the axis other than the main rotation, which every drive has.
     """
-    motion_s = newest.motion.motion_s
-    # An infinite ratio times 0 s would be NaN.
-    left_s = max(motion_s, 1e-6) * np.maximum(ratios - 1.0, 0.0)
-    return np.maximum(left_s, max(_least_motion_s(newest.calibration) - motion_s, 0.0))
+    main = int(np.argmax(motion.rotation))
+    index = AXES.index(axis) % 3
+    others = [other for other in range(3) if other not in (index, main)]
+    return bool(motion.rotation[others].max() >= MIN_ROTATION)
 
 
-def _least_motion_s(calibration: Calibration) -> float:
-    """Least duration of motion (s) before a standard deviation is trusted."""
-    lasting = calibration.noise.lasting if calibration.noise else ()
-    slowest_s = max((error.tau_s for error in lasting if error.kind != "path"), default=0.0)
-    return max(_MIN_MOTION_S, _CORRELATION_TIMES * slowest_s)
-
-
-def _advice(axis: str, left_s: float, is_stuck: bool, excitation: Excitation) -> str:
-    """Sentence with the most helpful motion for the axis that takes longest.
-
-    ``axis`` is empty if every axis is within its target.
-    """
-    left = duration(np.clip(left_s, _STEPS_S[1], _STEPS_S[-2]))
-    if not axis:
-        return f"Go on for about {left}: every axis is good enough if the next results agree."
-    motion = helpful_motion([axis], excitation)
-    axis_text = axes_in_words([axis])
-    if is_stuck:
-        return f"This motion will not determine {axis_text} well enough: {motion}."
-    if not np.isfinite(left_s):
-        return f"{axis_text} is not determined yet: {motion}."
-    return f"Go on for about {left}: {axis_text} takes longest, {motion}."
+def _too_small_in_words(axis: str, target: float, allowance: float) -> str:
+    """Return the sentence about a target below the allowance."""
+    return (
+        f"More motion cannot make {axes_in_words([axis])} good to {amount(axis, target)}: "
+        f"{amount(axis, allowance)} is the allowance for constant errors. "
+        "Stop and save, or set a larger target."
+    )

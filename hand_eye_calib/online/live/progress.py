@@ -1,5 +1,6 @@
 """Progress of a session towards its goal, as a part of its result."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -11,7 +12,7 @@ class AxisProgress:
     Attributes
     ----------
     sigma : float
-        Standard deviation (m or rad).
+        Standard deviation with the allowance (m or rad).
     target : float
         Standard deviation that is wanted (m or rad).
     seconds_left : float
@@ -34,23 +35,30 @@ class Progress:
         Next step of the person who moves the robot.
     done : bool
         Whether the goal is reached.
+    seconds_left : float
+        Time of similar motion until the goal is reached (s), in coarse steps; infinite if unknown.
     precision : str
         Precision of the best result, in words; empty before the goal is reached.
     is_faulty : bool
         Whether the streams have faults that make a calibration impossible.
     limiting_axis : str
-        Axis that is farthest from its target; empty without such an axis or without a result.
+        Axis that is farthest from its target; empty if every axis is within its target, or without
+        a result.
     will_not_get_there : bool
         Whether more of the present motion is useless for the limiting axis.
+    target_is_too_small : bool
+        Whether the allowance for constant errors alone exceeds the target of the limiting axis.
     axes : mapping of str to AxisProgress
     """
 
     sentence: str
     done: bool = False
+    seconds_left: float = math.inf
     precision: str = ""
     is_faulty: bool = False
     limiting_axis: str = ""
     will_not_get_there: bool = False
+    target_is_too_small: bool = False
     axes: Mapping[str, AxisProgress] = field(default_factory=dict)
 
 

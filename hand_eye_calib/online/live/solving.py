@@ -47,6 +47,9 @@ _NICENESS = 3
 # Time (s) after which a job counts as hung: live sessions are solved in seconds.
 HANGS_AFTER_S = 600.0
 
+# Time (ns) of the motion that the advice to a person is about.
+_NEWEST_NS = 60_000_000_000
+
 # Fewest poses of a stream, not paired yet, for a check of its received poses.
 _FEWEST_RAW = 200
 
@@ -120,6 +123,8 @@ class Answer:
         Options that the check has set.
     messages : tuple of str
         Sentences about these options.
+    newest_motion : Excitation or None
+        Motion of the last minute.
     """
 
     session: int
@@ -132,6 +137,7 @@ class Answer:
     check: CheckResult | None = None
     options: Options = field(default_factory=dict)
     messages: tuple[str, ...] = ()
+    newest_motion: Excitation | None = None
 
 
 def answer(job: Job) -> Answer:
@@ -147,7 +153,8 @@ def answer(job: Job) -> Answer:
         configured = with_options(received, job.options)
         snapshot = configured.resolved
         result = replace(result, time_offset=snapshot.time_offset)
-        result = replace(result, motion=excitation(snapshot.pose_pairs))
+        pairs = snapshot.pose_pairs
+        result = replace(result, motion=excitation(pairs), newest_motion=excitation(_newest(pairs)))
         result = replace(result, calibration=snapshot.estimate())
     except Exception as error:
         result = replace(result, failure=_failure(error))
@@ -159,6 +166,13 @@ def answer(job: Job) -> Answer:
     if result.check is not None:
         result = replace(result, check=with_raw_findings(result.check, received))
     return replace(result, seconds=time.monotonic() - start_s)
+
+
+def _newest(pairs: PosePairs) -> PosePairs:
+    """Return the pairs of the last minute."""
+    if not len(pairs):
+        return pairs
+    return pairs[pairs.stamps_ns > pairs.stamps_ns[-1] - _NEWEST_NS]
 
 
 def _checked(result: Answer, snapshot: Snapshot, options: Options) -> Answer:

@@ -50,6 +50,7 @@ ANSWER_FOR_S = 20.0
 # Words of headlines that decide about buttons.
 MOVED = "MOUNT MOVED"
 CHANGE_MOTION = "CHANGE THE MOTION"
+CHANGE_TARGET = "CHANGE THE TARGET"
 DONE = "DONE"
 
 # Names of the axes.
@@ -309,6 +310,8 @@ def _activity(state: NodeState) -> Headline:
         return Headline(tone, "PAUSED", sentence)
     if state.result is None:
         return Headline(Tone.BUSY, "START", sentence)
+    if at.progress.target_is_too_small:
+        return Headline(tone, CHANGE_TARGET, sentence)
     return Headline(tone, "GO ON" if tone is Tone.BUSY else CHANGE_MOTION, sentence)
 
 
@@ -387,7 +390,11 @@ def _facts(state: NodeState, is_old: bool) -> str:
 
 def _bar(axis: str, at: ProgressState, extrinsic: ExtrinsicState | None) -> Bar:
     row = at.progress.axes[axis]
-    share = min(1.0, (row.target / row.sigma) ** 2) if row.sigma > 0 else 1.0
+    # An axis with a prior is good enough with any standard deviation.
+    is_enough = row.seconds_left == 0 and math.isfinite(row.sigma)
+    share = 1.0
+    if not is_enough and row.sigma > row.target:
+        share = (row.target / row.sigma) ** 2
     target = amount(axis, row.target)
     if extrinsic and extrinsic.contradicted:
         tone = Tone.UNKNOWN
@@ -396,6 +403,8 @@ def _bar(axis: str, at: ProgressState, extrinsic: ExtrinsicState | None) -> Bar:
     elif math.isfinite(row.sigma):
         tone, word = _progress_in_words(row, at, axis)
         against = f"± {amount(axis, row.sigma)} of {target}"
+        if is_enough and row.sigma > row.target:
+            against = f"± {amount(axis, row.sigma)}, from the prior"
     else:
         tone = Tone.UNKNOWN
         # A time left without a standard deviation: these streams never observe the axis.
@@ -419,8 +428,6 @@ def _progress_in_words(row: AxisProgress, at: ProgressState, axis: str) -> tuple
     word = "not with this motion"
     if math.isfinite(row.seconds_left):
         word = f"{duration(row.seconds_left)} left"
-    if row.sigma <= row.target:
-        return Tone.BUSY, f"nearly: {word}"
     return Tone.ACT if at.progress.limiting_axis == axis else Tone.BUSY, word
 
 
