@@ -27,7 +27,7 @@ from hand_eye_calib.online.live.progress import AxisProgress, Progress
 _CONFIRMING_SHARE = 0.5
 # Shortest and longest motion (s) that confirms a result within the targets.
 _SHORTEST_CONFIRMATION_S = 20.0
-_LONGEST_CONFIRMATION_S = 90.0
+_LONGEST_CONFIRMATION_S = 75.0
 
 # Least motion (s) after which the motion may be called useless for an axis.
 _JUDGED_FROM_S = 30.0
