@@ -14,6 +14,7 @@ def register() -> None:
     COMMANDS["replay"] = Command("the same for bags and journals alone", _calibrate)
     COMMANDS["check"] = Command("check two pose streams before any solve", _check)
     COMMANDS["info"] = Command("show a saved result", _info)
+    COMMANDS["export"] = Command("print a saved result as the file of another program", _export)
     RESULT_METHODS["plot"] = _plot
     RESULT_METHODS["report"] = _report
     SESSION_PAGES["report"] = _session_report
@@ -35,6 +36,12 @@ def _info() -> Any:
     from hand_eye_calib.offline.cli import info
 
     return info
+
+
+def _export() -> Any:
+    from hand_eye_calib.offline.cli import export
+
+    return export
 
 
 def _plot(result: Any, ax: Any) -> Any:

@@ -233,7 +233,7 @@ def test_paths_that_are_no_bag(tmp_path):
         "absent": "no bag at .*absent",
         "notes.txt": r"notes\.txt is not a bag; expected",
         "folder": r"no bag in .*: expected files that end in .*check the path",
-        "runs": "no bag in .*runs/one/bag, or all bags below the folder with calibrate --batch ",
+        "runs": "no bag in .*runs/one/bag, or all bags below: hand_eye_calib batch ",
         "fifo.mcap": r"fifo\.mcap is not a bag; expected",
     }
     for suffix in ("bag", "mcap", "db3"):

@@ -17,12 +17,13 @@ from hand_eye_calib.core.base.registry import (
 
 
 def register() -> None:
-    """Register the command ``compare``, and batches and recordings of one rig for ``calibrate``."""
+    """Register commands, and batches and recordings of one rig for ``calibrate``."""
     PUBLIC_NAMES["calibrate_many"] = "hand_eye_calib.extras.fleet.together"
     PUBLIC_NAMES["calibrate_together"] = "hand_eye_calib.extras.fleet.together"
     COMMANDS["compare"] = Command(
         "compare results with the installed transform, or with each other", _compare
     )
+    COMMANDS["batch"] = Command("calibrate many recordings, such as those of a fleet", _batch)
     RESULT_PARTS["together"] = _together
     EXTRA_RULES["recordings_differ"] = ExtraRule(
         "nothing_known",
@@ -45,6 +46,12 @@ def _compare() -> Any:
     from hand_eye_calib.extras.fleet import compare
 
     return compare
+
+
+def _batch() -> Any:
+    from hand_eye_calib.extras.fleet.job import BATCH
+
+    return BATCH
 
 
 def _add_arguments(parser: Any) -> None:

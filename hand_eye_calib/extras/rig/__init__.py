@@ -4,15 +4,29 @@ from pathlib import Path
 from typing import Any
 
 from hand_eye_calib.core.base.errors import ConfigError
-from hand_eye_calib.core.base.registry import PUBLIC_NAMES, ROUTES, SESSION_PAGES, Route
+from hand_eye_calib.core.base.registry import (
+    COMMANDS,
+    PUBLIC_NAMES,
+    ROUTES,
+    SESSION_PAGES,
+    Command,
+    Route,
+)
 
 
 def register() -> None:
-    """Register rigs for ``calibrate``, and the pages of a session with further sensors."""
+    """Register the command ``rig``, its route, and the pages of a session of a rig."""
     PUBLIC_NAMES["RigCalibration"] = "hand_eye_calib.extras.rig.rig"
     PUBLIC_NAMES["calibrate_rig"] = "hand_eye_calib.extras.rig.rig"
+    COMMANDS["rig"] = Command("calibrate three sensors or more together", _rig)
     ROUTES["rig"] = Route(_add_arguments, _is_rig, _calibrate_rig)
     SESSION_PAGES["rig"] = _session_rig
+
+
+def _rig() -> Any:
+    from hand_eye_calib.extras.rig.job import RIG
+
+    return RIG
 
 
 def _session_rig(directory: Path, session: Any) -> None:

@@ -5,10 +5,12 @@ from typing import Any
 
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.registry import (
+    COMMANDS,
     FINDING_WORDS,
     PUBLIC_NAMES,
     RESULT_PARTS,
     ROUTES,
+    Command,
     Route,
 )
 
@@ -17,7 +19,8 @@ _SAMPLES = (".json", ".yaml", ".yml", ".samples", ".npz")
 
 
 def register() -> None:
-    """Register stops for ``calibrate``."""
+    """Register the command ``arm``, and stops for ``calibrate``."""
+    COMMANDS["arm"] = Command("calibrate the camera of an arm from its stops", _arm)
     RESULT_PARTS["worlds"] = _worlds
     FINDING_WORDS["stops"] = _words
     PUBLIC_NAMES["calibrate_arm"] = "hand_eye_calib.extras.stops.calibrate"
@@ -25,6 +28,12 @@ def register() -> None:
     PUBLIC_NAMES["read_arm_samples"] = "hand_eye_calib.extras.stops.samples"
     PUBLIC_NAMES["robot_poses"] = "hand_eye_calib.extras.stops.robot_angles"
     ROUTES["stops"] = Route(_add_arguments, _are_stops, _calibrate)
+
+
+def _arm() -> Any:
+    from hand_eye_calib.extras.stops.job import ARM
+
+    return ARM
 
 
 def _add_arguments(parser: Any) -> None:

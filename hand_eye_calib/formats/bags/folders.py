@@ -153,9 +153,7 @@ def _no_files(folder: Path) -> str:
     advice = "check the path"
     for subfolder in sorted(file.parent for file in [*folder.glob("*/*"), *folder.glob("*/*/*")]):
         if any(map(_suffix, subfolder.iterdir())):
-            advice = (
-                f"pass {subfolder}, or all bags below the folder with calibrate --batch {folder}"
-            )
+            advice = f"pass {subfolder}, or all bags below: hand_eye_calib batch {folder}"
             break
     return f"no bag in {folder}: expected files that end in {', '.join(REPAIRS)}; {advice}"
 

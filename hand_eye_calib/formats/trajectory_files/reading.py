@@ -326,7 +326,7 @@ def read_trajectories(*sources: TrajectoryLike) -> list[Trajectory]:
 
     Files are read in the format that they look like.
     """
-    paths = [Path(source) for source in sources if isinstance(source, str | PathLike)]
+    paths = [local_path(fspath(source)) for source in sources if isinstance(source, str | PathLike)]
     if len(paths) < len(sources):
         return [read_trajectory(source, AUTO) for source in sources]
     readings = read_trajectory_files([(path, FileOptions(format=AUTO)) for path in paths])

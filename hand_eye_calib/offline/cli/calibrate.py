@@ -27,12 +27,12 @@ examples:
   hand_eye_calib calibrate my_bag --parent-topic /lidar/odometry --child-topic /camera/odometry
   hand_eye_calib calibrate my_bag --parent-topic odom:lidar --child-topic /vio --out result
   hand_eye_calib calibrate gnss.csv slam.txt --time-offset estimate --prior z=1.85+/-0.02
-  hand_eye_calib calibrate lidar.txt front.txt rear.txt --out rig
+  hand_eye_calib rig lidar.txt front.txt rear.txt --out rig
   hand_eye_calib calibrate monday/bag tuesday/bag wednesday/bag --out together
-  hand_eye_calib calibrate --batch 'fleet/**' --vehicle 'fleet/{vehicle}/' --out results
-  hand_eye_calib calibrate samples.yaml --out arm
-  hand_eye_calib calibrate hand.tum images/ --target charuco:5x7:0.04:0.03 --camera camera.yaml
-  hand_eye_calib replay my_bag --topics /lidar/odometry /front/vio odom:rear --out rig
+  hand_eye_calib batch 'fleet/**' --vehicle 'fleet/{vehicle}/' --out results
+  hand_eye_calib arm samples.yaml --out arm
+  hand_eye_calib arm hand.tum images/ --target charuco:5x7:0.04:0.03 --camera camera.yaml
+  hand_eye_calib rig my_bag --topics /lidar/odometry /front/vio odom:rear --out rig
   hand_eye_calib replay live/journal --out result"""
 
 # Short help that fits on one screen.

@@ -147,7 +147,8 @@ def _run(argv: Sequence[str]) -> int:
     command = next((word for word in argv if not word.startswith("-")), None)
     parser = CommandParser(
         prog="hand_eye_calib",
-        description="Extrinsic calibration of two sensors on one rigid body from their motion.",
+        usage="%(prog)s [--help] [--version] COMMAND ...",
+        description=_description(),
         epilog=_EPILOG,
     )
     parser.add_argument("--version", action="store_true", help="show the version and exit")
@@ -186,12 +187,23 @@ def _run_command(module: Any, arguments: argparse.Namespace) -> int:
         raise InputError(f"{error}. Run: {typed} {typed_options(error.options.items())}") from None
 
 
+def _description() -> str:
+    """Return the purpose of the program, and a line for each command."""
+    lines = ["Extrinsic calibration of two sensors on one rigid body from their motion.", ""]
+    lines.append("commands:")
+    lines += [f"  {name:<12}{command.help}" for name, command in COMMANDS.items()]
+    return "\n".join(lines)
+
+
 def _add_commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
     """Add all commands to a parser, and return their parsers by name."""
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    # With the usage of the whole program, argparse would begin those of the commands.
+    commands = parser.add_subparsers(
+        dest="command", metavar="COMMAND", prog=parser.prog, help=argparse.SUPPRESS
+    )
     parsers = {}
-    for name, command in COMMANDS.items():
-        parsers[name] = commands.add_parser(name, help=command.help, add_help=False)
+    for name in COMMANDS:
+        parsers[name] = commands.add_parser(name, add_help=False)
         parsers[name].add_argument(
             "-h",
             "--help",

@@ -1,0 +1,83 @@
+"""Commands for one job: ``arm``, ``rig``, ``batch`` and ``export``."""
+
+import json
+import shutil
+
+import pytest
+
+import hand_eye_calib as hec
+from hand_eye_calib.core.base.config import EXPORT_FORMATS
+from hand_eye_calib.formats.files import local_path
+
+
+def as_json(run, *arguments):
+    _, out, err = run(*arguments, "--json")
+    assert out, err
+    return json.loads(out)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    result = hec.calibrate("sample:lidar.tum", "sample:camera.tum", checks=False)
+    return result.save(tmp_path_factory.mktemp("saved"))
+
+
+def test_arm_is_calibrate_for_samples(run):
+    alone = as_json(run, "arm", "sample:arm.yaml")
+    assert alone["T_parent_child"] == as_json(run, "calibrate", "sample:arm.yaml")["T_parent_child"]
+
+
+def test_arm_takes_two_files_as_stops(run, tmp_path):
+    files = []
+    for name, step in (("lidar.tum", 20), ("camera.tum", 40)):
+        lines = local_path(f"sample:{name}").read_text().splitlines(keepends=True)
+        poses = [line for line in lines if not line.startswith("#")]
+        files.append(tmp_path / name)
+        files[-1].write_text("".join(poses[::step]))
+    alone = as_json(run, "arm", *files, "--pair-by", "row")
+    both = as_json(run, "calibrate", *files, "--order", "none", "--pair-by", "row")
+    assert alone["reference"] == "stops"
+    assert alone["T_parent_child"] == both["T_parent_child"]
+
+
+def test_rig_is_calibrate_for_three_files(run, tmp_path):
+    rear = tmp_path / "rear.tum"
+    shutil.copy(local_path("sample:camera.tum"), rear)
+    code, out, _ = run("rig", "sample:lidar.tum", "sample:camera.tum", rear)
+    assert ": 3 sensors\n" in out
+    assert run("calibrate", "sample:lidar.tum", "sample:camera.tum", rear)[:2] == (code, out)
+
+
+def test_batch_is_calibrate_batch(run, tmp_path):
+    folder = tmp_path / "fleet"
+    folder.mkdir()
+    shutil.copy(local_path("sample:drive.mcap"), folder / "monday.mcap")
+    topics = ("--parent-topic", "/lidar/odometry", "--child-topic", "/camera/odometry")
+    rest = (*topics, "--no-report", "--jobs", "1")
+    code, out, _ = run("batch", folder, *rest)
+    assert code == 0
+    assert out.startswith("fleet: USE")
+    assert run("calibrate", "--batch", folder, *rest)[:2] == (code, out)
+
+
+@pytest.mark.parametrize("name", EXPORT_FORMATS)
+def test_export_is_info_as_format(run, saved, name):
+    file = run("export", saved, name)
+    assert file == run("info", saved, "--as", name)
+    assert file[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["arm"], "arm needs the samples of an arm, or the stops of its hand and camera"),
+        (["rig", "a.tum", "b.tum"], "rig needs 3 sensors or more, got 2"),
+        (["rig", "bag", "--topics", "/a", "/b"], "rig needs 3 sensors or more, got 2"),
+        (["batch"], "batch needs bags, folders or patterns of bags"),
+        (["export", "result", "kalbr"], "argument FORMAT: invalid choice: 'kalbr'"),
+    ],
+)
+def test_paths_that_are_not_those_of_the_job_are_refused(run, arguments, message):
+    code, out, err = run(*arguments)
+    assert (code, out) == (2, "")
+    assert message in err
