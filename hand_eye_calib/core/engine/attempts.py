@@ -11,14 +11,14 @@ from hand_eye_calib.core.engine.snapshot import STREAMS, Snapshot
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
 
-#: Options that put a stream right before it is paired.
+#: Options that correct a stream before it is paired.
 STREAM_REPAIRS = (
     "parent_scale",
     *(f"{stream}_{option}" for stream in STREAMS for option in ("invert", "quaternion")),
 )
 
-# Weighted squared residual per degree of freedom up to which a noise model fits: it is 1 if the
-# model holds, and less if there is no noise.
+# Largest weighted squared residual per degree of freedom of a noise model that fits. The value is 1
+# if the model is right, and less if there is no noise.
 _MAX_MISFIT = 2.0
 
 
@@ -36,7 +36,8 @@ class Attempt:
     options : mapping
         Options that were set because a check is certain of them, by name.
     messages : tuple of str
-        What was set and why. The warnings of the calibration begin with them.
+        Messages about these options, with the reason. They are the first warnings of the
+        calibration.
     """
 
     calibration: Calibration
@@ -48,12 +49,12 @@ class Attempt:
     @property
     def is_usable(self) -> bool:
         """Whether no finding forbids the use of the result."""
-        return not any(found.makes_unusable for found in self.check.findings)
+        return not any(finding.makes_unusable for finding in self.check.findings)
 
     @property
     def n_objections(self) -> int:
         """Number of findings graver than a note."""
-        return sum(found.severity is not Severity.NOTE for found in self.check.findings)
+        return sum(finding.severity is not Severity.NOTE for finding in self.check.findings)
 
     @property
     def noise_fits(self) -> bool:
@@ -63,12 +64,14 @@ class Attempt:
 
     @property
     def is_sound(self) -> bool:
-        """Whether nothing speaks against the result."""
+        """Whether the result is usable, without objections, and fits its noise model."""
         return self.is_usable and self.n_objections == 0 and self.noise_fits
 
     def is_better_than(self, other: "Attempt", n_fewer: int) -> bool:
-        """Return whether this attempt is usable and the other is not, or whether ``n_fewer``
-        objections or more are gone and the noise model fits no worse.
+        """Return whether this attempt is better than another one.
+
+        It is better if it alone is usable. It is also better if it has at least ``n_fewer``
+        objections fewer, and its noise model fits no worse.
         """
         if self.is_usable and not other.is_usable:
             return True
@@ -76,7 +79,7 @@ class Attempt:
         return is_improved and self.noise_fits >= other.noise_fits
 
     def with_findings(self, findings: Collection[Finding]) -> "Attempt":
-        """Return the attempt with other findings, and with no reading left to choose."""
+        """Return the attempt with other findings; the choice between two readings is made."""
         sorted_findings = gravest_first(tuple(findings))
         return replace(
             self,
@@ -85,7 +88,7 @@ class Attempt:
         )
 
     def with_doubts(self, doubts: Collection[Finding]) -> "Attempt":
-        """Return the attempt with further findings, about options that were set."""
+        """Return the attempt with further findings about options that were set automatically."""
         if not doubts:
             return self
         findings = gravest_first((*self.calibration.findings, *doubts))
@@ -96,7 +99,7 @@ class Attempt:
         )
 
     def with_messages(self, options: Options, messages: Collection[str]) -> "Attempt":
-        """Return the attempt with options that were set, and with warnings about these options."""
+        """Return the attempt with options that were set automatically, and warnings about them."""
         warnings = tuple(dict.fromkeys((*messages, *self.calibration.warnings)))
         calibration = replace(self.calibration, warnings=warnings)
         return replace(
@@ -107,7 +110,7 @@ class Attempt:
 def with_options(snapshot: Snapshot, options: Options) -> Snapshot:
     """Return the snapshot with other options.
 
-    Poses that were paired with another time offset are paired anew, from the stamps of the pairs.
+    For another time offset, poses that were paired already are paired again.
     """
     if not options:
         return snapshot
@@ -116,9 +119,9 @@ def with_options(snapshot: Snapshot, options: Options) -> Snapshot:
         return replace(snapshot, config=config)
     if not len(snapshot.kept):
         return replace(snapshot, config=config, time_offset=None)
-    # The poses as they came in: repairs apply once.
-    as_given = replace(snapshot.config, **defaults_of(STREAM_REPAIRS))
-    parent, child = replace(snapshot, config=as_given).streams
+    # The new snapshot applies the repairs, so its poses must not contain them.
+    without_repairs = replace(snapshot.config, **defaults_of(STREAM_REPAIRS))
+    parent, child = replace(snapshot, config=without_repairs).streams
     return replace(
         snapshot,
         config=replace(config, max_gap=snapshot.max_gap_s),

@@ -1,6 +1,6 @@
 """Calibrator: collects the poses of two streams while they arrive, and pairs them.
 
-The node, the replay of bags and the Python API use it. It imports neither ROS nor files.
+The node, the replay of bags and the Python API use this class.
 """
 
 import math
@@ -27,25 +27,25 @@ from hand_eye_calib.core.results.calibration import Calibration
 
 @dataclass(frozen=True, kw_only=True)
 class BufferLimits:
-    """Limits of the buffers, and when poses are made into pairs.
+    """Limits of the buffers, and of the batches of poses that are paired.
 
     Attributes
     ----------
     capacity : int
         Largest number of poses of a stream. A buffer fills up if the other stream lags behind, or
-        if the time offset is not estimated yet; then a batch is paired, or half of the buffer is
-        dropped.
+        if the time offset is not estimated yet. A full buffer is paired in part; if this is not
+        possible, half of its poses are dropped.
     pairing_starts : int
-        Number of buffered poses above which the oldest are paired. Up to this number, messages may
-        arrive in any order: 20 s at 100 Hz.
+        Number of buffered poses above which the oldest are paired: 20 s at 100 Hz. Buffered
+        messages may arrive in any order.
     batch : int
         Largest number of poses that are paired at once. Small batches keep the time of a single
         pose below a few milliseconds.
     batch_every : int
         Number of new poses between two batches.
     late_ns : int
-        Poses closer than this to the newest pose of their stream are not paired yet: others may
-        arrive late.
+        Poses closer than this to the newest pose of their stream are not paired yet, because
+        earlier poses may still arrive.
     """
 
     capacity: int = 20_000
@@ -64,13 +64,13 @@ class StreamStatistics:
     received : int
         Poses that were accepted.
     refused_duplicate : int
-        Poses whose stamp another pose had.
+        Poses that were refused because an earlier pose had the same stamp.
     refused_late : int
-        Poses that arrived after later ones had been paired.
+        Poses that were refused because later poses had already been paired.
     dropped_unpaired : int
-        Accepted poses at whose times the other stream had none.
+        Accepted poses that were dropped because the other stream had no poses at their times.
     first_stamp_ns, last_stamp_ns : int or None
-        Range of the stamps that were accepted.
+        Smallest and largest stamp that was accepted.
     """
 
     received: int = 0
@@ -88,11 +88,11 @@ _WIDTH = 7
 class _PoseBuffer:
     """Poses of one sensor in order of their stamps, the names of its frames, and its statistics.
 
-    The names are empty until they are received.
+    The names of the frames are empty until a message with names is received.
     """
 
     def __init__(self) -> None:
-        # Python's arrays append single poses as fast as lists, and NumPy copies them at once.
+        # Python's arrays append single poses as fast as lists do, and NumPy copies whole arrays.
         self.stamps_ns = array("q")
         self._poses = array("d")
         self._dropped_until_ns = -(2**63)
@@ -127,16 +127,16 @@ class _PoseBuffer:
         return self.stamps_ns[min(index, len(self) - 1)]
 
     def trajectory(self, until_ns: int = 2**63) -> Trajectory:
-        """Return the poses up to a stamp, and those after it that interpolation needs."""
+        """Return the poses up to a stamp, and the few poses after it that interpolation needs."""
         end = bisect_right(self.stamps_ns, until_ns) + REACH
         poses = np.array(self._poses[: _WIDTH * end]).reshape(-1, _WIDTH)
         stamps_ns = np.array(self.stamps_ns[:end], dtype=np.int64)
         return Trajectory.from_quat_xyzw(stamps_ns, poses[:, :3], poses[:, 3:])
 
     def drop(self, until_ns: int, unpaired: bool) -> None:
-        """Drop poses up to and including a stamp, except the last ones, which interpolation needs.
+        """Drop poses up to and including a stamp, except the last few for interpolation.
 
-        If ``unpaired``, the statistics count them as dropped.
+        If ``unpaired``, the statistics count the poses as dropped.
         """
         split = max(bisect_right(self.stamps_ns, until_ns) - REACH, 0)
         if unpaired:
@@ -185,7 +185,7 @@ class Calibrator:
         self._proposed_offset: TimeOffset | None = None
 
     def reconfigure(self, config: CalibratorConfig) -> None:
-        """Set other options. Poses stay, except pairs made with another time offset."""
+        """Set other options. Poses are kept, except pairs with another time offset."""
         if config.time_offset != self.config.time_offset:
             self._drop_pairs()
         self.config = config
@@ -207,7 +207,7 @@ class Calibrator:
         return self._buffers[stream].frame
 
     def set_frame(self, stream: str, sensor_frame: str) -> None:
-        """Set the name of a stream's sensor frame in its messages.
+        """Set the name of a stream's sensor frame, as its messages name it.
 
         An option that names the frame overrides this name.
 
@@ -235,7 +235,7 @@ class Calibrator:
         return self._buffers[stream].world
 
     def set_world(self, stream: str, world_frame: str) -> None:
-        """Set the name of the fixed frame of a stream's poses; the first name stays."""
+        """Set the name of the fixed frame of a stream's poses; later calls change nothing."""
         buffer = self._buffers[stream]
         buffer.world = buffer.world or frame_name(world_frame)
 
@@ -279,7 +279,7 @@ class Calibrator:
         if is_full or (is_due and len(buffer) > limits.pairing_starts):
             self._make_pairs(is_full)
         if len(buffer) >= limits.capacity:
-            # These poses cannot be paired: the other stream has no poses at their times.
+            # The older half cannot be paired, because the other stream has no poses at its times.
             buffer.drop(buffer.stamp_of(len(buffer) // 2), unpaired=True)
         return buffer.add(int(stamp_ns), (*position, *quat_xyzw))
 
@@ -300,27 +300,30 @@ class Calibrator:
         )
 
     def take_pairs(self) -> PosePairs:
-        """Return the pose pairs made so far and drop them, except the last one.
+        """Return the pose pairs made so far, and drop all but the last pair.
 
-        The next pairs follow the last one, and the next call returns it again.
+        The last pair is kept because new pairs must be later; the next call returns it again.
         """
         pairs = self._kept
         self._kept_parts = [pairs[-1:]]
         return pairs
 
     def estimate(self) -> Calibration:
-        """Estimate the extrinsic from all poses so far; errors as of ``Snapshot.estimate``."""
+        """Estimate the extrinsic from all poses so far.
+
+        Raises the errors of :meth:`~hand_eye_calib.core.engine.snapshot.Snapshot.estimate`.
+        """
         return self.snapshot().estimate()
 
     def adopt(self, offset: TimeOffset | None) -> None:
-        """Store the time offset that was estimated for a snapshot, to estimate it only once."""
+        """Store the time offset that was estimated for a snapshot, so that it is estimated once."""
         self._proposed_offset = offset or self._proposed_offset
 
     def _make_pairs(self, is_full: bool) -> None:
         """Pair the oldest poses, at most a batch, and drop them from the buffers.
 
-        Poses are old enough if none are expected to arrive before them. A time offset is estimated
-        when a buffer is full.
+        Poses are paired once earlier poses are not expected any more, see ``late_ns``. If the
+        options ask for a time offset, it is estimated when a buffer is full.
         """
         parent = self._buffers["parent"]
         child = self._buffers["child"]
@@ -336,7 +339,7 @@ class Calibrator:
         offset_ns = round(float(config.time_offset) * 1e9)
         if self._paired_at is None:
             self._paired_at = slower_stream(np.array(parent.stamps_ns), np.array(child.stamps_ns))
-        # On the parent's clock.
+        # Last stamp of the batch, on the parent's clock.
         horizon_ns = min(self._end_of_batch(parent), self._end_of_batch(child) + offset_ns)
         to_horizon = child.trajectory(horizon_ns - offset_ns)
         if self._time_offset:
@@ -371,19 +374,20 @@ class Calibrator:
 
     @property
     def _kept(self) -> PosePairs:
-        """All pose pairs made so far. The parts are concatenated on demand."""
+        """All pose pairs made so far."""
+        # Batches are concatenated only when all pairs are needed.
         if len(self._kept_parts) > 1:
             self._kept_parts = [PosePairs.concatenate(*self._kept_parts)]
         return self._kept_parts[0]
 
 
 class Calibrators(dict[str, Calibrator]):
-    """Calibrators with the same parent sensor, by child sensor: "child", and further names."""
+    """Calibrators with the same parent sensor. Keys are the child streams: "child" and others."""
 
     def takers(self, stream: str) -> list[tuple[str, Calibrator]]:
-        """Return the calibrators that use a stream, each with the name of the stream in it.
+        """Return the calibrators that use a stream, each with the calibrator's name of the stream.
 
-        All calibrators use the parent's stream.
+        All calibrators use the parent's stream. Each child stream is "child" in its own calibrator.
         """
         if stream == "parent":
             return [(stream, calibrator) for calibrator in self.values()]

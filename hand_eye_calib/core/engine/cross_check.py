@@ -1,12 +1,13 @@
-"""Comparison of a result with other answers to the same question.
+"""Comparison of a result with other estimates of the same transform.
 
-The other answers are of robust least squares: over several numbers of poses, and from each half of
-the recording. The scatter of the answers about the result is compared with what their covariances
-allow. Other numbers of poses reveal what the noise model misses, such as errors with longer
-correlation times than it assumes. The halves reveal what changes during the recording. Neither
+The other estimates come from robust least squares: from motions over several numbers of poses, and
+from each half of the recording. Their scatter about the result is compared with their covariances.
+Motions over other numbers of poses reveal errors that the noise model misses, such as errors with
+longer correlation times than it assumes. The halves reveal changes during the recording. Neither
 reveals a constant error.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -24,7 +25,7 @@ from hand_eye_calib.core.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.core.results.records import AXES, AxisScatter, CrossCheck
 from hand_eye_calib.core.solvers import robust
 
-# Motion pairs of the halves if the result has no reference of its own.
+# Reference of the halves if the result has no reference of its own.
 _REFERENCE_OF_HALVES = "B8"
 
 # Largest number of motion pairs of a half.
@@ -33,30 +34,30 @@ _MOST_PAIRS = 3_000
 # Smallest number of poses of a half.
 _MIN_POSES = 20
 
-# Smallest number of other answers for a robust standard deviation.
+# Smallest number of other estimates for a robust standard deviation.
 _MIN_OTHERS = 3
 
-# An answer is about as certain as the result if its standard deviation is below this many of the
-# result's.
+# An estimate is about as certain as the result if its standard deviation is below this multiple of
+# the result's.
 _AS_CERTAIN = 3.0
 
-# Smallest number of such answers for a robust standard deviation.
+# Smallest number of such estimates for a robust standard deviation.
 _MIN_AS_CERTAIN = 2
 
-# Halves are not compared on an axis whose standard deviations differ by this factor: the smaller
-# one comes from noise. The factor is 12 to 47 for simulated straight starts of 40 s, and 1.1 to 4.0
-# with curves in both halves.
+# Halves are not compared on an axis whose standard deviations differ by more than this factor: the
+# smaller one comes from noise. The factor is 12 to 47 for simulated straight starts of 40 s, and
+# 1.1 to 4.0 with curves in both halves.
 _UNEQUAL_HALVES = 5.0
 
-# Smallest joint standard deviation (m, rad) to divide by: noise-free data has none.
+# Smallest standard deviation (m, rad) that is divided by, for noise-free data.
 _ROUNDING = 1e-9
 
 
 def cross_checked(solved: Solved, config: CalibratorConfig, pose_pairs: PosePairs) -> Calibration:
     """Return the result of a solve with its cross-check.
 
-    An axis that no other solve and no half of the recording determines becomes weak. A prior on
-    such an axis replaces the estimate from motion.
+    An axis that the result determines and no other estimate does becomes weak. A prior on such an
+    axis replaces the estimate from motion.
 
     Parameters
     ----------
@@ -73,26 +74,25 @@ def cross_checked(solved: Solved, config: CalibratorConfig, pose_pairs: PosePair
     replaced = [axis for axis in unconfirmed if axis in config.prior()]
     if replaced:
         result = solved.calibration(replaced)
-    observability = tuple(
-        replace(dof, verdict=DofVerdict.WEAK)
-        if dof.name in unconfirmed and dof.verdict is DofVerdict.OBSERVED
-        else dof
-        for dof in result.observability_measured
-    )
-    # The result is compared as the noise model alone claims it. Its standard deviations contain
-    # the second opinions, which could not contradict it otherwise.
-    alone = replace(solved, excess=np.zeros((6, 6))).calibration(replaced)
+    observability = []
+    for dof in result.observability_measured:
+        if dof.name in unconfirmed and dof.verdict is DofVerdict.OBSERVED:
+            dof = replace(dof, verdict=DofVerdict.WEAK)
+        observability.append(dof)
+    # The standard deviations of the result contain the scatter of the other estimates, so these
+    # could not contradict it. The comparison uses those of the noise model alone.
+    of_model = replace(solved, excess=np.zeros((6, 6))).calibration(replaced)
     return replace(
         result,
-        observability_measured=observability,
-        cross_check=compare_answers(alone, others, halves),
+        observability_measured=tuple(observability),
+        cross_check=compare_answers(of_model, others, halves),
     )
 
 
 def _unconfirmed(result: Calibration, others: Sequence[Assessment]) -> BoolArray:
-    """Return which axes (6,) the result determines and no other answer does."""
-    # A result with a reference was solved where the motion is most informative: other references
-    # may be less informative.
+    """Return which axes (6,) the result determines and no other estimate does."""
+    # A result with a reference uses the most informative motions, so other motions may determine
+    # fewer axes.
     if len(others) < _MIN_OTHERS or METHODS[result.method].uses_reference:
         return np.zeros(len(AXES), dtype=bool)
     of_others = np.array([other.sigmas for other in others])
@@ -100,15 +100,15 @@ def _unconfirmed(result: Calibration, others: Sequence[Assessment]) -> BoolArray
 
 
 def answers_of_whole(result: Calibration, pose_pairs: PosePairs) -> tuple[Assessment, ...]:
-    """Return answers over several numbers of poses, with the scale of the result."""
+    """Estimate from motions over several numbers of poses, with the scale of the result."""
     scaled = pose_pairs.child_scaled(result.scale)
     return second_opinions(scaled.Ts_pw_p, scaled.Ts_cw_c, result.T_parent_child)
 
 
 def answers_of_halves(result: Calibration, pose_pairs: PosePairs) -> list[Assessment]:
-    """Return the answer from each half of the recording that has enough poses.
+    """Estimate from each half of the recording that has enough poses.
 
-    Both have the scale of the result, and its reference if it has one.
+    The estimates use the scale of the result, and its reference if there is one.
     """
     scaled = pose_pairs.child_scaled(result.scale)
     middle = len(scaled) // 2
@@ -120,8 +120,8 @@ def answers_of_halves(result: Calibration, pose_pairs: PosePairs) -> list[Assess
         if len(half) < _MIN_POSES:
             continue
         pairs = motion_pairs(half.Ts_pw_p, half.Ts_cw_c, reference)
-        pairs = pairs[:: max(-(-len(pairs) // _MOST_PAIRS), 1)]
         if len(pairs):
+            pairs = pairs[:: math.ceil(len(pairs) / _MOST_PAIRS)]
             answers.append(assess_robust(pairs, robust.solve(pairs, result.T_parent_child)))
     return answers
 
@@ -129,16 +129,16 @@ def answers_of_halves(result: Calibration, pose_pairs: PosePairs) -> list[Assess
 def compare_answers(
     calibration: Calibration, others: Sequence[Assessment] = (), halves: Sequence[Assessment] = ()
 ) -> CrossCheck:
-    """Compare a result with other answers to the same question.
+    """Compare a result with other estimates of the same transform.
 
     Parameters
     ----------
     calibration : Calibration
     others : sequence of Assessment
-        Answers from the whole recording.
+        Estimates from the whole recording.
     halves : sequence of Assessment
-        Answers from the first and the second half of the recording; not compared unless there are
-        two.
+        Estimates from the first and the second half of the recording. Only two halves are
+        compared.
     """
     sigmas = calibration.sigmas_measured
     allowance = calibration.allowance
@@ -172,10 +172,14 @@ def compare_answers(
 def _scatter_of_halves(
     calibration: Calibration, halves: Sequence[Assessment]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the standard deviation (6,) of a result by the difference of both halves.
+    """Estimate the standard deviation of a result from the difference of both halves.
 
-    The second array is the same in joint standard deviations. Axes are NaN if they are not
-    compared.
+    Returns
+    -------
+    (6,) array
+        Standard deviation (m, rad); NaN for axes that are not compared.
+    (6,) array
+        The same in units of the standard deviation that the covariances predict.
     """
     if len(halves) != 2:
         return np.full(6, np.nan), np.full(6, np.nan)
@@ -184,20 +188,20 @@ def _scatter_of_halves(
     half_sigmas = np.maximum([first.sigmas, second.sigmas], _ROUNDING)
     are_alike = half_sigmas.max(axis=0) < _UNEQUAL_HALVES * half_sigmas.min(axis=0)
     between = np.where(are_alike, between, np.nan)
-    # The result is about the mean of both halves, whose standard deviation is half of that of their
-    # difference. The halves do not contain the allowance, nor the slow errors that the noise model
-    # estimates.
+    # The result is about the mean of both halves. The standard deviation of a mean is half of that
+    # of a difference. The covariances of the halves contain neither the allowance nor the slow
+    # errors that the noise model estimates.
     has_slow_errors = not METHODS[calibration.method].uses_reference
-    beside = calibration.sigmas if has_slow_errors else calibration.allowance
-    return between / 2, between / 2 / np.hypot(joint / 2, beside)
+    missing = calibration.sigmas if has_slow_errors else calibration.allowance
+    return between / 2, between / 2 / np.hypot(joint / 2, missing)
 
 
 def _apart(
     T_parent_child: FloatArray, sigmas: FloatArray, other: Assessment
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the distance (6,) of another answer and the joint standard deviation.
+    """Return the distance (6,) of another estimate, and the joint standard deviation (6,).
 
-    Both are NaN on axes that either answer does not determine.
+    Both are NaN on axes that the result or the other estimate does not determine.
     """
     distance = np.abs(deviation(T_parent_child, other.T_parent_child))
     joint = np.hypot(sigmas, other.sigmas)
@@ -209,9 +213,9 @@ def _apart(
 
 
 def _robust_sigma(distances: FloatArray, fewest: int) -> FloatArray:
-    """Return the standard deviation (6,) by the median of distances (N, 6) from zero.
+    """Estimate the standard deviation (6,) from the median of absolute distances (N, 6).
 
-    It is NaN for axes with fewer than ``fewest`` finite distances.
+    The standard deviation is NaN for axes with fewer than ``fewest`` finite distances.
     """
     medians = np.full(6, np.nan)
     for axis, column in enumerate(distances.T):

@@ -1,5 +1,6 @@
-"""From synchronised poses to a calibration: settle the scale, choose the motion pairs, solve,
-assess, add the prior.
+"""From synchronised poses to a calibration.
+
+The steps: settle the scale, choose the motion pairs, solve, assess, add the prior.
 """
 
 from collections.abc import Collection
@@ -34,18 +35,18 @@ from hand_eye_calib.core.solvers.all_pairs import Solution
 from hand_eye_calib.core.solvers.registry import Method
 from hand_eye_calib.core.solvers.robust import Stride
 
-# Largest share of the increments that may be jumps without a warning. With jumps at a tenth of the
-# poses of both trajectories, a fifth of the increments are jumps.
+# Largest share of jumps among the increments without a warning. If a tenth of the poses of each
+# trajectory jumps, a fifth of the increments are jumps.
 _MAX_JUMPS = 0.25
 
 
-def _no_spread() -> FloatArray:
+def _zero_covariance() -> FloatArray:
     return np.zeros((6, 6))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Solved:
-    """Poses that were solved and assessed with any method, before a prior is added.
+    """Solution of synchronised poses and its assessment, before a prior is added.
 
     Attributes
     ----------
@@ -55,7 +56,7 @@ class Solved:
     measured : str
         Kind of data.
     pairs : MotionPairs
-        Motion pairs whose residuals the result states.
+        Motion pairs whose residuals become part of the result.
     weights : (K,) array
         Weights of the motion pairs.
     stamps_ns : (N,) int64 array
@@ -67,7 +68,7 @@ class Solved:
         Whether the minimum is proved to be global.
     warnings : tuple of str
     spread : (6, 6) array
-        Covariance of a shift of the mount that the recording may contain; zeros without one.
+        Covariance due to a possible shift of the mount during the recording; zeros without one.
     scale : float
         Factor of the child's lengths.
     scale_fit : SimilarityFit or None
@@ -77,9 +78,9 @@ class Solved:
     floor : (6, 6) array
         Common-mode covariance.
     opinions : tuple of Assessment
-        Second opinions on an answer of the noise model.
+        Estimates of other methods, which check the solution of the noise model.
     excess : (6, 6) array
-        Covariance that the noise model misses, by the second opinions.
+        Covariance that the noise model misses, estimated from ``opinions``.
     """
 
     solution: Solution | AdaptiveSolution
@@ -95,13 +96,13 @@ class Solved:
     reference_reason: str = ""
     proved_global: str = "not tried"
     warnings: tuple[str, ...] = ()
-    spread: FloatArray = field(default_factory=_no_spread)
+    spread: FloatArray = field(default_factory=_zero_covariance)
     scale: float = 1.0
     scale_fit: SimilarityFit | None = None
     time_offset: TimeOffset | None = None
-    floor: FloatArray = field(default_factory=_no_spread)
+    floor: FloatArray = field(default_factory=_zero_covariance)
     opinions: tuple[covariance.Assessment, ...] = ()
-    excess: FloatArray = field(default_factory=_no_spread)
+    excess: FloatArray = field(default_factory=_zero_covariance)
 
     def calibration(self, unseen: Collection[str] = ()) -> Calibration:
         """Return the result without frame names. The axes ``unseen`` become unobservable."""
@@ -113,28 +114,16 @@ class Solved:
         if unseen:
             assessment = covariance.without_axes(assessment, unseen)
         fused = fuse(assessment, config.prior())
-        offset_s = float(config.time_offset)
-        offset_sigma_s = 0.0
-        clock_rate = None
-        if self.time_offset:
-            offset_s = self.time_offset.seconds
-            offset_sigma_s = self.time_offset.sigma_s
-            clock_rate = self.time_offset.rate
-        scale = self.scale
-        scale_sigma = 0.0
         warnings = self.warnings
-        if self.scale_fit:
-            scale_sigma = self.scale_fit.scale_sigma
-            if config.scale == "auto":
-                factor = f"{scale:.4f} +/- {scale_sigma:.4f}, as estimated from the motion"
-                warnings = (f"the child's lengths are multiplied by {factor}", *warnings)
+        if self.scale_fit and config.scale == "auto":
+            factor = f"{self.scale:.4f} +/- {self.scale_fit.scale_sigma:.4f}"
+            warnings = (
+                f"the child's lengths are multiplied by {factor}, as estimated from the motion",
+                *warnings,
+            )
         noise = None
         if isinstance(solution, AdaptiveSolution):
             noise = solution.describe(self.stamps_ns)
-            offset_s += solution.time_offset_s
-            offset_sigma_s = solution.time_offset_sigma_s or offset_sigma_s
-            scale_sigma = scale * solution.scale_sigma or scale_sigma
-            scale *= solution.scale
         residuals = Residuals(
             *self.pairs.residuals(fused.T_parent_child),
             self.weights,
@@ -158,12 +147,36 @@ class Solved:
             reference_reason=self.reference_reason,
             noise=noise,
             backend=config.backend,
-            time_offset_s=offset_s,
-            time_offset_sigma_s=offset_sigma_s,
-            clock_rate=clock_rate,
-            scale=scale,
-            scale_sigma=scale_sigma,
+            **self._clock(),
+            **self._scale(),
         )
+
+    def _clock(self) -> dict[str, Any]:
+        """Return the fields of the result about the clocks."""
+        offset_s = float(self.config.time_offset)
+        offset_sigma_s = 0.0
+        clock_rate = None
+        if self.time_offset:
+            offset_s = self.time_offset.seconds
+            offset_sigma_s = self.time_offset.sigma_s
+            clock_rate = self.time_offset.rate
+        if isinstance(self.solution, AdaptiveSolution):
+            offset_s += self.solution.time_offset_s
+            offset_sigma_s = self.solution.time_offset_sigma_s or offset_sigma_s
+        return {
+            "time_offset_s": offset_s,
+            "time_offset_sigma_s": offset_sigma_s,
+            "clock_rate": clock_rate,
+        }
+
+    def _scale(self) -> dict[str, float]:
+        """Return the fields of the result about the scale of the child."""
+        scale = self.scale
+        scale_sigma = self.scale_fit.scale_sigma if self.scale_fit else 0.0
+        if isinstance(self.solution, AdaptiveSolution):
+            scale_sigma = scale * self.solution.scale_sigma or scale_sigma
+            scale *= self.solution.scale
+        return {"scale": scale, "scale_sigma": scale_sigma}
 
 
 def calibration_of(
@@ -175,12 +188,12 @@ def calibration_of(
     warnings: tuple[str, ...] = (),
     **fields: Any,
 ) -> Calibration:
-    """Return the result of a solution, whatever the streams measure.
+    """Return the result of a solution for any kind of data.
 
     Parameters
     ----------
     solution : object
-        Has ``converged`` and ``objective``.
+        Any object with the attributes ``converged`` and ``objective``.
     fused : Assessment
         Assessment of the solution, fused with the prior.
     residuals : Residuals
@@ -188,7 +201,7 @@ def calibration_of(
         Stamps of the poses.
     config : CalibratorConfig
     warnings : tuple of str
-        A warning about axes that are mostly from the prior comes before these.
+        A warning about axes that are mostly from the prior is put before these.
     **fields
         Further fields of the Calibration.
     """
@@ -238,9 +251,9 @@ def solve_poses(
     ----------
     pose_pairs : PosePairs
     config : CalibratorConfig
-        With a time offset in seconds, which the poses have already.
+        Its time offset is in seconds and applied to the poses already.
     time_offset : TimeOffset, optional
-        That time offset, if it was estimated.
+        The same time offset with its uncertainty, if it was estimated.
 
     Raises
     ------
@@ -256,12 +269,12 @@ def solve_poses(
         solved = _solve_stream(scaled, config, is_clock_free=time_offset is not None)
     else:
         solved = _solve_pairs(scaled, config)
-    spread = _no_spread()
+    spread = _zero_covariance()
     if scale_fit:
         by_log_scale = scale_fit.sensitivity[:, 0]
         relative_sigma = scale_fit.scale_sigma / scale_fit.scale
         spread += np.outer(by_log_scale, by_log_scale) * relative_sigma**2
-    # The covariance of the noise model contains the uncertainty of an offset that it estimates.
+    # A noise model that estimates the offset has its uncertainty in the covariance already.
     has_offset = isinstance(solved.solution, AdaptiveSolution) and solved.solution.time_offset_s
     if time_offset and time_offset.fit and not has_offset:
         by_offset = time_offset.fit.sensitivity[:, 1]
@@ -287,7 +300,7 @@ def solve_poses(
 
 def floor_of(solved: Solved, pose_pairs: PosePairs, config: CalibratorConfig) -> FloatArray:
     """Return the common-mode covariance (6, 6) of the sensors that are odometries."""
-    # The functions of `covariance` assume two odometries.
+    # The functions of `covariance` return the covariance of two odometries.
     share = [config.parent_kind, config.child_kind].count("odometry") / 2
     speed_m_s = covariance.usual_speed(pose_pairs.stamps_ns, se3.translation_of(pose_pairs.Ts_pw_p))
     if isinstance(solved.solution, AdaptiveSolution):
@@ -299,7 +312,7 @@ def floor_of(solved: Solved, pose_pairs: PosePairs, config: CalibratorConfig) ->
 def _solve_stream(pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free: bool) -> Solved:
     """Solve with the adaptive estimator.
 
-    Method ``auto`` takes DNLO if the noise model cannot work on these poses, or if the user set a
+    Method ``auto`` uses DNLO instead if no noise model fits these poses, or if the user set a
     reference, which only the paper's methods have.
     """
     is_auto = config.method == "auto"
@@ -307,9 +320,9 @@ def _solve_stream(pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free
     if is_auto and config.reference != "auto":
         reason = f"auto: dnlo, because the user set reference {config.reference}"
         return replace(_solve_pairs(pose_pairs, with_dnlo), method_reason=reason)
-    # Numbers that the user set are not estimated. The noise model refines a time offset that the
-    # user set to "estimate".
-    known = {
+    # The noise model does not estimate what the user set to a number. It refines a time offset that
+    # the user set to "estimate".
+    is_fixed = {
         "scale": config.is_known("scale"),
         "time": config.is_known("time_offset") and not is_clock_free,
     }
@@ -318,7 +331,7 @@ def _solve_stream(pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free
             pose_pairs.stamps_ns,
             pose_pairs.Ts_pw_p,
             pose_pairs.Ts_cw_c,
-            [name for name in SYSTEMATIC if not known.get(name)],
+            [name for name in SYSTEMATIC if not is_fixed.get(name)],
             is_clock_free=is_clock_free,
         )
     except NoiseModelError:
@@ -350,7 +363,7 @@ def _of_model(
 ) -> Solved:
     """Assess a solution of the adaptive estimator.
 
-    Its motion pairs have the scale and the time offset of the solution.
+    The motion pairs of the result have the scale and the time offset of the solution.
     """
     stamps_ns = pose_pairs.stamps_ns
     child = Trajectory(stamps_ns, pose_pairs.Ts_cw_c).scaled(solution.scale)
@@ -391,12 +404,13 @@ def _solve_pairs(
     pose_pairs : PosePairs
     config : CalibratorConfig
     adaptive : AdaptiveSolution, optional
-        Solution of the adaptive estimator, which the choice of the reference ``auto`` needs.
+        Solution of the adaptive estimator, which chooses the reference ``auto``. By default, the
+        poses are solved for this choice.
     """
     method = Method(config.method, config.threshold, config.min_inlier_fraction, config.backend)
     reference = config.reference
     reason = ""
-    spread = _no_spread()
+    spread = _zero_covariance()
     warnings: tuple[str, ...] = ()
     best: Stride | None = None
     if reference == "auto" and method.solve_best_stride:

@@ -29,14 +29,14 @@ class Kind:
     check : callable
         ``check(snapshot, calibration)`` checks the streams; the calibration may be None.
     least_clock_change_s : float
-        Change of the time offset (s) from which on the poses are paired anew.
+        Smallest change of the time offset (s) after which the poses are paired anew.
     is_timed_by_speed : bool
         Whether the time offset is estimated from speeds, rather than from angular rates.
     allowed : mapping
-        Options that have a meaning for whole poses only: the names of their fields, and the values
-        that may be set.
+        Options of whole poses that this kind cannot obey: the name of each option, and the values
+        that may be set all the same.
     has_conventions : bool
-        Whether checks find conventions, units and clocks of streams that cannot be solved as given.
+        Whether checks detect wrong conventions, units and clocks even if no solve succeeds.
     """
 
     solve: Callable[[Any, bool | None], Calibration]
@@ -52,7 +52,7 @@ class Kind:
         Raises
         ------
         ConfigError
-            If one is; the message names it.
+            If such an option is set; the message names the option.
         """
         for name, values in self.allowed.items():
             value = getattr(config, name)

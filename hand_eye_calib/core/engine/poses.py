@@ -1,4 +1,4 @@
-"""Poses of both sensors: how they are solved and checked, and mistakes in their conventions."""
+"""The kind of data of two streams of poses: solve and check them."""
 
 from dataclasses import replace
 
@@ -13,14 +13,14 @@ from hand_eye_calib.core.engine.kinds import Kind
 from hand_eye_calib.core.engine.snapshot import MOST_MOVED_S, Snapshot
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict
 
-#: Options that state whether the poses of a stream are inverse.
+#: Options that invert the poses of a stream.
 INVERSIONS = frozenset({"parent_invert", "child_invert"})
 
 
 def solve(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
-    """Solve synchronised poses, and compare the result with other references and with both halves.
+    """Solve synchronised poses, and cross-check the result.
 
-    With ``cross_check`` None, the comparison is made unless the user set the reference.
+    If ``cross_check`` is None, the result is cross-checked unless the user set the reference.
     """
     config = snapshot.config
     pairs = snapshot.pose_pairs
@@ -37,8 +37,8 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
     ----------
     snapshot : Snapshot
     calibration : Calibration, optional
-        A result from these streams. Its time offset, scale and extrinsic count as known. Without a
-        result, the time offset and the scale of the options count as known if they are numbers.
+        A result from these streams. The check uses its time offset, scale and extrinsic. Without a
+        result, the check uses the time offset and the scale of the options if they are numbers.
     """
     config = snapshot.config
     result = checking.check_streams(
@@ -51,22 +51,23 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
         are_exact=config.parent_kind == config.child_kind == "exact",
     )
     obsolete = _obsolete_codes(snapshot, calibration)
-    findings = [found for found in result.findings if found.code not in obsolete]
+    findings = [finding for finding in result.findings if finding.code not in obsolete]
     if calibration and config.scale == "none":
         findings += checking.check_model_scale(calibration.scale, calibration.scale_sigma)
     findings = answered(findings, config)
     if INVERSIONS & config.given:
-        # Whether both streams are inverse is the user's word.
+        # The user has decided whether both streams are inverse.
         findings = [
-            replace(found, severity=Severity.NOTE) if found.code == "inverse_both" else found
-            for found in findings
+            replace(finding, severity=Severity.NOTE) if finding.code == "inverse_both" else finding
+            for finding in findings
         ]
     return replace(result, findings=gravest_first(findings))
 
 
 def _known_extrinsic(calibration: Calibration | None) -> checking.Known | None:
-    """Return the extrinsic of a result with its standard deviations; infinite for all axes of a
-    result that does not observe all.
+    """Return the extrinsic of a result with its standard deviations.
+
+    All standard deviations are infinite if the result does not observe every axis.
     """
     if calibration is None:
         return None
@@ -76,18 +77,18 @@ def _known_extrinsic(calibration: Calibration | None) -> checking.Known | None:
 
 
 def _obsolete_codes(snapshot: Snapshot, calibration: Calibration | None) -> set[str]:
-    """Return the codes of findings that kept pairs or a result contradict."""
+    """Return the codes of findings that do not apply to these pairs or to this result."""
     obsolete = set()
     if len(snapshot.kept):
-        obsolete.add("gaps")  # pairs may have gaps where the streams have none
-    not_shown = DofVerdict.UNOBSERVABLE, DofVerdict.PRIOR
-    translations = calibration.observability[:3] if calibration else ()
-    if calibration and all(dof.verdict not in not_shown for dof in translations):
-        obsolete.add("one_axis")
+        obsolete.add("gaps")  # kept pairs have gaps even if the streams had none
+    if calibration:
+        unobserved = {DofVerdict.UNOBSERVABLE, DofVerdict.PRIOR}
+        if unobserved.isdisjoint(dof.verdict for dof in calibration.observability[:3]):
+            obsolete.add("one_axis")
     return obsolete
 
 
-#: Two streams of poses on the road.
+#: The kind of data of two streams of poses.
 POSES = Kind(
     solve=solve,
     check=check,

@@ -1,10 +1,11 @@
 """Choice between two readings of both streams: the second inverts every pose of the first.
 
 Both readings fit equally well (:class:`~hand_eye_calib.core.checks.hypotheses.Readings`). Two kinds
-of evidence differ: the likelihood of the noise (:mod:`~hand_eye_calib.core.noise.readings`) and the
-shape of the motion. The noise has priority. In a small space the shape must support it, because a
-camera that observes a target has the same noise there as inverted poses. If the evidence is not
-clear, both answers are reported, and the verdict is DO NOT USE.
+of evidence distinguish them: the likelihood of the noise
+(:mod:`~hand_eye_calib.core.noise.readings`) and the shape of the motion. The noise has priority. In
+a small space the shape must support the noise, because there a camera that observes a target has
+the same noise as inverted poses. If the evidence is not clear, both results are reported, and the
+verdict is DO NOT USE.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -23,13 +24,13 @@ from hand_eye_calib.core.noise.readings import loss_difference
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
 
-# Smallest difference of the losses that decides. In 200 recordings whose first reading is right and
-# that have no target cameras, the difference was never below -9.
+# Smallest difference of the losses (log likelihoods) that decides. In 200 recordings without target
+# cameras whose first reading is right, the difference was never below -9.
 CLEAR_NOISE = 20.0
 
-# Smallest `Readings.shape` (a logarithm, of either sign) that overrules the noise. The noise of a
-# stream nearly without errors misleads (shape -2.9); the shape never had the wrong sign in 190
-# recordings.
+# Smallest absolute `Readings.shape` (a logarithm) that overrules the noise. In 190 recordings the
+# shape never had the wrong sign. The noise misled for a stream almost without errors, whose shape
+# was -2.9.
 _OVERRULING_SHAPE = 2.0
 
 # Smallest `Readings.paths` (a logarithm) that supports the noise in a small space.
@@ -47,7 +48,7 @@ class Choice:
     doubts : tuple of Finding
         Findings about the choice itself, to be added to the result.
     is_repair : bool
-        Whether the chosen reading needs options, such as ``child_invert``.
+        Whether the chosen reading sets options, such as ``child_invert``.
     """
 
     findings: tuple[Finding, ...]
@@ -67,15 +68,15 @@ def choose(
     result : CheckResult
         A check whose ``readings`` are not None.
     pairs_of : callable
-        Returns the pose pairs for given options, on one clock.
+        Returns the pose pairs with these options, on one clock.
     answer_with : callable
-        Returns the result for given options, on one clock; None if the solve fails.
+        Returns the result with these options, on one clock; None if the solve fails.
     """
     readings = result.readings
     assert readings is not None
-    of_both = [findings_of(hypothesis) for hypothesis in readings.hypotheses]
-    options = [_options_of(findings) for findings in of_both]
-    difference = _difference(pairs_of(options[0]), pairs_of(options[1]))
+    findings_of_readings = [findings_of(hypothesis) for hypothesis in readings.hypotheses]
+    options = [_options_of(findings) for findings in findings_of_readings]
+    difference = _loss_difference(pairs_of(options[0]), pairs_of(options[1]))
     index = decide(readings, difference)
     can_be_right = readings.hypotheses[0].is_upright
     doubts: tuple[Finding, ...] = ()
@@ -85,12 +86,13 @@ def choose(
         index = 0 if can_be_right else int(readings.shape > 0.0)
     elif index == 1 and can_be_right and readings.is_small:
         doubts = (finding("inverse_small", "both"),)
+    # The findings of the chosen reading replace those of both readings.
     codes = {"inverse_both"}
-    for findings in of_both:
+    for findings in findings_of_readings:
         codes.update(suspect.code for suspect in findings)
     others = [other for other in result.findings if other.code not in codes]
     return Choice(
-        findings=gravest_first((*others, *of_both[index])),
+        findings=gravest_first((*others, *findings_of_readings[index])),
         doubts=doubts,
         is_repair=bool(options[index]),
     )
@@ -103,28 +105,36 @@ def decide(readings: Readings, difference: float) -> int | None:
     ----------
     readings : Readings
     difference : float
-        Loss of the second reading less that of the first.
+        Loss of the second reading minus the loss of the first.
     """
-    by_shape = readings.by_shape
     by_noise = 0
     if abs(difference) > CLEAR_NOISE:
         by_noise = -int(np.sign(difference))
-    can_be_right = readings.hypotheses[0].is_upright
-    if by_noise and readings.is_small and by_noise != by_shape:
-        choice = _in_a_small_space(readings, by_noise)
-    elif by_noise == -by_shape and abs(readings.shape) > _OVERRULING_SHAPE:
-        choice = by_shape
-    elif by_noise:
-        choice = by_noise
-    else:
-        choice = by_shape if readings.is_clear else 0
-    if choice == 0 and can_be_right and readings.shape < 0.0 and by_noise <= 0:
-        choice = -1
+    choice = _vote(readings, by_noise)
+    if choice == 0 and readings.hypotheses[0].is_upright:
+        # Without clear evidence, the streams stay as they are if nothing supports an inversion.
+        is_inversion_supported = readings.shape >= 0.0 or by_noise > 0
+        choice = 0 if is_inversion_supported else -1
     return {1: 1, -1: 0}.get(choice)
 
 
-def _in_a_small_space(readings: Readings, by_noise: int) -> int:
-    """Return the choice of the noise in a small space without the shape's support, or another."""
+def _vote(readings: Readings, by_noise: int) -> int:
+    """Return 1 for the second reading, -1 for the first, and 0 without clear evidence.
+
+    ``by_noise`` has the same values, for the evidence of the noise alone.
+    """
+    by_shape = readings.by_shape
+    if by_noise == 0:
+        return by_shape if readings.is_clear else 0
+    if readings.is_small and by_noise != by_shape:
+        return _vote_in_small_space(readings, by_noise)
+    if by_noise == -by_shape and abs(readings.shape) > _OVERRULING_SHAPE:
+        return by_shape
+    return by_noise
+
+
+def _vote_in_small_space(readings: Readings, by_noise: int) -> int:
+    """Return the vote, see :func:`_vote`, if the shape does not support the noise."""
     by_shape = readings.by_shape
     if by_noise * readings.paths > _CLEAR_PATHS:
         return by_noise
@@ -134,8 +144,8 @@ def _in_a_small_space(readings: Readings, by_noise: int) -> int:
     return by_noise if is_usual else 0
 
 
-def _difference(first: PosePairs, second: PosePairs) -> float:
-    """Return the loss of the second reading less that of the first, at their common stamps.
+def _loss_difference(first: PosePairs, second: PosePairs) -> float:
+    """Return the loss of the second reading minus that of the first, at their common stamps.
 
     The difference is 0 if the scale or the noise model of a reading cannot be estimated.
     """
@@ -170,12 +180,12 @@ def _options_of(findings: Collection[Finding]) -> dict[str, float | str]:
 def _unclear(
     options: Sequence[Options], answers: Sequence[Calibration | None], difference: float
 ) -> Finding:
-    """Return the finding that two readings are possible, with both answers."""
+    """Return the finding that both readings are possible, with the result of each reading."""
     texts = []
     for reading_options, answer in zip(options, answers, strict=True):
         values = options_in_words(reading_options)
         reading = f"with {values}" if values else "as the streams are"
-        pose = _in_words(answer.T_parent_child) if answer else "no result"
+        pose = _pose_text(answer.T_parent_child) if answer else "no result"
         texts.append(f"{reading} ({pose})")
     code = "inverse" if options[0] else "inverse_both"
     return finding(
@@ -183,7 +193,7 @@ def _unclear(
     )
 
 
-def _in_words(T_parent_child: np.ndarray) -> str:
+def _pose_text(T_parent_child: np.ndarray) -> str:
     """Format a pose as position (m) and Euler angles (deg)."""
     x, y, z, *rpy = se3.xyz_rpy(T_parent_child)
     roll, pitch, yaw = np.degrees(rpy)

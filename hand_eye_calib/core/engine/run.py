@@ -1,15 +1,15 @@
-"""The road from streams to a result: solve, check, repair, and solve at most twice more.
+"""From streams to a result: solve, check, repair, and solve at most twice more.
 
 1. Solve the streams as given. If the angular rates clearly show that the clocks differ, try an
    estimated time offset first.
 2. Check the streams with the result.
-3. Choose between two readings of both streams, if they fit alike.
-4. Solve with the options that repair a stream (units, conventions), if a check is certain of them.
-5. Solve with an estimated time offset or scale, if a check is certain that they differ.
+3. Choose between two readings of both streams, if both fit equally well.
+4. If a check is certain of options that repair a stream (units, conventions), solve with them.
+5. If a check is certain that clocks or scales differ, solve with an estimated time offset or scale.
 
 Each solve is an :class:`~hand_eye_calib.core.engine.attempts.Attempt`; the best one is kept. The
-command line, Python, the node, batches and rigs call :func:`run`, or :func:`review` for a result
-that they have already.
+command line, Python, the node, batches and rigs call :func:`run`, or :func:`review` if they have a
+result already.
 """
 
 from collections.abc import Callable, Collection
@@ -23,7 +23,8 @@ from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.checks import check as checking
 from hand_eye_calib.core.checks import units
 from hand_eye_calib.core.checks.check import CheckResult
-from hand_eye_calib.core.checks.findings import Finding, Severity, finding, repair_message
+from hand_eye_calib.core.checks.findings import Finding, Severity, repair_message
+from hand_eye_calib.core.checks.findings import finding as new_finding
 from hand_eye_calib.core.checks.hypotheses import HOLDS
 from hand_eye_calib.core.engine import readings as choosing
 from hand_eye_calib.core.engine.attempts import STREAM_REPAIRS, Attempt, with_options
@@ -33,28 +34,37 @@ from hand_eye_calib.core.engine.snapshot import MOST_MOVED_S, UNASKED_S, Snapsho
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
 
-#: Called with the share that is done, 0 to 1, and the step that begins.
+#: ``progress(share, step)``: share of the work that is done, 0 to 1, and name of the next step.
 Progress: TypeAlias = Callable[[float, str], None]
 
-# Share of the time at which the checks begin; a guess, only shown.
+# Share of the work before the checks, for the progress only; a guess.
 _CHECKS_BEGIN = 0.8
 
 _ESTIMATED_CLOCK: Options = {"time_offset": "estimate"}
 
-# Findings whose options are certain.
+# Findings that are certain enough for a second solve, besides those about conventions.
 _CERTAIN_CODES = ("time_offset", "scale", "units", "unit_or_scale")
 
-# Findings whose options are estimated, so that their uncertainty counts.
+# Findings whose option is estimated in the second solve, so that the result contains its
+# uncertainty.
 _ESTIMATED_CODES = ("time_offset", "scale", "unit_or_scale")
 
-# A clock rate counts as known if its spread is below this share of the largest time offset.
+# A clock rate is used if its spread is below this share of the largest time offset.
 _CLEAR_SPREAD = 0.5
 
 
 @dataclass(frozen=True)
 class _Reading:
-    """Chosen reading of both streams: its findings, doubts about the choice, and the options that
-    are settled with it.
+    """Chosen reading of both streams.
+
+    Attributes
+    ----------
+    findings : tuple of Finding
+        Findings of the check for this reading.
+    doubts : tuple of Finding
+        Findings about the choice itself.
+    settled : frozenset of str
+        Options that the choice settles.
     """
 
     findings: tuple[Finding, ...]
@@ -72,9 +82,10 @@ def run(
     snapshot : Snapshot
         The streams, and the options.
     checks : bool, optional
-        False: neither stream checks nor cross-checks, and no second solve. True: cross-checks also
-        with a reference that the user set, which are left out otherwise.
+        False skips stream checks, cross-checks and further solves. True cross-checks even if the
+        user set a reference. By default, such a result is not cross-checked.
     progress : callable, optional
+        See :data:`Progress`.
 
     Raises
     ------
@@ -100,9 +111,10 @@ def review(calibration: Calibration, snapshot: Snapshot, settled: Collection[str
     ----------
     calibration : Calibration
     snapshot : Snapshot
-        The poses and options that gave the result.
+        The poses and options of the result.
     settled : collection of str
-        Options that an earlier check has settled; they stay, as those of the user do.
+        Options that an earlier check has settled. They are not changed, as if the user had set
+        them.
     """
     return _best(_checked(calibration, snapshot), settled, None)
 
@@ -111,11 +123,11 @@ def _solved_and_checked(snapshot: Snapshot, checks: bool | None, report: Progres
     """Return the best attempt at a snapshot."""
     on_clock = _on_another_clock(snapshot)
     if on_clock and on_clock.is_sound and not on_clock.check.readings:
-        return _saying_estimates(on_clock, _ESTIMATED_CLOCK, ())
+        return _with_estimate_warnings(on_clock, _ESTIMATED_CLOCK, ())
     try:
         calibration = snapshot.estimate(cross_check=checks)
     except NotEnoughDataError:
-        # Some mistakes leave nothing to pair, or no scale to estimate.
+        # With some mistakes, no poses can be paired, or no scale can be estimated.
         can_repair = kind_of(snapshot.config).has_conventions
         repaired = _repaired_unsolved(snapshot) if can_repair else None
         if not repaired:
@@ -126,12 +138,11 @@ def _solved_and_checked(snapshot: Snapshot, checks: bool | None, report: Progres
 
 
 def _best(first: Attempt, settled: Collection[str], on_clock: Attempt | None) -> Attempt:
-    """Return the best of a first attempt and of those that its check asks for.
+    """Return the best attempt: the first one, or one with options from its check.
 
-    ``on_clock`` is the attempt with an estimated time offset, if it was made before.
+    ``on_clock`` is the attempt with an estimated time offset, if there is one already.
     """
-    known_s = first.calibration.time_offset_s
-    reading = _reading_of(first.snapshot, first.check, settled, known_s)
+    reading = _reading_of(first.snapshot, first.check, settled, first.calibration.time_offset_s)
     first = first.with_findings(reading.findings)
     settled = reading.settled.union(settled)
     certain = _certain(first.check.findings, first.snapshot.config.given.union(settled))
@@ -148,39 +159,43 @@ def _best(first: Attempt, settled: Collection[str], on_clock: Attempt | None) ->
 
 
 def _on_another_clock(snapshot: Snapshot) -> Attempt | None:
-    """Return the attempt with an estimated time offset, if the angular rates show clearly that the
-    clocks differ; None otherwise, or if no solve is saved by looking first.
+    """Return the attempt with an estimated time offset if the clocks clearly differ, else None.
+
+    Such an attempt first saves the solve without time offset. It is not made if the options or the
+    kind of data exclude a time offset, or if other mistakes must be repaired first.
     """
     config = snapshot.config
     is_free = config.method in ("auto", "adaptive") and config.reference == "auto"
-    is_known = "time_offset" in config.given or len(snapshot.kept) > 0
-    if is_known or not is_free or not kind_of(config).has_conventions:
+    is_settled = "time_offset" in config.given or len(snapshot.kept) > 0
+    if is_settled or not is_free or not kind_of(config).has_conventions:
         return None
     if not snapshot.correlation.is_clear:
         return None
     coarse = TimeOffset(snapshot.correlation.offset_s, correlation=snapshot.correlation)
-    # Motions over one time suffice for a first look.
-    look = refine_time_offset(*snapshot.streams, coarse, snapshot.max_gap_s, UNASKED_S)
-    if look.fit is None or abs(look.seconds) - 3.0 * look.sigma_s < MOST_MOVED_S:
+    # This precision suffices to decide whether the clocks differ.
+    preliminary = refine_time_offset(*snapshot.streams, coarse, snapshot.max_gap_s, UNASKED_S)
+    fit = preliminary.fit
+    smallest_s = abs(preliminary.seconds) - 3.0 * preliminary.sigma_s
+    if fit is None or smallest_s < MOST_MOVED_S:
         return None
-    # Streams with wrong conventions or units are solved as given first: the message of a repair
-    # needs that verdict.
-    if look.fit.has_own_unit or look.fit.unexplained > HOLDS:
+    # With wrong conventions or units, the streams are solved as given first: the message of the
+    # repair states this verdict.
+    if fit.has_own_unit or fit.unexplained > HOLDS:
         return None
-    offset = refine_time_offset(*snapshot.streams, look, snapshot.max_gap_s)
+    offset = refine_time_offset(*snapshot.streams, preliminary, snapshot.max_gap_s)
     other = replace(snapshot, config=replace(config, **_ESTIMATED_CLOCK), time_offset=offset)
     return _solved_with(other, {})
 
 
 def _clock_is_off(first: Attempt) -> bool:
-    """Return whether the poses must be paired anew because of the time offset."""
+    """Return whether the time offset changed so much that the poses must be paired anew."""
     snapshot = first.snapshot
     calibration = first.calibration
     moved_s = abs(calibration.time_offset_s - float(snapshot.resolved.config.time_offset))
     clock = first.check.offset
     is_free = not METHODS[snapshot.config.method].uses_reference
     if clock and is_free and snapshot.config.reference == "auto":
-        # The result has no clock rate, and that of DNLO no time offset: only the check has them.
+        # Only the check estimates a clock rate; for DNLO, only the check estimates the offset.
         largest_s = clock.largest_s(snapshot.unpaired[1].duration_s)
         if clock.spread_s < _CLEAR_SPREAD * largest_s:
             moved_s = max(moved_s, largest_s - _CLEAR_SPREAD * clock.spread_s)
@@ -193,16 +208,16 @@ def _clock_is_off(first: Attempt) -> bool:
 def _reading_of(
     snapshot: Snapshot, result: CheckResult, settled: Collection[str], known_s: float
 ) -> _Reading:
-    """Return the findings of the right reading of both streams, if two fit alike.
+    """Choose the reading of both streams, if two fit equally well.
 
-    ``known_s`` is the time offset (s) that the check was made with.
+    ``known_s`` is the time offset (s) that the streams had in the check.
     """
     if INVERSIONS & snapshot.config.given.union(settled):
         return _Reading(_without_readings(result))
     if not result.readings:
         return _Reading(result.findings)
-    left_s = result.offset.seconds if result.offset else 0.0
-    clock: Options = {"time_offset": known_s + left_s}
+    further_s = result.offset.seconds if result.offset else 0.0
+    clock: Options = {"time_offset": known_s + further_s}
 
     def pairs_of(options: Options) -> PosePairs:
         return with_options(snapshot, {**options, **clock}).pose_pairs
@@ -216,11 +231,14 @@ def _reading_of(
 
 
 def _without_readings(result: CheckResult) -> tuple[Finding, ...]:
-    """Return the findings without those about both streams being inverse, which is settled."""
+    """Return the findings without warnings that both streams are inverse.
+
+    The options have settled whether they are.
+    """
     return tuple(
-        found
-        for found in result.findings
-        if found.code != "inverse_both" or found.severity is Severity.NOTE
+        finding
+        for finding in result.findings
+        if finding.code != "inverse_both" or finding.severity is Severity.NOTE
     )
 
 
@@ -228,9 +246,7 @@ def _without_readings(result: CheckResult) -> tuple[Finding, ...]:
 
 
 def _repaired_unsolved(snapshot: Snapshot) -> Attempt | None:
-    """Return the attempt with repaired streams from which nothing could be solved as given; None if
-    no repair is certain.
-    """
+    """Repair streams that cannot be solved as given; None if no repair is certain."""
     result = check(snapshot)
     reading = _reading_of(snapshot, result, (), snapshot.config.given_time_offset_s)
     certain = _certain(reading.findings, snapshot.config.given)
@@ -245,9 +261,10 @@ def _repaired(
     settled: Collection[str],
     verdict_as_given: str,
 ) -> Attempt | None:
-    """Return the attempt with repaired streams; None if the streams do not agree then.
+    """Return the attempt with repaired streams; None if the repaired streams do not agree.
 
-    Time offset and scale are estimated after the repair, unless nothing can be paired before.
+    A time offset or scale is estimated after the repair, or together with the repair if no poses
+    can be paired otherwise.
     """
     options = {name: value for name, value in certain.items() if value != "estimate"}
     second = _solved_with(snapshot, options) if options else None
@@ -257,37 +274,38 @@ def _repaired(
     if not second:
         return None
     settled = {*settled, *options}
-    known_s = second.calibration.time_offset_s
-    reading = _reading_of(second.snapshot, second.check, settled, known_s)
+    offset_s = second.calibration.time_offset_s
+    reading = _reading_of(second.snapshot, second.check, settled, offset_s)
     second = second.with_findings(reading.findings)
     settled |= reading.settled
-    left = _certain(second.check.findings, second.snapshot.config.given.union(settled))
-    left = {name: value for name, value in left.items() if name not in STREAM_REPAIRS}
-    second = _estimated(second, left, settled, None).with_doubts(reading.doubts)
-    if any(map(_speaks_against_repair, second.check.findings)):
+    further = _certain(second.check.findings, second.snapshot.config.given.union(settled))
+    further = {name: value for name, value in further.items() if name not in STREAM_REPAIRS}
+    second = _estimated(second, further, settled, None).with_doubts(reading.doubts)
+    if any(map(_contradicts_repair, second.check.findings)):
         return None
     verdict = second.calibration.verdict.value
     message = repair_message(
-        [found for found in findings if {*found.options} & {*options}],
+        [finding for finding in findings if {*finding.options} & {*options}],
         options,
         f": {verdict}; as the streams are: {verdict_as_given}",
     )
     second = second.with_messages({**options, **second.options}, (message, *second.messages))
-    # A ratio of lengths does not exclude that the child has its own scale.
+    # The lengths of the parent may also differ because the child has its own scale.
     doubts = [
-        replace(found, severity=Severity.WARNING, options={})
-        for found in findings
-        if (found.code, found.stream) == ("units", "parent")
+        replace(finding, severity=Severity.WARNING, options={})
+        for finding in findings
+        if (finding.code, finding.stream) == ("units", "parent")
     ]
-    doubts += [found for found in findings if found.code == "ambiguous"]
+    doubts += [finding for finding in findings if finding.code == "ambiguous"]
     return _with_offset_doubt(second, doubts)
 
 
-def _speaks_against_repair(found: Finding) -> bool:
-    """Return whether the streams do not agree after a repair. Lengths that may be read in two ways
-    do not show that.
+def _contradicts_repair(finding: Finding) -> bool:
+    """Return whether a finding after a repair is about streams that do not agree.
+
+    A difference of lengths that is either a unit or a scale is no contradiction.
     """
-    return found.makes_unusable and found.code != "unit_or_scale"
+    return finding.makes_unusable and finding.code != "unit_or_scale"
 
 
 # ------------------------------------------------------------------ estimates
@@ -296,12 +314,13 @@ def _speaks_against_repair(found: Finding) -> bool:
 def _estimated(
     first: Attempt, certain: Options, settled: Collection[str], on_clock: Attempt | None
 ) -> Attempt:
-    """Return the attempt with an estimated time offset or scale, if a check asks for it and the
-    result is better; otherwise the first attempt.
+    """Return the attempt with an estimated time offset or scale, or the first attempt.
+
+    A second solve is made if a check asks for it, and kept if its result is better.
     """
-    given = first.snapshot.config.given.union(settled)
+    fixed = first.snapshot.config.given.union(settled)
     options = dict(certain)
-    if "time_offset" not in given and _clock_is_off(first):
+    if "time_offset" not in fixed and _clock_is_off(first):
         options = {**_ESTIMATED_CLOCK, **options}
     if not options:
         return first
@@ -309,57 +328,62 @@ def _estimated(
     second = second or _solved_with(first.snapshot, options)
     if not second:
         return first
-    if INVERSIONS & given:
+    if INVERSIONS & fixed:
         second = second.with_findings(_without_readings(second.check))
     n_fewer = 1 if certain else 0
     if not (second.is_better_than(first, n_fewer) or second.is_sound):
         return first
     findings = first.check.findings
-    doubts = []
-    if "parent_scale" not in given:
-        doubtful = [found for found in findings if found.code == "unit_or_scale"]
-        doubts = [_as_doubt(found, second.calibration) for found in doubtful]
-    return _saying_estimates(second, options, findings).with_doubts(doubts)
+    doubts = () if "parent_scale" in fixed else _unit_doubts(findings, second.calibration)
+    return _with_estimate_warnings(second, options, findings).with_doubts(doubts)
 
 
-def _as_doubt(found: Finding, calibration: Calibration) -> Finding:
-    """Return the finding about lengths that may be read in two ways, once one way is taken: an
-    error if the scale of the check, or that of the result, is a unit's within its uncertainty.
+def _unit_doubts(findings: Collection[Finding], calibration: Calibration) -> tuple[Finding, ...]:
+    """Return the doubts whether a difference of lengths is a unit, after the scale is estimated.
+
+    A doubt is an error if the scale of the check, or that of the result, equals the scale of a unit
+    within its uncertainty.
     """
-    off = abs(calibration.scale - 1.0 / found.evidence["factor"])
-    is_near = off <= units.UNIT_SIGMAS * calibration.scale_sigma
-    is_exact = bool(found.evidence["is_exact"]) or is_near
-    severity = Severity.ERROR if is_exact else Severity.WARNING
-    return replace(found, severity=severity, options={})
+    doubts = []
+    for finding in findings:
+        if finding.code == "unit_or_scale":
+            difference = abs(calibration.scale - 1.0 / finding.evidence["factor"])
+            is_near = difference <= units.UNIT_SIGMAS * calibration.scale_sigma
+            is_exact = finding.evidence["is_exact"] or is_near
+            severity = Severity.ERROR if is_exact else Severity.WARNING
+            doubts.append(replace(finding, severity=severity, options={}))
+    return tuple(doubts)
 
 
-def _saying_estimates(attempt: Attempt, options: Options, findings: Collection[Finding]) -> Attempt:
+def _with_estimate_warnings(
+    attempt: Attempt, options: Options, findings: Collection[Finding]
+) -> Attempt:
     """Return the attempt with warnings about the options that were set because of findings."""
-    what = {name: found.what for found in findings for name in found.options}
+    reasons = {name: finding.what for finding in findings for name in finding.options}
     calibration = attempt.calibration
     offset_s = calibration.time_offset_s
-    what["time_offset"] = (
+    reasons["time_offset"] = (
         f"the child's clock is {abs(offset_s):.4f} +/- {calibration.time_offset_sigma_s:.4f} "
         f"s {checking.offset_values(offset_s)['direction']} the parent's"
     )
     rate = calibration.clock_rate
     if rate and rate.is_used:
-        what["time_offset"] += f" and {rate}"
-    usual = defaults_of(options)
+        reasons["time_offset"] += f" and {rate}"
+    defaults = defaults_of(options)
     messages = [
-        f"{what[name]}: solved with {name} {value}; to take the stream as it is, give {name} "
-        f"{usual[name]}"
+        f"{reasons[name]}: solved with {name} {value}; to keep the stream unchanged, set {name} "
+        f"{defaults[name]}"
         for name, value in options.items()
     ]
     return _with_offset_doubt(attempt.with_messages(options, messages), [])
 
 
 def _with_offset_doubt(attempt: Attempt, doubts: Collection[Finding]) -> Attempt:
-    """Return the attempt with doubts, and with one about a large time offset that nobody gave."""
+    """Return the attempt with doubts, and with a doubt about a large estimated time offset."""
     offset_s = attempt.calibration.time_offset_s
     doubts = [*doubts]
     if "time_offset" in attempt.options and abs(offset_s) > UNASKED_S:
-        large = finding("large_time_offset", "child", **checking.offset_values(offset_s))
+        large = new_finding("large_time_offset", "child", **checking.offset_values(offset_s))
         if large not in attempt.calibration.findings:
             doubts.append(large)
     return attempt.with_doubts(doubts)
@@ -369,12 +393,12 @@ def _with_offset_doubt(attempt: Attempt, doubts: Collection[Finding]) -> Attempt
 
 
 def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckResult:
-    """Check the streams of a snapshot, with a result from them if there is one."""
+    """Check the streams of a snapshot; use a result from these streams if there is one."""
     return kind_of(snapshot.config).check(snapshot, calibration)
 
 
 def _checked(calibration: Calibration, snapshot: Snapshot) -> Attempt:
-    """Return an attempt: a result, and the check of the streams with this result."""
+    """Return the attempt of a result and the check of its streams."""
     result = check(snapshot, calibration)
     return Attempt(replace(calibration, findings=result.findings), snapshot, result)
 
@@ -388,21 +412,21 @@ def _solved_with(snapshot: Snapshot, options: Options) -> Attempt | None:
         return None
 
 
-def _certain(findings: Collection[Finding], given: Collection[str]) -> dict[str, float | str]:
-    """Return the options, by name, that repair a stream for certain and that the user did not set.
+def _certain(findings: Collection[Finding], fixed: Collection[str]) -> dict[str, float | str]:
+    """Return the options that certainly repair a stream, by name, without ``fixed`` options.
 
-    Units and conventions get their values. Time offset and scale are estimated, so that the result
-    contains their uncertainty. A difference of lengths of a few per cent gives only a warning,
-    because odometry with a drifting scale has the same effect.
+    Units and conventions are set. Time offset and scale are estimated, so that the result contains
+    their uncertainty. A difference of lengths of a few per cent is only a warning, because odometry
+    with a drifting scale has the same effect.
     """
     certain: dict[str, float | str] = {}
-    for found in findings:
-        for name, value in found.options.items():
-            is_clock_warning = name == "time_offset" and found.severity is Severity.WARNING
+    for finding in findings:
+        for name, value in finding.options.items():
+            is_clock_warning = name == "time_offset" and finding.severity is Severity.WARNING
             is_convention = name.endswith(("invert", "quaternion"))
-            is_known = found.code in _CERTAIN_CODES or is_convention
-            if not is_known or name in given:
+            is_certain = finding.code in _CERTAIN_CODES or is_convention
+            if not is_certain or name in fixed:
                 continue
-            if found.makes_unusable or is_clock_warning:
-                certain[name] = "estimate" if found.code in _ESTIMATED_CODES else value
+            if finding.makes_unusable or is_clock_warning:
+                certain[name] = "estimate" if finding.code in _ESTIMATED_CODES else value
     return certain

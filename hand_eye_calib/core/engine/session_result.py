@@ -18,7 +18,7 @@ class SessionResult:
     snapshot : Snapshot
         The poses and options of the result.
     inputs : dict
-        Sources of the poses, in plain values.
+        Sources of the poses as plain data: options, topics and statistics.
     with_report : bool
         Whether to write a report.
     others : mapping of str to Snapshot

@@ -1,4 +1,4 @@
-"""Snapshots: the poses and options of an estimate, independent of poses that come later."""
+"""Snapshots: the poses and options of an estimate, independent of poses that arrive later."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -24,15 +24,15 @@ from hand_eye_calib.core.results.calibration import Calibration
 
 STREAMS = ("parent", "child")
 
-# Smallest time offset (s) after which the poses are paired anew. The noise model moves poses along
-# their velocities by smaller ones.
+# Smallest time offset (s) for which the poses are paired anew. For a smaller offset, the noise
+# model moves the poses along their velocities.
 MOST_MOVED_S = 0.003
 
-# Smallest time offset (s) that gives a warning if the user did not ask for an estimate.
+# Largest time offset (s) without a warning, if the user did not ask for an estimate.
 UNASKED_S = 1.0
 
 # Largest number of pose pairs of whole trajectories, unless the user sets `max_pairs`: three hours
-# at 10 Hz. The noise model needs 8 kB for each.
+# at 10 Hz. The noise model needs 8 kB per pair.
 _MOST_PAIRS = 100_000
 
 # Longest gap that the stream checks interpolate across, in median intervals between kept pairs.
@@ -42,7 +42,7 @@ _GAP_INTERVALS = 4
 
 @dataclass(frozen=True, kw_only=True)
 class Snapshot:
-    """Poses and options of an estimate, which may run in any thread or process.
+    """Poses and options of an estimate. The estimate may run in any thread or process.
 
     Attributes
     ----------
@@ -72,12 +72,12 @@ class Snapshot:
 
     @property
     def parent_frame(self) -> str:
-        """Name of the parent sensor's frame, as the options read its poses."""
+        """Name of the parent sensor's frame, after an inversion of its poses by the options."""
         return self._frame("parent")
 
     @property
     def child_frame(self) -> str:
-        """Name of the child sensor's frame, as the options read its poses."""
+        """Name of the child sensor's frame, after an inversion of its poses by the options."""
         return self._frame("child")
 
     def _frame(self, stream: str) -> str:
@@ -107,15 +107,15 @@ class Snapshot:
                 )
             elif frame != names.name:
                 observed = names.name or "what it observes"
-                text = f"the {stream} is {frame}: inverted, the poses are those of {frame} "
-                text += f"in {observed}"
+                text = f"the {stream} sensor is now {frame}, because its poses are inverted: "
+                text += f"poses of {frame} in {observed}"
                 if names.option:
                     text += f", which {stream}_frame names"
                 warnings.append(text)
         return tuple(warnings)
 
     def _check_frames(self) -> None:
-        """Raise InputError if the names of the frames contradict each other."""
+        """Raise InputError if both sensors have one frame, or an option names the other's frame."""
         nameless = "a sensor without name"
         for stream in STREAMS:
             names, other = self._names(stream)
@@ -129,25 +129,25 @@ class Snapshot:
         if self.parent_frame == self.child_frame:
             raise InputError(
                 f"both streams name {self.parent_frame!r} as their sensor frame, so there is "
-                "nothing to calibrate between; give parent_frame and child_frame"
+                "nothing to calibrate between; set parent_frame and child_frame"
             )
 
     @property
     def unpaired(self) -> tuple[Trajectory, Trajectory]:
         """Trajectories of the poses of parent and child that are not paired yet.
 
-        The poses are in the usual convention. The child's stamps have no clock rate.
+        The options are applied to the poses, and the clock rate to the child's stamps.
         """
-        parent = _put_right(self.buffered_parent, "parent", self.config)
-        child = _put_right(self.buffered_child, "child", self.config)
+        parent = _corrected(self.buffered_parent, "parent", self.config)
+        child = _corrected(self.buffered_child, "child", self.config)
         return parent, self.time_offset.steadied(child) if self.time_offset else child
 
     @cached_property
     def resolved(self) -> "Snapshot":
         """The snapshot with its time offset in seconds.
 
-        If the options ask for an estimate, the estimate comes from the buffered poses, unless pairs
-        were made with an estimate before.
+        If the options ask for an estimate, the offset of the kept pairs is used. If no pairs are
+        kept, the offset is estimated from the buffered poses.
 
         Raises
         ------
@@ -169,7 +169,7 @@ class Snapshot:
 
     @property
     def max_gap_s(self) -> float:
-        """Longest gap (s) of the streams that is interpolated across."""
+        """Longest gap (s) of the streams across which poses are interpolated."""
         if not len(self.kept):
             return self.config.max_gap
         return max(self.config.max_gap, _GAP_INTERVALS * self.streams[0].interval_s)
@@ -184,15 +184,13 @@ class Snapshot:
             return self.resolved.pose_pairs
         kept = self.kept
         if len(kept):
-            parent, child = (
-                _put_right(Trajectory(kept.stamps_ns, Ts), stream, self.config)
-                for stream, Ts in zip(STREAMS, (kept.Ts_pw_p, kept.Ts_cw_c), strict=True)
-            )
+            parent = _corrected(Trajectory(kept.stamps_ns, kept.Ts_pw_p), "parent", self.config)
+            child = _corrected(Trajectory(kept.stamps_ns, kept.Ts_cw_c), "child", self.config)
             kept = PosePairs(kept.stamps_ns, parent.poses, child.poses)
         pairs = pair_poses(self.config, *self.unpaired, self.paired_at, kept)
-        pairs = PosePairs.concatenate(kept, pairs) if len(kept) else pairs
-        most = self.config.max_pairs
-        return downsample(pairs, most) if len(pairs) > most else pairs
+        if len(kept):
+            pairs = PosePairs.concatenate(kept, pairs)
+        return downsample(pairs, self.config.max_pairs)
 
     def estimate(self, cross_check: bool | None = None) -> Calibration:
         """Estimate the extrinsic.
@@ -206,7 +204,7 @@ class Snapshot:
         Raises
         ------
         NotEnoughDataError
-            If fewer than ``min_pairs`` poses can be paired; the message says what is missing.
+            If fewer than ``min_pairs`` poses can be paired; the message names the missing data.
         InputError
             If both streams have the same sensor frame, or an option names the frame of the other
             stream.
@@ -232,8 +230,7 @@ class Snapshot:
     def streams(self) -> tuple[Trajectory, Trajectory]:
         """Trajectories of the whole session, each on its own clock.
 
-        If pairs were made, the trajectories have the stamps of the pairs; otherwise those of the
-        poses as received.
+        If pairs are kept, the trajectories contain the pairs; otherwise the poses as received.
         """
         parent, child = self.unpaired
         if len(self.kept):
@@ -247,7 +244,7 @@ class Snapshot:
         )
 
     def _missing_data(self, n_pairs: int) -> str:
-        """Say which data are missing, if too few poses can be paired."""
+        """Return a message about the missing data, if too few poses can be paired."""
         needed = f"{self.config.min_pairs} synchronised pose pairs are needed, found {n_pairs}"
         parent, child = self.unpaired
         child = child.shifted(float(self.config.time_offset))
@@ -270,19 +267,19 @@ class Snapshot:
 
 
 def _measuring(trajectory: Trajectory, measures: str) -> Trajectory:
-    """Return the trajectory with what the options say that it measures."""
+    """Set the measured quantity of a trajectory to that of the options."""
     if measures in ("auto", trajectory.measures):
         return trajectory
     return replace(trajectory, measures=measures)
 
 
-def _put_right(trajectory: Trajectory, stream: str, config: CalibratorConfig) -> Trajectory:
-    """Return a trajectory in the usual convention, converted from that of the options.
+def _corrected(trajectory: Trajectory, stream: str, config: CalibratorConfig) -> Trajectory:
+    """Apply the options about inverse poses, order of quaternions and scale to a stream.
 
     Raises
     ------
     ConfigError
-        If the stream does not measure what the options convert.
+        If the options have no meaning for the quantity that the stream measures.
     """
     invert = getattr(config, f"{stream}_invert")
     order = getattr(config, f"{stream}_quaternion")
@@ -306,8 +303,7 @@ def whole_snapshot(
     ----------
     parent, child : Trajectory
     options : mapping
-        Options by their public names. All pairs up to 100,000 are used unless ``max_pairs`` is
-        among them.
+        Options by their public names. Without ``max_pairs``, up to 100,000 pairs are used.
     """
     of_streams = {
         "max_pairs": min(max(len(parent), len(child), 10), _MOST_PAIRS),
@@ -317,7 +313,7 @@ def whole_snapshot(
     config = CalibratorConfig.from_options(of_streams | dict(options))
     warnings: tuple[str, ...] = ()
     if min(len(parent), len(child)) > config.max_pairs == _MOST_PAIRS:
-        warnings = (f"{_MOST_PAIRS:,} pose pairs are used at most; give max_pairs to use more",)
+        warnings = (f"{_MOST_PAIRS:,} pose pairs are used at most; set max_pairs to use more",)
     return Snapshot(
         config=config,
         buffered_parent=parent,
@@ -337,7 +333,7 @@ def names_of(config: CalibratorConfig, stream: str, sensor: str, world: str) -> 
 def estimated_time_offset(
     config: CalibratorConfig, parent: Trajectory, child: Trajectory
 ) -> TimeOffset:
-    """Estimate the time offset of two streams of the kind that the options name."""
+    """Estimate the time offset of two streams with the method for their kind of data."""
     of_speed = kind_of(config).is_timed_by_speed
     return estimate_time_offset(parent, child, config.max_gap, of_speed)
 
@@ -345,8 +341,8 @@ def estimated_time_offset(
 def downsample(pose_pairs: PosePairs, max_pairs: int) -> PosePairs:
     """Return at most ``max_pairs`` of the pose pairs.
 
-    Every second pair may be dropped; those with the least rotation of the parent between their
-    neighbours are dropped first.
+    In a round, every second pair is a candidate. The candidates whose neighbours differ least in
+    the parent's rotation are dropped. The rounds go on until few enough pairs remain.
     """
     while len(pose_pairs) > max_pairs:
         candidates = np.arange(1, len(pose_pairs) - 1, 2)
@@ -367,26 +363,26 @@ def pair_poses(
     at: str | None,
     kept: PosePairs,
 ) -> PosePairs:
-    """Return the pose pairs of two trajectories that are keyframes and follow those ``kept``.
+    """Return the pose pairs of two trajectories that are keyframes and later than ``kept``.
 
     Parameters
     ----------
     config : CalibratorConfig
-        With a time offset in seconds.
+        Its time offset is in seconds.
     parent, child : Trajectory
         Each on its own clock.
     at : {"parent", "child"} or None
         Stream whose stamps the pairs have; the slower one if None.
     kept : PosePairs
     """
-    made = synchronise(parent, child.shifted(float(config.time_offset)), config.max_gap, at)
+    pairs = synchronise(parent, child.shifted(float(config.time_offset)), config.max_gap, at)
     if len(kept):
-        made = made[made.stamps_ns > kept.stamps_ns[-1]]
+        pairs = pairs[pairs.stamps_ns > kept.stamps_ns[-1]]
     keyframes = select_keyframes(
-        made,
+        pairs,
         config.keyframe_min_translation,
         config.keyframe_min_rotation,
         config.keyframe_min_interval,
         previous=kept[-1:],
     )
-    return made if len(keyframes) == len(made) else made[keyframes]
+    return pairs if len(keyframes) == len(pairs) else pairs[keyframes]

@@ -72,7 +72,22 @@ def solve_park(pairs: MotionPairs) -> Solution:
 
 
 def translation_equations(pairs: MotionPairs, R: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return ``R_A - I`` (K, 3, 3) and ``R t_B - t_A`` (K, 3), which it maps the translation to."""
+    """Return both sides of the equations ``(R_A - I) t = R t_B - t_A`` of the translation t.
+
+    Parameters
+    ----------
+    pairs : MotionPairs
+        K pairs.
+    R : (3, 3) array
+        Rotation of X.
+
+    Returns
+    -------
+    (K, 3, 3) array
+        ``R_A - I``.
+    (K, 3) array
+        ``R t_B - t_A``, m.
+    """
     A = pairs.Ts_parenti_parentj
     t_B = se3.translation_of(pairs.Ts_childi_childj)
     return se3.rotation_of(A) - np.eye(3), t_B @ R.T - se3.translation_of(A)
@@ -81,11 +96,17 @@ def translation_equations(pairs: MotionPairs, R: FloatArray) -> tuple[FloatArray
 def align_rotation_vectors(pairs: MotionPairs, weights: FloatArray | None = None) -> FloatArray:
     """Estimate the rotation (3, 3) from the child's rotation vectors b to the parent's a.
 
-    ``weights`` (K,) are those of the motion pairs, 1 by default.
     ``R_A = R R_B R'`` means ``a = R b``. The best R in least squares comes from the singular value
     decomposition of the 3 x 3 correlation of the vectors (Kabsch 1976), mirrored back if it is a
     reflection. No centroid is subtracted, because the vectors have a common origin. If a rotation
     is nearly pi, noise decides the sign of its vector.
+
+    Parameters
+    ----------
+    pairs : MotionPairs
+        K pairs.
+    weights : (K,) array, optional
+        Weights of the pairs, 1 by default.
     """
     a = se3.rotation_log(se3.rotation_of(pairs.Ts_parenti_parentj))
     b = se3.rotation_log(se3.rotation_of(pairs.Ts_childi_childj))
@@ -94,19 +115,19 @@ def align_rotation_vectors(pairs: MotionPairs, weights: FloatArray | None = None
 
 
 def solve_dnl(pairs: MotionPairs) -> Solution:
-    """Minimise ``sum |A X - X B|_F^2`` over X, of K >= 1 pairs."""
+    """Minimise ``sum |A X - X B|_F^2`` over X, for K >= 1 pairs."""
     coefficients = quadratic_form.coefficients(pairs)
     weights = np.ones(len(pairs))
     Q = quadratic_form.weighted_sum(coefficients, weights)
-    T, converged = lowest(Q, pairs)
+    T, converged = _lowest_minimum(Q, pairs)
     objective = float(quadratic_form.costs(coefficients, T).sum())
     return Solution(T, objective, converged, weights)
 
 
 def solve_ali(pairs: MotionPairs) -> Solution:
-    """Minimise ``sum |R_A t + t_A - R t_B - t|^2`` over X, of K >= 1 pairs."""
+    """Minimise ``sum |R_A t + t_A - R t_B - t|^2`` over X, for K >= 1 pairs."""
     rows = residual_rows(pairs)
-    T, converged = lowest(rows.T @ rows, pairs)
+    T, converged = _lowest_minimum(rows.T @ rows, pairs)
     objective = float((pairs.residuals(T)[0] ** 2).sum())
     return Solution(T, objective, converged, np.ones(len(pairs)))
 
@@ -124,8 +145,8 @@ def residual_rows(pairs: MotionPairs) -> FloatArray:
     return rows.reshape(-1, quadratic_form.DIMENSION)
 
 
-def lowest(Q: FloatArray, pairs: MotionPairs) -> tuple[FloatArray, bool]:
-    """Return the lowest minimum (4, 4) of a form (13, 13), and whether the search settled."""
+def _lowest_minimum(Q: FloatArray, pairs: MotionPairs) -> tuple[FloatArray, bool]:
+    """Return the X (4, 4) of the lowest minimum of a form (13, 13), and whether X converged."""
     Ts, values, converged = quadratic_form.minimise(Q, start_rotations(pairs))
     best = int(np.argmin(values))
     return Ts[best], bool(converged[best])
@@ -140,14 +161,14 @@ def start_rotations(pairs: MotionPairs) -> FloatArray:
     """Return rotations (4, 3, 3) to start from.
 
     The first rotation aligns the child's rotation axes with the parent's. It is close to the
-    solution if the sensors rotate at all. The other rotations add a rotation by pi about an axis of
-    the child, for motion with hardly any rotation.
+    solution if the sensors rotate at all. The other three rotate the child by pi about one of its
+    axes as well; they help if the sensors hardly rotate.
     """
-    # Skew parts align axes as well as rotation vectors do, and faster.
+    # The skew part of a rotation matrix has the direction of its axis, and takes less time than a
+    # rotation vector.
     axes_parent = se3.vee(pairs.Ts_parenti_parentj)
     axes_child = se3.vee(pairs.Ts_childi_childj)
-    left, _, right = np.linalg.svd(axes_parent.T @ axes_child)
-    aligned = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-    return aligned @ [
-        np.diag(signs) for signs in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])
-    ]
+    U, _, V_transposed = np.linalg.svd(axes_parent.T @ axes_child)
+    aligned = U @ np.diag([1.0, 1.0, np.linalg.det(U @ V_transposed)]) @ V_transposed
+    half_turns = ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])
+    return aligned @ [np.diag(signs) for signs in half_turns]

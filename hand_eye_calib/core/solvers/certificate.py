@@ -26,17 +26,16 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.solvers import quadratic_form
 
-# The bound may be below the minimum by this share of the minimum ...
+# A minimum is proved if the bound is below it by at most this share of the minimum, plus rounding.
 _RELATIVE = 1e-6
-# ... and by this share of the form's mean eigenvalue, which is rounding.
+# Rounding of the bound, as a share of the form's mean eigenvalue.
 _ROUNDING = 1e-11
 
-# Largest number of Newton steps.
-_MAX_STEPS = 60
-
-# Factor of the barrier's weight once a Newton step is short. The first weight is its square.
+# Factor by which the barrier's weight grows after a short Newton step. The first weight is its
+# square.
 _SHARPENING = 10.0
-# The iteration ends when the bound is this close to the best one.
+# The iteration ends when the bound is this close to the best one, as a share of the form's mean
+# eigenvalue.
 _CLOSE = 1e-12
 
 
@@ -51,7 +50,7 @@ def is_global(Q: FloatArray, T_parent_child: FloatArray) -> bool:
         Near a local minimum.
     """
     Ts, values, _ = quadratic_form.minimise(Q, T_parent_child[None, :3, :3])
-    # The form of S in R = R_minimum S, so that S is the identity at the minimum.
+    # R = R_minimum S, and M is the form of S. So S is the identity at the minimum.
     turn = np.eye(10)
     turn[:9, :9] = np.kron(Ts[0, :3, :3], np.eye(3))
     forms, _ = quadratic_form.without_translation(Q[None])
@@ -59,19 +58,20 @@ def is_global(Q: FloatArray, T_parent_child: FloatArray) -> bool:
     scale = max(float(np.trace(M)) / len(M), np.finfo(float).tiny)
     minimum = max(float(values[0]), 0.0)
     tolerance = _RELATIVE * minimum / scale + _ROUNDING
-    lowest = _highest_lowest_eigenvalue(M / scale, enough=-0.25 * tolerance)
-    # |x|^2 is 4 for every rotation.
-    gap = 4.0 * max(-lowest, 0.0)
+    eigenvalue = _largest_smallest_eigenvalue(M / scale, enough=-0.25 * tolerance)
+    # |x|^2 is 4 for every rotation, so the bound is below the minimum by at most 4 eigenvalues.
+    gap = 4.0 * max(-eigenvalue, 0.0)
     decrease = float(quadratic_form.decrease(Q, T_parent_child, Ts[0]))
     gap += max(decrease, 0.0) / scale
     return gap <= tolerance
 
 
-def _highest_lowest_eigenvalue(M: FloatArray, enough: float) -> float:
-    """Return the smallest eigenvalue of Z, as large as multipliers can make it, or ``enough``.
+def _largest_smallest_eigenvalue(M: FloatArray, enough: float) -> float:
+    """Maximise the smallest eigenvalue of Z over the free multipliers; return this eigenvalue.
 
-    A barrier method: minimise t with ``Z + t I`` positive definite across the directions
-    perpendicular to the identity. Along the identity Z is zero by construction.
+    The search ends early once the eigenvalue is at least ``enough``. A barrier method minimises t
+    with ``Z + t I`` positive definite on the directions perpendicular to the identity. Along the
+    identity, Z is zero by construction.
     """
     tables = _tables()
     across = tables.across
@@ -82,7 +82,7 @@ def _highest_lowest_eigenvalue(M: FloatArray, enough: float) -> float:
     unknowns = np.append(np.zeros(len(tables.free)), shift)
     weight = _SHARPENING**2
     best = float(np.linalg.eigvalsh(Z)[0])
-    for _ in range(_MAX_STEPS):
+    for _ in range(quadratic_form.MAX_NEWTON_STEPS):
         if best >= enough:
             break
         solved = np.linalg.solve(Z_across + np.tensordot(unknowns, derivatives, 1), derivatives)
@@ -98,9 +98,15 @@ def _highest_lowest_eigenvalue(M: FloatArray, enough: float) -> float:
 
 
 def _newton_step(solved: FloatArray, weight: float) -> tuple[FloatArray, float]:
-    """Return a Newton step (15,) of ``weight t - log det`` inside the cone, and its decrement.
+    """Return a Newton step (15,) of ``weight t - log det(Z + t I)``, and its Newton decrement.
 
-    ``solved`` (15, 9, 9) is the inverse of the matrix times its derivatives.
+    The step stays inside the cone of positive definite matrices.
+
+    Parameters
+    ----------
+    solved : (15, 9, 9) array
+        The inverse of ``Z + t I`` times its derivatives by the 14 multipliers and t.
+    weight : float
     """
     gradient = -np.trace(solved, axis1=1, axis2=2)
     gradient[-1] += weight
@@ -108,10 +114,12 @@ def _newton_step(solved: FloatArray, weight: float) -> tuple[FloatArray, float]:
     hessian[np.diag_indices_from(hessian)] += 1e-14 * np.trace(hessian)
     step = -np.linalg.solve(hessian, gradient)
     decrement = float(np.sqrt(max(-gradient @ step, 0.0)))
-    # The edge of the cone along the step.
+    # The step reaches the edge of the cone at the share 1 / falling. Stop before the edge, but take
+    # at least the damped step, which always stays inside.
     falling = -np.linalg.eigvals(np.tensordot(step, solved, 1)).real.min()
     inside = 0.9 / falling if falling > 0 else 1.0
-    return step * min(1.0, max(inside, 1.0 / (1.0 + decrement))), decrement
+    damped = 1.0 / (1.0 + decrement)
+    return step * min(1.0, max(inside, damped)), decrement
 
 
 class _Tables(NamedTuple):
@@ -126,7 +134,7 @@ class _Tables(NamedTuple):
     equations : (21, 10, 10) array
         Independent symmetric matrices A_i; the last one belongs to the last variable.
     stationary : (21, 10) array
-        Factors that take ``M x`` to minus the multipliers that make ``Z x = 0``.
+        Factors that map ``M x`` to the multipliers that make ``Z x = 0``, with signs reversed.
     free : (14, 10, 10) array
         Combinations of the equations that keep ``Z x = 0``.
     """
@@ -140,7 +148,7 @@ class _Tables(NamedTuple):
 
 @cache
 def _tables() -> _Tables:
-    """Compute the constants from equations that many random rotations fulfil."""
+    """Compute the constants from the equations that 200 random rotations fulfil."""
     rotations = se3.rotation_exp(np.random.default_rng(0).normal(size=(200, 3)))
     x = np.append(rotations.reshape(-1, 9), np.ones((200, 1)), axis=1)
     upper = np.triu_indices(10)

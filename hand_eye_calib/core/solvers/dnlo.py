@@ -34,41 +34,42 @@ from hand_eye_calib.core.solvers.all_pairs import Solution
 # Largest number of pairs that is searched.
 _MAX_SEARCHED = 512
 
-# Graduated non-convexity: Gauss-Newton steps to the minimum over all pairs.
+# Gauss-Newton steps to the minimum over all pairs, where graduated non-convexity starts.
 _STEPS_OVER_ALL = 4
-# Factor of the sharpness from round to round.
+# Factor of the sharpness (mu of Yang et al.) from round to round.
 _SHARPENING = 2.5
-# Sharpness of the last round.
+# Sharpness of the last round: the weights are then almost 0 or 1.
 _SHARP = 30.0
 
-# Rivals: shares of the inliers.
+# Shares of the inliers that a rival of the first kind is fitted to.
 _INLIER_SHARES = (0.2, 0.5)
-# Sizes of the subsets of all pairs. Small subsets escape outliers, large ones resist noise.
+# Numbers of pairs that a rival of the second kind is fitted to. Small subsets escape outliers,
+# large ones resist noise.
 _SUBSET_SIZES = (4, 8, 16, 32)
-# Rivals of each kind that are started, times the number of pairs: fifty for a hundred pairs.
+# Number of started rivals of each kind times number of pairs: about 50 rivals for 100 pairs.
 _STARTED_PAIRS = 5000
-# Rounds before the most promising rivals are chosen, and how many of each kind are followed.
+# Rounds before the most promising rivals are chosen.
 _FIRST_ROUNDS = 3
+# Most promising rivals of each kind, which are followed to the end.
 _FOLLOWED = 3
 # Largest number of times that rivals are started.
 _MAX_GENERATIONS = 3
 
-# A rival from any subset replaces the solution if its objective is below this share of it.
+# A rival from a subset of all pairs replaces the solution if its objective is below this share of
+# the solution's.
 _DECISIVE = 0.99
 # A generation of rivals that lowers the objective by a smaller share is the last.
 _NEGLIGIBLE = 1e-6
 
-# Rounds of weights and X in turn, and the share by which the objective falls in the last one: in
-# the search, and on all pairs.
+# Largest number of rounds, each with new weights and a new X.
 _MAX_ROUNDS = 100
+# A round of the search that lowers the objective by a smaller share is the last.
 _SETTLED = 1e-4
+# The same share for the refinement on all pairs.
 _CONVERGED = 1e-9
 
 # Cost of a pair that is left out: finite, and larger than the cost of any inlier.
 _NEVER = 1e100
-
-# Smallest divisor.
-_TINY = 1e-300
 
 
 def solve(pairs: MotionPairs, threshold: float, min_inlier_fraction: float) -> Solution:
@@ -99,7 +100,7 @@ def solve(pairs: MotionPairs, threshold: float, min_inlier_fraction: float) -> S
 def _refined(pairs: MotionPairs, T: FloatArray, threshold: float, floor: float) -> Solution:
     """Improve X (4, 4) and the weights in turn on all pairs.
 
-    The costs come from the coefficients of the pairs, which lose fewest digits.
+    The costs are computed from the coefficients of the pairs, which lose fewer digits than forms.
     """
     coefficients = quadratic_form.coefficients(pairs)
     weights, objective = truncate(quadratic_form.costs(coefficients, T), threshold, floor)
@@ -135,8 +136,7 @@ def solve_without(
 ) -> FloatArray:
     """Solve again without some of the pairs, for resampling.
 
-    A few pairs less may change the choice of the inliers, and with it the solution. The search
-    starts from the full solution.
+    The iteration starts from the full solution. With fewer pairs, other pairs may become inliers.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ def truncate(costs: FloatArray, threshold: float, floor: float) -> tuple[FloatAr
     if too_few.any():
         last = math.ceil(floor) - 1
         largest = np.partition(costs, last, axis=-1)[..., last, None]
-        # Where enough pairs are below c, these count already.
+        # This changes nothing for an X with enough pairs below c: they include the d smallest.
         counted |= costs <= largest
         weights = counted.astype(float)
         excess = too_few * (counted.sum(axis=-1) - floor)
@@ -234,6 +234,7 @@ class _Search:
         for _ in range(_MAX_GENERATIONS):
             rivals, objectives = self.settle(self._rivals(best, random))
             before = objective
+            # The first rivals come from inliers, the others from subsets of all pairs.
             for first, share in ((0, 1.0), (_FOLLOWED, _DECISIVE)):
                 rival = first + int(np.argmin(objectives[first : first + _FOLLOWED]))
                 if objectives[rival] < share * objective:
@@ -250,23 +251,27 @@ class _Search:
         subsets of all pairs.
         """
         n_pairs = len(self.condensed)
+        # A multiple of the numbers of shares and sizes.
         started = 4 * (1 + _STARTED_PAIRS // (4 * n_pairs))
         inliers, _ = truncate(self.costs(T), self.threshold, self.floor)
         of_inliers = np.repeat(_INLIER_SHARES, started // 2)[:, None] * inliers
         of_all = np.repeat(_SUBSET_SIZES, started // 4)[:, None] * np.full(n_pairs, 1 / n_pairs)
-        chances = np.concatenate([of_inliers, of_all])
-        weights = (random.random(chances.shape) < chances).astype(float)
+        probabilities = np.concatenate([of_inliers, of_all])
+        weights = (random.random(probabilities.shape) < probabilities).astype(float)
         Ts = np.repeat(T, len(weights), axis=0)
         for _ in range(_FIRST_ROUNDS):
             Ts = self.refit(weights, Ts)
             weights, objectives = truncate(self.costs(Ts), self.threshold, self.floor)
         order = np.argsort(objectives.reshape(2, started), axis=1, kind="stable")
-        return Ts[(order[:, :_FOLLOWED] + [[0], [started]]).ravel()]
+        promising = order[:, :_FOLLOWED]
+        return np.concatenate([Ts[promising[0]], Ts[started + promising[1]]])
 
     def anneal(self, Ts: FloatArray) -> FloatArray:
         """Return the ends (S, 4, 4) of graduated non-convexity from each start (S, 4, 4).
 
-        The truncation is at c or at the d-th smallest cost, whichever is larger.
+        The costs are truncated at c or at the d-th smallest cost, whichever is larger. The weight
+        of a pair with cost e is ``sqrt(c mu (mu + 1) / e) - mu``, limited to 0 and 1 (GNC-TLS of
+        Yang et al.). The sharpness mu grows from round to round.
         """
         last = max(math.ceil(self.floor) - 1, 0)
         sharpness = np.zeros(len(Ts))
@@ -279,8 +284,9 @@ class _Search:
             if sharpness.min() >= _SHARP:
                 return Ts
             cuts = (cut * sharpness * (sharpness + 1))[:, None]
-            ratio = np.sqrt(cuts / np.maximum(costs, _TINY)) - sharpness[:, None]
-            Ts = self.refit(ratio.clip(0.0, 1.0), Ts)
+            ratio = np.sqrt(cuts / np.maximum(costs, quadratic_form.TINY))
+            weights = (ratio - sharpness[:, None]).clip(0.0, 1.0)
+            Ts = self.refit(weights, Ts)
             sharpness = sharpness * _SHARPENING
 
     def settle(
@@ -306,7 +312,7 @@ class _Search:
         """
         weights, objectives = truncate(self.costs(Ts, left_out), self.threshold, self.floor)
         Ts = Ts.copy()
-        # Starts whose objective still falls. The others wait.
+        # Starts whose objective still falls. The other starts are done.
         falling = np.arange(len(Ts))
         for _ in range(_MAX_ROUNDS):
             Ts_new = self.refit(weights, Ts[falling])

@@ -63,7 +63,7 @@ def solve_dnlo(pairs: MotionPairs, threshold: float, min_inlier_fraction: float)
 def _minimum(
     problem: dict[str, _Expression], n_weights: int, **bounds: Any
 ) -> tuple[FloatArray, bool]:
-    """Solve from the identity and weights 1: X (4, 4), and whether Ipopt settled."""
+    """Return X (4, 4) from a start at the identity with weights 1, and whether Ipopt converged."""
     solver = casadi.nlpsol("solver", "ipopt", problem, _IPOPT_OPTIONS)
     # The rotation angle has no derivative at zero.
     solution = solver(x0=np.r_[np.full(3, 1e-6), np.zeros(3), np.ones(n_weights)], **bounds)

@@ -24,26 +24,29 @@ from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
 # Number of variables in x.
 DIMENSION = 13
 
-# Pairs in one block. The arrays of a block stay in the cache of the processor.
+# Pairs that are condensed at once: their arrays fit into the cache of the processor.
 _BLOCK = 128
+# Pairs that are summed at once, whose arrays are smaller.
 _SUMMED_BLOCK = 1024
 
 # Eigenvalues of the translation block below this share of the largest one are rounding. They count
 # as zero.
 _RANK_TOLERANCE = 1e-10
 
-# Limits of the Newton iteration: number of steps, and length (rad) of the last one.
-_MAX_NEWTON_STEPS = 60
+# Largest number of steps of a Newton iteration; a well-posed form needs about ten.
+MAX_NEWTON_STEPS = 60
+# A Newton step below this length (rad) is the last.
 _STEP_TOLERANCE = 1e-12
 
 # Smallest divisor.
-_TINY = 1e-300
+TINY = 1e-300
 
 # Positions of the variables x in the sixteen entries of X.
 _X_IN_T = np.array([0, 1, 2, 4, 5, 6, 8, 9, 10, 3, 7, 11, 15])
 
-# Upper triangle of a form: its rows, its columns, and how often an element counts.
+# Rows and columns of the upper triangle of a form.
 _ROWS, _COLUMNS = np.triu_indices(DIMENSION)
+# Elements beside the diagonal stand for two elements of the form.
 _MULTIPLICITY = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
 # Position in the triangle of every element of a form.
 _TRIANGLE = np.empty((DIMENSION, DIMENSION), dtype=int)
@@ -55,10 +58,14 @@ _GENERATORS = se3.skew(np.eye(3))
 
 
 def _residual_table() -> FloatArray:
-    """Factors (24, 12, 13) of coefficient u of a pair times variable m of x in residual (i, j)."""
+    """Return the factors F (24, 12, 13) of the residuals: ``e_r = sum u_c F[c, r, m] x_m``.
+
+    Residual r is element (i, j) of ``(A - I) X - X (B - I)``, row-major.
+    """
     flat = np.zeros((16, DIMENSION))
     flat[_X_IN_T, np.arange(DIMENSION)] = 1.0
     entry = flat.reshape(4, 4, DIMENSION)  # X[i, j] = entry[i, j] @ x
+    # Element (i, k) of A - I multiplies X[k, j]; element (k, j) of B - I multiplies X[i, k].
     of_parent = np.einsum("il,kjm->ikljm", np.eye(3), entry).reshape(12, 12, DIMENSION)
     of_child = -np.einsum("jl,ikm->kjilm", np.eye(4), entry[:3, :3]).reshape(12, 12, DIMENSION)
     return np.concatenate([of_parent, of_child])
@@ -73,7 +80,10 @@ def _twist_table() -> FloatArray:
 
 
 def _tangent_table() -> FloatArray:
-    """Factors (16, 91) that take X.ravel() to the x of all six ``X D``, then to x itself."""
+    """Return factors (16, 91) that map ``X.ravel()`` to seven vectors x (13,).
+
+    The first six are those of ``X D``, the derivatives of X; the last is that of X.
+    """
     maps = np.concatenate([_twist_table(), np.eye(4)[None]])
     tangents = np.einsum("in,dkl->nkdil", np.eye(4), maps).reshape(16, 7, 16)
     return tangents[:, :, _X_IN_T].reshape(16, 7 * DIMENSION)
@@ -87,7 +97,8 @@ _TANGENTS = _tangent_table()
 def condense(pairs: MotionPairs) -> FloatArray:
     """Return the upper triangles (K, 91) of the forms Q_k of all pairs.
 
-    Their order is that of ``numpy.triu_indices(13)``: ``condensed @ monomials(X)`` are the costs.
+    Their elements are in the order of ``numpy.triu_indices(13)``. The costs of the pairs are
+    ``condensed @ monomials(X)``.
     """
     condensed = np.empty((len(pairs), len(_ROWS)))
     u = coefficients(pairs)
@@ -119,15 +130,19 @@ def median_costs(coefficients: FloatArray, Ts: FloatArray, scales: FloatArray) -
     """Return the medians (S,) of the costs at each X (S, 4, 4), with the child scaled.
 
     Each scale (S,) multiplies the child's translations. The costs are in the smaller unit of
-    length; otherwise a scale of zero would cost least.
+    length; otherwise a scale of zero would have the smallest cost.
     """
     by_u = np.tensordot(Ts.reshape(-1, 16)[:, _X_IN_T], _RESIDUAL, axes=(1, 2))
+    # The second half of u is B - I (3, 4); its last column is the child's translation.
     by_u.reshape(-1, 2, 3, 4, 12)[:, 1, :, 3] *= scales[:, None, None]
     return medians(((coefficients @ by_u) ** 2).sum(axis=2)) / np.minimum(scales, 1.0) ** 2
 
 
 def weighted_sum(coefficients: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the sum (13, 13) of the forms with weights (K,), without making the forms."""
+    """Return the weighted sum (13, 13) of the forms of pairs with weights (K,).
+
+    The sum is made from the coefficients, which takes less time than a sum of forms.
+    """
     moments = np.zeros((24, 24))
     for start in range(0, len(coefficients), _SUMMED_BLOCK):
         block = slice(start, start + _SUMMED_BLOCK)
@@ -148,7 +163,7 @@ def decrease(
 def monomials(T_parent_child: FloatArray) -> FloatArray:
     """Return the products ``x_i x_j`` (..., 91) of the variables of transforms (..., 4, 4).
 
-    They take condensed forms to costs. Products of two different variables are doubled.
+    Products of two different variables are doubled, because a triangle has them once.
     """
     entries = T_parent_child.reshape((*T_parent_child.shape[:-2], 16))
     first = entries.take(_X_IN_T[_ROWS], axis=-1)
@@ -178,7 +193,7 @@ def minimise(Q: FloatArray, rotation_start: FloatArray) -> tuple[FloatArray, Flo
     (B,) array
         Values of the forms.
     (B,) bool array
-        Whether the iteration settled.
+        Whether the iteration converged.
     """
     R = np.array(rotation_start, dtype=float)
     whole_forms = np.broadcast_to(Q, (len(R), DIMENSION, DIMENSION))
@@ -187,19 +202,19 @@ def minimise(Q: FloatArray, rotation_start: FloatArray) -> tuple[FloatArray, Flo
     value, gradient, hessian = _derivatives(forms, R)
     damping = np.zeros(len(R))
     converged = np.zeros(len(R), dtype=bool)
-    for _ in range(_MAX_NEWTON_STEPS):
+    for _ in range(MAX_NEWTON_STEPS):
         if converged.all():
             break
         step, length, curvature = _newton_step(gradient, hessian, damping)
         R_new = R @ se3.rotation_exp(step)
         value_new, gradient_new, hessian_new = _derivatives(forms, R_new)
         better = (value_new < value) & ~converged
-        # At the rounding level the value falls no more. A tiny step that hardly raises it is the
-        # last.
+        # Near the minimum, a step changes the value by less than rounding. Such a step is the last.
         rounding = 1e-15 * (np.abs(value) + np.abs(constant))
         stalled = ~better & (0.5 * curvature * length**2 <= rounding)
         converged |= (length < _STEP_TOLERANCE) | stalled
-        less_damping = 0.25 * damping * (damping > 1e-9 * curvature)
+        is_damped = damping > 1e-9 * curvature
+        less_damping = np.where(is_damped, 0.25 * damping, 0.0)
         more_damping = np.maximum(4 * damping, 1e-3 * curvature)
         damping = np.where(better, less_damping, more_damping)
         R[better] = R_new[better]
@@ -219,7 +234,7 @@ def without_translation(Q: FloatArray) -> tuple[FloatArray, FloatArray]:
     (B, 10, 10) array
         Forms of ``(vec R, 1)`` at the best translation for R.
     (B, 3, 10) array
-        Factors that take ``(vec R, 1)`` to minus the best translation, m.
+        Factors that map ``(vec R, 1)`` to the best translation (m) with its sign reversed.
     """
     others = np.append(np.arange(9), 12)
     coupling = Q[:, 9:12][:, :, others]
@@ -235,27 +250,35 @@ def without_translation(Q: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _newton_step(
     gradient: FloatArray, hessian: FloatArray, damping: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return damped Newton steps (B, 3), rad, of at most 1 rad.
+    """Compute damped Newton steps.
 
-    The lengths (B,) before that limit, and the largest curvatures (B,), come with them.
+    Returns
+    -------
+    (B, 3) array
+        Steps, limited to 1 rad.
+    (B,) array
+        Lengths of the steps before the limit, rad.
+    (B,) array
+        Largest absolute curvature of each form.
     """
     values, axes = np.linalg.eigh(hessian)
-    # The absolute value follows negative curvature downhill, too.
+    # With absolute values, the step goes downhill along negative curvature, too.
     curvatures = np.abs(values)
     largest = curvatures.max(axis=1)
-    # The limit avoids a division by rounding.
-    curvatures = np.maximum(curvatures, 1e-14 * np.maximum(largest, _TINY)[:, None])
+    # A curvature below rounding would make an arbitrarily long step.
+    curvatures = np.maximum(curvatures, 1e-14 * np.maximum(largest, TINY)[:, None])
     along = axes.swapaxes(1, 2) @ gradient[:, :, None]
     step = -(axes @ (along / (curvatures + damping[:, None])[:, :, None]))[:, :, 0]
     length = np.linalg.norm(step, axis=1)
-    step *= np.minimum(1.0, 1.0 / np.maximum(length, _TINY))[:, None]
+    step *= np.minimum(1.0, 1.0 / np.maximum(length, TINY))[:, None]
     return step, length, largest
 
 
 def gauss_newton_step(Q: FloatArray, Ts_parent_child: FloatArray) -> FloatArray:
-    """Take one Gauss-Newton step of each form from its own transform.
+    """Take one Gauss-Newton step for each form from its own transform.
 
-    The step is fast, for searches whose result is refined afterwards.
+    This step takes less time than one of :func:`minimise`, but loses digits. It serves searches
+    whose result is refined afterwards.
 
     Parameters
     ----------
@@ -271,12 +294,12 @@ def gauss_newton_step(Q: FloatArray, Ts_parent_child: FloatArray) -> FloatArray:
     # The derivatives of x along the six tangents at X, and x itself, are linear in X.
     tangents = (Ts_parent_child.reshape(n_forms, 16) @ _TANGENTS).reshape(n_forms, 7, DIMENSION)
     normal = tangents @ Q @ tangents.transpose(0, 2, 1)
-    # Enough damping to keep directions that the pairs do not determine, and too little to slow down
-    # the others.
+    # The damping keeps X along directions that the pairs do not determine, and is too small to slow
+    # down the other directions. Every eighth of the 49 elements is on the diagonal.
     diagonal = normal.reshape(n_forms, 49)[:, :48:8]
-    diagonal += 1e-12 * diagonal.sum(axis=1, keepdims=True) + _TINY
+    diagonal += 1e-12 * diagonal.sum(axis=1, keepdims=True) + TINY
     step = np.linalg.solve(normal[:, :6, :6], -normal[:, :6, 6:])
-    # Cayley's map: a rotation, equal to the exponential up to second order, and faster.
+    # Cayley's map makes a rotation that equals the exponential up to second order, in less time.
     twist = (step[:, :, 0] @ _TWISTS).reshape(n_forms, 4, 4)
     shrink = 1 / (1 + 0.25 * (step[:, 3:] ** 2).sum(axis=1, keepdims=True))
     return Ts_parent_child @ (np.eye(4) + shrink * (twist + 0.5 * twist @ twist))
@@ -285,7 +308,14 @@ def gauss_newton_step(Q: FloatArray, Ts_parent_child: FloatArray) -> FloatArray:
 def _derivatives(forms: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the values of forms of (vec R, 1), and their derivatives under ``R Exp(phi)`` at 0.
 
-    The values (B,) are without the constant. The gradient is (B, 3), the Hessian (B, 3, 3).
+    Returns
+    -------
+    (B,) array
+        Values without the constant.
+    (B, 3) array
+        Gradients.
+    (B, 3, 3) array
+        Hessians.
     """
     S = forms[:, :9, :9]
     linear = forms[:, :9, 9]

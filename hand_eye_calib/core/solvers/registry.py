@@ -28,11 +28,13 @@ class _Solver(NamedTuple):
     Attributes
     ----------
     solve : callable
-        Takes motion pairs; for dnlo also a threshold and the least share of inliers.
+        ``solve(pairs)``; for dnlo ``solve(pairs, threshold, min_inlier_fraction)``.
     solve_near : callable or None
-        Solves motion pairs from ``T_start``, a transform (4, 4) near the solution: saves time.
+        ``solve_near(pairs, T_start)`` starts from a transform (4, 4) near the solution, which saves
+        time. None if the method cannot use a start.
     solve_best_stride : callable or None
-        Chooses the reference ``auto`` from poses; None if the adaptive estimator chooses it.
+        Solve poses and choose the motions for the reference ``auto``. None if the adaptive
+        estimator chooses them.
     """
 
     solve: Callable[..., Solution]
@@ -85,7 +87,7 @@ class Method:
 
     @property
     def solve_best_stride(self) -> Callable[[FloatArray, FloatArray], robust.Stride] | None:
-        """Solver that chooses the reference ``auto`` itself; None if the method has none."""
+        """Solver that chooses the motions for the reference ``auto``; None if there is none."""
         return _SOLVERS[self.name].solve_best_stride
 
     def solve(self, pairs: MotionPairs) -> Solution:

@@ -12,12 +12,13 @@ With ``z = tan(w/2) k`` for the rotation by w about k, Cayley's formula ``R = (I
 Both are linear in the sixteen products of (1, z) with (1, t). So the pairs are condensed once, by a
 QR decomposition, and an iteration takes the same time for any number of pairs.
 
-The axes enter with unit length even for the smallest angle, and g grows with the rotation of X. So
-noisy rotations or a large rotation of X bias the solution. A rotation of X by pi has no finite z.
-From the identity the iteration may also settle in a false minimum, more often for larger rotations
-of X (from about 1.8 rad on): in the published results 33 rows of one simulated trajectory with an X
-of 3.13 rad, three noise-free ones among them. The solution is still the published one, but it does
-not count as converged if the cost is lower near park's solution.
+The axes have unit length even for the smallest angle, and g grows with the rotation of X. So noisy
+rotations or a large rotation of X bias the solution. A rotation of X by pi has no finite z.
+
+The iteration starts from the identity. It may settle in a false minimum if X rotates by more than
+about 1.8 rad. In the published results this happens in 33 rows of one simulated trajectory with an
+X of 3.13 rad; three of these rows are noise-free. Such a solution is returned as published, but
+``converged`` is False if the cost is lower near park's solution.
 """
 
 import numpy as np
@@ -28,13 +29,15 @@ from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.core.solvers import all_pairs
 from hand_eye_calib.core.solvers.all_pairs import Solution
 
-# Limits of the authors' program: iterations, and size of every component of the last step.
+# Largest number of iterations, as in the authors' program.
 _MAX_ITERATIONS = 500
+# A step with every component below this size (m, or of z) is the last, as in the authors' program.
 _STEP_TOLERANCE = 1e-8
 
-# A minimum is lower than another by at least this share of the cost ...
+# A minimum is lower than another if its cost is smaller by more than this share, and by more than
+# rounding.
 _LOWER = 1e-6
-# ... and by residuals of this share of the data, which is rounding.
+# Rounding of the residuals, as a share of the data.
 _ROUNDING = 1e-12
 
 
@@ -42,7 +45,7 @@ def solve(pairs: MotionPairs) -> Solution:
     """Solve AX = XB of K >= 1 pairs by Gauss-Newton from the identity.
 
     ``objective`` is the sum of ``|f|^2 + |g|^2``. ``converged`` is False if the iteration did not
-    settle or settled in a false minimum.
+    settle, or if it settled in a false minimum.
     """
     M = _condense(pairs)
     parameters, objective, settled = _gauss_newton(M, np.zeros(6))
@@ -55,7 +58,7 @@ def solve(pairs: MotionPairs) -> Solution:
 
 
 def _gauss_newton(M: FloatArray, parameters: FloatArray) -> tuple[FloatArray, float, bool]:
-    """Iterate from (z, t) (6,), for a matrix M of :func:`_condense`.
+    """Iterate from parameters (z, t) (6,), with the matrix M of :func:`_condense`.
 
     Returns
     -------
@@ -78,9 +81,9 @@ def _gauss_newton(M: FloatArray, parameters: FloatArray) -> tuple[FloatArray, fl
 
 
 def _condense(pairs: MotionPairs) -> FloatArray:
-    """Matrix M (at most 20, 16) that takes the products of (1, z) with (1, t) to residuals.
+    """Return the matrix M (at most 20, 16) that maps products of (1, z) with (1, t) to residuals.
 
-    The residuals have the same squared length as all f and g together.
+    The squared length of these residuals is the sum of ``|f|^2 + |g|^2`` over all pairs.
     """
     A = pairs.Ts_parenti_parentj
     B = pairs.Ts_childi_childj
@@ -90,7 +93,7 @@ def _condense(pairs: MotionPairs) -> FloatArray:
     k_B = _axes(se3.rotation_of(B))
     # Factors of (1, z) in f.
     f = np.concatenate([(k_A - k_B)[:, :, None], se3.skew(k_A + k_B)], axis=2)
-    # Factors of z_i t_j, with z_0 = t_0 = 1, in g: first without the skew matrices of z.
+    # Factors of z_i t_j, with z_0 = t_0 = 1, in g. For z_1 to z_3 the skew matrix follows last.
     g = np.zeros((len(pairs), 3, 4, 4))
     g[..., 1:] = (se3.rotation_of(A) - np.eye(3))[:, :, None]
     g[:, :, 0, 0] = t_A - t_B
@@ -102,7 +105,10 @@ def _condense(pairs: MotionPairs) -> FloatArray:
 
 
 def _products(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Products (16,) of (1, z) and (1, t), z slowest, and their derivatives (16, 6) by (z, t)."""
+    """Return the products (16,) of (1, z) and (1, t), and their derivatives (16, 6) by (z, t).
+
+    The index of t varies fastest.
+    """
     one_z = np.append(1.0, parameters[:3])
     one_t = np.append(1.0, parameters[3:])
     derivatives = np.zeros((4, 4, 6))
@@ -112,7 +118,7 @@ def _products(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _axes(rotations: FloatArray) -> FloatArray:
-    """Unit rotation axes (K, 3); (0, 0, 1) without rotation."""
+    """Return the unit rotation axes (K, 3); (0, 0, 1) for a rotation by zero."""
     rotvecs = se3.rotation_log(rotations)
     angles = np.linalg.norm(rotvecs, axis=1, keepdims=True)
     axes = np.tile([0.0, 0.0, 1.0], (len(angles), 1))
@@ -127,7 +133,7 @@ def _rotation(z: FloatArray) -> FloatArray:
 
 
 def _parameters(T_parent_child: FloatArray) -> FloatArray:
-    """(z, t) (6,) of a transform."""
+    """Return the parameters (z, t) (6,) of a transform."""
     rotvec = se3.rotation_log(se3.rotation_of(T_parent_child))
     angle = np.linalg.norm(rotvec)
     factor = np.tan(angle / 2) / angle if angle > 0.0 else 0.5
