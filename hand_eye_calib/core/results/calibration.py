@@ -27,7 +27,7 @@ __all__ = ["Calibration", "DofObservability", "DofVerdict", "SolveStatus", "Verd
 
 
 def data_frame(rows: Sequence[Mapping[str, Any]], index: str) -> "pd.DataFrame":
-    """Return a DataFrame of rows with equal names, one of which is the index.
+    """Return a DataFrame of rows with the same names; the column ``index`` is the index.
 
     Raises
     ------
@@ -101,7 +101,7 @@ class Calibration(Judged):
     def inverse(self) -> "Calibration":
         """Return the pose of the parent sensor in the child sensor's frame, as a result.
 
-        Comparisons with other answers and with what is installed are left out.
+        The result has no residuals, no cross-check and no comparison with an installed transform.
         """
         T = self.T_parent_child
         covariance = inverse_covariance(T, self.covariance_measured)
@@ -147,7 +147,8 @@ class Calibration(Judged):
         Raises
         ------
         InputError
-            If the result was read from a file, which has no poses, or the report cannot be written.
+            If the result was read from a file, because files have no poses.
+            If the report cannot be written.
         """
         self.residuals()
         path = Path(path, "report.html") if Path(path).is_dir() else Path(path)
@@ -156,8 +157,9 @@ class Calibration(Judged):
     def static_transform_command(self) -> str:
         """Return the shell command that publishes the child's pose as a static transform.
 
-        The pose is in the frame that the child is mounted on. An unknown axis has a word that
-        static_transform_publisher refuses. The command is empty if the verdict is DO NOT USE.
+        The pose is in the frame that the child is mounted on. Instead of the number of an unknown
+        axis, the command has a word that static_transform_publisher refuses. The command is empty
+        if the verdict is DO NOT USE.
         """
         arguments = document.transform_arguments(self, 9)
         if not arguments:
@@ -172,21 +174,21 @@ class Calibration(Judged):
         format : str
             "autoware", "fast_lio", "fast_livo2", "lio_sam", "kalibr", "openvins", "vins",
             "orbslam3", "apollo", "dlio", "glim", "msa", "px4", "kitti", "nuscenes", "colmap",
-            "driveworks", "easy_handeye2", "opencv" or "numpy"; docs/exports.md has a page of them.
+            "driveworks", "easy_handeye2", "opencv" or "numpy". docs/exports.md describes them.
 
         Returns
         -------
         str
-            The text of the file. A comment names source and target frame of the numbers. If the
-            format has the sensors in the other order, the transform and the sign of the time
-            offset are inverted.
+            The text of the file, with a comment that names source and target frame of the numbers.
+            For a format with the sensors in the other order, the transform and the sign of the
+            time offset are inverted.
 
         Raises
         ------
         ConfigError
             For an unknown format.
         InputError
-            Under DO NOT USE, and if an axis of the format is unknown.
+            If the verdict is DO NOT USE, or if an axis that the format needs is unknown.
 
         Examples
         --------
@@ -197,8 +199,8 @@ class Calibration(Judged):
     def to_dict(self) -> Document:
         """Return the result without its residuals in plain values, for JSON or YAML.
 
-        Infinite numbers, and printed numbers of unknown axes, are None. Only a ``matrix`` has
-        numbers for unknown axes, so that it can be read back.
+        Infinite numbers and the values of unknown axes are None. Only a ``matrix`` has numbers for
+        unknown axes, so that :meth:`from_dict` can read it.
         """
         return document.document_of(self)
 
@@ -209,7 +211,7 @@ class Calibration(Judged):
         Raises
         ------
         InputError
-            If ``data`` is no calibration, is of another version or lacks a value; the message
+            If ``data`` is not a calibration, has another version or lacks a value. The message
             names the value.
         """
         return document.result_from(cls, data)

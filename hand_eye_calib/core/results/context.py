@@ -1,6 +1,6 @@
-"""Comparison of a result with what is installed, or of two results.
+"""Comparison of a result with the installed transform, or of two results.
 
-All are plain values under names, as in :mod:`hand_eye_calib.core.results.records`.
+The classes hold plain values, as those of :mod:`hand_eye_calib.core.results.records`.
 """
 
 from collections.abc import Mapping
@@ -14,13 +14,13 @@ class AxisDifference:
     Attributes
     ----------
     difference : float
-        Along or about the axis, m or rad.
+        Translation along the axis (m) or rotation about the axis (rad).
     sigma : float
         Standard deviation of the difference; infinite if unknown.
     visible : float
-        Change that the comparison would detect nine times out of ten.
+        Smallest change that the comparison detects nine times out of ten.
     verdict : str
-        same, moved or cannot tell.
+        "same", "moved" or "cannot tell".
     """
 
     difference: float
@@ -38,12 +38,12 @@ class Difference:
     first, second : str
         Names of the extrinsics.
     verdict : str
-        same, moved or cannot tell.
+        "same", "moved" or "cannot tell".
     sentence : str
         The verdict with its evidence.
     axes : mapping of str to AxisDifference
     change : str
-        Axes that have moved, and how far, in words; empty unless the verdict is moved.
+        Axes that moved and their distances, in words; empty unless the verdict is "moved".
     """
 
     first: str
@@ -56,20 +56,20 @@ class Difference:
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Comparison of a result with what is installed.
+    """Comparison of a result with the installed transform.
 
     Attributes
     ----------
     sentence : str
         The verdict with its evidence, or the reason why there is no comparison.
     verdict : str
-        same, moved or cannot tell; empty without a comparison.
+        "same", "moved" or "cannot tell"; empty without a comparison.
     installed : str
-        Origin of what is installed.
+        Origin of the installed transform, such as a file or TF.
     values : mapping of str to float
-        Installed values by axis, m or rad.
+        Installed transform by axis, m or rad.
     moved : tuple of str
-        Names of the results that have moved.
+        Names of the results that differ from the installed transform.
     differences : tuple of Difference
     """
 

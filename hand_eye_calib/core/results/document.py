@@ -1,5 +1,6 @@
-"""A result in plain values: its document in JSON and YAML, both ways, and the numbers that other
-programs read.
+"""Documents: a result as plain values for JSON and YAML, and back.
+
+The module also makes the numbers that other programs read.
 """
 
 import math
@@ -29,29 +30,30 @@ from hand_eye_calib.core.results.records import (
 from hand_eye_calib.core.results.result import Result
 from hand_eye_calib.core.results.verdict import Judged, Verdict
 
-# A change that an older reader cannot understand raises the version. In version 1, covariance and
-# sigma were without the allowance, which was called floor.
 _FORMAT = "hand_eye_calib/extrinsic"
+# A change that an older reader cannot understand raises the version. In version 1, covariance and
+# sigma did not contain the allowance, and the allowance was called floor.
 _VERSION = 2
 _READABLE = (1, 2)
 
 # Share of a standard deviation below which an allowance changes none of its two digits.
 _NEGLIGIBLE_SHARE = 0.01
 
-# Fields that a document has under other names, as matrices; and those that files do not have.
+# Fields of a result that are matrices in a document.
 _TRANSFORMS = ("T_parent_child", "T_method", "T_base_parent")
 _COVARIANCES = ("covariance_measured", "covariance_allowance")
+# Fields of a result that documents do not have.
 _NOT_IN_FILES = ("motion_residuals", "recording", "parts")
-# Fields that have readers of their own.
+# Fields that functions of their own read.
 _READ_APART = (*_NOT_IN_FILES, "findings")
 
-# The fields of a covariance in version 2 and what they were called in version 1.
+# Names of the covariances in version 2, and their names in version 1.
 _OLD_COVARIANCES = {"covariance_measured": "covariance", "covariance_allowance": "floor"}
 
-# With a direction unobservable, a larger standard deviation (m) in other axes comes from that.
+# If a direction is unobservable, an axis with a larger standard deviation (m) is unknown, too.
 UNKNOWN_M = 0.9
 
-# An axis with more than this share (a cosine) of an unobservable direction is unknown, too.
+# An axis is unknown if it contains more than this share (a cosine) of an unobservable direction.
 _SHARED = 0.02
 
 _OfResult = TypeVar("_OfResult", bound=Result)
@@ -59,10 +61,10 @@ _OfResult = TypeVar("_OfResult", bound=Result)
 
 @dataclass(frozen=True, kw_only=True)
 class Notation:
-    """A transform in the notations that people and programs use.
+    """A transform in the notations of documents: translation, quaternion, angles and matrix.
 
-    ``maps`` names source and target. Each printed number (m, deg) has a standard deviation and the
-    measured part of it; the rest is the allowance. An unknown number is NaN, and its standard
+    ``maps`` names source and target. Each number (m, deg) has a standard deviation (``sigma``), and
+    its part without the allowance (``sigma_measured``). An unknown number is NaN, and its standard
     deviation is infinite. An unknown rotation has no quaternion.
     """
 
@@ -99,9 +101,9 @@ def document_of(result: Judged) -> Document:
         of = "T_parent_child as the method solved it: nothing set, no prior added"
         document["T_method"] = {"of": of, "matrix": result.T_method}
     document["findings"] = [finding.to_dict() for finding in result.findings]
-    left_out = {*_TRANSFORMS, *_COVARIANCES, *_NOT_IN_FILES, "observability_measured"}
+    others = {*_TRANSFORMS, *_COVARIANCES, *_NOT_IN_FILES, "observability_measured"}
     for field in fields(result):
-        if field.name not in left_out.union(document):
+        if field.name not in others.union(document):
             document[field.name] = getattr(result, field.name)
     for extra in all_parts():
         document |= extra.write(result.parts.get(extra.name))
@@ -109,7 +111,7 @@ def document_of(result: Judged) -> Document:
 
 
 def _covariances_of(result: Result) -> Document:
-    """Return the covariance of a document, and its two parts."""
+    """Return the covariance of a result and its two parts, as fields of a document."""
     of = "error xi in T_parent_child @ exp(xi)"
     child = result.child_frame
     order = ["rho_x", "rho_y", "rho_z", "phi_x", "phi_y", "phi_z"]
@@ -123,7 +125,7 @@ def _covariances_of(result: Result) -> Document:
 
 
 def _observability_of(result: Result) -> list[Document]:
-    """Return a row for each axis: its standard deviation and the two parts of it."""
+    """Return a row for each axis: its standard deviation, and the two parts of it."""
     rows = []
     columns = zip(result.observability, result.sigmas_measured, result.allowance, strict=True)
     for dof, measured, allowance in columns:
@@ -133,14 +135,14 @@ def _observability_of(result: Result) -> list[Document]:
 
 
 class _Transform(NamedTuple):
-    """Transform of a result, which maps coordinates of ``source`` into ``target``.
+    """Transform of a result; it maps coordinates of ``source`` into ``target``.
 
     Attributes
     ----------
     covariances : (2, 6, 6) array-like
         Measured part and allowance.
     sigmas_m : (3,) array or None
-        Measured standard deviations of the translation; None for those of the covariance.
+        Measured standard deviations of the translation; computed from the covariance if None.
     is_extra : bool
         Whether the transform belongs to a part of the result.
     """
@@ -161,12 +163,13 @@ def transforms_of(result: Result) -> dict[str, Notation]:
     own = result.covariance_measured, result.covariance_allowance
     exchanged = [inverse_covariance(T, covariance) for covariance in own]
     sigmas_m = result.sigmas_measured[:3]
-    # Where the rotation is out of reach, the axes of both sensors are the same by convention.
-    is_turned = not {*ROTATIONS} <= {*result.out_of_reach}
+    # If the streams cannot determine the rotation, both sensors have the same axes by convention.
+    has_same_axes = {*ROTATIONS} <= {*result.out_of_reach}
+    sigmas_of_inverse_m = sigmas_m if has_same_axes else None
     transforms = {
         "T_parent_child": _Transform(T, child, parent, own, sigmas_m),
         "T_child_parent": _Transform(
-            result.T_child_parent, parent, child, exchanged, None if is_turned else sigmas_m
+            result.T_child_parent, parent, child, exchanged, sigmas_of_inverse_m
         ),
     }
     if result.T_base_child is not None:
@@ -190,16 +193,16 @@ def _notation(transform: _Transform, hidden: Collection[str]) -> Notation:
         sigmas_m = sigmas_in_parent(R, measured)[:3]
         if hidden or transform.is_extra:
             sigmas_m = np.where(sigmas_m > UNKNOWN_M, np.inf, sigmas_m)
-    is_turn_known = not {*ROTATIONS} & {*hidden}
+    is_rotation_known = not {*ROTATIONS} & {*hidden}
     sigmas = sigmas_rpy(T, measured)
-    # Near gimbal lock roll and yaw are known, but have no standard deviation.
-    is_known = np.isfinite(sigmas) | is_turn_known
+    # Near gimbal lock, roll and yaw are known but have no standard deviation.
+    is_known = np.isfinite(sigmas) | is_rotation_known
     return Notation(
         maps=f"coordinates of {transform.source} into {transform.target}",
         translation=np.where(np.isfinite(sigmas_m), se3.translation_of(T), np.nan),
         sigma_translation=np.hypot(sigmas_m, sigmas_in_parent(R, allowance)[:3]),
         sigma_measured_translation=sigmas_m,
-        quat_xyzw=se3.to_quat_xyzw(T) if is_turn_known else None,
+        quat_xyzw=se3.to_quat_xyzw(T) if is_rotation_known else None,
         rpy_deg=np.degrees(np.where(is_known, se3.rotation_to_rpy(R), np.nan)),
         sigma_rpy_deg=np.degrees(np.hypot(sigmas, sigmas_rpy(T, allowance))),
         sigma_measured_rpy_deg=np.degrees(sigmas),
@@ -216,12 +219,12 @@ def extra_transforms(result: Result) -> dict[str, ExtraTransform]:
 
 
 def matrix_of(of: str, frame: str, matrix: FloatArray) -> Document:
-    """Return a covariance as documents have it; ``of`` names its error."""
+    """Return a covariance as a field of a document; ``of`` names its error."""
     return {"of": of, "frame": frame, "units": "m, rad", "matrix": matrix}
 
 
 def summary(result: Result) -> dict[str, str]:
-    """Return how a result was solved, as names and values."""
+    """Return how a result was solved: names of quantities, and their values as text."""
     rate = result.clock_rate
     proof = {"yes": "", "no": "not "}
     offset = result.time_offset_s
@@ -242,7 +245,7 @@ def summary(result: Result) -> dict[str, str]:
     if rate and rate.is_used:
         rows["Time offset"] += f" at {rate.at_ns * 1e-9:.3f} s; the child's clock is {rate}"
     if result.noise:
-        # Documents have the first sentence with the name of the row.
+        # Documents begin the first sentence with the name of this row.
         sentences = [text.removeprefix("Noise: ").rstrip(".") for text in result.noise.in_words]
         rows["Noise"] = "; ".join(sentences)
     return rows
@@ -253,8 +256,8 @@ def printed_numbers(
 ) -> dict[str, str]:
     """Return the printed numbers of a transform by axis, with their standard deviations.
 
-    The axes are x, y, z (m), roll, pitch and yaw (deg). Three axes that are out of reach of the
-    streams have one text under their joint name.
+    The axes are x, y, z (m), roll, pitch and yaw (deg). If the streams cannot determine the
+    translation or the rotation, its three axes share one text under their joint name.
     """
     texts = {}
     for axes, values, sigmas, unit in (
@@ -276,7 +279,7 @@ def printed_numbers(
 
 
 def parts_of_sigmas(transform: Notation) -> dict[str, str]:
-    """Return the parts of each printed standard deviation by axis, in words.
+    """Return the measured part and the allowance of each standard deviation in words, by axis.
 
     An example is "4 mm measured, 8 mm allowance". Axes with a negligible allowance and unknown axes
     are left out.
@@ -286,12 +289,12 @@ def parts_of_sigmas(transform: Notation) -> dict[str, str]:
         transform.sigma_measured_translation, np.radians(transform.sigma_measured_rpy_deg)
     ]
     parts = {}
-    for axis, sigma, of_recording in zip(AXES, sigmas.tolist(), measured.tolist(), strict=True):
+    for axis, sigma, sigma_measured in zip(AXES, sigmas.tolist(), measured.tolist(), strict=True):
         if not math.isfinite(sigma):
             continue
-        allowance = math.sqrt(max(sigma**2 - of_recording**2, 0.0))
+        allowance = math.sqrt(max(sigma**2 - sigma_measured**2, 0.0))
         if allowance > _NEGLIGIBLE_SHARE * sigma:
-            recorded = amount(axis, of_recording)
+            recorded = amount(axis, sigma_measured)
             parts[axis] = f"{recorded} measured, {amount(axis, allowance)} allowance"
     return parts
 
@@ -318,8 +321,8 @@ def usable_numbers(result: Judged) -> dict[str, float | str]:
     -------
     dict
         x, y, z (m) and qx, qy, qz, qw. If an angle is unknown, roll, pitch and yaw (rad) replace
-        the quaternion. An unknown axis has a text that no parser takes, such as MEASURE_Z_BY_HAND.
-        Empty under DO NOT USE.
+        the quaternion. The value of an unknown axis is a text that every parser refuses, such as
+        MEASURE_Z_BY_HAND. The dict is empty if the verdict is DO NOT USE.
     """
     if result.verdict is Verdict.DO_NOT_USE:
         return {}
@@ -327,9 +330,9 @@ def usable_numbers(result: Judged) -> dict[str, float | str]:
     unknown = {*result.unobservable()}
     hidden = np.array([axis in unknown for axis in TRANSLATIONS])
     if result.T_base_parent is not None:
-        # Axes of the base that share a hidden direction are unknown, too.
-        of_base = np.abs(se3.rotation_of(result.T_base_parent)[:, hidden])
-        hidden = of_base.max(axis=1, initial=0.0) > _SHARED
+        # An axis of the base is unknown if an unknown axis of the parent has a component along it.
+        components = np.abs(se3.rotation_of(result.T_base_parent)[:, hidden])
+        hidden = components.max(axis=1, initial=0.0) > _SHARED
     numbers: dict[str, float | str] = {
         axis: by_hand(axis) if is_hidden else float(value)
         for axis, value, is_hidden in zip(TRANSLATIONS, se3.translation_of(T), hidden, strict=True)
@@ -342,7 +345,7 @@ def usable_numbers(result: Judged) -> dict[str, float | str]:
 def transform_arguments(result: Judged, decimals: int) -> list[str]:
     """Return the arguments of static_transform_publisher for a result's ``mounting``.
 
-    The list is empty under DO NOT USE.
+    The list is empty if the verdict is DO NOT USE.
     """
     arguments: list[str] = []
     for name, value in usable_numbers(result).items():
@@ -355,17 +358,17 @@ def transform_arguments(result: Judged, decimals: int) -> list[str]:
 def usable_angles(result: Result) -> dict[str, float | str]:
     """Return roll, pitch and yaw of a result's ``mounting``, rad, about fixed axes, as in URDF.
 
-    An unknown angle has a text that no parser takes.
+    The value of an unknown angle is a text that every parser refuses.
     """
     T = result.mounting[1]
-    # Near gimbal lock roll and yaw are known, but have no standard deviation.
-    known = np.full(3, True)
+    # Near gimbal lock, roll and yaw are known but have no standard deviation.
+    are_known = np.full(3, True)
     if set(result.unobservable()).intersection(ROTATIONS):
-        known = np.isfinite(sigmas_rpy(T, result.covariance_measured))
+        are_known = np.isfinite(sigmas_rpy(T, result.covariance_measured))
     angles = se3.rotation_to_rpy(se3.rotation_of(T)).tolist()
     return {
         name: angle if is_known else by_hand(name)
-        for name, angle, is_known in zip(ROTATIONS, angles, known, strict=True)
+        for name, angle, is_known in zip(ROTATIONS, angles, are_known, strict=True)
     }
 
 
@@ -378,7 +381,7 @@ def result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
     Raises
     ------
     InputError
-        If a value is missing or wrong; the message names it.
+        If a value is missing or wrong; the message names the value.
     """
     is_document = isinstance(data, Mapping)
     form = data.get("format") if is_document else None
@@ -399,7 +402,7 @@ def result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
 
 
 def _measured_parts(data: Mapping[str, Any]) -> Document:
-    """Return a document of any version with the measured parts that a result has as fields."""
+    """Return a document of any version with the measured parts under the names of version 2."""
     document = dict(data)
     if data["version"] == 1:
         document |= {name: data[old] for name, old in _OLD_COVARIANCES.items() if old in data}
@@ -431,10 +434,10 @@ def _result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
     if "T_base_child" in arrays:
         T_child_parent = se3.inverse(arrays["T_parent_child"])
         arrays["T_base_parent"] = arrays["T_base_child"] @ T_child_parent
-    known = {name: value for name, value in data.items() if name not in _READ_APART}
+    values = {name: value for name, value in data.items() if name not in _READ_APART}
     parts = {extra.name: extra.read(data) for extra in all_parts()}
     parts = {name: value for name, value in parts.items() if value is not None}
-    result: _OfResult = from_plain(of, known | arrays, Comparison=Comparison)
+    result: _OfResult = from_plain(of, values | arrays, Comparison=Comparison)
     result = replace(result, parts=parts, findings=_findings_of(data))
     if data["version"] == 1 and result.cross_check:
         result = replace(result, cross_check=_with_allowance(result))
@@ -445,7 +448,7 @@ def _result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
 
 
 def _require_known_names(result: Result) -> None:
-    """Raise ValueError if a result has another axis or method than this program has."""
+    """Raise ValueError if a result has an axis or a method that this program does not know."""
     if tuple(dof.name for dof in result.observability) != AXES:
         raise ValueError(f"the axes of observability are not {', '.join(AXES)}")
     for name in ("contradictions", "target_axes", "cross_check"):
@@ -464,14 +467,14 @@ def _findings_of(data: Mapping[str, Any]) -> tuple[Finding, ...]:
 
 
 def _require_sigmas(result: Result, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Raise ValueError unless the standard deviations are those of their two parts."""
+    """Raise ValueError unless each standard deviation is the root sum of squares of its parts."""
     sigmas = [from_plain(float, row["sigma"]) for row in rows]
     if not np.allclose(sigmas, result.sigmas, rtol=1e-6, atol=1e-300):
         raise ValueError("sigma is not that of sigma_measured and the allowance")
 
 
 def _with_allowance(result: Result) -> CrossCheck:
-    """Return the cross-check of a document of version 1 with the allowance, which it lacks."""
+    """Add the allowance to the standard deviations of a cross-check of version 1."""
     sizes = dict(zip(AXES, result.allowance.tolist(), strict=True))
     rows = dict(result.cross_check or {})
     for axis, row in rows.items():
@@ -490,12 +493,12 @@ def transform_of(data: Mapping[str, Any]) -> FloatArray:
 def covariance_of(data: Mapping[str, Any]) -> FloatArray:
     """Return the covariance (6, 6) of a document; unknown variances are infinite."""
     matrix = _matrix(data, 6)
-    known = np.isfinite(matrix)
+    is_known = np.isfinite(matrix)
     sigmas = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    # Rounding makes a correlation of 1 a little larger.
+    # A correlation of 1 may be a little larger due to rounding.
     bounds = (1 + 1e-6) * np.outer(sigmas, sigmas) + 1e-300
     is_symmetric = np.allclose(matrix, matrix.T, rtol=1e-6)
-    if not (is_symmetric and np.all(np.abs(matrix[known]) <= bounds[known])):
+    if not (is_symmetric and np.all(np.abs(matrix[is_known]) <= bounds[is_known])):
         raise ValueError("a matrix is not a covariance")
     return matrix
 

@@ -1,4 +1,4 @@
-"""Parts of a result that layers above the core add."""
+"""Parts of a result that layers above the core add, such as the scale of a goal."""
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
@@ -10,9 +10,9 @@ from hand_eye_calib.core.base.registry import RESULT_PARTS
 
 
 class ExtraTransform(NamedTuple):
-    """A transform of a part, which maps coordinates of ``source`` into ``target``.
+    """A transform of a part; it maps coordinates of ``source`` into ``target``.
 
-    ``covariance`` (6, 6) is that of the error of the transform, in the source's frame.
+    ``covariance`` (6, 6) is the covariance of its error, in the frame ``source``.
     """
 
     T_target_source: FloatArray
@@ -22,20 +22,20 @@ class ExtraTransform(NamedTuple):
 
 
 class Part:
-    """A part that is one record, under one name in results and documents.
+    """A part that is a single record; it has the same name in results and documents.
 
     Parameters
     ----------
     name : str
     load : callable
-        Return the type of the record.
+        ``load()`` returns the type of the record.
     details : callable, optional
-        Return lines about the record of a result; called with both.
+        ``details(record, result)`` returns lines of text about the record.
 
     Attributes
     ----------
     without : mapping of str to object
-        Attributes of a result with the part, and their values in a result without it.
+        Attributes that the part adds to a result, and their values if the result lacks the part.
     """
 
     def __init__(
@@ -54,11 +54,11 @@ class Part:
         return value
 
     def write(self, value: Any) -> Document:
-        """Return the fields of a document for the part, which may be None."""
+        """Return the fields of a document for the value of the part; None for a missing part."""
         return {self.name: value}
 
     def read(self, document: Mapping[str, Any]) -> Any:
-        """Return the part of a document; None if it has none.
+        """Return the value of the part in a document; None if the document lacks the part.
 
         Raises
         ------
@@ -74,7 +74,7 @@ class Part:
             raise TypeError(f"{self.name}: {error}") from None
 
     def invert(self, value: Any) -> Any:
-        """Return the part of the result with both sensors exchanged."""
+        """Return the value of the part for the result with both sensors exchanged."""
         return value
 
     def transforms(self, value: Any) -> dict[str, ExtraTransform]:
@@ -82,7 +82,7 @@ class Part:
         return {}
 
     def details(self, value: Any, result: Any) -> list[str]:
-        """Return lines for a person about the part of a result."""
+        """Return lines of text about the part of a result."""
         return self._details(value, result) if self._details else []
 
     def headline(self, value: Any) -> str:

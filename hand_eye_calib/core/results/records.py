@@ -1,7 +1,6 @@
 """Records of a calibration: status, observability, residuals, findings, noise, clock, cross-check.
 
-All records have plain values under names, which :mod:`hand_eye_calib.core.base.plain` reads and
-writes.
+All records hold plain values. :mod:`hand_eye_calib.core.base.plain` reads and writes the records.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -54,7 +53,7 @@ class SolveStatus(str, Enum):
 
 
 class DofVerdict(str, Enum):
-    """How well one degree of freedom is known; PRIOR if mostly or only from a prior."""
+    """How well a degree of freedom is known; PRIOR if mostly or only a prior determines it."""
 
     OBSERVED = "observed"
     WEAK = "weak"
@@ -72,8 +71,8 @@ class DofObservability:
         x, y, z (translation) or roll, pitch, yaw (rotation about x, y, z).
     verdict : DofVerdict
     sigma : float
-        One standard deviation, m or rad; ``inf`` if unobservable. Rows of ``observability`` contain
-        the allowance for constant errors; rows of ``observability_measured`` do not.
+        One standard deviation, m or rad; ``inf`` if unobservable. It contains the allowance for
+        constant errors in rows of ``observability``, not in rows of ``observability_measured``.
     """
 
     name: str
@@ -82,7 +81,7 @@ class DofObservability:
 
 
 def by_hand(axis: str) -> str:
-    """Return the text that files and commands have for an unknown axis; no parser takes it."""
+    """Return the text for an unknown axis in files and commands; every parser refuses it."""
     return f"MEASURE_{axis.upper()}_BY_HAND"
 
 
@@ -90,7 +89,7 @@ def by_hand(axis: str) -> str:
 class Residuals(Columns):
     """Residuals of K motion pairs at the result.
 
-    A pair of the adaptive estimator runs from one pose to the next.
+    A pair of the adaptive estimator is the motion from one pose to the next.
 
     Attributes
     ----------
@@ -137,8 +136,8 @@ class Residuals(Columns):
 class Severity(str, Enum):
     """How much a finding matters.
 
-    An error makes results from these streams unusable. With a warning a result may be used with
-    care. A note forbids nothing.
+    An error makes results from these streams unusable. A result with a warning may be used with
+    care. A note does not restrict the use.
     """
 
     NOTE = "note"
@@ -146,7 +145,7 @@ class Severity(str, Enum):
     ERROR = "error"
 
 
-#: Key of the words of a finding whose sentences are among its values.
+#: Key of the templates for a finding that stores its sentences among its values.
 AS_WRITTEN = "as_written"
 
 
@@ -154,20 +153,20 @@ AS_WRITTEN = "as_written"
 class Finding:
     """A problem of the streams that a check found.
 
-    The sentences are not stored. They are made from the values by the templates of ``key`` in
-    :data:`hand_eye_calib.core.base.registry.FINDING_WORDS`.
+    A finding stores values, not sentences. The templates of ``key`` in
+    :data:`hand_eye_calib.core.base.registry.FINDING_WORDS` make sentences from the values.
 
     Attributes
     ----------
     code : str
         Short name, stable over versions.
     key : str
-        Key of the templates of its sentences. Findings with one code may have different sentences.
+        Key of the templates. Findings with the same code may have different sentences.
     stream : str
         "parent", "child" or "both".
     severity : Severity
     values : mapping of str to number or str
-        Values that the sentences name, and other numbers that were measured.
+        Values for the sentences, and other numbers that were measured.
     options : mapping
         Options that repair the problem, by their names in :mod:`hand_eye_calib.core.base.config`;
         empty if no option repairs it.
@@ -182,17 +181,17 @@ class Finding:
 
     @property
     def what(self) -> str:
-        """What was found, with its values."""
+        """The problem, with its values."""
         return self._filled(words_of(self.key).what)
 
     @property
     def advice(self) -> str:
-        """What to do."""
+        """What the user should do."""
         return self._filled(words_of(self.key).advice)
 
     @property
     def cause(self) -> str:
-        """Usual cause; empty if :attr:`what` names it."""
+        """Usual cause; empty if :attr:`what` names the cause."""
         return self._filled(words_of(self.key).cause)
 
     @property
@@ -218,8 +217,8 @@ class Finding:
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
         """Build from the mapping that :meth:`to_dict` returned.
 
-        The sentences of the mapping are kept if this installation has no words for its values: the
-        mapping is of another version, or of an extra that is missing here.
+        The sentences of the mapping are kept if this installation has no templates for its values.
+        Such a mapping comes from another version, or from an extra that is not installed.
 
         Raises
         ------
@@ -228,7 +227,7 @@ class Finding:
         """
         if "values" in data:
             finding: Self = from_plain(cls, data)
-            if finding._has_words():
+            if finding._has_templates():
                 return finding
         values: Document = from_plain(dict[str, float], data.get("evidence", {}))
         sentences = {"cause": "", **data}
@@ -237,8 +236,8 @@ class Finding:
         as_written: Self = from_plain(cls, {**data, "key": AS_WRITTEN, "values": values})
         return as_written
 
-    def _has_words(self) -> bool:
-        """Whether this installation has words for the values of the finding."""
+    def _has_templates(self) -> bool:
+        """Whether this installation has templates for the values of the finding."""
         try:
             str(self)
         except (KeyError, TypeError, ValueError):
@@ -246,7 +245,7 @@ class Finding:
         return True
 
     def _filled(self, template: str) -> str:
-        """Return a template with the values of the finding."""
+        """Fill a template with the values of the finding."""
         whose = "both streams'" if self.stream == "both" else f"the {self.stream} stream's"
         return template.format(stream=self.stream, whose=whose, **self.values)
 
@@ -276,7 +275,7 @@ def has_error(findings: Iterable[Finding]) -> bool:
 
 
 def gravest_first(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Return findings by severity, errors first; equal ones stay in their order."""
+    """Sort findings by severity, errors first; findings of one severity keep their order."""
     order = list(Severity)
     return tuple(sorted(findings, key=lambda finding: -order.index(finding.severity)))
 
@@ -288,7 +287,7 @@ class CorrelatedError:
     Attributes
     ----------
     kind : str
-        body, world or path: the frame in which the error is constant for a while.
+        "body", "world" or "path": the frame in which the error stays constant for about ``tau_s``.
     part : str
         Part of the poses or of the path that has the error.
     sigma : float
@@ -307,8 +306,8 @@ class CorrelatedError:
 class Noise:
     """Noise of the trajectories, estimated by the adaptive estimator.
 
-    Standard deviations are per axis, of both sensors together: ``white`` ones of a single pose,
-    ``drift`` ones of the drift from pose to pose.
+    Standard deviations are per axis, for both sensors together. ``white`` is the noise of a single
+    pose; ``drift`` is the random walk from pose to pose.
     """
 
     in_words: tuple[str, ...]
@@ -323,17 +322,17 @@ class Noise:
 
 @dataclass(frozen=True, kw_only=True)
 class ClockRate:
-    """Rate at which the time offset changes, in parts per million.
+    """Rate of change of the time offset, in parts per million.
 
     Attributes
     ----------
     ppm, sigma_ppm : float
-        Microseconds to add to the child's stamps for each second after ``at_ns``, and one standard
+        Microseconds to add to the child's stamps per second after ``at_ns``, and one standard
         deviation. Positive if the child's clock is slow.
     at_ns : int
         Stamp of the child's clock at which the time offset is valid.
     is_used : bool
-        Whether the child's stamps were corrected: the rate is significant.
+        Whether the rate is significant, so that the child's stamps were corrected.
     """
 
     ppm: float
@@ -343,7 +342,7 @@ class ClockRate:
 
     @property
     def used(self) -> float:
-        """Correction of the child's stamps, seconds for each second."""
+        """Correction of the child's stamps, seconds per second."""
         return 1e-6 * self.ppm if self.is_used else 0.0
 
     def __str__(self) -> str:
@@ -353,25 +352,25 @@ class ClockRate:
 
 @dataclass(frozen=True, kw_only=True)
 class AxisScatter:
-    """Scatter of other answers about a result on one axis, m or rad; None if unknown.
+    """Scatter of other estimates about a result on one axis, m or rad; None if unknown.
 
     Attributes
     ----------
     sigma : float or None
-        The result's standard deviation, with the allowance and without second opinions; None if
-        the axis is unobservable.
+        Standard deviation of the result, with the allowance and without the scatter of other
+        estimates; None if the axis is unobservable.
     of_methods : float or None
-        Robust standard deviation of answers of robust least squares about the result.
+        Robust standard deviation of estimates by robust least squares about the result.
     of_halves : float or None
-        Standard deviation that follows from the difference between both halves of the recording.
+        Standard deviation computed from the difference between both halves of the recording.
     excess_of_methods, excess_of_halves : float or None
-        The same in joint standard deviations, which contain the allowance; those of the halves also
-        the result's own if it is of the noise model.
+        The same two, divided by the joint standard deviation. The joint standard deviation contains
+        the allowance; for halves and a result of the noise model, also the one of the result.
     excess_over_own : float or None
-        Distance of these answers in the result's own standard deviations, over those that are not
-        much less certain.
+        Robust standard deviation of the estimates that are about as certain as the result, divided
+        by the result's own standard deviation.
     is_confirmed : bool
-        False if the result determines the axis and no other answer does.
+        False if the result determines the axis and no other estimate does.
     """
 
     sigma: float | None
@@ -383,5 +382,5 @@ class AxisScatter:
     is_confirmed: bool = True
 
 
-#: Axis (x, y, z, roll, pitch, yaw) to the scatter of other answers about a result.
+#: Scatter of other estimates about a result, by axis (x, y, z, roll, pitch, yaw).
 CrossCheck: TypeAlias = Mapping[str, AxisScatter]

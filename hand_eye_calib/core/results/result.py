@@ -1,4 +1,4 @@
-"""An extrinsic with all that is known of its quality, as values."""
+"""An extrinsic and its quality, as values."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -35,49 +35,51 @@ class Result:
     Estimate
 
     T_parent_child : (4, 4) array
-        Pose of the child sensor in the parent sensor's frame: maps child coordinates into the
-        parent frame, metres.
+        Pose of the child sensor in the parent sensor's frame: maps child coordinates (m) into the
+        parent frame.
     T_method : (4, 4) array or None
-        The method's own answer, before directions that the motion does not reveal are set and
-        priors are added. None in a result read from a file that does not have it.
+        Solution of the method, before unobservable directions are set and priors are added. None
+        if the result was read from a file without this solution.
     status : SolveStatus
     objective : float
-        Value of the method's cost at ``T_method``; for dnlo eq. (5), the outliers' share included.
+        Value of the method's cost at ``T_method``; for dnlo eq. (5), with the cost of outliers.
     proved_global : str
-        Whether no other transform has a smaller cost over the motion pairs that count: "yes", "no",
-        or "not tried" (:mod:`hand_eye_calib.core.solvers.certificate`).
+        Whether it is proved that no transform has a smaller cost over the inliers: "yes", "no", or
+        "not tried" (:mod:`hand_eye_calib.core.solvers.certificate`).
     method, reference, backend : str
-        How it was solved; ``method`` and ``reference`` are those that ``auto`` chose.
+        Method, reference and backend of the solve. They are the chosen ones if the user set
+        ``auto``.
     method_reason, reference_reason : str
-        Why ``auto`` chose them; empty if they were set by the user.
+        Why ``auto`` chose the method and the reference; empty if the user set them.
     time_offset_s, time_offset_sigma_s : float
-        Seconds added to the child's stamps, and one standard deviation: 0 if the method took the
-        offset as set by the user.
+        Seconds added to the child's stamps, and one standard deviation. The standard deviation is
+        0 if the offset was not estimated.
     clock_rate : ClockRate or None
-        By how much the offset changes with time, if it was estimated.
+        Change of the offset with time, if it was estimated.
     scale, scale_sigma : float
-        Factor applied to the child's translations, in the same way.
+        Factor applied to the child's translations, and one standard deviation. The standard
+        deviation is 0 if the scale was not estimated.
 
     Uncertainty
 
     covariance_measured : (6, 6) array
         Covariance of the error xi in ``T_parent_child @ exp(xi)``, xi = (rho, phi), in the child
-        sensor's frame, m and rad: the part that the recording shows.
+        sensor's frame, m and rad: the part that is estimated from the recording.
     covariance_allowance : (6, 6) array
-        Covariance of the same xi from errors that are constant during the recording, which no
-        recording shows (:mod:`hand_eye_calib.core.assessment.covariance`). :attr:`covariance` is
-        the sum of both.
+        Covariance of the same xi due to errors that are constant during the recording, so that
+        they cannot be estimated from it (:mod:`hand_eye_calib.core.assessment.covariance`).
+        :attr:`covariance` is the sum of both.
     observability_measured : tuple of DofObservability
-        x, y, z, roll, pitch, yaw in the parent sensor's frame, with the measured part of their
-        standard deviations; :attr:`observability` has the whole.
+        x, y, z, roll, pitch, yaw in the parent sensor's frame, with standard deviations without the
+        allowance. Those of :attr:`observability` contain the allowance.
     contradictions : mapping
-        Axis to the distance, in joint standard deviations, of a prior that contradicts the motion.
+        Axes whose prior contradicts the motion, and the distances in joint standard deviations.
 
     Data
 
     measured : {"poses", "rotations", "positions"}
-        What the streams give together. Rotations, or angular rates, say nothing of the translation,
-        positions nothing of the rotation: :attr:`out_of_reach`.
+        Quantity that both streams measure together. Rotations (and angular rates) do not determine
+        the translation; positions do not determine the rotation: see :attr:`out_of_reach`.
     n_poses, n_pairs, n_inliers : int
         Synchronised pose pairs, motion pairs, and motion pairs that count as inliers.
     stamp_ns : int
@@ -88,36 +90,37 @@ class Result:
     Noise
 
     noise : Noise or None
-        Of the trajectories, by the adaptive estimator; None with other methods.
+        Noise of the trajectories, from the adaptive estimator; None with other methods.
 
     Checks
 
     findings : tuple of Finding
-        What the stream checks found.
+        Findings of the stream checks.
     cross_check : CrossCheck or None
-        Per axis, the scatter about this one of answers of robust least squares, over other numbers
-        of poses and from both halves of the recording; None without a cross-check.
+        Scatter of other estimates about this one, by axis: of motions over other numbers of poses,
+        and of both halves of the recording. None without a cross-check.
     warnings : tuple of str
-        What a person should know before using the result.
+        Messages for the user of the result.
     recording : object
-        The poses and options that gave it, for :meth:`Calibration.report`. Not part of files.
+        The poses and options of the solve, for :meth:`Calibration.report`. Not part of files.
 
     Context
 
     parent_frame, child_frame : str
     base_frame : str
-        Frame of the robot in which the child's pose is stated as well; empty for none.
+        A frame of the robot; the child's pose is stated in this frame, too. May be empty.
     T_base_parent : (4, 4) array or None
-        Pose of the parent sensor in that frame, as the robot's transforms have it.
+        Pose of the parent sensor in ``base_frame``, from the robot's transforms.
     target_translation, target_rotation : float
-        Standard deviations (m, rad) that are good enough for the use that is made of the result.
+        Standard deviations (m, rad) that are small enough for the intended use.
     target_axes : mapping
-        Axis to a target of its own, m or rad.
+        Targets of single axes, m or rad.
     comparison : Comparison or None
-        With what is installed.
+        Comparison with the installed transform.
     parts : mapping
-        What layers above the core add, by name: ``goal``, ``together``, ``rate_bias``, ``worlds``.
-        A result has their values as attributes, too (:mod:`hand_eye_calib.core.results.parts`).
+        Records of layers above the core, by name: ``goal``, ``together``, ``rate_bias``,
+        ``worlds``. A result has their values as attributes, too
+        (:mod:`hand_eye_calib.core.results.parts`).
     """
 
     T_parent_child: FloatArray
@@ -166,28 +169,31 @@ class Result:
     parts: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in _FRAMES:  # tf2 refuses the leading slash of ROS 1
+        # tf2 refuses the leading slash of ROS 1.
+        for name in _FRAMES:
             frame = getattr(self, name)
-            if isinstance(frame, str):  # a file that was changed may have anything
+            # A file that was changed by hand may have values of other types.
+            if isinstance(frame, str):
                 object.__setattr__(self, name, frame_name(frame))
 
-    if not TYPE_CHECKING:  # a misspelt attribute stays an error of types
+    # Hidden from type checkers, so that they still report misspelt attributes.
+    if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            """Return an attribute of a part."""
-            for part in () if name.startswith("_") else all_parts():
-                if name in part.without:
-                    value = self.parts.get(part.name)
-                    return part.without[name] if value is None else part.attribute(value, name)
+            """Return an attribute that a part adds."""
+            for extra in () if name.startswith("_") else all_parts():
+                if name in extra.without:
+                    value = self.parts.get(extra.name)
+                    return extra.without[name] if value is None else extra.attribute(value, name)
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def with_part(self, name: str, value: object) -> Self:
-        """Return the result with a part that a layer above the core adds."""
+        """Return the result with a part of a layer above the core."""
         return replace(self, parts={**self.parts, name: value})
 
     @property
     def rotation(self) -> "Rotation":
-        """Rotation of ``T_parent_child``, as SciPy has it."""
+        """Rotation of ``T_parent_child``, as a ``Rotation`` of SciPy."""
         from scipy.spatial.transform import Rotation
 
         return Rotation.from_matrix(se3.rotation_of(self.T_parent_child))
@@ -219,8 +225,9 @@ class Result:
 
     @property
     def mounting(self) -> tuple[str, FloatArray]:
-        """The frame that the child sensor is mounted on in the robot's description, and its pose
-        (4, 4) in it: the base frame if there is one, otherwise the parent sensor's.
+        """The frame that the child sensor is mounted on, and the child's pose (4, 4) in this frame.
+
+        The frame is the base frame if there is one, otherwise the parent sensor's.
         """
         if self.T_base_child is not None:
             return self.base_frame, self.T_base_child
@@ -228,27 +235,31 @@ class Result:
 
     @property
     def covariance(self) -> FloatArray:
-        """(6, 6) array: covariance of the error xi in ``T_parent_child @ exp(xi)``, xi = (rho,
-        phi), in the child sensor's frame, m and rad: the measured part and the allowance.
+        """(6, 6) array: sum of the measured covariance and the allowance.
+
+        It is the covariance of the error xi in ``T_parent_child @ exp(xi)``, xi = (rho, phi), in
+        the child sensor's frame, m and rad.
         """
         return self.covariance_measured + self.covariance_allowance
 
     @property
     def sigmas(self) -> FloatArray:
-        """(6,) array: standard deviations along (m) and about (rad) the axes of the parent sensor's
-        frame, with the allowance; infinite if unobservable.
+        """(6,) array: standard deviations in the parent sensor's frame, with the allowance.
+
+        They are along (m) and about (rad) the axes; infinite for unobservable axes.
         """
         return np.hypot(self.sigmas_measured, self.allowance)
 
     @property
     def sigmas_measured(self) -> FloatArray:
-        """(6,) array: the part of :attr:`sigmas` that the recording shows."""
+        """(6,) array: the part of :attr:`sigmas` that is estimated from the recording."""
         return np.array([dof.sigma for dof in self.observability_measured])
 
     @property
     def allowance(self) -> FloatArray:
-        """(6,) array: the part of :attr:`sigmas` that allows for constant errors of the odometries,
-        which no recording shows.
+        """(6,) array: the part of :attr:`sigmas` that allows for constant errors.
+
+        Constant errors of odometries cannot be estimated from a recording.
         """
         return sigmas_in_parent(se3.rotation_of(self.T_parent_child), self.covariance_allowance)
 
@@ -262,26 +273,28 @@ class Result:
 
     @property
     def sigmas_rpy(self) -> FloatArray:
-        """(3,) array: standard deviations, rad, of the roll, pitch and yaw that are printed, with
-        the allowance; infinite if one is unknown. Those of ``sigmas`` are of rotations about the
-        parent's axes.
+        """(3,) array: standard deviations (rad) of roll, pitch and yaw, with the allowance.
+
+        They are infinite for unknown angles. They differ from those of ``sigmas``, which are of
+        rotations about the parent's axes.
         """
         return sigmas_rpy(self.T_parent_child, self.covariance)
 
     @property
     def sigmas_printed(self) -> FloatArray:
-        """(6,) array: standard deviations of the printed x, y, z (m), roll, pitch and yaw (rad),
-        with the allowance; infinite if one is unknown.
+        """(6,) array: standard deviations of x, y, z (m), roll, pitch and yaw (rad).
+
+        They contain the allowance, and are infinite for unknown numbers.
         """
         return np.concatenate([self.sigmas[:3], self.sigmas_rpy])
 
     def residuals(self) -> records.Residuals:
-        """Residuals of the motion pairs that the result comes from, at ``T_parent_child``.
+        """Residuals of the motion pairs of the solve, at ``T_parent_child``.
 
         Raises
         ------
         InputError
-            If the result was read from a file: files do not have them.
+            If the result was read from a file, because files have no residuals.
         """
         if self.motion_residuals is None:
             raise InputError(
@@ -299,12 +312,12 @@ class Result:
 
     @property
     def hidden(self) -> list[str]:
-        """Names of the axes that the recording does not determine, though its streams could."""
+        """Names of the axes that these streams could determine, but this recording does not."""
         return [axis for axis in self.unobservable() if axis not in self.out_of_reach]
 
     @property
     def out_of_reach(self) -> tuple[str, ...]:
-        """Axes that streams of this kind say nothing about, and no prior either."""
-        silent = OUT_OF_REACH.get(self.measured, ())
-        unknown = self.unobservable()
-        return tuple(axis for axis in silent if axis in unknown)
+        """Axes that streams of this kind can never determine, and that have no prior."""
+        never_observed = OUT_OF_REACH.get(self.measured, ())
+        unobservable = self.unobservable()
+        return tuple(axis for axis in never_observed if axis in unobservable)

@@ -1,7 +1,8 @@
 """The verdict on a result, and the rules that lead to it.
 
-Each rule of :data:`RULES` examines a result and yields grounds against its use. The gravest rule
-that yields a ground decides. docs/verdict.md has the same table; a test compares both.
+Each rule of :data:`RULES` examines a result and yields grounds against its use. The rules are
+sorted by gravity; the first rule that yields a ground decides the verdict. docs/verdict.md has the
+same table; a test compares both.
 """
 
 import math
@@ -42,7 +43,7 @@ class Verdict(str, Enum):
     DO_NOT_USE = "DO NOT USE"
 
 
-# Options of reasons that no option repairs.
+# Options of a reason that no option repairs.
 NO_OPTIONS: Mapping[str, float | str] = {}
 
 
@@ -55,16 +56,18 @@ class Reason:
     rule : str
         Name of the rule in :data:`RULES`, stable over versions.
     verdict : Verdict
-        The verdict if there were no other reason.
+        The verdict on the result if this were the only reason.
     sentence : str
         The problem, with its values.
     what_to_do : str
+        What the user should do.
     axes : tuple of str
         x, y, z, roll, pitch, yaw; empty if the reason concerns the whole result.
     options : mapping
         Options that repair the problem, by their public names.
     kind : {"physics", "suspicion"}
-        A limit of the motion, the recording or the sensors; or a sign of a fault.
+        "physics" for a limit of the motion, the recording or the sensors; "suspicion" for a sign of
+        a fault.
 
     Examples
     --------
@@ -88,7 +91,7 @@ class Reason:
 
 
 class Ground(NamedTuple):
-    """What a rule yields: the fields of a reason that the rule itself does not set."""
+    """The fields of a reason that differ from result to result; a rule yields grounds."""
 
     sentence: str
     what_to_do: str
@@ -105,31 +108,33 @@ class Rule(NamedTuple):
     find: Callable[[Result], Iterator[Ground]]
 
 
-# Other answers contradict a result on an axis if their distance exceeds this number of joint
-# standard deviations and this share of the target. However large the distance is, other answers
-# never forbid a result: their methods contain less of the noise, and no time-correlated errors.
+# Other estimates contradict a result on an axis if their scatter about it exceeds this number of
+# joint standard deviations, and the share of the target below. They never lead to DO NOT USE,
+# because their methods have no model of time-correlated errors.
 CONTRADICTED_SIGMAS = 3.0
+# Share of the target, see above.
 CONTRADICTED_SHARE = 0.25
 
-# Answers that are about as certain as the result contradict it, too, if their scatter exceeds
-# CONTRADICTED_SIGMAS of the result's own standard deviations and this number of targets. Their own
-# uncertainty is no excuse for such a scatter.
+# Estimates that are about as certain as the result also contradict it if their scatter exceeds
+# CONTRADICTED_SIGMAS of the result's own standard deviations, and this number of targets. Their own
+# uncertainty cannot explain such a scatter.
 CONTRADICTED_TARGETS = 2.0
 
-# Smallest share of inliers among the motion pairs of a recording without a fault.
+# Smallest share of inliers among the motion pairs without a reason against the result.
 FEWEST_INLIERS = 0.7
 
-# The same among the poses, for a method that models the noise and rejects only outliers.
+# The same share for the adaptive method, whose noise model rejects only outliers.
 FEWEST_OF_MODEL = 0.9
 
-# Rules that state a limit of the recording. Reasons of all others are suspicions.
+# Rules about a limit of the recording. Reasons of all other rules are suspicions.
 _KINDS = dict.fromkeys(
     ("nothing_known", "unobservable", "unconfirmed", "target", "floor", "part_of_poses"),
     "physics",
 )
 _NO_FAULT = " (a limit of the recording; no fault was found)"
 
-# Other answers, what they contradict, and what to do.
+# Words of the rules "halves" and "methods": what disagrees, the claim that it contradicts, and what
+# the user should do.
 _OTHERS = {
     "halves": (
         "the two halves of the recording disagree",
@@ -145,12 +150,14 @@ _OTHERS = {
 
 
 class Judged(Result):
-    """A result that knows its verdict."""
+    """A result with its verdict."""
 
     @cached_property
     def reasons(self) -> tuple[Reason, ...]:
-        """Why the result may not be used as it is, the gravest first; empty if it may. The rules
-        are :data:`hand_eye_calib.core.results.verdict.RULES`.
+        """Why the result may not be used as it is, the gravest reason first.
+
+        The tuple is empty if the result may be used. The rules are
+        :data:`hand_eye_calib.core.results.verdict.RULES`.
         """
         reasons = []
         for rule in RULES:
@@ -166,12 +173,12 @@ class Judged(Result):
 
     @property
     def has_failed(self) -> bool:
-        """Whether the solve failed, and no finding about the poses explains that."""
+        """Whether the solve failed without a finding that explains the failure."""
         return bool(self.reasons) and self.reasons[0].rule in ("prior", "not_converged")
 
     @property
     def headline(self) -> str:
-        """The verdict with its gravest reason, or with what is known, in one line."""
+        """The verdict with its gravest reason, or with the accuracy, in one line."""
         return f"{self.verdict.value}: {self.sentence}"
 
     @property
@@ -184,8 +191,8 @@ class Judged(Result):
         first, *others = gravest
         if first.rule == "unobservable":
             hidden = listing(first.axes)
-            it = hidden if len(first.axes) == 1 else "them"
-            text = f"all but {hidden}; measure {it} by hand"
+            them = hidden if len(first.axes) == 1 else "them"
+            text = f"all but {hidden}; measure {them} by hand"
             if others:
                 text += f"; {others[0].sentence}"
         elif first.rule == "part_of_poses" and not others:
@@ -210,7 +217,7 @@ class Judged(Result):
         return gravest[:1]
 
     def _notes(self) -> list[str]:
-        """Notes for the headline, of extras and of findings that are no reasons."""
+        """Notes for the headline: those of parts, and of findings that do not lower the verdict."""
         notes = [part(name).headline(value) for name, value in self.parts.items()]
         notes += [finding.what for finding in self.findings if _is_notable(finding)]
         return [note for note in notes if note]
@@ -225,21 +232,20 @@ def _is_notable(finding: Finding) -> bool:
 
 
 def shown(reasons: Sequence[Reason]) -> tuple[Reason, ...]:
-    """Return the reasons that a person has to read.
+    """Return the reasons that a person has to read: those with the gravest verdict.
 
-    Under DO NOT USE these are the reasons that lead to it: the others may be consequences.
+    The other reasons may be consequences.
     """
     return tuple(reason for reason in reasons if reason.verdict is reasons[0].verdict)
 
 
 def what_is_known(result: Result) -> str:
-    """Return the axes and the largest standard deviation of each part, in words."""
+    """Return the largest standard deviation of translation and of rotation, in words."""
     axes = _axes(result)
     texts = []
     for names in (TRANSLATIONS, ROTATIONS):
-        if axes_of_part := [axis for axis in axes if axis.name in names]:
-            worst = max(axes_of_part, key=lambda axis: axis.total)
-            texts.append(amount(worst.name, worst.total))
+        if totals := [axis.total for axis in axes if axis.name in names]:
+            texts.append(amount(names[0], max(totals)))
     if not result.out_of_reach:
         return f"good to {listing(texts)} on every axis (1 sigma)"
     within_reach = listing([axis.name for axis in axes])
@@ -249,16 +255,16 @@ def what_is_known(result: Result) -> str:
 
 
 def target_of(axis: str, result: Result) -> float:
-    """Return the standard deviation (m or rad) that is good enough for an axis."""
-    usual = result.target_rotation if axis in ROTATIONS else result.target_translation
-    return float(result.target_axes.get(axis, usual))
+    """Return the target of an axis: the standard deviation (m or rad) that is small enough."""
+    default = result.target_rotation if axis in ROTATIONS else result.target_translation
+    return float(result.target_axes.get(axis, default))
 
 
 # ---------------------------------------------------------------- the rules
 
 
 def _not_converged(result: Result) -> Iterator[Ground]:
-    # An error finding names the cause if the poses contradict each other, and have no solution.
+    # If an error finding explains why there is no solution, this rule adds nothing.
     if result.status is SolveStatus.NOT_CONVERGED and not has_error(result.findings):
         yield Ground("the solver did not converge", "record more varied motion")
 
@@ -280,7 +286,7 @@ def _contradicted(result: Result) -> Iterator[Ground]:
 
 def _nothing_known(result: Result) -> Iterator[Ground]:
     if result.reference == "stops" and has_error(result.findings):
-        # Stops that contradict each other determine nothing; an error finding names the cause.
+        # If stops contradict each other, an error finding names the cause.
         return
     if all(axis.is_hidden for axis in _axes(result)):
         yield Ground(
@@ -288,8 +294,8 @@ def _nothing_known(result: Result) -> Iterator[Ground]:
             "record motion with rotations about all axes",
         )
     elif result.reference == "stops" and result.hidden:
-        is_flat = any(finding.code == "one_axis" for finding in result.findings)
-        why = "do not turn about two axes" if is_flat else "turn too little for their errors"
+        has_one_axis = any(finding.code == "one_axis" for finding in result.findings)
+        why = "do not turn about two axes" if has_one_axis else "turn too little for their errors"
         ground = _hidden_ground(result, f"these stops, which {why}")
         advice = f"turn the hand about at least two axes between them, or {ground.what_to_do}"
         yield ground._replace(what_to_do=advice)
@@ -302,7 +308,10 @@ def _findings_of(severity: Severity, result: Result) -> Iterator[Ground]:
 
 
 def _contradiction(kind: str, result: Result) -> Iterator[Ground]:
-    """Yield the axes on which other answers (``kind``: halves or methods) are too far away."""
+    """Yield a ground if other estimates contradict the result on some axes.
+
+    ``kind`` is "halves" or "methods": the origin of the other estimates.
+    """
     distances = {}
     sigmas = []
     for axis in _axes(result):
@@ -325,7 +334,7 @@ def _contradiction(kind: str, result: Result) -> Iterator[Ground]:
 
 
 def _scatter_of(kind: str, row: AxisScatter, axis: "_Axis") -> tuple[float, bool]:
-    """Return the scatter of other answers on an axis, and whether it is too large."""
+    """Return the scatter of other estimates on an axis, and whether it is too large."""
     if kind == "halves":
         scatter = row.of_halves
         excess = row.excess_of_halves
@@ -335,7 +344,7 @@ def _scatter_of(kind: str, row: AxisScatter, axis: "_Axis") -> tuple[float, bool
         excess = row.excess_of_methods
         over_own = row.excess_over_own
     if scatter is None and over_own is not None:
-        # Too few answers have a scatter, but they are about as certain as the result.
+        # There are too few estimates for `of_methods`, but they are about as certain as the result.
         scatter = over_own * (row.sigma or axis.total)
     if scatter is None:
         return 0.0, False
@@ -367,17 +376,17 @@ def _hidden(result: Result) -> Iterator[Ground]:
 
 
 def _hidden_ground(result: Result, source: str) -> Ground:
-    """Return the ground that a source of motion leaves axes open."""
+    """Return the ground that ``source`` ("this motion") does not determine some axes."""
     axes = tuple(axis.name for axis in _axes(result) if axis.is_hidden)
     priors = listing([f"prior.{axis} VALUE+/-SIGMA" for axis in axes])
-    it = "it" if len(axes) == 1 else "them"
+    them = "it" if len(axes) == 1 else "them"
     sentence = f"{axes_in_words(axes)} cannot be determined from {source}"
-    return Ground(sentence, f"measure {it} by hand and give {priors}", axes)
+    return Ground(sentence, f"measure {them} by hand and give {priors}", axes)
 
 
 def _few_inliers(result: Result) -> Iterator[Ground]:
     if result.reference == "stops":
-        # A finding has the numbers of the stops that were left out.
+        # A finding names the stops that were rejected.
         return
     share = result.n_inliers / max(result.n_pairs, 1)
     uses_reference = METHODS[result.method].uses_reference
@@ -393,7 +402,7 @@ _FLOOR_ADVICE = (
 
 
 def _amounts(axes: Iterable[tuple[str, float]], between: str = " ") -> str:
-    """Return axes and their sizes in words."""
+    """List axes with their sizes (m or rad) in words."""
     texts = [f"{axes_in_words([name])}{between}{amount(name, size)}" for name, size in axes]
     return listing(texts)
 
@@ -406,7 +415,7 @@ def _worse_than_target(result: Result) -> Iterator[Ground]:
     sizes = [f"{axes_in_words([axis.name])} {axis.beside_target()}" for axis in rough]
     sentence = f"standard deviations above the target of {_targets(rough)}: {listing(sizes)}"
     allowances = [(axis, math.sqrt(axis.total**2 - axis.sigma**2)) for axis in rough]
-    # A longer recording does not help where the allowance alone is above the target.
+    # A longer recording does not help if the allowance alone is above the target.
     hopeless = [(axis.name, size) for axis, size in allowances if size > axis.target]
     advice = []
     if len(hopeless) < len(rough):
@@ -438,11 +447,11 @@ def _floor(result: Result) -> Iterator[Ground]:
 
 
 def _targets(axes: Sequence["_Axis"]) -> str:
-    """Return the different targets of axes in words."""
+    """List the different targets of axes in words."""
     return listing([*dict.fromkeys(amount(axis.name, axis.target) for axis in axes)])
 
 
-# Faults that no check of positions or rotations alone detects, and what to do.
+# Faults that no check detects in streams of this quantity, and what the user should do.
 _UNSEEN = {
     "rotations": (
         "smoothing and slow drift of rotations alone cannot be seen",
@@ -457,9 +466,9 @@ def _part_of_poses(result: Result) -> Iterator[Ground]:
 
 
 class _Axis(NamedTuple):
-    """An axis within reach of the streams.
+    """An axis that the streams can determine.
 
-    ``sigma`` is the measured standard deviation (m or rad), ``total`` has the allowance, too.
+    ``sigma`` is the measured standard deviation (m or rad); ``total`` contains the allowance, too.
     """
 
     name: str
@@ -470,7 +479,7 @@ class _Axis(NamedTuple):
     is_known_by_hand: bool
 
     def beside_target(self) -> str:
-        """Return the standard deviation with digits that tell it from the target."""
+        """Return the standard deviation with enough digits to distinguish it from the target."""
         return amount_beside(self.name, self.total, self.target)
 
 
@@ -512,7 +521,7 @@ _OWN_RULES = (
         "a stream check found an error",
         partial(_findings_of, Severity.ERROR),
     ),
-    # Behind the faults of the streams, which are often its cause.
+    # After the error findings, because faults of the streams are often the cause.
     Rule(
         "not_converged",
         _NEVER,
@@ -536,8 +545,9 @@ _OWN_RULES = (
     Rule(
         "methods",
         _CARE,
-        f"answers of robust least squares {_APART}; or those about as certain by "
-        f"{CONTRADICTED_SIGMAS:g} of the result's own and {CONTRADICTED_TARGETS:g} targets",
+        f"answers of robust least squares {_APART}; or answers about as certain as the result "
+        f"differ by {CONTRADICTED_SIGMAS:g} of its standard deviations and "
+        f"{CONTRADICTED_TARGETS:g} targets",
         partial(_contradiction, "methods"),
     ),
     Rule(
@@ -575,7 +585,7 @@ _OWN_RULES = (
 
 
 def _with_extra_rules() -> tuple[Rule, ...]:
-    """Return the rules with those of the extras at their places."""
+    """Return the rules of this module with those of the extras inserted at their places."""
     rules = [*_OWN_RULES]
     for name, extra in EXTRA_RULES.items():
         names = [rule.name for rule in rules]
