@@ -1,9 +1,9 @@
 """Least squares from sums over blocks of time.
 
-The p unknowns x minimise the squares of ``W^(1/2) (J x - y)``. The evidence of a block is its table
-of products ``[J y]' W [J y]`` (p + 1, p + 1). The first p rows ``[H S]`` are the information and
-the score. Tables add over blocks, so any set of blocks (all, all but one, before or since a time)
-is solved from the sum of its tables.
+The p unknowns x minimise the squares of ``W^(1/2) (J x - y)``. The table of a block is its matrix
+of products ``[J y]' W [J y]`` (p + 1, p + 1). The first p rows of a table are ``[H S]``: the
+information ``J' W J`` and the score ``J' W y``. Tables of blocks add. So the solution for any set
+of blocks (all, all but one, before or since a time) follows from the sum of their tables.
 """
 
 from collections.abc import Sequence
@@ -13,16 +13,16 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 
-# Damping of directions without evidence, in units in which the diagonal is 1: above rounding.
+# Damping of directions without evidence, if the diagonal is scaled to 1; above rounding.
 _DAMPING = 1e-10
 
-# Smallest root of a diagonal element that counts as evidence.
-_LEAST_SIZE = 1e-30
+# Smallest root of a diagonal element of an unknown with evidence.
+_SMALLEST_ROOT = 1e-30
 
 
 @dataclass(frozen=True)
 class Blocks:
-    """Sums (B, ...) of B blocks in order of time: tables of products, or other evidence that adds.
+    """Sums (B, ...) of B blocks in order of time: tables, or other arrays that add over blocks.
 
     Examples
     --------
@@ -35,27 +35,28 @@ class Blocks:
 
     @classmethod
     def of_rows(cls, rows: FloatArray, n_blocks: int, probes: FloatArray | None = None) -> "Blocks":
-        """Tables of products of weighted rows (K, d, p + 1), in blocks of equally many rows.
+        """Make tables from weighted rows ``W^(1/2) [J y]`` (K, d, p + 1), in equally long blocks.
 
-        ``probes`` (K, d, p + 1) take the place of the rows on the left: instrumental variables.
+        ``probes`` (K, d, p + 1), if any, replace the left factor of the products. They are
+        instrumental variables.
         """
         n_columns = rows.shape[-1]
-        on_left = np.array_split(rows if probes is None else probes, n_blocks)
-        on_right = np.array_split(rows, n_blocks)
+        left_factors = np.array_split(rows if probes is None else probes, n_blocks)
+        right_factors = np.array_split(rows, n_blocks)
         tables = []
-        for left, right in zip(on_left, on_right, strict=True):
-            tables.append(left.reshape(-1, n_columns).T @ right.reshape(-1, n_columns))
+        for left_rows, right_rows in zip(left_factors, right_factors, strict=True):
+            tables.append(left_rows.reshape(-1, n_columns).T @ right_rows.reshape(-1, n_columns))
         return cls(np.stack(tables))
 
     @classmethod
     def gathered(cls, values: FloatArray, block_of: IntArray, n_blocks: int) -> "Blocks":
-        """Sums of values (K, ...) by the block (K,) of each."""
+        """Sum values (K, ...) over blocks; ``block_of`` (K,) is the index of a value's block."""
         sums = np.zeros((n_blocks, *values.shape[1:]))
         np.add.at(sums, block_of, values)
         return cls(sums)
 
     def merged(self, n_blocks: int) -> "Blocks":
-        """Fewer blocks, each of neighbours."""
+        """Merge neighbouring blocks, so that ``n_blocks`` remain."""
         starts = np.arange(n_blocks) * len(self.sums) // n_blocks
         return Blocks(np.add.reduceat(self.sums, starts))
 
@@ -65,7 +66,7 @@ class Blocks:
         return np.asarray(self.sums.sum(axis=0))
 
     def without(self) -> FloatArray:
-        """Sums (B, ...) of all blocks but one."""
+        """Sums (B, ...) of all blocks except one, for each block."""
         return self.total - self.sums
 
     def before(self, cuts: IntArray) -> FloatArray:
@@ -77,21 +78,22 @@ class Blocks:
         return np.asarray(np.cumsum(self.sums[::-1], axis=0)[::-1][cuts])
 
     def shift_since(self, cuts: IntArray, prior: FloatArray) -> FloatArray:
-        """Evidence (C, p, p + 1) of a shift of the unknowns at each cut, whatever they were before.
+        """Evidence ``[H S]`` (C, p, p + 1) of a shift of the unknowns at each cut (C,).
 
-        ``prior`` (p, p) is added to the information about the unknowns before the cut.
+        The unknowns before the cut are estimated from the blocks before it. ``prior`` (p, p) is
+        added to their information.
         """
         before = self.before(cuts)
         covariances = inverse(information(before) + prior)
-        known = (covariances @ score(before)[..., None])[..., 0]
-        return shift_evidence(self.since(cuts), known, covariances)
+        estimates = (covariances @ score(before)[..., None])[..., 0]
+        return shift_evidence(self.since(cuts), estimates, covariances)
 
     def solve(self, columns: Sequence[int]) -> FloatArray:
-        """Answer (k,) of all blocks for some of the unknowns, the others being zero."""
+        """Solve all blocks for some unknowns (k,); the other unknowns are zero."""
         return solve(self.total, columns)
 
     def jackknife(self, columns: Sequence[int]) -> FloatArray:
-        """Jackknife covariance (k, k) of :meth:`solve`, from the answers without each block."""
+        """Jackknife covariance (k, k) of :meth:`solve`, from solutions without one block each."""
         return jackknife_covariance(solve(self.without(), columns))
 
 
@@ -111,55 +113,57 @@ def inverse(matrices: FloatArray) -> FloatArray:
     try:
         inverses = np.linalg.inv(matrices)
     except np.linalg.LinAlgError:
-        # Exact poses have so much evidence along some directions that the others are rounding.
+        # With exact poses, the information along some directions is so large that the information
+        # along the other directions is rounding.
         inverses = np.linalg.pinv(matrices)
     return np.asarray(inverses, dtype=float)
 
 
 def answer_evidence(answers: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Evidence ``[H S]`` (..., p, p + 1) of answers (..., p) with covariances (..., p, p)."""
+    """Return evidence ``[H S]`` (..., p, p + 1) of estimates (..., p) with their covariances."""
     H = inverse(covariances)
     return np.concatenate([H, H @ answers[..., None]], axis=-1)
 
 
-def shift_evidence(tables: FloatArray, known: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Evidence ``[H S]`` (..., p, p + 1) of a shift of the unknowns from those that are known.
+def shift_evidence(tables: FloatArray, before: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return evidence ``[H S]`` (..., p, p + 1) of a shift of the unknowns from earlier estimates.
 
     Parameters
     ----------
     tables : (..., p, p + 1) or (..., p + 1, p + 1) array
         Evidence since the shift; H may be singular.
-    known : (..., p) array
-        The unknowns before the shift.
+    before : (..., p) array
+        Estimates of the unknowns before the shift.
     covariance : (..., p, p) array
-        Of the errors of ``known``.
+        Covariance of these estimates.
     """
     H = information(tables)
-    scores = score(tables)[..., None] - H @ known[..., None]
-    from_known = np.concatenate([H, scores], axis=-1)
+    scores = score(tables)[..., None] - H @ before[..., None]
+    relative = np.concatenate([H, scores], axis=-1)
     spread = np.eye(H.shape[-1]) + H @ covariance
-    return inverse(spread) @ from_known
+    return inverse(spread) @ relative
 
 
 def solve(tables: FloatArray, columns: Sequence[int], target: int = -1) -> FloatArray:
-    """Least-squares solution (..., k) of a target column by k others.
+    """Fit a target column by k other columns, by least squares.
 
     Parameters
     ----------
     tables : (..., p + 1, p + 1) array
         Products of the columns.
     columns : sequence of int
+        The k other columns.
     target : int
-        The column that the others are fitted to.
+        The column that is fitted.
 
     Returns
     -------
     (..., k) array
-        Zero along directions without evidence.
+        Coefficients of the columns; zero along directions without evidence.
     """
     normal = tables[..., columns, :][..., columns]
-    sizes = np.sqrt(np.abs(np.diagonal(normal, axis1=-2, axis2=-1)))
-    units = np.divide(1.0, sizes, out=np.zeros_like(sizes), where=sizes > _LEAST_SIZE)
+    roots = np.sqrt(np.abs(np.diagonal(normal, axis1=-2, axis2=-1)))
+    units = np.divide(1.0, roots, out=np.zeros_like(roots), where=roots > _SMALLEST_ROOT)
     balanced = normal * units[..., :, None] * units[..., None, :]
     damped = balanced + _DAMPING * np.eye(len(columns))
     scores = units * tables[..., columns, target]
@@ -168,7 +172,7 @@ def solve(tables: FloatArray, columns: Sequence[int], target: int = -1) -> Float
 
 
 def jackknife_covariance(answers: FloatArray) -> FloatArray:
-    """Covariance (p, p) from the answers (B, p) without each of B blocks.
+    """Covariance (p, p) from B estimates (B, p), each made without one of B blocks.
 
     B. Efron, R. J. Tibshirani, *An introduction to the bootstrap*, 1993, eq. 11.5:
     ``(B - 1) / B * sum (x_b - mean) (x_b - mean)'``.

@@ -1,4 +1,4 @@
-"""Every option of the package, once: name, unit, range, default and meaning.
+"""Options of the engine and of the node: name, unit, range, default and meaning.
 
 The node's parameters, the options of the command line, ``config/calibrator.yaml`` and the tables of
 the documentation are made from these dataclasses or tested against them.
@@ -15,7 +15,7 @@ from hand_eye_calib.core.base.option import OptionSet, option
 from hand_eye_calib.core.base.registry import MEASURES
 
 TRAJECTORY_FORMATS = ("tum", "kitti", "euroc", "csv")
-# As of formats/layouts.yaml.
+# The same names as in formats/layouts.yaml.
 EXPORT_FORMATS = (
     *("autoware", "fast_lio", "fast_livo2", "lio_sam", "kalibr", "openvins", "vins", "orbslam3"),
     *("apollo", "dlio", "glim", "msa", "px4", "kitti", "nuscenes", "colmap", "driveworks"),
@@ -32,7 +32,7 @@ POSE_TYPES = (
 
 BACKENDS = ("fast", "ipopt")
 
-# Largest time offset (s): that between any two stamps of 64 bits of nanoseconds which are not
+# Largest time offset (s): the largest difference of two stamps of int64 nanoseconds that are not
 # negative. Clocks may count from 1970, 1904, the start of the computer or of the GPS week.
 _LONGEST_OFFSET_S = 9.2e9
 
@@ -43,9 +43,9 @@ class MethodRecord(NamedTuple):
     Attributes
     ----------
     uses_reference : bool
-        Whether the method solves the motion pairs of a reference, rather than the pose stream.
+        Whether the method solves the motion pairs of a reference; otherwise all poses.
     rejects_outliers : bool
-        Whether outliers are left out, so that a few jumps of a stream hardly change the answer.
+        Whether the method rejects outliers, so that a few jumps hardly change the result.
     backends : tuple of str
         Allowed values of the option ``backend``.
     """
@@ -146,7 +146,8 @@ class CalibratorConfig(OptionSet):
     Attributes
     ----------
     given : frozenset of str
-        Those that the user set, at their defaults or not; ``dataclasses.replace`` keeps them.
+        Names of the options that the user set, also to their defaults. ``dataclasses.replace``
+        keeps these names.
 
     Examples
     --------
@@ -158,10 +159,10 @@ class CalibratorConfig(OptionSet):
     given: InitVar[Collection[str] | None] = None
 
     def __new__(cls, **values: Any) -> Self:
-        """Note which options are passed."""
+        """Store the names of the options that are passed."""
         config = super().__new__(cls)
-        given = values if values.get("given") is None else values["given"]
-        object.__setattr__(config, "given", frozenset(given) - {"given"})
+        names = values if values.get("given") is None else values["given"]
+        object.__setattr__(config, "given", frozenset(names) - {"given"})
         return config
 
     method: str = option(
@@ -292,30 +293,30 @@ class CalibratorConfig(OptionSet):
     )
 
     def is_known(self, name: str) -> bool:
-        """Return whether the user set ``time_offset`` or ``scale`` to a value, not to estimate."""
+        """Return whether the user set ``time_offset`` or ``scale`` to a fixed value."""
         return name in self.given and getattr(self, name) not in ("auto", "estimate")
 
     @property
     def given_time_offset_s(self) -> float:
-        """Time offset (s) if it is a number; 0 if it is to be estimated."""
+        """The option ``time_offset`` (s) if it is a number; 0 if it is "estimate"."""
         return 0.0 if isinstance(self.time_offset, str) else self.time_offset
 
     @property
     def given_scale(self) -> float:
-        """Factor of the child's lengths if it is a number; 1 if it is a word."""
+        """The option ``scale`` if it is a number; 1 if it is a word."""
         return 1.0 if isinstance(self.scale, str) else self.scale
 
     @property
     def measured(self) -> str:
-        """Kind of data that both streams make together: poses, rotations, positions or another.
+        """Kind of data of both streams together: "poses", "rotations", "positions" or another.
 
         Raises
         ------
         ConfigError
-            If the streams make none together, such as positions without poses.
+            If the streams cannot be calibrated together, such as two streams of positions.
         """
-        words = [word for word in (self.parent_measures, self.child_measures) if word != "auto"]
-        partial = [MEASURES[word] for word in words if word != "poses"]
+        words = (self.parent_measures, self.child_measures)
+        partial = [MEASURES[word] for word in words if word not in ("auto", "poses")]
         if not partial:
             return "poses"
         kinds = {measure.kind for measure in partial}
@@ -327,18 +328,18 @@ class CalibratorConfig(OptionSet):
             f"{reason}; the parent measures {self.parent_measures}, the child {self.child_measures}"
         )
 
-    def require_poses(self, what: str) -> None:
+    def require_poses(self, request: str) -> None:
         """Check that both sensors measure whole poses.
 
         Raises
         ------
         ConfigError
-            If a sensor measures anything else. ``what`` names the request at the start of the
-            message.
+            If a sensor measures anything else. The message begins with ``request``, the name of
+            what needs poses.
         """
         if self.measured != "poses":
             raise ConfigError(
-                f"{what} needs poses of both sensors; the parent measures "
+                f"{request} needs poses of both sensors; the parent measures "
                 f"{self.parent_measures}, the child {self.child_measures}"
             )
 
@@ -350,7 +351,7 @@ class CalibratorConfig(OptionSet):
         return tuple(single.get(axis, of_unit[unit]) for axis, unit in text.AXIS_UNITS.items())
 
     def prior(self) -> dict[str, tuple[float, float]]:
-        """The prior: axis name to (value, standard deviation), in m and rad."""
+        """Return the prior: (value, standard deviation) in m or rad, by the name of the axis."""
         priors = {}
         for axis in text.AXIS_UNITS:
             value = getattr(self, f"prior_{axis}")
@@ -359,11 +360,12 @@ class CalibratorConfig(OptionSet):
         return priors
 
 
-MOST_OTHERS = 7  # further child sensors of the node
+# Largest number of further child sensors of the node.
+MOST_OTHERS = 7
 
 
 def other_names(count: int = MOST_OTHERS) -> list[str]:
-    """Names of the inputs of so many further child sensors."""
+    """Return the names of the inputs of ``count`` further child sensors: child2, child3, ..."""
     return [f"child{number}" for number in range(2, count + 2)]
 
 

@@ -1,8 +1,8 @@
-"""The exceptions this package raises on purpose.
+"""The exceptions that this package raises on purpose.
 
-Every message says what was expected, what was found and what to do about it, in one line: command
-line and node print it as it is. Anything else that escapes is a defect of the package and keeps its
-traceback.
+A message is one line: what was expected, what was found, and what the user should do. The command
+line and the node print the message unchanged. Any other exception is a defect of the package and is
+printed with its traceback.
 """
 
 from collections.abc import Iterator, Mapping
@@ -41,7 +41,7 @@ class HandEyeCalibError(Exception):
 
 
 class ConfigError(HandEyeCalibError, ValueError):
-    """An option or parameter has a value it cannot have."""
+    """An option or parameter has a value that is not allowed."""
 
 
 class InputError(HandEyeCalibError, ValueError):
@@ -67,7 +67,7 @@ class NoPoseError(InputError):
 
 
 class NotEnoughDataError(InputError):
-    """Too little data to solve; the data themselves are valid."""
+    """The data are valid, but there are too few of them to solve."""
 
 
 class MissingDependencyError(HandEyeCalibError, ImportError):
@@ -76,7 +76,7 @@ class MissingDependencyError(HandEyeCalibError, ImportError):
 
 @contextmanager
 def located(where: object) -> Iterator[None]:
-    """Put a place, such as a path, before the messages of errors that the block raises."""
+    """Prepend a place, such as a path, to the messages of errors that the block raises."""
     try:
         yield
     except HandEyeCalibError as error:
@@ -84,7 +84,7 @@ def located(where: object) -> Iterator[None]:
 
 
 def installing(extra: str) -> str:
-    """Return the command that installs an extra; the package itself is on no package index."""
+    """Return the command that installs an extra. The package is not on a package index."""
     return f"pip install '.[{extra}]' in the source folder of hand_eye_calib"
 
 

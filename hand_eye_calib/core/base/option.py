@@ -10,11 +10,11 @@ from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.text import frame_name, shown_value
 
 OptionValue: TypeAlias = bool | int | float | str
-#: Values of options by their public names: the dataclass that takes them checks their types.
+#: Values of options by their public names. The dataclass of the options checks their types.
 Options: TypeAlias = Mapping[str, Any]
 OptionField: TypeAlias = dataclasses.Field[Any]
 
-# Whole numbers must be smaller in size: parameters of ROS have 64 bits.
+# Whole numbers must be smaller in absolute value, because parameters of ROS have 64 bits.
 _LARGEST_INT = 1 << 63
 
 _GROUPS = ("keyframe", "prior", "target")
@@ -42,13 +42,17 @@ def option(
     Parameters
     ----------
     default
-        Its type is the option's type.
-    doc, unit
-        One line for a person who is about to set it; unit of the value, empty for none.
-    within, choices
-        Smallest and largest allowed value; the allowed values.
+        Default value. Its type is the type of the option.
+    doc
+        Help text of one line for the user.
+    unit
+        Unit of the value; empty for none.
+    within
+        Smallest and largest allowed number.
+    choices
+        Allowed texts.
     words
-        Words that may stand for a number, such as "none".
+        Words that are allowed instead of a number, such as "none".
     read_only
         The node cannot change the option while it runs.
     parse
@@ -67,16 +71,16 @@ def option_name(field: OptionField) -> str:
     return f"{group}.{name}" if group in _GROUPS else field.name
 
 
-def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """``; did you mean X?`` for a misspelt word; empty if no known word is close."""
+def did_you_mean(word: str, candidates: Iterable[str]) -> str:
+    """Return ``; did you mean X?`` for a misspelt word; empty if no candidate is similar."""
     import difflib
 
-    close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
+    close = difflib.get_close_matches(word, list(candidates), n=1, cutoff=0.6)
     return f"; did you mean {close[0]}?" if close else ""
 
 
 def _of_python(value: object) -> object:
-    """Return the Python value of a scalar of NumPy, such as ``np.float64(0.1)``; others as is."""
+    """Convert a scalar of NumPy, such as ``np.float64(0.1)``, to Python; keep other values."""
     is_scalar = type(value).__module__ == "numpy" and getattr(value, "ndim", None) == 0
     return value.item() if is_scalar else value  # type: ignore[attr-defined]
 
@@ -98,17 +102,25 @@ def check_value(field: OptionField, value: object) -> OptionValue:
     kind: type = float if words else type(field.default)
     if isinstance(value, str) and (value in words or kind is str):
         return _checked_text(field, value)
-    if words and isinstance(value, str):
-        with contextlib.suppress(ValueError):
-            value = float(value)
-    if kind is float and type(value) is int:
-        value = float(value)
+    if kind is float:
+        value = _as_float(value, has_words=bool(words))
     if type(value) is not kind or not isinstance(value, bool | int | float):
         expected = f"{' or '.join(words)} or a number" if words else _TYPE_NAMES[kind]
         raise ConfigError(
             f"{name} must be {expected}; got {shown_value(value)}{did_you_mean(str(value), words)}"
         )
     return _checked_number(field, value)
+
+
+def _as_float(value: object, has_words: bool) -> object:
+    """Convert a whole number to float, and the text of a number if the option allows words.
+
+    Other values stay unchanged.
+    """
+    if type(value) is int or (has_words and isinstance(value, str)):
+        with contextlib.suppress(ValueError):
+            return float(value)
+    return value
 
 
 def _checked_text(field: OptionField, text: str) -> str:
@@ -131,16 +143,16 @@ def _checked_number(field: OptionField, value: float) -> float:
     name = option_name(field)
     if not math.isfinite(value):
         raise ConfigError(f"{name} must be a finite number; got {value}")
-    least, most = field.metadata["within"] or (value, value)
-    if not least <= value <= most:
-        bound = f"at least {least}" if value < least else f"at most {most}"
+    low, high = field.metadata["within"] or (value, value)
+    if not low <= value <= high:
+        bound = f"at least {low}" if value < low else f"at most {high}"
         unit = field.metadata["unit"]
         raise ConfigError(f"{name} must be {' '.join([bound, unit]).rstrip()}; got {value}")
     return value
 
 
 class OptionSet:
-    """Base of dataclasses made of options: checks every value and knows the public names."""
+    """Base of dataclasses whose fields are options: checks values, converts to public names."""
 
     given: frozenset[str]
     __dataclass_fields__: ClassVar[dict[str, OptionField]]
@@ -161,17 +173,17 @@ class OptionSet:
         Raises
         ------
         ConfigError
-            If a name is unknown, with a list of the known ones, or a value is not allowed.
+            If a name is unknown (the message lists the known names), or a value is not allowed.
         """
-        known = cls.by_name()
-        unknown = [name for name in options if name not in known]
+        by_name = cls.by_name()
+        unknown = [name for name in options if name not in by_name]
         if unknown:
             raise ConfigError(
-                f"unknown option {unknown[0]!r}{did_you_mean(unknown[0], known)}; known are "
-                f"{', '.join(sorted(known))}"
+                f"unknown option {unknown[0]!r}{did_you_mean(unknown[0], by_name)}; known are "
+                f"{', '.join(sorted(by_name))}"
             )
-        return cls(**{known[name].name: value for name, value in options.items()})
+        return cls(**{by_name[name].name: value for name, value in options.items()})
 
     def to_options(self) -> dict[str, OptionValue]:
-        """Mapping of public names to values."""
+        """Return the values of all options by their public names."""
         return {name: getattr(self, field.name) for name, field in self.by_name().items()}

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 # A mapping of JSON or YAML: names to values that any program reads.
 Document: TypeAlias = dict[str, Any]
 
-# Numbers of a file must be smaller, so that products of several of them are finite.
+# Numbers of a file must be smaller, so that products of several numbers are finite.
 _LARGEST = 1e50
 
 
@@ -23,44 +23,49 @@ def plain(value: Any) -> Any:
     """Convert a value and its contents to mappings, lists, texts, bools and numbers.
 
     A dataclass becomes a mapping of its fields. Numbers and arrays of NumPy become numbers and
-    lists. An enum becomes its value, with underscores for spaces. Infinity and NaN, which JSON does
-    not have, become None.
+    lists. An enum becomes its value, with underscores instead of spaces. Infinity and NaN, which
+    JSON does not have, become None.
     """
     if isinstance(value, Enum):
-        value = value.value.replace(" ", "_") if isinstance(value.value, str) else value.value
+        return _plain_member(value)
     if is_dataclass(value) and not isinstance(value, type):
-        value = {each.name: getattr(value, each.name) for each in fields(value)}
-    if isinstance(value, Mapping):
-        return {key: plain(each) for key, each in value.items()}
-    if isinstance(value, np.ndarray):
+        value = {field.name: getattr(value, field.name) for field in fields(value)}
+    if isinstance(value, (np.ndarray, np.generic)):
         value = value.tolist()
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(each) for each in value]
-    if isinstance(value, (float, np.floating)):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
-    return value.item() if isinstance(value, np.generic) else value
+    return value
+
+
+def _plain_member(member: Enum) -> Any:
+    value = member.value
+    return value.replace(" ", "_") if isinstance(value, str) else plain(value)
 
 
 def from_plain(kind: Any, value: Any, **names: type) -> Any:
     """Convert plain data back to a type: the inverse of :func:`plain`.
 
-    Keys without a field in the dataclass are ignored. A float that is None becomes infinite.
+    Keys without a field in the dataclass are ignored. None for a float becomes infinity.
 
     Parameters
     ----------
     kind : type
-        A dataclass, an enum, float, int, bool, str; tuple, Mapping or union of such; arrays stay
-        as they are.
+        A dataclass, an enum, float, int, bool or str; or a tuple, a Mapping or a union of these
+        types. For an array type, ``value`` must be an array already.
     value : plain data
     **names
-        Types that the module of a dataclass imports for type checkers alone.
+        Types that the module of a dataclass imports only for type checkers.
 
     Raises
     ------
     KeyError
-        If a dataclass lacks a field.
+        If the data lack a field of a dataclass.
     TypeError, ValueError
-        If the value has another type, or a number is far too large.
+        If the data have another type, or a number is too large.
     """
     origin = get_origin(kind)
     if origin in (Union, types.UnionType):
@@ -79,13 +84,13 @@ def from_plain(kind: Any, value: Any, **names: type) -> Any:
 
 
 def _one_of(kinds: Sequence[Any], value: Any) -> Any:
-    """Convert plain data to the first of several types that can take it; None stays None."""
+    """Convert plain data to the first type of a union that fits; None stays None."""
     if value is None:
         return None
-    wanted = [kind for kind in kinds if kind is not types.NoneType]
-    fitting = [kind for kind in wanted if get_origin(kind) or is_dataclass(kind)]
-    fitting = fitting or [kind for kind in wanted if isinstance(value, kind)]
-    return from_plain((fitting or wanted)[0], value)
+    kinds = [kind for kind in kinds if kind is not types.NoneType]
+    fitting = [kind for kind in kinds if get_origin(kind) or is_dataclass(kind)]
+    fitting = fitting or [kind for kind in kinds if isinstance(value, kind)]
+    return from_plain((fitting or kinds)[0], value)
 
 
 def _collection(kind: Any, value: Any) -> Any:
@@ -99,13 +104,13 @@ def _collection(kind: Any, value: Any) -> Any:
         if isinstance(value, str):
             raise TypeError("found a text in place of a list")
         return tuple(from_plain(args[0], item) for item in _of_type(Sequence, value))
-    # NDArray is an alias from NumPy 2.5 on; before, its origin is the array.
+    # From NumPy 2.5 on, the origin of an array type is NDArray; before, it is np.ndarray.
     assert origin in (np.ndarray, NDArray), kind
     return _of_type(np.ndarray, value)
 
 
 def _member(kind: type[Enum], value: Any) -> Enum:
-    """Return the member of an enum by its plain data, or else by its value."""
+    """Return the member of an enum by its plain data or by its value."""
     by_plain = {plain(member): member for member in kind}
     return by_plain[value] if value in by_plain else kind(value)
 
@@ -115,17 +120,18 @@ _hints = cache(get_type_hints)
 
 
 def _record(kind: Any, value: Mapping[str, Any], names: Mapping[str, type]) -> Any:
+    """Convert plain data to a dataclass; see :func:`from_plain`."""
     hints = get_type_hints(kind, localns=names) if names else _hints(kind)
-    given = {}
-    for each in fields(kind):
-        if each.name in value:
+    values = {}
+    for field in fields(kind):
+        if field.name in value:
             try:
-                given[each.name] = from_plain(hints[each.name], value[each.name])
+                values[field.name] = from_plain(hints[field.name], value[field.name])
             except TypeError as error:
-                raise TypeError(f"{each.name}: {error}") from None
-        elif each.default is MISSING and each.default_factory is MISSING:
-            raise KeyError(each.name)
-    return kind(**given)
+                raise TypeError(f"{field.name}: {error}") from None
+        elif field.default is MISSING and field.default_factory is MISSING:
+            raise KeyError(field.name)
+    return kind(**values)
 
 
 def _number(value: Any) -> float:
@@ -145,5 +151,5 @@ def _of_type(kind: type, value: Any) -> Any:
 
 
 def json_text(document: Any) -> str:
-    """One JSON document, as people can read it."""
+    """Return a JSON text with indentation."""
     return json.dumps(plain(document), indent=2, allow_nan=False)

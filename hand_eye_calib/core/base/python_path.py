@@ -1,7 +1,7 @@
-"""Where Python looks for modules, without the folder that a command happens to run in.
+"""The folders in which Python searches modules, without the current folder of a command.
 
-Python puts the current folder first for ``python -m`` and ``python -c``. A file ``queue.py`` beside
-a bag would then run as code of the standard library.
+``python -m`` and ``python -c`` search the current folder first. A file ``queue.py`` next to a bag
+would then be run in place of the module of the standard library.
 """
 
 import os
@@ -16,21 +16,21 @@ _PACKAGE_PARENT = str(Path(__file__).resolve().parents[3])
 def trusted_path() -> list[str]:
     """Return the folders of ``sys.path`` without the current folder.
 
-    The current folder stays if the package itself lies there, or if ``PYTHONPATH`` names it.
+    The current folder is kept if the package lies in it, or if ``PYTHONPATH`` names it.
     """
     current = os.path.realpath(os.getcwd())
     named = os.environ.get("PYTHONPATH", "").split(os.pathsep)
-    kept = {os.path.realpath(folder) for folder in named if folder}
-    kept.add(_PACKAGE_PARENT)
-    if current in kept:
+    trusted = {os.path.realpath(folder) for folder in named if folder}
+    trusted.add(_PACKAGE_PARENT)
+    if current in trusted:
         return [folder or current for folder in sys.path]
     return [folder for folder in sys.path if os.path.realpath(folder) != current]
 
 
 def trusted_environment() -> dict[str, str]:
-    """Return the environment for another Python with the modules of this process.
+    """Return the environment for a Python process with the modules of this process.
 
-    ``PYTHONSAFEPATH`` keeps that Python from adding its current folder.
+    ``PYTHONSAFEPATH`` prevents that process from searching its current folder.
     """
     return {**os.environ, **_settings()}
 

@@ -1,8 +1,8 @@
-"""Tables that layers above fill, so that no layer imports one above it.
+"""Tables that higher layers fill, so that no layer imports a higher one.
 
-Each layer and each extra has a function ``register()`` in its ``__init__.py``; the package calls
-all of them once, when it is imported. A registered function imports its module when it is called,
-so that importing the package takes no time.
+Each layer and each extra has a function ``register()`` in its ``__init__.py``. The package calls
+these functions once, when it is imported. A registered function imports its module only when it is
+called, so that importing the package takes little time.
 """
 
 from collections.abc import Callable
@@ -18,8 +18,8 @@ class Registry(dict[str, Entry]):
 
     Parameters
     ----------
-    what : str
-        What an entry is, for messages.
+    noun : str
+        Noun for an entry in messages, such as "command".
 
     Raises
     ------
@@ -27,13 +27,13 @@ class Registry(dict[str, Entry]):
         If a name is looked up that no layer has registered.
     """
 
-    def __init__(self, what: str) -> None:
+    def __init__(self, noun: str) -> None:
         super().__init__()
-        self.what = what
+        self._noun = noun
 
     def __missing__(self, name: str) -> Entry:
         names = ", ".join(self) or "none"
-        raise ConfigError(f"unknown {self.what} {name!r}; this installation has: {names}")
+        raise ConfigError(f"unknown {self._noun} {name!r}; this installation has: {names}")
 
 
 class Command(NamedTuple):
@@ -44,8 +44,8 @@ class Command(NamedTuple):
     help : str
         One line for the list of commands.
     load : callable
-        Return the module of the command, with ``add_arguments(parser)`` and
-        ``run(arguments) -> int``.
+        ``load()`` returns the module of the command. The module has the functions
+        ``add_arguments(parser)`` and ``run(arguments) -> int``.
     """
 
     help: str
@@ -53,17 +53,17 @@ class Command(NamedTuple):
 
 
 class Route(NamedTuple):
-    """A way of ``calibrate`` for other data than two streams.
+    """An extension of the command ``calibrate`` for other data than two streams.
 
     Attributes
     ----------
     add_arguments : callable
-        Declare the arguments of the route on a parser.
+        ``add_arguments(parser)`` declares the arguments of the route.
     takes : callable
-        Return whether parsed arguments ask for the route.
+        ``takes(arguments)`` returns whether the route applies to parsed arguments.
     run : callable
-        Calibrate; called with the arguments and what puts URLs back into plain values. Return the
-        exit code.
+        ``run(arguments, restore_urls)`` calibrates and returns the exit code. ``restore_urls``
+        replaces paths of downloaded files by their URLs in plain values.
     """
 
     add_arguments: Callable[[Any], None]
@@ -72,14 +72,14 @@ class Route(NamedTuple):
 
 
 class Measure(NamedTuple):
-    """What a stream may measure.
+    """A quantity that a stream may measure.
 
     Attributes
     ----------
     kind : str
-        Name in ``KINDS`` of the kind of data that the stream makes together with poses.
+        Kind of data of this stream together with a stream of poses: a name in ``KINDS``.
     needs_poses : str
-        Why the other stream must be of poses; empty if it need not be.
+        Reason why the other stream must measure poses; empty if it may measure the same quantity.
     """
 
     kind: str
@@ -92,13 +92,13 @@ class ExtraRule(NamedTuple):
     Attributes
     ----------
     after : str
-        Name of the rule that it follows.
+        Name of the rule before this one in the table of rules.
     forbids : bool
-        Whether its reasons lead to DO NOT USE, rather than to USE WITH CARE.
+        Whether the reasons of the rule lead to DO NOT USE; otherwise to USE WITH CARE.
     when : str
         The condition in words.
     find : callable
-        Yield the grounds against a result, ``Ground`` of that module.
+        ``find(result)`` yields the grounds (``Ground`` of that module) against a result.
     """
 
     after: str
@@ -119,45 +119,47 @@ PUBLIC_NAMES: Registry[str] = Registry("public name")
 #: Commands of the command line, in the order of its help.
 COMMANDS: Registry[Command] = Registry("command")
 
-#: Ways of ``calibrate`` for other data than two streams; the first that takes the arguments counts.
+#: Routes of ``calibrate`` for other data than two streams. The first route that takes the arguments
+#: is run.
 ROUTES: Registry[Route] = Registry("way to calibrate")
 
-#: How several recordings of one rig become one result. Called with the arguments and the bags of
-#: each recording; returns the exit code.
+#: Functions ``run(arguments, bags_of_recordings)`` that join several recordings of a rig into one
+#: result. They return the exit code.
 SEVERAL_RECORDINGS: Registry[Callable[..., int]] = Registry("way to join recordings")
 
-#: Monitors of the mount. Called with the session, what is installed, why that is unknown, and the
-#: log.
+#: Functions ``start(session, installed, reason, log)`` that monitor the mount. ``installed`` is the
+#: installed transform; ``reason`` explains why it is unknown.
 MOUNT_MONITORS: Registry[Callable[..., Any]] = Registry("monitor of the mount")
 
-#: Methods of a result that take a layer above the core: save, plot, report, export.
+#: Methods of a result that need a layer above the core: save, plot, report, export.
 RESULT_METHODS: Registry[Callable[..., Any]] = Registry("method of a result")
 
-#: Writers of the pages of a session of the node. Called with the output directory and the session's
-#: result.
+#: Functions ``write(output_directory, session_result)`` that write pages of a session of the node.
 SESSION_PAGES: Registry[Callable[..., None]] = Registry("page of a session")
 
-#: Readers of messages that are no poses, by their type, or "images of a target". Called with the
-#: bag, the stream, the topic and what the source names behind it.
+#: Functions ``read(bag, stream, topic, rest)`` that read messages that are not poses, by message
+#: type or as "images of a target". ``rest`` is the text after the topic in the name of the source.
 BAG_READINGS: Registry[Callable[..., Any]] = Registry("kind of messages")
 
-#: Modules that find targets in images of a folder: functions that return one.
+#: Functions that return a module that detects targets in the images of a folder.
 TARGET_IMAGES: Registry[Callable[[], Any]] = Registry("reader of images of a target")
 
-#: Readers of trajectory files of other programs. Called with the path, the bytes, and the options;
+#: Functions ``read(path, content, options)`` that read trajectory files of other programs. They
 #: return None for a file of another format.
 FILE_READERS: Registry[Callable[..., Any]] = Registry("reader of files")
 
-#: What a stream may measure: the values of the options ``parent_measures`` and ``child_measures``.
+#: Quantities that a stream may measure: values of the options ``parent_measures`` and
+#: ``child_measures``.
 MEASURES: Registry[Measure] = Registry("measure")
 
-#: Axes that a kind of data has no information about, by the name of the kind; missing for none.
+#: Axes that a kind of data can never determine, by the name of the kind. Kinds that can determine
+#: all axes are missing.
 OUT_OF_REACH: Registry[tuple[str, ...]] = Registry("kind of streams")
 
-#: Functions that return a kind of data (:class:`hand_eye_calib.core.engine.kinds.Kind`), by what
-#: both sensors measure together.
+#: Functions that return a kind of data (:class:`hand_eye_calib.core.engine.kinds.Kind`), by the
+#: name of the kind.
 KINDS: Registry[Callable[[], Any]] = Registry("kind of streams")
 
-#: Sentences of findings: functions that return
-#: :class:`hand_eye_calib.core.checks.words.FindingWords` by the key of the finding.
+#: Functions that return the sentences of findings
+#: (:class:`hand_eye_calib.core.checks.words.FindingWords`) by the key of the finding.
 FINDING_WORDS: Registry[Callable[[], Any]] = Registry("sentences of findings")

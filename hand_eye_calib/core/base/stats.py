@@ -1,8 +1,8 @@
-"""Quantiles and robust weights, once for the whole package.
+"""Quantiles and robust weights.
 
-Quantiles are written out because NumPy's import ``numpy.ma``, which takes a tenth of the time of
-importing NumPy. Quantiles of distributions are tables, because importing SciPy's takes longer than
-a whole comparison of results.
+Quantiles of data are computed here because NumPy's functions import ``numpy.ma``, which takes a
+tenth of the time of importing NumPy. Quantiles of distributions are tables, because importing
+SciPy's functions takes longer than a whole comparison of results.
 """
 
 from collections.abc import Callable, Mapping
@@ -12,38 +12,36 @@ from numpy.typing import ArrayLike
 
 from hand_eye_calib.core.base.arrays import FloatArray
 
-# Medians of the absolute value of a normal variable, and of the length of a normal vector in three
-# dimensions.
+# Median of the absolute value of a standard normal variable.
 MEDIAN_NORMAL = 0.6745
+# Median length of a standard normal vector in three dimensions.
 MEDIAN_LENGTH = 1.538
 
-# Quantiles of chi-square: probability of a larger value -> degrees of freedom -> quantile.
+# Quantiles of chi-square, by the probability of a larger value and by the degrees of freedom.
 CHI2 = {
     0.5: {1: 0.455, 6: 5.348},
     0.01: {1: 6.63, 2: 9.21, 3: 11.34, 4: 13.28, 5: 15.09, 6: 16.81},
     0.001: {6: 22.457744},
 }
-# Limit that the largest size of six normal variables exceeds once in 200 times.
+# The largest absolute value of six standard normal variables exceeds this limit once in 200 times.
 LARGEST_OF_SIX = 3.341479
 
-# Standard normal quantile of 0.9: a value this many standard deviations above a limit exceeds the
-# limit in nine of ten cases.
+# Standard normal quantile of 0.9. If the expected value of an estimate is this many standard
+# deviations above a limit, the estimate exceeds the limit in nine of ten cases.
 NINE_TIMES_OUT_OF_TEN = 1.281552
 
 # Degrees of freedom of Student's t distribution for heavy tails.
 STUDENT = 4.0
 
-_MAX_STEPS = 20
-
 # Singular values of a regression below this share of the largest are rounding errors.
 _RANK_TOLERANCE = 1e-9
 
-# Smallest length of residuals that weights are relative to.
+# Smallest unit of residuals of a robust regression, for exact data.
 _SMALLEST_UNIT = 1e-12
 
 
 def median(values: ArrayLike) -> float:
-    """Median of finite values in any shape; NaN if there are none.
+    """Median of finite values in any shape; NaN without values.
 
     It takes a fraction of the time of ``numpy.median`` for a few hundred values.
     """
@@ -54,18 +52,17 @@ def median(values: ArrayLike) -> float:
 def medians(values: FloatArray) -> FloatArray:
     """Medians (...) of finite values (..., K), K at least 1."""
     half = values.shape[-1] // 2
-    is_odd = values.shape[-1] % 2
-    parted = np.partition(values, half if is_odd else (half - 1, half), axis=-1)
-    return np.asarray(
-        parted[..., half] if is_odd else 0.5 * (parted[..., half - 1] + parted[..., half])
-    )
+    if values.shape[-1] % 2:
+        return np.asarray(np.partition(values, half, axis=-1)[..., half])
+    parted = np.partition(values, (half - 1, half), axis=-1)
+    return np.asarray(0.5 * (parted[..., half - 1] + parted[..., half]))
 
 
 def quantile(values: ArrayLike, share: float) -> float:
     """Quantile of one or more finite values in any shape.
 
-    The quantile is interpolated linearly between two neighbouring values. The result is that of
-    ``numpy.quantile``, in less time.
+    The quantile is interpolated linearly between two neighbouring values, as in
+    ``numpy.quantile``, but in less time.
     """
     flat = np.asarray(values, dtype=np.float64).ravel()
     rank = share * (len(flat) - 1)
@@ -76,7 +73,7 @@ def quantile(values: ArrayLike, share: float) -> float:
 
 
 def robust_sigma(vectors: FloatArray) -> FloatArray:
-    """Standard deviations (...) per axis of vectors (..., K, 3), of which some may be far off."""
+    """Standard deviations (...) per axis of vectors (..., K, 3), robust against outliers."""
     return medians(np.linalg.norm(vectors, axis=-1)) / MEDIAN_LENGTH
 
 
@@ -96,7 +93,8 @@ def student_weights(squared: FloatArray, degrees: float = STUDENT) -> FloatArray
     return (degrees + 6.0) / (degrees + squared)
 
 
-# Weights by kind, of squared residuals in units of the square at which they fall.
+# Weight functions by kind. Their argument is the squared residual in units of the square at which
+# the weight falls.
 _WEIGHTS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
     # P. J. Huber, *Robust estimation of a location parameter*, Ann. Math. Statist. 35, 1964.
     "huber": lambda squared: np.asarray(1.0 / np.maximum(np.sqrt(squared), 1.0)),
@@ -141,12 +139,14 @@ def robust_regression(
     Parameters
     ----------
     kind : str
-        Of :func:`robust_weights`.
+        Kind of weights, see :func:`robust_weights`.
     rows : (K, d, p) array
     targets : (K, d) array
     rounds : int
+        Number of iterations.
     unit : callable
-        Length of a residual at which its weight falls, from the lengths (K,) of all.
+        ``unit(lengths)`` returns the length at which weights fall, from the lengths (K,) of all
+        residuals.
 
     Returns
     -------
@@ -169,10 +169,10 @@ def chi_square_quantile(tail: float) -> float:
 
     ``tail`` is from 1e-30 to 0.99. Chi-square exceeds 2 h with probability
     ``exp(-h) (1 + h + h^2 / 2)``. The negative logarithm of this probability is convex and grows
-    with h. Newton's method therefore converges from above, in ten steps or fewer.
+    with h. So Newton's method converges from above, in at most ten steps.
     """
     half = 10.0 - 2.0 * np.log(tail)
-    for _ in range(_MAX_STEPS):
+    for _ in range(20):
         series = 1.0 + half + half**2 / 2
         excess = half - np.log(series) + np.log(tail)
         half -= excess * series / (half**2 / 2)

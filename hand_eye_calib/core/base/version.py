@@ -1,12 +1,12 @@
-"""Versions of the package and of others."""
+"""Versions of this package and of other packages."""
 
 from functools import cache
 
 
 @cache
 def version_of(package: str = "hand_eye_calib") -> str:
-    """Version of an installed package, read once; "unknown" without an installation."""
-    # Costs some ten milliseconds to import.
+    """Return the version of a package; "unknown" if the package is not installed."""
+    # The import takes some ten milliseconds.
     from importlib.metadata import PackageNotFoundError, version
 
     try:

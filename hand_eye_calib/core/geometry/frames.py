@@ -1,6 +1,6 @@
-"""Checks of poses that files and users supply, and the tree of frames.
+"""Checks of poses from files and users, and the tree of frames of a robot.
 
-Robot descriptions, ``/tf`` and ``/tf_static`` become a tree of frames.
+A tree of frames is made from a robot description, ``/tf`` or ``/tf_static``.
 """
 
 import math
@@ -48,7 +48,7 @@ def are_null(poses: FloatArray) -> BoolArray:
     when they are lost.
     """
     is_null = (poses[:, 3:] == 0.0).all(axis=1)
-    # One sum is faster than a check of every row: it is finite if all values are.
+    # A finite sum proves that all values are finite, in less time than a check of every row.
     with np.errstate(invalid="ignore", over="ignore"):
         total = poses.sum()
     if not np.isfinite(total):
@@ -131,7 +131,7 @@ def pose_of(*values: Any) -> FloatArray:
     return T
 
 
-def pose_stack(values: Any, what: str) -> FloatArray:
+def pose_stack(values: Any, label: str) -> FloatArray:
     """Return the poses (N, 4, 4) that arrays describe, checked.
 
     Parameters
@@ -139,7 +139,7 @@ def pose_stack(values: Any, what: str) -> FloatArray:
     values : array-like
         Matrices (N, 4, 4) or (N, 3, 4), rows (N, 7) of x, y, z, qx, qy, qz, qw, or a pair (R, t):
         rotations (N, 3, 3) or rotation vectors (N, 3), rad, and translations (N, 3), m.
-    what : str
+    label : str
         Name of the poses in messages.
 
     Raises
@@ -148,34 +148,37 @@ def pose_stack(values: Any, what: str) -> FloatArray:
         If a pose is invalid; the message names its row, counted from 1.
     """
     pair = _pair_of_stacks(values)
-    Ts = _joined(*pair, what) if pair else _one_stack(values, what)
+    Ts = _joined(*pair, label) if pair else _single_stack(values, label)
     is_finite = np.isfinite(Ts).all(axis=(1, 2))
     if not is_finite.all():
-        raise InputError(f"{what}, row {np.argmin(is_finite) + 1}: a number is not finite")
-    return _rigid(Ts, what)
+        raise InputError(f"{label}, row {np.argmin(is_finite) + 1}: a number is not finite")
+    return _rigid(Ts, label)
 
 
-def _rigid(Ts: FloatArray, what: str = "") -> FloatArray:
-    """Return transforms (N, 4, 4) with each rotation replaced by the nearest exact one.
+def _rigid(Ts: FloatArray, label: str = "") -> FloatArray:
+    """Return transforms (N, 4, 4) with each 3x3 part replaced by the nearest rotation.
 
-    Raises InputError at the first matrix that has no rotation, or whose last row is not 0 0 0 1.
-    The message names the row of ``what``, if given.
+    Raises
+    ------
+    InputError
+        At the first matrix whose 3x3 part is not a rotation, or whose last row is not 0 0 0 1. The
+        message names the row if there is a ``label``.
     """
     rotations = se3.nearest_rotation(se3.rotation_of(Ts))
     deviations = np.abs(rotations - se3.rotation_of(Ts)).max(axis=(1, 2), initial=0.0)
     if (deviations > _ROTATION_WITHIN).any():
         row = int(np.argmax(deviations > _ROTATION_WITHIN))
-        raise InputError(_place(what, row) + "the 3x3 part is not a rotation matrix")
+        raise InputError(_place(label, row) + "the 3x3 part is not a rotation matrix")
     deviations = np.abs(Ts[:, 3] - _LAST_ROW).max(axis=1, initial=0.0)
     if (deviations > LAST_ROW_WITHIN).any():
         row = int(np.argmax(deviations > LAST_ROW_WITHIN))
-        raise InputError(_place(what, row) + wrong_last_row(Ts[row]))
+        raise InputError(_place(label, row) + wrong_last_row(Ts[row]))
     return se3.from_rotation_translation(rotations, se3.translation_of(Ts))
 
 
-def _place(what: str, row: int) -> str:
-    """Return the beginning of a message about a row."""
-    return f"{what}, row {row + 1}: " if what else ""
+def _place(label: str, row: int) -> str:
+    """Return the beginning of a message about a row; empty without a label."""
+    return f"{label}, row {row + 1}: " if label else ""
 
 
 def _numbers(values: Any) -> FloatArray | None:
@@ -187,7 +190,7 @@ def _numbers(values: Any) -> FloatArray | None:
 
 
 def _pair_of_stacks(values: Any) -> tuple[FloatArray, FloatArray] | None:
-    """Return rotations and translations if the values are a pair of them, otherwise None."""
+    """Return rotations and translations if the values are such a pair, otherwise None."""
     if not isinstance(values, tuple | list) or len(values) != 2:
         return None
     rotations, translations = map(_numbers, values)
@@ -199,11 +202,11 @@ def _pair_of_stacks(values: Any) -> tuple[FloatArray, FloatArray] | None:
     return rotations, translations
 
 
-def _joined(rotations: FloatArray, translations: FloatArray, what: str) -> FloatArray:
+def _joined(rotations: FloatArray, translations: FloatArray, label: str) -> FloatArray:
     """Return poses (N, 4, 4) of rotations or rotation vectors, and translations."""
     if len(rotations) != len(translations):
         raise InputError(
-            f"{what}: {len(rotations)} rotations, {len(translations)} translations; each pose "
+            f"{label}: {len(rotations)} rotations, {len(translations)} translations; each pose "
             "needs both"
         )
     if rotations.shape[1:] != (3, 3):
@@ -211,13 +214,13 @@ def _joined(rotations: FloatArray, translations: FloatArray, what: str) -> Float
     return se3.from_rotation_translation(rotations, translations.reshape(-1, 3))
 
 
-def _one_stack(values: Any, what: str) -> FloatArray:
+def _single_stack(values: Any, label: str) -> FloatArray:
     """Return poses (N, 4, 4) of matrices or rows."""
     array = _numbers(values)
     if array is not None and array.ndim == 2 and array.shape[1] == 7:
         stack = []
         for number, row in enumerate(array.tolist(), 1):
-            with located(f"{what}, row {number}"):
+            with located(f"{label}, row {number}"):
                 stack.append(checked_pose(row[:3], row[3:]))
         return np.reshape(stack, (-1, 4, 4))
     if array is not None and array.shape[1:] == (3, 4):
@@ -225,14 +228,14 @@ def _one_stack(values: Any, what: str) -> FloatArray:
     if array is None or array.shape[1:] != (4, 4):
         shape = "rows of different shapes" if array is None else f"an array {array.shape}"
         raise InputError(
-            f"{what}: expected poses as (N, 4, 4), (N, 7) of x, y, z, qx, qy, qz, qw, or a pair of "
-            f"rotations (N, 3, 3) and translations (N, 3); found {shape}"
+            f"{label}: expected poses as (N, 4, 4), (N, 7) of x, y, z, qx, qy, qz, qw, or a pair "
+            f"of rotations (N, 3, 3) and translations (N, 3); found {shape}"
         )
     return array
 
 
 def wrong_last_row(T: FloatArray) -> str:
-    """Return what is wrong with a matrix (4, 4) whose last row is not 0 0 0 1."""
+    """Return a message about a matrix (4, 4) whose last row is not 0 0 0 1."""
     numbers = " ".join(f"{value:.4g}" for value in T[3])
     is_transposed = np.allclose(T[:, 3], _LAST_ROW, atol=LAST_ROW_WITHIN)
     cause = ": the matrix is transposed, write it row by row" if is_transposed else ""
@@ -242,7 +245,7 @@ def wrong_last_row(T: FloatArray) -> str:
 def numbers_of(value: Any) -> list[float]:
     """Return the numbers of nested lists, a message, OpenCV's matrix or a text, in their order.
 
-    Values of any other kind give an empty list.
+    The list is empty for values of any other kind.
     """
     if isinstance(value, Mapping):
         position = value.get("translation", value.get("position"))
@@ -276,7 +279,7 @@ class StreamFrames:
     world : str
         Name of the fixed frame in the messages.
     option : str
-        Name of the sensor's frame that the user gave.
+        Name of the sensor's frame that the user set.
     """
 
     sensor: str = ""
@@ -290,11 +293,11 @@ class StreamFrames:
 
     @property
     def inverse_name(self) -> str:
-        """Name of the sensor's frame if the poses have to be inverted.
+        """Name of the sensor's frame if the poses are inverted.
 
-        Transforms camera -> marker of a fixed marker are inverse poses of the camera, so the frames
-        exchange their roles. Inverse poses with the frames odom -> base_link do not: their sensor
-        remains base_link, because a frame with the name of a world is no sensor.
+        For transforms camera -> marker of a fixed marker, both frames exchange their roles: the
+        sensor is the camera. For inverse poses odom -> base_link, the sensor remains base_link,
+        because a frame with the name of a world is not a sensor.
         """
         is_named_otherwise = self.option not in ("", self.sensor)
         if not self.world or is_named_otherwise:
@@ -316,7 +319,7 @@ class Extrinsic:
     covariance : (6, 6) array
         Covariance of the error xi in ``T_parent_child @ exp(xi)``; zero if the source states none.
     is_calibration : bool
-        Whether the pose was estimated from motion, with the same sensors.
+        Whether the pose was estimated from the motion of the same sensors.
     """
 
     T_parent_child: FloatArray

@@ -1,7 +1,8 @@
 """Integration of angular rates to orientations.
 
-The rate over an interval is the mean of both ends, ``R_j = R_i exp(dt (w_i + w_j) / 2)``, without
-coning terms (P. Savage, *Strapdown inertial navigation integration algorithm design*, 1998).
+The rate over an interval is the mean of the rates at both ends: ``R_j = R_i exp(dt (w_i + w_j) /
+2)``. Coning terms are neglected (P. Savage, *Strapdown inertial navigation integration algorithm
+design*, 1998).
 """
 
 import numpy as np
@@ -41,6 +42,6 @@ class RateIntegrator:
         steps = se3.rotation_exp(means * intervals_s[:, None])
         rotations = self._rotation @ se3.chained(steps)[1:]
         self._last = stamps_ns[-1:].copy(), rates[-1:].copy()
-        # Rounding errors would add up over hours: make the last orientation an exact rotation.
+        # Make the last orientation an exact rotation, because rounding errors add up over hours.
         self._rotation = se3.nearest_rotation(rotations[-1])
         return rotations

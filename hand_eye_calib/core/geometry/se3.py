@@ -45,14 +45,14 @@ def vee(matrices: FloatArray) -> FloatArray:
     return np.stack([twice[..., 2, 1], twice[..., 0, 2], twice[..., 1, 0]], axis=-1)
 
 
-def cross(left: FloatArray, right: FloatArray) -> FloatArray:
+def cross(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return cross products (..., 3) of two arrays of vectors of the same shape (..., 3).
 
-    For a few hundred vectors this takes a fraction of the time of ``numpy.cross``.
+    For a few hundred vectors, this function takes a fraction of the time of ``numpy.cross``.
     """
-    x, y, z = left.T
-    u, v, w = right.T
-    products = np.empty(left.shape)
+    x, y, z = first.T
+    u, v, w = second.T
+    products = np.empty(first.shape)
     products.T[0] = y * w - z * v
     products.T[1] = z * u - x * w
     products.T[2] = x * v - y * u
@@ -146,10 +146,10 @@ def rotation_to_rpy(rotation: ArrayLike) -> FloatArray:
 
 
 def in_other_order(rotations: FloatArray) -> FloatArray:
-    """Return rotations (N, 3, 3) with their roll, pitch and yaw taken about turning axes.
+    """Correct rotations (N, 3, 3) whose Euler angles were read in the wrong convention.
 
-    The angles of ``rotations`` (N, 3, 3) were read as if about fixed axes; their source meant
-    turning axes, in the order x, y, z.
+    Roll, pitch and yaw were read as angles about fixed axes. Their source means angles about the
+    turning axes x, y, z, in this order.
     """
     roll, pitch, yaw = _about_axes(rotation_to_rpy(rotations))
     return roll @ pitch @ yaw
@@ -162,9 +162,9 @@ def nearest_rotation(matrices: FloatArray) -> FloatArray:
     in a plane does not determine this sign (S. Umeyama, *Least-squares estimation of transformation
     parameters between two point patterns*, 1991).
     """
-    left, _, right = np.linalg.svd(matrices)
-    left[..., :, 2] *= np.sign(np.linalg.det(left @ right))[..., None]
-    return np.asarray(left @ right)
+    U, _, V_transposed = np.linalg.svd(matrices)
+    U[..., :, 2] *= np.sign(np.linalg.det(U @ V_transposed))[..., None]
+    return np.asarray(U @ V_transposed)
 
 
 def rotation_log(rotation: ArrayLike) -> FloatArray:
@@ -192,7 +192,8 @@ def _scaled_quats(rotations: FloatArray) -> FloatArray:
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotations.reshape(-1, 9).T
     trace = r00 + r11 + r22
     quats = np.stack([r21 - r12, r02 - r20, r10 - r01, 1.0 + trace], axis=1)
-    # The scalar is the largest coefficient where the trace is positive; else one of the vector.
+    # If the trace is positive, the scalar is large enough. Otherwise start from the largest
+    # coefficient of the vector.
     large = np.flatnonzero(trace < 0.0)
     if large.size:
         R = rotations[large]
@@ -248,8 +249,8 @@ def inverse(transforms: ArrayLike) -> FloatArray:
 def retracted(transform: FloatArray, step: FloatArray) -> FloatArray:
     """Return a transform (4, 4) after a small step (rho, phi) in the axes of its source frame.
 
-    The step equals ``transform @ exp(step)`` to first order. Translation and rotation are applied
-    separately.
+    Translation and rotation are applied separately. The result equals ``transform @ exp(step)`` to
+    first order.
     """
     rotation = rotation_of(transform)
     return from_rotation_translation(
@@ -373,9 +374,9 @@ def interpolate(start: FloatArray, end: FloatArray, fraction: ArrayLike) -> Floa
 
 
 def chained(steps: FloatArray) -> FloatArray:
-    """Return the products (N + 1, k, k) of the first 0, 1, ..., N steps, out of N in all.
+    """Return the cumulative products (N + 1, k, k) of steps (N, k, k), beginning with the identity.
 
-    The steps (N, k, k) are rotations or transforms.
+    The steps are rotations or transforms.
     """
     products = np.concatenate([np.eye(steps.shape[-1])[None], steps])
     # Each pass doubles the number of steps in a product, until all products are complete.
@@ -387,15 +388,15 @@ def chained(steps: FloatArray) -> FloatArray:
 
 
 def put_right(Ts: FloatArray, invert: str = "none", quaternion: str = "xyzw") -> FloatArray:
-    """Correct poses (N, 4, 4) that were read in another convention than they were written in.
+    """Correct poses (N, 4, 4) that were read in the wrong convention.
 
     Parameters
     ----------
     Ts : (N, 4, 4) array
     invert : {"none", "poses", "orientations"}
-        Part to invert: the source writes this part as the world in the sensor's frame.
+        Part to invert, because the source writes it as that of the world in the sensor's frame.
     quaternion : {"xyzw", "wxyz", "yzwx"}
-        True meaning of the four numbers that were read as x y z w.
+        True order of the four numbers that were read as x y z w.
     """
     if quaternion != "xyzw":
         quats = np.roll(to_quat_xyzw(Ts), -quaternion.index("x"), axis=-1)
@@ -415,11 +416,12 @@ def xyz_rpy(T_target_source: FloatArray) -> FloatArray:
 
 # ------------------------------------------------------------- uncertainty of transforms
 
-# Standard deviation (rad) above which an angle is unknown: linearisation is not valid that far.
+# Standard deviation (rad) above which an angle is unknown, because the linearisation is not valid.
 _UNKNOWN_ANGLE = 0.3
 
-# Gimbal lock: roll and yaw are inseparable if the cosine of the pitch is below this many standard
-# deviations of the rotation. Roll and yaw would have sigmas above 10 deg, and be far from normal.
+# Gimbal lock: roll and yaw are inseparable if the cosine of the pitch is below this number of
+# standard deviations (rad) of the rotation. Their own standard deviations would exceed 10 deg, and
+# their errors would not be normal.
 _LOCKED_SIGMAS = 5.0
 # Gimbal lock of exact rotations: smallest cosine of the pitch.
 _LOCKED_COSINE = 1e-4
@@ -429,9 +431,9 @@ def turned(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
     """Rotate covariances (..., 6, 6) of (rho, phi) by rotations (..., 3, 3).
 
     The rotated covariance is along and about the parent's axes, the convention of ROS messages
-    (REP 103). An error xi = (rho, phi) in ``T_parent_child @ exp(xi)`` moves the child's origin by
-    ``R rho``, to first order. It rotates the child by ``R phi`` about axes through the child's
-    origin, parallel to the parent's: no lever arm enters.
+    (REP 103). To first order, an error xi = (rho, phi) in ``T_parent_child @ exp(xi)`` moves the
+    child's origin by ``R rho``, and rotates the child by ``R phi`` about its own origin. So the
+    lever arm between both sensors has no effect.
     """
     both = block_diagonal(rotation)
     return np.asarray(both @ covariance @ np.swapaxes(both, -1, -2))

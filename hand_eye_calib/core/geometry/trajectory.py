@@ -57,8 +57,8 @@ _VARIANCE_OF_MEAN = 1.0 / 6.0
 def scatter_of_direction(poses: FloatArray) -> float:
     """Return the scatter of the direction of motion of poses (N, 4, 4) in the sensor's axes.
 
-    The scatter is 0 if the direction is always the same, as on vehicles. It is 1 if the sensor
-    moves in all directions, or if there are too few steps.
+    The scatter is 0 if the direction never changes, as on vehicles. It is 1 if the sensor moves in
+    all directions, or if there are too few steps.
     """
     positions = se3.translation_of(poses)
     rotations = se3.rotation_of(poses)
@@ -354,15 +354,15 @@ class Trajectory(Columns):
         changes = np.zeros((len(self), 6))
         changes[1:-1] = np.diff(steps / spans_s, axis=0) / (0.5 * (spans_s[1:] + spans_s[:-1]))
         shares = np.empty((len(changes) - 1, 6))
-        for part in (slice(0, 3), slice(3, 6)):
-            vectors = changes[:, part]
+        for columns in (slice(0, 3), slice(3, 6)):
+            vectors = changes[:, columns]
             squares = (vectors**2).sum(axis=1)
             products = _sums_nearby((vectors[1:] * vectors[:-1]).sum(axis=1))
             powers = _sums_nearby(0.5 * (squares[1:] + squares[:-1]))
             correlation = products / np.maximum(powers, 1e-300)
             motion = np.clip((correlation - _CORRELATION) / (1.0 - _CORRELATION), 0.0, 1.0)
             noise = (1.0 - motion) * _VARIANCE_OF_MEAN
-            shares[:, part] = (motion / (motion + noise))[:, None]
+            shares[:, columns] = (motion / (motion + noise))[:, None]
         return steps, changes, shares
 
     def at(
@@ -437,12 +437,12 @@ def far_position(x: float, y: float, z: float) -> str:
     return f"position ({x:.4g}, {y:.4g}, {z:.4g}) is more than {FARTHEST_M:g} m from the origin"
 
 
-def _check_finite(what: str, rows: FloatArray) -> None:
+def _check_finite(noun: str, rows: FloatArray) -> None:
     """Raise InputError at the first row (N, K) with a value that is not finite."""
     is_finite = np.isfinite(rows).all(axis=1)
     if not is_finite.all():
         raise InputError(
-            f"{what} {int(np.argmin(is_finite))} has a value that is not finite; "
+            f"{noun} {int(np.argmin(is_finite))} has a value that is not finite; "
             "remove it or repair its source"
         )
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from hand_eye_calib.core.base.errors import InputError
-from hand_eye_calib.core.base.text import amount, told_apart
+from hand_eye_calib.core.base.text import amount, distinct_names
 from hand_eye_calib.offline.cli.options import add_json_argument, print_result, waiting_for
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
         frames = results[0].parent_frame, results[0].child_frame
         with waiting_for(f"reading {arguments.installed}"):
             installed = open_installed(arguments.installed)(*frames)
-    comparison = compare(results, installed, told_apart(arguments.results))
+    comparison = compare(results, installed, distinct_names(arguments.results))
     print_result(_lines(comparison, results[0]), comparison if arguments.json else None)
     return {"same": 0, "moved": 4}.get(comparison.verdict, 3)
 

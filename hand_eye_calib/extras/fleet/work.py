@@ -22,7 +22,7 @@ from hand_eye_calib.core.base.errors import HandEyeCalibError, InputError, requi
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.python_path import starting_trusted
-from hand_eye_calib.core.base.text import told_apart
+from hand_eye_calib.core.base.text import distinct_names
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.extras.fleet.together import row_of_result
 from hand_eye_calib.formats import remote
@@ -104,7 +104,7 @@ def tasks_of(groups: Sequence[Sequence[str]], vehicle: str = "", **common: Any) 
         bag.partition("?")[0] if remote.is_url(bag) else str(Path(bag).resolve())
         for bag, *_ in groups
     ]
-    stems = told_apart([str(_without_suffix(Path(path))) for path in paths])
+    stems = distinct_names([str(_without_suffix(Path(path))) for path in paths])
     tasks: list[Task] = []
     names = {STATE, TABLE, INDEX, VEHICLES}
     for group, stem in zip(groups, stems, strict=True):

@@ -20,7 +20,7 @@ from hand_eye_calib.core.base.arrays import IntArray
 from hand_eye_calib.core.base.config import PAIR_BY, STAMP_UNITS, TRAJECTORY_FORMATS
 from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.base.registry import FILE_READERS
-from hand_eye_calib.core.base.text import MUCH_NULL, shortened, told_apart, without_poses
+from hand_eye_calib.core.base.text import MUCH_NULL, distinct_names, shortened, without_poses
 from hand_eye_calib.core.geometry.trajectory import Trajectory, TrajectoryLike
 from hand_eye_calib.formats.files import LONGEST_NAME, decoded, local_path, read_bytes, read_text
 from hand_eye_calib.formats.trajectory_files.columns import (
@@ -317,7 +317,7 @@ def _sensor_names(paths: Sequence[Path]) -> list[str]:
     """Return different names of sensors, from the names of files; empty for equal files."""
     names = [path.stem for path in paths]
     if len({*names}) < len(names):
-        names = told_apart([str(path.with_suffix("")) for path in paths])
+        names = distinct_names([str(path.with_suffix("")) for path in paths])
     return names if len({*names}) == len(names) else [""] * len(names)
 
 
