@@ -324,7 +324,8 @@ def _weighted_translation(
     """Solve ``slopes @ t = targets`` of K pairs with weights (K,) by least squares."""
     weighted_slopes = (weights[:, None, None] * slopes).reshape(-1, 3)
     weighted_targets = (weights[:, None] * targets).ravel()
-    return np.linalg.lstsq(weighted_slopes, weighted_targets, rcond=1e-9)[0]
+    translation = np.linalg.lstsq(weighted_slopes, weighted_targets, rcond=1e-9)[0]
+    return np.asarray(translation, dtype=float)
 
 
 def _median_length(vectors: FloatArray) -> float:
