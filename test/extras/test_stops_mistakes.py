@@ -181,6 +181,7 @@ NOISY = {
     "rotations inverted, robot": (transposed_rotations, same),
     "rotations inverted, target": (same, transposed_rotations),
     "target of twice the size": (same, lambda Ts: scaled(Ts, 2.0)),
+    "a row missing in the middle": (without_middle, lambda Ts: Ts[:-1]),
 }
 
 
@@ -200,6 +201,36 @@ def test_strong_noise_does_not_hide_a_mistake(name, place):
         error_m = np.linalg.norm(error[:3])
         is_refused = result.verdict is hec.Verdict.DO_NOT_USE
         assert is_refused or error_m < 2.0 * clean_error_m + 0.02
+
+
+def around_a_target(seed):
+    """Thirty stops with strong noise of a camera that turns by 15 deg around a target."""
+    random = np.random.default_rng(seed)
+    turns = se3.rotation_exp(random.normal(size=(30, 3)) * 0.25)
+    positions = turns @ [0.0, 0.0, -0.8] + random.normal(size=(30, 3)) * 0.025
+    target = pose((0.5, 0.05, 0.02), (3.1, 0.0, 0.4))
+    camera = pose((0.06, -0.03, 0.09), (0.1, -0.05, 1.5))
+    views = target @ se3.from_rotation_translation(turns, positions)
+    noise = se3.exp(random.normal(size=(30, 6)) * 0.02)
+    return views @ se3.inverse(camera), se3.inverse(views) @ target @ noise
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+class TestNoisyStopsAroundATarget:
+    def test_a_target_of_twice_the_size_is_refused(self, seed):
+        robot, tracking = around_a_target(seed)
+        result = calibrate_arm(robot, scaled(tracking, 2.0))
+        assert [finding.code for finding in result.findings] == ["scale"]
+
+    def test_a_missing_row_is_refused(self, seed):
+        robot, tracking = around_a_target(seed)
+        result = calibrate_arm(np.delete(robot, 22, axis=0), tracking[:-1])
+        assert [finding.code for finding in result.findings] == ["rows"]
+
+    def test_clean_stops_have_no_finding(self, seed):
+        robot, tracking = around_a_target(seed)
+        result = calibrate_arm(robot, tracking)
+        assert [finding.code for finding in result.findings] == []
 
 
 @pytest.mark.parametrize("place", [ON_HAND, BESIDE])

@@ -89,6 +89,8 @@ class RobotWorld:
         Share by which longer positions of the children would fit best, to first order, and its
         standard deviation; infinite if the stops do not determine it. For several sensors or
         targets, those of the pair with most stops.
+    inflation : float
+        Factor of the variances for errors that last over several stops.
     """
 
     Ts_parent_child: FloatArray
@@ -102,6 +104,7 @@ class RobotWorld:
     converged: bool
     scale_step: float = 0.0
     scale_sigma: float = float("inf")
+    inflation: float = 1.0
 
     def undetermined(self) -> FloatArray:
         """Return the directions (6, K), as right perturbations, of the first X that are unknown."""
@@ -426,7 +429,11 @@ def _with_lasting_errors(
     level_factor = 1.0 + 2.0 / max(3.0 * len(stops) - 0.5 * len(scores), 0.5)
     covariance = level_factor * (fit.covariance + fit.covariance @ scores @ fit.covariance)
     return replace(
-        fit, covariance=covariance, scale_step=step, scale_sigma=sigma * math.sqrt(level_factor)
+        fit,
+        covariance=covariance,
+        scale_step=step,
+        scale_sigma=sigma * math.sqrt(level_factor),
+        inflation=float(inflation),
     )
 
 

@@ -6,11 +6,12 @@ together break this, and so do Euler angles that were read as rotation vectors.
 """
 
 from collections.abc import Callable, Iterator
+from operator import attrgetter
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.stats import median, medians
 from hand_eye_calib.core.checks.findings import Finding, finding
 from hand_eye_calib.core.geometry import se3
@@ -45,11 +46,10 @@ _ROUNDING = 1e-6
 # Largest shift of rows that is tried.
 _LARGEST_SHIFT = 3
 
-# A stop agrees if its angles to this share of the other stops agree.
-_AGREEING_SHARE = 0.3
-
-# Smallest share of the stops in a shifted block that is reported.
-_SMALLEST_BLOCK = 0.15
+# Gain of log likelihood for each pair of stops from which on a block of rows is shifted. Measured
+# on 7 to 30 stops of KinHEC and of simulated arms: at most 0.21 without a fault; 0.4 or more in
+# 99 % of the sets with a missing row.
+_LEAST_BLOCK_GAIN = 0.3
 
 # Readings of angles that leave less than this times the smallest difference agree equally well.
 _ABOUT_EQUAL = 1.5
@@ -134,27 +134,43 @@ def _check_shifted_block(of_parent: FloatArray, of_child: FloatArray) -> Iterato
     of_parent, of_child : (N, N) arrays
         Angles between the stops of each side, rad.
     """
-    agree_in_place = _agreeing(of_parent, of_child)
-    after_first = slice(1, None)
-    before_last = slice(None, -1)
-    for parent_rows, child_rows in ((after_first, before_last), (before_last, after_first)):
-        agree = _agreeing(of_parent[parent_rows, parent_rows], of_child[child_rows, child_rows])
-        in_block = agree & ~agree_in_place[parent_rows] & ~agree_in_place[child_rows]
-        if in_block.mean() > _SMALLEST_BLOCK:
-            row = int(np.flatnonzero(in_block)[0]) + 1
-            yield finding("rows", text=f"from row {row} on if one side is moved by one row")
-            return
+    blocks = [_likeliest_block(of_parent, of_child), _likeliest_block(of_child, of_parent)]
+    best = max(blocks, key=attrgetter("gain"))
+    if best.gain > _LEAST_BLOCK_GAIN:
+        text = f"from row {best.first_row + 1} on if one side is moved by one row"
+        yield finding("rows", text=text)
 
 
-def _agreeing(of_parent: FloatArray, of_child: FloatArray) -> BoolArray:
-    """Return whether (N,) each stop has the same angles to a third of the others on both sides.
+class _Block(NamedTuple):
+    """Rows from ``first_row`` on that are shifted, and the gain of log likelihood per pair."""
 
-    Angles agree within three times the 20 % quantile of all differences, and within 3 deg.
+    first_row: int
+    gain: float
+
+
+def _likeliest_block(of_one: FloatArray, of_other: FloatArray) -> _Block:
+    """Return the likeliest block of rows in which row i of one side belongs to row i + 1.
+
+    Differences of the angles (N, N) between stops have a Cauchy distribution. Its scale is the
+    20 % quantile in place or shifted by one row: whichever is smaller.
     """
-    differences_rad = np.abs(of_parent - of_child)
-    within_rad = 3.0 * float(np.quantile(above_diagonal(differences_rad), 0.2)) + 1e-9
-    are_close = differences_rad < min(within_rad, LEAST_TURN_RAD)
-    return np.asarray(np.mean(are_close, axis=1) > _AGREEING_SHARE)
+    in_place = np.abs(of_one - of_other)[:-1, :-1]
+    shifted = np.abs(of_one[:-1, :-1] - of_other[1:, 1:])
+    # Between a row in place and a shifted row.
+    across = np.abs(of_one[:-1, :-1] - of_other[:-1, 1:])
+    quantiles_rad = [np.quantile(above_diagonal(off), 0.2) for off in (in_place, shifted)]
+    scale_rad = min(quantiles_rad) + _ROUNDING
+    in_place, shifted, across = [
+        np.log1p((off / scale_rad) ** 2) for off in (in_place, shifted, across)
+    ]
+    n = len(in_place)
+    costs = []
+    for first in range(n):
+        cost = in_place[:first, :first].sum() + shifted[first:, first:].sum()
+        costs.append(cost + 2.0 * across[:first, first:].sum())
+    first_row = int(np.argmin(costs))
+    gain = (in_place.sum() - costs[first_row]) / (n * (n - 1))
+    return _Block(first_row, float(gain))
 
 
 # ------------------------------------------------------------------ angles read otherwise

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError
@@ -23,14 +24,10 @@ from hand_eye_calib.extras.stops.rough_fit import (
 )
 from hand_eye_calib.extras.stops.worlds import SETUPS
 
-# A scale is not 1 if it differs by so many standard deviations, and by this share beyond them.
+# A scale is not 1 if its likelihood is that of so many standard deviations, and if it differs by
+# this share.
 _SCALE_SIGMAS = 3.0
 _SCALE_SHARE = 0.01
-
-# Bias of the scale by noise of the child's positions, in squared standard deviations (as a share)
-# for each stop; it makes the scale smaller. Measured with KinHEC's noisy stops, whose scale is 0.76
-# +/- 0.06 where 1 is right.
-_BIAS_BY_NOISE = 3.0
 
 # A scale beyond this factor is not that of a target of another size.
 _LARGEST_SIZE = 10.0
@@ -139,14 +136,7 @@ def solve_checked(
     if setup and reading.lead < -LEAST_LEAD:
         other = "hand" if reading.is_inverse else "beside"
         findings.insert(0, finding("setup", place=SETUPS[setup], other=SETUPS[other]))
-    is_used = False
-    if config.scale == "estimate" or _determines_scale(poses, findings):
-        free = _with_free_scale(poses, reading)
-        is_used = _judge_scale(free, repaired)
-    if is_used:
-        reading = free
-    elif reading.scale != 1.0:
-        reading = _likelier_reading(poses, 1.0, setup)
+    reading = _with_settled_scale(reading, repaired, setup)
     findings += _check_unknown(poses, reading.fit, findings)
     reading = replace(
         reading,
@@ -277,39 +267,68 @@ def _with_free_scale(poses: StopPoses, reading: Reading) -> Reading:
     return replace(reading, fit=fit, stops=stops, scale=scale, scale_sigma=sigma)
 
 
-def _judge_scale(free: Reading, repaired: _Repaired) -> bool:
-    """Return whether an estimated scale is used; add the finding and the warning about it."""
+def _with_settled_scale(reading: Reading, repaired: _Repaired, setup: str | None) -> Reading:
+    """Return the reading with the child's lengths as they are, or times an estimated scale.
+
+    A scale that is clearly not 1 becomes a finding, unless the user allows the scale to be
+    estimated.
+    """
+    poses = repaired.poses
     config = repaired.config
-    unit = repaired.unit
+    if config.scale == "estimate":
+        return _with_free_scale(poses, reading)
+    as_given = reading
+    if reading.scale != 1.0:
+        as_given = _likelier_reading(poses, 1.0, setup)
+    if not _determines_scale(poses, repaired.findings):
+        return as_given
+    free = _with_free_scale(poses, reading)
     is_auto = config.scale == "auto"
-    is_estimate = config.scale == "estimate"
+    has_other_unit = is_auto and repaired.unit != 1.0
+    if not (has_other_unit or _is_not_one(poses, free, as_given)):
+        return as_given
     is_size = 1.0 / _LARGEST_SIZE < free.scale < _LARGEST_SIZE
-    is_clear = _difference_from_one(free) > _SCALE_SHARE or (is_auto and unit != 1.0)
-    is_asked = is_estimate or (is_auto and is_size)
-    scale = unit * free.scale
-    sigma = unit * free.scale_sigma
-    if is_clear and not is_asked:
+    scale = repaired.unit * free.scale
+    sigma = repaired.unit * free.scale_sigma
+    if not (is_auto and is_size):
         issue = finding("target_scale", "child", scale=scale, sigma=sigma, times=1.0 / scale)
         repaired.findings.append(replace(issue, options={"scale": "estimate"}))
-    if is_estimate:
-        return True
-    is_used = is_clear and is_size and not config.is_known("scale")
-    if is_used:
-        undo = "none" if unit == 1.0 or is_auto else unit
-        repaired.warnings.append(
-            f"solved with the child's lengths times {scale:.4f} +/- {sigma:.4f}; to take them as "
-            f"they are, give scale {undo}"
-        )
-    return is_used
+    if not is_size or config.is_known("scale"):
+        return as_given
+    undo = "none" if repaired.unit == 1.0 or is_auto else repaired.unit
+    repaired.warnings.append(
+        f"solved with the child's lengths times {scale:.4f} +/- {sigma:.4f}; to take them as they "
+        f"are, give scale {undo}"
+    )
+    return free
 
 
-def _difference_from_one(free: Reading) -> float:
-    """Return the difference of an estimated scale from 1, as a share beyond its errors and bias."""
-    share = free.scale_sigma / free.scale
-    bias = _BIAS_BY_NOISE * len(free.stops) * share**2
-    lowest = np.log(free.scale) - _SCALE_SIGMAS * share
-    highest = np.log(free.scale) + bias + _SCALE_SIGMAS * share
-    return float(max(lowest, -highest, 0.0))
+def _is_not_one(poses: StopPoses, free: Reading, as_given: Reading) -> bool:
+    """Return whether an estimated scale is certainly not 1, by the ratio of likelihoods."""
+    if abs(np.log(free.scale)) < _SCALE_SHARE:
+        return False
+    least_gain = 0.5 * _SCALE_SIGMAS**2 * free.fit.inflation
+    gain = as_given.fit.objective - free.fit.objective
+    if free.scale < 1.0 and gain > least_gain:
+        gain = _gain_in_measured_lengths(poses, free, as_given)
+    return bool(gain > least_gain)
+
+
+def _gain_in_measured_lengths(poses: StopPoses, free: Reading, as_given: Reading) -> float:
+    """Return the largest gain of log likelihood by a scale between the estimated one and 1.
+
+    Residuals of positions shrink with the child's lengths, and so does noise of these lengths. The
+    log density of the lengths as they were measured has the term ``3 log(scale)`` for each stop.
+    """
+    mistakes = Mistakes(is_inverse=free.is_inverse)
+
+    def objective(log_scale: float) -> float:
+        fit = solve(poses.without(mistakes, float(np.exp(log_scale))))
+        return fit.objective - 3.0 * len(poses) * log_scale
+
+    bounds = (float(np.log(free.scale)), 0.0)
+    best = minimize_scalar(objective, bounds=bounds, options={"xatol": _SCALE_SHARE})
+    return as_given.fit.objective - float(best.fun)
 
 
 def _check_unknown(poses: StopPoses, fit: RobotWorld, findings: Sequence[Finding]) -> list[Finding]:
