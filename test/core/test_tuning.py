@@ -147,7 +147,6 @@ CHANGES = {
     "first_jump_sigmas": (10.0, "bursts"),
     "most_spikes": (0.4, "bursts"),
     "negligible": (0.01, "drive"),
-    "widths": ((3,), "bursts"),
     "noisy": (0.4, "target"),
     "strides": ((5,), "target"),
     "least_gain": (120.0, "drive"),

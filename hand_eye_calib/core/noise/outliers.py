@@ -21,7 +21,6 @@ from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.stats import (
     CHI2,
     MEDIAN_LENGTH,
-    STUDENT,
     chi_square_quantile,
     median,
     robust_weights,
@@ -221,37 +220,17 @@ def bridged(streams: Streams, T_parent_child: FloatArray, spikes: BoolArray) -> 
     return Streams(streams.stamps_s, streams.Ts_pw_p, Ts_cw_c)
 
 
-def tail_weights(posterior: Posterior, tuning: Tuning) -> FloatArray:
-    """Return weights (N,) of white errors w with Student's t distribution.
+def tail_weights(posterior: Posterior) -> FloatArray:
+    """Return weights (N,) of the white errors w if these have Student's t distribution.
 
-    ``u = (nu + 6) / (nu m + E w' S^-1 w)``, where the level m may change over time. The level of a
-    pose is the mean over the number of neighbouring poses that predicts the pose best, or 1 if none
-    predicts it clearly better. Smoothing takes a share of the expectation. This share is spread
-    over the poses in inverse proportion to their weights.
+    ``u = (nu + 6) / (nu + E w' S^-1 w)`` with nu degrees of freedom and the white covariance S.
+    Smoothing removes a share of the expectation. This share is spread over the poses in inverse
+    proportion to their weights.
     """
     w = posterior.states_after(posterior.normal.step)[:, :WHITE]
     squares = (w * se3.times(posterior.white_precision, w)).sum(axis=1)
     weights = posterior.space.weights
     is_free = weights == 0.0
-    share_kept = min(float(np.mean((weights * squares)[~is_free])) / 6.0, 1.0)
-    hidden = 6.0 * (1.0 - share_kept) / np.where(is_free, 1.0, weights)
-    expected = np.where(is_free, 0.0, squares + hidden)
-    levels = [np.ones(len(expected))]
-    values = np.array([~is_free, expected])
-    for width in tuning.widths:
-        sums = np.cumsum(np.pad(values, ((0, 0), (width + 1, width))), axis=1)
-        n_neighbours, of_neighbours = sums[:, 2 * width + 1 :] - sums[:, : len(is_free)] - values
-        levels.append((STUDENT + of_neighbours) / (STUDENT + 6.0 * n_neighbours))
-    losses = [_student_loss(expected[~is_free], m[~is_free]) for m in levels]
-    best = int(np.argmin(losses))
-    # A level that changes needs a clear gain per pose.
-    if losses[best] >= losses[0] - 0.1:
-        best = 0
-    m = levels[best]
-    return robust_weights("student", expected / m) / m
-
-
-def _student_loss(squares: FloatArray, levels: FloatArray) -> float:
-    """Mean negative log likelihood of six errors with Student's t distribution, by pose."""
-    losses = 3.0 * np.log(levels) + 5.0 * np.log1p(squares / (STUDENT * levels))
-    return float(np.mean(losses))
+    share_kept = min(float(np.mean((weights * squares)[~is_free])) / WHITE, 1.0)
+    hidden = WHITE * (1.0 - share_kept) / np.where(is_free, 1.0, weights)
+    return robust_weights("student", np.where(is_free, 0.0, squares + hidden))

@@ -401,17 +401,16 @@ def _states_of(workspace: Workspace, fit: Fit) -> FloatArray:
 
 
 def tails(workspace: Workspace, fit: Fit) -> Fit:
-    """Weight white errors with heavy tails, whose level may vary."""
-    tuning = workspace.problem.tuning
+    """Weight white errors with heavy tails."""
     if not fit.has_heavy_tails:
         return fit
     for _ in range(2):
         posterior = workspace.posterior(fit)
         # Three rounds of weights at one model; the last weights are those of the next fit.
         for _ in range(2):
-            weights = np.where(fit.outliers.spikes, 0.0, tail_weights(posterior, tuning))
+            weights = np.where(fit.outliers.spikes, 0.0, tail_weights(posterior))
             posterior = Posterior(replace(posterior.space, weights=weights), posterior.levels)
-        fit = noise(workspace, replace(fit, weights=tail_weights(posterior, tuning)))
+        fit = noise(workspace, replace(fit, weights=tail_weights(posterior)))
     return _with_outliers(workspace, fit, 2, with_spikes=False)
 
 
@@ -550,7 +549,7 @@ def _polished(workspace: Workspace, fit: Fit) -> Fit:
     problem = workspace.problem
     posterior = workspace.posterior(fit)
     if fit.has_heavy_tails and "tails" not in problem.without:
-        fit = replace(fit, weights=tail_weights(posterior, problem.tuning))
+        fit = replace(fit, weights=tail_weights(posterior))
     step = posterior.normal.step
     moved = fit.moved(step, problem.columns)
     return moved.corrected(problem.streams, posterior.states_after(step))

@@ -66,8 +66,6 @@ class Tuning:
     most_spikes: float = 0.2
     # The noise levels are fitted again if more than this share of poses changed status.
     negligible: float = 0.005
-    # Poses on either side that may share a level of the white errors.
-    widths: tuple[int, ...] = (2, 5, 12, 30)
 
     # -- Rotation noise that is large beside the rotation --
     # Rotation noise is not small if it exceeds this share of the rotation between poses.
