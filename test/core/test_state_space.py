@@ -43,9 +43,8 @@ def space_of(seed=1, cut=(4,)):
         columns=columns,
         ahead=ahead,
         behind=behind,
-        white_bases=(bases[0][None], bases[1][None]),
+        white_bases=(bases[0][None], bases[1][None], twists[:, :, None] * twists[:, None]),
         walk_bases=bases,
-        twists=twists,
         group_sizes=SIZES,
         weights=random.uniform(0.3, 2.0, N_POSES),
         cut=flags,
@@ -69,7 +68,6 @@ def dense_covariance(space, levels):
     prior = np.zeros((N_POSES, d, N_POSES, d))
     for pose in range(N_POSES):
         bases = [basis[pose if len(basis) > 1 else 0] for basis in space.white_bases]
-        bases.append(np.outer(space.twists[pose], space.twists[pose]))
         white = sum(variance * basis for variance, basis in zip(variances, bases, strict=False))
         prior[pose, :6, pose, :6] = white / space.weights[pose]
     times = np.r_[0.0, np.cumsum(space.intervals_s)]

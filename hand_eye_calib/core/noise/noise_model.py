@@ -137,6 +137,7 @@ class NoiseModel:
         white_rotations = rotations[None]
         if self.centre != "sensors":
             white_rotations = self._swing(streams, to_child)
+        jitter = twists[:, :, None] * twists[:, None]
         ahead = [np.zeros((len(intervals_s), 6, 0))]
         behind = [linearisation.adjoints]
         for kind, part in self.slow:
@@ -154,9 +155,8 @@ class NoiseModel:
             columns=linearisation.columns,
             ahead=np.concatenate(ahead, axis=2),
             behind=np.concatenate(behind, axis=2) if self.slow else linearisation.adjoints,
-            white_bases=(TRANSLATIONS[None], white_rotations),
+            white_bases=(TRANSLATIONS[None], white_rotations, jitter),
             walk_bases=(TRANSLATIONS, rotations),
-            twists=twists,
             group_sizes=tuple(matrices.shape[2] for matrices in ahead[1:]),
             weights=weights,
             cut=cut,

@@ -118,9 +118,7 @@ def innovations(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, Fl
     )
     white = states[:, :WHITE]
     weights = np.where(spikes, 1.0, space.weights)
-    jitter = np.exp(posterior.levels[len(space.white_bases)]) * space.twists
     covariance = total_covariance(posterior.levels, space.white_bases)
-    covariance = covariance + jitter[:, :, None] * space.twists[:, None]
     covariance_left = posterior.factor.selected_inverse[0][:, :WHITE, :WHITE]
     of_white = chi_squares(
         white[:, :, 0],

@@ -202,8 +202,6 @@ def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
     excess = precision - precision @ moments @ precision
     excess[space.weights == 0.0] = 0.0
     traces = [float((excess * basis).sum()) for basis in space.white_bases]
-    along = (excess @ space.twists[:, :, None])[:, :, 0]
-    traces.append(float((along * space.twists).sum()))
     moments = posterior.walk_covariances() + walk @ transposed(walk)
     total = np.tensordot(posterior.evidence, moments, axes=1)
     walk_precision = posterior.walk_precision
@@ -247,9 +245,7 @@ def _average_information(posterior: Posterior, states: FloatArray, walk: FloatAr
     forces[space.weights == 0.0] = 0.0
     for level, basis in enumerate(space.white_bases):
         moved[:, :WHITE, level] = variances[level] * (basis @ forces[:, :, None])[:, :, 0]
-    along = variances[n_white] * (space.twists * forces).sum(axis=1)
-    moved[:, :WHITE, n_white] = along[:, None] * space.twists
-    first_of_groups = n_white + 1 + len(space.walk_bases)
+    first_of_groups = n_white + len(space.walk_bases)
     for level, group in zip(
         range(first_of_groups, len(variances), 2), posterior.groups, strict=True
     ):
@@ -259,7 +255,7 @@ def _average_information(posterior: Posterior, states: FloatArray, walk: FloatAr
     columns = space.apply_u(moved)
     # f_k of the walk, which acts on the increments directly.
     forces = walk @ posterior.walk_precision
-    for level, basis in enumerate(space.walk_bases, start=n_white + 1):
+    for level, basis in enumerate(space.walk_bases, start=n_white):
         columns[:, :, level] = variances[level] * forces @ basis
     columns[space.cut] = 0.0
     weighted, whitened = posterior.forward_half(columns)

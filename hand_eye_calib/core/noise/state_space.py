@@ -61,8 +61,6 @@ class StateSpace:
         The covariance of a white error is ``sum exp(level) basis``.
     walk_bases : tuple of (6, 6) arrays
         The same of the walk.
-    twists : (N, 6) array
-        v of one more basis ``v v'`` of each pose's white error.
     group_sizes : tuple of int
         Numbers of Gauss-Markov processes that share a variance and a time constant, by group. The
         states of the groups follow the white error.
@@ -81,7 +79,6 @@ class StateSpace:
     behind: FloatArray
     white_bases: tuple[FloatArray, ...]
     walk_bases: tuple[FloatArray, ...]
-    twists: FloatArray
     group_sizes: tuple[int, ...]
     weights: FloatArray
     cut: BoolArray
@@ -90,10 +87,6 @@ class StateSpace:
     def white_precision(self, levels: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Invert the covariances of the white errors for weight 1.
 
-        With ``S S' = (sum exp(level) basis)^-1``, ``z = S' v`` and the variance j along v the
-        inverse is R'R, ``R = (I - a z z') S'``, ``a = (1 - (1 + j z'z)^-1/2) / z'z``. Unlike a
-        difference of matrices, R'R is never indefinite.
-
         Returns
         -------
         (N, 6, 6) array
@@ -101,14 +94,8 @@ class StateSpace:
         (N,) array
             Logarithms of the determinants of the covariances.
         """
-        n_bases = len(self.white_bases)
         roots, log_determinants = inverse_roots(total_covariance(levels, self.white_bases))
-        z = roots @ self.twists[:, :, None]
-        squares = (z**2).sum(axis=1, keepdims=True)
-        grown = np.log1p(np.exp(levels[n_bases]) * squares)
-        a = -np.expm1(-0.5 * grown) / np.where(squares > 0.0, squares, 1.0)
-        roots = roots - a * z @ (transposed(z) @ roots)
-        return transposed(roots) @ roots, log_determinants + grown[:, 0, 0]
+        return transposed(roots) @ roots, log_determinants
 
     def apply_u(self, states: FloatArray) -> FloatArray:
         """Return ``U x`` (n, 6, k) of states (N, d, k)."""
@@ -190,8 +177,8 @@ class Posterior:
     ----------
     space : StateSpace
     levels : (m,) array
-        Logarithms of the variances of the white bases, along v and of the walk bases; then of the
-        variance and the time constant (s) of every group.
+        Logarithms of the variances of the white bases and of the walk bases; then of the variance
+        and the time constant (s) of every group.
 
     Attributes
     ----------
@@ -226,7 +213,7 @@ class Posterior:
     def __init__(self, space: StateSpace, levels: FloatArray) -> None:
         self.space = space
         self.levels = levels
-        n_white = len(space.white_bases) + 1
+        n_white = len(space.white_bases)
         is_free = space.weights == 0.0
         self.white_precision, white_log_determinants = space.white_precision(levels)
         self._white_precisions = space.weights[:, None, None] * self.white_precision

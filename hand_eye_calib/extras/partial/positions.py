@@ -32,6 +32,7 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.noise import increments, reml
 from hand_eye_calib.core.noise.estimator import PLAIN_SIGMAS, ModelSolution
 from hand_eye_calib.core.noise.noise_model import (
+    JITTER,
     LOWEST_VARIANCE,
     N_FAST,
     ROTATION,
@@ -289,7 +290,7 @@ class _State:
         return replace(
             space,
             walk_factors=space.walk_factors * self.walk_factors,
-            white_bases=(TRANSLATIONS[None], ROTATIONS[None]),
+            white_bases=(TRANSLATIONS[None], ROTATIONS[None], space.white_bases[JITTER]),
             walk_bases=(TRANSLATIONS, to_child @ ROTATIONS @ to_child.T),
         )
 
