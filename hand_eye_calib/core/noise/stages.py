@@ -36,7 +36,6 @@ from hand_eye_calib.core.noise.noise_model import (
     LASTING,
     LOWEST_VARIANCE,
     N_FAST,
-    PARTS,
     ROTATION,
     VARIANCES,
     WALKS,
@@ -285,7 +284,7 @@ def start(problem: Problem) -> Fit:
         course=course,
         T=T,
         model=NoiseModel((), centre, interval_s, duration_s, tuning),
-        levels=rough_levels(residuals, left_out, tuning),
+        levels=rough_levels(residuals, left_out, tuning.jitter),
         outliers=outliers,
         weights=np.ones(len(streams)),
         sigmas=np.array(tuning.first_sizes),
@@ -307,28 +306,26 @@ def _centre(streams: Streams, T: FloatArray, residuals: FloatArray, decisive: fl
     return best if sizes[best] < decisive * sizes["sensors"] else "sensors"
 
 
-def rough_levels(residuals: FloatArray, left_out: BoolArray, tuning: Tuning) -> FloatArray:
-    """Return log levels (5,) to start at, from scatter and correlation of residuals (n, 6).
+def rough_levels(residuals: FloatArray, left_out: BoolArray, jitter: float) -> FloatArray:
+    """Return log levels (5,) to start at: half of each mean square is white noise, half is walk.
 
-    Differences of white noise have variance 2 s^2 and a covariance of -s^2 with their neighbours;
-    the walk adds only variance.
+    Parameters
+    ----------
+    residuals : (n, 6) array
+    left_out : (n,) bool array
+        Increments that are no evidence.
+    jitter : float
+        Log variance (s^2) of the jitter of stamps.
     """
-    kept = ~left_out
-    are_neighbours = kept[1:] & kept[:-1]
-    levels = np.full(N_FAST, tuning.jitter)
-    whites = levels[WHITES]
-    walks = levels[WALKS]
-    for at, rows in enumerate(PARTS.values()):
-        values = residuals[:, rows]
-        total = np.mean(values[kept] ** 2) if kept.any() else LOWEST_VARIANCE
-        total = max(float(total), 100 * LOWEST_VARIANCE)
-        covariance = -total / 2
-        if are_neighbours.any():
-            products = values[1:][are_neighbours] * values[:-1][are_neighbours]
-            covariance = float(np.mean(products))
-        white = float(np.clip(-covariance, *np.multiply(tuning.first_white, total)))
-        whites[at] = np.log(white)
-        walks[at] = np.log(max(total - 2 * white, 0.02 * total))
+    squares = (residuals[~left_out] ** 2).reshape(-1, 2, 3)
+    variances = np.zeros(2)
+    if len(squares):
+        variances = squares.mean(axis=(0, 2))
+    total = np.log(np.maximum(variances, 100 * LOWEST_VARIANCE))
+    levels = np.full(N_FAST, jitter)
+    # An increment has the white noise of two poses.
+    levels[WHITES] = total + np.log(0.25)
+    levels[WALKS] = total + np.log(0.5)
     return levels
 
 

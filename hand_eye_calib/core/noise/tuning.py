@@ -37,8 +37,6 @@ class Tuning:
     jitter: float = -14.0
     # Prior precision of the levels of time constants.
     tau_precision: float = 0.3
-    # Bounds of the starting value of white noise, as shares of all noise.
-    first_white: tuple[float, float] = (0.05, 0.5)
     # Steps of the child count as noise until their squared differences from their neighbours
     # exceed the noise variance by this factor.
     caution: float = 10.0

@@ -233,7 +233,7 @@ class _State:
         squares = (residuals[:, :3] ** 2).sum(axis=1)
         square_of_position = [squares[:1], 0.5 * (squares[1:] + squares[:-1]), squares[-1:]]
         imprecise = _imprecise(np.concatenate(square_of_position), tuning, LOWEST_VARIANCE)
-        levels = rough_levels(residuals, imprecise[1:] | imprecise[:-1], tuning)
+        levels = rough_levels(residuals, imprecise[1:] | imprecise[:-1], tuning.jitter)
         levels[ROTATION] = _ANY_ROTATION
         levels[WALK_ROTATION] = tuning.rotation_walk[1]
         streams = bridged(streams, state.X, imprecise)
