@@ -27,9 +27,10 @@ from hand_eye_calib.core.noise.state_space import WHITE, Markov, Posterior, Stat
 _MAX_STEPS = 20
 _SHORTEST_STEP = 1e-3
 
-# First and largest radius of a step of a log level.
-_FIRST_RADIUS = 1.5
-_LARGEST_RADIUS = 3.0
+# Longest step of a log level: a variance changes by a factor of 4.5 at most.
+_LONGEST_STEP = 1.5
+# Factor of a step that did not lower the loss.
+_SHORTENED = 0.3
 
 # Information added to every level. It bounds the step along levels that do not matter.
 _ADDED_CURVATURE = 0.05
@@ -52,24 +53,6 @@ class Prior(NamedTuple):
 Reduced: TypeAlias = tuple[StateSpace, FloatArray, Prior] | None
 
 
-class _Move(NamedTuple):
-    """A step that lowers the loss.
-
-    Attributes
-    ----------
-    posterior : Posterior
-        After the step.
-    gain : float
-        Decrease of the loss.
-    radius : float
-        Of the next step.
-    """
-
-    posterior: Posterior
-    gain: float
-    radius: float
-
-
 def fit(
     space: StateSpace,
     start: FloatArray,
@@ -77,7 +60,7 @@ def fit(
     settled_loss: float,
     reduce: Callable[[FloatArray, FloatArray], Reduced] | None = None,
 ) -> tuple[Posterior, FloatArray]:
-    """Minimise the loss over the levels by Newton steps within a trust region.
+    """Minimise the loss over the levels by Newton steps that are shortened if they overshoot.
 
     Parameters
     ----------
@@ -105,7 +88,6 @@ def fit(
     """
     posterior = Posterior(space, np.clip(start, prior.lower, prior.upper))
     loss = posterior.loss + prior.loss(posterior.levels)
-    radius = _FIRST_RADIUS
     for _ in range(_MAX_STEPS):
         gradient, information = derivatives(posterior)
         reduced = reduce(posterior.levels, information) if reduce else None
@@ -116,73 +98,58 @@ def fit(
             gradient, information = derivatives(posterior)
         gradient = gradient + prior.precision * (posterior.levels - prior.mean)
         curvature = information + np.diag(prior.precision + _ADDED_CURVATURE)
-        move = _move(posterior, loss, gradient, curvature, prior, radius, settled_loss)
-        if move is None:
+        step = _step(posterior.levels, gradient, curvature, prior)
+        promised_gain = -float(gradient @ step + 0.5 * step @ curvature @ step)
+        if promised_gain < settled_loss:
             break
-        posterior = move.posterior
-        radius = move.radius
-        loss = loss - move.gain
-        if move.gain < 0.5 * settled_loss:
+        posterior, gain = _moved(posterior, step, prior, loss)
+        loss -= gain
+        if gain < 0.5 * settled_loss:
             break
     return posterior, information
 
 
-def _move(
-    posterior: Posterior,
-    loss: float,
-    gradient: FloatArray,
-    curvature: FloatArray,
-    prior: Prior,
-    radius: float,
-    settled_loss: float,
-) -> _Move | None:
-    """Return a step that lowers the loss; None if no step promises to lower it enough.
+def _moved(
+    posterior: Posterior, step: FloatArray, prior: Prior, loss: float
+) -> tuple[Posterior, float]:
+    """Shorten a step until it lowers the loss.
 
-    The radius follows the usual rules of a trust region (Nocedal, Wright, *Numerical optimization*,
-    chapter 4). It grows after a step whose gain is more than half of the predicted gain. It shrinks
-    after a step whose gain is less than a fifth of it.
+    Returns
+    -------
+    Posterior
+        After the step; the same one if even the shortest step does not lower the loss.
+    float
+        Decrease of the loss.
     """
-    while radius > _SHORTEST_STEP:
-        step, is_newton = _step(posterior.levels, gradient, curvature, prior, radius)
-        length = float(np.abs(step).max())
-        promised = -float(gradient @ step + 0.5 * step @ curvature @ step)
-        if length < _SHORTEST_STEP or (is_newton and promised < settled_loss):
-            return None
-        gain = 0.0
+    while np.abs(step).max() > _SHORTEST_STEP:
         with suppress(np.linalg.LinAlgError):
             rival = Posterior(posterior.space, posterior.levels + step)
-            gain = loss - (rival.loss + prior.loss(rival.levels))
-        if gain > 0.0:
-            if gain > 0.5 * promised:
-                radius = min(2.0 * radius, _LARGEST_RADIUS)
-            elif gain < 0.2 * promised:
-                radius = 0.5 * length
-            return _Move(rival, gain, radius)
-        radius = 0.3 * length
-    return None
+            gain = loss - rival.loss - prior.loss(rival.levels)
+            if gain > 0.0:
+                return rival, gain
+        step = _SHORTENED * step
+    return posterior, 0.0
 
 
 def _step(
-    levels: FloatArray, gradient: FloatArray, curvature: FloatArray, prior: Prior, radius: float
-) -> tuple[FloatArray, bool]:
-    """Return the step of the levels, damped to stay within the radius, and whether it is undamped.
+    levels: FloatArray, gradient: FloatArray, curvature: FloatArray, prior: Prior
+) -> FloatArray:
+    """Return the Newton step of the levels (m,), damped until it is within the longest step.
 
     Levels at a bound that the gradient pushes against do not move.
     """
-    free = (levels > prior.lower + 1e-9) | (gradient < 0)
-    free &= (levels < prior.upper - 1e-9) | (gradient > 0)
+    is_free = (levels > prior.lower + 1e-9) | (gradient < 0)
+    is_free &= (levels < prior.upper - 1e-9) | (gradient > 0)
+    gradient = gradient[is_free]
+    curvature = curvature[np.ix_(is_free, is_free)]
+    least_damping = 0.05 * np.abs(gradient).max(initial=0.0) / _LONGEST_STEP
     step = np.zeros(len(levels))
-    values, vectors = np.linalg.eigh(curvature[np.ix_(free, free)])
-    along = vectors.T @ gradient[free]
-    steepest = float(np.abs(gradient[free]).max(initial=0.0))
-    smallest_damping = 0.05 * max(steepest / radius, 1e-3)
     damping = 0.0
     while True:
-        step[free] = -vectors @ (along / (values + damping))
-        if np.abs(step).max() <= radius:
-            break
-        damping = max(2.0 * damping, smallest_damping)
-    return np.clip(levels + step, prior.lower, prior.upper) - levels, damping == 0.0
+        step[is_free] = -np.linalg.solve(curvature + damping * np.eye(len(gradient)), gradient)
+        if np.abs(step).max() <= _LONGEST_STEP:
+            return np.clip(levels + step, prior.lower, prior.upper) - levels
+        damping = 2.0 * damping + least_damping
 
 
 def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
