@@ -21,7 +21,13 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.noise.normal import multiplied, transposed
-from hand_eye_calib.core.noise.state_space import WHITE, Markov, Posterior, StateSpace
+from hand_eye_calib.core.noise.state_space import (
+    LEVEL_CHANGE,
+    WHITE,
+    Markov,
+    Posterior,
+    StateSpace,
+)
 
 # Largest number of steps, and the shortest step of a log level.
 _MAX_STEPS = 20
@@ -181,24 +187,27 @@ def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
 
 
 def _group_gradient(posterior: Posterior, group: Markov, states: FloatArray) -> FloatArray:
-    """Derivatives (2,) of the loss by the log variance and the log time constant of a group."""
-    phi = group.phi
-    rest = group.rest
+    """Numerical derivatives (2,) of the loss by the log variance and time constant of a group.
+
+    The part of the loss that depends on them is ``1/2 (tr(Pi M) - log|Pi|)`` with the second
+    moments M of the smoothed processes and their precision Pi.
+    """
     covariance, below = posterior.factor.selected_inverse
     values = states[:, group.states]
-    size = values.shape[1]
-    # Expected squares of each pose, and products of each pose with the pose before.
+    n_processes = values.shape[1]
+    # Second moments of each pose, and of each pose with the pose before.
     squares = np.einsum("nii->n", covariance[:, group.states, group.states])
     squares += np.einsum("nij,nij->n", values, values)
     products = np.einsum("nii->n", below[:, group.states, group.states])
     products += np.einsum("nij,nij->n", values[1:], values[:-1])
-    innovations = squares[1:] - 2.0 * phi * products + phi**2 * squares[:-1]
-    total = squares[0] + float((innovations / rest).sum())
-    by_variance = 0.5 * (size * len(squares) - total / group.variance)
-    by_phi = phi * innovations / rest**2 - (products - phi * squares[:-1]) / rest
-    by_phi /= group.variance
-    by_phi -= size * phi / rest
-    return np.array([by_variance, float((by_phi * group.slope).sum())])
+    gradient = np.zeros(2)
+    for sign in (1.0, -1.0):
+        for level, change in enumerate(sign * LEVEL_CHANGE * np.eye(2)):
+            changed = group.changed(change)
+            trace = float(changed.diagonal @ squares + 2.0 * changed.between @ products)
+            deviance = trace + n_processes * changed.log_determinant
+            gradient[level] += sign * deviance / (4.0 * LEVEL_CHANGE)
+    return gradient
 
 
 def _average_information(posterior: Posterior, states: FloatArray, walk: FloatArray) -> FloatArray:

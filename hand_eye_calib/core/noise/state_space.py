@@ -38,6 +38,10 @@ WHITE = 6
 # Share by which the diagonal of P is raised. Rounding must not make P indefinite.
 _RAISED = 1e-13
 
+# Change of a level for numerical derivatives: errors of the formula and of rounding are both about
+# 1e-10.
+LEVEL_CHANGE = 1e-5
+
 # Number of parts of a recording for the jackknife.
 _N_PARTS = 20
 
@@ -123,51 +127,64 @@ class StateSpace:
 class Markov:
     """Group of independent Gauss-Markov processes with one variance and one time constant.
 
-    Attributes
+    The precision Pi (N, N) of the values of one process at all poses is tridiagonal.
+
+    Parameters
     ----------
     states : slice
         Of the state of a pose.
-    variance : float
-        Stationary variance of each process.
-    phi : (n,) array
-        exp(-dt / tau).
-    slope : (n,) array
-        Derivative of phi by log tau.
-    rest : (n,) array
-        Variance of q, relative to the stationary variance: ``1 - phi^2``.
+    levels : (2,) array
+        Logarithms of the stationary variance and of the time constant (s).
+    intervals_s : (n,) array
+
+    Attributes
+    ----------
+    first : float
+        Contribution to Pi of the stationary variance of the first state.
     after, between, before : (n,) arrays
-        Contributions of an increment to Pi for unit variance: to the state after the increment,
-        between both states, and to the state before. The first state has 1 besides.
+        Contributions of an increment to Pi: to the state after the increment, between both states,
+        and to the state before the increment.
+    diagonal : (N,) array
+        Diagonal of Pi; ``between`` is beside the diagonal.
+    log_determinant : float
+        -log|Pi|.
     """
 
     def __init__(self, states: slice, levels: FloatArray, intervals_s: FloatArray) -> None:
-        ratio = intervals_s / np.exp(levels[1])
         self.states = states
-        self.variance = float(np.exp(levels[0]))
-        self.phi = np.exp(-ratio)
-        self.slope = self.phi * ratio
-        self.rest = -np.expm1(-2.0 * ratio)
-        self.after = 1.0 / self.rest
-        self.between = -self.phi * self.after
-        self.before = self.phi**2 * self.after
+        self._levels = levels
+        self._intervals_s = intervals_s
+        ratios = intervals_s / np.exp(levels[1])
+        phi = np.exp(-ratios)
+        variances_of_q = -np.exp(levels[0]) * np.expm1(-2.0 * ratios)
+        self.first = float(np.exp(-levels[0]))
+        self.after = 1.0 / variances_of_q
+        self.between = -phi * self.after
+        self.before = phi**2 * self.after
+        self.diagonal = np.r_[self.first, self.after] + np.r_[self.before, 0.0]
+        self.log_determinant = float(levels[0] + np.log(variances_of_q).sum())
+
+    def changed(self, change: FloatArray) -> Markov:
+        """Return the group after a change (2,) of the levels."""
+        return Markov(self.states, self._levels + change, self._intervals_s)
+
+    def forces(self, values: FloatArray) -> FloatArray:
+        """Return ``Pi values`` (N, k) of states (N, k)."""
+        forces = self.diagonal[:, None] * values
+        forces[1:] += self.between[:, None] * values[:-1]
+        forces[:-1] += self.between[:, None] * values[1:]
+        return forces
 
     def derivative_by_log_tau(self, values: FloatArray) -> FloatArray:
-        """Derivative by log tau of states (N, k): ``dC f`` with C their covariance, C f = values.
+        """Derivative by log tau of states (N, k): ``dC f`` with C = Pi^-1 and C f = values.
 
-        ``dC f = -C (dPi) values`` with the derivative dPi of the precision ``Pi = C^-1``.
+        ``dC f = -C (dPi) values`` with the numerical derivative dPi of the precision.
         """
-        phi = self.phi
-        rest = self.rest
-        slope = self.slope
-        by_rest = 2.0 * phi * slope / rest**2
-        between = (slope / rest + phi * by_rest)[:, None]
-        before = (2.0 * phi * slope / rest + phi**2 * by_rest)[:, None]
-        forces = np.zeros_like(values)
-        forces[1:] += by_rest[:, None] * values[1:] - between * values[:-1]
-        forces[:-1] += before * values[:-1] - between * values[1:]
-        diagonal = np.r_[1.0, self.after] + np.r_[self.before, 0.0]
-        factor = Factor(diagonal[:, None, None], self.between[:, None, None])
-        return -factor.restore(factor.whiten(forces[:, None]))[:, 0]
+        change = np.array([0.0, LEVEL_CHANGE])
+        forces = self.changed(change).forces(values) - self.changed(-change).forces(values)
+        factor = Factor(self.diagonal[:, None, None], self.between[:, None, None])
+        moved = factor.restore(factor.whiten(forces[:, None]))[:, 0]
+        return np.asarray(moved / (-2.0 * LEVEL_CHANGE))
 
 
 class Posterior:
@@ -257,7 +274,7 @@ class Posterior:
         weights = space.weights[space.weights != 0.0]
         of_pi = float((WHITE * np.log(weights) - white_log_determinants).sum())
         for group, size in zip(self.groups, space.group_sizes, strict=True):
-            of_pi -= size * (len(space.weights) * np.log(group.variance) + np.log(group.rest).sum())
+            of_pi -= size * group.log_determinant
         evidence = space.walk_factors[~space.cut]
         of_walk = WHITE * np.log(evidence).sum()
         of_walk += len(evidence) * np.linalg.slogdet(self.walk_covariance)[1]
@@ -294,12 +311,11 @@ class Posterior:
             diagonal[0, :WHITE, :WHITE] += self._white_precisions[0]
         for group in self.groups:
             states = range(size)[group.states]
-            variance = group.variance
-            below[:, states, states] += group.between[increments, None] / variance
-            diagonal[:-1, states, states] += group.before[increments, None] / variance
-            diagonal[1:, states, states] += group.after[increments, None] / variance
+            below[:, states, states] += group.between[increments, None]
+            diagonal[:-1, states, states] += group.before[increments, None]
+            diagonal[later, states, states] += group.after[increments, None]
             if start == 0:
-                diagonal[0, states, states] += 1.0 / variance
+                diagonal[0, states, states] += group.first
         return diagonal, below
 
     def forward_half(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
