@@ -81,7 +81,9 @@ NO_SYSTEMATIC_ERROR = np.zeros(increments.N_SYSTEMATIC)
 
 def linearised(streams, T_parent_child=T_PARENT_CHILD, parameters=NO_SYSTEMATIC_ERROR):
     course = increments.course_of(streams, T_PARENT_CHILD)
-    return increments.linearise(streams, course, T_parent_child, parameters)
+    return increments.linearise(
+        streams, course, T_parent_child, parameters, list(range(increments.N_SYSTEMATIC))
+    )
 
 
 def inner_residuals(streams, T_parent_child, parameters):

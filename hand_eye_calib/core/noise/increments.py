@@ -20,7 +20,7 @@ than their noise would seem to shrink.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -199,7 +199,7 @@ def linearise(
     course: Course,
     T_parent_child: FloatArray,
     parameters: FloatArray,
-    columns: Sequence[int] = range(N_SYSTEMATIC),
+    columns: list[int],
     error: FloatArray | None = None,
 ) -> Linearisation:
     """Compute residuals and derivatives.
@@ -221,49 +221,47 @@ def linearise(
     R_c_transposed = transposed(streams.Ts_cw_c[:-1, :3, :3])
     steps = se3.times(R_c_transposed, np.diff(course.path, axis=0))
     metres = R_c_transposed @ np.diff(course.along, axis=0)
-    B, by_rate = _child_motions(streams, course, parameters, RATE[0] in columns)
+    B, by_rate = _child_motions(streams, course, parameters)
     B[:, :3, 3] = (1.0 + parameters[SCALE]) * se3.translation_of(B) - metres @ parameters[BIAS]
     B_inverse = se3.inverse(B)
     R_B_transposed = se3.rotation_of(B_inverse)
     adjoints = se3.adjoint(B_inverse)
     by_steps = np.zeros((len(steps), 6, 4))
     by_steps[:, :3] = -R_B_transposed @ np.dstack([steps, se3.skew(steps)])
-    by_bias = R_B_transposed @ metres
-    all_columns = np.zeros((len(steps), 6, 6 + len(columns) + 1))
-    np.subtract(np.eye(6), adjoints, out=all_columns[:, :, :6])
-    for k, parameter in enumerate(columns, start=6):
-        if parameter == SCALE:
-            all_columns[:, :, k] = by_steps[:, :, 0]
-        elif parameter == TIME:
-            all_columns[:, :, k] = se3.times(adjoints, course.twists[:-1]) - course.twists[1:]
-        elif parameter in BIAS:
-            all_columns[:, :3, k] = by_bias[:, :, BIAS.index(parameter)]
-        else:
-            all_columns[:, 3:, k] = by_rate[:, :, RATE.index(parameter)]
     A_X = (streams.motions_p.reshape(-1, 4) @ T_parent_child).reshape(B.shape)
-    residuals = all_columns[:, :, -1]
-    residuals[:] = se3.log(B_inverse @ (se3.inverse(T_parent_child) @ A_X))
+    residuals = se3.log(B_inverse @ (se3.inverse(T_parent_child) @ A_X))
     if error is not None:
         residuals += error[1:] - se3.times(adjoints, error[:-1])
+    systematic = np.zeros((len(steps), 6, N_SYSTEMATIC))
+    systematic[:, :, SCALE] = by_steps[:, :, 0]
+    systematic[:, :3, BIAS] = R_B_transposed @ metres
+    systematic[:, :, TIME] = se3.times(adjoints, course.twists[:-1]) - course.twists[1:]
+    systematic[:, 3:, RATE] = by_rate
+    by_xi = np.eye(6) - adjoints
+    all_columns = np.concatenate([by_xi, systematic[:, :, columns], residuals[:, :, None]], axis=2)
     by_path = {"scale": by_steps[:, :, :1], "direction": by_steps[:, :, 1:]}
     return Linearisation(all_columns, adjoints, by_path)
 
 
 def _child_motions(
-    streams: Streams, course: Course, parameters: FloatArray, has_rates: bool
+    streams: Streams, course: Course, parameters: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Motions (n, 4, 4) of the child without its time offset and bias of rates, and derivatives.
+    """Compute motions of the child without its time offset and bias of rates.
 
-    The derivatives (n, 3, 3) of the rotations by the bias of rates are empty without rates.
+    Returns
+    -------
+    (n, 4, 4) array
+        Motions.
+    (n, 3, 3) array
+        Derivatives of their rotations by the bias of rates.
     """
     Ts_cw_c = streams.Ts_cw_c
-    by_rate = np.empty(0)
     if parameters[TIME]:
         Ts_cw_c = Ts_cw_c @ se3.exp(parameters[TIME] * course.twists)
     child_motions = motions(Ts_cw_c[:-1], Ts_cw_c[1:])
-    if has_rates:
-        rotations = se3.rotation_of(child_motions)
-        by_rate = _derivatives_by_rate_bias(rotations, np.diff(streams.stamps_s))
+    rotations = se3.rotation_of(child_motions)
+    by_rate = _derivatives_by_rate_bias(rotations, np.diff(streams.stamps_s))
+    if parameters[RATE].any():
         child_motions[:, :3, :3] = rotations @ se3.rotation_exp(-by_rate @ parameters[RATE])
     return child_motions, by_rate
 

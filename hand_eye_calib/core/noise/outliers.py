@@ -96,7 +96,7 @@ def first_outliers(
     if spikes.any():
         poses = bridged(streams, T_parent_child, spikes)
         parameters = np.zeros(N_SYSTEMATIC)
-        bridging = linearise(poses, course, T_parent_child, parameters, ()).residuals
+        bridging = linearise(poses, course, T_parent_child, parameters, []).residuals
         jumps |= (_part_sizes(bridging) > limits).any(axis=1) & spikes[:-1]
     return Outliers(jumps, spikes)
 

@@ -272,7 +272,7 @@ def start(problem: Problem) -> Fit:
     pairs = motion_pairs(streams.Ts_pw_p, streams.Ts_cw_c, tuning.start_reference)
     T = Method("dnlo").solve(pairs).T_parent_child
     course = course_of(streams, T)
-    residuals = linearise(streams, course, T, np.zeros(N_SYSTEMATIC), ()).residuals
+    residuals = linearise(streams, course, T, np.zeros(N_SYSTEMATIC), []).residuals
     outliers = first_outliers(streams, course, T, residuals, tuning)
     interval_s = median(np.diff(streams.stamps_s))
     duration_s = float(np.ptp(streams.stamps_s))
