@@ -85,14 +85,16 @@ def _values_of(score: Score) -> dict[str, Any]:
     for name in ("over_bound", "nees"):
         if name in values:
             values[name] = float(f"{values[name]:.4g}")
-    if score.errors:
-        values["errors"] = [float(f"{error:.4g}") for error in score.errors]
+    for name in ("errors", "robust_errors"):
+        if name in values:
+            values[name] = [float(f"{error:.4g}") for error in values[name]]
     return values
 
 
 def _score_of(values: dict[str, Any]) -> Score:
     errors = tuple(values.get("errors", ()))
-    return Score(**{"verdict": "", **values, "errors": errors})
+    robust_errors = tuple(values.get("robust_errors", ()))
+    return Score(**{"verdict": "", **values, "errors": errors, "robust_errors": robust_errors})
 
 
 @dataclass(frozen=True)
@@ -128,8 +130,9 @@ def _comparison(
     row: dict[str, object] = {"family": family, "recordings": len(now)}
     for name, value in figures.items():
         text = _FORMATS[name].format(value)
-        if name in old_figures:
-            text += f" ({_FORMATS[name].format(old_figures[name])})"
+        old_value = old_figures.get(name, np.nan)
+        if not np.isnan(old_value):
+            text += f" ({_FORMATS[name].format(old_value)})"
         row[name] = "" if np.isnan(value) else text
     failures = [] if tolerances is None else [*_failures(figures, old_figures, tolerances, now)]
     row["result"] = _result(failures) if tolerances else ""
@@ -138,6 +141,8 @@ def _comparison(
 
 _FORMATS = {
     "error / bound": "{:.2f}",
+    "over robust": "{:.2f}",
+    "over robust, 90 %": "{:.2f}",
     "90 % covers": "{:.1%}",
     "with allowance": "{:.1%}",
     "NEES": "{:.2f}",
@@ -155,14 +160,31 @@ def _figures(scores: Sequence[Score]) -> dict[str, float]:
     axes = sum(score.axes for score in scores)
     inside = sum(score.inside for score in scores)
     inside_allowance = sum(score.inside_allowance for score in scores)
+    over_robust = over_robust_least_squares(scores)
     return {
         "error / bound": float(np.sqrt(np.median(over_bound) / MEDIAN_6)) if over_bound else np.nan,
+        "over robust": float(np.median(over_robust)) if len(over_robust) else np.nan,
+        "over robust, 90 %": float(np.quantile(over_robust, 0.9)) if len(over_robust) else np.nan,
         "90 % covers": inside / axes if axes else np.nan,
         "with allowance": inside_allowance / axes if axes else np.nan,
         "NEES": float(np.median(nees)) if nees else np.nan,
         "no answer": float(sum(not score.verdict for score in scores)),
         "USE but wrong": float(sum(score.is_wrong for score in scores)),
     }
+
+
+def over_robust_least_squares(scores: Sequence[Score]) -> FloatArray:
+    """Return errors (K,) over those of robust least squares on the same recordings.
+
+    Translation and rotation of a recording are two ratios. Recordings without an error of either
+    are skipped.
+    """
+    ratios = []
+    for score in scores:
+        for error, robust_error in zip(score.errors, score.robust_errors, strict=False):
+            if error > 0.0 and robust_error > 0.0:
+                ratios.append(error / robust_error)
+    return np.array(ratios)
 
 
 def error_ratio(now: Sequence[Score], before: Sequence[Score]) -> float:

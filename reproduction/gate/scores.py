@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.geometry.se3 import deviation
+from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.verdict import Verdict
 from reproduction.coverage.measures import MEDIAN_3
 from reproduction.coverage.scores import answer
@@ -25,7 +26,9 @@ class Score:
     """Errors and intervals of the answer to one recording.
 
     ``errors`` are those of translation and rotation, over the bound if there is one, otherwise in
-    mm and deg; empty if an axis of a simulated recording is missing. ``over_bound`` and ``nees``
+    mm and deg; empty if an axis of a simulated recording is missing. ``robust_errors`` are the
+    errors of robust least squares on the same recording, in the same units. ``over_bound`` and
+    ``nees``
     are squared errors (6 degrees of freedom) under the bound and under the measured covariance.
     ``inside`` counts true values in measured 90 % intervals, ``inside_allowance`` those in
     intervals with the allowance, out of ``axes``.
@@ -36,6 +39,7 @@ class Score:
     # Empty: no answer.
     verdict: str
     errors: tuple[float, ...] = ()
+    robust_errors: tuple[float, ...] = ()
     over_bound: float | None = None
     nees: float | None = None
     axes: int = 0
@@ -61,25 +65,20 @@ def score(case: Case) -> Score:
     measured = np.hypot(result.sigmas_measured, case.sigmas)[is_known]
     stated = np.hypot(result.sigmas, case.sigmas)[is_known]
     sizes = np.abs(errors)[is_known]
-    parts: tuple[float, ...] = ()
     over_bound = None
     nees = None
-    if case.bound is None:
-        parts = _sizes(np.where(is_known, errors, 0.0), case.sigmas)
-    elif is_observed.all():
-        to_parent = np.kron(np.eye(2), result.T_parent_child[:3, :3])
-        bound = to_parent @ case.bound @ to_parent.T
+    if case.bound is not None and is_observed.all():
+        to_parent = _to_parent(result)
         covariance = to_parent @ result.covariance_measured @ to_parent.T
-        parts = tuple(
-            np.sqrt(_squared(errors[axes], bound[axes, axes]) / MEDIAN_3) for axes in _PARTS
-        )
-        over_bound = _squared(errors, bound)
+        over_bound = _squared(errors, to_parent @ case.bound @ to_parent.T)
         nees = _squared(errors, covariance)
+    robust = answer(*case.streams, {**case.options, "method": "robust", "checks": False})
     return Score(
         family=case.family,
         name=case.name,
         verdict=result.verdict.value,
-        errors=parts,
+        errors=_errors_of(case, result, is_observed),
+        robust_errors=_errors_of(case, robust, is_observed) if robust else (),
         over_bound=over_bound,
         nees=nees,
         axes=int(is_known.sum()),
@@ -87,6 +86,30 @@ def score(case: Case) -> Score:
         inside_allowance=int((sizes < _REACH_90 * stated).sum()),
         is_wrong=is_use and bool((sizes > _REACH_999 * stated).any()),
     )
+
+
+def _errors_of(case: Case, result: Calibration, is_observed: BoolArray) -> tuple[float, ...]:
+    """Errors of translation and rotation, over the bound if there is one, otherwise in mm and deg.
+
+    Axes that the answer to be scored does not observe do not count in real recordings. A simulated
+    recording has no errors then.
+    """
+    errors = deviation(result.T_parent_child, case.T_parent_child)
+    if case.bound is None:
+        is_known = is_observed & np.isfinite(case.sigmas)
+        return _sizes(np.where(is_known, errors, 0.0), case.sigmas)
+    if not is_observed.all():
+        return ()
+    to_parent = _to_parent(result)
+    bound = to_parent @ case.bound @ to_parent.T
+    return tuple(
+        float(np.sqrt(_squared(errors[axes], bound[axes, axes]) / MEDIAN_3)) for axes in _PARTS
+    )
+
+
+def _to_parent(result: Calibration) -> FloatArray:
+    """Rotation (6, 6) of errors from the child's axes to the parent's axes."""
+    return np.asarray(np.kron(np.eye(2), result.T_parent_child[:3, :3]))
 
 
 def score_simulated(family: str, seed: int, number: int) -> Score:

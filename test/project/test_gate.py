@@ -88,6 +88,18 @@ def test_an_error_that_was_zero_by_luck_does_not_count_as_a_large_ratio():
     assert 1.0 < error_ratio(usual, lucky) < 1.02
 
 
+def test_errors_over_robust_least_squares_are_a_median_and_a_quantile():
+    before = drawn_scores()
+    scores = [
+        dataclasses.replace(score, robust_errors=tuple(2.0 * error for error in score.errors))
+        for score in before
+    ]
+    baseline = Baseline(1, "numpy 2", {score.name: score for score in before})
+    row = compare(scores, baseline)[-1].row
+    assert row["over robust"] == "0.50"
+    assert row["over robust, 90 %"] == "0.50"
+
+
 def test_recordings_drawn_anew_pass_by_chance_and_fail_if_errors_are_larger():
     before = drawn_scores(0, count=80)
     new = drawn_scores(1, count=60)
@@ -101,7 +113,9 @@ def test_recordings_drawn_anew_pass_by_chance_and_fail_if_errors_are_larger():
 def test_a_baseline_is_read_as_it_was_written(tmp_path):
     refused = Score(family="flat_agv", name="flat_agv 0", verdict="DO NOT USE")
     unanswered = Score(family="flat_agv", name="flat_agv 1", verdict="")
-    scores = [*drawn_scores(count=2), refused, unanswered]
+    first, second = drawn_scores(count=2)
+    first = dataclasses.replace(first, robust_errors=(0.5, 2.0))
+    scores = [first, second, refused, unanswered]
     written = Baseline(7, "numpy 2", {score.name: score for score in scores})
     written.write(tmp_path / "baseline.json")
     read = Baseline.read(tmp_path / "baseline.json")
@@ -109,6 +123,7 @@ def test_a_baseline_is_read_as_it_was_written(tmp_path):
     assert read.scores["flat_agv 0"] == refused
     assert read.scores["flat_agv 1"] == unanswered
     assert read.scores["car 0"].errors == pytest.approx(scores[0].errors, rel=1e-3)
+    assert read.scores["car 0"].robust_errors == pytest.approx((0.5, 2.0))
 
 
 def test_a_damaged_baseline_is_named(tmp_path):
