@@ -11,9 +11,11 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from io import BufferedReader
+from os import PathLike
 from pathlib import Path
+from typing import Any
 
-from hand_eye_calib.core.base.errors import InputError, printable
+from hand_eye_calib.core.base.errors import InputError, printable, require_type
 from hand_eye_calib.core.base.option import did_you_mean
 
 # Recordings that come with the package, for ``sample:NAME``.
@@ -102,6 +104,18 @@ def local_path(source: str | Path) -> Path:
     """Return a path; for ``sample:NAME`` that of a recording in the package."""
     name = str(source)
     return _SAMPLES / name.removeprefix("sample:") if name.startswith("sample:") else Path(source)
+
+
+def path_of(name: str, value: Any) -> Path:
+    """Return the path that an argument of the Python interface names, as :func:`local_path`.
+
+    Raises
+    ------
+    InputError
+        If the argument is no path.
+    """
+    require_type(name, value, str, PathLike)
+    return local_path(os.fspath(value))
 
 
 def similar(path: str | Path) -> str:

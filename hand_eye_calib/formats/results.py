@@ -14,12 +14,18 @@ from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
-from hand_eye_calib.core.base.errors import InputError, located, printable
+from hand_eye_calib.core.base.errors import InputError, located, printable, require_type
 from hand_eye_calib.core.base.version import version_of
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
 from hand_eye_calib.core.results.document import transform_arguments, usable_angles, usable_numbers
 from hand_eye_calib.core.results.records import ROTATIONS, TRANSLATIONS
-from hand_eye_calib.formats.files import open_regular, read_bytes, write_atomically, writing
+from hand_eye_calib.formats.files import (
+    open_regular,
+    path_of,
+    read_bytes,
+    write_atomically,
+    writing,
+)
 from hand_eye_calib.formats.yaml_files import read_yaml, yaml_text
 
 FILE_NAME = "extrinsic.yaml"
@@ -63,13 +69,15 @@ def save_result(
     >>> hec.save(result, "saved")
     PosixPath('saved/extrinsic.yaml')
     """
+    require_type("the result", calibration, Calibration)
+    directory = path_of("directory", directory)
     is_usable = calibration.verdict is not Verdict.DO_NOT_USE
     texts = {
         XACRO_NAME: _xacro_text(calibration) if is_usable else None,
         LAUNCH_NAME: _launch_text([calibration]) if is_usable else None,
         FILE_NAME: _yaml_text(calibration.to_dict(), inputs),
     }
-    return _written(Path(directory), texts)
+    return _written(directory, texts)
 
 
 def save_rig(
@@ -215,7 +223,7 @@ def load_result(path: str | Path) -> Calibration:
     >>> hec.load(path) == result
     True
     """
-    path = Path(path)
+    path = path_of("path", path)
     if path.is_dir():
         if (path / RIG_NAME).exists() and not (path / FILE_NAME).exists():
             sensors = sorted(str(file.parent) for file in path.glob(f"*/{FILE_NAME}"))

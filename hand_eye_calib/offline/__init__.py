@@ -7,7 +7,7 @@ from hand_eye_calib.core.base.registry import COMMANDS, RESULT_METHODS, SESSION_
 
 
 def register() -> None:
-    """Register the commands for recordings, and the methods ``plot`` and ``report`` of results."""
+    """Register the commands for recordings, and the methods of results."""
     COMMANDS["calibrate"] = Command(
         "calibrate from two trajectory files, a bag or a journal", _calibrate
     )
@@ -17,6 +17,7 @@ def register() -> None:
     COMMANDS["export"] = Command("print a saved result as the file of another program", _export)
     RESULT_METHODS["plot"] = _plot
     RESULT_METHODS["report"] = _report
+    RESULT_METHODS["html"] = _html
     SESSION_PAGES["report"] = _session_report
 
 
@@ -55,6 +56,12 @@ def _report(result: Any, path: Path) -> Path:
     from hand_eye_calib.offline.report.report import render
 
     return save_text(path, render(result, result.recording))
+
+
+def _html(result: Any) -> str:
+    from hand_eye_calib.offline.report.report import render_brief
+
+    return render_brief(result)
 
 
 def _session_report(directory: Path, session: Any) -> None:

@@ -2,12 +2,19 @@
 
 import inspect
 import textwrap
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 from hand_eye_calib.core.base.config import CalibratorConfig
-from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.base.errors import (
+    ConfigError,
+    InputError,
+    UnclearStreamsError,
+    require_type,
+)
 from hand_eye_calib.core.base.option import option_name
 from hand_eye_calib.core.base.text import AXIS_UNITS, Prior, shown_value
 from hand_eye_calib.core.engine.cross_check import (
@@ -20,6 +27,7 @@ from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry.trajectory import Trajectory, TrajectoryLike
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.records import CrossCheck
+from hand_eye_calib.formats.files import path_of
 
 MethodName: TypeAlias = Literal[
     "auto", "dnlo", "dnl", "park", "taylor", "zhuang", "ali", "adaptive", "robust"
@@ -32,8 +40,10 @@ _Order: TypeAlias = Literal["xyzw", "wxyz", "yzwx"]
 
 def calibrate(
     parent: TrajectoryLike,
-    child: TrajectoryLike,
+    child: TrajectoryLike | None = None,
     *,
+    parent_topic: str | None = None,
+    child_topic: str | None = None,
     method: MethodName | None = None,
     reference: str | None = None,
     backend: Literal["fast", "ipopt"] | None = None,
@@ -79,6 +89,9 @@ def calibrate(
         (:meth:`Trajectory.from_positions`): the result is the lever arm. Either may be rotations
         or angular rates (:meth:`Trajectory.from_rates`): the result is the rotation, with the bias
         of the rates.
+        A bag of both sensors is given alone, as ``parent``.
+    parent_topic, child_topic : str, optional
+        Topics of a bag, or frames such as "odom:lidar". Default: the obvious pair, if there is one.
     prior : mapping of str to (float, float) or str, optional
         Value and standard deviation of x, y, z (m), roll, pitch or yaw (rad), such as
         ``{"z": (1.85, 0.02)}``; see :data:`~hand_eye_calib.core.base.text.Prior`.
@@ -106,12 +119,11 @@ def calibrate(
     ('lidar', 'camera')
     """
     values = {name: value for name, value in locals().items() if value is not None}
-    first = parent
-    second = child
-    if not (isinstance(first, Trajectory) and isinstance(second, Trajectory)):
-        from hand_eye_calib.formats.trajectory_files.reading import read_trajectories
-
-        first, second = read_trajectories(first, second)
+    if progress is not None and not callable(progress):
+        raise InputError(f"progress must be a function; got {type(progress).__name__}")
+    if checks is not None:
+        require_type("checks", checks, bool)
+    first, second = _both(parent, child, {"parent": parent_topic, "child": child_topic})
     values |= prior_fields({} if prior is None else prior)
     given = {
         option_name(field): values[field.name]
@@ -120,6 +132,52 @@ def calibrate(
     }
     result = run(whole_snapshot(first, second, given), checks=checks, progress=progress)
     return replace(result.calibration, recording=result.snapshot)
+
+
+def _both(
+    parent: TrajectoryLike, child: TrajectoryLike | None, topics: Mapping[str, str | None]
+) -> Sequence[Trajectory]:
+    """Return the trajectories of both sensors, from what can be read as one, or from a bag."""
+    if child is None:
+        return _both_of_bag(path_of("a bag without a child", parent), topics)
+    for stream, topic in topics.items():
+        if topic is not None:
+            raise ConfigError(f"{stream}_topic chooses a topic of a bag; give the bag alone")
+    if isinstance(parent, Trajectory) and isinstance(child, Trajectory):
+        return parent, child
+    from hand_eye_calib.formats.trajectory_files.reading import read_trajectories
+
+    return read_trajectories(parent, child)
+
+
+def _both_of_bag(path: Path, topics: Mapping[str, str | None]) -> Sequence[Trajectory]:
+    """Return the trajectories of both streams of a bag; notes become warnings."""
+    from hand_eye_calib.formats.bags.reader import PoseBag
+    from hand_eye_calib.formats.bags.sources import source_of
+
+    named = {}
+    for stream, topic in topics.items():
+        if topic is not None:
+            require_type(f"{stream}_topic", topic, str)
+            named[stream] = source_of(topic)
+    trajectories = []
+    notes: list[str] = []
+    with PoseBag(path) as bag:
+        try:
+            sources = bag.select(named.get("parent"), named.get("child"))
+        except UnclearStreamsError as error:
+            options = ", ".join(f"{name}={topic!r}" for name, topic in error.options.items())
+            raise InputError(f"{error}. Set {options}" if options else str(error)) from None
+        if len(named) < len(sources):
+            notes.append(f"parent is {sources[0]}, child is {sources[1]}")
+        for source in sources:
+            trajectory, repairs = bag.trajectory(source)
+            trajectories.append(trajectory)
+            notes += repairs
+        notes += bag.warnings
+    for text in notes:
+        warnings.warn(text, UserWarning, stacklevel=4)
+    return trajectories
 
 
 def _options_in_words() -> str:
@@ -207,6 +265,11 @@ def cross_check(
     >>> list(scatter)
     ['x', 'y', 'z', 'roll', 'pitch', 'yaw']
     """
+    require_type("calibration", calibration, Calibration)
+    require_type("parent", parent, Trajectory)
+    require_type("child", child, Trajectory)
+    if config is not None:
+        require_type("config", config, CalibratorConfig)
     snapshot = whole_snapshot(parent, child, {"method": calibration.method})
     config = config or snapshot.config
     config.require_poses("a cross-check")

@@ -20,6 +20,8 @@ from hand_eye_calib.core.solvers.all_pairs import pair_costs
 from hand_eye_calib.core.solvers.registry import Method
 from hand_eye_calib.offline.calibrate import prior_fields
 
+# Keywords of calibrate that are no options of the engine.
+OWN_KEYWORDS = ("parent_topic", "child_topic", "prior", "progress", "checks")
 PRIOR_FIELDS = {f"prior_{axis}" for axis in AXIS_UNITS}
 
 
@@ -37,7 +39,7 @@ class TestOptionsOfCalibrate:
         fields = {field.name: field for field in dataclasses.fields(CalibratorConfig)}
         assert set(fields) >= PRIOR_FIELDS
         keywords = self.keywords()
-        assert set(keywords) == set(fields) - PRIOR_FIELDS | {"prior", "progress", "checks"}
+        assert set(keywords) == set(fields) - PRIOR_FIELDS | {*OWN_KEYWORDS}
         assert {keyword.default for keyword in keywords.values()} == {None}
         for name in fields.keys() - PRIOR_FIELDS:
             meta = fields[name].metadata
@@ -71,7 +73,7 @@ class TestOptionsOfCalibrate:
         numbers_given |= dict(parent_frame="lidar", child_frame="camera")
         for stream in ("parent", "child"):
             numbers_given |= {f"{stream}_quaternion": "wxyz", f"{stream}_kind": "exact"}
-        assert set(numbers_given) | {"prior", "progress", "checks"} == set(self.keywords())
+        assert set(numbers_given) | {*OWN_KEYWORDS} == set(self.keywords())
         hec.calibrate(*streams(), **numbers_given, prior={"z": (1.85, 0.02)})
         (config,) = seen
         assert {name: getattr(config, name) for name in numbers_given} == numbers_given
@@ -249,3 +251,118 @@ def test_numbers_that_no_option_can_have_are_refused_in_one_line(name, value):
 def test_a_prior_of_another_form_is_refused_with_an_example(prior):
     with pytest.raises(ConfigError, match="prior"):
         hec.calibrate(*streams(), prior=prior)
+
+
+# ---- wrong arguments, each answered in one line
+
+PARENT = hec.read_trajectory("sample:lidar.tum")
+CHILD = hec.read_trajectory("sample:camera.tum")
+
+
+@pytest.fixture(scope="module")
+def solved():
+    return hec.calibrate(PARENT, CHILD, method="dnlo", checks=False)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda _: hec.calibrate(3, CHILD), "expected a path, an array"),
+        (lambda _: hec.calibrate(PARENT), "a bag without a child must be of type str or PathLike"),
+        (lambda _: hec.calibrate("absent"), "no bag at absent"),
+        (lambda _: hec.calibrate(PARENT, "absent.tum"), "cannot read absent.tum"),
+        (lambda _: hec.calibrate(PARENT, CHILD, parent_topic="/a"), "give the bag alone"),
+        (
+            lambda _: hec.calibrate("sample:drive.mcap", parent_topic=3),
+            "must be of type str; got int",
+        ),
+        (lambda _: hec.calibrate("sample:drive.mcap", parent_topic="/x"), "no topic /x in "),
+        (
+            lambda _: hec.calibrate(PARENT, CHILD, progress=3),
+            "progress must be a function; got int",
+        ),
+        (
+            lambda _: hec.calibrate(PARENT, CHILD, checks="no"),
+            "checks must be of type bool; got str",
+        ),
+        (lambda _: hec.calibrate(PARENT, CHILD, max_gap=[1]), "max_gap must be a number; got [1]"),
+        (lambda _: hec.save(3, "out"), "the result must be of type Calibration; got int"),
+        (lambda result: hec.save(result, 3), "directory must be of type str or PathLike; got int"),
+        (lambda _: hec.load(None), "path must be of type str or PathLike; got NoneType"),
+        (lambda _: hec.plot(3), "the result must be of type Calibration; got int"),
+        (lambda result: hec.plot(result, 3), "ax must be three axes of Matplotlib; got int"),
+        (lambda result: result.report(3), "path must be of type str or PathLike; got int"),
+        (lambda _: hec.compare(3, 4), "results must be of type Sequence; got int"),
+        (lambda _: hec.compare([3]), "each result must be of type Calibration; got int"),
+        (
+            lambda result: hec.compare([result], "robot.urdf"),
+            "installed must be of type Calibration",
+        ),
+        (
+            lambda result: hec.cross_check(result, 3, CHILD),
+            "parent must be of type Trajectory; got",
+        ),
+        (lambda _: hec.calibrate_many(3), "recordings must be of type Iterable; got int"),
+        (lambda _: hec.calibrate_together(3), "recordings must be of type Iterable; got int"),
+        (lambda _: hec.calibrate_rig(3), "trajectories must be of type Mapping; got int"),
+        (
+            lambda _: hec.calibrate_rig({"a": 1}),
+            "each trajectory must be of type Trajectory; got int",
+        ),
+        (lambda _: hec.calibrate_stops(3, 4), "parent: expected poses as (N, 4, 4)"),
+        (lambda _: hec.read_arm_samples(3), "path must be of type str or PathLike; got int"),
+        (lambda _: hec.robot_poses(np.zeros((3, 6)), 3), "the robot must be one of abb, fanuc"),
+        (lambda _: hec.simulate("x"), "seed must be of type Integral; got str"),
+        (lambda _: hec.Trajectory([1, 2], "x"), "poses must be numbers; got str"),
+        (
+            lambda _: hec.Trajectory([0.5], np.eye(4)[None]),
+            "stamps_ns must be one-dimensional integ",
+        ),
+        (
+            lambda _: hec.Trajectory.from_positions([1], 4),
+            "positions must be numbers of shape (N, 3)",
+        ),
+        (lambda _: hec.Trajectory.from_rates([1], 4), "rates must be numbers of shape (N, 3)"),
+        (lambda _: PARENT.shifted("x"), "offset_s must be of type Real; got str"),
+        (lambda _: PARENT.scaled(None), "scale must be of type Real; got NoneType"),
+        (lambda _: hec.write_trajectory(PARENT, "x.tum"), "path must be of type str or PathLike"),
+        (
+            lambda _: hec.write_trajectory("x.tum", 3),
+            "trajectory must be of type Trajectory; got int",
+        ),
+        (lambda _: hec.read_trajectory(3), "expected a path, an array"),
+        (lambda _: hec.Calibration.from_dict(3), "expected format hand_eye_calib/extrinsic"),
+        (lambda result: result.export("kalbr"), "unknown format 'kalbr'; known are"),
+    ],
+)
+def test_a_wrong_argument_is_answered_in_one_line(solved, call, message):
+    with pytest.raises(hec.HandEyeCalibError) as caught:
+        call(solved)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_bag_is_calibrated_by_its_topics():
+    topics = {"parent_topic": "/lidar/odometry", "child_topic": "/camera/odometry"}
+    named = hec.calibrate("sample:drive.mcap", checks=False, **topics)
+    with pytest.warns(UserWarning, match="parent is /lidar/odometry, child is /camera/odometry"):
+        chosen = hec.calibrate("sample:drive.mcap", checks=False)
+    assert named == chosen
+    assert (named.parent_frame, named.child_frame) == ("lidar", "camera")
+
+
+def test_a_notebook_gets_six_numbers_in_degrees_and_three_views(solved):
+    html = solved._repr_html_()
+    x, y, z = solved.translation
+    roll, *_ = solved.rotation.as_euler("xyz", degrees=True)
+    for number in (f"{x:.4f} ± ", f"{y:.4f} ± ", f"{z:.4f} ± ", f"{roll:.2f} ± "):
+        assert number in html
+    assert solved.headline in html
+    assert html.count("<svg") == 1
+    for view in ("from above", "from the side", "from the front"):
+        assert view in html
+    assert "measured, " in html
+
+
+def test_a_printed_result_has_one_sigma(solved):
+    assert f"x {solved.translation[0]:.6g} +/- {solved.sigmas[0]:.2g}, " in repr(solved)

@@ -10,7 +10,7 @@ from hand_eye_calib.core.assessment.agreement import Agreement, agreement_of
 from hand_eye_calib.core.assessment.change import UNKNOWN, Change, moved
 from hand_eye_calib.core.assessment.moved import scatter_of_recordings
 from hand_eye_calib.core.base.arrays import FloatArray
-from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.base.errors import InputError, require_type
 from hand_eye_calib.core.base.text import listing
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import Extrinsic
@@ -57,6 +57,11 @@ def compare(
     >>> hec.compare([result], installed=result).verdict
     'same'
     """
+    require_type("results", results, Sequence)
+    for result in results:
+        require_type("each result", result, Calibration)
+    if installed is not None:
+        require_type("installed", installed, Calibration, Extrinsic)
     by_name = _by_name(results, names)
     require_same_frames(each for each in (*results, installed) if isinstance(each, Calibration))
     couples: list[tuple[_Named, tuple[str, Calibration]]] = [*combinations(by_name.items(), 2)]

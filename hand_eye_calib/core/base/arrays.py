@@ -1,10 +1,28 @@
-"""Names for the kinds of NumPy arrays, for annotations; docstrings give their shapes."""
+"""Names for the kinds of NumPy arrays, for annotations, and the check of an argument."""
 
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from hand_eye_calib.core.base.errors import InputError
 
 FloatArray: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
+
+
+def floats(name: str, values: ArrayLike, columns: int = 0) -> FloatArray:
+    """Return an argument of the Python interface as an array of numbers; (N, columns) if not 0.
+
+    Raises
+    ------
+    InputError
+        If the argument is no array of numbers, or has another shape.
+    """
+    try:
+        array = np.asarray(values, dtype=float)
+        return array.reshape(-1, columns) if columns else array
+    except (TypeError, ValueError):
+        shape = f" of shape (N, {columns})" if columns else ""
+        raise InputError(f"{name} must be numbers{shape}; got {type(values).__name__}") from None

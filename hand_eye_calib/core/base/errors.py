@@ -74,6 +74,13 @@ class MissingDependencyError(HandEyeCalibError, ImportError):
     """An optional package that this request needs is not installed."""
 
 
+def require_type(name: str, value: object, *kinds: type) -> None:
+    """Raise InputError if an argument of the Python interface is of none of these types."""
+    if not isinstance(value, kinds):
+        expected = " or ".join(kind.__name__ for kind in kinds)
+        raise InputError(f"{name} must be of type {expected}; got {type(value).__name__}")
+
+
 @contextmanager
 def located(where: object) -> Iterator[None]:
     """Prepend a place, such as a path, to the messages of errors that the block raises."""

@@ -11,6 +11,7 @@ the formula is the geodesic of SE(3) of Välimäki et al. 2023.
 
 from dataclasses import dataclass, fields
 from functools import cached_property
+from numbers import Real
 from os import PathLike
 from typing import Any, ClassVar, Protocol, Self, TypeAlias
 
@@ -18,8 +19,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
-from hand_eye_calib.core.base.arrays import FloatArray, IntArray
-from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.base.arrays import FloatArray, IntArray, floats
+from hand_eye_calib.core.base.errors import InputError, require_type
 from hand_eye_calib.core.base.registry import MEASURES
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.geometry import se3
@@ -165,7 +166,7 @@ class Trajectory(Columns):
 
     def __post_init__(self) -> None:
         stamps_ns = np.ascontiguousarray(self.stamps_ns)
-        poses = np.ascontiguousarray(self.poses, dtype=float)
+        poses = np.ascontiguousarray(floats("poses", self.poses))
         if stamps_ns.ndim != 1 or not np.issubdtype(stamps_ns.dtype, np.integer):
             raise InputError(
                 "stamps_ns must be one-dimensional integers (nanoseconds); "
@@ -208,8 +209,8 @@ class Trajectory(Columns):
         InputError
             If a value is not finite or a quaternion is more than 1 % away from unit length.
         """
-        translations = np.asarray(translations, dtype=float).reshape(-1, 3)
-        quats_xyzw = np.asarray(quats_xyzw, dtype=float).reshape(-1, 4)
+        translations = floats("translations", translations, 3)
+        quats_xyzw = floats("quats_xyzw", quats_xyzw, 4)
         _check_finite("pose", np.concatenate([translations, quats_xyzw], axis=1))
         norms = np.linalg.norm(quats_xyzw, axis=1)
         wrong = np.abs(norms - 1.0) > QUATERNION_NORM_TOLERANCE
@@ -235,7 +236,7 @@ class Trajectory(Columns):
 
         Examples are the antenna of a GNSS receiver and the prism of a total station.
         """
-        poses = se3.from_rotation_translation(np.eye(3), np.reshape(positions, (-1, 3)))
+        poses = se3.from_rotation_translation(np.eye(3), floats("positions", positions, 3))
         return cls(stamps_ns, poses, sensor_frame, world_frame, "positions")
 
     @classmethod
@@ -247,7 +248,7 @@ class Trajectory(Columns):
         InputError
             If a rate is not finite or the stamps do not increase.
         """
-        rates = np.asarray(rates, dtype=float).reshape(-1, 3)
+        rates = floats("rates", rates, 3)
         _check_finite("rate", rates)
         from hand_eye_calib.core.geometry.rates import RateIntegrator
 
@@ -299,6 +300,7 @@ class Trajectory(Columns):
         InputError
             If a stamp would not fit 64 bits.
         """
+        require_type("offset_s", offset_s, Real)
         if not len(self) or not (offset_s or rate):
             return self
         offset_ns = round(offset_s * 1e9)
@@ -317,6 +319,7 @@ class Trajectory(Columns):
 
     def scaled(self, scale: float) -> Self:
         """Return the same rotations with every translation multiplied by ``scale``."""
+        require_type("scale", scale, Real)
         if scale == 1.0:
             return self
         poses = self.poses.copy()

@@ -4,12 +4,13 @@ import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from hand_eye_calib.core.base.errors import required
+from hand_eye_calib.core.base.errors import require_type, required
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.registry import RESULT_METHODS
 from hand_eye_calib.core.base.text import AXIS_UNITS
@@ -141,6 +142,11 @@ class Calibration(Judged):
         """Draw the result: a figure of Matplotlib; see :func:`hand_eye_calib.plot`."""
         return RESULT_METHODS["plot"](self, ax)
 
+    def _repr_html_(self) -> str:
+        """Return verdict, numbers and the three views, for notebooks."""
+        html: str = RESULT_METHODS["html"](self)
+        return html
+
     def report(self, path: str | Path) -> Path:
         """Write the report as one HTML file; a directory gets ``report.html``.
 
@@ -151,6 +157,7 @@ class Calibration(Judged):
             If the report cannot be written.
         """
         self.residuals()
+        require_type("path", path, str, PathLike)
         path = Path(path, "report.html") if Path(path).is_dir() else Path(path)
         return RESULT_METHODS["report"](self, path)
 

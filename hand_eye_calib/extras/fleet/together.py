@@ -16,7 +16,7 @@ from hand_eye_calib.core.assessment.comparison import (
     require_same_frames,
 )
 from hand_eye_calib.core.assessment.covariance import Assessment, combined
-from hand_eye_calib.core.base.errors import HandEyeCalibError, InputError, located
+from hand_eye_calib.core.base.errors import HandEyeCalibError, InputError, located, require_type
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.text import listing
 from hand_eye_calib.core.geometry import se3
@@ -146,6 +146,7 @@ def _named(recordings: _Recordings, names: Sequence[str] | None) -> Iterable[tup
     if isinstance(recordings, Mapping):
         names = [*recordings]
         recordings = recordings.values()
+    require_type("recordings", recordings, Iterable)
     pairs = [*recordings]
     if not all(isinstance(pair, Sequence) and len(pair) == 2 for pair in pairs):
         raise InputError("each recording must be a pair of parent and child: [(parent, child)]")

@@ -16,7 +16,7 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
-from hand_eye_calib.core.base.errors import ConfigError, InputError
+from hand_eye_calib.core.base.errors import ConfigError, InputError, require_type
 from hand_eye_calib.core.base.plain import Document, plain
 from hand_eye_calib.core.base.stats import CHI2
 from hand_eye_calib.core.base.text import angle, frame_name, length, listing
@@ -115,6 +115,9 @@ def _between(before: Trajectory, after: Trajectory, method: str, max_gap_s: floa
 
 def _require_rig(trajectories: Mapping[str, Trajectory], options: Mapping[str, Any]) -> None:
     """Raise InputError or ConfigError if a rig cannot have these trajectories or options."""
+    require_type("trajectories", trajectories, Mapping)
+    for trajectory in trajectories.values():
+        require_type("each trajectory", trajectory, Trajectory)
     if len(trajectories) < 3:
         raise InputError(
             f"a rig needs at least three sensors; found {len(trajectories)}: "

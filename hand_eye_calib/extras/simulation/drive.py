@@ -7,11 +7,13 @@ last until the end, and only the child sensor drifts.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from numbers import Integral
 from typing import Literal
 
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.errors import require_type
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory, WithArrays
 from hand_eye_calib.extras.simulation import options
@@ -91,6 +93,7 @@ def simulate(
     config = options.HILLY_DRIVE if drive == "hilly" else options.PUBLISHED_DRIVE
     config = replace(config, poses=poses, parent_frame="lidar", child_frame="camera")
     noise = replace(options.REALISTIC, gaussian=gaussian, outliers=outliers, drift=drift)
+    require_type("seed", seed, Integral)
     return simulate_drive(seed, config, noise)
 
 

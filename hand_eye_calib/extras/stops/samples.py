@@ -24,7 +24,7 @@ from hand_eye_calib.core.base.errors import InputError, located
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import numbers_of, pose_of, pose_stack
 from hand_eye_calib.extras.stops.pose_files import read_pose_folder
-from hand_eye_calib.formats.files import LONGEST_NAME, local_path
+from hand_eye_calib.formats.files import LONGEST_NAME, path_of
 from hand_eye_calib.formats.npz import read_arrays
 from hand_eye_calib.formats.yaml_files import read_yaml
 
@@ -117,7 +117,7 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     >>> hec.read_arm_samples("samples.yaml").robot.shape
     (40, 4, 4)
     """
-    path = local_path(path)
+    path = path_of("path", path)
     if path.is_dir():
         robot, tracking = read_pose_folder(path)
         return ArmSamples(robot, tracking, {})

@@ -17,11 +17,11 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.base.config import STAMP_UNITS
-from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.base.errors import InputError, require_type
 from hand_eye_calib.core.base.text import shortened, shown_value
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import ROTATION_TOLERANCE, Trajectory
-from hand_eye_calib.formats.files import LONGEST_NAME, write_atomically, writing
+from hand_eye_calib.formats.files import LONGEST_NAME, path_of, write_atomically, writing
 from hand_eye_calib.formats.trajectory_files.cells import angle, is_null, number
 from hand_eye_calib.formats.trajectory_files.columns import (
     MATRIX,
@@ -468,12 +468,14 @@ def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:
     --------
     >>> hec.write_trajectory("moved.tum", child.shifted(result.time_offset_s))
     """
+    path = path_of("path", path)
+    require_type("trajectory", trajectory, Trajectory)
     stamps_ns = trajectory.stamps_ns.tolist()
     poses = se3.to_rows(trajectory.poses).tolist()
     lines = map(tum_line, stamps_ns, poses)
     text = "\n".join([f"# {TUM_COLUMNS}", *lines, ""])
     with writing(path):
-        write_atomically({Path(path): text})
+        write_atomically({path: text})
 
 
 def tum_line(stamp_ns: int, pose: Iterable[float]) -> str:

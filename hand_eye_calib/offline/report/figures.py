@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.core.base.errors import printable
+from hand_eye_calib.core.base.errors import InputError, printable, require_type
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.text import amount, angle, length, listing, share
 from hand_eye_calib.core.geometry import se3
@@ -433,7 +433,10 @@ def plot(calibration: Calibration, ax: Any = None) -> Figure:
     --------
     >>> hec.plot(result).savefig("result.png")
     """
+    require_type("the result", calibration, Calibration)
     if ax is not None:
+        if np.size(ax) != len(_VIEWS):
+            raise InputError(f"ax must be three axes of Matplotlib; got {type(ax).__name__}")
         draw_views(ax, calibration)
         return ax[0].figure
     with page_style(figure_facecolor="white", savefig_facecolor="white"):

@@ -31,7 +31,7 @@ from hand_eye_calib.core.results.document import (
 from hand_eye_calib.core.results.records import ROTATIONS
 from hand_eye_calib.core.results.verdict import shown, target_of
 from hand_eye_calib.offline.report.evidence import Evidence, gather, summarise
-from hand_eye_calib.offline.report.figures import LOOK, figures_of
+from hand_eye_calib.offline.report.figures import LOOK, figure_of_views, figures_of
 
 MARKS = {"good": "✓", "warn": "!", "bad": "✗"}
 TONES = {
@@ -154,6 +154,18 @@ def render(
         figures=figures_of(calibration, evidence),
         shown_first=_SHOWN_FIRST,
         **_data(calibration, snapshot, evidence, inputs),
+    )
+
+
+def render_brief(calibration: Calibration) -> str:
+    """Return verdict, numbers and the three views of a result as HTML for a notebook."""
+    transform = transforms_of(calibration)["T_parent_child"]
+    return _template(_FOLDER / "brief.html").render(
+        calibration=calibration,
+        numbers=printed_numbers(transform, calibration.out_of_reach, "±"),
+        parts=parts_of_sigmas(transform),
+        allowance=allowance_in_words(calibration),
+        views=figure_of_views([calibration]),
     )
 
 
