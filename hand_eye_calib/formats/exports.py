@@ -16,12 +16,14 @@ import numpy as np
 import yaml
 
 from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.config import ROBOT_FORMATS
 from hand_eye_calib.core.base.errors import ConfigError, InputError, printable
 from hand_eye_calib.core.base.text import axes_in_words
 from hand_eye_calib.core.base.version import version_of
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.core.results.verdict import Judged, Verdict
+from hand_eye_calib.formats.results import launch_text, xacro_text
 
 # Beginnings of words in a frame's name, by the kind of sensor. The kinds are in the order of their
 # distance from the body: if the names state nothing, the parent is nearer than the child.
@@ -146,10 +148,15 @@ def export_text(result: Judged, name: str) -> str:
     InputError
         If the result is not usable, or an axis that the format needs is not determined.
     """
-    if name not in formats():
-        raise ConfigError(f"unknown format {name!r}; known are {', '.join(formats())}")
+    if name not in (*formats(), *ROBOT_FORMATS):
+        known = ", ".join([*formats(), *ROBOT_FORMATS])
+        raise ConfigError(f"unknown format {name!r}; known are {known}")
     if result.verdict is Verdict.DO_NOT_USE:
         raise InputError(f"nothing is written: {result.headline}")
+    if name == "urdf":
+        return xacro_text(result)
+    if name == "launch":
+        return launch_text([result])
     frames = (result.parent_frame, result.child_frame)
     T = result.T_parent_child
     arrangement = arranged(formats()[name], *frames)

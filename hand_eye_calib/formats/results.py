@@ -19,6 +19,7 @@ from hand_eye_calib.core.base.version import version_of
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
 from hand_eye_calib.core.results.document import transform_arguments, usable_angles, usable_numbers
 from hand_eye_calib.core.results.records import ROTATIONS, TRANSLATIONS
+from hand_eye_calib.core.results.verdict import Judged
 from hand_eye_calib.formats.files import (
     open_regular,
     path_of,
@@ -73,8 +74,8 @@ def save_result(
     directory = path_of("directory", directory)
     is_usable = calibration.verdict is not Verdict.DO_NOT_USE
     texts = {
-        XACRO_NAME: _xacro_text(calibration) if is_usable else None,
-        LAUNCH_NAME: _launch_text([calibration]) if is_usable else None,
+        XACRO_NAME: xacro_text(calibration) if is_usable else None,
+        LAUNCH_NAME: launch_text([calibration]) if is_usable else None,
         FILE_NAME: _yaml_text(calibration.to_dict(), inputs),
     }
     return _written(directory, texts)
@@ -102,7 +103,7 @@ def save_rig(
     usable = [
         calibration for calibration in calibrations if calibration.verdict is not Verdict.DO_NOT_USE
     ]
-    launch = _launch_text(usable) if usable else None
+    launch = launch_text(usable) if usable else None
     texts = {LAUNCH_NAME: launch, RIG_NAME: _yaml_text(document, inputs)}
     return _written(Path(directory), texts)
 
@@ -234,7 +235,7 @@ def load_result(path: str | Path) -> Calibration:
         return Calibration.from_dict(document)
 
 
-def _xacro_text(calibration: Calibration) -> str:
+def xacro_text(calibration: Judged) -> str:
     """Return a fixed joint from the parent's to the child's link, for a robot description."""
     parent = calibration.mounting[0]
     child = calibration.child_frame
@@ -255,7 +256,7 @@ def _quoted(text: str) -> str:
     return quoteattr(printable(text).replace("$", "$$"))
 
 
-def _launch_text(calibrations: Sequence[Calibration]) -> str:
+def launch_text(calibrations: Sequence[Judged]) -> str:
     """Return a launch file that publishes extrinsics as static transforms."""
     comments = []
     transforms = []
@@ -272,7 +273,7 @@ def _template(name: str) -> str:
     return Path(__file__).with_name("templates").joinpath(f"{name}.in").read_text("utf-8")
 
 
-def _remarks(calibration: Calibration) -> list[str]:
+def _remarks(calibration: Judged) -> list[str]:
     """Return lines for the user who opens the file: verdict, direction and origin."""
     parent = calibration.mounting[0]
     child = calibration.child_frame

@@ -6,7 +6,7 @@ import shutil
 import pytest
 
 import hand_eye_calib as hec
-from hand_eye_calib.core.base.config import EXPORT_FORMATS
+from hand_eye_calib.core.base.config import EXPORT_FORMATS, ROBOT_FORMATS
 from hand_eye_calib.formats.files import local_path
 
 
@@ -60,11 +60,19 @@ def test_batch_is_calibrate_batch(run, tmp_path):
     assert run("calibrate", "--batch", folder, *rest)[:2] == (code, out)
 
 
-@pytest.mark.parametrize("name", EXPORT_FORMATS)
+@pytest.mark.parametrize("name", [*EXPORT_FORMATS, *ROBOT_FORMATS])
 def test_export_is_info_as_format(run, saved, name):
     file = run("export", saved, name)
     assert file == run("info", saved, "--as", name)
     assert file[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [("urdf", "extrinsic.urdf.xacro"), ("launch", "static_transform.launch.py")],
+)
+def test_files_of_a_robot_are_exported_as_they_are_saved(run, saved, name, file):
+    assert run("export", saved, name)[1] == (saved.parent / file).read_text()
 
 
 @pytest.mark.parametrize(

@@ -208,7 +208,10 @@ def test_first_command_of_the_readme_prints_its_output(capsys):
     ]
     (output,) = re.findall(r"```text\n(.*?)```", PAGES["README.md"], re.DOTALL)
     assert main(list(command)) == 0
-    assert capsys.readouterr().out.startswith(output)
+    printed = capsys.readouterr().out
+    # The measured parts, less than a tenth of the allowance, change with each noise model.
+    measured = re.compile(r"\([\d.]+ (?=\w+ measured)")
+    assert measured.sub("(", printed).startswith(measured.sub("(", output))
 
 
 def test_commands_of_the_readme_on_samples_run(tmp_path, monkeypatch, no_figures):

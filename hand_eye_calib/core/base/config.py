@@ -21,6 +21,8 @@ EXPORT_FORMATS = (
     *("apollo", "dlio", "glim", "msa", "px4", "kitti", "nuscenes", "colmap", "driveworks"),
     *("easy_handeye2", "opencv", "numpy"),
 )
+#: Files of a robot description and of a launch, beside the formats of other programs.
+ROBOT_FORMATS = ("urdf", "launch")
 PAIR_BY = ("time", "row", "name")
 STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 POSE_TYPES = (

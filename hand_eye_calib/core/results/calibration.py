@@ -181,7 +181,8 @@ class Calibration(Judged):
         format : str
             "autoware", "fast_lio", "fast_livo2", "lio_sam", "kalibr", "openvins", "vins",
             "orbslam3", "apollo", "dlio", "glim", "msa", "px4", "kitti", "nuscenes", "colmap",
-            "driveworks", "easy_handeye2", "opencv" or "numpy". docs/exports.md describes them.
+            "driveworks", "easy_handeye2", "opencv", "numpy", "urdf" or "launch".
+            docs/exports.md describes them.
 
         Returns
         -------

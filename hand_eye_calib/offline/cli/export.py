@@ -2,7 +2,9 @@
 
 import argparse
 
-from hand_eye_calib.core.base.config import EXPORT_FORMATS
+from hand_eye_calib.core.base.config import EXPORT_FORMATS, ROBOT_FORMATS
+
+_FORMATS = (*ROBOT_FORMATS, *EXPORT_FORMATS)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -14,8 +16,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     result = "extrinsic.yaml, or the directory that contains it"
     parser.add_argument("result", metavar="RESULT", help=result)
-    formats = f"one of {', '.join(EXPORT_FORMATS)}"
-    parser.add_argument("format", metavar="FORMAT", choices=EXPORT_FORMATS, help=formats)
+    formats = f"one of {', '.join(_FORMATS)}"
+    parser.add_argument("format", metavar="FORMAT", choices=_FORMATS, help=formats)
 
 
 def run(arguments: argparse.Namespace) -> int:

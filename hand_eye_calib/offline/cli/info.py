@@ -2,8 +2,10 @@
 
 import argparse
 
-from hand_eye_calib.core.base.config import EXPORT_FORMATS
+from hand_eye_calib.core.base.config import EXPORT_FORMATS, ROBOT_FORMATS
 from hand_eye_calib.offline.cli.options import add_json_argument, print_result
+
+_FORMATS = (*ROBOT_FORMATS, *EXPORT_FORMATS)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -15,10 +17,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     result = "extrinsic.yaml, or the directory that contains it"
     parser.add_argument("result", metavar="RESULT", help=result)
-    formats = f"print it as the file of another program instead: {', '.join(EXPORT_FORMATS)}"
-    parser.add_argument(
-        "--as", dest="format", choices=EXPORT_FORMATS, metavar="FORMAT", help=formats
-    )
+    formats = f"print it as the file of another program instead: {', '.join(_FORMATS)}"
+    parser.add_argument("--as", dest="format", choices=_FORMATS, metavar="FORMAT", help=formats)
     add_json_argument(parser, or_verbose=True)
 
 
