@@ -129,6 +129,25 @@ def test_the_rotation_that_was_seen_does_not_fall_while_driving(cycle):
         assert rotation_deg == pytest.approx({"x": 0.0, "y": 9.0, "z": 179.0})
 
 
+@pytest.mark.parametrize(
+    ("motion_s", "rotation_deg", "has_result"),
+    [(19.0, 29.0, False), (20.0, 1.0, True), (3.0, 30.0, True)],
+)
+def test_a_first_result_takes_20_s_of_motion_or_a_rotation_of_30_deg(
+    cycle, motion_s, rotation_deg, has_result
+):
+    motion = seen(motion_s, (0.0, 0.0, rotation_deg))
+    good, text = cycle.conclude(Answer(0, 0.1, motion, result()))
+    assert good == has_result
+    assert (cycle.published is not None) == has_result
+    if not has_result:
+        assert text == (
+            "Move the sensors: a first result takes 20 s of motion or a rotation of 30 deg, "
+            "so far 19 s and 29 deg."
+        )
+        assert cycle.goal.progress.sentence == text
+
+
 def test_a_solve_that_fails_says_so_and_changes_nothing(cycle):
     reach_goal(cycle)
     before = cycle.result

@@ -46,6 +46,10 @@ OnSolved: TypeAlias = Callable[[bool, str], None]
 # Least time between two stream checks (s). A check takes one or two seconds.
 _CHECK_PERIOD_S = 30.0
 
+# Least motion (s) or rotation (rad) of a result. Before, estimates and advice jump.
+_LEAST_MOTION_S = 20.0
+_LEAST_ROTATION_RAD = float(np.radians(30.0))
+
 # Options that change the verdict on a result, but not the result.
 _TARGETS = ("target_translation", "target_rotation", "target_axes")
 
@@ -265,24 +269,18 @@ class SolveCycle:
             return False, "the session was reset during the solve: the result is dropped"
         # Pause for the duration of the solve, so that half of the processor time stays free.
         self._rest_until_s = time.monotonic() + answer.seconds
-        # Keep the largest rotation so far: the measured rotation can decrease with more poses.
-        rotation = np.maximum(self._motion.rotation, answer.motion.rotation)
-        self._motion = replace(answer.motion, rotation=rotation)
-        self._newest_motion = answer.newest_motion
-        self._session.calibrator.adopt(answer.time_offset)
-        if answer.options:
-            self._check_options = {**self._check_options, **answer.options}
-            self._option_warnings = answer.messages
-        if answer.check is not None:
-            self.checks.take(answer.check)
-        elif answer.is_checked:
-            self._check_due_s = 0.0
+        self._take_motion(answer)
+        self._take_check(answer)
+        is_early = self.result is None and _is_too_little(self._motion)
         self._failure = answer.failure
-        if answer.failure is not None:
-            text = self._report(answer.failure)
-            if answer.calibration is None:
+        if is_early and answer.failure is None:
+            self._failure = Failure(_too_little_in_words(self._motion), is_early=True)
+        if self._failure is not None:
+            text = self._report(self._failure)
+            if is_early or answer.calibration is None:
                 missing = what_is_missing(self._motion) if self._motion.n_poses else ""
-                self._keep_result(missing or answer.failure.what)
+                advice = self._failure.what if is_early else missing
+                self._keep_result(advice or self._failure.what)
                 return False, text
         assert answer.calibration is not None
         warnings = tuple(dict.fromkeys((*self._option_warnings, *answer.calibration.warnings)))
@@ -296,6 +294,24 @@ class SolveCycle:
             self._keep_result(f"No usable result: {newest.status.failure}.")
             return False, self._describe(newest)
         return self._take(self._complete(newest))
+
+    def _take_motion(self, answer: Answer) -> None:
+        """Store motion and clock offset of an answer."""
+        # Keep the largest rotation so far: the measured rotation can decrease with more poses.
+        rotation = np.maximum(self._motion.rotation, answer.motion.rotation)
+        self._motion = replace(answer.motion, rotation=rotation)
+        self._newest_motion = answer.newest_motion
+        self._session.calibrator.adopt(answer.time_offset)
+
+    def _take_check(self, answer: Answer) -> None:
+        """Store the stream check of an answer, and the options that the check has set."""
+        if answer.options:
+            self._check_options = {**self._check_options, **answer.options}
+            self._option_warnings = answer.messages
+        if answer.check is not None:
+            self.checks.take(answer.check)
+        elif answer.is_checked:
+            self._check_due_s = 0.0
 
     def _keep_result(self, advice: str) -> None:
         """Keep the result after a failed solve, and mark it as outdated.
@@ -511,6 +527,22 @@ def pause_of(inputs: Mapping[str, InputState], accepts_poses: bool) -> Condition
     streams = listing([f"{name} ({state.topic})" for name, state in paused.items()])
     longest_s = max(state.silent_s or 0.0 for state in paused.values())
     return level, f"Paused: no pose of {streams} for {duration(longest_s)}; {remedy}."
+
+
+def _is_too_little(motion: Excitation) -> bool:
+    """Whether the motion is too short for a result."""
+    has_rotated = motion.rotation.max() >= _LEAST_ROTATION_RAD
+    return bool(motion.motion_s < _LEAST_MOTION_S and not has_rotated)
+
+
+def _too_little_in_words(motion: Excitation) -> str:
+    """Return what a first result needs, and the motion so far."""
+    rotation_deg = np.degrees(motion.rotation.max())
+    return (
+        f"Move the sensors: a first result takes {_LEAST_MOTION_S:g} s of motion or a rotation of "
+        f"{np.degrees(_LEAST_ROTATION_RAD):.0f} deg, so far {motion.motion_s:.0f} s and "
+        f"{rotation_deg:.0f} deg."
+    )
 
 
 def _with_newest_halves(kept: Calibration, newest: Calibration) -> Calibration:
