@@ -22,14 +22,19 @@ RATE_HZ = 10.0
 
 
 @pytest.fixture
-def node(monkeypatch):
+def log_lines():
+    return []
+
+
+@pytest.fixture
+def node(monkeypatch, log_lines):
     """Both inputs of a session on a clock of its own, and the state that the node would publish."""
     nothing = SimpleNamespace(submit=lambda job: None, stop=lambda s: None, answers=list)
     monkeypatch.setattr(cycle_module, "SolvingProcess", lambda wake: nothing)
     now = [1000.0]
     monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
-    silent = dict.fromkeys(("debug", "info", "warning", "error"), lambda text: None)
-    log = NodeLog(SimpleNamespace(**silent))
+    write = dict.fromkeys(("debug", "info", "warning", "error"), log_lines.append)
+    log = NodeLog(SimpleNamespace(**write))
     session = LiveSession(log, CalibratorConfig())
     inputs = [
         PoseInput(name, f"/{name}_odom", session, log, lambda source: None)
@@ -170,6 +175,21 @@ def test_a_slow_stream_is_not_paused_between_its_poses(node):
     assert node.inputs[0].silent_s(node.now[0]) == pytest.approx(0.0)
     assert not node.inputs[0].is_paused(node.now[0] + 12.0)
     assert node.inputs[0].is_paused(node.now[0] + 21.0)
+
+
+def test_a_step_of_a_clock_is_named_and_a_gap_is_not(node, log_lines):
+    run(node, 20.0)
+    run(node, 3.0, senders=["parent"])
+    run(node, 2.0)
+    assert not [line for line in log_lines if "jump ahead" in line]
+    assert state_of(node).inputs["child"].text.endswith(" Hz, longest gap 3.1 s")
+    for _ in range(10):
+        node.now[0] += 0.1
+        stamp_ns = round((node.now[0] + 30.0) * 1e9)
+        node.inputs[1].accept(stamp_ns, lambda stamp_ns=stamp_ns: pose_at(stamp_ns))
+    (line,) = [line for line in log_lines if "jump ahead" in line]
+    assert line.startswith("/child_odom: the stamps jump ahead by 30.1")
+    assert state_of(node).inputs["child"].text.endswith("longest gap 30 s")
 
 
 def test_two_publishers_on_one_topic_are_a_warning_with_their_names(node):

@@ -19,7 +19,7 @@ from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.plain import from_plain, plain
 from hand_eye_calib.core.results import context
 from hand_eye_calib.core.results.context import Comparison, Difference
-from hand_eye_calib.online.live.progress import AxisProgress, Progress
+from hand_eye_calib.online.live.progress import AXIS_KEYS, AxisProgress, Progress
 from hand_eye_calib.online.live.state import (
     Broadcast,
     ChecksState,
@@ -59,7 +59,7 @@ BEHIND = AxisProgress(sigma=0.04, target=0.02, seconds_left=25.0)
 AT = Progress(
     sentence="Go on for about 25 s: z is behind.",
     limiting_axis="z",
-    axes=dict.fromkeys(AXES, ROTATION) | {"x": KNOWN, "y": KNOWN, "z": BEHIND},
+    axes=dict.fromkeys(AXIS_KEYS.values(), ROTATION) | {"x": KNOWN, "y": KNOWN, "z": BEHIND},
 )
 CHECKS = ChecksState(level=Level.OK, text="sound", age_s=3.0, findings=())
 MOUNT = MountState(level=Level.OK, text="it has not", seconds_of_motion=200)
@@ -274,7 +274,7 @@ def test_the_pose_has_the_angles_as_printed_with_their_own_standard_deviations()
 
 def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
     differs = context.AxisDifference(difference=0.031, sigma=0.004, visible=0.01, verdict="moved")
-    axes = dict.fromkeys(AXES, differs) | {"yaw": replace(differs, sigma=INF)}
+    axes = dict.fromkeys(AXIS_KEYS.values(), differs) | {"about_z": replace(differs, sigma=INF)}
     difference = Difference(first="a", second="b", verdict="moved", sentence="", axes=axes)
     difference = replace(difference, change="z by +3 cm +/- 4 mm")
     comparison = Comparison(
@@ -317,9 +317,9 @@ def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
             text="the mount has moved",
             since_ns=10**18,
             newest_ns=10**18 + 130 * 10**9,
-            visible_10min=dict.fromkeys(AXES, 0.004) | {"z": None},
-            shift={"yaw": 0.0175, "x": 0.001},
-            shift_sigma={"yaw": 0.001, "x": 0.001},
+            visible_10min=dict.fromkeys(AXIS_KEYS.values(), 0.004) | {"z": None},
+            shift={"about_z": 0.0175, "x": 0.001},
+            shift_sigma={"about_z": 0.001, "x": 0.001},
         )
     )
     lines = {line.name: (line.tone, line.text) for line in view.watched}
@@ -581,7 +581,7 @@ def test_the_address_is_drawn_as_a_code(monkeypatch):
     assert qr_code("http://x") == ""
     monkeypatch.undo()
     pytest.importorskip("segno", reason="segno is not installed: '.[qr]'")
-    assert len(qr_code("http://192.168.178.43:8765/?key=Ab3dE_-9").splitlines()) > 14
+    assert len(qr_code("http://192.168.178.43:8775/?key=Ab3dE_-9").splitlines()) > 14
 
 
 def test_a_port_in_use_is_said_in_one_line(server):

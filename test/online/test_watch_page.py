@@ -187,6 +187,15 @@ def test_a_phone_shakes_at_each_new_word_once_it_was_touched(page):
     assert page.get("#sound", "textContent") == "Sound: on"
 
 
+def test_a_phone_shakes_at_a_new_sentence_but_not_at_new_numbers(page):
+    page.browser.click("#sound")
+    page.show(replace(GO_ON, sentence="Go on for about 90 s: z takes longest."))
+    page.wait_for_count("vibrations", 1)
+    page.show(replace(GO_ON, sentence="Go on for about 2 min: z takes longest."))
+    page.show(replace(GO_ON, sentence="Confirming, 30 s: every axis is within its target."))
+    page.wait_for_count("vibrations", 2)
+
+
 def test_the_screen_stays_on_while_the_page_is_visible(page):
     page.wait_for_count("locks", 1)
     session_of_page = page.browser.session

@@ -38,6 +38,7 @@ from hand_eye_calib.core.geometry.se3 import sigmas_in_parent
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_between
 from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.online.live.log import NodeLog
+from hand_eye_calib.online.live.progress import AXIS_KEYS
 from hand_eye_calib.online.live.session import LiveSession
 from hand_eye_calib.online.live.state import Level, MountState, by_axis
 
@@ -518,8 +519,8 @@ class MountWatch:
             text=text,
             is_learning=monitor.is_learning,
             seconds_of_motion=monitor.seconds,
-            shift={axis: shift[axis].difference for axis in shift},
-            shift_sigma={axis: shift[axis].sigma for axis in shift},
+            shift={AXIS_KEYS[axis]: row.difference for axis, row in shift.items()},
+            shift_sigma={AXIS_KEYS[axis]: row.sigma for axis, row in shift.items()},
             visible_10min=by_axis(visible),
             since_ns=alarm.since_ns if alarm else None,
             newest_ns=self._last_ns,

@@ -22,6 +22,7 @@ from hand_eye_calib.core.results.context import Comparison
 from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.online.live.goal import Goal
 from hand_eye_calib.online.live.log import GOES_ON_S, ONCE_S, NodeLog
+from hand_eye_calib.online.live.progress import AXIS_KEYS
 from hand_eye_calib.online.live.session import LiveSession
 from hand_eye_calib.online.live.solving import NO_MOTION, Answer, Failure, Job, SolvingProcess
 from hand_eye_calib.online.live.state import (
@@ -36,7 +37,7 @@ from hand_eye_calib.online.live.state import (
     ProgressState,
     ResultState,
     Standing,
-    by_axis,
+    as_printed,
 )
 from hand_eye_calib.online.live.stream_checks import RAW_POSE_CODES, StreamChecks, merged
 
@@ -509,7 +510,7 @@ class SolveCycle:
     def _comparison(self, why_not: str) -> Comparison | None:
         """Return the comparison with the installed transform, or why there is none yet."""
         if self.result is not None and self.result.comparison is not None:
-            return self.result.comparison
+            return _with_axis_keys(self.result.comparison)
         return Comparison(sentence=f"not compared yet: {why_not}") if why_not else None
 
 
@@ -557,6 +558,15 @@ def _with_newest_halves(kept: Calibration, newest: Calibration) -> Calibration:
     return replace(kept, cross_check=rows)
 
 
+def _with_axis_keys(comparison: Comparison) -> Comparison:
+    """Return the comparison with its differences by ``AXIS_KEYS``."""
+    differences = []
+    for difference in comparison.differences:
+        axes = {AXIS_KEYS[axis]: row for axis, row in difference.axes.items()}
+        differences.append(replace(difference, axes=axes))
+    return replace(comparison, differences=tuple(differences))
+
+
 def is_refuted(result: Calibration) -> bool:
     """Whether the solve failed, or an error in the streams makes every axis unusable."""
     return bool(result.status.failure) or any(finding.makes_unusable for finding in result.findings)
@@ -578,8 +588,8 @@ def _state_of(result: Calibration, age_s: float) -> ResultState:
         verdict=result.verdict.value,
         status=result.status.value,
         reasons=tuple(f"{reason.sentence}: {reason.what_to_do}" for reason in result.reasons),
-        pose=by_axis(np.where(np.isfinite(sigmas), pose, np.nan)),
-        pose_sigma=by_axis(sigmas),
+        pose=as_printed(np.where(np.isfinite(sigmas), pose, np.nan)),
+        pose_sigma=as_printed(sigmas),
         warnings=result.warnings,
         n_poses=result.n_poses,
         time_offset_s=result.time_offset_s,

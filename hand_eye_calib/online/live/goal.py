@@ -21,7 +21,7 @@ from hand_eye_calib.core.base.text import amount, axes_in_words, duration
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.core.results.verdict import what_is_known
-from hand_eye_calib.online.live.progress import AxisProgress, Progress
+from hand_eye_calib.online.live.progress import AXIS_KEYS, AxisProgress, Progress
 
 # Share of the motion so far during which every result must be within the targets.
 _CONFIRMING_SHARE = 0.5
@@ -293,12 +293,12 @@ class Goal:
         reachable = np.where(is_too_small, 0.0, needs)
         limiting = int(np.argmax(reachable if reachable.max() > 1.0 else needs))
         axis = AXES[limiting]
-        row = progress.axes[axis]
+        row = progress.axes[AXIS_KEYS[axis]]
         if is_too_small[limiting]:
             return replace(
                 progress,
                 sentence=_too_small_in_words(axis, row.target, newest.allowance[limiting]),
-                limiting_axis=axis,
+                limiting_axis=AXIS_KEYS[axis],
                 will_not_get_there=True,
                 target_is_too_small=True,
             )
@@ -321,7 +321,7 @@ class Goal:
         return replace(
             progress,
             sentence=sentence,
-            limiting_axis=axis,
+            limiting_axis=AXIS_KEYS[axis],
             will_not_get_there=will_not_get_there,
         )
 
@@ -358,10 +358,11 @@ class Goal:
 
     def _by_axis(self, sigmas: FloatArray, left_s: Sequence[float]) -> dict[str, AxisProgress]:
         """Progress by axis from standard deviations (6,) and times left."""
-        columns = zip(AXES, sigmas.tolist(), self._targets.tolist(), left_s, strict=True)
+        keys = AXIS_KEYS.values()
+        columns = zip(keys, sigmas.tolist(), self._targets.tolist(), left_s, strict=True)
         return {
-            axis: AxisProgress(sigma=sigma, target=target, seconds_left=seconds)
-            for axis, sigma, target, seconds in columns
+            key: AxisProgress(sigma=sigma, target=target, seconds_left=seconds)
+            for key, sigma, target, seconds in columns
         }
 
     def _reason_to_stop(self, newest: Calibration) -> str:

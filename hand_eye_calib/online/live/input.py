@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from hand_eye_calib.core.base.config import STAMP_UNITS, CalibratorConfig
 from hand_eye_calib.core.base.errors import HandEyeCalibError, NoPoseError
-from hand_eye_calib.core.base.text import MUCH_NULL, listing, share
+from hand_eye_calib.core.base.text import MUCH_NULL, duration, listing, share
 from hand_eye_calib.core.engine.calibrator import StreamStatistics
 from hand_eye_calib.core.geometry.frames import check_not_null
 from hand_eye_calib.formats.transforms import PoseFields
@@ -40,6 +40,9 @@ NEAR_NS = 1_000_000_000
 _PERIODS = 5
 # Longest distance (ns) of two held messages in sequence.
 _LONGEST_PAUSE_NS = 60_000_000_000
+
+# Least ratio of a gap between stamps to the time in which it arrived for a step of the clock.
+_STEP_RATIO = 2.0
 
 # Time (s) without a message after which a stream is silent. After one stream has jumped back, old
 # messages of the other streams are dropped for the same time.
@@ -253,7 +256,6 @@ class PoseInput:
         """
         self._sensor_frame = ""
         self._world_frame = ""
-        self._last_stamp_ns: int | None = None
         self._longest_gap_ns = 0
         # Time (steady, s) of the last pose.
         self._taken_s: float | None = None
@@ -291,9 +293,6 @@ class PoseInput:
         self._arrived_s = now_s
         if not self.is_enabled:
             return
-        if self._last_stamp_ns is not None:
-            self._longest_gap_ns = max(self._longest_gap_ns, stamp_ns - self._last_stamp_ns)
-        self._last_stamp_ns = stamp_ns
         last_ns = self._guard.last_ns
         judgement = self._guard.check(stamp_ns, read, now_s)
         if judgement.jumped_back:
@@ -304,6 +303,8 @@ class PoseInput:
                 "discarded"
             )
             self._on_jump_back(self)
+        elif judgement.taken and last_ns is not None:
+            self._take_gap(judgement.taken[0][0] - last_ns, now_s)
         for dropped_ns in judgement.dropped:
             self._refuse_stamp(dropped_ns, "its stamp does not fit those before and after it")
         for repeated_ns in judgement.repeated:
@@ -314,6 +315,17 @@ class PoseInput:
             self._is_new = False
             first_s = judgement.taken[0][0] * 1e-9
             self._log.info(f"first pose on {self.topic}, stamp {first_s:.3f} s")
+
+    def _take_gap(self, gap_ns: int, now_s: float) -> None:
+        """Store the interval (ns) before an accepted stamp, and report a step of its clock."""
+        self._longest_gap_ns = max(self._longest_gap_ns, gap_ns)
+        gap_s = gap_ns * 1e-9
+        silent_s = self.silent_s(now_s)
+        if silent_s is not None and gap_ns > NEAR_NS and gap_s > _STEP_RATIO * silent_s:
+            self._log.warning(
+                f"{self.topic}: the stamps jump ahead by {gap_s:.3f} s within {silent_s:.3f} s "
+                "(a clock that was set? a gap in a bag that is played fast?)"
+            )
 
     def refuse(self, message: str, reason: str, text: str) -> None:
         """Count and log a message that cannot be used."""
@@ -404,6 +416,8 @@ class PoseInput:
         rate_hz = arrived / seconds if seconds > 0 else 0.0
         level, text = self._condition(steady_s, rate_hz, lost / max(arrived + lost, 1), may_rest)
         accepted = self._session.engines.statistics(self.name)
+        if level is Level.OK and self._longest_gap_ns > NEAR_NS:
+            text = f"{text}, longest gap {duration(self._longest_gap_ns * 1e-9)}"
         advice = self._advice((now.null - first.null) / max(arrived, 1), accepted)
         if level is Level.OK and advice:
             self._log.warning(f"{self.topic}: {advice}")

@@ -4,6 +4,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from hand_eye_calib.core.base.text import ABOUT
+from hand_eye_calib.core.results.records import AXES
+
+# Names of the six axes on topics. The Euler angles of a printed pose are roll, pitch and yaw.
+AXIS_KEYS = {axis: f"about_{ABOUT[axis]}" if axis in ABOUT else axis for axis in AXES}
+
 
 @dataclass(frozen=True, kw_only=True)
 class AxisProgress:
@@ -42,13 +48,14 @@ class Progress:
     is_faulty : bool
         Whether the streams have faults that make a calibration impossible.
     limiting_axis : str
-        Axis that is farthest from its target; empty if every axis is within its target, or without
-        a result.
+        Of ``AXIS_KEYS``: the axis that is farthest from its target; empty if every axis is within
+        its target, or without a result.
     will_not_get_there : bool
         Whether more of the present motion is useless for the limiting axis.
     target_is_too_small : bool
         Whether the allowance for constant errors alone exceeds the target of the limiting axis.
     axes : mapping of str to AxisProgress
+        By ``AXIS_KEYS``.
     """
 
     sentence: str

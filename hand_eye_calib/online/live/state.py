@@ -1,7 +1,8 @@
 """The state of the node as one document.
 
 It is published as JSON, and ``/diagnostics`` and ``watch`` are made from it. All values are in SI
-units. Mappings by axis have x, y, z, roll, pitch and yaw. None means unknown.
+units. Mappings by axis have x, y, z, about_x, about_y and about_z, those of a pose as printed roll,
+pitch and yaw. None means unknown.
 """
 
 from collections.abc import Iterator, Mapping
@@ -13,7 +14,7 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.plain import plain
 from hand_eye_calib.core.results.context import Comparison
 from hand_eye_calib.core.results.records import AXES
-from hand_eye_calib.online.live.progress import Progress
+from hand_eye_calib.online.live.progress import AXIS_KEYS, Progress
 
 # Period (s) at which the node publishes its state.
 REPORT_PERIOD_S = 1.0
@@ -27,9 +28,14 @@ ANSWER_WITHIN_S = 20.0
 AxisValues: TypeAlias = Mapping[str, float | None]
 
 
-def by_axis(values: FloatArray) -> AxisValues:
-    """Return values (6,) by axis; None for a value that is not finite."""
+def as_printed(values: FloatArray) -> AxisValues:
+    """Return values (6,) of a printed pose by name; None for a value that is not finite."""
     return dict(zip(AXES, plain(values), strict=True))
+
+
+def by_axis(values: FloatArray) -> AxisValues:
+    """Return values (6,) along and about the axes; None for a value that is not finite."""
+    return dict(zip(AXIS_KEYS.values(), plain(values), strict=True))
 
 
 class Level(IntEnum):

@@ -15,6 +15,7 @@ from hand_eye_calib.core.base.plain import plain
 from hand_eye_calib.core.base.text import in_words
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.records import AXES, ROTATIONS
+from hand_eye_calib.online.live.progress import AXIS_KEYS
 from hand_eye_calib.online.live.state import GRACE_S, NodeState
 from hand_eye_calib.online.ros.conversions import (
     LATCHED,
@@ -27,6 +28,9 @@ from hand_eye_calib.online.ros.markers import to_markers
 PROGRESS_TOPIC = "progress"
 # Time for which the end of the node waits until listeners have its last state.
 _GRACE = Duration(seconds=GRACE_S)
+
+# Names of axes and of the values of a printed pose.
+_AXIS_NAMES = {*AXES, *AXIS_KEYS.values()}
 
 # Keys of the state that the names of values on /diagnostics omit.
 _OMITTED = ("progress", "axes", "result", "differences")
@@ -126,7 +130,7 @@ def _values(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]
         for key, item in value.items():
             yield from _values(item, (*path, key))
     elif path not in (("level",), ("text",)):
-        axes = [key for key in path if key in AXES]
+        axes = [key for key in path if key in _AXIS_NAMES]
         keys = [key for key in path if key not in (*_OMITTED, *axes)]
         text = in_words(value)
         if value is None:

@@ -3,7 +3,12 @@
 from collections.abc import Callable
 from typing import Any
 
-from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -133,6 +138,15 @@ def _descriptor(field: OptionField) -> ParameterDescriptor:
         description += f" Unit: {meta['unit']}."
     if words:
         description += f" Values: {', '.join(words)}."
-    return ParameterDescriptor(
+    descriptor = ParameterDescriptor(
         description=description, read_only=meta["read_only"], dynamic_typing=is_dynamic
     )
+    if meta["within"] is not None:
+        least, most = meta["within"]
+        if isinstance(field.default, int):
+            descriptor.integer_range = [IntegerRange(from_value=int(least), to_value=int(most))]
+        else:
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=float(least), to_value=float(most))
+            ]
+    return descriptor

@@ -262,22 +262,32 @@ class TfBroadcaster:
     def _decide(self, result: Calibration | None, why_not: str) -> BroadcastState:
         if not self._is_on:
             return Broadcast.OFF, ""
-        if result is None or why_not:
+        if result is None:
+            return Broadcast.WAITING, why_not
+        was_checked = time.monotonic() - self._began_s >= LOOK_S
+        # A tree that forbids the edge is reported before the goal is reached.
+        if was_checked and (reason := self._what_forbids(result)):
+            return Broadcast.REFUSED, reason
+        if why_not:
             return Broadcast.WAITING, why_not
         if result.verdict is Verdict.DO_NOT_USE:
             return Broadcast.REFUSED, result.headline
         if hidden := result.unobservable():
             return Broadcast.REFUSED, f"{axes_in_words(hidden)} not determined"
-        if time.monotonic() - self._began_s < LOOK_S:
+        if not was_checked:
             return Broadcast.WAITING, "the transform tree is checked first"
-        if reason := self._tree.what_forbids(result.mounting[0], result.child_frame):
+        return Broadcast.ON, ""
+
+    def _what_forbids(self, result: Calibration) -> str:
+        """Return and log why the tree forbids the edge of a result; empty if it does not."""
+        reason = self._tree.what_forbids(result.mounting[0], result.child_frame)
+        if reason:
             self._log.error(
                 f"publish_tf is refused: {reason}. Copy the result into the "
                 "robot's description (extrinsic.urdf.xacro of ~/save), or "
                 "switch publish_tf off"
             )
-            return Broadcast.REFUSED, reason
-        return Broadcast.ON, ""
+        return reason
 
     def _broadcast(self, result: Calibration, is_first: bool) -> None:
         # The tree has been checked, and this topic may be fast.

@@ -25,8 +25,8 @@ examples:
   hand_eye_calib watch --node /robot1/calibrator
   hand_eye_calib watch > seen.txt          a line whenever something else is said"""
 
-# Default port of the page.
-_PORT = 8765
+# Default port of the page; 8765 is that of foxglove_bridge.
+_PORT = 8775
 
 # Longest wait (s) for a message between two looks at keyboard and browser.
 _LISTEN_S = 0.1

@@ -24,7 +24,7 @@ from hand_eye_calib.core.base.text import (
     two_digits,
 )
 from hand_eye_calib.core.results.records import AXES, ROTATIONS
-from hand_eye_calib.online.live.progress import AxisProgress
+from hand_eye_calib.online.live.progress import AXIS_KEYS, AxisProgress
 from hand_eye_calib.online.live.state import (
     REPORT_PERIOD_S,
     Broadcast,
@@ -241,7 +241,7 @@ def _axes_by_hand(state: NodeState, word: str) -> Texts:
     axes = [*extrinsic.contradicted]
     progress = state.progress.progress
     if progress.will_not_get_there and word == CHANGE_MOTION:
-        axes.append(progress.limiting_axis)
+        axes += [axis for axis, key in AXIS_KEYS.items() if key == progress.limiting_axis]
     axes += extrinsic.priors
     return tuple(axis for axis in dict.fromkeys(axes) if axis in AXES)
 
@@ -389,7 +389,8 @@ def _facts(state: NodeState, is_old: bool) -> str:
 
 
 def _bar(axis: str, at: ProgressState, extrinsic: ExtrinsicState | None) -> Bar:
-    row = at.progress.axes[axis]
+    key = AXIS_KEYS[axis]
+    row = at.progress.axes[key]
     # An axis with a prior is good enough with any standard deviation.
     is_enough = row.seconds_left == 0 and math.isfinite(row.sigma)
     share = 1.0
@@ -413,7 +414,7 @@ def _bar(axis: str, at: ProgressState, extrinsic: ExtrinsicState | None) -> Bar:
         against = "" if is_out_of_reach else f"wanted: {target}"
     difference = ""
     if at.comparison and at.comparison.differences:
-        moved = at.comparison.differences[0].axes[axis]
+        moved = at.comparison.differences[0].axes[key]
         difference = change(axis, moved.difference, moved.sigma)
     meaning = _ON_A_VEHICLE[axis] if extrinsic and extrinsic.has_vehicle_axes else ""
     return Bar(_NAMES[axis], meaning, share, tone, word, against, difference)
@@ -428,7 +429,7 @@ def _progress_in_words(row: AxisProgress, at: ProgressState, axis: str) -> tuple
     word = "not with this motion"
     if math.isfinite(row.seconds_left):
         word = f"{duration(row.seconds_left)} left"
-    return Tone.ACT if at.progress.limiting_axis == axis else Tone.BUSY, word
+    return Tone.ACT if at.progress.limiting_axis == AXIS_KEYS[axis] else Tone.BUSY, word
 
 
 def _values(result: ResultState) -> Iterator[tuple[str, str]]:
@@ -449,9 +450,10 @@ def _watched(axis: str, mount: MountState) -> Line:
 
     The line has the shift, or the smallest shift that ten minutes of motion would reveal.
     """
-    shift = mount.shift.get(axis) or 0.0
-    sigma = mount.shift_sigma.get(axis) or math.inf
-    visible = mount.visible_10min.get(axis)
+    key = AXIS_KEYS[axis]
+    shift = mount.shift.get(key) or 0.0
+    sigma = mount.shift_sigma.get(key) or math.inf
+    visible = mount.visible_10min.get(key)
     tone = Tone.UNKNOWN
     text = "cannot be watched with this motion"
     if abs(shift) > LARGEST_OF_SIX * sigma:

@@ -14,6 +14,7 @@ const buttons = document.querySelectorAll("button[data-request]");
 const SILENT_MS = 4000, RETRY_MS = 1000;
 let priors = {};
 let source = null, heardAt = 0, lostAt = null, isOld = false, tones = null;
+let lastSentence = "";
 
 const ICONS = {good: "#11703a", busy: "#0b5cad", act: "#c77700", bad: "#b3211c", unknown: "#6b4a8a"};
 
@@ -55,12 +56,15 @@ function put(html) {
   for (const link of links) {
     link.hidden = !state.dataset.files.split(" ").includes(link.dataset.file);
   }
-  const word = view.querySelector("h1").textContent;
-  if (word !== document.title) {
+  const headline = view.querySelector(".headline").innerText;
+  // A sentence that differs only in its numbers is not new.
+  const sentence = headline.replace(/[\d.,]+( (s|min|h)\b)?/g, "");
+  if (sentence !== lastSentence) {
     call(state.className);
-    part("said").textContent = view.querySelector(".headline").innerText;
+    part("said").textContent = headline;
   }
-  document.title = word;
+  lastSentence = sentence;
+  document.title = view.querySelector("h1").textContent;
   const colour = encodeURIComponent(ICONS[state.className]);
   part("icon").href = "data:image/svg+xml,<svg xmlns='http://www.w3.org/2000/svg' "
     + `viewBox='0 0 9 9'><circle cx='4.5' cy='4.5' r='4' fill='${colour}'/></svg>`;
