@@ -1,6 +1,7 @@
-"""Launch file of the node ``calibrator``, on two topics with poses.
+"""Launch file of the node ``calibrator``, on two topics with poses; with page and recording.
 
 ros2 launch hand_eye_calib calibrator.launch.py parent_topic:=/lidar/odom child_topic:=/camera/odom
+    watch:=true record:=drive
 
 Every parameter of the node is an argument of the same name. An argument that is not set leaves its
 parameter to the parameter file.
@@ -8,10 +9,11 @@ parameter to the parameter file.
 
 import contextlib
 import dataclasses
+import sys
 from pathlib import Path
 
 from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
@@ -41,6 +43,8 @@ ARGUMENTS = {name: (topic, f"Topic in place of {topic}.") for name, topic in REM
     "namespace": ("", "Namespace of the node; relative topics are looked for in it."),
     "use_sim_time": ("", "true follows /clock, as with a bag played with --clock."),
     "log_level": ("", "Of this node: debug, info, warn, error or fatal."),
+    "watch": ("false", "true also serves the page of watch; its address is in the output."),
+    "record": ("", "Directory of a bag with the poses and the results, by ros2 bag record."),
     "respawn": ("false", "true starts the node again if it dies; use it with journal:=resume."),
 }
 
@@ -75,12 +79,17 @@ def argument(context: LaunchContext, name: str) -> str:
     return LaunchConfiguration(name).perform(context)
 
 
-def logger_name(context: LaunchContext) -> str:
-    """Return the name of the node's logger, with the namespaces of groups around this file."""
+def full_namespace(context: LaunchContext) -> str:
+    """Return the node's namespace, with the namespaces of groups around this file."""
     outer = context.launch_configurations.get("ros_namespace", "")
     own = argument(context, "namespace")
-    namespace = own if own.startswith("/") else f"{outer}/{own}"
-    names = [*namespace.split("/"), argument(context, "name")]
+    namespace = own if own.startswith("/") else f"/{outer}/{own}"
+    return "".join(f"/{name}" for name in namespace.split("/") if name)
+
+
+def logger_name(context: LaunchContext) -> str:
+    """Return the name of the node's logger."""
+    names = [*full_namespace(context).split("/"), argument(context, "name")]
     return ".".join(filter(None, names))
 
 
@@ -96,6 +105,33 @@ def is_true(context: LaunchContext, name: str) -> bool:
     if text not in ("true", "false"):
         raise ConfigError(f"{name} must be true or false; got '{text}'")
     return text == "true"
+
+
+def page(context: LaunchContext) -> list[ExecuteProcess]:
+    """Return the program that serves the page of watch, if asked for."""
+    if not is_true(context, "watch"):
+        return []
+    command = [sys.executable, "-m", "hand_eye_calib", "watch", "--web"]
+    return [ExecuteProcess(cmd=command, name="watch", output="screen")]
+
+
+def recording(context: LaunchContext) -> list[ExecuteProcess]:
+    """Return the program that records poses, transforms, results and state, if asked for."""
+    directory = argument(context, "record")
+    if not directory:
+        return []
+    others = other_names(int(argument(context, "other_children") or 0))
+    names = [f"{name}_topic" for name in ("parent", "child", *others)]
+    names += ["tf_topic", "tf_static_topic"]
+    own_name = argument(context, "name")
+    results = ("extrinsic", "extrinsic_with_covariance", "progress")
+    topics = [argument(context, name) for name in names]
+    topics += [f"{own_name}/{name}" for name in results]
+    namespace = full_namespace(context)
+    topics = [name if name.startswith("/") else f"{namespace}/{name}" for name in topics]
+    topics.append("/diagnostics")
+    command = ["ros2", "bag", "record", "-o", directory, *topics]
+    return [ExecuteProcess(cmd=command, name="record", output="screen")]
 
 
 def calibrator(context: LaunchContext) -> list[Node]:
@@ -127,12 +163,12 @@ def calibrator(context: LaunchContext) -> list[Node]:
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return arguments and node."""
+    """Return arguments, node, page and recording."""
     arguments = ARGUMENTS | {name: ("", describe(field)) for name, field in PARAMETERS.items()}
     return LaunchDescription(
         [
             DeclareLaunchArgument(name, default_value=default, description=description)
             for name, (default, description) in arguments.items()
         ]
-        + [OpaqueFunction(function=calibrator)]
+        + [OpaqueFunction(function=function) for function in (calibrator, page, recording)]
     )

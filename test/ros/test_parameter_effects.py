@@ -16,6 +16,7 @@ import pytest
 import ros_harness
 import yaml
 from geometry_msgs.msg import PoseStamped, TransformStamped
+from lifecycle_msgs.srv import GetState
 from nav_msgs.msg import Odometry
 from source_code import ROOT
 
@@ -271,6 +272,12 @@ def monitor_is_used(start_node, peer, tmp_path):
     peer.spin_until(lambda: "/calibrator: extrinsic" in statuses, "the state of a calibration")
 
 
+def lifecycle_is_used(start_node, peer, tmp_path):
+    start_node(*QUIET, "-p lifecycle:=true")
+    state = peer.call(GetState, "get_state").current_state
+    assert state.label == "unconfigured"
+
+
 TF = [(f"{stream}_tf", "odom:lidar", "/tf") for stream in STREAMS]
 TF.append(("base_frame", "base_link", "/tf_static"))
 EFFECTS = {
@@ -288,6 +295,7 @@ EFFECTS = {
     "installed": installed_is_used,
     "monitor": monitor_is_used,
     "enabled": enabled_is_used,
+    "lifecycle": lifecycle_is_used,
 }
 
 
@@ -332,6 +340,7 @@ GIVEN = {name: (str(value), value) for name, (value, _) in CHANGES.items()} | {
     "base_frame": ("base_link", "base_link"),
     "monitor": ("true", True),
     "enabled": ("false", False),
+    "lifecycle": ("true", True),
 }
 
 # monitor watches one child sensor.
@@ -445,6 +454,23 @@ def test_a_value_that_is_not_allowed_is_refused_with_its_name(prefix, argument, 
     done = subprocess.run([*LAUNCHER, argument], env=environment(prefix), **options)
     assert done.returncode == 1
     assert message in done.stdout + done.stderr
+
+
+def test_the_launch_file_also_serves_the_page_and_records(start_launch, peer, tmp_path):
+    recorder = tmp_path / "bin" / "ros2"
+    recorder.parent.mkdir()
+    recorder.write_text('#!/bin/sh\necho "recorded: $*"\n')
+    recorder.chmod(0o755)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PATH", f"{recorder.parent}{os.pathsep}{os.environ['PATH']}")
+        log = start_launch(
+            *TYPES, "namespace:=robot1", "parent_topic:=/lidar/odom", "watch:=true", "record:=drive"
+        )
+    peer.target = "/robot1/calibrator"
+    assert peer.trigger("reset").success
+    ready = ("open http://", "recorded: bag record -o drive /lidar/odom /robot1/child_odom /tf")
+    peer.spin_until(lambda: all(text in log.read_text() for text in ready), f"{ready}")
+    assert "/robot1/calibrator/extrinsic /robot1/calibrator/extrinsic_with" in log.read_text()
 
 
 def test_name_namespace_topics_and_log_level(start_launch, peer):

@@ -25,6 +25,10 @@ def parameter_file(path, **parameters):
 def test_every_option_is_a_described_parameter_changes_are_applied_or_rejected(start_node, peer):
     start_node("-p solve_period:=1000.0", *RELIABLE_INPUTS)
     assert set(FIELDS) <= set(peer.call(ListParameters, "list_parameters").result.names)
+    (of_threshold,) = peer.describe("threshold").floating_point_range
+    assert (of_threshold.from_value, of_threshold.to_value) == (1e-12, 1e6)
+    (of_max_pairs,) = peer.describe("max_pairs").integer_range
+    assert (of_max_pairs.from_value, of_max_pairs.to_value) == (10, 10**8)
     for name in ("threshold", "max_pairs", "method", "scale", "parent_frame"):
         meta = FIELDS[name].metadata
         descriptor = peer.describe(name)
@@ -43,7 +47,8 @@ def test_every_option_is_a_described_parameter_changes_are_applied_or_rejected(s
     for name, value, reason in [
         ("method", "magic", f"method must be one of {', '.join(METHODS)}"),
         ("reference", "B0", "reference must be auto, A, B<n>"),
-        ("threshold", -1.0, "threshold must be "),
+        ("threshold", -1.0, "threshold out of range Min: 1e-12"),
+        ("max_pairs", 3, "max_pairs out of range. Min: 10"),
         ("threshold", 1, "Wrong parameter type"),
         ("scale", "huge", "scale must be none or "),
         ("scale", -2.0, "scale must be at least"),

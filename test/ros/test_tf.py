@@ -109,13 +109,13 @@ class TestNode:
             return newest.message if is_faulty else ""
 
         publishers = peer.publishers()
-        poses = drive(450)
-        peer.solve(publishers, *(half[:400] for half in poses))
+        poses = drive(500)
+        peer.solve(publishers, *(half[:250] for half in poses))
         early = "the goal is not reached"
         is_early = lambda: statuses and state(key="tf_static_reason") == early  # noqa: E731
         peer.spin_until(is_early, "the state", fault)
         assert state() == "not_yet"
-        peer.solve(publishers, *(half[400:] for half in poses))
+        peer.solve(publishers, *(half[250:] for half in poses))
         peer.spin_until(lambda: state("progress", "done") == "true", "the goal", fault)
         # Nothing comes in any more: the two results that reached the goal suffice.
         peer.spin_until(lambda: edges(heard), "the edge")

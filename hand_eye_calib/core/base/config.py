@@ -434,6 +434,13 @@ class NodeConfig(OptionSet):
         "Saved files and publish_tf then describe this edge. Empty for none.",
         read_only=True,
     )
+    lifecycle: bool = option(
+        False,
+        "Be a managed node: another program, such as nav2_lifecycle_manager, "
+        "configures, activates, deactivates and cleans up the node. enabled "
+        "and ~/set_enabled have no meaning then.",
+        read_only=True,
+    )
     monitor: bool = option(
         False,
         "Monitor the mount instead of calibrating: compare the motion with "

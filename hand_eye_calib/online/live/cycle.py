@@ -456,7 +456,7 @@ class SolveCycle:
             joint = ": " if self.standing is Standing.REFUTED else ", but "
             return Level.WARN, f"{result.verdict.value}{joint}{self.problem}"
         if not accepts_poses:
-            return Level.WARN, "poses are not accepted: call ~/set_enabled to continue"
+            return Level.WARN, "poses are not accepted: call ~/set_enabled, or activate the node"
         if result is None:
             return Level.WARN, self._why_no_result()
         if broadcast is Broadcast.REFUSED and result.verdict is not Verdict.DO_NOT_USE:
@@ -517,7 +517,10 @@ class SolveCycle:
 def pause_of(inputs: Mapping[str, InputState], accepts_poses: bool) -> Condition:
     """Return severity and reason if no poses arrive; level OK and an empty text otherwise."""
     if not accepts_poses:
-        return Level.WARN, "Paused: poses are not accepted; call ~/set_enabled to continue."
+        return (
+            Level.WARN,
+            "Paused: poses are not accepted; call ~/set_enabled, or activate the node.",
+        )
     paused = {name: state for name, state in inputs.items() if state.is_paused}
     if not paused:
         return Level.OK, ""

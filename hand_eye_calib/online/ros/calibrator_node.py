@@ -33,12 +33,13 @@ from hand_eye_calib.online.live.saving import Saver
 from hand_eye_calib.online.live.session import LiveSession, output_path
 from hand_eye_calib.online.live.state import REPORT_PERIOD_S, NodeState, Outcome
 from hand_eye_calib.online.ros.inputs import TfInput, TopicInput
+from hand_eye_calib.online.ros.lifecycle import ManagedNode
 from hand_eye_calib.online.ros.outputs import PROGRESS_TOPIC, ResultTopics, StateTopics
 from hand_eye_calib.online.ros.parameters import Parameters
 from hand_eye_calib.online.ros.tf import TF, Robot, RobotTree, TfBroadcaster, message_type
 
 
-class CalibratorNode(Node):
+class CalibratorNode(ManagedNode):
     """Estimates the pose of the child sensor in the parent sensor's frame from two live streams.
 
     Raises
@@ -68,6 +69,21 @@ class CalibratorNode(Node):
         self._options = Parameters(self, self._follow_parameters, self._check_options)
         for line in self._options.unknown:
             self._log.warning(line)
+        self._inputs: list[TopicInput | TfInput] = []
+        if self._options.node.lifecycle:
+            self.manage()
+        else:
+            self.configure()
+            self.is_configured = True
+
+    def configure(self) -> None:
+        """Make session, inputs, topics, services and timers.
+
+        Raises
+        ------
+        ConfigError
+            If an option cannot be applied.
+        """
         options = self._options.node
         config = self._options.calibrator
         # From now on, participants may only choose a directory below this directory.
@@ -87,6 +103,7 @@ class CalibratorNode(Node):
         self._tf = TfBroadcaster(self, self._log, tree)
         self._inputs = [self._make_input(name) for name in ("parent", "child", *others)]
         self._start_session()
+        self._made.callback(self._session.stop_journal)
         self._results = ResultTopics(self)
         self._states = StateTopics(self)
         self._tf.switch(options.publish_tf)
@@ -100,6 +117,7 @@ class CalibratorNode(Node):
             self._publish,
             config.targets,
         )
+        self._made.callback(self._cycle.stop, 0.0)
         self._saver = Saver(self._session, self._cycle, self._log)
         self._serve()
         self._start_timers()
@@ -113,6 +131,8 @@ class CalibratorNode(Node):
 
     def stop(self, timeout_s: float) -> bool:
         """End the solving process and save the newest result; return False if that failed."""
+        if not self.is_configured:
+            return True
         self._cycle.stop(timeout_s)
         is_saved = True
         if self._cycle.result is not None:
@@ -122,7 +142,15 @@ class CalibratorNode(Node):
                 self._log.warning("the result is not saved: output_directory is not set")
         self._publish(has_ended=True)
         self._session.stop_journal()
+        self._inputs = []
         return is_saved
+
+    def accept_poses(self, accept: bool) -> None:
+        """Accept poses, or no longer."""
+        for source in self._inputs:
+            source.is_enabled = accept
+        self._log.info("accepting poses" if accept else "not accepting poses")
+        self._publish()
 
     # ---------------------------------------------------------------- set-up
 
@@ -179,7 +207,7 @@ class CalibratorNode(Node):
         else:
             source = TopicInput(self, name, getattr(options, f"{name}_type", "auto"), parts)
         source.configure(self._options.calibrator)
-        source.is_enabled = options.enabled
+        source.is_enabled = options.enabled and not options.lifecycle
         return source
 
     def _serve(self) -> None:
@@ -327,11 +355,10 @@ class CalibratorNode(Node):
         return True, text
 
     def _set_enabled(self, request: SetBool.Request) -> Outcome:
-        for source in self._inputs:
-            source.is_enabled = request.data
-        text = "accepting poses" if request.data else "not accepting poses"
-        self._log.info(text)
-        return True, text
+        if self._options.node.lifecycle:
+            return False, "this is a managed node: activate or deactivate it"
+        self.accept_poses(request.data)
+        return True, "accepting poses" if request.data else "not accepting poses"
 
     # ------------------------------------------------------------ parameters
 
@@ -348,6 +375,8 @@ class CalibratorNode(Node):
 
     def _follow_parameters(self, before: CalibratorConfig) -> None:
         """Apply changed parameters; ``before`` has the options of the engine before the change."""
+        if not self.is_configured:
+            return
         options = self._options.node
         config = self._options.calibrator
         if (config, config.given) != (before, before.given):

@@ -1,0 +1,125 @@
+"""The node as a managed node: its transitions, as in the design of ROS 2 lifecycle nodes.
+
+=============  ==========================================================================
+unconfigured   parameters and the services of the life cycle, nothing else
+inactive       topics, services and journal; poses are not accepted
+active         poses are accepted
+finalized      nothing; a signal ends the process
+=============  ==========================================================================
+
+``cleanup`` and ``shutdown`` save the result, and end the session.
+"""
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any
+
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle.node import LifecycleNodeMixin
+from rclpy.node import Node
+
+from hand_eye_calib.core.base.errors import HandEyeCalibError
+from hand_eye_calib.online.live.log import NodeLog
+from hand_eye_calib.online.live.state import GRACE_S
+
+_DONE = TransitionCallbackReturn.SUCCESS
+
+
+class ManagedNode(LifecycleNodeMixin, Node):
+    """A node that another program may configure, activate, deactivate and clean up.
+
+    A subclass builds everything that it needs in :meth:`configure`, and ends it in :meth:`stop`.
+
+    Attributes
+    ----------
+    is_configured : bool
+    """
+
+    _log: NodeLog
+
+    def __init__(self, name: str, **options: Any) -> None:
+        Node.__init__(self, name, **options)
+        self.is_configured = False
+        # Destroys what configure() has made.
+        self._made = ExitStack()
+
+    def manage(self) -> None:
+        """Serve the transitions; from now on, only they configure the node."""
+        LifecycleNodeMixin.__init__(self)
+
+    def configure(self) -> None:
+        """Make topics, services and timers. Poses are not accepted yet.
+
+        Raises
+        ------
+        HandEyeCalibError
+            If an option cannot be applied.
+        """
+        raise NotImplementedError
+
+    def accept_poses(self, accept: bool) -> None:
+        """Accept poses, or no longer."""
+        raise NotImplementedError
+
+    def stop(self, timeout_s: float) -> bool:
+        """Save the result and end the session; return False if the result could not be saved."""
+        raise NotImplementedError
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Make topics, services and timers; fail with the reason in the log."""
+        self._made = ExitStack()
+        self._destroy_later()
+        try:
+            self.configure()
+        except HandEyeCalibError as error:
+            self._log.error(f"the node is not configured: {error}")
+            self._made.close()
+            return TransitionCallbackReturn.FAILURE
+        self.is_configured = True
+        return _DONE
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Accept poses."""
+        self.accept_poses(True)
+        return _DONE
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Accept no poses; results stay published."""
+        self.accept_poses(False)
+        return _DONE
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Save the result, end the session, and destroy topics, services and timers."""
+        if self.is_configured:
+            # A result that cannot be saved is an error in the log.
+            self.stop(GRACE_S)
+        self.is_configured = False
+        self._made.close()
+        return _DONE
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Do what a cleanup does, from any state."""
+        return self.on_cleanup(state)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Do what a cleanup does after an exception; the node can be configured again."""
+        return self.on_cleanup(state)
+
+    def _destroy_later(self) -> None:
+        """Register the destruction of publishers, subscriptions and so on that are made later."""
+        kinds: dict[str, Callable[[Any], object]] = {
+            "publishers": self.destroy_publisher,
+            "subscriptions": self.destroy_subscription,
+            "services": self.destroy_service,
+            "timers": self.destroy_timer,
+            "guards": self.destroy_guard_condition,
+        }
+        before = {kind: {id(item) for item in getattr(self, kind)} for kind in kinds}
+
+        def destroy() -> None:
+            for kind, destroy_item in kinds.items():
+                for item in list(getattr(self, kind)):
+                    if id(item) not in before[kind]:
+                        destroy_item(item)
+
+        self._made.callback(destroy)
