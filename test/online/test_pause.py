@@ -162,7 +162,10 @@ def test_a_node_that_accepts_no_poses_is_paused(node):
     run(node, 8.0)
     state = state_of(node)
     assert {item.level for item in state.inputs.values()} == {Level.OK}
-    assert state.progress.text == "Paused: poses are not accepted; call ~/set_enabled, or activate the node."
+    assert (
+        state.progress.text
+        == "Paused: poses are not accepted; call ~/set_enabled, or activate the node."
+    )
     assert (state.progress.level, view_of(state).word) == (Level.WARN, "PAUSED")
 
 
