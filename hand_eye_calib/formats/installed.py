@@ -15,13 +15,13 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import EXPORT_FORMATS
 from hand_eye_calib.core.base.errors import ConfigError, InputError, located
-from hand_eye_calib.core.base.text import frame_name, parse_pose
+from hand_eye_calib.core.base.text import frame_name, parse_pose, shown_value
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import Extrinsic, FrameTree, numbers_of, pose_of
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.records import AXES, ROTATIONS, TRANSLATIONS
 from hand_eye_calib.formats.exports import Layout, arranged, formats
-from hand_eye_calib.formats.files import read_bytes
+from hand_eye_calib.formats.files import read_bytes, similar
 from hand_eye_calib.formats.results import FILE_NAME, load_result
 from hand_eye_calib.formats.yaml_files import read_yaml
 
@@ -62,10 +62,10 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
     if not os.path.exists(text):
         try:
             values = parse_pose("installed", text)
-        except ConfigError as error:
+        except ConfigError:
             raise ConfigError(
-                "the installed transform must be an existing file (URDF, "
-                f"extrinsic.yaml, bag) or six numbers in m and rad: {error}"
+                f"installed: no file {shown_value(text)}{similar(text)}; expected a URDF, "
+                "extrinsic.yaml, a bag, or X Y Z ROLL PITCH YAW in m and rad"
             ) from None
         T = se3.from_rotation_translation(se3.rotation_from_rpy(values[3:]), values[:3])
         return lambda parent_frame, child_frame: Extrinsic(T, text)

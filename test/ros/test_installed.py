@@ -100,9 +100,8 @@ def test_a_wrong_path_to_what_is_installed_ends_the_start_in_one_line(start_node
     node = start_node("-p monitor:=true", "-p installed:=robot.urdf")
     assert node.wait() == 1
     assert node.log == (
-        "calibrator: the installed transform must be an existing file (URDF, extrinsic.yaml, bag) "
-        "or six numbers in m and rad: installed must be X Y Z ROLL PITCH YAW; "
-        "got 'robot.urdf'\n"
+        "calibrator: installed: no file 'robot.urdf'; expected a URDF, extrinsic.yaml, a bag, or "
+        "X Y Z ROLL PITCH YAW in m and rad\n"
     )
 
 

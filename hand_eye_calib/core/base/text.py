@@ -234,6 +234,8 @@ def parse_prior(name: str, text: str) -> tuple[float, float]:
     value, _, sigma = text.replace("±", "+/-").replace("+-", "+/-").partition("+/-")
     unit = AXIS_UNITS[name.removeprefix("prior.")]
     form = "VALUE+/-SIGMA, with its standard deviation"
+    if not sigma.strip():
+        raise ConfigError(f"{name} must be {form}; got {shown_value(text)}")
     (prior,) = quantities(name, [unit], value.split(), form)
     (prior_sigma,) = quantities(name, [unit], sigma.split(), form, 0.0)
     words = value.strip(), sigma.strip()

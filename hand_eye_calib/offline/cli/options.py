@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from enum import IntEnum
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import hand_eye_calib.core.base.config as config
 from hand_eye_calib.core.base.errors import ConfigError, printable
@@ -306,28 +306,45 @@ def _read_config(path: Path) -> Options:
     if not isinstance(document, dict | None):
         kind = type(document).__name__
         raise ConfigError(f"{path}: expected a mapping of options to values; found {kind}")
+    settings = _settings_of_file(document or {})
     options: dict[str, OptionValue] = {}
     ignored = []
-    other_nodes = []
-    for name, value in _flat(document or {}):
-        node, is_ros_parameter, option = name.rpartition(f"{_OF_ROS}.")
-        if is_ros_parameter and re.split("[./]", node.rstrip("."))[-1] not in _NODES:
-            other_nodes.append(f"/{node.strip('/.')}")
-        elif option in OPTION_FIELDS:
+    for option, value in settings.named:
+        if option in OPTION_FIELDS:
             options |= [_named_in_file(path, option, value)]
         elif option in _NODE_OPTIONS or option.partition(".")[0] in _ROS_OPTIONS:
             ignored.append(repr(option))
         elif value is not None or not option.endswith(_OF_ROS):
             # The section of the parameters may be empty: then it is no option.
             raise _unknown_option(path, option)
-    if other_nodes and not (options or ignored):
-        nodes = ", ".join(dict.fromkeys(other_nodes))
+    if settings.other_nodes and not (options or ignored):
+        nodes = ", ".join(settings.other_nodes)
         raise ConfigError(
             f"{path}: no parameters of a node named calibrator; the file has those of {nodes}"
         )
     if ignored:
         note(f"{path}: only the node uses {', '.join(ignored)}; ignored here")
     return options
+
+
+class _Settings(NamedTuple):
+    """Names and values of the calibrator in a file, and the names of other nodes."""
+
+    named: list[tuple[str, Any]]
+    other_nodes: list[str]
+
+
+def _settings_of_file(document: Mapping[str, Any]) -> _Settings:
+    """Return the settings of a file, without the sections of a ROS parameter file."""
+    named = []
+    other_nodes: dict[str, None] = {}
+    for name, value in _flat(document):
+        node, is_ros_parameter, option = name.rpartition(f"{_OF_ROS}.")
+        if is_ros_parameter and re.split("[./]", node.rstrip("."))[-1] not in _NODES:
+            other_nodes[f"/{node.strip('/.')}"] = None
+        else:
+            named.append((option, value))
+    return _Settings(named, [*other_nodes])
 
 
 def _named_in_file(path: Path, option: str, value: object) -> tuple[str, OptionValue]:
@@ -342,11 +359,10 @@ def _named_in_file(path: Path, option: str, value: object) -> tuple[str, OptionV
 
 def _unknown_option(path: Path, option: str) -> ConfigError:
     """Return the error about an option of a file that does not exist."""
-    names = sorted(OPTION_FIELDS)
-    return ConfigError(
-        f"{path}: unknown option {option!r}{did_you_mean(option, names)}; "
-        f"known are {', '.join(map(repr, names))}"
-    )
+    # In quotes the names keep the spelling of the file.
+    names = sorted(map(repr, OPTION_FIELDS))
+    hint = did_you_mean(repr(option), names) or f"; known are {', '.join(names)}"
+    return ConfigError(f"{path}: unknown option {option!r}{hint}")
 
 
 def _flat(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

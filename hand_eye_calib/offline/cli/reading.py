@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.base.plain import Document
@@ -28,6 +29,7 @@ from hand_eye_calib.offline.cli.options import (
 if TYPE_CHECKING:
     from hand_eye_calib.formats.trajectory_files.reading import FileOptions
 
+_OPTIONS_OF_DNLO = ("threshold", "min_inlier_fraction")
 _BAG_SUFFIXES = (".bag", ".db3", ".mcap", ".zstd")
 
 
@@ -67,8 +69,22 @@ class Recording:
 
             files = with_progress(self.files, len(self.files), "hashing")
             self.inputs["files"] = [fingerprint(file) for file in files]
-        warnings = (*checked_run.calibration.warnings, *self.warnings)
-        return dataclasses.replace(checked_run.calibration, warnings=warnings)
+        calibration = checked_run.calibration
+        ignored = _ignored_options(self.snapshot.config, calibration.method)
+        warnings = (*calibration.warnings, *self.warnings, *ignored)
+        return dataclasses.replace(calibration, warnings=warnings)
+
+
+def _ignored_options(config: CalibratorConfig, method: str) -> list[str]:
+    """Return warnings about options of dnlo that differ from their defaults, for other methods."""
+    if method == "dnlo":
+        return []
+    defaults = CalibratorConfig()
+    return [
+        f"the option {name} has no effect with method {method}: only dnlo uses it"
+        for name in _OPTIONS_OF_DNLO
+        if getattr(config, name) != getattr(defaults, name)
+    ]
 
 
 def are_bags(paths: Sequence[Path | str]) -> bool:

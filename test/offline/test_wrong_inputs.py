@@ -1,0 +1,193 @@
+"""Wrong inputs: each is answered by one line that names the cause, with the right exit code."""
+
+import shlex
+import shutil
+
+import numpy as np
+import pytest
+
+from hand_eye_calib.formats.files import local_path
+
+# Exit code, command, and a part of the answer.
+TABLE = """
+2 | calibrat lidar.tum camera.tum | did you mean calibrate?
+2 | calibrate lidar.tum | lidar.tum is one trajectory file: pass those of two sensors
+2 | calibrate lidar.tum lidar.tum | lidar.tum appears twice
+1 | calibrate lidr.tum camera.tum | did you mean lidar.tum?
+1 | calibrate empty.tum camera.tum | empty.tum: the file contains no poses; expected lines of 8
+1 | calibrate comment.tum camera.tum | comment.tum: the file contains no poses
+1 | calibrate one.tum camera.tum | the streams do not overlap in time
+1 | calibrate few.tum camera.tum | 10 synchronised pose pairs are needed, found 3
+1 | calibrate words.tum camera.tum | words.tum: no column for x, y, z, qx, qy, qz, qw
+1 | calibrate binary.tum camera.tum | binary.tum: not a text file
+1 | calibrate html.tum camera.tum | html.tum: it is XML of an unsupported kind
+1 | calibrate short.tum camera.tum | name the 7 with --columns
+1 | calibrate quat2.tum camera.tum | line 1: found a quaternion of length 2
+1 | calibrate zeroq.tum camera.tum | all 600 rows are empty, zero or not finite
+1 | calibrate nan.tum camera.tum | all 600 rows are empty, zero or not finite
+1 | calibrate far.tum camera.tum | line 1: position (1e+12,
+1 | calibrate same_stamp.tum camera.tum | 600 poses have 5 different stamps; write all digits
+1 | calibrate cells.tum camera.tum | for the timestamp
+1 | calibrate nohead.csv camera.tum | name the 4 with --columns
+1 | calibrate kitti.txt camera.tum --parent-times times.txt | 20 poses, but times.txt has 2 stamps
+1 | calibrate image.png camera.tum | image.png: not a text file
+1 | calibrate folder | no bag in folder: expected files that end in
+2 | calibrate folder camera.tum | folder is a folder without a bag
+1 | calibrate junk.mcap | repair it with 'mcap recover'
+1 | calibrate junk.db3 | repair it with sqlite3's '.recover'
+1 | calibrate junk.bag | repair it with 'rosbag reindex'
+1 | calibrate cut.mcap | it ends in the middle of a record
+2 | calibrate drive.mcap camera.tum | drive.mcap is a bag, and another path is not
+1 | calibrate drive.mcap --parent-topic /lidar/odo | did you mean /lidar/odometry?
+1 | calibrate drive.mcap --parent-topic /a --child-topic /a | no topic /a in
+1 | calibrate drive.mcap --parent-topic a:b | no transforms in drive.mcap
+2 | calibrate drive.mcap --parent-topic :b | two frames as WORLD:SENSOR, such as odom:lidar
+2 | calibrate drive.mcap --child-fields t=x | --child-fields needs --child-topic
+2 | calibrate drive.mcap --stamps now | invalid choice: 'now' (choose from
+2 | calibrate lidar.tum camera.tum --stamps receive | --stamps applies to bags only
+2 | calibrate lidar.tum camera.tum --max-gap fast | --max-gap: must be a number; got 'fast'
+2 | calibrate lidar.tum camera.tum --max-gap -1 | --max-gap: must be at least 0.001 s; got -1.0
+2 | calibrate lidar.tum camera.tum --max-gap nan | --max-gap: must be a finite number; got nan
+2 | calibrate lidar.tum camera.tum --max-gab 1 | did you mean --max-gap?
+2 | calibrate lidar.tum camera.tum --method best | --method: must be one of auto, dnlo
+2 | calibrate lidar.tum camera.tum --reference D5 | must be auto, A, B<n> such as B5
+2 | calibrate lidar.tum camera.tum --time-offset yes | must be estimate or a number; got 'yes'
+2 | calibrate lidar.tum camera.tum --scale 0 | --scale: must be at least
+2 | calibrate lidar.tum camera.tum --prior z=1.85 | with its standard deviation; got '1.85'
+2 | calibrate lidar.tum camera.tum --prior h=1+/-0.1 | AXIS one of x, y, z, roll, pitch, yaw
+2 | calibrate lidar.tum camera.tum --prior z=22+/-2 | write 22cm+/-2cm or 22m+/-2m
+2 | calibrate lidar.tum camera.tum --prior yaw=90+/-2 | write 90deg for degrees
+2 | calibrate lidar.tum camera.tum --prior z=1+/-0 | needs a standard deviation above 0; got '0'
+2 | calibrate lidar.tum camera.tum --prior z=1kg+/-0.1 | numbers in m or cm or mm; got '1kg'
+2 | calibrate lidar.tum camera.tum --target-axes z | z must be numbers in m or cm or mm
+2 | calibrate lidar.tum camera.tum --target-translation 0 | must be at least 1e-06 m; got 0.0
+1 | calibrate lidar.tum camera.tum --config absent.yaml | cannot read absent.yaml
+1 | calibrate lidar.tum camera.tum --config bad.yaml | bad.yaml is not readable YAML
+2 | calibrate lidar.tum camera.tum --config list.yaml | expected a mapping of options to values
+2 | calibrate lidar.tum camera.tum --config typo.yaml | 'max_gapp'; did you mean 'max_gap'?
+2 | calibrate lidar.tum camera.tum --config value.yaml | 'max_gap' must be a number; got 'fast'
+2 | calibrate lidar.tum camera.tum --config other.yaml | the file has those of /talker
+1 | calibrate lidar.tum camera.tum --out junk.db3 --method park | cannot write junk
+2 | calibrate lidar.tum camera.tum --label vehicle | expected NAME=VALUE, such as vehicle=7
+2 | calibrate lidar.tum camera.tum --base-frame base --method park | needs --installed ROBOT.urdf
+1 | calibrate lidar.tum camera.tum --parent-frame a --child-frame a | both streams name 'a'
+2 | calibrate lidar.tum camera.tum --format kity | invalid choice: 'kity' (choose from 'tum'
+1 | calibrate lidar.tum camera.tum --columns t,x | no column for y, z, qx, qy, qz, qw among t, x
+1 | calibrate lidar.tum camera.tum --pair-by row | found [600, 1200]
+1 | calibrate lidar.tum camera.tum --pair-by name | pair by time or row
+2 | calibrate lidar.tum camera.tum --stamp-unit h | choose from 's', 'ms', 'us', 'ns'
+2 | calibrate lidar.tum camera.tum --parent-quaternion zyxw | must be one of xyzw, wxyz, yzwx
+1 | calibrate lidar.tum camera.tum --min-pairs 100000 | 100000 synchronised pose pairs are needed
+2 | calibrate lidar.tum camera.tum --batch x | --batch cannot be combined with PATH
+2 | calibrate lidar.tum camera.tum --vehicle x | --dask and --vehicle need --batch
+2 | calibrate lidar.tum camera.tum --jobs 0 | expected a whole number of at least 1, got '0'
+2 | calibrate lidar.tum camera.tum --setup hand | it needs the samples of an arm or --target
+2 | calibrate lidar.tum camera.tum --parent-angles ur | it needs two files and --order none
+2 | calibrate lidar.tum camera.tum --target charuco:5x7 | --target and --camera go together
+1 | calibrate samples.yaml | samples.yaml: expected samples of an arm
+1 | calibrate samples.npz | cannot read samples.npz: File is not a zip file
+1 | arm lidar.tum camera.tum | found [600, 1200]
+2 | arm sample:arm.yaml --setup both | invalid choice: 'both' (choose from 'hand', 'beside')
+1 | rig lidar.tum camera.tum empty.tum | empty.tum: the file contains no poses
+1 | rig drive.mcap --topics /lidar/odometry /camera/odometry /x | no topic /x in drive.mcap
+2 | batch folder | no bag matches folder/**
+2 | check | expected one bag or two trajectory files; got 0
+2 | check drive.mcap camera.tum | drive.mcap is a bag, and another path is not
+1 | info absent | cannot read absent: No such file or directory
+1 | info list.yaml | expected format hand_eye_calib/extrinsic
+2 | info folder --as nothing | invalid choice: 'nothing' (choose from 'urdf'
+1 | export folder urdf | cannot read folder/extrinsic.yaml
+2 | compare | required: RESULT
+2 | simulate | required: --out
+2 | simulate --out new --drive rocky | choose from 'published', 'hilly'
+2 | watch --port x | unknown '--port'
+"""
+ROWS = [[cell.strip() for cell in row.split(" | ")] for row in TABLE.strip().splitlines()]
+
+TEXTS = {
+    "empty.tum": "",
+    "comment.tum": "# nothing\n",
+    "one.tum": "0 0 0 0 0 0 0 1\n",
+    "words.tum": "hello world\nthis is text\n",
+    "html.tum": "<html><body>404</body></html>\n",
+    "nohead.csv": "0,1,2,3\n1,2,3,4\n",
+    "kitti.txt": "1 0 0 0 0 1 0 0 0 0 1 0\n" * 20,
+    "times.txt": "0\n1\n",
+    "bad.yaml": "a: [1\n",
+    "list.yaml": "- 1\n- 2\n",
+    "typo.yaml": "max_gapp: 1\n",
+    "value.yaml": "max_gap: fast\n",
+    "other.yaml": "/talker:\n  ros__parameters:\n    rate: 3\n",
+    "samples.yaml": "samples: []\n",
+    "samples.npz": "junk",
+    "junk.mcap": "junk" * 10,
+    "junk.db3": "junk" * 10,
+    "junk.bag": "junk" * 10,
+}
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("inputs")
+    (folder / "folder").mkdir()
+    for name in ("lidar.tum", "camera.tum", "drive.mcap"):
+        shutil.copy(local_path(f"sample:{name}"), folder / name)
+    for name, text in TEXTS.items():
+        (folder / name).write_text(text)
+    (folder / "binary.tum").write_bytes(bytes(range(256)) * 10)
+    (folder / "image.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    (folder / "cut.mcap").write_bytes((folder / "drive.mcap").read_bytes()[:3000])
+    write_poses(folder)
+    return folder
+
+
+def write_poses(folder):
+    """Write trajectories of 600 poses, each with one fault."""
+    rows = np.loadtxt(local_path("sample:lidar.tum"))
+    double = rows.copy()
+    double[:, 4:] *= 2.0
+    no_rotation = rows.copy()
+    no_rotation[:, 4:] = 0.0
+    no_numbers = rows.copy()
+    no_numbers[:, 1:] = np.nan
+    far = rows.copy()
+    far[:, 1] = 1e12
+    repeated = rows.copy()
+    repeated[5:, 0] = rows[4, 0]
+    poses = {
+        "short": rows[:, :7],
+        "few": rows[:4],
+        "quat2": double,
+        "zeroq": no_rotation,
+        "nan": no_numbers,
+        "far": far,
+        "same_stamp": repeated,
+    }
+    for name, table in poses.items():
+        np.savetxt(folder / f"{name}.tum", table, fmt="%.9f")
+    text = (folder / "lidar.tum").read_text()
+    (folder / "cells.tum").write_text(text.replace("1", "abc", 1))
+
+
+@pytest.mark.parametrize(("code", "command", "message"), ROWS, ids=[row[1] for row in ROWS])
+def test_a_wrong_input_is_answered_in_one_line(run, inputs, monkeypatch, code, command, message):
+    monkeypatch.chdir(inputs)
+    exit_code, out, err = run(*shlex.split(command))
+    assert (exit_code, out) == (int(code), "")
+    lines = [line for line in err.splitlines() if not line.startswith("hand_eye_calib: note: ")]
+    assert len(lines) == 1
+    assert lines[0].startswith("hand_eye_calib: error: ")
+    assert message in lines[0]
+
+
+def test_there_are_sixty_wrong_inputs_or_more():
+    assert len(ROWS) >= 60
+
+
+def test_an_option_of_dnlo_has_a_note_with_another_method(run):
+    paths = ("sample:lidar.tum", "sample:camera.tum")
+    _, out, _ = run("calibrate", *paths, "--threshold", "0.5")
+    words = " ".join(out.split())
+    assert "Note: the option threshold has no effect with method adaptive: only dnlo uses" in words
+    _, out, _ = run("calibrate", *paths, "--threshold", "0.5", "--method", "dnlo")
+    assert "has no effect" not in out
