@@ -95,6 +95,8 @@ setup(
         (f"share/{name}", ["package.xml"]),
         (f"share/{name}/config", files("config/*.*")),
         (f"share/{name}/launch", files("launch/*.launch.py")),
+        # A workspace has bin/ on PATH, but not lib/; pip makes the same command itself.
+        *([("bin", ["scripts/hand_eye_calib"])] if is_for_ros else []),
     ],
     zip_safe=False,
     python_requires=">=3.11",

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree import ElementTree
 
 import pytest
@@ -17,7 +18,7 @@ from packaging.requirements import Requirement
 from source_code import ROOT
 
 from hand_eye_calib.core.base.registry import COMMANDS
-from hand_eye_calib.online.watch.board import AXES
+from hand_eye_calib.online.live.progress import AXIS_KEYS
 
 PACKAGE = "hand_eye_calib"
 WHERE = "import hand_eye_calib; print(hand_eye_calib.__file__)"
@@ -99,7 +100,7 @@ def source(tmp_path_factory):
     target = tmp_path_factory.mktemp("source") / PACKAGE
     target.mkdir()
     compiled = shutil.ignore_patterns("__pycache__")
-    for folder in (PACKAGE, "config", "launch", "resource"):
+    for folder in (PACKAGE, "config", "launch", "resource", "scripts"):
         shutil.copytree(ROOT / folder, target / folder, ignore=compiled)
     for file in ("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / file, target)
@@ -237,6 +238,34 @@ def assert_data_files(prefix):
         assert {path.name for path in (share / folder).iterdir() if path.is_file()} == expected
 
 
+class TutorialCommands(NamedTuple):
+    """Names in the blocks of shell commands of the tutorials and of the pages for beginners."""
+
+    commands: set[str]
+    executables: set[str]
+    launch_files: set[str]
+
+
+def tutorial_commands():
+    pages = [*(ROOT / "docs" / "tutorials").glob("*.md")]
+    pages += [ROOT / "docs" / f"{name}.md" for name in ("quickstart", "node", "installation")]
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
+    blocks = "\n".join(re.findall(r"```(?:bash|ini)\n(.*?)```", text, re.DOTALL))
+    return TutorialCommands(
+        commands=set(re.findall(rf"^{PACKAGE} ([a-z]+)", blocks, re.MULTILINE)),
+        executables=set(re.findall(rf"ros2 run {PACKAGE} (\w+)", blocks)),
+        launch_files=set(re.findall(rf"ros2 launch {PACKAGE} (\S+)", blocks)),
+    )
+
+
+def test_the_commands_of_the_tutorials_exist_after_colcon_and_after_pip():
+    names = tutorial_commands()
+    assert names.commands >= {"calibrate", "calibrator", "watch", "info", "compare"}
+    assert names.commands <= set(COMMANDS)
+    assert names.executables <= set(COMMANDS)
+    assert names.launch_files == {"calibrator.launch.py"}
+
+
 def test_colcon_lays_out_an_install_space_whose_commands_run(declared, source, tmp_path):
     colcon = [sys.executable, "-m", "colcon", "--log-base", tmp_path / "log", "build"]
     options = ["--base-paths", source, "--packages-select", PACKAGE]
@@ -252,11 +281,16 @@ def test_colcon_lays_out_an_install_space_whose_commands_run(declared, source, t
     (tmp_path / "each.py").write_text(EACH)
     program = f"source install/setup.bash && {sys.executable} each.py '{folder}'/*"
     program += f" && '{folder}/{PACKAGE}' --version"
+    # The commands of the tutorials, as a shell finds them.
+    program += f" && command -v {PACKAGE} && {PACKAGE} watch --help"
     output = run(["bash", "-c", program], env=clean_environment(), cwd=tmp_path).stdout
     assert Path(output.splitlines()[0]).resolve().is_relative_to(prefix)
     for command in COMMANDS:
         assert f"usage: hand_eye_calib {command}" in output
     assert declared["version"] in output
+    assert str(prefix / "bin" / PACKAGE) in output
+    assert tutorial_commands().executables <= set(executables)
+    assert tutorial_commands().launch_files <= {path.name for path in prefix.rglob("*.launch.py")}
 
 
 WORKFLOWS = {
@@ -326,8 +360,8 @@ def test_foxglove_shows_what_the_node_publishes_and_serves_each_panel_once():
     topics = ["/calibrator/extrinsic_with_covariance", "/calibrator/markers"]
     assert list(panels["3D!extrinsic"]["topics"]) == topics
     values = [path["value"] for panel in panels.values() for path in panel.get("paths", ())]
-    keys = set(re.findall(r'key=="([a-z.]+)"', " ".join(values)))
-    assert keys == {*(f"sigma.{axis}" for axis in AXES), "target.x", "target.roll"}
+    keys = set(re.findall(r'key=="([a-z._]+)"', " ".join(values)))
+    assert keys == {*(f"sigma.{key}" for key in AXIS_KEYS.values()), "target.x", "target.about_x"}
 
     def placed(panel):
         if isinstance(panel, str):
