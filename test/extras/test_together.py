@@ -396,7 +396,7 @@ def test_json_has_it_all(saved, run):
     [
         (["first"], 1, "two results or more"),
         (["first", "first"], 1, "2 different names"),
-        (["first", "--with", "absent.urdf"], 2, "existing file"),
+        (["first", "--with", "absent.urdf"], 2, "no file 'absent.urdf'"),
         (["absent", "first"], 1, "cannot read absent"),
         (["first", "--with", "1e400 0 0 0 0 0"], 2, "must be at most 1e+06 m; got '1e400'"),
         (["first", "--with", "0 0 0 0 1e300 0"], 2, "must be at most 1e+06 rad; got '1e300'"),

@@ -78,7 +78,7 @@ def test_installed_from_numbers_and_descriptions(urdf):
     drawn = open_installed(str(urdf))("lidar", "camera")
     np.testing.assert_allclose(numbers.T_parent_child, drawn.T_parent_child, atol=1e-12)
     assert not numbers.covariance.any()
-    with pytest.raises(ConfigError, match="existing file"):
+    with pytest.raises(ConfigError, match="installed: no file"):
         open_installed("robot.urdf")("lidar", "camera")
     with pytest.raises(InputError, match="no frame 'radar'"):
         open_installed(str(urdf))("lidar", "radar")

@@ -445,7 +445,7 @@ def test_the_config_file_of_the_package_holds_the_defaults(config_file, capsys):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{methd: dnl}", r"config\.yaml: unknown option 'methd'; did you mean method\?; known"),
+        ("{methd: dnl}", r"config\.yaml: unknown option 'methd'; did you mean 'method'\?"),
         ("{threshold: -1.0}", r"config\.yaml: 'threshold' must be at least"),
         ("[1, 2]", r"config\.yaml: expected a mapping of options to values; found list"),
         ("/slam: {ros__parameters: {a: 1}}", "named calibrator; the file has those of /slam"),
