@@ -63,6 +63,8 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
         try:
             values = parse_pose("installed", text)
         except ConfigError:
+            if len(text.split()) == len(AXES):
+                raise
             raise ConfigError(
                 f"installed: no file {shown_value(text)}{similar(text)}; expected a URDF, "
                 "extrinsic.yaml, a bag, or X Y Z ROLL PITCH YAW in m and rad"
