@@ -1,4 +1,4 @@
-"""Cells of the lines of a text file: the separator between them, and the numbers in them.
+"""Cells of the lines of a text file: the separator between cells, and the numbers in cells.
 
 Every pattern matches a whole cell, in time proportional to its length.
 """
@@ -10,15 +10,15 @@ from math import nan
 
 from hand_eye_calib.formats.trajectory_files.dates import is_date_or_time
 
-#: Separator of cells between which there is only white space.
+#: Separator that stands for white space.
 BLANKS = ""
-# Separators in the order in which they are tried: the first of equally good ones is taken.
+# Possible separators. The first of equally good separators is used.
 _SEPARATORS = (";", "\t", ",", "|", BLANKS)
 _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)(e[-+]?\d+)?|[-+]?nan|[-+]?inf", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(e[-+]?\d+)?", re.IGNORECASE)
-# Texts that programs write in place of a missing value.
+# Texts that programs write for a missing value.
 _NULLS = {"", "nan", "-nan", "null", "none", "na", "n/a", "#n/a", "nil", "-", "--", "?"}
-# Degrees, minutes and seconds with their signs, and a hemisphere before or behind them.
+# Degrees, minutes and seconds with their signs, and a hemisphere before or after the numbers.
 _ANGLE = re.compile(
     r"(?P<before>[NSEW]?)\s*"
     r"(?P<degrees>[-+]?\d{1,3}(?:[.,]\d*)?)(?:[°ºd:\s]+(?P<minutes>\d{1,2}(?:[.,]\d*)?)"
@@ -26,16 +26,16 @@ _ANGLE = re.compile(
     r"(?P<behind>[NSEW]?)",
     re.ASCII,
 )
-# Characters of the longest angle.
+# Largest number of characters of an angle.
 _LONGEST_ANGLE = 40
-# Characters that an angle has and that other cells of numbers do not have.
+# Characters of angles that other cells with numbers do not have.
 _ANGLE_SIGNS = set("NSEW°º'′’\"″”:")
 
 CellsOf = Callable[[str], list[str]]
 
 
 def is_number(cell: str) -> bool:
-    """Whether a cell is a number, perhaps with a decimal comma."""
+    """Whether a cell is a number, with a decimal point or comma."""
     return bool(_NUMBER.fullmatch(cell) or _DECIMAL_COMMA.fullmatch(cell))
 
 
@@ -55,12 +55,12 @@ def is_angle(cell: str) -> bool:
 
 
 def _is_marked_angle(cell: str) -> bool:
-    """Whether a cell is an angle rather than a row of numbers between blanks."""
+    """Whether a cell is an angle with a sign, and not numbers separated by blanks."""
     return not _ANGLE_SIGNS.isdisjoint(cell) and is_angle(cell)
 
 
 def number(cell: str) -> float:
-    """Return the number in a cell: NaN for a missing value.
+    """Return the number in a cell; NaN for a missing value.
 
     Raises
     ------
@@ -133,9 +133,9 @@ def _split_at_blanks(line: str) -> list[str]:
 
 
 def separator_of(lines: Sequence[str]) -> str:
-    """Return the separator with which the most digits are in cells that are numbers.
+    """Return the separator for which cells that are numbers contain the most digits.
 
-    Lines without numbers have the first separator that is in the first line.
+    Without numbers, return the first possible separator that the first line contains.
     """
     n_digits = {}
     for separator in _SEPARATORS:
@@ -153,10 +153,10 @@ def _digits_in_numbers(cells: Sequence[str]) -> int:
 
 
 def names_in(line: str, separator: str) -> list[list[str]]:
-    """Return the names that a line may have, one list for each way to split the line.
+    """Return possible names of columns in a line: a list for each way to split the line.
 
     A line is split at the separator, at the separator outside brackets, at white space outside
-    brackets, at wide gaps, and at other separators.
+    brackets, at gaps of two or more spaces, and at other separators.
     """
     text = line.lstrip("#/%").strip()
     between_gaps = [name.strip() for name in text.split("  ")]

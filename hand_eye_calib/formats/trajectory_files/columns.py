@@ -20,10 +20,11 @@ TRANSLATION = tuple(f"m{row}4" for row in "123")
 LAST_ROW = tuple(f"m4{column}" for column in "1234")
 RATES = ("wx", "wy", "wz")
 TWIST = ("vx", "vy", "vz", *RATES)
-# Groups of quantities that are a position or an orientation, the preferred group first; and the
-# smaller groups that suffice for a machine on a plane.
+# Groups of quantities that are a position, the preferred group first.
 _POSITIONS = (POSITION, ("lat", "lon", "height"), ("x", "y", "height"))
+#: Groups that are the position of a machine on a plane.
 PLANAR_POSITIONS = (("x", "y"), ("lat", "lon"))
+# Groups of quantities that are an orientation, the preferred group first.
 _ORIENTATIONS = (
     QUATERNION,
     SCALAR_FIRST,
@@ -38,20 +39,21 @@ _ORIENTATION_QUANTITIES = {
     name for group in (*_ORIENTATIONS, *_PLANAR_ORIENTATIONS) for name in group
 }
 
-# Names of a coordinate, by its axis and the axis's number, and names of its own.
+# Names of the coordinate of a position. {0} is the axis, {1} its number, {2} the names of this axis
+# alone.
 _POSITION_NAMES = (
     "{0} t{0} t_{0} p{0} p_{0} pos_{0} position_{0} translation_{0} position{1} "
     "actual_tcp_pose_{1} ecef_{0} {0}_ecef {0}_ecf {2}"
 )
 _DIRECTIONS = {"x": "easting pos_east", "y": "northing pos_north", "z": "altitude pos_up"}
-# Beginnings of the names of angular rates, velocities and quaternions, before the axis.
+# Beginnings of the names of angular rates, velocities and quaternions. The axis follows.
 _BEGINNINGS = {
     "w": "w w_ omega_ gyro_ gyr_ angvel_ ang_vel_ angular_velocity_ angular_rate_ rate_",
     "v": "v",
     "q": "q q_ o quat_ quaternion_ rot_ orientation_ rotation_",
 }
-# Names of each quantity, in lower case, with underscores between words. A column of a bag's export
-# has a whole path, such as .pose.pose.position.x, whose end is compared.
+# Names of each quantity, in lower case, with underscores between words. In files exported from
+# bags, a column has a whole path, such as .pose.pose.position.x; the end of the path is compared.
 _NAMES = {
     "header": "header_stamp",
     "t": "t ts time timestamp timestamps stamp gpstime gps_time sim_time tracking_timestamp "
@@ -92,13 +94,13 @@ _NAMES = {
     "rotvec_z": "rotvec_z actual_tcp_pose_5 rz",
     **{name: name for name in MATRIX},
 }
-# Names of one word that a path may end in, such as gps_fix_latitude.
+# Names of a single word that may be the end of a path, such as gps_fix_latitude.
 _ENDS = {"latitude", "longitude", "altitude", "itow", *QUATERNION, "tx", "ty", "tz"}
 # An element of a matrix: t_00, r11, rot_1_2, pose.T[0][3].
 _ELEMENT = re.compile(
     r"(?:^|_)(?:m|r|t|h|rot|mat|matrix|rotation|pose|transform|rotm)_?(\d)_?(\d)$"
 )
-# Parts of an orientation or of a position in the names of all columns, also in unknown names.
+# Signs of an orientation, and of a position, in the names of all columns joined by commas.
 _ORIENTED = re.compile(
     r"(^|[^a-z])q(\d|uat|,|$)|orient|rot|angle|euler|attitude|"
     r"(^|,)(a,b,c|w,p,r|rx,ry,rz|ex,ey,ez|omega,phi,kappa)(,|$)"
@@ -121,7 +123,7 @@ _UNIT_NAMES = {
     "ns": "ns nanosecond nanoseconds",
 }
 _UNITS = {name: unit for unit, names in _UNIT_NAMES.items() for name in names.split()}
-# Units in brackets. Without brackets these are the last words of names, such as stamp_sec.
+# Units in brackets. Some of them are not units as the last word of a name, such as stamp_sec.
 _UNITS_IN_BRACKETS = {
     **_UNITS,
     **dict.fromkeys(("sec", "secs"), "s"),
@@ -129,17 +131,17 @@ _UNITS_IN_BRACKETS = {
     # Degrees, minutes and seconds.
     **dict.fromkeys(("d/m/s", "+/-d/m/s", "dms", "d/m"), "deg"),
 }
-# Word in the name of a stamp, before a unit of time. The last words are seconds of a GPS week.
+# Word in the name of a stamp that has a unit of time. "tow" and "sow" are seconds of a GPS week.
 _TIME_WORD = re.compile(r"t|time.*|stamp.*|(?:gps|i)?(?:tow|sow)")
-# Brackets with their content, up to the end of the name if nothing closes them.
+# Brackets with their content; brackets without an end extend to the end of the name.
 _BRACKETS = re.compile(r"[\[(]([^\])]*)([\])]|$)")
 
 
 def named_columns(names: Sequence[str]) -> tuple[dict[str, list[int]], list[str]]:
     """Return the columns of each quantity, and the unit in each name.
 
-    A column belongs to a quantity if it has one of the quantity's names. If no column has one, a
-    path that ends in one of these names counts.
+    A column belongs to a quantity if its name is one of the quantity's names. If a quantity has no
+    such column, names that end in one of the quantity's names are accepted.
 
     Parameters
     ----------
@@ -148,29 +150,38 @@ def named_columns(names: Sequence[str]) -> tuple[dict[str, list[int]], list[str]
     Returns
     -------
     columns : dict of str to list of int
-        Only quantities with a column.
+        Quantities without a column are missing.
     units : (N,) list of str
         Empty for a name without a unit.
     """
     split = [_split(name) for name in names]
     plain = [name for name, _ in split]
+    units = [unit for _, unit in split]
     columns: dict[str, list[int]] = {}
     for quantity, text in _NAMES.items():
-        aliases = text.split()
-        places = [place for place, name in enumerate(plain) if name in aliases]
-        if not places:
-            # The last part of a path counts, such as position_x of pose.position_x. Short names are
-            # too common as a part, but for those of _ENDS.
-            ends = tuple(f"_{end}" for end in aliases if "_" in end or end in _ENDS)
-            places = [place for place, name in enumerate(plain) if name.endswith(ends)]
+        places = _places_of(text.split(), plain)
         if quantity in ROTATION_VECTOR:
             # rx, ry and rz in degrees are Euler angles of an unknown order, not a rotation vector.
-            is_angle = [is_brief(name) and unit == "deg" for name, unit in split]
-            places = [place for place in places if not is_angle[place]]
+            places = [
+                place for place in places if not (is_brief(plain[place]) and units[place] == "deg")
+            ]
         if places:
             columns[quantity] = places
     columns |= _elements(plain, columns)
-    return columns, [unit for _, unit in split]
+    return columns, units
+
+
+def _places_of(aliases: Sequence[str], plain: Sequence[str]) -> list[int]:
+    """Return the columns whose names are aliases; if there are none, those that end in an alias.
+
+    The end of a path is compared, such as position_x of pose.position_x. Most aliases of a single
+    word are too common at the end of other names; those of ``_ENDS`` are not.
+    """
+    places = [place for place, name in enumerate(plain) if name in aliases]
+    if places:
+        return places
+    ends = tuple(f"_{alias}" for alias in aliases if "_" in alias or alias in _ENDS)
+    return [place for place, name in enumerate(plain) if name.endswith(ends)]
 
 
 def is_brief(name: str) -> bool:
@@ -206,9 +217,10 @@ def _elements(plain: Sequence[str], columns: Mapping[str, list[int]]) -> dict[st
 def measured(
     columns: Mapping[str, list[int]], names: Sequence[str], measures: str
 ) -> tuple[str, Sequence[str]]:
-    """Return the kind of data in a table, and the quantities to read for that kind.
+    """Return the kind of data in a table, and the quantities to read for this kind.
 
-    In doubt these are the preferred quantities of poses, so that an error names the missing ones.
+    In doubt, the preferred quantities of poses are returned, so that an error names the missing
+    quantities.
 
     Parameters
     ----------
@@ -228,7 +240,7 @@ def measured(
     if measures == "poses":
         if has_matrix:
             return measures, MATRIX
-        # A position without a height is one of a machine on a plane.
+        # Only a machine on a plane, with a yaw or a heading, may have no height.
         if position in PLANAR_POSITIONS and orientation not in _PLANAR_ORIENTATIONS:
             position = ()
         return measures, (*(position or POSITION), *orientation)
@@ -245,7 +257,7 @@ def measured(
 def _first_group(
     groups: Iterable[Sequence[str]], columns: Mapping[str, list[int]]
 ) -> Sequence[str]:
-    """Return the first group of quantities that all have columns; empty if there is none."""
+    """Return the first group whose quantities all have columns; empty without such a group."""
     return next((group for group in groups if {*group} <= columns.keys()), ())
 
 
@@ -264,8 +276,8 @@ def _kind_of(columns: Mapping[str, list[int]], names: Sequence[str]) -> str:
     return "poses"
 
 
-#: Quantities that make a stamp, the preferred ones first. The stamp of the message's header counts
-#: before the time of its arrival, and a date with a time of day before the week of GPS.
+# Groups of quantities that make a stamp, the preferred group first. The stamp of a message's header
+# is preferred to the time of its arrival, and a date with a time of day to a week of GPS.
 _STAMPS = (
     ("secs", "nsecs"),
     ("header",),
@@ -281,9 +293,10 @@ _STAMPS = (
 
 
 def stamp_columns(columns: Mapping[str, list[int]]) -> Sequence[str]:
-    """Return the quantities that make the stamp; empty if there are none.
+    """Return the quantities that make the stamp; empty without such quantities.
 
-    If there are a stamp, a week of GPS and its second, the stamp is on the clock of the recording.
+    If there are a stamp, a week of GPS and a second of the week, the stamp is used, because it is
+    on the clock of the recording.
     """
     has_second = "sow" in columns or "mow" in columns
     if has_second and {"week", "t"} <= columns.keys():
@@ -292,7 +305,7 @@ def stamp_columns(columns: Mapping[str, list[int]]) -> Sequence[str]:
 
 
 def is_pose(columns: Iterable[str]) -> bool:
-    """Whether there are columns of a position, of rates, or of a rotation matrix."""
+    """Whether quantities include a position, rates, or a rotation matrix."""
     groups = (*PLANAR_POSITIONS, RATES, ROTATION)
     return any({*group} <= {*columns} for group in groups)
 
@@ -303,14 +316,15 @@ def plain_name(name: str) -> str:
 
 
 def _split(name: str) -> tuple[str, str]:
-    """Return a column's name without its unit, and the unit, empty if there is none.
+    """Return a column's name without its unit, and the unit; empty for a name without a unit.
 
-    ``.pose.position.x [mm]`` becomes pose_position_x and mm, wx_deg_s becomes wx and deg/s.
+    ``.pose.position.x [mm]`` becomes pose_position_x and mm; wx_deg_s becomes wx and deg/s.
     """
     name = name.strip().lower()
-    if re.search(r"\[\d\]$", name):  # an element such as q[0] or T[0][3]
+    # The index of an element, such as q[0] or T[0][3], is not a unit in brackets.
+    if re.search(r"\[\d\]$", name):
         name = re.sub(r"\[(\d)\]", r"_\1_", name)
-    # Frames as in p_RS_R_x.
+    # Remove names of frames, as in p_RS_R_x.
     name = re.sub(r"^([pqw])_[a-z]{2}(_[a-z])?_|_(world|odometry)_device$", r"\1_", name)
     outside = _BRACKETS.sub(lambda match: "" if match[2] else f" {match[1]}", name)
     words = re.findall("[a-z0-9°µμ]+", outside)
@@ -327,7 +341,7 @@ def _unit_in_brackets(text: str) -> str:
 
 
 def _split_words(words: list[str]) -> tuple[str, str]:
-    """Return the words of a name without a unit in the last words, joined, and the unit."""
+    """Return the words of a name, joined without a unit at the end, and this unit."""
     if len(words) > 1 and words[-1].isdigit() and words[-2] in ("q", "position"):
         return "_".join(words[:-1]) + words[-1], ""
     is_time = any(_TIME_WORD.fullmatch(word) for word in words)

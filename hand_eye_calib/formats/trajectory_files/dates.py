@@ -1,8 +1,9 @@
-"""Stamps in text, exactly as they are written: numbers, weeks of GPS, dates and times of day.
+"""Stamps in text: numbers, weeks of GPS, dates and times of day, without loss of digits.
 
 Every pattern is applied to at most :data:`_LONGEST` characters.
 """
 
+import math
 import re
 from collections.abc import Sequence
 from datetime import date
@@ -15,9 +16,9 @@ GPS_TIME = "stamps are of GPS time, 18 s ahead of UTC since 2017"
 
 # Nanoseconds in a second.
 _NS = STAMP_UNITS["s"]
-# Characters of the longest date with time and zone, with room for spaces.
+# Largest number of characters of a date with time and zone, with some spaces.
 _LONGEST = 48
-# Proleptic day of 1970-01-01, from which stamps count.
+# Number of the day 1970-01-01 in Python's calendar.
 _EPOCH_DAY = date(1970, 1, 1).toordinal()
 #: Seconds in a day.
 DAY_S = 86_400
@@ -39,21 +40,21 @@ _TIME = re.compile(
     re.IGNORECASE | re.ASCII,
 )
 _ZONE = re.compile(r"([-+])(\d\d):?(\d\d)?", re.ASCII)
-# Characters of the longest time of day that belongs to a date in another column.
+# Largest number of characters of a time of day that has its date in another column.
 _LONGEST_TIME = len("HH:MM:SS.123456789ab")
 
 
 def seconds_of(text: str) -> Decimal:
-    """Return the seconds since 1970 of a date with a time of day.
+    """Return the seconds since 1970 of a date with or without a time of day.
 
-    A time of day alone becomes the seconds of the day. A time without a zone is UTC. If the
+    For a time of day alone, return the seconds of the day. A time without a zone is UTC. If the
     fraction has the same separator as minutes and seconds, its digits are a number of milliseconds,
     microseconds or nanoseconds.
 
     Raises
     ------
     ValueError
-        If the text is neither.
+        If the text is neither a date nor a time of day.
     """
     text = text.strip()
     if len(text) > _LONGEST:
@@ -87,7 +88,7 @@ def is_date(text: str) -> bool:
 
 
 def is_ambiguous(text: str) -> bool:
-    """Whether day and month of a date could be exchanged."""
+    """Whether a date remains valid if its day and month are exchanged."""
     match = _YEAR_LAST.match(text.strip()[:_LONGEST])
     if not match or match[2] != "/" or not match[3].isdigit():
         return False
@@ -95,7 +96,7 @@ def is_ambiguous(text: str) -> bool:
 
 
 def _day_and_rest(text: str) -> tuple[int | None, str]:
-    """Return the day since 1970 of a date at the beginning of a text, and the text behind the date.
+    """Return the day since 1970 of a date at the beginning of a text, and the rest of the text.
 
     The day is None if the text does not begin with a date.
     """
@@ -106,7 +107,7 @@ def _day_and_rest(text: str) -> tuple[int | None, str]:
         return None, text
     day = match[1]
     month = match[3]
-    # With slashes the month is first, unless the first number is too large for a month.
+    # In dates with slashes the month is first, unless the first number is too large for a month.
     if match[2] == "/" and int(match[1]) <= 12:
         day = match[3]
         month = match[1]
@@ -114,6 +115,7 @@ def _day_and_rest(text: str) -> tuple[int | None, str]:
 
 
 def _day(year: str, month: str, day: str) -> int:
+    """Return the day since 1970 of a date; the month is a number or a name."""
     month_number = int(month) if month.isdigit() else 1 + _MONTHS.index(month[:3].lower())
     return date(int(year), month_number, int(day)).toordinal() - _EPOCH_DAY
 
@@ -124,25 +126,34 @@ def _time_of_day(text: str) -> Decimal:
     if not match:
         raise ValueError("no time of day")
     hour_text, separator, minute_text, second_text, point, digits, half, zone = match.groups()
-    hour = int(hour_text)
+    hour = _hour_of_day(int(hour_text), half)
     minute = int(minute_text)
     second = int(second_text or 0)
-    if half:
-        if not 1 <= hour <= 12:
-            raise ValueError("no hour of twelve")
-        hour = hour % 12 + (12 if half.lower() == "pm" else 0)
     if hour > 24 or minute > 59 or second > 60:
         raise ValueError("no time of day")
-    n_decimals = len(digits or "")
-    if point == separator and point != ".":
-        # The digits are a number of ms, us or ns: the decimals are 3, 6 or 9.
-        n_decimals = -(-n_decimals // 3) * 3
-    fraction = Decimal(digits or 0).scaleb(-n_decimals)
-    return 3600 * hour + 60 * minute + second + fraction - _zone_s(zone or "")
+    # With the separator of minutes and seconds, the digits are a number of ms, us or ns.
+    is_number = point == separator and point != "."
+    fraction = _fraction(digits, is_number) if digits else 0
+    return Decimal(3600 * hour + 60 * minute + second - _zone_s(zone or "")) + fraction
+
+
+def _hour_of_day(hour: int, half: str | None) -> int:
+    """Return the hour of 24 for an hour of 12 with am or pm; other hours unchanged."""
+    if half is None:
+        return hour
+    if not 1 <= hour <= 12:
+        raise ValueError("no hour of twelve")
+    return hour % 12 + (12 if half.lower() == "pm" else 0)
+
+
+def _fraction(digits: str, is_number: bool) -> Decimal:
+    """Return the seconds of the digits of a fraction, or of a number of ms, us or ns."""
+    n_decimals = 3 * math.ceil(len(digits) / 3) if is_number else len(digits)
+    return Decimal(digits).scaleb(-n_decimals)
 
 
 def _zone_s(zone: str) -> int:
-    """Return the seconds that a time zone is ahead of UTC."""
+    """Return the offset (s) of a time zone from UTC, positive in the east."""
     match = _ZONE.fullmatch(zone)
     if not match:
         return 0
@@ -154,7 +165,7 @@ def _zone_s(zone: str) -> int:
 
 
 def stamp_of(names: Sequence[str], cells: Sequence[str], unit: str = "") -> Decimal:
-    """Return the stamp of a row as it is written, never through a binary floating-point number.
+    """Return the stamp of a row with all its digits.
 
     Parameters
     ----------
@@ -162,14 +173,14 @@ def stamp_of(names: Sequence[str], cells: Sequence[str], unit: str = "") -> Deci
         Quantities of the cells, such as ("date", "t"); see columns.stamp_columns.
     cells : sequence of str
     unit : str, optional
-        Unit of the seconds in a GPS week, if the column names it. Without a name, a number that is
-        too large for seconds of this week or the next is in milliseconds.
+        Unit of the second of a GPS week, if the name of the column states it. By default, the
+        number is in seconds, or in milliseconds if it is too large for two weeks.
 
     Returns
     -------
     Decimal
-        In the unit of its column; in seconds for dates and weeks of GPS; in nanoseconds for columns
-        of seconds and nanoseconds.
+        For dates and weeks of GPS in seconds; for columns of seconds and nanoseconds in
+        nanoseconds; otherwise in the unit of the column.
 
     Raises
     ------
@@ -185,16 +196,16 @@ def stamp_of(names: Sequence[str], cells: Sequence[str], unit: str = "") -> Deci
         second = _number(last)
         if second is not None and second.is_finite():
             return _stamp_in_week(cells[0], second, unit)
-    # A stamp that is complete in itself does not need the date.
+    # Ignore the date if the other cell is a complete stamp.
     if names[0] == "date" and ":" in last and len(last) < _LONGEST_TIME:
         return seconds_of(" ".join(cells))
     return _decimal(last)
 
 
 def _stamp_in_week(week_text: str, second: Decimal, unit: str) -> Decimal:
-    """Convert a GPS week and the second in it to seconds since 1970, in GPS time.
+    """Convert a GPS week and a second of the week to seconds since 1970, in GPS time.
 
-    A number that is too large for a second of a week is returned as it is.
+    A number that is too large for a second of a week is a whole stamp and returned unchanged.
     """
     for possible_unit in (unit,) if unit else ("s", "ms"):
         second_of_week = second * STAMP_UNITS[possible_unit] / _NS
@@ -208,7 +219,8 @@ def _stamp_in_week(week_text: str, second: Decimal, unit: str) -> Decimal:
 
 def _number(text: str) -> Decimal | None:
     """Return the number in a text; None for other text."""
-    if "_" in text:  # Decimal skips underscores, but in a stamp they separate
+    # Decimal would ignore underscores, which are separators in stamps.
+    if "_" in text:
         return None
     for number in (text, text.replace(",", ".")):
         try:
@@ -229,7 +241,7 @@ def _decimal(text: str) -> Decimal:
 
 
 def notes_on_stamps(names: Sequence[str], cells: Sequence[str]) -> list[str]:
-    """Return notes for the user on stamps such as those of one row."""
+    """Return notes for the user on the stamps of a table, from the cells of one row."""
     notes = []
     if names and names[0] == "week":
         notes.append(GPS_TIME)

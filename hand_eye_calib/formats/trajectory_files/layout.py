@@ -1,7 +1,7 @@
 """Layout of a text file with rows of numbers.
 
-The layout states where the rows begin, what separates their cells, and the quantity of each column,
-recognised by the names above the rows or by the numbers themselves.
+The layout states where the rows begin, what separates their cells, and the quantity of each column.
+The quantities are recognised by the names above the rows, or by the numbers themselves.
 """
 
 import re
@@ -48,26 +48,26 @@ DIGITS = {"ns": 17, "us": 14, "ms": 11}
 COMMENTS = ("#", "//")
 _LINE = re.compile(r"\S[^\r\n]*")
 
-# Lines that are no comments, from which the layout is recognised. Text above the columns has some
-# twenty lines, sometimes a hundred.
+# Largest number of lines from which the layout is recognised, without comments. Text above the
+# columns has some twenty lines, sometimes a hundred.
 _MOST_LINES = 300
-# Characters of these lines.
+# Largest number of characters of these lines.
 _MOST_CHARACTERS = 1 << 19
-# Comments just above the first of these lines.
+# Largest number of comments above these lines that may name the columns.
 _MOST_COMMENTS = 100
-# Rows whose numbers are compared with what a column may be.
+# Largest number of rows whose numbers decide what a column is.
 _MOST_ROWS = 100
-# Smallest share of values among the cells of a row: a row may also have names of frames.
-_LEAST_SHARE = 0.5
+# Smallest share of values among the cells of a row. The other cells may be names of frames.
+_MIN_SHARE_OF_VALUES = 0.5
 
 #: Columns of a row in the format tum.
 TUM = ("t", *POSITION, "qx", "qy", "qz", "qw")
 #: Columns of a stamp and a pose whose quaternion may be in either order.
 STAMPED_POSE = ("t", *POSITION, *UNNAMED)
-# Columns of the state that FAST-LIO and its relatives write: a stamp, a rotation vector, a
-# position, and five vectors of which the last is gravity.
+# Columns of the state that FAST-LIO and related programs write: a stamp, a rotation vector, a
+# position, and six vectors of which the last is gravity.
 _FAST_LIO = ("t", *ROTATION_VECTOR, *POSITION, *[""] * 18)
-# Range of lengths of gravity (m/s^2).
+# Smallest and largest length of gravity (m/s^2).
 _GRAVITY_M_S2 = (9.6, 10.0)
 # Ten digits of seconds since 1970.
 _SINCE_1970 = re.compile(r"\d{10,}(\.\d*)?", re.ASCII)
@@ -86,13 +86,13 @@ class Layout:
     row : list of str
         Cells of the first row; empty without rows.
     names : tuple of str, optional
-        Names of the columns above the rows.
+        Names of the columns, from a line above the rows.
     format : str
-        Format that the rows look like; "tum" in doubt, so that its reader reports the problem.
+        Format of the rows; "tum" in doubt, so that the reader of this format reports the problem.
     columns : tuple of str, optional
-        Columns in that format, if they are known.
+        Quantities of the columns in this format, if they are known.
     is_transposable : bool
-        Whether rows and columns of the rotation could be exchanged.
+        Whether the matrices may be written row by row or column by column.
     """
 
     rows_after: int
@@ -107,7 +107,7 @@ class Layout:
 def lines_of(path: str | Path, text: str, after: int | None = None) -> Iterator[tuple[int, str]]:
     """Yield the number and the text of each line that is not blank.
 
-    If ``after`` is given, comments and the lines up to this line are skipped.
+    With ``after``, comments and the lines up to this line number are skipped.
 
     Raises
     ------
@@ -129,14 +129,20 @@ def lines_of(path: str | Path, text: str, after: int | None = None) -> Iterator[
 def layout_of(path: str | Path, text: str, needs_names: bool) -> Layout:
     """Return the layout of a text.
 
-    ``needs_names`` is True if no option names the columns.
+    Parameters
+    ----------
+    path : str or path-like
+        Name of the text in messages.
+    text : str
+    needs_names : bool
+        Whether names above the rows must fit the columns, because no option names the columns.
 
     Raises
     ------
     InputError
-        For a line that is too long, and for another number of names than of columns.
+        For a line that is too long, and for names that do not fit the columns.
     """
-    comments, lines = _beginning(path, text)
+    comments, lines = _first_lines(path, text)
     separator = separator_of([line for _, line in lines])
     split = splitter(separator)
     cells = [split(line) for _, line in lines]
@@ -145,29 +151,21 @@ def layout_of(path: str | Path, text: str, needs_names: bool) -> Layout:
         return _layout_without_rows(lines, separator)
     above = [*comments, *(line for _, line in lines[:n_above])]
     row = _usual_row(cells[n_above:])
-    header = _header_above(above, row, separator)
-    merge = header.merge if header else None
-    if header is None and not row[-1]:
-        row = row[:-1]
-        merge = _without_last
-        header = _header_above(above, row, separator)
-    if header is None:
-        if needs_names:
-            _refuse_other_number(path, lines[:n_above], row, separator)
-        if merge is None and _is_split_stamp(row):
-            merge = _joining([2, *[1] * (len(row) - 2)])
-    cells_of = _merged(split, merge) if merge else split
+    header = _header_of(above, row, separator)
+    if needs_names and header.names is None:
+        _refuse_other_number(path, lines[:n_above], _without_last(row), separator)
+    cells_of = _merged(split, header.merge) if header.merge else split
     rows = [cells_of(line) for _, line in lines[n_above:]]
     rows_after = lines[n_above - 1][0] if n_above else 0
-    layout = Layout(rows_after, cells_of, _usual_row(rows), header.names if header else None)
+    layout = Layout(rows_after, cells_of, _usual_row(rows), header.names)
     is_separated = separator in (",", ";")
-    if layout.names is not None:
-        return _with_named_columns(layout, is_separated)
+    if header.names is not None:
+        return _with_named_columns(layout, header.names, is_separated)
     return _with_fitting_columns(layout, rows, is_separated)
 
 
 def _layout_without_rows(lines: Sequence[tuple[int, str]], separator: str) -> Layout:
-    """Return the layout of a text without numbers: its last line may name columns."""
+    """Return the layout of a text without rows of numbers. Its last line may name columns."""
     split = splitter(separator)
     if not lines:
         return Layout(0, split, [], None, "tum", STAMPED_POSE)
@@ -181,8 +179,8 @@ def _usual_row(rows: Sequence[list[str]]) -> list[str]:
     return next(row for row in rows if len(row) == n_cells)
 
 
-def _beginning(path: str | Path, text: str) -> tuple[list[str], list[tuple[int, str]]]:
-    """Return the comments above the first other line, and the first lines that are no comments."""
+def _first_lines(path: str | Path, text: str) -> tuple[list[str], list[tuple[int, str]]]:
+    """Return the comments at the beginning, and the first numbered lines that are not comments."""
     comments: deque[str] = deque(maxlen=_MOST_COMMENTS)
     lines: list[tuple[int, str]] = []
     n_characters = 0
@@ -205,7 +203,7 @@ def _lines_above_rows(cells: Sequence[Sequence[str]]) -> int | None:
         return None
     usual = n_cells.most_common(1)[0][0]
     first = next(place for place, row in enumerate(cells) if is_row[place] and len(row) == usual)
-    # Rows with another number of cells may be above the first usual row. Text is above them all.
+    # Rows with another number of cells may precede the first usual row. The text ends before them.
     return 1 + max((place for place in range(first) if not is_row[place]), default=-1)
 
 
@@ -214,7 +212,7 @@ def _is_row(cells: Sequence[str]) -> bool:
     filled = [cell for cell in cells if cell]
     n_values = sum(map(is_value, filled))
     has_number = any(is_number(cell) or is_date_or_time(cell) for cell in filled)
-    return has_number and n_values >= _LEAST_SHARE * len(filled)
+    return has_number and n_values >= _MIN_SHARE_OF_VALUES * len(filled)
 
 
 # ---- joining of cells
@@ -224,18 +222,20 @@ _Merge = Callable[[Sequence[str]], list[str]]
 
 
 def _merged(split: CellsOf, merge: _Merge) -> CellsOf:
+    """Return a function that splits a line and then joins cells."""
     return lambda line: merge(split(line))
 
 
 def _without_last(cells: Sequence[str]) -> list[str]:
-    """Drop an empty cell behind the last separator."""
+    """Drop an empty cell after the last separator."""
     return [*cells] if cells[-1] else [*cells[:-1]]
 
 
 def _joining(widths: Sequence[int]) -> _Merge:
     """Return a function that joins neighbouring cells of a row into columns.
 
-    ``widths`` are the numbers of cells in the columns; columns of width 0 have no cell.
+    ``widths`` are the numbers of cells of the columns, some of them 0. Rows with another total
+    number of cells stay unchanged.
     """
     ends = np.cumsum([width for width in widths if width]).tolist()
     spans = list(zip([0, *ends[:-1]], ends, strict=True))
@@ -257,16 +257,30 @@ def _is_split_stamp(cells: Sequence[str]) -> bool:
 
 
 class _Header(NamedTuple):
-    """Names of the columns, and the joining of the cells that belong to one name."""
+    """Names of the columns, if there are any, and a function that joins cells of one column."""
 
-    names: tuple[str, ...]
+    names: tuple[str, ...] | None
     merge: _Merge | None = None
 
 
-def _header_above(above: Sequence[str], row: Sequence[str], separator: str) -> _Header | None:
-    """Return the names of the columns from the lines above the rows; None without such a line.
+def _header_of(above: Sequence[str], row: list[str], separator: str) -> _Header:
+    """Return the header of rows such as ``row``, from the lines above the rows."""
+    header = _header_above(above, row, separator)
+    if header:
+        return header
+    if not row[-1]:
+        header = _header_above(above, row[:-1], separator)
+        return _Header(header.names if header else None, _without_last)
+    if _is_split_stamp(row):
+        return _Header(None, _joining([2, *[1] * (len(row) - 2)]))
+    return _Header(None)
 
-    The nearest line with known names counts, then the nearest line that fits and is no comment.
+
+def _header_above(above: Sequence[str], row: Sequence[str], separator: str) -> _Header | None:
+    """Return the header from the lines above the rows; None if no line fits the row.
+
+    The nearest line with known names is preferred. Without known names, the nearest line that fits
+    and is not a comment is used.
     """
     unknown = None
     for place in reversed(range(len(above))):
@@ -274,7 +288,7 @@ def _header_above(above: Sequence[str], row: Sequence[str], separator: str) -> _
         is_comment = line.startswith(COMMENTS)
         for names in names_in(line, separator):
             header = _fitted(names, row, is_comment)
-            if header is None:
+            if header is None or header.names is None:
                 continue
             if _is_known(header.names):
                 below = above[place + 1] if place + 1 < len(above) else ""
@@ -288,7 +302,7 @@ def _header_above(above: Sequence[str], row: Sequence[str], separator: str) -> _
 def _refuse_other_number(
     path: str | Path, lines: Sequence[tuple[int, str]], row: Sequence[str], separator: str
 ) -> None:
-    """Raise an InputError if a line above the rows names another number of columns."""
+    """Raise an InputError if a line above the rows names more or fewer columns than a row has."""
     for line_number, line in lines:
         names = names_in(line, separator)[0]
         if _is_known(names) and len(row) > 1:
@@ -300,14 +314,16 @@ def _refuse_other_number(
 
 
 def _is_known(names: Sequence[str]) -> bool:
+    """Whether some of the names are those of a pose, of rates or of an orientation."""
     columns = named_columns(names)[0].keys()
     return is_pose(columns) or {"x", "qw"} <= columns or {"roll", "pitch"} <= columns
 
 
 def _fitted(names: Sequence[str], row: Sequence[str], is_comment: bool) -> _Header | None:
-    """Return as many names as a row has cells, or joined cells; None if the names do not fit.
+    """Return a header with one name for each cell of a row; None if the names do not fit.
 
-    If a comment has too many names, its last names count: the first may be a word like "format:".
+    Cells may be joined to fit. If a comment has too many names, its last names are used, because
+    its first words may be text such as "format:".
     """
     if len(names) == len(row) + 1 and not names[-1]:
         names = names[:-1]
@@ -317,44 +333,45 @@ def _fitted(names: Sequence[str], row: Sequence[str], is_comment: bool) -> _Head
         widths = _widths(names, row, n_angle_cells)
         if sum(widths) == len(row):
             return _header_of_widths(names, widths, row)
-    n_more = len(row) - len(names)
+    n_missing = len(row) - len(names)
     if _is_open(names[-1]):
-        if len(names) > 1 and n_more >= -1:
-            return _Header((*names[:-1], *[""] * (n_more + 1)))
-    elif is_comment and n_more < 0:
+        if len(names) > 1 and n_missing >= -1:
+            return _Header((*names[:-1], *[""] * (n_missing + 1)))
+    elif is_comment and n_missing < 0:
         return _Header(tuple(names[-len(row) :]))
     return None
 
 
 def _header_of_widths(names: Sequence[str], widths: Sequence[int], row: Sequence[str]) -> _Header:
-    """Return the names that have cells, and the joining of their cells."""
-    kept = [name for name, width in zip(names, widths, strict=True) if width]
+    """Return the header of the names with cells, whose cells are joined by their widths."""
+    names = [name for name, width in zip(names, widths, strict=True) if width]
     if max(widths) == 1:
-        return _Header(_with_degrees(kept, row))
+        return _Header(_with_degrees(names, row))
     merge = _joining(widths)
-    return _Header(_with_degrees(kept, merge(row)), merge)
+    return _Header(_with_degrees(names, merge(row)), merge)
 
 
 def _is_open(name: str) -> bool:
-    """Whether the last name belongs to any number of columns, also to none."""
+    """Whether the last name may belong to any number of columns, also to none."""
     return name.startswith("*") or name.endswith("...") or "cov" in name.lower()
 
 
-# Numbers of cells of a latitude: degrees; degrees, minutes and seconds; degrees and minutes.
+# Numbers of cells that a latitude may have: degrees; degrees, minutes and seconds; degrees and
+# minutes.
 _ANGLE_CELLS = (1, 3, 2)
 _HEMISPHERES = {"N", "S", "E", "W"}
 
 
 def _places_of(names: Sequence[str], *quantities: str) -> set[int]:
-    """Return the first column of each of the quantities that have one."""
+    """Return the first column of each quantity; quantities without a column are skipped."""
     columns = named_columns(names)[0]
     return {columns[quantity][0] for quantity in quantities if quantity in columns}
 
 
 def _widths(names: Sequence[str], row: Sequence[str], n_angle_cells: int) -> list[int]:
-    """Return the number of cells of a row that each name has.
+    """Return the number of cells of each name in a row.
 
-    A name has no cells if its cell belongs to the name before, as the cell of a hemisphere does.
+    A name has no cells if its cell is joined to the name before, such as the cell of a hemisphere.
     """
     angles = _places_of(names, "lat", "lon")
     stamps = _places_of(names, "t", "date")
@@ -376,7 +393,7 @@ def _widths(names: Sequence[str], row: Sequence[str], n_angle_cells: int) -> lis
 
 
 def _with_degrees(names: Sequence[str], row: Sequence[str]) -> tuple[str, ...]:
-    """Add the unit to the names of angles in degrees, minutes and seconds."""
+    """Append the unit "deg" to the names of angles in degrees, minutes and seconds."""
     with_units = [*names]
     for place in _places_of(names, "lat", "lon"):
         if not is_number(row[place]) and is_angle(row[place]):
@@ -385,24 +402,22 @@ def _with_degrees(names: Sequence[str], row: Sequence[str]) -> tuple[str, ...]:
 
 
 def _with_units(names: tuple[str, ...], below: str, separator: str) -> tuple[str, ...]:
-    """Add the units in the line below the names, if it has as many cells."""
-    ways = names_in(below, separator) if below else []
-    for units in ways:
+    """Append the units in the line below the names, if this line has one unit for each name."""
+    for units in names_in(below, separator) if below else []:
         if len(units) == len(names) and not _is_row(units):
             return tuple(map(" ".join, zip(names, units, strict=True)))
     return names
 
 
 def _with_stamp(names: tuple[str, ...], row: Sequence[str]) -> tuple[str, ...]:
-    """Rename a first column of unknown name to "t" if it has stamps since 1970."""
+    """Rename a first column with an unknown name to "t" if it contains stamps since 1970."""
     columns = named_columns(names)[0].keys()
     has_stamp = not columns.isdisjoint({"t", "secs", *named_columns(names[:1])[0]})
     return names if has_stamp or not _SINCE_1970.fullmatch(row[0]) else ("t", *names[1:])
 
 
-def _with_named_columns(layout: Layout, is_separated: bool) -> Layout:
-    """Return the layout with its format and columns, by the names above the rows."""
-    names = layout.names or ()
+def _with_named_columns(layout: Layout, names: tuple[str, ...], is_separated: bool) -> Layout:
+    """Set the format and the columns of a layout by the names above the rows."""
     if not is_separated and " ".join(names[1:]).lower() == TUM_COLUMNS.partition(" ")[2]:
         return replace(layout, format="tum", columns=TUM)
     return replace(layout, format="csv", columns=names)
@@ -410,7 +425,7 @@ def _with_named_columns(layout: Layout, is_separated: bool) -> Layout:
 
 # ---- numbers without names
 
-# Columns of a pose without a stamp: the numbers are compared with each in turn.
+# Possible columns of a pose without a stamp, in the order in which they are tried.
 _POSES: tuple[tuple[str, ...], ...] = (
     (*MATRIX, *LAST_ROW),
     tuple(f"m{row}{column}" for column in "1234" for row in "1234"),
@@ -420,18 +435,19 @@ _POSES: tuple[tuple[str, ...], ...] = (
     (*POSITION, *UNNAMED),
     (*UNNAMED, *POSITION),
 )
-# Poses whose rotations are apart from the translations.
+# Poses with a rotation matrix in separate columns, which may be written row by row or column by
+# column.
 _TRANSPOSABLE = _POSES[3:5]
-# Numbers of a pose's covariance behind the pose: its diagonal, one half, or all.
+# Numbers of columns of a covariance after the pose: its diagonal, one half, or all elements.
 _COVARIANCES = (6, 21, 36)
-# Numbers of columns that could be several things, which their numbers do not distinguish.
+# Numbers of columns for which several formats are possible.
 _UNCLEAR = (4, 7)
 
 
 def _with_fitting_columns(
     layout: Layout, rows: Sequence[Sequence[str]], is_separated: bool
 ) -> Layout:
-    """Return the layout with its format and columns, by the numbers of rows without names."""
+    """Set the format and the columns of a layout without names by the numbers of its rows."""
     n_columns = len(layout.row)
     columns = _fitting(layout.row, rows)
     is_stamped_pose = columns is None or columns[: len(TUM)] == STAMPED_POSE
@@ -447,23 +463,31 @@ def _with_fitting_columns(
             columns=columns,
             is_transposable=pose in _TRANSPOSABLE,
         )
+    return _in_doubt(layout, is_separated)
+
+
+def _in_doubt(layout: Layout, is_separated: bool) -> Layout:
+    """Set the format of a layout whose numbers fit nothing, by the number of its columns."""
+    n_columns = len(layout.row)
     if is_separated or n_columns in _UNCLEAR:
-        return replace(layout, format="csv", columns=STAMPED_POSE if n_columns == 8 else None)
+        columns = STAMPED_POSE if n_columns == len(STAMPED_POSE) else None
+        return replace(layout, format="csv", columns=columns)
     if n_columns == len(MATRIX):
         return replace(layout, format="kitti", columns=MATRIX)
     return replace(layout, format="tum", columns=STAMPED_POSE)
 
 
 def _fitting(row: Sequence[str], rows: Sequence[Sequence[str]]) -> tuple[str, ...] | None:
-    """Return the columns that the numbers of the first rows fit, with empty names for the others.
+    """Return columns that fit the numbers of the first rows; None if nothing fits.
 
-    None if the numbers fit nothing, or no row is complete.
+    Cells of text have columns with empty names.
     """
     places = [place for place, cell in enumerate(row) if is_value(cell)]
     if not places:
         return None
     values = _complete(rows, places, len(row))
-    with np.errstate(all="ignore"):  # numbers may be of any size
+    # Numbers of a file may be too large for their squares.
+    with np.errstate(all="ignore"):
         columns = _columns_of(values) if len(values) else None
     if columns is None:
         return None
@@ -474,24 +498,33 @@ def _fitting(row: Sequence[str], rows: Sequence[Sequence[str]]) -> tuple[str, ..
 
 
 def _columns_of(values: FloatArray) -> tuple[str, ...] | None:
-    """Return the columns that numbers (N, n) fit; None if they fit nothing.
+    """Return columns that fit numbers (N, n); None if nothing fits.
 
-    They are a pose with or without a stamp, or a stamped pose and other columns behind it.
+    The columns are a pose with or without a stamp, or a stamped pose and further columns.
     """
-    n_columns = values.shape[1]
-    if n_columns == len(_FAST_LIO) and _is_gravity(values[:, -3:]):
+    if values.shape[1] == len(_FAST_LIO) and _is_gravity(values[:, -3:]):
         return _FAST_LIO
-    stamps: tuple[tuple[str, ...], ...] = ((), ("t",))
+    return _pose_alone(values) or _pose_with_more(values)
+
+
+def _pose_alone(values: FloatArray) -> tuple[str, ...] | None:
+    """Return the columns of a pose with or without a stamp; None if numbers (N, n) do not fit."""
+    stamps: list[tuple[str, ...]] = [(), ("t",)]
     if _are_seconds_and_ns(values):
-        stamps = (*stamps, ("secs", "nsecs"))
+        stamps.append(("secs", "nsecs"))
     for pose in _POSES:
         for stamp in stamps:
-            has_length = len(stamp) + len(pose) == n_columns
-            if has_length and _fits(pose, values[:, len(stamp) :]):
-                return (*stamp, *pose)
+            columns = (*stamp, *pose)
+            if len(columns) == values.shape[1] and _fits(pose, values[:, len(stamp) :]):
+                return columns
+    return None
+
+
+def _pose_with_more(values: FloatArray) -> tuple[str, ...] | None:
+    """Return the columns of a stamped pose and further columns; None if numbers do not fit."""
     for pose in _POSES:
-        n_more = n_columns - 1 - len(pose)
-        # Behind a position and a quaternion any number of others may be.
+        n_more = values.shape[1] - 1 - len(pose)
+        # Any number of columns may follow a position and a quaternion.
         may_have_more = pose == STAMPED_POSE[1:] or n_more in _COVARIANCES
         if n_more > 0 and may_have_more and _fits(pose, values[:, 1 : 1 + len(pose)]):
             return ("t", *pose, *[""] * n_more)
@@ -499,9 +532,9 @@ def _columns_of(values: FloatArray) -> tuple[str, ...] | None:
 
 
 def _complete(rows: Sequence[Sequence[str]], places: Sequence[int], n_columns: int) -> FloatArray:
-    """Return the numbers (N, n) of the first rows that have all of them.
+    """Return the numbers (N, n) of the first rows in which all n cells are numbers.
 
-    A stamp in the first cell that is no number becomes 0.
+    A first cell that is not a number, such as a date, becomes 0.
     """
     values: list[list[float]] = []
     for cells in islice((cells for cells in rows if len(cells) == n_columns), _MOST_ROWS):
@@ -516,7 +549,7 @@ def _complete(rows: Sequence[Sequence[str]], places: Sequence[int], n_columns: i
 
 
 def _fits(pose: Sequence[str], values: FloatArray) -> bool:
-    """Whether the columns of a pose, in this order, can have these values (N, n)."""
+    """Whether values (N, n) can be those of a pose with these columns."""
     if UNNAMED[0] in pose:
         norms = np.linalg.norm(_values_of(UNNAMED, pose, values), axis=1)
         is_unit = np.abs(norms - 1.0) <= QUATERNION_NORM_TOLERANCE
@@ -548,7 +581,7 @@ def _are_seconds_and_ns(values: FloatArray) -> bool:
 
 
 def _is_gravity(values: FloatArray) -> bool:
-    """Whether vectors (N, 3) are as long as gravity."""
+    """Whether vectors (N, 3) have the length of gravity."""
     lengths = np.linalg.norm(values, axis=1)
     shortest, longest = _GRAVITY_M_S2
     return bool(((lengths >= shortest) & (lengths <= longest)).all())

@@ -1,9 +1,9 @@
 """Poses from the numbers of a table.
 
-A file may not state the order of its quaternions or the convention of its angles. They are
-recognised by the motion: a vehicle moves in a steady direction of its own body, usually forward.
-With orientations of a wrong convention this direction wanders as the vehicle turns. Hand-held
-sensors and drones move in all directions, so that their motion does not distinguish conventions.
+A file may not state the order of its quaternions or the convention of its angles. The motion then
+decides: a vehicle moves in a steady direction of its own body, usually forward. If orientations are
+read in a wrong convention, this direction changes as the vehicle turns. Hand-held sensors and
+drones move in all directions, so their motion does not distinguish conventions.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,9 +41,9 @@ from hand_eye_calib.formats.trajectory_files.table import Table
 
 # Largest angle (rad) of a column without a unit: one turn, with room for rounding.
 _LARGEST_ANGLE_RAD = 2 * np.pi + 0.01
-# Units of lengths, angles and rates in m, rad and rad/s. Without a name the unit is the first, or
-# the second if a value is larger than the limit. The limit of rates is 2,000 deg/s, which no
-# gyroscope exceeds.
+# Units of lengths, angles and rates, as factors to m, rad and rad/s, and a limit. A column without
+# a unit is in the first unit, or in the second if a value exceeds the limit. The limit of rates is
+# 2,000 deg/s, the range of usual gyroscopes.
 _KINDS = {
     "length": ({"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}, np.inf),
     "angle": ({"rad": 1.0, "deg": np.pi / 180}, _LARGEST_ANGLE_RAD),
@@ -52,10 +52,10 @@ _KINDS = {
 
 _COMPASS = "clockwise from north"
 _MATHEMATICAL = "counterclockwise from x (east)"
-# Inverse rotation in roll, pitch and yaw, as the library pyboreas has it.
+# Roll, pitch and yaw of the inverse rotation, as in the library pyboreas.
 _INVERSE = "that of the world in the sensor's frame"
 _OTHER_ORDER = "counterclockwise from x, about axes that roll and pitch have turned"
-# Scatter of the vertical in a level sensor that is only noise: 1 minus the cosine of 2.5 deg.
+# Largest scatter of the vertical direction in a level sensor: 1 minus the cosine of 2.5 deg.
 _LEVEL = 1e-3
 
 # ---- poses and rates
@@ -64,25 +64,24 @@ _LEVEL = 1e-3
 def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, ...]:
     """Return the poses of a table, or its angular rates.
 
-    Notes on what the file does not state are added to the table's ``guesses``.
+    Notes about conventions that the file does not state are added to the table's ``guesses``.
 
     Parameters
     ----------
     table : Table
     convention : str, optional
-        Convention of the angles, instead of the one that fits the motion.
+        Convention of the angles. By default, the motion decides.
 
     Returns
     -------
     positions : (N, 3) array
-        In m.
+        Positions, m. For angular rates, the tuple has only one array (N, 3), rad/s.
     quats_xyzw : (N, 4) array
-        For rates there is one array instead, (N, 3) in rad/s.
 
     Raises
     ------
     InputError
-        For values that cannot be, with their line.
+        For invalid values; the message names their line.
     """
     table.refuse(
         np.asarray(~np.isfinite(table.values()).all(axis=1)),
@@ -111,8 +110,8 @@ def _rotations_of(quats_xyzw: FloatArray) -> FloatArray:
 def _positions(table: Table) -> tuple[FloatArray, FloatArray | None]:
     """Return the positions (N, 3), m, of a table without matrices.
 
-    For latitudes, also return the rotations (N, 3, 3) from the axes east, north and up of each
-    position to those of the first position.
+    The second value is None, or for latitudes the rotations (N, 3, 3) from the axes east, north and
+    up of each position to the same axes of the first position.
     """
     positions = np.zeros((len(table.line_numbers), 3))
     to_first = None
@@ -129,6 +128,7 @@ def _positions(table: Table) -> tuple[FloatArray, FloatArray | None]:
 
 
 def _refuse_far(table: Table, positions: FloatArray) -> None:
+    """Raise an InputError at the first position that is too far from the origin."""
     table.refuse(
         np.asarray(np.abs(positions).max(axis=1) > FARTHEST_M),
         lambda row: f"{far_position(*positions[row])}; check its unit",
@@ -138,7 +138,7 @@ def _refuse_far(table: Table, positions: FloatArray) -> None:
 def _of_matrices(table: Table) -> tuple[FloatArray, FloatArray]:
     """Return the positions (N, 3), m, and quaternions (N, 4), scalar last, of matrices.
 
-    The orientations are the nearest rotations, because the numbers of files have few digits.
+    The orientations are the rotations nearest to the matrices, whose numbers may have few digits.
     """
     matrices = table.values(MATRIX).reshape(-1, 3, 4)
     positions = matrices[:, :, 3]
@@ -169,11 +169,11 @@ _R_ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 def _in_axes_of_earth(table: Table, positions: FloatArray, quats_xyzw: FloatArray) -> FloatArray:
-    """Return quaternions (N, 4) in the axes of the earth, of a file with positions (N, 3) in them.
+    """Return quaternions (N, 4) in the earth's axes (ECEF), in which the positions (N, 3) are.
 
-    The orientations of the file may be in the axes of the earth, or east, north and up, or north,
-    east and down of each position. The motion decides, or else the way in which a vehicle stays
-    level.
+    The orientations of the file may be relative to the earth's axes, to east, north and up, or to
+    north, east and down at each position. The motion decides. If several ways fit the motion, those
+    in which the vehicle remains level are preferred.
     """
     axes = axes_of_places(positions)
     rotations = _rotations_of(quats_xyzw)
@@ -197,18 +197,19 @@ def _in_axes_of_earth(table: Table, positions: FloatArray, quats_xyzw: FloatArra
 
 
 def _tilt(quats_xyzw: FloatArray, up: FloatArray) -> float:
-    """Return the scatter of directions (N, 3) in the axes of a sensor: 0 for a constant direction.
+    """Return the scatter of directions (N, 3) in the axes of a sensor.
 
-    It is 1 minus the length of the mean direction.
+    The scatter is 1 minus the length of the mean direction; 0 for a constant direction.
     """
     in_sensor = np.einsum("nji,nj->ni", _rotations_of(quats_xyzw), up)
     return 1.0 - float(np.linalg.norm(in_sensor.mean(axis=0)))
 
 
 def _on_earth(table: Table, up: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-    """Return positions (N, 3), m, east, north and up of the first position.
+    """Return positions (N, 3), m, along the axes east, north and up of the first position.
 
-    Also return the rotations (N, 3, 3) from these axes at each position to those at the first.
+    The second value is the rotations (N, 3, 3) from these axes of each position to the same axes of
+    the first position.
     """
     lat_rad, lon_rad = _in_si(table, ("lat", "lon"), "angle").T
     table.refuse(
@@ -228,7 +229,7 @@ def _on_earth(table: Table, up: Sequence[str]) -> tuple[FloatArray, FloatArray]:
 def _in_si(table: Table, names: Sequence[str], kind: str) -> FloatArray:
     """Return columns (N, k) in m, rad or rad/s.
 
-    Their unit is the one in their names, or is recognised from the size of their values.
+    The names of the columns state their unit; otherwise it is recognised from their values.
     """
     factors, largest_of_first = _KINDS[kind]
     values = table.values(names)
@@ -261,7 +262,7 @@ def _in_si(table: Table, names: Sequence[str], kind: str) -> FloatArray:
 
 
 def _orientations(table: Table, positions: FloatArray, convention: str) -> FloatArray:
-    """Return quaternions (N, 4), scalar last: the identity if the table has no orientations."""
+    """Return quaternions (N, 4), scalar last; the identity if the table has no orientations."""
     for names in (QUATERNION, SCALAR_FIRST, UNNAMED):
         if names[0] in table.at:
             return _of_quaternions(table, names, positions)
@@ -276,24 +277,14 @@ def _orientations(table: Table, positions: FloatArray, convention: str) -> Float
 def _of_quaternions(table: Table, names: Sequence[str], positions: FloatArray) -> FloatArray:
     """Return the quaternions (N, 4) of a table, with the scalar last.
 
-    The order of coefficients without clear names is the usual one, unless the motion or the first
-    orientation speaks for the other.
+    Without clear names of the columns, the coefficients are in the usual order, unless the motion
+    or the first orientation is evidence for the other order.
     """
-    quats = table.values(names)
-    with np.errstate(over="ignore"):
-        norms = np.linalg.norm(quats, axis=1)
-    table.refuse(
-        np.abs(norms - 1.0) > QUATERNION_NORM_TOLERANCE,
-        lambda index: (
-            f"found a quaternion of length {norms[index]:.4g}, expected 1 within "
-            f"{QUATERNION_NORM_TOLERANCE}; check the column order ({table.expected})"
-        ),
-    )
+    quats = _unit_quaternions(table, names)
     if names == QUATERNION:
         return quats
     ways = {"last": quats, "first": np.roll(quats, -1, axis=1)}
-    usual = "first" if names == SCALAR_FIRST else "last"
-    other = "last" if names == SCALAR_FIRST else "first"
+    usual, other = ("first", "last") if names == SCALAR_FIRST else ("last", "first")
     fitting = _fitting(positions, ways)
     # An odometry starts at the identity.
     is_identity = {
@@ -318,6 +309,21 @@ def _of_quaternions(table: Table, names: Sequence[str], positions: FloatArray) -
     return ways[usual]
 
 
+def _unit_quaternions(table: Table, names: Sequence[str]) -> FloatArray:
+    """Return the columns (N, 4) of quaternions; raise an InputError if one has no unit length."""
+    quats = table.values(names)
+    with np.errstate(over="ignore"):
+        norms = np.linalg.norm(quats, axis=1)
+    table.refuse(
+        np.abs(norms - 1.0) > QUATERNION_NORM_TOLERANCE,
+        lambda index: (
+            f"found a quaternion of length {norms[index]:.4g}, expected 1 within "
+            f"{QUATERNION_NORM_TOLERANCE}; check the column order ({table.expected})"
+        ),
+    )
+    return quats
+
+
 def _require_rotation_vectors(table: Table) -> None:
     """Raise an InputError if columns rx, ry, rz are angles in degrees, in an unknown order."""
     if not is_brief(table.names[table.at[ROTATION_VECTOR[0]]]):
@@ -326,20 +332,20 @@ def _require_rotation_vectors(table: Table) -> None:
     table.refuse(
         lengths > _LARGEST_ANGLE_RAD,
         lambda row: (
-            f"rx, ry, rz are {lengths[row]:.4g} long, more than a turn: angles in degrees? Name "
-            "the columns roll_deg, pitch_deg, yaw_deg (about the fixed axes x, y, z), or "
-            "rotvec_x_deg, rotvec_y_deg, rotvec_z_deg"
+            f"rx, ry, rz have a length of {lengths[row]:.4g} rad, more than one turn. Are they "
+            "angles in degrees? Name the columns roll_deg, pitch_deg, yaw_deg (about the fixed "
+            "axes x, y, z), or rotvec_x_deg, rotvec_y_deg, rotvec_z_deg"
         ),
     )
     table.guess("rx, ry, rz read as a rotation vector, as of Universal Robots")
 
 
 def _of_angles(table: Table, positions: FloatArray, convention: str) -> FloatArray:
-    """Return quaternions (N, 4) of roll, pitch and yaw (about the fixed axes x, y, z) or heading.
+    """Return quaternions (N, 4) of roll, pitch and yaw or heading.
 
-    The axes of the body are x forward, y left and z up, in a frame with z up. With a heading a
-    positive pitch is nose up, as on aircraft and in INS. With a yaw the pitch is about y, as in
-    REP 103.
+    Angles are about the fixed axes x, y and z. The axes of the body are x forward, y left and z up,
+    in a frame with z up. Beside a heading, a positive pitch is nose up, as on aircraft and in INS.
+    Beside a yaw, the pitch is about y, as in REP 103.
     """
     names = [name for name in ("roll", "pitch", "yaw", "heading") if name in table.at]
     *tilt, angle = _in_si(table, names, "angle").T
@@ -355,7 +361,7 @@ def _of_angles(table: Table, positions: FloatArray, convention: str) -> FloatArr
         _OTHER_ORDER: se3.to_quat_xyzw(se3.in_other_order(usual)),
     }
     expected = _COMPASS if names[-1] == "heading" else _MATHEMATICAL
-    # In flat motion the order of angles does not matter.
+    # The other order comes last: on flat ground it makes no difference, so the motion always fits.
     unlikely = {expected: 0, _OTHER_ORDER: 2}
     table.conventions = sorted(_fitting(positions, ways), key=lambda way: unlikely.get(way, 1))
     way = convention or table.conventions[0]
@@ -373,10 +379,10 @@ def _of_angles(table: Table, positions: FloatArray, convention: str) -> FloatArr
 
 
 def _fitting(positions: FloatArray, ways: Mapping[str, FloatArray]) -> list[str]:
-    """Return the ways to read orientations (N, 4) that the motion does not contradict.
+    """Return the ways to read orientations (N, 4) that fit the motion.
 
-    The motion contradicts a way if another way fits it clearly better. The positions (N, 3) are
-    those of the sensor in its world.
+    A way does not fit if another way fits the motion clearly better. ``positions`` (N, 3) are those
+    of the sensor in its world.
     """
     scatters = {
         way: scatter_of_direction(se3.from_quat_xyzw(positions, quats_xyzw))

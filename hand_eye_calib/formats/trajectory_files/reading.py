@@ -46,10 +46,10 @@ from hand_eye_calib.formats.trajectory_files.stamps import (
 )
 from hand_eye_calib.formats.trajectory_files.table import Table, table_of_object
 
-#: The format that the lines look like.
+#: Recognise the format from the lines.
 AUTO = "auto"
 
-# Columns of the formats whose columns have an order, and the description of a row.
+# Columns of the formats with a fixed order of columns, and the description of a row in messages.
 _FORMATS: dict[str, tuple[Sequence[str], str]] = {
     "tum": (TUM, f"8 numbers, {TUM_COLUMNS}"),
     "kitti": (MATRIX, "12 numbers, the first three rows of a pose"),
@@ -62,15 +62,15 @@ _EXPECTED = (
     "lines of a trajectory: save the poses of MATLAB, HDF5, Arrow, spreadsheets, receivers and "
     "autopilots as csv, a model of COLMAP as text"
 )
-# Name of a file of stamps beside a file of poses.
+# Name of a file of stamps in the folder of a file of poses.
 _TIMES = "times.txt"
-# Letters and signs of Latin-1 that headers have.
+# Letters and signs of Latin-1 that may occur in headers: the degree sign, ...
 _LATIN_1 = [bytes([code]) for code in (0xB0, 0xB2, 0xB5, *range(0xC0, 0x100))]
-# Characters of ASCII that texts have.
+# Printable characters of ASCII, and white space.
 _ASCII = bytes([*b"\t\n\r", *range(32, 127)])
 # Largest share of Latin-1 letters in a text.
 _FEW_LETTERS = 0.05
-# Time (ns) between poses that are paired without stamps.
+# Interval (ns) between poses that are paired without stamps.
 _STEP_NS = 100_000_000
 
 
@@ -81,8 +81,8 @@ class FileOptions:
     Attributes
     ----------
     pair_by : str
-        "time", or "row" or "name" (of images) to pair poses without stamps. It is the same for all
-        files that belong together.
+        "time"; or "row" or "name" (of images) to pair poses without stamps. Files that belong
+        together have the same value.
 
     Raises
     ------
@@ -101,16 +101,17 @@ class FileOptions:
     def __post_init__(self) -> None:
         _refuse_unknown("unit of stamps", self.stamp_unit or "s", (*STAMP_UNITS,))
         _refuse_unknown("trajectory format", self.format, (*TRAJECTORY_FORMATS, AUTO))
-        text = ""
+        reason = ""
         if self.columns is not None and self.format not in ("csv", AUTO):
-            text = "columns can be set for format csv only"
+            reason = "columns can be set for format csv only"
         elif self.times is not None and self.format not in ("kitti", AUTO):
-            text = "a file of times belongs to format kitti only"
-        if text:
-            raise ConfigError(f"{text}; the format is {self.format}")
+            reason = "a file of times belongs to format kitti only"
+        if reason:
+            raise ConfigError(f"{reason}; the format is {self.format}")
 
 
 def _refuse_unknown(setting: str, value: str, choices: Sequence[str]) -> None:
+    """Raise a ConfigError for a value that is not among the choices."""
     if value not in choices:
         raise ConfigError(f"unknown {setting} {value!r}; known are {', '.join(choices)}")
 
@@ -122,11 +123,11 @@ class FileReading(NamedTuple):
     ----------
     trajectory : Trajectory
     repairs : list of str
-        Notes on faults of the file that were repaired.
+        Notes about faults of the file that were repaired.
     guesses : list of str
-        Notes on what the file does not state and was recognised or assumed.
+        Notes about properties that the file does not state, so that they were guessed.
     warnings : list of str
-        Warnings that belong to a result.
+        Warnings for the result.
     """
 
     trajectory: Trajectory
@@ -151,12 +152,11 @@ def read_trajectory(
     Parameters
     ----------
     source : str, path-like or object
-        A file, or a bag if ``topic`` is given; ``sample:NAME`` for one that comes with the package;
-        or matrices (N, 4, 4) with ``times``, rows (N, 8)
-        of t, x, y, z, qx, qy, qz, qw or (N, 7) without t, or a pandas DataFrame with columns named
-        as in csv files.
+        A file, or a bag together with ``topic``; ``sample:NAME`` for a sample of the package;
+        matrices (N, 4, 4) with ``times``; rows (N, 8) of t, x, y, z, qx, qy, qz, qw, or (N, 7)
+        without t; or a pandas DataFrame with the column names of csv files.
     format : str
-        "tum", "kitti", "euroc", "csv", or "auto" for the format that the file looks like.
+        "tum", "kitti", "euroc", "csv", or "auto" to recognise the format.
     topic : str, optional
         Topic of the poses in a bag; or two frames, ``world:sensor``, whose transform in ``/tf``
         and ``/tf_static`` is the trajectory. Only ``measures`` can be combined with a topic.
@@ -165,30 +165,29 @@ def read_trajectory(
         ``"t,x,y,z,qw,qx,qy,qz"`` or ``"t,lat,lon,height,roll_deg,pitch_deg,heading_deg"``. Columns
         with other names are skipped.
     times : str, path-like or (N,) array-like, optional
-        File of the stamps, for kitti. Stamps as seconds, whole numbers or datetimes, for an
-        object.
+        For kitti, the file of the stamps. For an object, the stamps as seconds, whole numbers or
+        datetimes.
     stamp_unit : str, optional
         "s", "ms", "us" or "ns". By default the unit is that of the header (``timestamp [ns]``), or
         is recognised from the size of the stamps.
-    measures : str
-        Kind of data to read: "poses", or only "positions", "rotations" or angular "rates"; "auto"
-        for the kind that the columns of a file or the messages of a bag have.
     repair : bool
-        Sort poses that are out of order, and drop poses with a stamp that is there already. A
-        ``UserWarning`` has their number. Otherwise they are an error.
+        Sort poses that are not in order of time, and drop poses with a repeated stamp; a
+        ``UserWarning`` states their number. By default, such poses are an error.
+    measures : str
+        Kind of data to read: "poses", "positions", "rotations" or (angular) "rates"; "auto" for
+        the kind that the columns of a file or the messages of a bag have.
 
     Returns
     -------
     Trajectory
-        Stamps are exactly the decimal numbers of the file, in nanoseconds. Frame names are those of
-        the messages of a bag, and empty otherwise. Latitude and longitude become metres east and
-        north of the first position. A ``UserWarning`` reports a guess.
+        Stamps are the decimal numbers of the file in nanoseconds, without rounding. Frame names are
+        those of the messages of a bag, otherwise empty. Latitude and longitude become metres east
+        and north of the first position. A ``UserWarning`` reports a guess.
 
     Raises
     ------
     InputError
-        If the file or one of its lines cannot be read. The message has the file, the line and its
-        content.
+        If the file or one of its lines cannot be read; the message names file, line and content.
     ConfigError
         For an unknown format or unit, and for options that cannot be combined.
 
@@ -205,14 +204,14 @@ def read_trajectory(
     path = local_path(fspath(source)) if isinstance(source, str | PathLike) else None
     file_of_times = Path(times) if isinstance(times, str | PathLike) else None
     has_times_in_memory = times is not None and not file_of_times
-    is_format_named = format not in (FileOptions.format, AUTO)
-    has_file_options = is_format_named or columns is not None or file_of_times is not None
+    is_format_set = format not in (FileOptions.format, AUTO)
+    is_file_option_set = any([is_format_set, columns is not None, file_of_times])
     if topic:
-        has_options = any([has_file_options, has_times_in_memory, stamp_unit, repair])
-        if has_options or not path:
+        is_option_set = any([is_file_option_set, has_times_in_memory, stamp_unit, repair])
+        if is_option_set or not path:
             raise ConfigError("topic is for bags and cannot be combined with options of text files")
         return _of_bag(path, topic, measures)
-    if has_times_in_memory if path else has_file_options:
+    if has_times_in_memory if path else is_file_option_set:
         raise ConfigError(
             "format, columns and a file of times apply to text files only; "
             "pass arrays of times for objects"
@@ -232,13 +231,13 @@ def read_trajectory(
 
 
 def _warn_of(reading: FileReading) -> None:
-    """Warn the user of the caller."""
+    """Emit the notes of a reading as warnings at the caller of the public function."""
     for text in (*reading.guesses, *reading.repairs, *reading.warnings):
         warnings.warn(text, UserWarning, stacklevel=3)
 
 
 def _of_bag(path: Path, topic: str, measures: str) -> Trajectory:
-    """Return the trajectory of a topic or of two frames, and warn the user of the caller."""
+    """Return the trajectory of a topic or of two frames in a bag, with warnings at the caller."""
     from hand_eye_calib.formats.bags.reader import PoseBag
     from hand_eye_calib.formats.bags.sources import source_of
 
@@ -250,9 +249,9 @@ def _of_bag(path: Path, topic: str, measures: str) -> Trajectory:
 
 
 def read_trajectory_files(files: Sequence[tuple[Path, FileOptions]]) -> list[FileReading]:
-    """Read text files that belong together, with sensors named after the files.
+    """Read text files that belong together; the sensors are named after the files.
 
-    Files with the same columns come from one program, and so their angles have one convention.
+    Files with the same columns come from the same program, so their angles have one convention.
 
     Parameters
     ----------
@@ -275,7 +274,7 @@ def read_trajectory_files(files: Sequence[tuple[Path, FileOptions]]) -> list[Fil
     ]
     for number, convention in _other_conventions(tables).items():
         path, options = files[number]
-        # A new table, because the notes of the first one are about its own convention.
+        # Read the table again, because its notes are about the other convention.
         table = read_table(path, options)
         readings[number] = _read(table, options, rows_of_tables[number], convention)
     names = _sensor_names([path for path, _ in files])
@@ -286,7 +285,9 @@ def read_trajectory_files(files: Sequence[tuple[Path, FileOptions]]) -> list[Fil
 
 
 def _other_conventions(tables: Sequence[Table]) -> dict[int, str]:
-    """Return the common convention of angles for each table that was read with another one.
+    """Return the common convention of angles for the tables that were read with another one.
+
+    The keys are the numbers of these tables. Tables with the same columns have one convention.
 
     Raises
     ------
@@ -314,7 +315,7 @@ def _other_conventions(tables: Sequence[Table]) -> dict[int, str]:
 
 
 def _sensor_names(paths: Sequence[Path]) -> list[str]:
-    """Return different names of sensors, from the names of files; empty for equal files."""
+    """Return different names of sensors from the names of files; empty if the files are equal."""
     names = [path.stem for path in paths]
     if len({*names}) < len(names):
         names = distinct_names([str(path.with_suffix("")) for path in paths])
@@ -322,9 +323,9 @@ def _sensor_names(paths: Sequence[Path]) -> list[str]:
 
 
 def read_trajectories(*sources: TrajectoryLike) -> list[Trajectory]:
-    """Read trajectories that belong together, with warnings as of :func:`read_trajectory`.
+    """Read trajectories that belong together, in the format that is recognised.
 
-    Files are read in the format that they look like.
+    Guesses and repairs are reported as in :func:`read_trajectory`.
     """
     paths = [local_path(fspath(source)) for source in sources if isinstance(source, str | PathLike)]
     if len(paths) < len(sources):
@@ -336,22 +337,22 @@ def read_trajectories(*sources: TrajectoryLike) -> list[Trajectory]:
 
 
 def _rows_without_stamps(tables: Sequence[Table], pair_by: str) -> list[IntArray]:
-    """Return the rows of each table that belong together, paired by "row" or by "name" of image.
+    """Return the rows of each table that belong together, by "row" or by "name" of the image.
 
-    A row without a pose is skipped in all tables.
+    A row without a pose in one of the tables is skipped in all tables.
     """
     n_rows = [table.n_rows for table in tables]
     if pair_by == "row" and len({*n_rows}) > 1:
         raise InputError(
             f"pairing by row needs files with the same number of poses; found {n_rows}"
         )
-    keys: list[Sequence[Any]] = [
-        table.images if pair_by == "name" else table.rows for table in tables
-    ]
-    places = [{key: place for place, key in enumerate(keys_of)} for keys_of in keys]
+    places: list[dict[Any, int]] = []
+    for table in tables:
+        keys: Sequence[Any] = table.images if pair_by == "name" else table.rows
+        places.append({key: place for place, key in enumerate(keys)})
     common = sorted(set.intersection(*map(set, places)))
     if not common:
-        n_names = [len(keys_of) for keys_of in keys]
+        n_names = [len(table.rows) for table in tables]
         raise InputError(
             f"no image has a name that is in all files; found {n_names} names; pair by time or row"
         )
@@ -368,9 +369,10 @@ def _read(
     table : Table
     options : FileOptions
     rows : (N,) array of int, optional
-        Rows to use, at regular stamps of their own.
+        Rows that are paired without stamps; they get regular stamps. By default, all rows are used
+        with their own stamps.
     convention : str, optional
-        Convention of the table's angles; by default it is recognised by the motion.
+        Convention of the table's angles. By default, the motion decides.
     """
     if not table.line_numbers:
         raise InputError(f"{table.path}: the file contains no poses{_why_no_poses(table)}")
@@ -409,7 +411,10 @@ def _why_no_poses(table: Table) -> str:
 
 
 def _notes_on_left_out(table: Table) -> tuple[list[str], list[str]]:
-    """Return notes on the rows without a pose: as a repair if they are few, else as a warning."""
+    """Return the repairs and the warnings about rows without a pose.
+
+    A few such rows are a repair, many are a warning.
+    """
     if not table.n_left_out:
         return [], []
     counts = without_poses(table.n_left_out, table.n_rows)
@@ -423,19 +428,20 @@ def _notes_on_left_out(table: Table) -> tuple[list[str], list[str]]:
 
 
 def read_table(path: str | Path, options: FileOptions) -> Table:
-    """Return the rows of a file, in the format of the options or the one that it looks like.
+    """Return the rows of a file, in the format of the options or the recognised format.
 
     Raises
     ------
     InputError
-        If the file or one of its lines cannot be read, or its columns have no names.
+        If the file or one of its lines cannot be read, or if its columns have no names.
     """
     data = read_bytes(path)
     for read in FILE_READERS.values():
         table: Table | None = read(path, data, options)
         if table is not None:
             return table
-    text = decoded(path, _in_utf8(data).replace(b"\0", b"\xff"), _EXPECTED)  # no text has a zero
+    # Texts contain no zero byte: replace zeros by a byte that cannot be decoded.
+    text = decoded(path, _in_utf8(data).replace(b"\0", b"\xff"), _EXPECTED)
     needs_names = not options.columns and options.format in (AUTO, "csv")
     layout = layout_of(path, text, needs_names)
     guesses = []
@@ -445,7 +451,7 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
         guesses = [f"{path}{guess}" for guess in _guesses_of(layout)]
     table = _empty_table(path, layout, options)
     table.guesses = guesses
-    if layout.row:  # a file without rows needs no second pass
+    if layout.row:
         table.fill(lines_of(path, text, layout.rows_after), layout.cells_of)
         stamp_cells = [layout.row[place] for place in table.stamp_at if place < len(layout.row)]
         for note in notes_on_stamps(table.stamp_names, stamp_cells):
@@ -455,9 +461,9 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
 
 
 def _in_utf8(data: bytes) -> bytes:
-    """Return a text in UTF-8 if it is in UTF-16 or has some letters of Latin-1, such as °.
+    """Convert a text in UTF-16, or with some letters of Latin-1 such as °, to UTF-8.
 
-    Other data is returned as it is.
+    Other data is returned unchanged.
     """
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         with suppress(UnicodeDecodeError):
@@ -480,7 +486,7 @@ def _with_options(layout: Layout, options: FileOptions) -> Layout:
         format = "csv"
         columns = tuple(name.strip() for name in options.columns.split(","))
     elif format == AUTO:
-        # The file of times is for poses without stamps.
+        # Only the option `times` is set. It applies to poses without stamps.
         if layout.columns and not stamp_columns(named_columns(layout.columns)[0]):
             return layout
         format = "kitti"
@@ -491,7 +497,7 @@ def _with_options(layout: Layout, options: FileOptions) -> Layout:
 
 
 def _guesses_of(layout: Layout) -> list[str]:
-    """Return notes for the user on a layout that no option names."""
+    """Return notes for the user on a layout that was recognised without options."""
     if layout.format == "tum":
         return []
     order = ", qw qx qy qz" if layout.format == "euroc" else ""
@@ -527,9 +533,9 @@ def _empty_table(path: str | Path, layout: Layout, options: FileOptions) -> Tabl
 
 
 def _add_times(table: Table, options: FileOptions) -> None:
-    """Add stamps to poses without stamps, from the file of an option or from times.txt.
+    """Add stamps to poses without stamps, from the file of the option ``times``.
 
-    The file times.txt is in the same folder as the poses.
+    By default, the file times.txt in the folder of the poses is used if it exists.
     """
     if table.stamp_at:
         return

@@ -1,4 +1,4 @@
-"""Stamps of a table, as increasing whole nanoseconds."""
+"""Stamps of a table in whole nanoseconds, and their order."""
 
 from decimal import Decimal
 
@@ -14,17 +14,15 @@ from hand_eye_calib.formats.trajectory_files.table import Table
 
 # Nanoseconds in a second.
 _NS = STAMP_UNITS["s"]
-# Longest median time between poses (s) that a calibration can use. A longer one is a sign of a
-# mistaken unit.
+# Longest median time between poses (s). A longer time means that the unit is probably wrong.
 _LONGEST_INTERVAL_S = 10
-# Numbers such as 20231114221320.5 are dates with the time of day: from 2000-01-01 on, and before
-# 2100-01-01.
+# Numbers such as 20231114221320.5 are dates with a time of day: first number, of 2000-01-01.
 _FIRST_PACKED = Decimal(20_000_101_000_000)
+# End of these numbers, of 2100-01-01.
 _END_OF_PACKED = Decimal(21_000_101_000_000)
-# Share of poses that move on while their stamp does not: from this share on the stamps have lost
-# their last digits.
+# Smallest share of poses with the stamp of the pose before, for stamps that lost their last digits.
 _COARSE_SHARE = 0.25
-# Poses differ if a number of theirs differs by more than this, which is rounding.
+# Largest difference of the numbers of equal poses: rounding.
 _SAME = 1e-12
 
 
@@ -35,8 +33,8 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
     ----------
     table : Table
     stamp_unit : str or None
-        "s", "ms", "us" or "ns". None for the unit in the column's name, or else the unit that the
-        size of the stamps suggests.
+        "s", "ms", "us" or "ns". If None, the unit is that in the column's name, or is recognised
+        from the size of the stamps.
 
     Returns
     -------
@@ -45,7 +43,7 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
     Raises
     ------
     InputError
-        If the table has no stamps, they are too large, or their unit is unclear.
+        If the table has no stamps, if stamps are too large, or if their unit is unclear.
     """
     if not table.stamps:
         raise InputError(
@@ -68,7 +66,7 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
     )
     whole = (int((stamp * factor).to_integral_value()) for stamp in stamps)
     stamps_ns = np.fromiter(whole, dtype=np.int64, count=len(stamps))
-    # Stamps with a fraction are in seconds: their unit is clear.
+    # The unit of stamps with a fraction is clear, because only seconds have one.
     if not unit and not any(stamp % 1 for stamp in stamps):
         _refuse_unclear_unit(table, stamps_ns, recognised)
     for period_s in (DAY_S, WEEK_S):
@@ -77,7 +75,7 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
 
 
 def _unit_of_size(largest: float) -> str:
-    """Return the unit of stamps since 1970 whose largest is given."""
+    """Return the unit of stamps since 1970 from the largest stamp."""
     for unit, digits in DIGITS.items():
         if largest >= 10.0**digits:
             return unit
@@ -85,7 +83,7 @@ def _unit_of_size(largest: float) -> str:
 
 
 def _unpacked(stamps: list[Decimal]) -> list[Decimal]:
-    """Return the seconds of dates such as 20231114221320.5; the stamps if one is no date."""
+    """Convert dates such as 20231114221320.5 to seconds; unchanged if a stamp is not a date."""
     try:
         return [seconds_of(f"{stamp:f}") for stamp in stamps]
     except ValueError:
@@ -93,7 +91,7 @@ def _unpacked(stamps: list[Decimal]) -> list[Decimal]:
 
 
 def _refuse_unclear_unit(table: Table, stamps_ns: IntArray, recognised: str) -> None:
-    """Raise an InputError if the poses are so far apart that the unit seems to be mistaken."""
+    """Raise an InputError if the poses are so far apart that the unit is probably wrong."""
     intervals_s = np.abs(np.diff(stamps_ns.astype(float))) * 1e-9
     if len(intervals_s) and median(intervals_s) > _LONGEST_INTERVAL_S:
         raise InputError(
@@ -104,10 +102,10 @@ def _refuse_unclear_unit(table: Table, stamps_ns: IntArray, recognised: str) -> 
 
 
 def _continued(stamps_ns: IntArray, period_s: int) -> IntArray:
-    """Return stamps that go on where stamps of a day or a week begin again at 0.
+    """Continue stamps of a day or a week that begin again at 0.
 
-    They begin again where a stamp in the last tenth of the period is followed by one in the first
-    tenth.
+    Stamps begin again if a stamp in the last tenth of the period is followed by a stamp in the
+    first tenth.
     """
     period_ns = period_s * _NS
     if not len(stamps_ns) or stamps_ns.min() < 0 or stamps_ns.max() > period_ns:
@@ -122,7 +120,8 @@ def _continued(stamps_ns: IntArray, period_s: int) -> IntArray:
 def refuse_coarse(table: Table, stamps_ns: IntArray, values: FloatArray) -> None:
     """Raise an InputError if stamps (N,) have lost their last digits.
 
-    They have if many poses (N, k) differ from the pose before them with the same stamp.
+    The criterion is that many poses (N, k) have the same stamp as the pose before, but differ from
+    it.
     """
     if len(stamps_ns) < 2:
         return
@@ -145,7 +144,7 @@ def refuse_coarse(table: Table, stamps_ns: IntArray, values: FloatArray) -> None
 
 
 def in_order(table: Table, stamps_ns: IntArray, repair: bool) -> tuple[IntArray, list[str]]:
-    """Return the indices of poses in the order of time, each stamp once, and notes on the repair.
+    """Return the indices of poses sorted by time without repeated stamps, and notes on repairs.
 
     Raises
     ------

@@ -1,7 +1,8 @@
 """Table of the numbers of a trajectory, before they become poses.
 
-A table has the quantities of its columns, by their names, and their values row by row. It is filled
-from the lines of a file or from numbers in memory. Rows of the format tum are also written here.
+A table contains the values of its quantities row by row. The names of its columns define the
+quantities. It is filled from the lines of a file or from numbers in memory. This module also writes
+files in the format tum.
 """
 
 import math
@@ -37,10 +38,11 @@ from hand_eye_calib.formats.trajectory_files.columns import (
 )
 from hand_eye_calib.formats.trajectory_files.dates import seconds, stamp_of
 
-# Quantities that are all 0 where there is no orientation, such as while tracking is lost.
-_TURNS = (QUATERNION, SCALAR_FIRST, UNNAMED, ROTATION)
+# Quantities of an orientation. All are 0 in a row without orientation, such as a row of a tracker
+# that is lost.
+_ORIENTATIONS = (QUATERNION, SCALAR_FIRST, UNNAMED, ROTATION)
 
-# Most sensors that a column names. A column with more names is about something else, such as
+# Largest number of sensors in a column. A column with more names is about something else, such as
 # images.
 _MOST_SENSORS = 20
 
@@ -54,19 +56,19 @@ class Table:
     Attributes
     ----------
     path : object
-        Name of the table in messages.
+        Path of the file, or another name for the table in messages.
     names : sequence of str
         Names of all columns.
     measures : str
-        Kind of data to read: one of config.MEASURES, "twists" for velocities, or "auto", which
-        becomes the kind that the columns have.
+        Kind of data to read: "poses", "positions", "rotations", "rates" or "twists" (velocities).
+        "auto" is replaced by the kind that the columns have.
     expected : str
         Description of a row for messages.
     format : str
     is_transposable : bool
-        Whether rows and columns of the rotations could be exchanged.
+        Whether the matrices may be written row by row or column by column.
     line_numbers, rows : array
-        Line number of each row with a pose, and its number among all rows, from 0.
+        Line number of each row with a pose, and the number of this row among all rows, from 0.
     n_rows : int
         Number of all rows.
     first_skipped : int or None
@@ -76,19 +78,19 @@ class Table:
     numbers : array of float
         Values of the quantities, row after row.
     images : list of str
-        Names of images, if there is a column of them.
+        Names of images, from a column for these names.
     guesses : list of str
-        Notes for the user on what the file does not state.
+        Notes for the user about properties that the file does not state.
     conventions : list of str
-        Conventions of angles that the motion does not contradict, the usual one first.
+        Conventions of angles that fit the motion, the usual one first.
     at : dict of str to int
         Column of each quantity, such as "x" or "qw".
     units : dict of str to str
-        Units of quantities in the columns' names.
+        Units of the quantities, if the names of their columns state them.
     stamp_names, stamp_at : sequence
         Quantities that make the stamp, and their columns.
     stamp_unit : str
-        Unit of the stamps; empty if it is to be recognised from their size.
+        Unit of the stamps; empty if their size decides.
     second_unit : str
         Unit of the second of a week of GPS; empty if no name states it.
 
@@ -128,13 +130,13 @@ class Table:
         self._image_at = columns.get("image", [])[:1]
         self._sensor_at = columns.get("sensor", [])[:1]
         self._sensors: set[str] = set()
-        turn = next((group for group in _TURNS if {*group} <= {*quantities}), ())
-        self._turn_at = [quantities.index(name) for name in turn]
+        orientation = next((group for group in _ORIENTATIONS if {*group} <= {*quantities}), ())
+        self._orientation_at = [quantities.index(name) for name in orientation]
 
     def _refuse_unclear_columns(
         self, columns: Mapping[str, list[int]], quantities: Sequence[str]
     ) -> None:
-        """Raise an InputError if a quantity has no column or several."""
+        """Raise an InputError if a quantity has no column or several columns."""
         if missing := [name for name in quantities if name not in columns]:
             listed = self._listed(self.names)
             has_accelerations = re.search(r", a(cc\w*)?_?x", listed)
@@ -185,7 +187,7 @@ class Table:
     def fill(
         self, lines: Iterable[tuple[int, Any]], cells_of: Callable[[Any], Sequence[str]]
     ) -> Self:
-        """Add rows, and return the table.
+        """Add rows, and return this table.
 
         Parameters
         ----------
@@ -197,14 +199,14 @@ class Table:
         Raises
         ------
         InputError
-            At the first line with another number of cells or with text in place of a number, and
+            At the first line with another number of cells, or with text instead of a number. Also
             if the poses are of several sensors.
         """
         n_columns = len(self.names)
         for line_number, content in lines:
             cells = cells_of(content)
             if len(cells) != n_columns:
-                cells = self._as_many_as_columns(cells, line_number, content)
+                cells = self._padded(cells, line_number, content)
             try:
                 self._add(cells, line_number)
             except ValueError as error:
@@ -220,14 +222,16 @@ class Table:
         return self
 
     def fill_from_arrays(self, values: FloatArray, stamps: Sequence[Decimal | None] | None) -> None:
-        """Add the rows of values (N, k) that have a pose, and a stamp if there are stamps."""
+        """Add the rows of values (N, k) with a pose; with ``stamps``, also those with a stamp."""
         is_pose = np.isfinite(values).all(axis=1)
-        if self._turn_at:
-            is_pose &= values[:, self._turn_at].any(axis=1)
+        if self._orientation_at:
+            is_pose &= values[:, self._orientation_at].any(axis=1)
         if stamps is not None:
             is_pose &= np.array([stamp is not None for stamp in stamps], dtype=bool)
-            both = zip(stamps, is_pose, strict=True)
-            self.stamps = [stamp for stamp, is_used in both if stamp is not None and is_used]
+            stamps_and_uses = zip(stamps, is_pose, strict=True)
+            self.stamps = [
+                stamp for stamp, is_used in stamps_and_uses if is_used and stamp is not None
+            ]
         rows = np.flatnonzero(is_pose).tolist()
         self.numbers.frombytes(np.ascontiguousarray(values[is_pose]).tobytes())
         self.line_numbers.extend(row + 1 for row in rows)
@@ -237,12 +241,12 @@ class Table:
             self.first_skipped = int(np.argmin(is_pose)) + 1
 
     def _add(self, cells: Sequence[str], line_number: int) -> None:
-        """Add a row, or count it if it has no pose.
+        """Add a row; a row without a pose is only counted.
 
         Raises
         ------
         ValueError
-            If a cell has text in place of a number.
+            If a cell has text instead of a number.
         """
         row = self.n_rows
         self.n_rows += 1
@@ -259,7 +263,7 @@ class Table:
         self.rows.append(row)
 
     def _add_stamp(self, cells: Sequence[str]) -> bool:
-        """Add the stamp of a row. Return False if the row needs a stamp and has none."""
+        """Add the stamp of a row; return False if the stamp is missing."""
         if not self.stamp_at:
             return True
         texts = [cells[column] for column in self.stamp_at]
@@ -282,17 +286,16 @@ class Table:
 
     def _is_pose(self, values: Sequence[float]) -> bool:
         """Whether the values of a row are finite, and its orientation is not all 0."""
-        # The sum is quick, but the sum of large numbers may not be finite.
+        # A finite sum proves that all values are finite, in little time. The sum of large finite
+        # values may be infinite.
         if not math.isfinite(sum(values)) and not all(map(math.isfinite, values)):
             return False
-        return not self._turn_at or any(values[place] for place in self._turn_at)
+        return not self._orientation_at or any(values[place] for place in self._orientation_at)
 
-    def _as_many_as_columns(
-        self, cells: Sequence[str], line_number: int, content: object
-    ) -> Sequence[str]:
-        """Return as many cells as columns, of a row with another number of cells.
+    def _padded(self, cells: Sequence[str], line_number: int, content: object) -> Sequence[str]:
+        """Return one cell for each column, for a row with another number of cells.
 
-        An empty cell at the end is dropped. Empty cells are added to a row that has only a stamp.
+        An empty cell at the end is dropped. Empty cells are appended to a row with only a stamp.
 
         Raises
         ------
@@ -312,11 +315,11 @@ class Table:
         )
 
     def guess(self, text: str) -> None:
-        """Add a note for the user on what the file does not state."""
+        """Add a note for the user about a property that the file does not state."""
         self.guesses.append(f"{self.path}: {text}")
 
     def refuse(self, is_wrong: BoolArray, message: Callable[[int], str]) -> None:
-        """Raise an InputError at the first wrong row of (N,), if there is one."""
+        """Raise an InputError at the first row for which ``is_wrong`` (N,) is true."""
         index = int(np.argmax(is_wrong))
         if is_wrong[index]:
             raise InputError(f"{self.path}, line {self.line_numbers[index]}: {message(index)}")
@@ -336,20 +339,20 @@ def columns_of_array(source: Any) -> tuple[Sequence[str], FloatArray, list[str]]
     Parameters
     ----------
     source : array_like
-        (N, 8) of t, x, y, z, qx, qy, qz, qw; (N, 7) without t; (N, 4) of t, x, y, z; or matrices
-        (N, 4, 4) or (N, 3, 4).
+        Rows (N, 8) of t, x, y, z, qx, qy, qz, qw; (N, 7) without t; (N, 4) of t, x, y, z; or
+        matrices (N, 4, 4) or (N, 3, 4).
 
     Returns
     -------
     names : sequence of str
     values : (N, k) array
     notes : list of str
-        Notes for the user on how the array was read.
+        Notes for the user about the way in which the array was read.
 
     Raises
     ------
     InputError
-        For anything else.
+        For another shape, and if the values are not numbers.
     """
     try:
         values = np.asarray(source, dtype=float)
@@ -365,7 +368,7 @@ def columns_of_array(source: Any) -> tuple[Sequence[str], FloatArray, list[str]]
 
 
 def _columns_of_matrices(matrices: FloatArray) -> tuple[Sequence[str], FloatArray, list[str]]:
-    """Return the columns of matrices (N, 3, 4) or (N, 4, 4), perhaps transposed."""
+    """Return the columns of matrices (N, 3, 4) or (N, 4, 4); transposed matrices are corrected."""
     notes = []
     if matrices.shape[1:] == (4, 4) and not _has_last_row(matrices):
         matrices = np.swapaxes(matrices, 1, 2)
@@ -388,7 +391,7 @@ def table_of_object(source: Any, times: Any = None) -> Table:
     Raises
     ------
     InputError
-        If the source is neither, or the stamps are not numbers or datetimes, one for each pose.
+        If the source is neither. Also unless there is one number or datetime as stamp of each pose.
     """
     if hasattr(source, "columns"):
         keys = [*source.columns]
@@ -412,7 +415,7 @@ def table_of_object(source: Any, times: Any = None) -> Table:
 
 
 def _times_of_columns(columns: Sequence[Any], table: Table) -> Any:
-    """Return the stamps in columns of a DataFrame; None without a column."""
+    """Return the stamps from their columns in a DataFrame; None without such columns."""
     if len(columns) < 2:
         return columns[0] if columns else None
     rows = zip(*(map(str, column) for column in columns), strict=True)
@@ -420,7 +423,7 @@ def _times_of_columns(columns: Sequence[Any], table: Table) -> Any:
 
 
 def _stamps_of_objects(times: Any, table: Table, n_poses: int) -> list[Decimal | None]:
-    """Return one stamp for each pose, None for a missing time."""
+    """Return the stamp of each pose; None for a missing time."""
     if isinstance(times, list) and times and isinstance(times[0], Decimal):
         return [*times]
     if getattr(getattr(times, "dtype", None), "tz", None) is not None:
@@ -442,17 +445,19 @@ def _stamps_of_objects(times: Any, table: Table, n_poses: int) -> list[Decimal |
         raise InputError(
             f"there must be one stamp per pose; found {stamps.size} stamps and {n_poses} poses"
         )
-    both = zip(stamps.tolist(), is_time.tolist(), strict=True)
-    return [Decimal(stamp) if is_valid else None for stamp, is_valid in both]
+    return [
+        Decimal(stamp) if is_valid else None
+        for stamp, is_valid in zip(stamps.tolist(), is_time.tolist(), strict=True)
+    ]
 
 
-# ---- rows that are written
+# ---- writing
 
 
 def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:
     """Write a trajectory to a text file in the format tum, which evo also reads.
 
-    A file that exists is replaced. Reading the file back returns the same stamps and poses.
+    An existing file is replaced. Reading the file returns the same stamps and poses.
 
     Parameters
     ----------
