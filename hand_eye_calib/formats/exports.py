@@ -1,8 +1,8 @@
-"""Extrinsics in the files of other programs, whose layouts are in ``layouts.yaml``.
+"""Extrinsics in the files of other programs. Their layouts are in ``layouts.yaml``.
 
-The direction of a transform is the most frequent mistake. Therefore each file names the frames
-between which its numbers map coordinates, and states whether the calibration was inverted. The
-sources of the directions are in docs/exports.md.
+The direction of a transform is the most frequent mistake. Therefore each file names source and
+target frame of its numbers, and states whether the calibration was inverted. docs/exports.md names
+the sources for the directions.
 """
 
 import json
@@ -25,8 +25,8 @@ from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.core.results.verdict import Judged, Verdict
 from hand_eye_calib.formats.results import launch_text, xacro_text
 
-# Beginnings of words in a frame's name, by the kind of sensor. The kinds are in the order of their
-# distance from the body: if the names state nothing, the parent is nearer than the child.
+# Beginnings of words in a frame's name, by the kind of sensor. The kinds are sorted by their usual
+# distance from the body.
 _ROLES = {
     "base": ("base", "ego", "vehicle", "chassis", "rig", "hand", "tool", "flange"),
     "imu": ("imu", "body", "gyro", "ins", "novatel", "xsens"),
@@ -35,31 +35,31 @@ _ROLES = {
     "gnss": ("gnss", "gps", "antenna", "rtk"),
 }
 _RANKS = {role: rank for rank, role in enumerate(_ROLES)}
-# Decimals of the numbers in a file: a thousandth of a micrometre.
+# Decimals of the numbers in a file. For metres, the last digit is 1 pm.
 _DECIMALS = 12
 # Longest delay (ms) that PX4 accepts (EKF2_EV_DELAY).
 _LONGEST_DELAY_MS = 300.0
 
 
 class Layout(NamedTuple):
-    """Layout of one pair of sensors in a format: its numbers are ``T_target_source``.
+    """Layout of a format for two kinds of sensors. Its numbers are ``T_target_source``.
 
     Attributes
     ----------
     target, source : str
         Kinds of the sensors; empty for any kind.
     is_inverted : bool or None
-        Whether the target is the child; None if both are possible.
+        True if the target is the child, False if it is the parent, None if either is possible.
     keys : sequence of str
-        Keys by which a reader finds a pose, or translation and rotation.
+        Keys of the pose in the file, or of translation and rotation.
     text : str
-        Text of the file, with ``%(name)s`` in place of numbers and names.
+        Text of the file, with ``%(name)s`` for numbers and names.
     clock : int
         Sign of the shift in ``t_target = t_source + clock * shift``; 0 if the file has no shift.
     axes : sequence of str
         Axes that the recording must determine.
     axes_note : str
-        Note in the file on its axes.
+        Note about the axes, for the user of the file.
     """
 
     target: str = ""
@@ -105,7 +105,7 @@ def role_of(frame: str) -> str:
         for role, beginnings in _ROLES.items()
         if any(word.startswith(beginnings) for word in words)
     ]
-    # Another role behind "base" decides: base_imu_link belongs to an IMU.
+    # A second role is preferred to "base": base_imu_link belongs to an IMU.
     if len(roles) > 1 and roles[0] == "base":
         return roles[1]
     return roles[0] if roles else ""
@@ -114,8 +114,8 @@ def role_of(frame: str) -> str:
 def arranged(layouts: Sequence[Layout], parent_frame: str, child_frame: str) -> Arrangement:
     """Return the layout and the direction that fit the sensors best.
 
-    Most kinds of sensors must match, then fewest must differ. Then the first layout counts, and a
-    parent that is nearer to the body than the child.
+    The criteria are, in this order: most matching kinds of sensors, fewest differing kinds, the
+    first layout, and a parent that is nearer to the body than the child.
     """
     roles = (role_of(parent_frame), role_of(child_frame))
     best_score: tuple[Any, ...] = ()
@@ -161,7 +161,8 @@ def export_text(result: Judged, name: str) -> str:
     T = result.T_parent_child
     arrangement = arranged(formats()[name], *frames)
     layout = arrangement.layout
-    if layout.is_inverted is False and not layout.target:  # the vehicle or robot, if it is known
+    # The target of such a format is a vehicle or robot: prefer the frame of its description.
+    if layout.is_inverted is False and not layout.target:
         frames = (result.mounting[0], result.child_frame)
         T = result.mounting[1]
     if unknown := [axis for axis in result.unobservable() if axis in layout.axes]:
@@ -177,6 +178,7 @@ def export_text(result: Judged, name: str) -> str:
         T = se3.inverse(T)
         offset_s = -offset_s
     texts = _numbers(T) | _robot_frames(target)
+    # The delay of PX4 is that of the child, whatever the direction of the transform.
     texts |= {
         "target": json.dumps(target),
         "source": json.dumps(source),
@@ -185,9 +187,10 @@ def export_text(result: Judged, name: str) -> str:
     }
     lines = _remarks(result, name, arrangement, target, source)
     lines = [printable(" ".join(line.split())) for line in lines]
-    if name == "kitti":  # a value, not a comment
+    # Files of kitti and JSON have no comments, so the remarks are a value.
+    if name == "kitti":
         texts["about"] = json.dumps(" ".join(lines))
-    elif layout.text.startswith(("{", "[")):  # JSON has no comments
+    elif layout.text.startswith(("{", "[")):
         texts["about"] = json.dumps(lines)
     else:
         texts["about"] = "\n".join(f"# {line}" for line in lines)
@@ -195,14 +198,15 @@ def export_text(result: Judged, name: str) -> str:
 
 
 def _robot_frames(target: str) -> dict[str, str]:
-    """Return the texts of a robot's base and hand: the target is one of them."""
-    if "base" in target.lower():  # a camera beside the robot, not on its hand
+    """Return the texts of a robot's base and hand. The target is one of these frames."""
+    # The camera is beside the robot, not on its hand.
+    if "base" in target.lower():
         return {"eye": "eye_on_base", "robot": json.dumps(target), "effector": '"hand"'}
     return {"eye": "eye_in_hand", "robot": '"base"', "effector": json.dumps(target)}
 
 
 def _delay_of_px4(delay_ms: float) -> str:
-    """Return the line that sets a delay in PX4, or a comment if PX4 does not accept the delay."""
+    """Return the command that sets a delay in PX4; a comment if PX4 does not accept the delay."""
     if 0 <= delay_ms <= _LONGEST_DELAY_MS:
         return f"param set EKF2_EV_DELAY {_number(round(delay_ms, 3))}"
     return f"# EKF2_EV_DELAY would be {delay_ms:.1f} ms; PX4 accepts 0 to 300 ms"
@@ -261,7 +265,7 @@ def _listed(values: FloatArray, separator: str = ", ") -> str:
 
 
 def _number(value: float) -> str:
-    """Return a number with a decimal point and without a power of ten, for every parser."""
+    """Format a number with a decimal point and without an exponent, for every parser."""
     # Adding 0.0 turns -0.0 into 0.0.
     text = f"{round(float(value), _DECIMALS) + 0.0:.{_DECIMALS}f}".rstrip("0")
     return f"{text}0" if text.endswith(".") else text

@@ -1,8 +1,8 @@
-"""Files: limits of reading, and writing in one step.
+"""Files: limits of their size, and writing in one step.
 
-The size that a file states for itself is not trusted. Text and YAML that are too large are refused
-before memory is allocated. Libraries read bags: meanwhile a command limits the additional memory of
-the process to :data:`LARGEST`. The poses that are kept take memory of their own.
+A size that a file states may be wrong. So text and YAML that are too large are refused before
+memory is allocated. Bags are read by libraries: during this time, a command limits the growth of
+its process to :data:`LARGEST`. The poses that are kept take memory of their own.
 """
 
 import os
@@ -18,56 +18,56 @@ from typing import Any
 from hand_eye_calib.core.base.errors import InputError, printable, require_type
 from hand_eye_calib.core.base.option import did_you_mean
 
-# Recordings that come with the package, for ``sample:NAME``.
+# Folder of the recordings in the package, for ``sample:NAME``.
 _SAMPLES = Path(__file__).parents[1] / "sample"
 
 # ---- all files
 
-#: Bytes of the largest trajectory file, and of the memory to read a bag in a command.
+#: Largest number of bytes of a trajectory file, and of the memory for reading a bag in a command.
 LARGEST = 512 << 20
 
 # ---- bags
 
 #: Largest ratio of a file to its compressed size.
 LARGEST_RATIO = 256
-#: Bytes of the longest name of a topic, a type or a frame.
+#: Largest number of bytes of the name of a topic, a type or a frame.
 LONGEST_NAME = 1_024
-#: Bytes at which a block of messages is passed on.
+#: Number of bytes at which a block of messages is complete.
 BLOCK_BYTES = 4 << 20
 
 # ---- YAML
 
-#: Bytes of the largest YAML file.
+#: Largest number of bytes of a YAML file.
 LARGEST_YAML = 1 << 20
-#: Whole numbers must be smaller than this: they fit into a signed integer of 64 bits.
+#: Whole numbers must be smaller than this, so that they fit into a signed integer of 64 bits.
 LARGEST_INT = 1 << 63
 #: Largest number of levels of nesting.
 DEEPEST_YAML = 32
 
 # ---- .npz
 
-#: Bytes of all arrays of the largest file. The poses of 100,000 stops take 26 million.
+#: Largest number of bytes of all arrays of a file. The poses of 100,000 stops have 26 million.
 LARGEST_ARRAYS = 64 << 20
 
 # ---- trajectory files
 
-#: Characters of the longest line.
+#: Largest number of characters of a line.
 LONGEST_LINE = 65_536
 
 
 _STATM = Path("/proc/self/statm")
 _is_limited = False
 
-# Limits before the readings that are in progress, perhaps in several threads. The last reading
-# restores the limits before the first.
+# Limits of the process before each reading in progress. Readings may run in several threads; the
+# last one to end restores the limits before the first one.
 _before: list[tuple[int, int]] = []
 _lock = threading.Lock()
 
 
 def limit_memory() -> None:
-    """Limit the memory of all later readings, if the system can (Linux).
+    """Limit the memory of all later readings, if the system allows this (Linux).
 
-    Only commands do so: the limit is for the whole process, which may have other threads.
+    Only commands call this function, because the limit is for the whole process.
     """
     global _is_limited
     _is_limited = _STATM.exists()
@@ -77,7 +77,8 @@ def limit_memory() -> None:
 def reading_memory() -> Iterator[None]:
     """Limit the growth of the process to :data:`LARGEST` while the block runs.
 
-    The limit is set only after :func:`limit_memory`. Beyond it a MemoryError is raised.
+    The limit is set only after a call of :func:`limit_memory`. A growth beyond it raises a
+    MemoryError.
     """
     if not _is_limited:
         yield
@@ -101,7 +102,7 @@ def reading_memory() -> Iterator[None]:
 
 
 def local_path(source: str | Path) -> Path:
-    """Return a path; for ``sample:NAME`` that of a recording in the package."""
+    """Return a source as path; ``sample:NAME`` is a recording in the package."""
     name = str(source)
     return _SAMPLES / name.removeprefix("sample:") if name.startswith("sample:") else Path(source)
 
@@ -119,8 +120,9 @@ def path_of(name: str, value: Any) -> Path:
 
 
 def similar(path: str | Path) -> str:
-    """Return ``; did you mean NAME?`` for a missing file with a neighbour of a similar name."""
-    with suppress(OSError, ValueError):  # no folder, or a zero byte in the path
+    """Return ``; did you mean NAME?`` for a missing file if its folder has a similar name."""
+    # The folder may not exist, or the path may contain a zero byte.
+    with suppress(OSError, ValueError):
         if not Path(path).exists():
             return did_you_mean(Path(path).name, os.listdir(Path(path).parent))
     return ""
@@ -138,7 +140,8 @@ def open_regular(path: str | Path) -> BufferedReader:
         file = open(  # noqa: SIM115
             path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)
         )
-    except (OSError, ValueError) as error:  # a ValueError for a path with a zero byte
+    # A path with a zero byte raises a ValueError.
+    except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"cannot read {printable(str(path))}: {reason}{similar(path)}") from None
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -174,7 +177,7 @@ def decoded(path: str | Path, data: bytes, expected: str) -> str:
     Raises
     ------
     InputError
-        If the data is no text. The message has ``expected``, the description of the file.
+        If the data is not text. The message contains ``expected``, a description of the file.
     """
     try:
         return data.decode("utf-8-sig")
@@ -184,7 +187,7 @@ def decoded(path: str | Path, data: bytes, expected: str) -> str:
 
 @contextmanager
 def writing(path: str | Path) -> Iterator[None]:
-    """Turn an OSError in the block into an InputError that names the file, or else the path."""
+    """Turn an OSError in the block into an InputError that names the file or the path."""
     try:
         yield
     except OSError as error:
@@ -195,15 +198,15 @@ def writing(path: str | Path) -> Iterator[None]:
 
 
 def write_atomically(contents: Mapping[Path, str | bytes]) -> None:
-    """Write files in one step each, after all are on the disk under temporary names.
+    """Write files under temporary names, and then rename them.
 
-    A reader gets the old file or the new one, never a part. Text is written in UTF-8. A symbolic
-    link is replaced by the file; the target of the link stays as it is.
+    So a reader gets the whole old file or the whole new file. Text is written in UTF-8. A symbolic
+    link is replaced by the file; the target of the link is not changed.
 
     Raises
     ------
     OSError
-        If a file cannot be written; the error has its name. The old files stay.
+        If a file cannot be written; the error names the file. The old files are not changed.
     """
     temporaries = {
         path: path.with_name(f".{path.name[:100]}.{os.urandom(8).hex()}") for path in contents

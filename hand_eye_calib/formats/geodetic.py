@@ -17,13 +17,14 @@ _RADIUS_M = 6_378_137.0
 _FLATTENING = 1.0 / 298.257223563
 # Square of the first eccentricity, e^2.
 _ECCENTRICITY_2 = _FLATTENING * (2.0 - _FLATTENING)
-# Range of distances (m) from the centre of the earth, on the ground and in aircraft.
+# Smallest distance (m) of a position on the ground from the centre of the earth.
 _SMALLEST_M = 6.3e6
+# Largest distance (m) of a position in an aircraft from the centre of the earth.
 _LARGEST_M = 6.45e6
 
 
 class LocalOrigin:
-    """First position of a stream, from which the other positions count.
+    """First position of a stream; the other positions are relative to it.
 
     Attributes
     ----------
@@ -40,7 +41,8 @@ class LocalOrigin:
             self.geodetic = float(lat_rad[0]), float(lon_rad[0]), float(height_m[0])
         origin = np.array(self.geodetic)[:, None]
         from_origin = _earth_centred(lat_rad, lon_rad, height_m) - _earth_centred(*origin)
-        # A matrix product would round a single position, as in live use, in another way than many.
+        # These sums round a single position, as in live use, like many positions; a matrix product
+        # would not.
         terms = from_origin[:, :, None] * _axes(*origin[:2])
         return np.asarray(terms[:, 0] + terms[:, 1] + terms[:, 2])
 
@@ -68,7 +70,7 @@ def axes_of_places(positions: FloatArray) -> FloatArray:
 
 
 def rotations_to_first(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:
-    """Return the rotations (N, 3, 3) from each position's axes to those of the first position.
+    """Return the rotations (N, 3, 3) from the axes of each position to those of the first one.
 
     The axes are east, north and up.
     """

@@ -1,4 +1,4 @@
-"""Extrinsic that is installed now.
+"""Read the installed extrinsic: the one that a robot uses now.
 
 Its source is a robot description, an earlier result, a file of another program, a bag, or numbers.
 """
@@ -25,7 +25,7 @@ from hand_eye_calib.formats.files import read_bytes, similar
 from hand_eye_calib.formats.results import FILE_NAME, load_result
 from hand_eye_calib.formats.yaml_files import read_yaml
 
-# Format that a result states.
+# Value of the key "format" in a result of this package.
 _FORMAT = "hand_eye_calib/extrinsic"
 _DESCRIPTIONS = (".urdf", ".xml", ".xacro")
 _DOCUMENTS = (".yaml", ".yml", ".json", ".txt", ".calib")
@@ -41,15 +41,15 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
     Parameters
     ----------
     text : str
-        A robot description (``.urdf``), a result (``extrinsic.yaml``, or its directory), a file of
-        another program, one of formats/exports.py, a bag with ``/tf_static``, or
+        A robot description (``.urdf``), a result (``extrinsic.yaml`` or its directory), a file of
+        another program (see formats/exports.py), a bag with ``/tf_static``, or
         ``X Y Z ROLL PITCH YAW`` in m and rad.
 
     Returns
     -------
     callable
-        Takes the parent's and the child's frame, and returns the pose of the child sensor in the
-        parent sensor's frame. Raises an InputError if the source has no such pose.
+        ``find(parent_frame, child_frame)`` returns the pose of the child sensor in the parent
+        sensor's frame. It raises an InputError if the source has no such pose.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def stated(
     Raises
     ------
     InputError
-        If the source does not have it. The message begins with the origin.
+        If the source does not have this pose. The message begins with the origin.
     """
     with located(origin):
         return Extrinsic(find(parent_frame, child_frame), origin)
@@ -149,7 +149,8 @@ def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
             names, values = _of_sensors(nodes, layout.keys, {parent_frame, child_frame})
             is_fixed = layout.is_inverted is not None
             if is_fixed and child_frame not in names and parent_frame in names:
-                is_inverted = not is_inverted  # the format names its child
+                # The file names the frame of its child, and this frame is the parent here.
+                is_inverted = not is_inverted
             T = pose_of(*values)
             return se3.inverse(T) if is_inverted else T
     if len(numbers_of(document)) in (12, 16):
@@ -179,18 +180,21 @@ def _nodes(document: Any, path: tuple[str, ...]) -> Iterator[_Node]:
 def _named(path: tuple[str, ...], node: Mapping[str, Any]) -> tuple[Any, ...]:
     """Return parent and child of a node that names both frames, and its pose.
 
-    The pose is one value, or two: translation and angles (deg). Empty for other nodes.
+    The pose is one value, or two values: translation and angles (deg). The tuple is empty for other
+    nodes.
     """
     header = node.get("header")
     parameters = node.get("parameters")
-    if isinstance(header, Mapping) and "child_frame_id" in node:  # TransformStamped
+    # TransformStamped of ROS.
+    if isinstance(header, Mapping) and "child_frame_id" in node:
         return header.get("frame_id"), node["child_frame_id"], node.get("transform")
     if {"parent", "child", "value"} <= node.keys():
         return node["parent"], node["child"], node["value"]
     if {*AXES} <= node.keys() and len(path) > 1:
         rpy_deg = np.degrees(numbers_of([node[name] for name in ROTATIONS]))
         return *path[-2:], [node[name] for name in TRANSLATIONS], rpy_deg
-    if isinstance(parameters, Mapping) and "transform" in node:  # easy_handeye2
+    # easy_handeye2.
+    if isinstance(parameters, Mapping) and "transform" in node:
         is_fixed = parameters.get("calibration_type") == "eye_on_base"
         robot = parameters.get("robot_base_frame" if is_fixed else "robot_effector_frame")
         return robot, parameters.get("tracking_base_frame"), node["transform"]
@@ -202,13 +206,13 @@ def _of_sensors(
 ) -> tuple[set[str], list[Any]]:
     """Return the frames that an extrinsic names, and the values under its keys.
 
-    The names are in the same mapping as the values, or else in the path to it. Of several
-    extrinsics only those that name a frame are considered.
+    The names are in the same mapping as the values, or in the path to this mapping. If there are
+    several extrinsics, those that name none of the frames are ignored.
 
     Raises
     ------
     InputError
-        If there are several such extrinsics.
+        If several extrinsics remain, or none.
     """
     extrinsics = []
     for path, node in nodes:
@@ -247,7 +251,7 @@ def read_urdf(path: str | Path) -> FrameTree:
     Raises
     ------
     InputError
-        If the file cannot be read, is no URDF, or has macros of xacro, whose values are unknown.
+        If the file cannot be read, is not a URDF file, or contains macros of xacro.
     """
     data = read_bytes(path)
     with located(path):

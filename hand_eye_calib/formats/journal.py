@@ -1,14 +1,14 @@
 """Session journal: the poses of the node, written to disk as they arrive.
 
-A crash loses only the last poses.
+After a crash, only the last poses are lost.
 
 A journal is a directory with a text file for each stream: ``parent.tum``, ``child.tum`` and so on.
-Other programs also read these files. Each pose is a line ``t x y z qx qy qz qw``, with the stamp in
-seconds and all digits of every number. A line that begins with ``# {`` has JSON: the first one
-describes the stream and its options, later ones their changes. ``parent_poses`` is the number of
-poses in the parent's file when the poses below it were written. It determines the order of arrival.
-A process that is killed while it writes may leave an incomplete line: the reader stops before the
-first line that it cannot read.
+Other programs can read these files, too. Each pose is a line ``t x y z qx qy qz qw``, with the
+stamp in seconds and all digits of every number. A line that begins with ``# {`` is JSON: the first
+such line describes the stream and its options, later lines their changes. ``parent_poses`` in such
+a line is the number of poses in the parent's file when the next poses of this file were written.
+This number determines the order of arrival. A process that is killed may leave an incomplete line.
+So the reader stops before the first line that it cannot read.
 """
 
 import json
@@ -36,13 +36,13 @@ _FORMAT = "hand_eye_calib/journal"
 _VERSION = 2
 _STREAMS = ("parent", "child", *other_names())
 _BATCH = "parent_poses"
-# Largest number in the name of a journal that is kept aside.
+# Largest number in the name of a journal that was set aside.
 _MOST_ASIDE = 100
 _ADVICE = "move it away to start anew"
-# Errors of a line that does not belong to a journal.
+# Errors while parsing a line that does not belong to a journal.
 _UNREADABLE = (ValueError, TypeError, OverflowError, RecursionError)
 
-#: Description of each stream in plain values, such as topic, frame, origin and options.
+#: Description of each stream in plain values: topic, frame, origin, options and others.
 About = Mapping[str, Document]
 
 
@@ -54,16 +54,16 @@ class JournalWriter:
     Parameters
     ----------
     directory : str or path-like
-        It is made if it does not exist.
+        A missing directory is made.
     about : About
         Description of each stream.
     resumed : Journal, optional
-        Session in the directory that is continued. The unreadable end of its files is cut off.
+        Session in the directory to be continued. The unreadable end of its files is cut off.
 
     Raises
     ------
     OSError
-        Also if a file of a stream's name is a link, or does not belong to a journal.
+        Also if a file with a stream's name is a link, or does not belong to a journal.
     """
 
     def __init__(
@@ -71,23 +71,27 @@ class JournalWriter:
     ) -> None:
         Path(directory).mkdir(parents=True, exist_ok=True)
         _refuse_foreign(Path(directory))
-        before = resumed or Journal({}, np.array([]), np.array([]), np.array([]), {})
-        self._parent_poses = int((before.streams == "parent").sum())
-        self._about: dict[str, Document] = {**before.about}
-        self._pending: dict[str, list[str]] = {stream: [] for stream in {**about, **before.about}}
+        self._parent_poses = 0
+        self._about: dict[str, Document] = {}
+        whole_bytes: dict[str, int] = {}
+        if resumed:
+            self._parent_poses = int((resumed.streams == "parent").sum())
+            self._about |= resumed.about
+            whole_bytes = resumed.whole_bytes
+        self._pending: dict[str, list[str]] = {stream: [] for stream in {**about, **self._about}}
         self._files: dict[str, FileIO] = {}
         for stream in self._pending:
-            # Without a buffer, data is in the operating system at once and survives this process.
+            # Without a buffer, data survives this process as soon as it is written.
             path = Path(directory, f"{stream}.tum")
             self._files[stream] = open(path, "ab", buffering=0, opener=_open_no_link)  # noqa: SIM115
-            self._files[stream].truncate(before.whole_bytes.get(stream, 0))
+            self._files[stream].truncate(whole_bytes.get(stream, 0))
         head = {"format": _FORMAT, "version": _VERSION}
         self.describe({stream: head | {"stream": stream} | {**about[stream]} for stream in about})
 
     def add_pose(
         self, stream: str, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float]
     ) -> None:
-        """Add a pose. It is written with the next :meth:`flush`."""
+        """Add a pose. The next :meth:`flush` writes it."""
         self._pending[stream].append(tum_line(stamp_ns, (*position, *quat_xyzw)))
 
     def describe(self, about: About) -> None:
@@ -101,8 +105,9 @@ class JournalWriter:
             self._about[stream] = {**before, **description}
 
     def flush(self) -> None:
-        """Write all poses to the operating system, where they survive this process."""
-        for stream, lines in self._pending.items():  # the parent is first
+        """Write all poses to the operating system, so that they survive this process."""
+        # The parent's stream is the first.
+        for stream, lines in self._pending.items():
             if not lines:
                 continue
             if stream == "parent":
@@ -114,7 +119,7 @@ class JournalWriter:
 
     def _write(self, stream: str, lines: Sequence[str]) -> None:
         file = self._files[stream]
-        # Data that is written to a file without its name would be lost.
+        # If the file was replaced or deleted, data written to it would be lost.
         if not os.path.samestat(os.stat(file.name), os.fstat(file.fileno())):
             raise OSError("another program has replaced its file")
         file.write("\n".join([*lines, ""]).encode())
@@ -142,7 +147,7 @@ class Journal:
     poses : (N, 7) array
         x y z (m), qx qy qz qw.
     whole_bytes : dict of str to int
-        Bytes of each stream's file up to the end of the last readable line.
+        Number of readable bytes of each stream's file.
     """
 
     about: dict[str, Document]
@@ -158,11 +163,12 @@ def read_journal(directory: str | Path) -> Journal:
     Raises
     ------
     InputError
-        If there is none, or it cannot be read.
+        If the directory has no session, or the session cannot be read.
     """
     paths = {stream: Path(directory, f"{stream}.tum") for stream in _STREAMS}
     files = {stream: _read(path) for stream, path in paths.items() if os.path.lexists(path)}
-    if "parent" not in files:  # a node may just have renamed the directory
+    # A node may just have renamed the directory.
+    if "parent" not in files:
         raise InputError(f"no session journal in {directory}")
     rows = np.concatenate([np.reshape(file.values, (-1, 8)) for file in files.values()])
     order = np.argsort(rows[:, 0], kind="stable")
@@ -180,8 +186,8 @@ def read_journal(directory: str | Path) -> Journal:
 class _StreamFile(NamedTuple):
     """File of one stream.
 
-    A row of ``values`` is the time of arrival, counted in poses of the parent, and x y z qx qy qz
-    qw. ``whole_bytes`` is the number of readable bytes.
+    A row of ``values`` is the order of arrival and x y z qx qy qz qw. The order of arrival is
+    counted in poses of the parent. ``whole_bytes`` is the number of readable bytes.
     """
 
     about: Document
@@ -193,7 +199,7 @@ class _StreamFile(NamedTuple):
 def _read(path: Path) -> _StreamFile:
     """Read the file of one stream up to the first unreadable line."""
     about: Document = {}
-    # A session may last all day: a pose has 72 bytes in these arrays, and 500 in lists.
+    # A session may last all day: a pose takes 72 bytes in these arrays, and 500 in lists.
     stamps_ns = array("q")
     values = array("d")
     whole_bytes = 0
@@ -206,7 +212,7 @@ def _read(path: Path) -> _StreamFile:
                 seconds, _, decimals = stamp.partition(b".")
                 if len(cells) != 7 or len(decimals) != 9:
                     break
-                # The parent's poses count from 0. Other poses arrived between two of them.
+                # The parent's poses are 0, 1, 2, ... Other poses arrived between two of them.
                 arrived = about.get(_BATCH, len(stamps_ns) + 0.5) - 0.5
                 row = [float(cell) for cell in (arrived, *cells)]
                 stamps_ns.append(int(seconds + decimals))
@@ -223,7 +229,7 @@ def _read(path: Path) -> _StreamFile:
 
 
 def _refuse_foreign(directory: Path) -> None:
-    """Raise an OSError if a file of a stream's name is no journal: writing would empty it."""
+    """Raise an OSError if a file with a stream's name is not a journal, to protect its content."""
     for stream in _STREAMS:
         path = directory / f"{stream}.tum"
         if os.path.lexists(path) and not _is_own(path):
@@ -231,7 +237,7 @@ def _refuse_foreign(directory: Path) -> None:
 
 
 def _is_own(path: Path) -> bool:
-    """Whether a file is empty or begins like a journal, and is no link."""
+    """Whether a file is empty or begins like a journal, and is not a link."""
     if path.is_symlink() or not path.is_file():
         return False
     with open_regular(path) as file:
@@ -244,7 +250,7 @@ def _open_no_link(path: str, flags: int) -> int:
 
 
 def is_used(directory: str | Path) -> bool:
-    """Whether a directory has a file of a stream's name, with any content."""
+    """Whether a directory has a file with a stream's name and any content."""
     return any(os.path.lexists(Path(directory, f"{stream}.tum")) for stream in _STREAMS)
 
 
@@ -254,10 +260,15 @@ def has_session(directory: str | Path) -> bool:
 
 
 def keep_aside(directory: str | Path) -> Path:
-    """Rename a journal's directory so that a new session can use it, and return the new path.
+    """Rename the directory of a journal, so that a new session can use its name.
 
-    The new name is ``journal.previous``. A journal of that name is removed. If other files have the
-    name, the next free name is used, such as ``journal.previous2``.
+    The new name is ``journal.previous``. An older journal with this name is removed. If the name
+    belongs to other files, the next free name is used, such as ``journal.previous2``.
+
+    Returns
+    -------
+    pathlib.Path
+        The new path.
 
     Raises
     ------
@@ -283,7 +294,7 @@ def _is_journal(directory: Path) -> bool:
 
 
 def count_poses(directory: str | Path) -> int | None:
-    """Return the number of poses in the session of a directory; None if it cannot be read."""
+    """Return the number of poses in the session of a directory; None for unreadable sessions."""
     try:
         return len(read_journal(directory).stamps_ns)
     except InputError:
@@ -291,12 +302,12 @@ def count_poses(directory: str | Path) -> int | None:
 
 
 def replay_journal(journal: Journal, directory: Path, engines: Calibrators) -> None:
-    """Add the poses of a directory's session to engines, in the order of their arrival.
+    """Add the poses of a session to calibrators, in the order of their arrival.
 
     Raises
     ------
     InputError
-        If the engines refuse a pose.
+        If a calibrator refuses a pose. The message names the directory.
     """
     with located(f"cannot use the session journal {directory}"):
         for stream, about in journal.about.items():

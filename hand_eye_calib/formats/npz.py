@@ -33,8 +33,8 @@ def read_arrays(path: str | Path, largest: int = LARGEST_ARRAYS) -> dict[str, np
     Raises
     ------
     InputError
-        If the file cannot be read, or the arrays take more than ``largest`` bytes. The size of the
-        file is no limit, because zeros compress to a thousandth.
+        If the file cannot be read, or if the arrays take more than ``largest`` bytes. The size of
+        the file itself is not limited, because zeros are compressed to a thousandth.
     """
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
@@ -55,7 +55,7 @@ def read_arrays(path: str | Path, largest: int = LARGEST_ARRAYS) -> dict[str, np
 
 
 def _check_array_size(member: IO[bytes], size: int) -> None:
-    """Raise a ValueError if an array states more bytes than its file has."""
+    """Raise a ValueError if the header of an array states more bytes than the file contains."""
     version = np.lib.format.read_magic(member)
     read_header = {
         (1, 0): np.lib.format.read_array_header_1_0,

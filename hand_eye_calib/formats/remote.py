@@ -1,7 +1,7 @@
 """Bags in object storage and on web servers.
 
-The package fsspec reaches them, such as ``s3://bucket/run_1``, ``gs://...`` and
-``https://host/run_1.mcap``. It copies a bag to a temporary folder. The copy is read and removed.
+The package fsspec copies such a bag to a temporary folder. The copy is read and then removed.
+Examples of URLs are ``s3://bucket/run_1``, ``gs://...`` and ``https://host/run_1.mcap``.
 """
 
 import json
@@ -19,11 +19,12 @@ from hand_eye_calib.core.base.errors import (
     installing,
 )
 
-AsGiven = Callable[[Any], Any]
+#: Function that replaces paths of copies by URLs in plain values.
+RestoreUrls = Callable[[Any], Any]
 
-# Ends of the names of a bag's files.
+# Endings of the files of a bag.
 _SUFFIXES = (".yaml", ".mcap", ".db3", ".bag", ".zstd")
-# Ends of files with the newest messages of a .db3 whose recorder was killed.
+# Endings of files with the newest messages of a .db3 whose recorder was killed.
 _JOURNALS = (".db3-wal", ".db3-journal")
 
 
@@ -33,7 +34,7 @@ def is_url(path: object) -> bool:
 
 
 def public(url: str) -> str:
-    """Return a URL without user, password and query, which are secret; a path stays as it is."""
+    """Remove user, password and query from a URL, because they are secret; a path is unchanged."""
     if not is_url(url):
         return url
     protocol, mark, rest = url.partition("?")[0].partition("://")
@@ -42,28 +43,32 @@ def public(url: str) -> str:
 
 
 def expanded(pattern: str) -> list[str]:
-    """Return the URLs that match a pattern with ``*``, sorted. Raises as :func:`local_copies`."""
+    """Return the URLs that match a pattern with ``*``, sorted.
+
+    Raises the errors of :func:`local_copies`.
+    """
     with _reached(pattern) as (system, path):
         return sorted(system.unstrip_protocol(name) for name in system.glob(path.rstrip("/")))
 
 
 @contextmanager
-def local_copies(paths: Sequence[Any]) -> Iterator[tuple[list[Any], AsGiven]]:
+def local_copies(paths: Sequence[Any]) -> Iterator[tuple[list[Any], RestoreUrls]]:
     """Copy remote bags to this machine while the block runs.
 
-    Errors that are raised in the block name the URLs.
+    Errors that the block raises name the URLs instead of the copies.
 
     Yields
     ------
     paths : list of path-like
         Paths on this machine.
-    as_given : callable
-        Replaces the paths of the copies in plain values by the URLs.
+    restore_urls : callable
+        Replaces the paths of the copies by the URLs in plain values.
 
     Raises
     ------
     InputError
-        If a store cannot be reached, has no bag, or the bag would fill more than half of the disk.
+        If a store cannot be reached or has no bag, or if the bag is larger than half of the free
+        space.
     MissingDependencyError
         If a package that the store needs is not installed.
     """
@@ -76,7 +81,7 @@ def local_copies(paths: Sequence[Any]) -> Iterator[tuple[list[Any], AsGiven]]:
             for number, path in enumerate(paths)
         ]
 
-        def as_given(value: Any) -> Any:
+        def restore_urls(value: Any) -> Any:
             text = json.dumps(value)
             for copy, path in zip(local, paths, strict=True):
                 url = public(str(path)).rstrip("/")
@@ -84,9 +89,9 @@ def local_copies(paths: Sequence[Any]) -> Iterator[tuple[list[Any], AsGiven]]:
             return json.loads(text)
 
         try:
-            yield local, as_given
+            yield local, restore_urls
         except HandEyeCalibError as error:
-            error.args = tuple(as_given(list(error.args)))
+            error.args = tuple(restore_urls(list(error.args)))
             raise
 
 
@@ -100,7 +105,7 @@ def _copied(url: str, folder: Path) -> Path:
         files = [entry for entry in entries if _name(entry["name"]).endswith(suffixes)]
         if not files:
             raise InputError(f"no bag there: expected files that end in {', '.join(_SUFFIXES)}")
-        # Other processes need the other half of the free space for their copies.
+        # Leave the other half of the free space for the copies of other processes.
         largest = shutil.disk_usage(folder).free // 2
         if sum(entry.get("size") or 0 for entry in files) > largest:
             raise InputError(
@@ -108,13 +113,13 @@ def _copied(url: str, folder: Path) -> Path:
                 f"{tempfile.gettempdir()}; set TMPDIR to a folder with more space"
             )
         for entry in files:
-            # Only the last part of the name: a store must not choose the folder.
+            # Use only the last part of the name, because a store must not choose the folder.
             system.get_file(entry["name"], str(folder / _name(entry["name"])))
         return folder / _name(path) if is_file else folder
 
 
 def _entries_of_file(system: Any, path: str) -> list[dict[str, Any]]:
-    """Return the entries of a file in a store, and of the journals that belong to it."""
+    """Return the entries of a file in a store, and of the SQLite journals that belong to it."""
     paths = [path]
     if path.endswith(".db3"):
         journals = [path.removesuffix(".db3") + suffix for suffix in _JOURNALS]
@@ -129,10 +134,10 @@ def _name(path: str) -> str:
 
 @contextmanager
 def _reached(url: str) -> Iterator[tuple[Any, str]]:
-    """Yield the file system of a URL, and the path in it.
+    """Yield the file system of a URL, and the path in this file system.
 
-    Every error in the block becomes an InputError of one line: each kind of store has errors of its
-    own, and only code of fsspec runs in the block.
+    Any error in the block becomes an InputError of one line, because every kind of store raises
+    other errors. Only code of fsspec runs in the block, so no other defect is hidden.
     """
     try:
         from fsspec.core import url_to_fs

@@ -1,7 +1,7 @@
-"""Files of calibrations and rigs.
+"""Write and read the files of calibrations and rigs.
 
-``extrinsic.yaml`` or ``rig.yaml`` has everything. An xacro file and a launch file have only the
-transforms.
+``extrinsic.yaml`` and ``rig.yaml`` contain the whole result. An xacro file and a launch file
+contain only the transforms.
 """
 
 import hashlib
@@ -34,7 +34,7 @@ RIG_NAME = "rig.yaml"
 XACRO_NAME = "extrinsic.urdf.xacro"
 LAUNCH_NAME = "static_transform.launch.py"
 _NAMES = (XACRO_NAME, LAUNCH_NAME, FILE_NAME)
-# Marks of a file that this program wrote: its name, or the column of headlines of a table.
+# Texts in every file that this program wrote: its name, or the column of headlines of a table.
 _MARKS = (b"hand_eye_calib", b'"headline"')
 
 
@@ -43,14 +43,14 @@ def save_result(
 ) -> Path:
     """Write ``extrinsic.yaml``, ``extrinsic.urdf.xacro`` and ``static_transform.launch.py``.
 
-    If the verdict is DO NOT USE, only the first is written, and files of an earlier result with the
-    other two names are removed. If a file cannot be written, none changes.
+    If the verdict is DO NOT USE, only ``extrinsic.yaml`` is written, and the other two files of an
+    earlier result are removed. If a file cannot be written, no file changes.
 
     Parameters
     ----------
     calibration : Calibration
     directory : str or path-like
-        It is made if it is missing.
+        A missing directory is made.
     inputs : mapping, optional
         Origin of the data in plain values, for the provenance in the file. Its ``options`` become
         the parameters of the provenance.
@@ -58,7 +58,7 @@ def save_result(
     Returns
     -------
     pathlib.Path
-        ``extrinsic.yaml``.
+        Path of ``extrinsic.yaml``.
 
     Raises
     ------
@@ -87,14 +87,15 @@ def save_rig(
     directory: str | Path,
     inputs: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Write the files of a rig, and return ``rig.yaml``.
+    """Write the files of a rig, and return the path of ``rig.yaml``.
 
-    ``rig.yaml`` has the document, the rig in plain values. ``static_transform.launch.py`` has all
-    usable transforms. Each sensor has a directory with the files of :func:`save_result`.
+    ``rig.yaml`` contains ``document``, the rig in plain values. ``static_transform.launch.py``
+    contains all usable transforms. Each sensor has a directory with the files of
+    :func:`save_result`.
     """
     folders = {RIG_NAME, LAUNCH_NAME, "report.html"}
     for calibration in calibrations:
-        # Characters of a frame's name that a folder's name should not have are replaced.
+        # Replace characters of the frame's name that the name of a folder should not contain.
         name = re.sub(r"[^\w.-]", "_", calibration.child_frame.strip("/")).lstrip(".") or "sensor"
         while name in folders:
             name += "_2"
@@ -120,7 +121,7 @@ def save_text(path: Path, text: str) -> Path:
 
 
 def _written(directory: Path, texts: Mapping[str, str | None]) -> Path:
-    """Write all texts or none into files of a directory, and return the last file.
+    """Write texts into files of a directory, all or none, and return the path of the last file.
 
     A file whose text is None is removed.
     """
@@ -153,10 +154,11 @@ def _yaml_text(document: Mapping[str, Any], inputs: Mapping[str, Any] | None) ->
 
 
 def _keep_foreign(path: Path) -> None:
-    """Add a second name to a file that this program has not written, before it is replaced.
+    """Preserve a file that this program has not written, before it is replaced.
 
-    The name is that of the file with ``.kept``, or ``.kept2`` and so on. A link needs none, because
-    its target stays. A file with a copy in ``previous`` needs none either.
+    The file gets a second name: its own with ``.kept``, ``.kept2`` and so on. Links are not
+    preserved, because their targets do not change. Files with a copy in ``previous`` are not
+    preserved either.
     """
     if path.is_symlink() or not path.is_file():
         return
@@ -201,10 +203,7 @@ def keep_earlier_results(directory: str | Path) -> str:
 
 
 def fingerprint(path: str | Path) -> dict[str, str | int]:
-    """Return name, size and SHA-256 of an input file, for the provenance.
-
-    The file is read piece by piece.
-    """
+    """Return name, size and SHA-256 of an input file, for the provenance."""
     with open_regular(path) as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
         return {"file": str(path), "bytes": file.tell(), "sha256": digest}
@@ -216,7 +215,7 @@ def load_result(path: str | Path) -> Calibration:
     Raises
     ------
     InputError
-        If the file cannot be read, is no calibration or is of an unknown version.
+        If the file cannot be read, is not a calibration or has an unknown version.
 
     Examples
     --------
@@ -241,8 +240,9 @@ def xacro_text(calibration: Judged) -> str:
     child = calibration.child_frame
     numbers = usable_numbers(calibration) | usable_angles(calibration)
     comment = "\n".join(f"     {line}" for line in _remarks(calibration))
+    # XML forbids two hyphens in a comment.
     return _template(XACRO_NAME).format(
-        comment=re.sub("-(?=-)", "- ", comment),  # XML forbids two hyphens in a comment
+        comment=re.sub("-(?=-)", "- ", comment),
         joint=_quoted(f"{parent}_to_{child}"),
         parent=_quoted(parent),
         child=_quoted(child),

@@ -1,4 +1,4 @@
-"""Poses of one frame in another, from transforms that arrive live or are read from a bag."""
+"""Poses of a frame in another frame, from transforms that arrive live or are read from a bag."""
 
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,15 +15,15 @@ from hand_eye_calib.core.base.text import split_frames
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import FrameTree, check_pose
 
-# Jump back of an edge's stamps (ns) above which a new session begins.
+# If the stamps of an edge jump back by more than this (ns), a new session begins.
 _JUMP_BACK_NS = STAMP_UNITS["s"]
 
-# Transforms of each moving edge from which its rate is estimated.
+# Smallest number of transforms for an estimate of an edge's rate.
 _RATE_FROM = 5
-# Transforms of each moving edge that are kept.
+# Largest number of transforms of a moving edge that are stored.
 _MOST_KEPT = 2000
 
-# x y z qx qy qz qw of a frame in its parent.
+# Pose x y z qx qy qz qw of a frame in its parent.
 _Row = tuple[float, ...]
 # Newest stamps (ns) and poses of a moving edge, in order of time.
 _MovingEdge = deque[tuple[int, _Row]]
@@ -45,10 +45,10 @@ class TfSource(NamedTuple):
 
 
 class PoseFields(NamedTuple):
-    """Stamped pose or transform of a message, in m.
+    """Stamped pose or transform of a message; positions in m.
 
-    The frames are the parent and the child of a transform. The sensor's frame is None if the type
-    of the message does not have it.
+    For a transform, the frames are its parent and its child. ``sensor_frame`` is None if the type
+    of the message has no such field.
     """
 
     stamp_ns: int
@@ -61,15 +61,15 @@ class PoseFields(NamedTuple):
 class TfStream:
     """Stream of a sensor's poses, composed from the edges of a transform tree as they arrive.
 
-    There is one pose for each transform of the moving edge with the lowest rate. The other moving
-    edges are interpolated at its stamp, never extrapolated and never across more than
+    Each transform of the moving edge with the lowest rate makes one pose. The other moving edges
+    are interpolated at its stamp, never extrapolated, and never across a gap of more than
     ``max_gap_s``. Repeated and late transforms of an edge are skipped.
 
     Parameters
     ----------
     source : TfSource
     max_gap_s : float
-        It may be changed later.
+        The attribute of this name may be changed later.
     tree : FrameTree, optional
         Edges that are known before the first transform.
     """
@@ -83,7 +83,10 @@ class TfStream:
         self._find_chain()
 
     def add(self, transform: PoseFields, is_static: bool) -> Iterator[PoseFields]:
-        """Add a transform, and yield the poses that it completes. Raises as :meth:`edges_at`."""
+        """Add a transform, and yield the poses that it completes.
+
+        Raises the errors of :meth:`edges_at`.
+        """
         for stamp_ns, rows in self.edges_at(transform, is_static):
             T_world_sensor = self.composed({name: np.array(row) for name, row in rows.items()})
             x, y, z, *quat_xyzw = _row(T_world_sensor)
@@ -103,7 +106,7 @@ class TfStream:
         Raises
         ------
         InputError
-            If the transform is no pose, or its frame has another parent.
+            If the transform is not a valid pose, or its frame has another parent.
         """
         parent = transform.world_frame
         frame = transform.sensor_frame or ""
@@ -126,7 +129,7 @@ class TfStream:
         return self._tree.pose(*self.source, matrices)
 
     def describe_missing(self) -> str:
-        """Return the reason for which there is no pose yet."""
+        """Return the reason why there is no pose yet."""
         try:
             up, down = self._tree.route(*self.source)
         except InputError as error:
@@ -139,6 +142,7 @@ class TfStream:
         return "its transforms have no common time"
 
     def _find_chain(self) -> None:
+        """Find the moving edges between both frames; none if the frames are not connected."""
         self._slowest = ""
         frames = []
         with suppress(InputError):
@@ -154,18 +158,21 @@ class TfStream:
         if last_ns - _JUMP_BACK_NS <= stamp_ns <= last_ns:
             return
         if stamp_ns < last_ns:
+            # The recording begins again.
             self._slowest = ""
             self._last_ns.clear()
-            for edge in self._moving.values():  # their stamps begin again
+            for edge in self._moving.values():
                 edge.clear()
         self._last_ns[frame] = stamp_ns
         self._moving[frame].append((stamp_ns, row))
         self._slowest = self._slowest or self._find_slowest()
-        if not self._slowest:
-            return
+        if self._slowest:
+            yield from self._completed()
+
+    def _completed(self) -> Iterator[tuple[int, dict[str, _Row]]]:
+        """Yield the stamps of the slowest edge that all edges have reached, and their poses."""
         slowest = self._moving[self._slowest]
         others = {name: edge for name, edge in self._moving.items() if edge is not slowest}
-        # Poses at the stamps of the slowest edge that every other edge has reached.
         while slowest and all(edge and edge[-1][0] >= slowest[0][0] for edge in others.values()):
             at_ns, slowest_row = slowest.popleft()
             rows = {self._slowest: slowest_row}
@@ -178,7 +185,8 @@ class TfStream:
 
     def _find_slowest(self) -> str:
         """Return the moving edge with the lowest rate; empty until the rates of all are known."""
-        if len(self._moving) == 1:  # the usual case, in which no pose has to wait
+        # In this usual case, no pose has to wait.
+        if len(self._moving) == 1:
             return next(iter(self._moving))
         if any(len(edge) < _RATE_FROM for edge in self._moving.values()):
             return ""
@@ -190,9 +198,10 @@ class TfStream:
 
 
 def _interpolated(edge: _MovingEdge, stamp_ns: int, max_gap_s: float) -> _Row | None:
-    """Return the pose at a stamp that is not after the edge's last one; None if it is not known.
+    """Return the pose of an edge at a stamp; None before the first pose and in long gaps.
 
-    Earlier poses are removed: the stamps of later calls must not be before this one.
+    The stamp must not be after the last pose. Earlier poses are removed, so the stamps of calls
+    must not decrease.
     """
     while len(edge) > 1 and edge[1][0] <= stamp_ns:
         edge.popleft()

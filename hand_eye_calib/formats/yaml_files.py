@@ -1,8 +1,8 @@
-"""YAML of unknown origin, read within limits.
+"""Read YAML files of unknown origin within limits.
 
 Every YAML file of the package is read here, also JSON with comments and YAML of OpenCV. Values are
-those of JSON: a date is read as text. Other tags of YAML, repeated keys, aliases, and documents
-that are too large or too deep are refused, with an error of one line.
+those of JSON; a date is read as text. Other tags of YAML, repeated keys, aliases, and documents
+that are too large or too deep raise an error of one line.
 """
 
 import re
@@ -23,11 +23,11 @@ from hand_eye_calib.formats.files import (
     read_text,
 )
 
-# Characters of the longest whole number: 64 binary digits, with signs between them.
+# Largest number of characters of a whole number: 64 binary digits with underscores.
 _LONGEST_INT = 100
 _TAGS = ("null", "bool", "int", "float", "str", "seq", "map")
 
-# The loader of libyaml is several times as fast, and is part of most builds.
+# The loader of libyaml takes a fraction of the time. Most builds contain it.
 _Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _dump = partial(yaml.dump, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False)
 
@@ -35,7 +35,7 @@ _dump = partial(yaml.dump, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper),
 class _Loader(_Base):
     """Safe loader of YAML, restricted to the values of JSON."""
 
-    # Without dates, 2024-13-45 is a text like any other.
+    # Dates are not recognised, because an impossible date such as 2024-13-45 would be an error.
     yaml_implicit_resolvers: ClassVar = {
         first: [(tag, pattern) for tag, pattern in resolvers if not tag.endswith(":timestamp")]
         for first, resolvers in _Base.yaml_implicit_resolvers.items()
@@ -59,7 +59,7 @@ class _Loader(_Base):
 def _whole_number(loader: Any, node: Any) -> int:
     """Return a whole number in any base.
 
-    Its text is checked first: ``0xff...`` of any length would be a whole number, too.
+    The length of the text is checked first, because ``0xff...`` may have any length.
     """
     is_short = len(node.value) <= _LONGEST_INT
     number = int(loader.construct_yaml_int(node)) if is_short else LARGEST_INT
@@ -91,19 +91,19 @@ def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
     try:
         _check_events(text)
         return yaml.load(text, Loader=_Loader)
-    # A loader raises errors of many kinds for values that do not fit their tags.
+    # The loader raises errors of many kinds for values that do not fit their tags.
     except Exception as error:
         reason = shortened(" ".join(str(error).split()), LONGEST_NAME // 2) or type(error).__name__
         raise InputError(f"{path} is not readable YAML: {reason}") from None
 
 
 def yaml_text(document: Any) -> str:
-    """Return a document of any values as YAML for programs and people."""
+    """Convert a document of any values to YAML that is easy to read."""
     return str(_dump(plain(document), default_flow_style=None, width=120, allow_unicode=True))
 
 
 def _check_events(text: str) -> None:
-    """Raise a ValueError for aliases and deep nesting, before any value is made."""
+    """Raise a ValueError for aliases and deep nesting, before any value is constructed."""
     depth = 0
     for event in yaml.parse(text, Loader=_Loader):
         depth += isinstance(event, yaml.CollectionStartEvent)

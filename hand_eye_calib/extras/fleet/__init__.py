@@ -1,4 +1,4 @@
-"""Several recordings: compared, together, in batches."""
+"""Several recordings: compare their results, combine them, or calibrate a batch."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ from hand_eye_calib.core.base.registry import (
 
 
 def register() -> None:
-    """Register commands, and batches and recordings of one rig for ``calibrate``."""
+    """Register the commands, the rules, and the routes of ``calibrate`` for several recordings."""
     PUBLIC_NAMES["calibrate_many"] = "hand_eye_calib.extras.fleet.together"
     PUBLIC_NAMES["calibrate_together"] = "hand_eye_calib.extras.fleet.together"
     COMMANDS["compare"] = Command(

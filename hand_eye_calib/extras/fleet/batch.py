@@ -1,6 +1,6 @@
 """Commands ``calibrate --batch`` and ``calibrate RECORDING RECORDING ...``.
 
-Results of an earlier run are reused; results of one vehicle are combined.
+Results of an earlier run are reused. Results of the same vehicle are combined.
 """
 
 import argparse
@@ -34,7 +34,7 @@ from hand_eye_calib.offline.cli.options import (
 from hand_eye_calib.offline.cli.present import deliver, gravest_code, wrapped
 from hand_eye_calib.offline.cli.reporting import REPORT
 
-# Largest number of results on the terminal, the worst first; rows.csv has all.
+# Largest number of results on the terminal. rows.csv contains all results.
 _MOST_LINES = 200
 
 # Verdicts of outcomes, the worst first.
@@ -45,7 +45,10 @@ _FORMULA = ("=", "+", "-", "@", *"＝＋－＠")
 
 
 def run_batch(arguments: argparse.Namespace) -> int:
-    """Calibrate from many recordings; return the exit code. A bag that fails is a row."""
+    """Calibrate from many recordings; return the exit code.
+
+    A recording that fails becomes a row with its error.
+    """
     title = " ".join(arguments.batch)
     with waiting_for(f"looking for {title}"):
         groups = [[bag] for pattern in arguments.batch for bag in matching(pattern)]
@@ -54,15 +57,7 @@ def run_batch(arguments: argparse.Namespace) -> int:
     if arguments.out:
         _write_rows_and_page(arguments.out, title, done, vehicles, work.INDEX)
     if arguments.json:
-        document = {
-            "batch": title,
-            "counts": dict(Counter(outcome.verdict for outcome in done)),
-            "failures": [outcome.row["name"] for outcome in done if outcome.row["error"]],
-            "vehicles": {name: result.to_dict() for name, result in vehicles.items()},
-        }
-        # Outcomes are JSON texts already.
-        print(json_text(document).removesuffix("\n}") + ',\n  "results": [')
-        print(",\n".join(f"    {outcome.text}" for outcome in done) + "\n  ]\n}")
+        _print_json(title, done, vehicles)
     else:
         _print_results(done, vehicles)
     n_alone = sum(bool(outcome.row["verdict"] and not outcome.row["vehicle"]) for outcome in done)
@@ -75,8 +70,20 @@ def run_batch(arguments: argparse.Namespace) -> int:
     return gravest_code(outcome.code for outcome in done)
 
 
+def _print_json(title: str, done: Sequence[Outcome], vehicles: Mapping[str, Calibration]) -> None:
+    """Print one JSON document with all outcomes. Each outcome is a JSON text already."""
+    document = {
+        "batch": title,
+        "counts": dict(Counter(outcome.verdict for outcome in done)),
+        "failures": [outcome.row["name"] for outcome in done if outcome.row["error"]],
+        "vehicles": {name: result.to_dict() for name, result in vehicles.items()},
+    }
+    print(json_text(document).removesuffix("\n}") + ',\n  "results": [')
+    print(",\n".join(f"    {outcome.text}" for outcome in done) + "\n  ]\n}")
+
+
 def run_together(arguments: argparse.Namespace, groups: Sequence[Sequence[Path | str]]) -> int:
-    """Calibrate from several recordings of one rig for one result; return the exit code.
+    """Calibrate from several recordings of one rig to one result; return the exit code.
 
     ``groups`` are the bags of each recording.
     """
@@ -98,7 +105,7 @@ def run_together(arguments: argparse.Namespace, groups: Sequence[Sequence[Path |
 def _all_done(
     groups: Sequence[Sequence[str]], vehicle: str, arguments: argparse.Namespace
 ) -> list[Outcome]:
-    """Return the outcomes of all recordings in order, those of an earlier run reused."""
+    """Return the outcomes of all recordings in order; outcomes of an earlier run are reused."""
     out: Path | None = arguments.out
     tasks = tasks_of(
         groups,
@@ -108,14 +115,7 @@ def _all_done(
         with_fingerprints=bool(out),
         with_report=bool(out) and not arguments.no_report,
     )
-    done: dict[str, Outcome] = {}
-    if out:
-        for task in with_progress(tasks, len(tasks), "looking for earlier results"):
-            earlier = stored(task, out)
-            if earlier:
-                done[task.name] = earlier
-    if done:
-        note(f"{len(done)} of {len(tasks)} bags are done already; their results are in {out}")
+    done = _earlier_outcomes(tasks, out) if out else {}
     waiting = [task for task in tasks if task.name not in done]
     running = outcomes(waiting, arguments.jobs or os.cpu_count() or 1, arguments.dask)
     for task, outcome in with_progress(running, len(waiting), "calibrating"):
@@ -128,13 +128,26 @@ def _all_done(
     return [done[task.name] for task in tasks]
 
 
+def _earlier_outcomes(tasks: Sequence[Task], directory: Path) -> dict[str, Outcome]:
+    """Return the outcomes of an earlier run by the names of their tasks."""
+    done: dict[str, Outcome] = {}
+    for task in with_progress(tasks, len(tasks), "looking for earlier results"):
+        earlier = stored(task, directory)
+        if earlier:
+            done[task.name] = earlier
+    if done:
+        note(f"{len(done)} of {len(tasks)} bags are done already; their results are in {directory}")
+    return done
+
+
 def stored(task: Task, directory: Path) -> Outcome | None:
     """Return the outcome of an earlier run; None if it is absent, failed or of other data."""
     try:
         about, text = (directory / task.name / work.STATE).read_text(encoding="utf-8").splitlines()
         state = json.loads(about)
         return Outcome(state["row"], state["code"], text) if state["key"] == task.key() else None
-    except Exception:  # the task is repeated, whatever is wrong with the file
+    # The task is repeated, whatever is wrong with the file.
+    except Exception:
         return None
 
 
@@ -145,22 +158,23 @@ def _store(task: Task, outcome: Outcome, directory: Path) -> None:
         save_result(outcome.calibration, folder, outcome.inputs)
     if outcome.page:
         save_text(folder / REPORT, outcome.page)
-    # A failed task is always repeated; its bag may be out of reach for a key.
+    # A failed task is always repeated. It has no key, because its bag may be unreadable.
     key = "" if outcome.row["error"] else task.key()
     about = json.dumps({"key": key, "row": outcome.row, "code": outcome.code})
     save_text(folder / work.STATE, f"{about}\n{outcome.text}\n")
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
-    """Write a CSV file of rows: texts in quotes, numbers without, unknown values empty."""
+    """Write a CSV file of rows: texts in quotes, numbers without quotes, unknown values empty."""
     text = io.StringIO()
+    # Rows of failures lack columns; the longest row has all columns.
     columns = [*max(rows, key=len)]
     writer = csv.DictWriter(text, columns, None, lineterminator="\n", quoting=csv.QUOTE_NONNUMERIC)
     writer.writeheader()
     for row in rows:
         safe = dict(row)
         for name, value in row.items():
-            # An apostrophe prevents that a text becomes a formula.
+            # An apostrophe prevents a spreadsheet from reading the text as a formula.
             if isinstance(value, str) and value.lstrip()[:1] in _FORMULA:
                 safe[name] = f"'{value}"
         writer.writerow(safe)
@@ -168,7 +182,7 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
 
 
 def _vehicles(done: Sequence[Outcome], directory: Path | None) -> dict[str, Calibration]:
-    """Return the common result of the recordings of each vehicle, by the vehicle's name.
+    """Return the common result of each vehicle with several recordings, by the vehicle's name.
 
     The result of an earlier run with the same recordings is reused.
     """

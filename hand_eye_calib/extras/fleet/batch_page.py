@@ -1,7 +1,7 @@
 """``index.html`` of a batch.
 
-The page has the common result of each vehicle, a figure of each axis over time, and a row for each
-recording with a link to its report.
+The page contains the common result of each vehicle with a figure of each axis over time, and a row
+for each recording with a link to its report.
 """
 
 from collections import Counter
@@ -90,9 +90,9 @@ def _gravity(verdict: str) -> int:
 
 @page_style(path_simplify=False)
 def _trend(result: Calibration, number: int) -> Drawn:
-    """Return the figure of a vehicle's recordings about their common extrinsic, over time.
+    """Draw the differences of a vehicle's recordings from their common extrinsic over time.
 
-    ``number`` is that of the vehicle on the page.
+    ``number`` is the number of the vehicle on the page.
     """
     together = result.parts.get("together")
     recordings = together.recordings if together else ()
@@ -113,7 +113,7 @@ def _trend(result: Calibration, number: int) -> Drawn:
         panel.axhline(0, color=GRID, lw=0.8)
         if is_determined:
             panel.axhspan(-band, band, color=PARENT, alpha=0.15, lw=0)
-        # A dot is a line of no length: a mark for each would make a page of many vehicles heavy.
+        # A dot is drawn as a line of length 0, because markers would make a large page.
         for half, width in ((sigmas, 0.8), (0 * sigmas, 3.2)):
             ends = np.stack([values - half, values + half, np.full(len(days), np.nan)], axis=1)
             for group, colour, cap in ((~is_apart, INK, "round"), (is_apart, BAD, "projecting")):
@@ -136,13 +136,14 @@ def _values(row: Document) -> list[str]:
 def _cells(row: Document, is_linked: bool) -> list[Any]:
     """Return the cells of a recording in the table.
 
-    They are name, vehicle, verdict, start, whether the recording has a report, and the values. Each
-    value has its standard deviation after a space. A failed recording has its error instead.
+    The cells are name, vehicle, verdict, start, whether the recording has a report, and the values.
+    A value is a text of the number and its standard deviation. Instead of values, a failed
+    recording has its error.
     """
     values: list[str] | str = row["error"]
     if row["verdict"] is not None and not row["error"]:
         values = [text.replace(" +/- ", " ") for text in _values(row)]
-    # To the minute.
+    # Cut the seconds.
     start = (row["start"] or "")[:16].replace("T", " ")
     verdict = "failed" if row["error"] else row["verdict"]
     return [printable(row["name"]), row["vehicle"], verdict, start, int(is_linked), values]

@@ -1,4 +1,4 @@
-"""Command ``compare RESULT...``: compare results with what is installed, or with each other."""
+"""Command ``compare RESULT...``: compare results with the installed transform or each other."""
 
 import argparse
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Recordings as a part of their common result."""
+"""The part of a common result that describes its recordings."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -9,17 +9,17 @@ from hand_eye_calib.core.results.verdict import Ground
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded:
-    """One of several recordings: its own result, and its difference from the common result.
+    """A recording: its own result, and its difference from the common result.
 
     Attributes
     ----------
     name, headline : str
     left_out : str
-        Why the common result does not contain the recording; empty if it does.
+        Why the common result does not contain the recording; empty if it contains it.
     deviations, sigmas : mapping of str to float
-        Deviations from the common result by axis, m or rad, and their standard deviations with the
-        usual scatter of recordings; NaN (None in files) if the recording does not determine the
-        axis.
+        Deviations from the common result by axis (m or rad), and their standard deviations. These
+        contain the usual scatter between recordings. Axes that the recording does not determine are
+        NaN (None in files).
     time_offset_s, scale, stamp_ns
         Fields of the recording's own result.
     """
@@ -41,11 +41,13 @@ class Together:
     Attributes
     ----------
     kind : str
-        single, agree, scatter (more than recordings of one rig usually do), one off, moved (between
-        two recordings), or differ (two recordings contradict each other, and there is no third).
+        "single" for a single recording; "agree"; "scatter" for more scatter than usual; "one off"
+        if one recording contradicts the others; "moved" if the mount moved between two recordings;
+        "differ" if two recordings contradict each other, and there is no third.
     sentence : str
+        The agreement in words.
     scatter : mapping of str to float
-        Standard deviation between recordings by axis, m or rad, beyond those of the recordings.
+        Standard deviation between recordings by axis (m or rad), in addition to their own.
     recordings : tuple of Recorded
         In order of time.
     """
@@ -56,7 +58,7 @@ class Together:
     recordings: tuple[Recorded, ...]
 
 
-#: Rule of the verdict to the kinds of agreement that it is about.
+#: Kinds of agreement for each rule of the verdict.
 RULES = {
     "recordings_differ": ("differ", "moved"),
     "recordings": ("one off", "scatter"),
@@ -73,7 +75,7 @@ _ADVICE = {
 
 
 def find_kinds(rule: str, result: Any) -> Iterator[Ground]:
-    """Yield the ground against a result whose recordings have a kind of agreement of the rule."""
+    """Yield a ground if the agreement of the recordings is of a kind that the rule names."""
     together = result.parts.get("together")
     if together and together.kind in RULES[rule]:
         yield Ground(together.sentence, _ADVICE[together.kind])
@@ -85,7 +87,7 @@ def is_in_headline(result: Any) -> bool:
 
 
 def details(together: Together, result: Any) -> list[str]:
-    """Return lines about the recordings of a result, for a person."""
+    """Return lines of text about the recordings of a result."""
     lines = [] if is_in_headline(result) else [together.sentence]
     for recording in together.recordings:
         left_out = recording.left_out and f"left out, {recording.left_out}"

@@ -1,4 +1,4 @@
-"""Several recordings: one extrinsic from recordings of one rig, or a table of many."""
+"""Several recordings: one extrinsic from recordings of one rig, or a table of many results."""
 
 import math
 from collections import Counter
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 _Pair: TypeAlias = tuple[TrajectoryLike, TrajectoryLike]
 _Recordings: TypeAlias = Iterable[_Pair] | Mapping[str, _Pair]
 
-# Fields of a result that its row contains.
+# Fields of a result in its row of the table.
 _FIELDS_OF_ROW = (
     *("verdict", "headline", "status", "parent_frame", "child_frame"),
     *("method", "reference", "n_poses", "n_pairs", "n_inliers"),
@@ -49,7 +49,7 @@ _FIELDS_OF_ROW = (
 # Fields of the common result that are sums over the recordings.
 _COUNTS = ("n_poses", "n_pairs", "n_inliers")
 
-# Fields of the common result that are those of the newest recording.
+# Fields of the common result that are taken from the newest recording.
 _OF_NEWEST = (
     *("reference", "backend", "measured", "stamp_ns", "parent_frame", "child_frame"),
     *("base_frame", "T_base_parent", "target_translation", "target_rotation", "target_axes"),
@@ -63,15 +63,16 @@ def calibrate_together(
 ) -> Calibration:
     """Estimate one extrinsic from several recordings of one rig.
 
-    Each recording is calibrated by itself, with a clock offset and a scale of its own. The results
-    are averaged by their covariances and the scatter between recordings. An axis that a recording
-    does not determine comes from the others. A recording that contradicts the others is named and
-    left out.
+    Each recording is calibrated separately, with its own clock offset and scale. The results are
+    averaged with weights from their covariances and from the scatter between recordings. An axis
+    that a recording does not determine is taken from the others. A recording that contradicts the
+    others is named and left out.
 
     Parameters
     ----------
-    recordings : iterable of (Trajectory, Trajectory), or of what can be read as one
-        Poses of parent and child of each recording; or a mapping of names to such pairs.
+    recordings : iterable of (Trajectory, Trajectory), or mapping of names to such pairs
+        Poses of parent and child of each recording: trajectories, or sources of
+        :func:`~hand_eye_calib.read_trajectory`.
     names : sequence of str, optional
         Names of the recordings; numbers by default.
     **options
@@ -80,19 +81,19 @@ def calibrate_together(
     Returns
     -------
     Calibration
-        With :attr:`~Calibration.together`: each recording's own result, and the scatter.
+        Its part :attr:`~Calibration.together` has the result of each recording, and the scatter.
 
     Raises
     ------
     InputError
         If no recording can be used, or the recordings have different frames.
     HandEyeCalibError
-        As of ``calibrate``, with the name of the recording.
+        The errors of ``calibrate``, with the name of the recording.
 
     Examples
     --------
-    >>> found = hec.calibrate_together([(parent[:300], child), (parent[300:], child)])
-    >>> len(found.together.recordings)
+    >>> result = hec.calibrate_together([(parent[:300], child), (parent[300:], child)])
+    >>> len(result.together.recordings)
     2
     """
     results: dict[str, Calibration] = {}
@@ -107,18 +108,19 @@ def calibrate_many(
     names: Sequence[str] | None = None,
     **options: Any,
 ) -> "pd.DataFrame":
-    """Calibrate many recordings, each by itself, one after the other.
+    """Calibrate many recordings separately, one after the other.
 
     Parameters
     ----------
     recordings, names, **options
-        As of :func:`calibrate_together`.
+        As for :func:`calibrate_together`.
 
     Returns
     -------
     pandas.DataFrame
         A row for each recording by its name: verdict, headline, x, y and z (m), roll, pitch and yaw
-        (deg), their standard deviations, whether each is observed; an ``error`` if it failed.
+        (deg), their standard deviations, and whether each axis is observed. A recording that failed
+        has an ``error``.
 
     Raises
     ------
@@ -142,7 +144,7 @@ def calibrate_many(
 
 
 def _named(recordings: _Recordings, names: Sequence[str] | None) -> Iterable[tuple[str, _Pair]]:
-    """Return the recordings with their names."""
+    """Return the names and the pairs of all recordings, after checks."""
     if isinstance(recordings, Mapping):
         names = [*recordings]
         recordings = recordings.values()
@@ -156,7 +158,7 @@ def _named(recordings: _Recordings, names: Sequence[str] | None) -> Iterable[tup
 
 
 def row_of_result(calibration: Document) -> Document:
-    """Return the row of a result from its ``to_dict``; unknown values are None."""
+    """Return the row of a result from its document; unknown values are None."""
     transform = calibration["T_parent_child"]
     row = {name: calibration[name] for name in _FIELDS_OF_ROW}
     row["verdict"] = str(calibration["verdict"]).replace("_", " ")
@@ -174,8 +176,9 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
     Parameters
     ----------
     results : mapping of str to Calibration
-        Results by the names of the recordings. Method, frames and targets of the common result are
-        theirs; clock offset and scale too, if all recordings have the same.
+        Results by the names of the recordings. The common result has the most frequent method and
+        the frames and targets of the newest recording. It has a clock offset and a scale only if
+        all recordings have the same.
 
     Raises
     ------
@@ -221,13 +224,13 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
 
 
 def _is_unusable(result: Calibration) -> bool:
-    """Return whether a result is DO NOT USE, not only because its axes are unknown."""
+    """Return whether the verdict is DO NOT USE for another reason than unknown axes."""
     rules = {reason.rule for reason in result.reasons if reason.verdict is Verdict.DO_NOT_USE}
     return bool(rules - {"nothing_known"})
 
 
 def _warnings_of(recordings: Mapping[str, Calibration]) -> tuple[str, ...]:
-    """Return the warnings of all recordings, with the names of those that have each of them."""
+    """Return each different warning, with the recordings that have it unless all have it."""
     names: dict[str, list[str]] = {}
     for name, result in recordings.items():
         for warning in result.warnings:
@@ -242,7 +245,7 @@ def _warnings_of(recordings: Mapping[str, Calibration]) -> tuple[str, ...]:
 def _joint(
     recordings: Mapping[str, Calibration], agreement: Agreement, record: Together
 ) -> Calibration:
-    """Return the result of recordings that belong together, in order of time."""
+    """Return the common result of recordings that agree, sorted by time."""
     used = [*recordings.values()]
     assessed = _assessed(used, agreement)
     is_open = any(math.isinf(dof.sigma) for dof in assessed.observability)
@@ -270,7 +273,8 @@ def _joint(
 def _assessed(used: Sequence[Calibration], agreement: Agreement) -> Assessment:
     """Assess the common result of recordings.
 
-    An axis that all recordings have from one measurement by hand is no more certain than that.
+    If all recordings have an axis from a prior, its standard deviation is at least the smallest one
+    of the recordings: they share one measurement by hand.
     """
     T = agreement.T_parent_child
     covariance = agreement.covariance.copy()

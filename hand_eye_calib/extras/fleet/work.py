@@ -1,4 +1,4 @@
-"""Tasks of a batch, the work of a task, and its distribution: to processes or a Dask cluster."""
+"""Tasks of a batch, and their distribution to processes or a Dask cluster."""
 
 import hashlib
 import json
@@ -41,20 +41,21 @@ Row = Document
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """One recording to calibrate from, in plain values for other processes and machines.
+    """A recording to calibrate from, in plain values for other processes and machines.
 
     Attributes
     ----------
     name : str
-        Name of its row and its folder.
+        Name of the row and of the folder.
     bags : tuple of str
-        Paths or URLs of its parts, or the directory of a journal.
+        Paths or URLs of the bags of the recording, or the directory of a journal.
     vehicle : str
-        The rig; recordings of one rig get a common result. Empty if unknown.
+        Name of the rig; empty if unknown. Recordings of one rig get a common result.
     options : dict
     sources : dict
-        "parent" and "child" to a topic or WORLD:SENSOR, if the user set them.
+        Topics or WORLD:SENSOR of "parent" and "child", if the user set them.
     with_fingerprints, with_report : bool
+        Whether to compute hashes of the input files, and to render a report.
     """
 
     name: str
@@ -68,7 +69,7 @@ class Task:
     def key(self) -> str:
         """Return a digest of the task, its options, and names, sizes and times of its files.
 
-        A stored result with another key is not that of this task.
+        A stored result with another key belongs to other data or options.
         """
         text = json.dumps([asdict(self), list(map(_state, self.bags))], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
@@ -86,20 +87,20 @@ def _state(bag: str) -> list[Any]:
 
 
 def tasks_of(groups: Sequence[Sequence[str]], vehicle: str = "", **common: Any) -> list[Task]:
-    """Return a task for each group of bags that are one recording.
+    """Return a task for each recording.
 
     Parameters
     ----------
     groups : sequence of sequences of str
         Bags of each recording.
     vehicle : str
-        Name of the vehicle, or a pattern of the paths with ``{vehicle}`` at its place.
+        Name of the vehicle, or a pattern of the paths with ``{vehicle}`` in place of the name.
     **common
         Further fields of all tasks.
     """
     pattern = re.escape(vehicle).replace(r"\*\*", ".*").replace(r"\*", "[^/]*")
     pattern = pattern.replace(re.escape("{vehicle}"), "([^/]+)")
-    # Resolved, because a path such as "." has no name.
+    # Paths are resolved, because a path such as "." has no name.
     paths = [
         bag.partition("?")[0] if remote.is_url(bag) else str(Path(bag).resolve())
         for bag, *_ in groups
@@ -121,7 +122,7 @@ def tasks_of(groups: Sequence[Sequence[str]], vehicle: str = "", **common: Any) 
 
 
 def _without_suffix(path: Path) -> Path:
-    """Return a path without the last suffix; the root of the file system has no name."""
+    """Return a path without the last suffix; the root of the file system is unchanged."""
     return path.with_suffix("") if path.name else path
 
 
@@ -158,29 +159,35 @@ class Outcome(NamedTuple):
         result: Calibration | None = None,
         inputs: Mapping[str, Any] | None = None,
         page: str = "",
-        as_given: remote.AsGiven = lambda value: value,
+        restore_urls: remote.RestoreUrls = lambda value: value,
         **more: str,
     ) -> "Outcome":
         """Return the outcome of a task from its error, or from its result with inputs and page.
 
-        ``as_given`` puts URLs back into plain values; ``more`` are further fields of the text.
+        ``restore_urls`` replaces paths of copies by URLs in plain values. ``more`` are further
+        fields of the text.
         """
         inputs = inputs or {}
         row: Row = {"name": task.name, "vehicle": task.vehicle, "error": error}
         bags = [remote.public(bag) for bag in task.bags]
-        document = as_given(result.to_dict()) if result else None
-        whole = row | {"bags": bags, "calibration": document, "inputs": as_given(inputs), **more}
+        document = restore_urls(result.to_dict()) if result else None
+        whole = row | {
+            "bags": bags,
+            "calibration": document,
+            "inputs": restore_urls(inputs),
+            **more,
+        }
         row |= _times_of([inputs[stream] for stream in STREAMS if stream in inputs])
         row |= {"verdict": None, "headline": None, "bags": " ".join(bags)}
         if document and result:
             row |= row_of_result(document) | {"warnings": "; ".join(document["warnings"])}
             row["findings"] = " ".join(finding.code for finding in result.findings)
         code = exit_code(result) if result and not error else 1
-        return cls(row, code, json.dumps(whole, separators=(",", ":")), as_given(page))
+        return cls(row, code, json.dumps(whole, separators=(",", ":")), restore_urls(page))
 
     @property
     def calibration(self) -> Calibration:
-        """Result of a row with a verdict."""
+        """Result of a task that did not fail."""
         return Calibration.from_dict(json.loads(self.text)["calibration"])
 
     @property
@@ -195,7 +202,7 @@ class Outcome(NamedTuple):
 
 
 def _times_of(streams: Sequence[Mapping[str, Any]]) -> Row:
-    """Return start and duration of the time that all streams share; None if unknown."""
+    """Return start and duration of the time span common to all streams; None if unknown."""
     starts_ns = [stream["first_stamp_ns"] for stream in streams]
     if not starts_ns or None in starts_ns:
         return {"start": None, "duration_s": None}
@@ -208,23 +215,24 @@ def _times_of(streams: Sequence[Mapping[str, Any]]) -> Row:
     }
 
 
-# Function that does a task.
+# Function that performs a task.
 Work = Callable[[Task], Outcome]
 
 
 def work(task: Task) -> Outcome:
-    """Do a task; errors become part of the outcome, so that the other tasks continue."""
+    """Perform a task. Errors become part of the outcome, so that other tasks continue."""
     from hand_eye_calib.offline.report.report import render
 
-    limit_memory()  # of this worker process
+    # Limit this worker process.
+    limit_memory()
     try:
-        with remote.local_copies(task.bags) as (paths, as_given):
+        with remote.local_copies(task.bags) as (paths, restore_urls):
             recording = read_recording([*map(Path, paths)], task.sources, task.options)
             result = recording.solved(task.with_fingerprints)
             inputs = recording.inputs
             page = render(result, recording.snapshot, inputs) if task.with_report else ""
             error = result.reasons[0].sentence if result.has_failed else None
-            return Outcome.of(task, error, result, inputs, page, as_given)
+            return Outcome.of(task, error, result, inputs, page, restore_urls)
     except HandEyeCalibError as error:
         return Outcome.of(task, str(error))
     except Exception as error:
@@ -238,9 +246,10 @@ def work(task: Task) -> Outcome:
 def outcomes(
     tasks: Sequence[Task], jobs: int, dask: str | None = None, do: Work = work
 ) -> Iterator[tuple[Task, Outcome]]:
-    """Do tasks in worker processes; yield tasks with their outcomes as they end.
+    """Perform tasks in worker processes; yield each task with its outcome when it is done.
 
-    If a worker dies, the tasks that may have killed it are repeated one by one, then the others.
+    If a worker dies, the tasks that may have killed it are repeated one at a time; then the other
+    unfinished tasks are repeated.
 
     Parameters
     ----------
@@ -250,7 +259,7 @@ def outcomes(
     dask : str, optional
         Address of a Dask cluster to use instead. Its workers need the bags at the same paths.
     do : callable
-        Function that does a task.
+        Function that performs a task.
     """
     waiting = [[*tasks]] if tasks else []
     while waiting:
@@ -268,22 +277,34 @@ def outcomes(
         unfinished = [task for task in group if task.name in lost]
         if dask or len(group) == 1:
             for task in unfinished:
-                reason = "worker processes crash on it, perhaps for lack of memory: use --jobs 1"
-                if dask:
-                    reason = f"the cluster lost it: {lost[task.name]}"
-                yield task, Outcome.of(task, reason)
-            continue
-        # A pool begins its tasks in order, so that the first ones may have killed the worker.
-        waiting[:0] = [[task] for task in unfinished[:jobs]]
-        if unfinished[jobs:]:
-            waiting.insert(jobs, unfinished[jobs:])
+                yield task, Outcome.of(task, _reason_of_loss(lost[task.name], dask))
+        else:
+            waiting[:0] = _groups_to_repeat(unfinished, jobs)
+
+
+def _reason_of_loss(error: str, dask: str | None) -> str:
+    """Return a message about a task whose worker died again."""
+    if dask:
+        return f"the cluster lost it: {error}"
+    return "worker processes crash on it, perhaps for lack of memory: use --jobs 1"
+
+
+def _groups_to_repeat(unfinished: Sequence[Task], jobs: int) -> list[list[Task]]:
+    """Return groups of tasks to repeat after a worker died.
+
+    Workers begin tasks in order, so one of the first ``jobs`` tasks has killed the worker. Each of
+    these tasks is a group of its own; the others are one group.
+    """
+    groups = [[task] for task in unfinished[:jobs]]
+    others = [*unfinished[jobs:]]
+    return [*groups, others] if others else groups
 
 
 @contextmanager
 def _processes(jobs: int) -> Iterator[Executor]:
     """Start worker processes by spawning: forking a program with threads is not safe."""
     spawning = multiprocessing.get_context("spawn")
-    # A worker is `python -c`, which imports modules from the current folder unless prevented.
+    # A worker is started as `python -c`, which would import modules from the current folder.
     with starting_trusted():
         executor = ProcessPoolExecutor(jobs, spawning, initializer=_begin)
         try:

@@ -59,7 +59,7 @@ def _is_rig(arguments: Any) -> bool:
     return not are_bags(arguments.paths)
 
 
-def _calibrate_rig(arguments: Any, as_given: Any) -> int:
+def _calibrate_rig(arguments: Any, restore_urls: Any) -> int:
     from hand_eye_calib.extras.rig.command import calibrate_rig
 
-    return calibrate_rig(arguments, as_given)
+    return calibrate_rig(arguments, restore_urls)

@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     from hand_eye_calib.core.base.plain import Document
     from hand_eye_calib.core.geometry.trajectory import Trajectory
     from hand_eye_calib.extras.rig.rig import RigCalibration
-    from hand_eye_calib.formats.remote import AsGiven
+    from hand_eye_calib.formats.remote import RestoreUrls
 
 
-def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
+def calibrate_rig(arguments: argparse.Namespace, restore_urls: "RestoreUrls") -> int:
     """Calibrate a rig, print it, and save it if ``--out`` is set; return the exit code.
 
-    The data are a trajectory file for each sensor, or topics of bags. ``as_given`` puts the name of
-    a remote bag back into plain values.
+    The data are a trajectory file for each sensor, or topics of bags. ``restore_urls`` replaces
+    paths of downloaded bags by their URLs in plain values.
     """
     from hand_eye_calib.extras.rig import rig as of_rig
     from hand_eye_calib.formats.results import keep_earlier_results, save_rig
@@ -42,19 +42,20 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
         raise ConfigError("--installed and --base-frame apply to two sensors, not to a rig")
     readings = _read_topics(arguments) if arguments.topics else _read_files(arguments)
     sensors = _by_frame(readings)
-    inputs = as_given(readings.inputs) | {"options": options_from(arguments)}
+    inputs = restore_urls(readings.inputs) | {"options": options_from(arguments)}
     if arguments.label:
         inputs["labels"] = dict(arguments.label)
     with waiting_for(f"solving for {len(sensors)} sensors"):
         rig = of_rig.calibrate_rig(sensors, inputs["options"])
-    rig = rig.with_warnings(as_given(readings.warnings))
+    rig = rig.with_warnings(restore_urls(readings.warnings))
     if arguments.out:
         kept = keep_earlier_results(arguments.out)
         note(f"wrote {save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs)}{kept}")
     document = rig.to_dict() | {"inputs": inputs} if arguments.json else None
     try:
         print_result(as_lines(rig, arguments.verbose), document)
-    finally:  # also if the reader of the printed lines has ended
+    finally:
+        # Write the report even if the reader of the printed lines has ended.
         if arguments.out:
             from hand_eye_calib.extras.rig.page import write_rig_report
 
@@ -63,7 +64,7 @@ def calibrate_rig(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
 
 
 class _Readings(NamedTuple):
-    """Trajectories of a rig, their files or topics, their origin, and warnings for the results."""
+    """Trajectories of a rig, the names of their files or topics, their origin, and warnings."""
 
     trajectories: "list[Trajectory]"
     names: list[str]

@@ -1,4 +1,4 @@
-"""Report of a rig: poses of its sensors, and closure of the results for two at a time."""
+"""Report of a rig: poses of its sensors, and closures of three sensors."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +11,7 @@ from hand_eye_calib.offline.cli.reporting import write_page
 from hand_eye_calib.offline.report.figures import figure_of_views
 from hand_eye_calib.offline.report.report import TONES, page
 
-# Frame of a child sensor without name. In a rig such a sensor has the name of its input.
+# Frame of a child sensor without a name. A rig uses the name of the input for such a sensor.
 _NAMELESS = "child_sensor"
 
 
@@ -40,7 +40,7 @@ def render_rig(rig: RigCalibration, inputs: Sequence[str]) -> str:
 def write_session_rig(directory: Path, session: SessionResult) -> None:
     """Solve for all sensors of a session together, and write the files and the page.
 
-    A time offset or a scale in numbers is that of the first child; the other children have none.
+    A time offset or a scale that is a number applies to the first child only.
     """
     config = session.snapshot.config
     parent, child = session.snapshot.streams

@@ -1,8 +1,8 @@
 """Extrinsics of three sensors or more, and the closure test.
 
-Model: X_1k is the pose of sensor k in the frame of the first sensor. Answers for the first sensor
-with every other one, and for neighbours in the list, close if X_1k X_k(k+1) = X_1(k+1). Weighted
-least squares shares what they miss closing by among the X_1k.
+Model: X_1k is the pose of sensor k in the frame of the first sensor. The first sensor is calibrated
+with every other sensor, and each other sensor with its neighbour in the list. These results close
+if X_1k X_k(k+1) = X_1(k+1). Weighted least squares distributes the closure errors among the X_1k.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import synchronise
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
 
-# Beginnings of the names of options for two sensors.
+# Beginnings of the names of options that apply to two sensors only.
 _OF_ONE_PAIR = ("parent_", "child_", "base_frame", "prior")
 
 
@@ -42,27 +42,28 @@ def calibrate_rig(
 ) -> RigCalibration:
     """Estimate the poses of all sensors of a rig in the frame of the first one.
 
-    Every other sensor is calibrated against the first one, as
-    :func:`~hand_eye_calib.offline.calibrate.calibrate` does, and neighbours in the list against
-    each other. The closure of these answers tests them. The closure error is then distributed, so
-    that all chains of extrinsics between two sensors agree.
+    Every other sensor is calibrated with the first one, as by
+    :func:`~hand_eye_calib.offline.calibrate.calibrate`, and with its neighbour in the list. The
+    closure errors test these results. They are then distributed, so that all chains of extrinsics
+    between two sensors agree.
 
     Parameters
     ----------
     trajectories : mapping of str to Trajectory
         Poses of each sensor in its own world, by the name of its frame; at least three.
     options : mapping of str to value, optional
-        By their public names, such as method, max_gap or target.translation; see
+        Options by their public names, such as method, max_gap or target.translation; see
         :class:`~hand_eye_calib.core.base.config.CalibratorConfig`.
     time_offset, scale : str, optional
-        "estimate", for the scale also "auto" or "none"; for every sensor against the first one.
+        "estimate", for the scale also "auto" or "none". The option applies to every sensor relative
+        to the first one.
 
     Raises
     ------
     ConfigError, InputError
         If an option is not allowed, or there are fewer than three trajectories.
     NotEnoughDataError
-        If too few instants have poses of two sensors.
+        If too few poses of two sensors are synchronous.
 
     Examples
     --------
@@ -93,10 +94,10 @@ def calibrate_rig(
 
 
 def _aligned(child: Trajectory, attempt: Attempt) -> Trajectory:
-    """Return the poses of a child in the convention, unit and clock of an attempt.
+    """Return the poses of a child with the convention, unit and clock of an attempt.
 
-    The frame has the name of the result: inverse poses are those of the other frame of the stream,
-    such as those of a camera that observes a marker.
+    The frame is that of the result. It differs from the stream's if poses are inverted, such as
+    poses of a marker that a camera observes.
     """
     config = attempt.snapshot.config
     calibration = attempt.calibration
@@ -106,7 +107,7 @@ def _aligned(child: Trajectory, attempt: Attempt) -> Trajectory:
 
 
 def _between(before: Trajectory, after: Trajectory, method: str, max_gap_s: float) -> Calibration:
-    """Calibrate two neighbours, which have one clock and one unit of length."""
+    """Calibrate two neighbours that have the same clock and unit of length already."""
     pairs = synchronise(before, after, max_gap_s)
     config = CalibratorConfig(method=method, max_pairs=max(len(pairs), 10))
     calibration = solve_poses(pairs, config).calibration()
@@ -139,28 +140,28 @@ def _require_rig(trajectories: Mapping[str, Trajectory], options: Mapping[str, A
             )
 
 
-# Variance (m^2, rad^2) above which a direction counts as unknown.
+# Variance (m^2, rad^2) above which a direction is unknown.
 _UNKNOWN = 1.0
 
-# Smallest variance (m^2, rad^2) of an answer: poses without noise have none.
+# Smallest variance (m^2, rad^2) of a result, for poses without noise.
 _ROUNDING = 1e-16
 
 
 @dataclass(frozen=True)
 class Closure:
-    """Closure error of the answers for three sensors, two at a time.
+    """Closure error of three results, each for two of three sensors a, b and c.
 
     Attributes
     ----------
     sensors : (str, str, str)
     translation_m, rotation_rad : float
-        Size of ``T_ab T_bc T_ca``, which is the identity without errors, along directions that all
-        three answers determine.
+        Size of ``T_ab T_bc T_ca`` along directions that all three results determine. The product is
+        the identity without errors.
     chi2 : float
-        The same squared in standard deviations, as if the three answers were independent. They
-        share sensors, so that chi2 is rather too small.
+        Squared size in standard deviations of independent results. The results share sensors, so
+        chi2 tends to be too small.
     dof : int
-        Number of these directions.
+        Number of the directions.
     """
 
     sensors: tuple[str, str, str]
@@ -192,7 +193,7 @@ class RigCalibration:
     Attributes
     ----------
     sensors : tuple of str
-        Frames of the S sensors. The first frame is that of all extrinsics.
+        Frames of the S sensors. All extrinsics are poses in the first frame.
     calibrations : tuple of Calibration
         S - 1 results: every other sensor in the frame of the first sensor.
     neighbours : tuple of Calibration
@@ -219,12 +220,12 @@ class RigCalibration:
         star: Sequence[Calibration],
         neighbours: Sequence[Calibration],
     ) -> RigCalibration:
-        """Return the rig from answers for two sensors at a time.
+        """Return the rig from results for two sensors each.
 
-        The closure errors are distributed by the covariances of the answers.
+        The closure errors are distributed by the covariances of the results.
         """
         triangles = zip(star, neighbours, star[1:], strict=False)
-        closures = tuple(closure(*answers) for answers in triangles)
+        closures = tuple(closure(*results) for results in triangles)
         rig = cls(sensors, tuple(star), tuple(neighbours), closures)
         calibrations = tuple(
             replace(calibration, T_parent_child=se3.exp(step) @ calibration.T_parent_child)
@@ -256,10 +257,10 @@ class RigCalibration:
         return np.array([np.eye(4), *Xs])
 
     def _steps(self) -> FloatArray:
-        """Return the changes (S - 1, 6) of the extrinsics that make all answers close.
+        """Return the changes (S - 1, 6) of the extrinsics that distribute the closure errors.
 
-        The changes are in the frame of the first sensor, by weighted least squares: normal
-        equations ``H x = s``.
+        The changes are in the frame of the first sensor. They solve the normal equations ``H x =
+        s`` of weighted least squares.
         """
         K = len(self.calibrations)
         H = np.zeros((K, 6, K, 6))
@@ -286,9 +287,9 @@ class RigCalibration:
     def covariance(self, first: str, second: str) -> FloatArray:
         """Return the covariance (6, 6) of xi = (rho, phi) in ``T(first, second) @ Exp(xi)``.
 
-        The covariance, in m and rad, is that of the answer for both sensors, with the allowance. If
-        there is none, it is the sum of their covariances with the first sensor of the rig, which
-        contains that sensor's errors twice.
+        The covariance (m, rad) is that of the result for both sensors, with the allowance. Without
+        such a result, it is the sum of the covariances of both sensors relative to the first sensor
+        of the rig. The sum contains the errors of the first sensor twice.
         """
         return self._covariance(first, second, with_allowance=True)
 
@@ -301,11 +302,11 @@ class RigCalibration:
         if near == far:
             return np.zeros((6, 6))
         if 0 < near == far - 1:
-            answers = [(self.neighbours[near - 1], self.Xs[far])]
+            results = [(self.neighbours[near - 1], self.Xs[far])]
         else:
-            answers = [(self.calibrations[k - 1], self.Xs[k]) for k in (near, far) if k]
+            results = [(self.calibrations[k - 1], self.Xs[k]) for k in (near, far) if k]
         to_second = se3.adjoint(self.T(second, self.sensors[0]))
-        in_first = np.sum([_in_first(*answer, with_allowance) for answer in answers], axis=0)
+        in_first = np.sum([_in_first(*result, with_allowance) for result in results], axis=0)
         return np.asarray(to_second @ in_first @ to_second.T)
 
     def to_dict(self) -> Document:
@@ -323,7 +324,7 @@ class RigCalibration:
 
 
 def _in_first(calibration: Calibration, X: FloatArray, with_allowance: bool = False) -> FloatArray:
-    """Return the covariance (6, 6) of an answer in the frame in which its child has the pose X."""
+    """Return the covariance (6, 6) of a result in the frame in which its child has the pose X."""
     adjoint = se3.adjoint(X)
     covariance = calibration.covariance_measured + _ROUNDING * np.eye(6)
     if with_allowance:
@@ -332,7 +333,7 @@ def _in_first(calibration: Calibration, X: FloatArray, with_allowance: bool = Fa
 
 
 def closure(to_second: Calibration, between: Calibration, to_third: Calibration) -> Closure:
-    """Return the closure of the answers for a -> b, b -> c and a -> c."""
+    """Return the closure of the results for a -> b, b -> c and a -> c."""
     chain = to_second.T_parent_child @ between.T_parent_child
     covariance = _in_first(to_second, to_second.T_parent_child) + _in_first(between, chain)
     covariance += _in_first(to_third, to_third.T_parent_child)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 TOPICS = {"parent": "/lidar/odometry", "child": "/camera/odometry"}
 
-# One minute.
+# A drive of one minute.
 DRIVE = dataclasses.replace(HILLY_DRIVE, poses=600, parent_frame="lidar", child_frame="camera")
 
 # Factor by which the playback is faster than the recording.
@@ -91,7 +91,8 @@ def run(arguments: argparse.Namespace) -> int:
 def _node(log_path: Path) -> Iterator[Callable[[], None]]:
     """Run the node in its own process; yield a function that raises an error if it has ended."""
     command = [sys.executable, "-m", "hand_eye_calib", "calibrator", "--ros-args"]
-    command += ["-p", "solve_period:=1000.0"]  # the player asks for the solve of all poses
+    # The player calls ~/solve when all poses are sent.
+    command += ["-p", "solve_period:=1000.0"]
     for stream, topic in TOPICS.items():
         command += ["-r", f"{stream}_odom:={topic}"]
         # Best effort may lose messages at this speed, but both results must use the same messages.
@@ -113,7 +114,7 @@ def _node(log_path: Path) -> Iterator[Callable[[], None]]:
             yield check
             process.send_signal(signal.SIGINT)
             if process.wait(10.0) != 0:
-                check()  # raises the error
+                check()
         finally:
             process.kill()
 

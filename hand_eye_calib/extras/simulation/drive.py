@@ -1,8 +1,8 @@
 """Simulate a ground vehicle with two sensors on hills, and the errors of odometry and SLAM.
 
-Välimäki et al. 2023, section 4.1. Where the article's text and its published trajectories differ,
-the simulation follows the trajectories: the value called sigma^2 is a standard deviation, jumps
-last until the end, and only the child sensor drifts.
+Reference: Välimäki et al. 2023, section 4.1. If the article's text differs from its published
+trajectories, the simulation follows the trajectories: the value called sigma^2 is a standard
+deviation, jumps last until the end, and only the child sensor drifts.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,8 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory, WithArrays
 from hand_eye_calib.extras.simulation import options
 
-# Start of the published drives, heading along x, in units of the surface's arguments.
+# Position at the start of the published drives, in units of the arguments of the surface. The
+# vehicle starts along x.
 _START = np.array([0.0, 0.5])
 # Time from the start of the published drives to their first pose (s).
 _LEAD_S = 0.1
@@ -34,12 +35,12 @@ _NO_NOISE = options.NoiseConfig()
 
 @dataclass(frozen=True, eq=False)
 class SimulatedDrive(WithArrays):
-    """Trajectories that both sensors report, and the truth.
+    """Trajectories of both sensors, and the truth.
 
     Attributes
     ----------
     parent, child : Trajectory
-        With noise, each sensor in its own world.
+        Poses with noise, of each sensor in its own world.
     T_parent_child : (4, 4) array
         The true extrinsic.
     T_pw_cw : (4, 4) array
@@ -66,12 +67,13 @@ def simulate(
     Parameters
     ----------
     seed : int
-        The same seed gives the same drive. Default: 0.
+        Equal seeds make equal drives. Default: 0.
     drive : {"hilly", "published"}
-        A robot outdoors at 1.5 m/s, sensors at 10 and 20 Hz without common stamps (default), or
-        the drive of the article: 0.5 m/s, 10 Hz, equal stamps.
+        "hilly" (default): a robot outdoors at 1.5 m/s; sensors at 10 and 20 Hz without common
+        stamps. "published": the drive of the article at 0.5 m/s; both sensors at 10 Hz with equal
+        stamps.
     poses : int
-        Poses of the parent sensor. Default: 600, a minute.
+        Number of poses of the parent sensor. Default: 600, one minute.
     gaussian : float
         Standard deviation of each pose's translation error per axis. Default: 0.002 m.
     outliers : float
@@ -82,7 +84,7 @@ def simulate(
     Returns
     -------
     SimulatedDrive
-        With ``parent``, ``child`` and ``T_parent_child``.
+        Trajectories ``parent`` and ``child``, and the truth ``T_parent_child``.
 
     Examples
     --------
@@ -107,7 +109,8 @@ def simulate_drive(
     Parameters
     ----------
     seed : int or sequence of int
-        Equal seeds give the same drive with any noise, and the same random numbers of the noise.
+        Equal seeds make equal drives, whatever the noise. They also make equal random numbers for
+        the noise, which its levels multiply.
     config : DriveConfig
     noise : NoiseConfig
 
@@ -127,7 +130,7 @@ def simulate_drive(
     rotation = se3.rotation_of(se3.from_quat_xyzw(np.zeros(3), extrinsic_rng.standard_normal(4)))
     offset = extrinsic_rng.uniform(-_LARGEST_OFFSET_M, _LARGEST_OFFSET_M, 3)
     T_parent_child = se3.from_rotation_translation(rotation, offset)
-    # Euler angles (rad) and translation (m) are differences of two uniform numbers from 0 to 1.
+    # Euler angles (rad) and translation (m) are each the difference of two uniform numbers.
     angles, translation = extrinsic_rng.uniform(size=(2, 3)) - extrinsic_rng.uniform(size=(2, 3))
     T_pw_cw = se3.from_rotation_translation(se3.rotation_from_rpy(angles[::-1]), translation)
     Ts_cw_c = se3.inverse(T_pw_cw) @ Ts_pw_p_at_child @ T_parent_child
@@ -148,9 +151,9 @@ def simulate_drive(
 def _ground_track(
     config: options.DriveConfig, rng: np.random.Generator, times_s: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return positions (N, 2) and headings (N,) at any times (N,) since the start.
+    """Return positions (N, 2), m, and headings (N,), rad, at times (N,), s, since the start.
 
-    The track has circular arcs, because each yaw rate lasts for its hold time.
+    The track consists of circular arcs, because each yaw rate is constant for its hold time.
     """
     holds_s = np.full(int(times_s.max() // config.hold_time) + 2, config.hold_time)
     holds_s[0] = _FIRST_HOLD_S
@@ -168,7 +171,7 @@ def _ground_track(
 def _arc(
     speed: float, heading: FloatArray, yaw_rate: FloatArray, duration_s: FloatArray
 ) -> FloatArray:
-    """Return displacements (N, 2) along arcs; a chord has the mean heading of both ends."""
+    """Return displacements (N, 2) along arcs. A chord has the mean heading of both ends."""
     half_turn = 0.5 * yaw_rate * duration_s
     chord = speed * duration_s * np.sinc(half_turn / np.pi)
     direction = heading + half_turn
@@ -184,15 +187,17 @@ def _poses_on_terrain(
     normals = np.stack([-slope_x, -slope_y, np.ones_like(z)], axis=-1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     if config.attitude == "published":
-        # Fitted to the noise-free poses: to 0.01 rad, the heading exactly. Yaw is the heading,
-        # pitch and roll are the arc sines of x and y of the normal, the matrix is transposed.
+        # This formula was fitted to the published noise-free poses. It reproduces their heading
+        # exactly, and pitch and roll to 0.01 rad. Yaw is the heading. Pitch and roll are the arc
+        # sines of x and y of the normal. The rotation matrix is then transposed.
         angles = np.stack([headings, *np.arcsin(normals[:, :2].T)], axis=-1)
         rotations = np.swapaxes(se3.rotation_from_rpy(angles[:, ::-1]), -1, -2)
-    else:  # z along the normal, x in the vertical plane of the heading
+    else:
+        # z is along the normal, and x is in the vertical plane of the heading.
         ahead = np.stack([np.cos(headings), np.sin(headings), np.zeros_like(headings)], axis=-1)
-        left = np.cross(normals, ahead)
-        left /= np.linalg.norm(left, axis=-1, keepdims=True)
-        rotations = np.stack([np.cross(left, normals), left, normals], axis=-1)
+        y_axes = np.cross(normals, ahead)
+        y_axes /= np.linalg.norm(y_axes, axis=-1, keepdims=True)
+        rotations = np.stack([np.cross(y_axes, normals), y_axes, normals], axis=-1)
     return se3.from_rotation_translation(rotations, np.column_stack([positions, z]))
 
 
@@ -202,10 +207,11 @@ def surface(config: options.DriveConfig, x: FloatArray, y: FloatArray) -> tuple[
     Parameters
     ----------
     config : DriveConfig
-        Terrain height and scale are metres per unit of :func:`_peaks` and of its arguments.
-        Arguments beyond +/- the limit are mirrored, so that a long drive stays on the hills.
+        ``terrain_height`` is the height (m) of one unit of :func:`_peaks`; ``terrain_scale`` is the
+        length (m) of one unit of its arguments. Arguments beyond +/- ``terrain_limit`` are
+        mirrored, so that a long drive stays on the hills.
     x, y : (N,) arrays
-        Places, m.
+        Positions, m.
     """
     height = config.terrain_height
     scale = config.terrain_scale
@@ -220,7 +226,7 @@ def surface(config: options.DriveConfig, x: FloatArray, y: FloatArray) -> tuple[
 def _peaks(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the height of three hills and three hollows, and its derivatives by x and y.
 
-    The arrays have one shape and no unit. The ground is flat beyond about 3.5 from the origin.
+    The arrays have the same shape and no unit. The ground is flat more than 3.5 from the origin.
     """
     hill = 3.0 * np.exp(-(x**2) - (y + 1.0) ** 2)
     middle = 10.0 * np.exp(-(x**2) - y**2)
@@ -235,7 +241,7 @@ def _peaks(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatA
 
 
 def _mirrored(values: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:
-    """Return a triangle wave, equal to its argument within +/- limit, and its slope."""
+    """Return a triangle wave, equal to ``values`` within +/- ``limit``, and its slope."""
     phase = np.mod(values + limit, 4.0 * limit)
     is_falling = phase > 2.0 * limit
     wave = np.where(is_falling, 3.0 * limit - phase, phase - limit)
@@ -245,9 +251,9 @@ def _mirrored(values: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]
 def add_noise(
     Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, noise: options.NoiseConfig, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Add Gaussian noise, then drift (child only), then jumps to both sensors.
+    """Add Gaussian noise to both sensors, then drift to the child, then jumps to both sensors.
 
-    Each kind of noise draws from its own random stream: a change of one kind does not change the
+    Each kind of noise has its own random numbers, so a change of one kind does not change the
     others.
 
     Parameters

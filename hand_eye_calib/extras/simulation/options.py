@@ -22,13 +22,14 @@ class DriveConfig:
     speed : float
         Horizontal, m/s.
     max_yaw_rate, hold_time : float
-        Yaw rates are drawn within +/- this limit, rad/s, and last this time, s.
+        Yaw rates are drawn within +/- ``max_yaw_rate`` (rad/s), and are constant for ``hold_time``
+        (s).
     terrain_height, terrain_scale, terrain_limit : float
         See :func:`~hand_eye_calib.extras.simulation.drive.surface`.
     attitude : {"vehicle", "published"}
         "vehicle": x ahead and z along the normal of the surface. "published": the orientations of
-        the published trajectories, which no vehicle has (transposed, slopes not rotated with the
-        heading).
+        the published trajectories. No vehicle has these, because they are transposed, and slopes
+        are not rotated with the heading.
     """
 
     poses: int = 100
@@ -50,8 +51,8 @@ class DriveConfig:
 # The published drives of the article.
 PUBLISHED_DRIVE = DriveConfig(attitude="published")
 
-# Two minutes of a robot or forklift outdoors: hills steep enough to reveal all six degrees of
-# freedom, sensors at different rates without a common stamp.
+# Two minutes of a robot or forklift outdoors. The hills are steep enough to determine all six axes.
+# The sensors have different rates and no common stamps.
 HILLY_DRIVE = DriveConfig(
     poses=1200,
     child_rate=20.0,
@@ -68,18 +69,18 @@ HILLY_DRIVE = DriveConfig(
 
 @dataclass(frozen=True)
 class NoiseConfig:
-    """Level of each kind of noise. Default: none.
+    """Level of each kind of noise. By default, there is no noise.
 
     Attributes
     ----------
     gaussian : float
         Standard deviation of each pose's translation error per axis, m (published: 0 to 0.010).
     rotation_per_metre : float
-        Standard deviation of each pose's Euler angles, divided by that of its translation, rad/m.
+        Standard deviation of each pose's Euler angles (rad) divided by that of its translation (m).
     outliers : float
-        Share of the poses of each sensor at which its trajectory jumps (published: 0 to 0.10).
+        Share of the poses of each sensor at which the trajectory jumps (published: 0 to 0.10).
     drift : float
-        Drift of the child sensor along one of its axes, m/m (published: 0 to 0.05).
+        Drift of the child sensor along one of its axes, metres per metre (published: 0 to 0.05).
     """
 
     gaussian: float = 0.0
@@ -88,8 +89,8 @@ class NoiseConfig:
     drift: float = 0.0
 
 
-# Good odometry: 2 mm and 0.06 deg per pose, 2 mm of drift per metre, a few SLAM corrections of
-# decimetres.
+# Good odometry: 2 mm and 0.06 deg per pose, 2 mm of drift per metre, and a few corrections of SLAM
+# of some decimetres.
 REALISTIC = NoiseConfig(gaussian=0.002, rotation_per_metre=0.5, outliers=0.005, drift=0.002)
 
 # Mixture of the article: the middle of each range.

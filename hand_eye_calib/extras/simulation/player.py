@@ -1,6 +1,6 @@
 """Play poses to a node ``calibrator`` in another process, and wait for its result.
 
-``demo`` uses it as the other side of the middleware.
+The command ``demo`` uses this module.
 """
 
 import time
@@ -50,12 +50,12 @@ def play(
     until_ns : int
         The result must use the poses up to this stamp.
     check : callable
-        Called during waiting. Raises an error if the node has ended.
+        ``check()`` is called while waiting. It raises an error if the node has ended.
 
     Returns
     -------
     (4, 4) array
-        T_parent_child that the node publishes.
+        ``T_parent_child`` of the node.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def play(
             return all(publisher.get_subscription_count() for publisher in publishers.values())
 
         def is_covered() -> bool:
-            # Poses and service calls have no common order, so one call of ~/solve may be too early.
+            # A call of ~/solve may overtake poses, so it is repeated until the result has them all.
             if requests[-1].done():
                 requests.append(solve.call_async(Trigger.Request()))
             return transform_of(results[-1]).stamp_ns >= until_ns
@@ -102,7 +102,7 @@ def play(
 
 @contextmanager
 def _player_node() -> Iterator[tuple[Node, SingleThreadedExecutor]]:
-    """Start a node of its own; yield the node and its executor."""
+    """Start a node with its own context; yield the node and its executor."""
     context = rclpy.Context()
     try:
         rclpy.init(args=[], context=context)

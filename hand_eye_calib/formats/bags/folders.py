@@ -24,10 +24,10 @@ from hand_eye_calib.formats.bags.storage import (
 from hand_eye_calib.formats.yaml_files import read_yaml
 
 _EXPECTED = "a rosbag2 directory, a .mcap or .db3 file of one, or a rosbag1 .bag file"
-# SQLite stores the newest messages in these files beside a .db3 if the recorder was killed.
+# Endings of files next to a .db3 in which SQLite leaves the newest messages of a killed recorder.
 _UNFINISHED = ("-wal", "-journal")
 _METADATA = "metadata.yaml"
-# A message names at most this many missing files.
+# Largest number of missing files that a message names.
 _MOST_NAMED = 5
 
 
@@ -39,7 +39,7 @@ def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
     Raises
     ------
     InputError
-        If a path is no bag, or a bag cannot be read.
+        If a path is not a bag, or a bag cannot be read.
     """
     storages = list[Storage]()
     for file in [file for path in paths for file in _files_of(path)]:
@@ -66,7 +66,7 @@ def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
 
 
 def _unfinished(file: Path) -> list[Path]:
-    """Return the files of SQLite beside a .db3 without which messages would be missing."""
+    """Return the files of SQLite next to a .db3 that contain its newest messages."""
     if file.suffix != ".db3":
         return []
     paths = [file.with_name(f"{file.name}{suffix}") for suffix in _UNFINISHED]
@@ -74,10 +74,10 @@ def _unfinished(file: Path) -> list[Path]:
 
 
 def _complete(file: Path, unfinished: Iterable[Path], copy: Path) -> None:
-    """Copy a database with its unfinished files, and let SQLite finish the copy.
+    """Copy a database with its unfinished files, and let SQLite merge them in the copy.
 
-    The user's folder must not change, but SQLite writes into the folder of a database that it only
-    reads.
+    SQLite writes into the folder of a database even if it only reads, but the folder of the user
+    must not change.
     """
     try:
         shutil.copyfile(file, copy)
@@ -120,7 +120,7 @@ def _unpack(file: Path, target: Path) -> str:
 
 
 def _files_of(path: Path) -> list[Path]:
-    """Return the files of a bag that hold messages; a packed file only if it is not unpacked, too.
+    """Return the files of a bag with messages, without packed copies of unpacked files.
 
     Raises
     ------
@@ -142,7 +142,7 @@ def _files_of(path: Path) -> list[Path]:
 
 
 def _no_files(folder: Path) -> str:
-    """Explain why a folder without storage files cannot be read."""
+    """Return a message about a folder without storage files."""
     missing = missing_files(folder).n_messages
     if missing:
         return (
@@ -159,15 +159,15 @@ def _no_files(folder: Path) -> str:
 
 
 class MissingFiles(NamedTuple):
-    """Files that the metadata of a bag lists and its folder lacks.
+    """Files that the metadata of a bag lists and that its folder lacks.
 
     Attributes
     ----------
     n_messages : dict of str to int
-        Number of messages of each file by its name; of any type in damaged metadata, None if it is
-        not stated.
+        Number of messages of each missing file by its name. It is None if the metadata lack it, and
+        may have any type in damaged metadata.
     n_in_bag : int
-        Number of messages of the whole bag; likewise.
+        Number of messages of the whole bag; with the same exceptions.
     """
 
     n_messages: dict[str, Any]
@@ -179,7 +179,8 @@ def missing_files(folder: Path) -> MissingFiles:
     present = {file.name.removesuffix(".zstd") for file in folder.iterdir()}
     missing = {}
     n_in_bag = None
-    with suppress(InputError, AttributeError, TypeError, KeyError):  # no metadata, or damaged
+    # The metadata may be missing or damaged.
+    with suppress(InputError, AttributeError, TypeError, KeyError):
         metadata = read_yaml(folder / _METADATA)["rosbag2_bagfile_information"]
         counts = {file["path"]: file["message_count"] for file in metadata.get("files") or ()}
         for path in map(str, metadata["relative_file_paths"]):
@@ -191,6 +192,7 @@ def missing_files(folder: Path) -> MissingFiles:
 
 
 def _listing(names: Iterable[str]) -> str:
+    """List names in words; only the first names of a long list."""
     listed = [*names]
     if len(listed) > _MOST_NAMED:
         listed[_MOST_NAMED:] = [f"{len(listed) - _MOST_NAMED} more"]
@@ -198,10 +200,10 @@ def _listing(names: Iterable[str]) -> str:
 
 
 def losses_of(path: Path, n_present: int) -> list[str]:
-    """Return a line about the listed files that the folder of a bag lacks; empty if there are none.
+    """Return a line about files that the metadata list and the folder lacks; empty without such.
 
-    The line states which share of all messages they hold. ``n_present`` is the number of messages
-    in the present files.
+    The line states the share of all messages in these files. ``n_present`` is the number of
+    messages in the present files.
     """
     if not path.is_dir():
         return []

@@ -16,19 +16,19 @@ from mcap.stream_reader import StreamReader
 from hand_eye_calib.formats import files
 from hand_eye_calib.formats.bags.storage import Message, MessageKind, Storage, kind_of, reason_of
 
-# Record of an mcap chunk: opcode (uint8) and length (uint64).
+# Head of a record in an mcap chunk: opcode (uint8) and length (uint64).
 _RECORD = struct.Struct("<BQ")
-# Message of an mcap chunk: channel (uint16), sequence number, log time (uint64), publish time.
+# Head of a message: channel (uint16), sequence number, log time (uint64), publish time.
 _MESSAGE = struct.Struct("<H4xQ8x")
-# Schema of channels that have none, such as some with JSON.
+# Schema of a channel without schema, such as some channels with JSON.
 _NO_SCHEMA = records.Schema(id=0, name="", encoding="", data=b"")
 
 
 class McapFile(Storage):
     """An .mcap file, read by the library mcap.
 
-    An intact file is read by its index. Otherwise its records are read up to the first damaged
-    one, and the intact records of a chunk that is cut off.
+    An intact file is read by its index. In a damaged file, all records before the damage are read,
+    also those of a chunk that is cut off.
     """
 
     def _open(self, opened: ExitStack) -> None:
@@ -51,7 +51,7 @@ class McapFile(Storage):
             self.span_ns = statistics.message_start_time, statistics.message_end_time
 
     def _checked_summary(self) -> Any:
-        """Return the summary of the file; raise an error of any kind if it lacks a message."""
+        """Return the summary of the file; raise an error of any kind if it is incomplete."""
         summary: Any = make_reader(self._stream).get_summary()
         statistics = summary.statistics
         is_complete = (
@@ -64,13 +64,12 @@ class McapFile(Storage):
         return summary
 
     def _add_kind(self, channel: Any, schemas: Mapping[int, Any]) -> None:
-
         schema = schemas.get(channel.schema_id, _NO_SCHEMA)
         description = (schema.name, channel.message_encoding, schema.encoding, schema.data)
         self._kinds[channel.id] = kind_of(channel.topic, *description)
 
     def _scan(self, reason: Exception) -> None:
-        """Count the messages of a file without an index; ``reason`` is why there is none."""
+        """Count the messages of a file without a usable index; ``reason`` is the error with it."""
         schemas = {}
         times_ns = []
         for record in self._records(self.losses):
@@ -90,9 +89,9 @@ class McapFile(Storage):
             raise ValueError(f"{self.losses[0]}, and no message before can be read") from reason
 
     def _messages(self, kinds: Mapping[int, MessageKind]) -> Iterable[Message]:
-
         if not self._chunks:
-            for record in self._records([]):  # `losses` has had its line since the file was opened
+            # `losses` has a line about the damage since the file was opened.
+            for record in self._records([]):
                 if isinstance(record, records.Message) and record.channel_id in kinds:
                     yield kinds[record.channel_id], record.log_time, record.data
         for index in self._chunks:
@@ -102,7 +101,7 @@ class McapFile(Storage):
                 yield from sorted(messages, key=itemgetter(1))
 
     def _content(self, start: int) -> bytes:
-        """Return the unpacked records of the chunk at a place in the file."""
+        """Return the unpacked records of the chunk at a position in the file."""
         self._stream.seek(start + _RECORD.size)
         chunk = records.Chunk.read(ReadDataStream(self._stream))
         stream, size = stream_reader.get_chunk_data_stream(chunk, validate_crc=True)
@@ -120,11 +119,12 @@ class McapFile(Storage):
         except Exception as error:
             losses.append(f"it is truncated or damaged ({reason_of(error)}); the rest is lost")
             if isinstance(error, EOFError):
-                with suppress(Exception):  # the cut ends the records of the chunk, too
+                # The records of the last chunk end in an error, too, where the file is cut off.
+                with suppress(Exception):
                     yield from self._records_of_cut_chunk(position)
 
     def _records_of_cut_chunk(self, position: int) -> Iterator[Any]:
-        """Iterate over the records before the cut in the chunk at a position, if it is a chunk."""
+        """Iterate over the records of a chunk that is cut off; none if it is another record."""
         with self._file.open("rb") as file:
             file.seek(position)
             if file.read(_RECORD.size)[0] != Opcode.CHUNK:
@@ -161,9 +161,9 @@ def _messages_of_chunk(content: bytes, kinds: Mapping[int, MessageKind]) -> Iter
 
 
 class _WholeReads(BufferedReader):
-    """A file whose read never returns fewer bytes than requested.
+    """A file whose ``read`` raises EOFError instead of returning fewer bytes than requested.
 
-    The library mcap would take fewer bytes for a whole record.
+    The library mcap would accept fewer bytes as a whole record.
     """
 
     def read(self, size: int | None = -1) -> bytes:

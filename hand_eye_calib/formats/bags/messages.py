@@ -1,9 +1,8 @@
 """Types of messages, and the poses or parts of poses that they measure.
 
-Frequent types are unpacked from their bytes: all begin with a ``std_msgs/Header``, some have the
-sensor's frame next, then come the measured values. Only these parts are unpacked, which takes a
-small part of the time of a whole message and needs no type definitions. Libraries decode the
-messages of all other types. A new type is a row in the table.
+Frequent types are unpacked from their bytes: a ``std_msgs/Header``, the sensor's frame in some
+types, and the measured values. This takes little time and needs no type definitions. Libraries
+decode messages of all other types. A new type is a row in the table.
 """
 
 import json
@@ -51,14 +50,14 @@ _NO_VECTOR = (math.nan,) * 3
 
 # ---- bytes
 
-# CDR begins with 4 bytes that name the encoding; alignment counts from behind them. A ROS 1 header
-# begins with a sequence number of as many bytes, and ROS 1 aligns nothing.
+# Number of bytes before the stamp: in CDR the encoding, and values are aligned relative to the end
+# of these bytes; in ROS 1 a sequence number, and values are not aligned.
 _START = struct.calcsize("=I")
 _CDR = b"\x00\x01"
 
 
 class Cursor:
-    """Read the parts of a message in their order.
+    """Read the values of a message in their order.
 
     Raises
     ------
@@ -74,7 +73,7 @@ class Cursor:
         self.position = _START
 
     def read(self, format_: str) -> tuple[Any, ...]:
-        """Read numbers of one size; the format is that of struct."""
+        """Read numbers of the same size; ``format_`` is a format of ``struct``."""
         if not self._is_ros1:
             self.position += (_START - self.position) % struct.calcsize(format_[-1])
         values = struct.unpack_from(f"<{format_}", self._data, self.position)
@@ -117,7 +116,7 @@ def _point(cursor: Cursor) -> Sequence[float]:
 def _imu(cursor: Cursor) -> Sequence[float]:
     """Read angular rates (rad/s) and orientation xyzw of an Imu message.
 
-    NaN for a quantity that the first entry of its covariance marks as absent.
+    An absent quantity is NaN; the first element of its covariance is then -1.
     """
     values = cursor.read("25d")
     orientation = _NO_ROTATION if values[4] == -1.0 else values[:4]
@@ -145,11 +144,11 @@ class MessageType(NamedTuple):
     measures : sequence of str
         Quantities that the messages can be read as, the usual one first.
     unpack : callable, optional
-        Reads the values behind the frames. None for types that are not unpacked from their bytes.
+        Reads the values after the frames. None for types that are not unpacked from their bytes.
     has_child_frame : bool
-        The sensor's frame comes behind the header.
+        Whether the sensor's frame follows the header.
     fields : str
-        Fields that are read if the messages are decoded, as in :mod:`.sources`.
+        Fields to read from decoded messages, in the notation of :mod:`.sources`.
     """
 
     name: str
@@ -197,7 +196,7 @@ _NOVATEL = (
     "t=header.stamp,lat_deg=latitude,lon_deg=longitude,height=height,"
     "roll_deg=roll,pitch_deg=pitch,heading_deg=azimuth"
 )
-# Types that are read by their fields. The first element of an array in a message counts.
+# Types that are read by their fields. If a message has an array of poses, the first pose is read.
 _FIELDS = {
     "novatel_oem7_msgs/msg/INSPVA": _NOVATEL,
     "novatel_oem7_msgs/msg/INSPVAX": _NOVATEL,
@@ -250,7 +249,7 @@ FIELD_POSE_TYPES = tuple(
 
 
 def measured_as(message_type: str, wanted: str, source: object) -> str:
-    """Return the quantity that messages of a type are read as.
+    """Return the quantity to read from messages of a type.
 
     Parameters
     ----------
@@ -302,7 +301,7 @@ def _decoder(kind: MessageKind) -> Callable[[bytes], Any]:
         return make_decoder(kind)
     except HandEyeCalibError:
         raise
-    except Exception as error:  # of many kinds, at damaged definitions
+    except Exception as error:  # damaged definitions raise errors of many kinds
         raise InputError(
             f"the bag contains no readable definition of {kind.type}; record "
             "it as mcap, which stores definitions"
@@ -329,7 +328,7 @@ def _rosbags_decoder(kind: MessageKind) -> Callable[[bytes], Any]:
             defined = get_types_from_msg(text, kind.type)
         new_names = defined.keys() - typestore.types.keys()
         typestore.register({name: defined[name] for name in new_names})
-    typestore.types[kind.type]  # raises KeyError if it is not defined
+    typestore.types[kind.type]  # raises KeyError if the type is not defined
     decode = typestore.deserialize_ros1 if kind.is_ros1 else typestore.deserialize_cdr
     return lambda data: decode(data, kind.type)
 
@@ -383,7 +382,7 @@ class Run(NamedTuple):
         for data in self.messages:
             try:
                 message = decode(data)
-            except Exception as error:  # the libraries raise many kinds
+            except Exception as error:  # the libraries raise errors of many kinds
                 raise self.unreadable(error) from error
             yield message
 
@@ -399,7 +398,7 @@ class Run(NamedTuple):
             try:
                 for transform in getattr(message, "transforms", [message]):
                     yield bag_ns, transform_of(transform)
-            except (AttributeError, TypeError) as error:  # JSON may have any fields
+            except (AttributeError, TypeError) as error:  # a message in JSON may have any fields
                 raise self.unreadable(error) from error
 
     def unreadable(self, error: Exception) -> InputError:
@@ -414,7 +413,7 @@ class Run(NamedTuple):
 
 
 class _Unpacked(NamedTuple):
-    """Parts of a message; ``end`` is the position behind the values."""
+    """Unpacked fields of a message; ``end`` is the position after the values."""
 
     stamp_ns: int
     world_frame: str
@@ -424,7 +423,7 @@ class _Unpacked(NamedTuple):
 
 
 class _Frames(NamedTuple):
-    """Frames of a pose in CDR: their bytes, behind the stamp, and the position behind these."""
+    """Frames of a pose in CDR: their bytes after the stamp, and the position after these bytes."""
 
     data: bytes
     end: int
@@ -443,10 +442,9 @@ def _unpack(row: MessageType, is_ros1: bool, data: bytes) -> _Unpacked:
 
 
 def unpack_poses(messages: Sequence[bytes], message_type: str, is_ros1: bool) -> PoseTable:
-    """Unpack one or more messages of one of MESSAGE_TYPES.
+    """Unpack messages of one of MESSAGE_TYPES; raise MALFORMED if one is not of its type.
 
-    Poses that differ only in stamps and values are unpacked together. Raises MALFORMED if a message
-    is not of its type.
+    Poses with equal frames are unpacked together, which takes less time.
     """
     row = MESSAGE_TYPES[message_type]
     if row.unpack is _pose and len(messages) > 1:
@@ -459,14 +457,14 @@ def unpack_poses(messages: Sequence[bytes], message_type: str, is_ros1: bool) ->
 
 
 def _unpack_alike(messages: Sequence[bytes], row: MessageType, is_ros1: bool) -> PoseTable | None:
-    """Unpack poses together; None if their lengths or frames differ, or a stamp is impossible."""
+    """Unpack poses together; None if their lengths or frames differ, or a stamp is invalid."""
     size = len(messages[0])
     if any(len(data) != size for data in messages):
         return None
     first = _unpack(row, is_ros1, messages[0])
     rows = np.frombuffer(b"".join(messages), dtype=np.uint8).reshape(-1, size)
     encodings = rows[:, :2]
-    # The sequence numbers of ROS 1 may differ, the encodings of CDR may not.
+    # These bytes are the encoding of CDR, which must not differ, or the sequence number of ROS 1.
     is_alike = is_ros1 or (encodings == encodings[0]).all()
     frames = rows[:, _START + _STAMP_SIZE : first.end - _POSE_SIZE]
     stamps = np.ascontiguousarray(rows[:, _START : _START + _STAMP_SIZE])
@@ -485,8 +483,8 @@ def _unpack_alike(messages: Sequence[bytes], row: MessageType, is_ros1: bool) ->
 class MessageReader:
     """Unpack the messages of one topic in their order as poses.
 
-    Positions without orientations get level orientations, and rotations without positions get
-    positions at the origin. Both are placeholders without meaning.
+    Poses without orientations have the identity as orientation, and poses without positions are at
+    the origin. These values are placeholders.
 
     Parameters
     ----------
@@ -494,7 +492,7 @@ class MessageReader:
     measures : str
         A quantity, see :func:`measured_as`.
     origin : LocalOrigin, optional
-        Origin of latitudes and longitudes. Default: the first place that is read.
+        Origin of latitudes and longitudes; by default, the first position.
 
     Attributes
     ----------
@@ -507,7 +505,7 @@ class MessageReader:
         self._measures = measures
         self._are_poses = message_type in POSE_TYPES and measures == "poses"
         self._rates = RateIntegrator()
-        # Frames of the previous pose. No message has these bytes.
+        # Frames of the previous pose. The first value differs from the bytes of every message.
         self._frames = _Frames(data=b" ", end=0, world_frame="", sensor_frame=None)
         self._origin = origin or LocalOrigin()
         self.n_left_out = 0
@@ -540,8 +538,9 @@ class MessageReader:
         self.n_left_out += int((~is_usable).sum())
         poses = np.tile([0.0] * 6 + [1.0], (len(values), 1))
         if is_usable.any():
-            part = _COLUMNS["positions" if self._measures == "positions" else "rotations"]
-            poses[is_usable, part] = self._measured(columns.stamps_ns[is_usable], values[is_usable])
+            target = _COLUMNS["positions" if self._measures == "positions" else "rotations"]
+            measured = self._measured(columns.stamps_ns[is_usable], values[is_usable])
+            poses[is_usable, target] = measured
         poses[~is_usable] = np.nan
         if self._row.unpack not in (_imu, _fix):
             return replace(columns, poses=poses), is_usable
@@ -564,7 +563,7 @@ class MessageReader:
         return self._origin.local(lat, lon, values[:, 2])
 
     def _pose_fields(self, data: bytes) -> PoseFields:
-        """Unpack a pose in CDR. Frames are decoded only if they differ from those before."""
+        """Unpack a pose in CDR. Frames are decoded only if they differ from the previous frames."""
         start = _START + _STAMP_SIZE
         if data[start : self._frames.end] != self._frames.data:
             unpacked = _unpack(self._row, False, data)
@@ -585,7 +584,7 @@ class MessageReader:
         NoPoseError
             If the message lacks the measured quantity.
         InputError
-            If it cannot be unpacked.
+            If the message cannot be unpacked.
         """
         try:
             if self._are_poses:

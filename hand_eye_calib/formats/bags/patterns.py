@@ -1,4 +1,4 @@
-"""Find the bags that a folder, or a pattern with ``*``, stands for."""
+"""Find the bags in a folder, or those that match a pattern with ``*``."""
 
 from glob import glob, has_magic
 from pathlib import Path
@@ -10,17 +10,18 @@ _SUFFIXES = (".bag", ".mcap", ".db3")
 
 
 def matching(pattern: str) -> list[str]:
-    """Return the bags that a pattern stands for.
+    """Return the bags that match a pattern.
 
-    A bag stands for itself, and any other folder for all bags below it. ``**`` skips files that are
-    no bags, and files inside bags.
+    A bag matches itself; any other folder matches all bags below it. ``**`` skips files that are
+    not bags, and files inside bags.
 
     Raises
     ------
     ConfigError
-        If there is none.
+        If no bag matches.
     """
-    if remote.is_url(pattern):  # a question mark begins the query of a URL
+    # In a URL, a question mark begins the query.
+    if remote.is_url(pattern):
         paths = remote.expanded(pattern) if "*" in pattern else [pattern]
     else:
         if _is_folder_of_bags(Path(pattern)):
@@ -41,7 +42,7 @@ def _local_bags(pattern: str) -> list[str]:
 
 
 def _is_folder_of_bags(path: Path) -> bool:
-    """Return whether a path is a folder that is no bag itself."""
+    """Return whether a path is a folder, but not a bag."""
     return path.is_dir() and not any(
         file.name == "metadata.yaml" or file.suffix in _SUFFIXES for file in path.iterdir()
     )

@@ -1,4 +1,4 @@
-"""Poses of streams in columns, as bags have them."""
+"""Poses of one or two streams as columns, in the order of bag time."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -22,9 +22,9 @@ class PoseTable(Columns):
     stamps_ns : (N,) int64 array
         Header stamps.
     world_frames, sensor_frames : (N,) object array
-        Names of frames; None if the message type does not carry them.
+        Names of frames; None if the message type has no such field.
     poses : (N, 7) array
-        x y z qx qy qz qw, m. Messages that are no poses have their unpacked values instead.
+        x y z qx qy qz qw, m. Messages without poses have their unpacked values instead.
     bag_ns : (N,) int64 array
         Times at which the messages were recorded.
     """
@@ -38,17 +38,23 @@ class PoseTable(Columns):
 
     @classmethod
     def of(cls, stamps_ns: Any, poses: Any, world: Any = "", sensor: Any = None) -> Self:
-        """Make a table without stream names whose stamps (N,) are the bag times, too.
+        """Make a table without stream names; the stamps (N,) are also the bag times.
 
-        ``world`` and ``sensor`` are one frame for all poses, or (N,).
+        ``world`` and ``sensor`` are the frame of all poses, or the frames (N,).
         """
         stamps_ns = np.array(stamps_ns, dtype=np.int64)
 
         def column(value: Any) -> NDArray[np.object_]:
             return np.broadcast_to(np.array(value, dtype=object), stamps_ns.shape)
 
-        frames = column(world), column(sensor)
-        return cls(column(""), stamps_ns, *frames, np.asarray(poses), stamps_ns)
+        return cls(
+            streams=column(""),
+            stamps_ns=stamps_ns,
+            world_frames=column(world),
+            sensor_frames=column(sensor),
+            poses=np.asarray(poses),
+            bag_ns=stamps_ns,
+        )
 
     def recorded(self, stream: str, bag_ns: Any) -> Self:
         """Return the table with the name of its stream and the bag times (N,) of its poses."""
@@ -59,12 +65,12 @@ class PoseTable(Columns):
     def joined(cls, tables: Iterable[Self]) -> Self:
         """Return the rows of one or more tables in the order of bag time."""
         table = cls.concatenate(*tables)
-        # Most bags are in order: then no column is copied.
+        # Most bags are in order, and need no copy of the columns.
         is_sorted = (np.diff(table.bag_ns) >= 0).all()
         return table if is_sorted else table[np.argsort(table.bag_ns, kind="stable")]
 
     def trajectory(self) -> Trajectory:
-        """Return the poses of one stream in the order of stamps; the first of equal stamps."""
+        """Return the poses of one stream sorted by stamps; of equal stamps, the first pose."""
         stamps_ns, first = np.unique(self.stamps_ns, return_index=True)
         poses = self.poses[first]
         sensor_frame = self.sensor_frames[first[0]] or ""

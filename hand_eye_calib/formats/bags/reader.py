@@ -46,13 +46,13 @@ class PoseBag:
     start_ns, end_ns : int or None
         Bag times of the first and the last message; None without messages.
     shown : callable
-        Passes on runs of messages, and may show the progress. It takes the runs, the number of all
-        messages, the text of the step, and a function that returns the size of a run.
+        ``shown(runs, n_messages, step, size_of)`` yields the runs of messages, and may report the
+        progress. ``step`` is the text of the step; ``size_of`` returns the size of a run.
 
     Raises
     ------
     InputError
-        If a path is no bag, or a bag cannot be read.
+        If a path is not a bag, or a bag cannot be read.
     """
 
     def __init__(self, *paths: str | Path) -> None:
@@ -94,7 +94,7 @@ class PoseBag:
 
     @property
     def warnings(self) -> list[str]:
-        """Lines about unread parts and wrong poses; complete after reading."""
+        """Lines about unread parts and wrong poses, complete after all poses are read."""
         warnings = [*self._notes]
         for storage in self._storages:
             warnings += [f"{storage.paths[0]}: {loss}" for loss in storage.losses]
@@ -120,7 +120,8 @@ class PoseBag:
     def edges_on(self, topic: str) -> list[str]:
         """Return pairs of frames, ``parent:child``, in the first messages of a topic.
 
-        Empty if the messages are no transforms. Raises InputError if they cannot be read.
+        The list is empty if the messages are not transforms. Raises InputError if the messages
+        cannot be read.
         """
         if self.type_of(topic) not in messages.TF_TYPES:
             return []
@@ -131,7 +132,7 @@ class PoseBag:
         return sorted(edges)
 
     def measured(self, source: Source, wanted: str = "auto") -> str:
-        """Return the quantity that a source measures, one of registry.MEASURES.
+        """Return the quantity that a source measures: a key of registry.MEASURES.
 
         Parameters
         ----------
@@ -155,28 +156,28 @@ class PoseBag:
         return wanted
 
     def check(self, source: Source) -> None:
-        """Raise InputError, with the topics of the bag, if a source cannot be read.
+        """Raise InputError if a source cannot be read; the message lists the topics of the bag.
 
-        This is the case for a topic without poses, and for frames if the bag has no transforms.
+        Topics without poses cannot be read, nor frames in a bag without transforms.
         """
         if isinstance(source, TfSource):
             if not self._tf_topics():
                 raise InputError(f"no transforms in {self}. {self._listing()}")
             return
         topic, _, fields = source.partition("?")
-        parts = self._parts_of(topic)
-        for part in parts:
-            if part not in self.topics:
-                hint = did_you_mean(part, self.topics) or "."
-                raise InputError(f"no topic {part} in {self}{hint} {self._listing()}")
-        if len(parts) > 1:
-            self.measured(parts[0], "positions")
-            self.measured(parts[1], "rotations")
+        topics = self._parts_of(topic)
+        for name in topics:
+            if name not in self.topics:
+                hint = did_you_mean(name, self.topics) or "."
+                raise InputError(f"no topic {name} in {self}{hint} {self._listing()}")
+        if len(topics) > 1:
+            self.measured(topics[0], "positions")
+            self.measured(topics[1], "rotations")
         elif not fields:
             self._check_type(topic)
 
     def _check_type(self, topic: str) -> None:
-        """Raise InputError if messages of a topic need more than the topic's name to be read."""
+        """Raise InputError if messages of a topic cannot be read by the topic's name alone."""
         type_ = self.type_of(topic)
         if type_ in messages.MESSAGE_TYPES:
             return
@@ -228,12 +229,15 @@ class PoseBag:
             return parent, topics[0]
         if child:
             return topics[0], child
-        frames = frames or {}
+        return self._by_role(topics, frames or {})
+
+    def _by_role(self, topics: Sequence[str], frames: Mapping[str, str]) -> tuple[str, str]:
+        """Return the topics of the parent and of the child."""
         sensors = {}
         if any(frames.values()):
             sensors = {topic: self.sensor_frame(topic) for topic in topics}
-        parent_topic, child_topic = roles.parent_and_child(topics, frames, sensors)
-        return parent_topic, child_topic
+        parent, child = roles.parent_and_child(topics, frames, sensors)
+        return parent, child
 
     def _choice(self, missing: Sequence[str], used: Collection[Source]) -> list[str]:
         """Return topics for the missing streams; an UnclearStreamsError without obvious ones."""
@@ -245,7 +249,7 @@ class PoseBag:
         return choose(free, missing, self.sensor_frame, moving_edges)
 
     def sensor_frame(self, topic: str) -> str:
-        """Return the sensor's frame in the first message of a topic of poses; empty if none."""
+        """Return the sensor's frame in the first message of a topic of poses; may be empty."""
         type_ = self.type_of(topic)
         if type_ not in messages.POSE_TYPES:
             return ""
@@ -259,7 +263,10 @@ class PoseBag:
         return table.sensor_frames[0] or ""
 
     def _parts_of(self, topic: str) -> list[str]:
-        """Return the topics of positions and orientations of ``/fix+/imu``; else the topic."""
+        """Split ``/fix+/imu`` into the topics of positions and of orientations.
+
+        Return the name of any other topic alone.
+        """
         parts = topic.split("+")
         is_joined = topic not in self.topics and len(parts) == 2 and all(parts)
         return parts if is_joined else [topic]
@@ -280,9 +287,9 @@ class PoseBag:
         ----------
         parent, child : Source
         max_gap_s : float
-            Longest time between two transforms of a chain that is interpolated.
+            Longest time between two transforms across which is interpolated.
         measures : mapping of str to str, optional
-            Quantities that the topics of "parent" and "child" are read as, see :meth:`measured`.
+            Quantities to read from the topics of "parent" and "child", see :meth:`measured`.
         stamps : mapping of str to str, optional
             Origin of the stamps of "parent" and "child": "header" or "receive".
 
@@ -314,7 +321,8 @@ class PoseBag:
     ) -> Reading:
         """Return the reader of a source."""
         if isinstance(source, TfSource):
-            self.static_frames.route(*source)  # raises InputError if the frames are not connected
+            # Raise an InputError if the frames are not connected.
+            self.static_frames.route(*source)
             tf_stream = TfStream(source, max_gap_s, self.static_frames)
             return sources.TransformReading(stream, tf_stream, self._tf_topics())
         topic, _, fields = source.partition("?")
@@ -342,13 +350,13 @@ class PoseBag:
     def trajectory(
         self, source: Source, measures: str = "auto", stamps: str = "header"
     ) -> tuple[Trajectory, list[str]]:
-        """Read the trajectory of one source in the order of stamps; the first of equal stamps.
+        """Read the trajectory of one source, sorted by stamps; of equal stamps, the first pose.
 
         Parameters
         ----------
         source : Source
         measures : str
-            Quantity that the source is read as, see :meth:`measured`.
+            Quantity to read, see :meth:`measured`.
         stamps : {"header", "receive"}
 
         Returns
@@ -379,10 +387,10 @@ class PoseBag:
 
     @cached_property
     def static_frames(self) -> FrameTree:
-        """Frames of the bag and their static transforms; the last of repeated ones.
+        """Frames of the bag and their static transforms; of repeated transforms, the last.
 
-        Transforms that are no poses are skipped, as in tf2. Raises InputError if the frames form no
-        tree, or a message is damaged.
+        Invalid transforms are skipped, as in tf2. Raises InputError if the frames do not form a
+        tree, or if a message is damaged.
         """
         tree = FrameTree("the bag's transforms")
         notes = {}
@@ -401,9 +409,9 @@ class PoseBag:
     # ---- messages
 
     def runs(self, topics: Collection[str]) -> Iterator[Run]:
-        """Iterate over messages of some topics in the order of bag time, many of a kind at once.
+        """Iterate over messages of some topics in the order of bag time, in runs of one kind.
 
-        Files that were recorded at the same time follow each other.
+        Files that were recorded at the same time are read one after the other.
         """
         for storage in self._storages:
             for block in storage.blocks(topics):
@@ -416,7 +424,7 @@ class PoseBag:
 
 
 def _bag_times(bag_ns: Sequence[int]) -> IntArray:
-    """Return times as int64 (N,); times out of range, in a damaged bag, become its limits."""
+    """Return times as int64 (N,); times out of range, as in damaged bags, are limited."""
     try:
         return np.array(bag_ns, dtype=np.int64)
     except OverflowError:

@@ -7,34 +7,34 @@ from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.geometry.frames import words_of
 from hand_eye_calib.formats.exports import role_of
 
-# Words in the name of a topic that mark its stream, the likeliest parent first.
+# Words in the names of topics, the likeliest parent first. The empty word is that of other topics.
 _WORDS = ("parent", "base", "lidar", "", "child")
 
-# Words that many frames share.
+# Words that many names of frames contain.
 _COMMON_WORDS = {"link", "frame", "sensor", "optical", "base"}
 
-# Scores of a topic for a frame that the user names. The messages name the same frame.
+# Score of a topic for a frame that the user names, if its messages name the same frame.
 _SAME_NAME = 8.0
-# Each word that the frame shares with the topic, or with the frame of its messages.
+# Score of each word that the frame shares with the topic or with the frame of its messages.
 _SAME_WORD = 2.0
-# The frame and the topic name sensors of one kind.
+# Score if the frame and the topic name sensors of the same kind.
 _SAME_KIND = 1.0
-# The messages name no frame, which is better than another name.
+# Score if the messages name no frame, which is better than another frame.
 _NO_NAME = 0.5
 
 
 def parent_and_child(
     topics: Sequence[str], frames: Mapping[str, str], sensors: Mapping[str, str]
 ) -> list[str]:
-    """Return two topics of poses in their order: parent, child.
+    """Sort two topics of poses: parent, child.
 
     Parameters
     ----------
     topics : sequence of 2 str
     frames : mapping of str to str
-        Frames of the sensors of "parent" and "child" as the user names them; empty without name.
+        Frames of the sensors of "parent" and "child" that the user set; empty if not set.
     sensors : mapping of str to str
-        Frame of the sensor in the messages of each topic; empty without name.
+        Frame of the sensor in the messages of each topic; empty if the messages name none.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def parent_and_child(
 
 
 def _match(frame: str, topic: str, sensor: str) -> float:
-    """Return the score of a frame for being that of the sensor of a topic."""
+    """Return a score that is higher the more likely a frame is that of a topic's sensor."""
     score = 0.0
     if sensor == frame:
         score += _SAME_NAME
@@ -81,7 +81,7 @@ def _match(frame: str, topic: str, sensor: str) -> float:
 
 
 def _parent_first(topic: str) -> tuple[int, str]:
-    """Return a key that sorts the likelier parent first: by its words, then by name."""
+    """Return a sort key: by the likeliest word of a topic's name, then by the name."""
     words = {*re.split(r"[/_:]+", topic.lower()), ""}
     if "child" in words:
         return _WORDS.index("child"), topic

@@ -1,12 +1,12 @@
-"""Sources that a stream can be read from.
+"""Sources of a stream in a bag.
 
 A source is a topic of poses, two topics that are joined, a path, the points of a lidar, images of a
 target, fields of any message, or transforms.
 
 Fields are written ``/topic?t=header.stamp,x=pose.position.x,...``. The names before the equals
 signs are those of csv columns, with their units; vx, vy, vz, wx, wy, wz are integrated. A target is
-written ``/camera/image_raw?charuco:5x7:0.04:0.03:4X4_50``, with ``@FILE`` behind it to name the
-file of the camera's intrinsics.
+written ``/camera/image_raw?charuco:5x7:0.04:0.03:4X4_50``. ``@FILE`` at its end names the file of
+the camera's intrinsics.
 """
 
 from abc import ABC, abstractmethod
@@ -32,18 +32,17 @@ from hand_eye_calib.formats.transforms import TfSource, TfStream
 
 Source = str | TfSource
 
-# The delay of a message is its stamp against bag time. A stamp is wrong if its delay differs from
-# the delays of both neighbours by this much (s) more than these differ from each other, after the
-# usual step is subtracted. Messages are delayed by less on a busy computer.
+# Smallest jump (s) of a wrong stamp, see `are_believable`. On a busy computer, delays of messages
+# differ by less.
 _JUMP_S = 0.5
-# Stamps cannot be used if this share of them is 0, or repeats another stamp.
+# Stamps are unusable if at least this share of them is 0 or repeats another stamp.
 _MOSTLY = 0.5
 
 _NO_POSES = PoseTable.of([], np.empty((0, 7)))
 
 
 def source_of(text: str) -> Source:
-    """Return the topic or the pair of frames that a text names."""
+    """Parse the name of a source: a topic or a pair of frames."""
     return TfSource.parse(text) if ":" in text.partition("?")[0] else text
 
 
@@ -90,7 +89,7 @@ class Reading(ABC):
         """Return the poses of all messages; raise InputError if there can be none."""
 
     def _stamped(self, table: PoseTable) -> PoseTable:
-        """Return the table with the chosen stamps, without poses whose stamp is 0."""
+        """Return the table with the chosen stamps; poses with stamp 0 are left out."""
         if self.stamps == "receive":
             self.notes.append(
                 f"{self.name}: the stamps are the times at which the recorder "
@@ -101,7 +100,8 @@ class Reading(ABC):
         is_zero = table.stamps_ns == 0
         n_zero = int(is_zero.sum())
         self._refuse_zeros(n_zero, len(table))
-        if n_zero > 1:  # a simulation may begin at 0
+        # A single stamp may be 0, because a simulation may begin at 0.
+        if n_zero > 1:
             self.notes.append(
                 f"{self.name}: {n_zero:,} poses were left out: their header stamps are 0"
             )
@@ -119,7 +119,7 @@ class Reading(ABC):
             )
 
     def _refuse_whole_seconds(self, stamps_ns: IntArray) -> None:
-        """Raise InputError if header stamps have whole seconds only, and repeat each other."""
+        """Raise InputError if header stamps are whole seconds and many of them are repeated."""
         if (stamps_ns % messages.NS_PER_S).any():
             return
         n_stamps = len(np.unique(stamps_ns))
@@ -132,7 +132,7 @@ class Reading(ABC):
             )
 
     def _note_null(self, n_null: int, n_all: int) -> None:
-        """Note how many null poses were left out."""
+        """Add a note about null poses that were left out."""
         if n_null:
             self.notes.append(f"{self.name}: {without_poses(n_null, n_all)}")
 
@@ -181,32 +181,34 @@ class TopicReading(Reading):
 def are_believable(stamps_ns: IntArray, bag_ns: IntArray) -> BoolArray:
     """Detect stamps that jump away from bag time and back.
 
-    With such a wrong stamp, a recording of minutes would last for years.
+    A single wrong stamp may extend a recording of minutes to years. The delay of a message is bag
+    time minus stamp. A stamp is wrong if its delay differs from the delays of both neighbours by
+    more than ``_JUMP_S``, the difference of these two delays and the usual step together.
 
     Parameters
     ----------
     stamps_ns, bag_ns : (N,) int64 arrays
-        Of messages in the order of the recording.
+        Stamps and bag times of messages, in the order of the recording.
 
     Returns
     -------
     (N,) bool array
-        Stamps that can be right.
+        False for wrong stamps.
     """
     if len(stamps_ns) < 3:
         return np.ones(len(stamps_ns), dtype=bool)
     delays_s = np.asarray(bag_ns - stamps_ns, dtype=float) * 1e-9
-    # The first and the last message have both neighbours on one side.
+    # The neighbours of the first and the last message are both on the same side.
     padded_s = np.r_[delays_s[2], delays_s, delays_s[-3]]
     steps_s = np.abs(np.diff(padded_s))
-    to_nearest_s = np.minimum(steps_s[:-1], steps_s[1:])
+    smaller_steps_s = np.minimum(steps_s[:-1], steps_s[1:])
     between_neighbours_s = np.abs(padded_s[2:] - padded_s[:-2])
     usual_step_s = np.median(steps_s[1:-1])
-    return np.asarray(to_nearest_s <= _JUMP_S + between_neighbours_s + usual_step_s)
+    return np.asarray(smaller_steps_s <= _JUMP_S + between_neighbours_s + usual_step_s)
 
 
 class JoinedReading(Reading):
-    """Read positions of one topic, and interpolate orientations of another at their stamps."""
+    """Read positions of a topic, and interpolate orientations of another topic at their stamps."""
 
     def __init__(self, fixes: TopicReading, rotations: TopicReading) -> None:
         super().__init__(fixes.stream, *fixes.topics, *rotations.topics)
@@ -218,9 +220,9 @@ class JoinedReading(Reading):
         self._rotations.use_stamps(stamps)
 
     def take(self, run: messages.Run) -> None:
-        for part in (self._fixes, self._rotations):
-            if run.kind.topic in part.topics:
-                part.take(run)
+        for reading in (self._fixes, self._rotations):
+            if run.kind.topic in reading.topics:
+                reading.take(run)
 
     def table(self) -> PoseTable:
         fixes = self._fixes.table()
@@ -240,8 +242,8 @@ class JoinedReading(Reading):
 class PathReading(Reading):
     """Read the poses of the newest message of a path.
 
-    A path is published again and again as it grows, perhaps with all poses corrected. Its stamps
-    count as bag times.
+    A path is published repeatedly as it grows, and all of its poses may be corrected. The stamps of
+    its poses are also their bag times.
     """
 
     _newest: messages.Run | None = None
@@ -320,8 +322,8 @@ class FieldReading(Reading):
         """Return the field of a message as text; a stamp in seconds with all its digits."""
         value = message
         try:
-            for part in path:
-                value = value[int(part)] if part.isdecimal() else getattr(value, part)
+            for name in path:
+                value = value[int(name)] if name.isdecimal() else getattr(value, name)
         except (AttributeError, IndexError, TypeError):
             raise InputError(
                 f"{self.name}: a message has no {'.'.join(path)}; name other fields"
@@ -360,7 +362,7 @@ class TransformReading(Reading):
     def __init__(self, stream: str, source: TfStream, topics: Collection[str]) -> None:
         super().__init__(stream, *(topic for topic in topics if not topic.endswith("tf_static")))
         self._source = source
-        # Bag time, stamp, and the moving edges x y z qx qy qz qw by frame, of each pose.
+        # Bag time, stamp, and rows x y z qx qy qz qw of the moving edges by frame, for each pose.
         self._poses: list[tuple[int, int, Any]] = []
         self._n_null = 0
         self._n_zero = 0

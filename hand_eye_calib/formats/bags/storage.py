@@ -15,18 +15,18 @@ from urllib.parse import quote
 from hand_eye_calib.core.base.errors import InputError, MissingDependencyError, printable, required
 from hand_eye_calib.formats import files
 
-# Suffix of each kind of storage file, and the tool that repairs a damaged file.
+# Tool that repairs a damaged file, by the suffix of the storage file.
 REPAIRS = {".mcap": "'mcap recover'", ".db3": "sqlite3's '.recover'", ".bag": "'rosbag reindex'"}
-# First bytes of a message that zstd has compressed. Plain CDR never begins with them.
+# First bytes of a message that zstd has compressed. Plain CDR never begins with these bytes.
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-# Length (uint32) of the header, or of the data, of a rosbag1 record.
+# Length (uint32) of the header or of the data of a rosbag1 record.
 _LENGTH = struct.Struct("<I")
 # Field of a rosbag1 record header that marks a message.
 _MESSAGE_OP = b"op=\x02"
 
 
 class MessageKind(NamedTuple):
-    """Topic, type, encoding and definition that messages have in common.
+    """Topic, type, encoding and definition of messages.
 
     Attributes
     ----------
@@ -56,13 +56,14 @@ Message: TypeAlias = tuple[MessageKind, int, bytes]
 @lru_cache
 def kind_of(topic: str, name: str, encoding: str, language: str, content: bytes) -> MessageKind:
     """Return the kind of a connection; the cache returns one object for equal connections."""
-    if encoding == "ros1" and name.count("/") == 1:  # ROS 1 writes package/Type
+    # ROS 1 writes package/Type.
+    if encoding == "ros1" and name.count("/") == 1:
         name = name.replace("/", "/msg/")
     return MessageKind(printable_name(topic), printable_name(name), encoding, (language, content))
 
 
 def printable_name(name: str) -> str:
-    """Return a name as it can be printed, cut to the length of the longest name."""
+    """Return a name in printable characters, cut to the largest length of names."""
     return printable(name[: files.LONGEST_NAME])
 
 
@@ -72,11 +73,11 @@ class Storage(ABC):
     Parameters
     ----------
     paths : list of Path
-        The file as the user names it, and unfinished files beside it.
+        The file of the user, and its unfinished files.
     file : Path
         The unpacked file, which is read.
     opened : ExitStack
-        Closes the file.
+        Closes the file at its end.
 
     Attributes
     ----------
@@ -115,8 +116,8 @@ class Storage(ABC):
     def blocks(self, topics: Collection[str]) -> Iterator[list[Message]]:
         """Iterate over blocks of messages of some topics in the order of bag time.
 
-        If chunks of an mcap file overlap, they are read one after the other, so this order is only
-        within each chunk.
+        Chunks of an mcap file that overlap in time are read one after the other. Their messages are
+        in order only within each chunk.
         """
         kinds = {key: kind for key, kind in self._kinds.items() if kind.topic in topics}
         if not kinds:
@@ -134,7 +135,7 @@ class Storage(ABC):
         """Limit the memory, and turn any error of the block into an InputError of one line.
 
         The libraries raise errors of many kinds for damaged files. Only the libraries and the
-        recovery run in the block, so no other defect is hidden.
+        recovery of damaged files run in the block, so no other defect is hidden.
         """
         try:
             with files.reading_memory():
@@ -157,14 +158,16 @@ class Storage(ABC):
 class RosbagsFile(Storage):
     """A .db3 or .bag file, read by the library rosbags.
 
-    Also reads an intact .mcap file of ROS 2 if the library mcap, which rosdep lacks, is missing.
+    If the library mcap is missing, this class also reads intact .mcap files of ROS 2. rosdep cannot
+    install that library.
     """
 
     def _open(self, opened: ExitStack) -> None:
         suffix = self._file.suffix
         reader = rosbags(1 if suffix == ".bag" else 2).Reader(self._file)
         self._reader = reader
-        if suffix == ".db3":  # SQLite reads the path as a URI
+        # SQLite reads the path as a URI.
+        if suffix == ".db3":
             reader.storage.path = Path(quote(str(self._file)))
         if suffix == ".mcap":
             self._repair = "the library for damaged mcap files, 'pip install mcap'"
@@ -195,7 +198,7 @@ class RosbagsFile(Storage):
     def _rosbag1_messages(self, kinds: Mapping[int, MessageKind]) -> Iterator[Message]:
         """Iterate over messages of rosbag1 in the order of bag time.
 
-        Cuts the messages from their chunks by the library's index. The library's own iteration
+        The index of the library states the position of each message. The library's own iteration
         takes 1.7 times as long.
         """
         reader = self._reader
@@ -213,7 +216,7 @@ class RosbagsFile(Storage):
 
 
 def _rosbag1_message(chunk: bytes, start: int) -> bytes:
-    """Return the message at a place in a chunk, or behind the connection record at that place."""
+    """Return the message at a position in a chunk, or after the connection record there."""
     end = start
     is_message = False
     while not is_message:
@@ -237,7 +240,7 @@ def rosbags(version: int) -> Any:
 
 
 def message_blocks(messages: Iterable[Message]) -> Iterator[list[Message]]:
-    """Iterate over blocks of messages; unpack the messages that zstd has compressed."""
+    """Group messages into blocks; unpack messages that zstd has compressed."""
     block = list[Message]()
     size = 0
     for kind, bag_ns, data in messages:

@@ -23,14 +23,14 @@ def write_bag(path: str | Path, streams: Streams, storage: str = "mcap") -> None
     path : str or Path
         Directory to make, or for rosbag1 the ``.bag`` file; it must not exist.
     streams : mapping of str to (Trajectory, str)
-        Trajectory and message type of each topic. The types are Odometry, which has the sensor's
-        frame, and PoseStamped. Header stamps are bag times, too.
+        Trajectory and message type of each topic. The type is Odometry, which has the sensor's
+        frame, or PoseStamped. The header stamps are also the bag times.
     storage : {"mcap", "sqlite3", "rosbag1"}
 
     Raises
     ------
     InputError
-        If the system cannot write there.
+        If the bag cannot be written.
     """
     path = Path(path)
     options: dict[str, object] = {}

@@ -296,7 +296,7 @@ def _of_quaternions(table: Table, names: Sequence[str], positions: FloatArray) -
     elif is_identity[other] and other in fitting:
         reason = "the first orientation is then the identity"
     if reason:
-        order = "qw qx qy qz" if other == "first" else "qx qy qz qw"
+        order = {"first": "qw qx qy qz", "last": "qx qy qz qw"}[other]
         table.guess(f"quaternions read with the scalar {other}, t x y z {order}: {reason}")
         return ways[other]
     is_sure = fitting == [usual] or is_identity[usual]

@@ -18,7 +18,7 @@ from hand_eye_calib.offline.cli.options import note, print_result, waiting_for
 
 if TYPE_CHECKING:
     from hand_eye_calib.core.base.plain import Document
-    from hand_eye_calib.formats.remote import AsGiven
+    from hand_eye_calib.formats.remote import RestoreUrls
 
 EXAMPLES = """\
 examples:
@@ -145,7 +145,7 @@ def run(arguments: argparse.Namespace) -> int:
         return _run_here(arguments, as_given)
 
 
-def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
+def _run_here(arguments: argparse.Namespace, as_given: "RestoreUrls") -> int:
     """Calibrate from local files, and return the exit code.
 
     ``as_given`` replaces the paths of copies in plain values by their URLs.
@@ -180,7 +180,7 @@ def _run_here(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
     return deliver(calibration, as_given(recording.inputs), arguments, recording.snapshot, bag)
 
 
-def _list_topics(arguments: argparse.Namespace, as_given: "AsGiven") -> int:
+def _list_topics(arguments: argparse.Namespace, as_given: "RestoreUrls") -> int:
     """Print the topics of a bag, and return the exit code.
 
     Each row has the rate in the bag's time, the frames of the first messages, and whether the topic
