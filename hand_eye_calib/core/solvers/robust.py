@@ -191,10 +191,10 @@ def _components(pairs: MotionPairs, T_parent_child: FloatArray) -> tuple[_Compon
     # Exp(-xi) Y Exp(xi) = Y Exp(xi - Ad(Y^-1) xi) to first order. The errors are near the identity,
     # so that their own rotation is neglected in the Jacobians.
     jacobians = np.eye(6) - se3.adjoint(se3.inverse(predicted))
-    rotation = se3.rotation_log(se3.rotation_of(errors))
-    return _Component(se3.translation_of(errors), jacobians[:, :3]), _Component(
-        rotation, jacobians[:, 3:]
-    )
+    rotation_vectors = se3.rotation_log(se3.rotation_of(errors))
+    translation = _Component(se3.translation_of(errors), jacobians[:, :3])
+    rotation = _Component(rotation_vectors, jacobians[:, 3:])
+    return translation, rotation
 
 
 def _scales(components: tuple[_Component, _Component]) -> FloatArray:

@@ -1,8 +1,8 @@
-"""Read trajectories of other programs whose files are no tables of numbers.
+"""Read trajectories of other programs whose files are not tables of numbers.
 
-A format is a function, found by the first bytes of a file. The function makes rows under a header,
-which are read as a csv file. A format that cannot be read has a sentence instead of a function: the
-content of such files, and what to do.
+The first bytes of a file select its format. A format is a function that returns a header and rows;
+these are read like a csv file. A format that cannot be read has a sentence instead of a function,
+which names the content of such files and what the user should do.
 """
 
 import csv
@@ -33,21 +33,18 @@ from hand_eye_calib.formats.trajectory_files.columns import (
     QUATERNION,
     ROTATION_VECTOR,
 )
-from hand_eye_calib.formats.trajectory_files.dates import GPS_TIME
+from hand_eye_calib.formats.trajectory_files.dates import DAY_S, GPS_EPOCH_S, GPS_TIME, WEEK_S
 from hand_eye_calib.formats.trajectory_files.reading import FileOptions
 from hand_eye_calib.formats.trajectory_files.table import Table, columns_of_array
 
 _POSE = (*POSITION, *QUATERNION)
 _PLACE = ("t [s]", "lat [deg]", "lon [deg]", "height [m]")
-# From axes forward, right, down to axes forward, left, up. From OpenGL's camera to OpenCV's.
+# Rotation from the axes forward, right, down to forward, left, up. It is also the rotation from the
+# camera axes of OpenGL to those of OpenCV.
 _FLIP = np.diag([1.0, -1.0, -1.0])
-# A Motive file has at most this many lines before the rows: 7 in format version 1.25.
+# Largest number of lines before the rows of a Motive file; 7 in format version 1.25.
 _MOTIVE_HEADER_LINES = 20
 _MOTIVE_UNITS = {"Meters": "m", "Centimeters": "cm", "Millimeters": "mm"}
-# The epoch of GPS time, 1980-01-06, and the length of a week (s).
-_GPS_EPOCH_S = 315_964_800
-_WEEK_S = 604_800
-_DAY_S = 86_400
 _NUMBERED = "the file has no times: the numbers of its {} are used as seconds, to pair the poses"
 
 
@@ -59,7 +56,7 @@ class _Rows(NamedTuple):
     notes: Sequence[str] = ()
 
 
-# Takes the bytes of a file, and the name of one of several bodies or None.
+# ``read(content, choice)``: the content of a file, and the name of a body or None.
 _Reader = Callable[[bytes, str | None], _Rows]
 
 
@@ -81,7 +78,9 @@ def table_of_program(path: str | Path, data: bytes, options: FileOptions) -> Tab
 def foreign_table(
     path: str | Path, data: bytes, read: _Reader | str, choice: str | None, measures: str
 ) -> Table:
-    """Read a file by its value in :data:`PROGRAMS`; ``choice`` names one of several bodies.
+    """Read a file by its value in :data:`PROGRAMS`.
+
+    ``choice`` names the body to read from a file with several bodies.
 
     Raises
     ------
@@ -94,7 +93,8 @@ def foreign_table(
         header, rows, notes = read(data, choice)
     except MissingDependencyError:
         raise
-    except Exception as error:  # of many kinds, if the rest of the file does not fit its beginning
+    # If a file does not continue as it begins, a reader raises errors of many kinds.
+    except Exception as error:
         raise _unreadable(path, error) from None
     table = Table(path, (*header,), measures)
     table.guesses = [f"{path}: {note}" for note in notes]
@@ -102,19 +102,20 @@ def foreign_table(
 
 
 def _text_rows(path: str | Path, rows: Iterable[Sequence[Any]]) -> Iterator[list[str]]:
-    """Yield the cells of rows as text, one row at a time: a file may have millions of them.
+    """Yield the cells of rows as text, one row at a time, because a file may have millions of rows.
 
     Raises
     ------
     InputError
-        If there is no row, or one cannot be read.
+        If there are no rows, or a row cannot be read.
     """
     is_empty = True
     try:
         for row in rows:
             yield [str(cell) for cell in row]
             is_empty = False
-    except Exception as error:  # of many kinds, if the rest of the file does not fit its beginning
+    # If a file does not continue as it begins, a reader raises errors of many kinds.
+    except Exception as error:
         raise _unreadable(path, error) from None
     if is_empty:
         raise _unreadable(path, ValueError("no poses in it"))
@@ -133,28 +134,41 @@ def _lines(data: bytes) -> list[str]:
 
 
 def _of_nmea(data: bytes, _: str | None) -> _Rows:
-    """Read GGA sentences; the day is that of the previous RMC sentence."""
+    """Read GGA sentences; the previous RMC sentence states their day."""
     rows: list[list[float]] = []
     day_s = None
     n_damaged = 0
     for line in _lines(data):
         sentence, _, checksum = line[line.find("$") + 1 :].partition("*")
-        if checksum and f"{reduce(xor, sentence.encode(), 0):02X}" != checksum[:2].upper():
+        if checksum and _checksum(sentence) != checksum[:2].upper():
             n_damaged += 1
             continue
         cells = sentence.strip().split(",")
         kind = cells[0][-3:]
-        if kind == "RMC" and len(cells) > 9 and cells[9]:
-            day_s = datetime.strptime(cells[9], "%d%m%y").replace(tzinfo=UTC).timestamp()
+        if kind == "RMC":
+            day_s = _day_of_rmc(cells) or day_s
         elif kind == "GGA" and day_s is not None and _has_fix(cells):
             row = _gga_row(cells, day_s)
-            if rows and row[0] < rows[-1][0] - _DAY_S / 2:  # midnight, before the next date
-                row[0] += _DAY_S
+            # After midnight, the date is still the old one until the next RMC sentence.
+            if rows and row[0] < rows[-1][0] - DAY_S / 2:
+                row[0] += DAY_S
             rows.append(row)
     if not rows:
         raise ValueError("NMEA: expected GGA sentences with a fix, and the date in RMC sentences")
     notes = [f"{n_damaged} sentences with a wrong checksum left out"] if n_damaged else []
     return _Rows(_PLACE, rows, notes)
+
+
+def _checksum(sentence: str) -> str:
+    """Return the checksum of a sentence of NMEA: two hexadecimal digits."""
+    return f"{reduce(xor, sentence.encode(), 0):02X}"
+
+
+def _day_of_rmc(cells: Sequence[str]) -> float | None:
+    """Return the start of the day (s since 1970) of an RMC sentence; None without a date."""
+    if len(cells) <= 9 or not cells[9]:
+        return None
+    return datetime.strptime(cells[9], "%d%m%y").replace(tzinfo=UTC).timestamp()
 
 
 def _has_fix(cells: Sequence[str]) -> bool:
@@ -204,12 +218,14 @@ def _of_novatel(data: bytes, _: str | None) -> _Rows:
         head, _, body = line.partition(";")
         header = head.split(",")
         cells = body.split(",")
+        # The latitude is 0 before there is a solution.
         if not header[0][1:].startswith("INSPVA") or not float(cells[2]):
-            continue  # the latitude is 0 before there is a solution
+            continue
         height = float(cells[4])
         angles = cells[8:11]
         if "INSPVAX" in header[0]:
-            height += float(cells[5])  # undulation of the geoid
+            # Add the undulation of the geoid.
+            height += float(cells[5])
             angles = cells[9:12]
         week = 5 if line[0] == "#" else 1
         rows.append((_of_week(header[week], header[week + 1]), *cells[2:4], height, *angles))
@@ -219,8 +235,8 @@ def _of_novatel(data: bytes, _: str | None) -> _Rows:
 
 
 def _of_week(week: str, second: str) -> str:
-    """Return the stamp (s) of a second of a GPS week."""
-    return repr(_GPS_EPOCH_S + _WEEK_S * int(week) + float(second))
+    """Return the stamp (s since 1970, GPS time) of a week of GPS and its second."""
+    return repr(GPS_EPOCH_S + WEEK_S * int(week) + float(second))
 
 
 # ---- poses
@@ -272,17 +288,17 @@ def _of_json(data: bytes, _: str | None) -> _Rows:
 
 
 def _of_images(names: Sequence[str], poses: FloatArray, notes: list[str]) -> _Rows:
-    """Return poses (N, 4, 4) of images with their names.
+    """Return rows of poses (N, 4, 4) with the names of their images.
 
-    The last number in the name of an image is its stamp. Without a number in every name, there are
-    no stamps.
+    The last number in the name of an image is its stamp. There are no stamps unless every name has
+    a number.
     """
     images = [Path(name).stem for name in names]
     rows = [(*row, image) for row, image in zip(_as_rows(poses).tolist(), images, strict=True)]
     stamps = [number for image in images for number in re.findall(r"\d+\.\d+|\d+", image)[-1:]]
     if len(stamps) < len(images):
         return _Rows((*MATRIX, "image"), rows, notes)
-    # Seconds since 1970 have ten digits before the point. No recording has so many images.
+    # Seconds since 1970 have ten digits before the point; numbers of images have fewer.
     if min(len(stamp.partition(".")[0]) for stamp in stamps) < 10:
         notes = [_NUMBERED.format("images"), *notes]
     stamped = [(stamp, *row) for stamp, row in zip(stamps, rows, strict=True)]
@@ -294,15 +310,16 @@ def _of_motive(data: bytes, choice: str | None) -> _Rows:
     """Read a rigid body in a take of OptiTrack's Motive."""
     lines = csv.reader(_lines(data))
     head = [*islice(lines, _MOTIVE_HEADER_LINES)]
-    # The last line of the header, and the line with the kind of each column.
+    # Number of the last line of the header; 0 without such a line, so that there are no bodies.
     last = next((row for row, cells in enumerate(head) if "Time (Seconds)" in cells), 0)
+    # Number of the line with the kind of each column.
     kinds = next((row for row in range(1, last) if "Rigid Body" in head[row]), None)
     if kinds is None:
         raise ValueError("it contains no rigid bodies of Motive: export them")
     places_of_bodies: dict[str, dict[str, int]] = {}
     columns = zip(head[kinds], head[kinds + 1], head[last - 1], head[last], strict=False)
-    for place, (kind, body, part, axis) in enumerate(columns):
-        prefix = {"Position": "", "Rotation": "q"}.get(part)
+    for place, (kind, body, quantity, axis) in enumerate(columns):
+        prefix = {"Position": "", "Rotation": "q"}.get(quantity)
         if kind == "Rigid Body" and prefix is not None:
             places_of_bodies.setdefault(body, {})[f"{prefix}{axis.lower()}"] = place
     body = _chosen(places_of_bodies, choice, "rigid bodies")
@@ -319,7 +336,10 @@ def _of_motive(data: bytes, choice: str | None) -> _Rows:
 
 
 def _of_vicon(data: bytes, choice: str | None) -> _Rows:
-    """Read a segment of Vicon Nexus or Tracker, whose rotations are rotation vectors."""
+    """Read a segment of Vicon Nexus, or an object of Vicon Tracker.
+
+    Its rotations are rotation vectors, or quaternions if there is a column RW.
+    """
     lines = csv.reader(_lines(data))
     _, (rate, *_), names, columns, units = islice(lines, 5)
     rate_hz = float(rate)
@@ -352,7 +372,7 @@ def _of_numpy(data: bytes, _: str | None) -> _Rows:
 
 
 def _of_pcd(data: bytes, _: str | None) -> _Rows:
-    """Read key poses that LIO-SAM saves as points with angles and a time."""
+    """Read the key poses of LIO-SAM, which are points with angles and a time."""
     head, encoding, body = re.split(rb"(?m)^DATA (\w+)\r?\n", data, maxsplit=1)
     fields = {name: values for name, *values in map(str.split, _lines(head))}
     names = fields["FIELDS"]
@@ -375,7 +395,8 @@ def _of_ulog(data: bytes, _: str | None) -> _Rows:
         log = pyulog.ULog(io.BytesIO(data), topics)
         first_instances = [logged for logged in log.data_list if logged.multi_id == 0]
         stamps_us, Ts = _logged_poses({logged.name: logged.data for logged in first_instances})
-    except Exception as error:  # of many kinds, at damaged logs
+    # Damaged logs raise errors of many kinds.
+    except Exception as error:
         reason = "" if isinstance(error, KeyError) else f", {type(error).__name__}: {error}"
         raise ValueError(
             f"the log of PX4 does not contain {' or '.join(topics[:2])}{reason}"
@@ -407,10 +428,11 @@ def _logged_poses(data: Mapping[str, Any]) -> tuple[IntArray, FloatArray]:
 
 
 def _logged(data: Mapping[str, Any], *names: str) -> tuple[IntArray, FloatArray]:
-    """Return increasing stamps (us) and the valid values of a topic in a log of PX4."""
+    """Return the valid values of a topic in a log of PX4, and their increasing stamps (us)."""
     values = np.stack([data[name] for name in names], axis=1).astype(float)
     is_valid = np.isfinite(values).all(axis=1)
-    for flag in {"xy_valid", "z_valid"} & data.keys():  # in local positions
+    # Local positions have these flags.
+    for flag in {"xy_valid", "z_valid"} & data.keys():
         is_valid &= data[flag] > 0
     if not is_valid.any():
         raise ValueError(f"none of {', '.join(names)} is valid")
@@ -424,17 +446,17 @@ def _as_rows(poses: FloatArray) -> FloatArray:
     return poses[:, :3].reshape(-1, 12)
 
 
-def _chosen(bodies: Mapping[str, Any], choice: str | None, what: str) -> str:
-    """Return the named body, or the only one; raise ValueError if there are several."""
+def _chosen(bodies: Mapping[str, Any], choice: str | None, noun: str) -> str:
+    """Return the body ``choice`` or the only body; raise ValueError if there are several."""
     if choice in bodies:
         return str(choice)
     if len(bodies) != 1:
         listed = shortened(", ".join(bodies), LONGEST_NAME)
-        raise ValueError(f"several {what}: {listed}; name one with `columns`")
+        raise ValueError(f"several {noun}: {listed}; name one with `columns`")
     return next(iter(bodies))
 
 
-# Position of the pose among the cells of a message, by the number of cells.
+# Number of the first cell of the pose in a message, by the number of cells of the message.
 _POSE_CELL = {
     10: 3,  # PoseStamped
     46: 3,  # PoseWithCovarianceStamped
@@ -453,8 +475,8 @@ def _of_echo(data: bytes, _: str | None) -> _Rows:
     return _Rows(("secs", "nsecs", *_POSE), rows)
 
 
-#: Beginnings of files that are no text with a row of numbers on each line: what reads them, or
-#: what to do instead.
+#: Formats by a pattern of the beginning of a file: the function that reads the file, or a sentence
+#: about files that cannot be read. Files with a row of numbers on each line are not among them.
 PROGRAMS: dict[bytes, _Reader | str] = {
     rb"\Asource_timestamp,destination_timestamp": "motions between images, no poses; chain them",
     rb"<gpx[\s>]": _of_gpx,
@@ -478,7 +500,7 @@ PROGRAMS: dict[bytes, _Reader | str] = {
     rb"\$[A-Z]{2}(GGA|RMC),": _of_nmea,
     rb"\A\d{9,10},\d{1,9},(?=[^,\n]*[A-Za-z/])[^,\n]*,": _of_echo,
     rb"(?m)^%\s+(GPST|UTC|JST)\b.*(latitude|ecef|baseline)": _of_rtklib,
-    # Emlid writes no header. Degrees have nine decimals or more, metres have four.
+    # Emlid writes no header. Degrees have nine or more decimals; metres have four.
     rb"\A\d{4}/\d\d/\d\d +\S+( +-?\d+\.\d{9,}){2} ": _of_rtklib,
     rb"\A\d{4}/\d\d/\d\d +\S+ +-?\d+\.\d{4} ": "RTKLIB without degrees: set its format to llh",
     rb"\A#.*\n(#.*\n)*#\s+IMAGE_ID, QW": _of_colmap,

@@ -114,11 +114,9 @@ def _point(cursor: Cursor) -> Sequence[float]:
 
 
 def _imu(cursor: Cursor) -> Sequence[float]:
-    """Read angular rates (rad/s) and orientation xyzw of an Imu message.
-
-    An absent quantity is NaN; the first element of its covariance is then -1.
-    """
+    """Read angular rates (rad/s) and orientation xyzw of an Imu message; NaN if absent."""
     values = cursor.read("25d")
+    # The first element of the covariance of an absent quantity is -1.
     orientation = _NO_ROTATION if values[4] == -1.0 else values[:4]
     rates = _NO_VECTOR if values[16] == -1.0 else values[13:16]
     return rates + orientation

@@ -24,8 +24,8 @@ _EPOCH_DAY = date(1970, 1, 1).toordinal()
 DAY_S = 86_400
 #: Seconds in a week of GPS.
 WEEK_S = 604_800
-# Beginning of GPS time, 1980-01-06, in s since 1970 (IS-GPS-200).
-_GPS_EPOCH_S = 315_964_800
+#: Beginning of GPS time, 1980-01-06, in s since 1970 (IS-GPS-200).
+GPS_EPOCH_S = 315_964_800
 
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 _YEAR_FIRST = re.compile(r"(\d{4})([-/._ ])(\d\d?|[a-z]{3,9})\2(\d\d?)", re.IGNORECASE | re.ASCII)
@@ -213,7 +213,7 @@ def _stamp_in_week(week_text: str, second: Decimal, unit: str) -> Decimal:
             week = Decimal(week_text)
             if week != int(week) or not 0 <= week < 10_000:
                 raise ValueError(f"found {week_text[:20]!r} for the week of GPS")
-            return _GPS_EPOCH_S + WEEK_S * int(week) + second_of_week
+            return GPS_EPOCH_S + WEEK_S * int(week) + second_of_week
     return second
 
 
