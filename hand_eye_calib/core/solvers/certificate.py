@@ -77,9 +77,10 @@ def _largest_smallest_eigenvalue(M: FloatArray, enough: float) -> float:
     across = tables.across
     Z = M - np.tensordot(tables.stationary @ (M @ tables.identity), tables.equations, 1)
     Z_across = across.T @ Z @ across
+    # The unknowns are the free multipliers and t. At the start, Z + t I is positive definite.
     derivatives = np.concatenate([across.T @ tables.free @ across, np.eye(9)[None]])
-    shift = max(-float(np.linalg.eigvalsh(Z_across)[0]), 0.0) + 0.1
-    unknowns = np.append(np.zeros(len(tables.free)), shift)
+    t_start = max(-float(np.linalg.eigvalsh(Z_across)[0]), 0.0) + 0.1
+    unknowns = np.append(np.zeros(len(tables.free)), t_start)
     weight = _SHARPENING**2
     best = float(np.linalg.eigvalsh(Z)[0])
     for _ in range(quadratic_form.MAX_NEWTON_STEPS):

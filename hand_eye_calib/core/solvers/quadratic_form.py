@@ -46,7 +46,7 @@ _X_IN_T = np.array([0, 1, 2, 4, 5, 6, 8, 9, 10, 3, 7, 11, 15])
 
 # Rows and columns of the upper triangle of a form.
 _ROWS, _COLUMNS = np.triu_indices(DIMENSION)
-# Elements beside the diagonal stand for two elements of the form.
+# An element off the diagonal counts twice, because the triangle has it once.
 _MULTIPLICITY = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
 # Position in the triangle of every element of a form.
 _TRIANGLE = np.empty((DIMENSION, DIMENSION), dtype=int)

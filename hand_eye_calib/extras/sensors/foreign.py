@@ -341,12 +341,13 @@ def _of_vicon(data: bytes, choice: str | None) -> _Rows:
     Its rotations are rotation vectors, or quaternions if there is a column RW.
     """
     lines = csv.reader(_lines(data))
-    _, (rate, *_), names, columns, units = islice(lines, 5)
-    rate_hz = float(rate)
+    _, rates, names, columns, units = islice(lines, 5)
+    rate_hz = float(rates[0])
     if "RX" not in columns:
         raise ValueError(
             "it contains no segments of Vicon: export Segments or Objects (global), not markers"
         )
+    # Columns of each body: its rotation from RX on, then its position from TX on.
     starts = {names[at] or "object": at for at, name in enumerate(columns) if name == "RX"}
     body = _chosen(starts, choice, "segments")
     start = starts[body]

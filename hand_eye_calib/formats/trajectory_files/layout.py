@@ -450,8 +450,9 @@ def _with_fitting_columns(
     """Set the format and the columns of a layout without names by the numbers of its rows."""
     n_columns = len(layout.row)
     columns = _fitting(layout.row, rows)
-    is_stamped_pose = columns is None or columns[: len(TUM)] == STAMPED_POSE
-    if is_stamped_pose and is_separated and n_columns >= len(TUM) and _is_in_ns(layout.row[0]):
+    may_be_stamped_pose = columns is None or columns[: len(TUM)] == STAMPED_POSE
+    is_long_enough = is_separated and n_columns >= len(TUM)
+    if may_be_stamped_pose and is_long_enough and _is_in_ns(layout.row[0]):
         return replace(layout, format="euroc", columns=("t [ns]", *POSITION, *SCALAR_FIRST))
     if columns == STAMPED_POSE and not is_separated:
         return replace(layout, format="tum", columns=columns)

@@ -426,6 +426,7 @@ def _stamps_of_objects(times: Any, table: Table, n_poses: int) -> list[Decimal |
     """Return the stamp of each pose; None for a missing time."""
     if isinstance(times, list) and times and isinstance(times[0], Decimal):
         return [*times]
+    # Datetimes of pandas with a time zone.
     if getattr(getattr(times, "dtype", None), "tz", None) is not None:
         times = np.asarray(times, dtype="datetime64[ns]")
     stamps = np.asarray(times)
