@@ -128,6 +128,7 @@ def _vote(readings: Readings, by_noise: int) -> int:
         return by_shape if readings.is_clear else 0
     if readings.is_small and by_noise != by_shape:
         return _vote_in_small_space(readings, by_noise)
+    # Only a very clear shape overrules the noise.
     if by_noise == -by_shape and abs(readings.shape) > _OVERRULING_SHAPE:
         return by_shape
     return by_noise
@@ -136,12 +137,15 @@ def _vote(readings: Readings, by_noise: int) -> int:
 def _vote_in_small_space(readings: Readings, by_noise: int) -> int:
     """Return the vote, see :func:`_vote`, if the shape does not support the noise."""
     by_shape = readings.by_shape
+    # The paths alone may support the noise.
     if by_noise * readings.paths > _CLEAR_PATHS:
         return by_noise
+    # Both readings invert a stream, so the streams cannot stay as they are.
     if not readings.hypotheses[0].is_upright:
         return by_shape or by_noise
-    is_usual = by_noise < 0 and by_shape == 0
-    return by_noise if is_usual else 0
+    # Without evidence of the shape, the noise can only confirm the streams as they are.
+    is_confirmed = by_noise < 0 and by_shape == 0
+    return by_noise if is_confirmed else 0
 
 
 def _loss_difference(first: PosePairs, second: PosePairs) -> float:

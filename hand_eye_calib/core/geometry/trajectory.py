@@ -63,6 +63,7 @@ def scatter_of_direction(poses: FloatArray) -> float:
     """
     positions = se3.translation_of(poses)
     rotations = se3.rotation_of(poses)
+    # Select the first pose after each further step along the path.
     step_m = float(np.linalg.norm(np.ptp(positions, axis=0))) / _STEPS_IN_EXTENT
     travelled_m = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))]
     n_steps_before = np.floor(travelled_m / (step_m or np.inf))

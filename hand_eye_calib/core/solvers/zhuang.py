@@ -51,6 +51,7 @@ def solve(pairs: MotionPairs) -> Solution:
     parameters, objective, settled = _gauss_newton(M, np.zeros(6))
     near_park = _parameters(all_pairs.solve_park(pairs).T_parent_child)
     _, objective_near_park, _ = _gauss_newton(M, near_park)
+    # A solution in a false minimum has a higher cost than the minimum near park's solution.
     rounding = _ROUNDING**2 * float((M**2).sum())
     is_lowest = objective <= objective_near_park / (1 - _LOWER) + rounding
     T_parent_child = se3.from_rotation_translation(_rotation(parameters[:3]), parameters[3:])

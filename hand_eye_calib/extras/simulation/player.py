@@ -6,6 +6,7 @@ The command ``demo`` uses this module.
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 
 import rclpy
 from geometry_msgs.msg import TransformStamped
@@ -70,13 +71,7 @@ def play(
         solve = node.create_client(Trigger, "calibrator/solve")
         node.create_subscription(TransformStamped, "calibrator/extrinsic", results.append, LATCHED)
 
-        def wait(condition: Callable[[], object], purpose: str) -> None:
-            end_s = time.monotonic() + _PATIENCE_S
-            while not condition():
-                check()
-                if time.monotonic() > end_s:
-                    raise HandEyeCalibError(f"waited {_PATIENCE_S:g} s for the node to {purpose}")
-                executor.spin_once(timeout_sec=_SPIN_S)
+        wait = partial(_wait, executor, check)
 
         def are_subscribed() -> bool:
             return all(publisher.get_subscription_count() for publisher in publishers.values())
@@ -98,6 +93,21 @@ def play(
         wait(is_covered, "give a result with all poses")
     result = transform_of(results[-1])
     return se3.from_quat_xyzw(result.position, result.quat_xyzw)
+
+
+def _wait(
+    executor: SingleThreadedExecutor,
+    check: Callable[[], None],
+    condition: Callable[[], object],
+    purpose: str,
+) -> None:
+    """Run callbacks until a condition is true; ``purpose`` completes the message of the error."""
+    end_s = time.monotonic() + _PATIENCE_S
+    while not condition():
+        check()
+        if time.monotonic() > end_s:
+            raise HandEyeCalibError(f"waited {_PATIENCE_S:g} s for the node to {purpose}")
+        executor.spin_once(timeout_sec=_SPIN_S)
 
 
 @contextmanager

@@ -325,6 +325,7 @@ def _fitted(names: Sequence[str], row: Sequence[str], is_comment: bool) -> _Head
     Cells may be joined to fit. If a comment has too many names, its last names are used, because
     its first words may be text such as "format:".
     """
+    # A separator at the end of the line makes an empty name.
     if len(names) == len(row) + 1 and not names[-1]:
         names = names[:-1]
     if not names:
@@ -335,6 +336,7 @@ def _fitted(names: Sequence[str], row: Sequence[str], is_comment: bool) -> _Head
             return _header_of_widths(names, widths, row)
     n_missing = len(row) - len(names)
     if _is_open(names[-1]):
+        # The last name stands for all further columns, which get empty names.
         if len(names) > 1 and n_missing >= -1:
             return _Header((*names[:-1], *[""] * (n_missing + 1)))
     elif is_comment and n_missing < 0:
