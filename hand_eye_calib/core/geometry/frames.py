@@ -42,10 +42,10 @@ _MOST_LISTED = 50
 
 
 def are_null(poses: FloatArray) -> BoolArray:
-    """Return a mask (N,) of the rows x y z qx qy qz qw (N, 7) that are no pose.
+    """Return a mask (N,) of null poses among rows x y z qx qy qz qw (N, 7).
 
-    These rows have a value that is not finite, or a quaternion of zeros. Trackers publish both
-    when they are lost.
+    A null pose has a value that is not finite, or a quaternion of zeros. Trackers publish null
+    poses when they are lost.
     """
     is_null = (poses[:, 3:] == 0.0).all(axis=1)
     # A finite sum proves that all values are finite, in less time than a check of every row.
@@ -57,7 +57,7 @@ def are_null(poses: FloatArray) -> BoolArray:
 
 
 def check_not_null(*values: float) -> None:
-    """Raise NoPoseError for x, y, z, qx, qy, qz, qw that :func:`are_null`."""
+    """Raise NoPoseError if x, y, z, qx, qy, qz, qw are a null pose, see :func:`are_null`."""
     if not all(map(math.isfinite, values)):
         raise NoPoseError("the pose has a value that is not finite")
     if not any(values[3:]):

@@ -542,7 +542,7 @@ class MessageReader:
         poses[~is_usable] = np.nan
         if self._row.unpack not in (_imu, _fix):
             return replace(columns, poses=poses), is_usable
-        # The header of an Imu or NavSatFix names the sensor's frame.
+        # The header of these types names the sensor's frame, not a world.
         return PoseTable.of(columns.stamps_ns, poses, "", columns.world_frames), is_usable
 
     def _measured(self, stamps_ns: IntArray, values: FloatArray) -> FloatArray:

@@ -28,7 +28,7 @@ _ANGLE = re.compile(
 )
 # Largest number of characters of an angle.
 _LONGEST_ANGLE = 40
-# Characters of angles that other cells with numbers do not have.
+# Characters of angles that other cells with numbers do not have: hemispheres and signs.
 _ANGLE_SIGNS = set("NSEW°º'′’\"″”:")
 
 CellsOf = Callable[[str], list[str]]
@@ -55,7 +55,7 @@ def is_angle(cell: str) -> bool:
 
 
 def _is_marked_angle(cell: str) -> bool:
-    """Whether a cell is an angle with a sign, and not numbers separated by blanks."""
+    """Whether a cell is an angle with a hemisphere, a degree sign, a quote or a colon."""
     return not _ANGLE_SIGNS.isdisjoint(cell) and is_angle(cell)
 
 
