@@ -89,14 +89,7 @@ class Attempt:
 
     def with_doubts(self, doubts: Collection[Finding]) -> "Attempt":
         """Return the attempt with further findings about options that were set automatically."""
-        if not doubts:
-            return self
-        findings = gravest_first((*self.calibration.findings, *doubts))
-        return replace(
-            self,
-            calibration=replace(self.calibration, findings=findings),
-            check=replace(self.check, findings=gravest_first((*self.check.findings, *doubts))),
-        )
+        return self.with_findings((*self.check.findings, *doubts)) if doubts else self
 
     def with_messages(self, options: Options, messages: Collection[str]) -> "Attempt":
         """Return the attempt with options that were set automatically, and warnings about them."""

@@ -17,6 +17,7 @@ from hand_eye_calib.core.base.errors import printable
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.text import ABOUT, counted, listing, with_sigma
 from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.extras.fleet.records import Recorded
 from hand_eye_calib.extras.fleet.together import row_of_result
 from hand_eye_calib.offline.report.figures import (
     BAD,
@@ -96,34 +97,42 @@ def _trend(result: Calibration, number: int) -> Drawn:
     """
     together = result.parts.get("together")
     recordings = together.recordings if together else ()
-    stamps_ns = np.array([recording.stamp_ns for recording in recordings], dtype="datetime64[ns]")
-    days = date2num(stamps_ns)
-    is_apart = np.array([bool(recording.left_out) for recording in recordings])
     figure = Figure(figsize=(LOOK.width, _HEIGHT), layout="constrained")
     panels = figure.subplots(2, 3, sharex=True).ravel()
     for axis, panel, sigma in zip(_AXES, panels, result.sigmas_measured, strict=True):
-        factor, unit = (100.0, "cm") if axis in "xyz" else (np.degrees(1.0), "deg")
-        points = [(recording.deviations[axis], recording.sigmas[axis]) for recording in recordings]
-        values, sigmas = factor * np.where(np.isfinite(points), points, np.nan).T
-        band = factor * LOOK.sigmas * sigma
-        is_determined = np.isfinite(band)
-        title = f"about {ABOUT[axis]}" if axis in ABOUT else axis
-        title += f", {unit}" if is_determined else ": not determined"
-        panel.set_title(title, loc="left")
-        panel.axhline(0, color=GRID, lw=0.8)
-        if is_determined:
-            panel.axhspan(-band, band, color=PARENT, alpha=0.15, lw=0)
-        # A dot is drawn as a line of length 0, because markers would make a large page.
-        for half, width in ((sigmas, 0.8), (0 * sigmas, 3.2)):
-            ends = np.stack([values - half, values + half, np.full(len(days), np.nan)], axis=1)
-            for group, colour, cap in ((~is_apart, INK, "round"), (is_apart, BAD, "projecting")):
-                line = panel.plot(np.repeat(days[group], 3), ends[group].ravel(), color=colour)
-                line[0].set(lw=width, solid_capstyle=cap)
+        _draw_axis(panel, axis, sigma, recordings)
     locator = AutoDateLocator(minticks=2, maxticks=4)
     panels[0].xaxis.set_major_locator(locator)
     panels[0].xaxis.set_major_formatter(ConciseDateFormatter(locator))
     title = "Each recording against the common extrinsic"
     return as_drawn(figure, f"vehicle-{number}", title, _CAPTION)
+
+
+def _draw_axis(panel: Any, axis: str, sigma: float, recordings: Sequence[Recorded]) -> None:
+    """Draw the differences of recordings from the common value of an axis (m or rad).
+
+    ``sigma`` is the measured standard deviation of the common value.
+    """
+    factor, unit = (100.0, "cm") if axis in "xyz" else (np.degrees(1.0), "deg")
+    stamps_ns = np.array([recording.stamp_ns for recording in recordings], dtype="datetime64[ns]")
+    days = date2num(stamps_ns)
+    is_apart = np.array([bool(recording.left_out) for recording in recordings])
+    points = [(recording.deviations[axis], recording.sigmas[axis]) for recording in recordings]
+    values, sigmas = factor * np.where(np.isfinite(points), points, np.nan).T
+    band = factor * LOOK.sigmas * sigma
+    is_determined = np.isfinite(band)
+    title = f"about {ABOUT[axis]}" if axis in ABOUT else axis
+    title += f", {unit}" if is_determined else ": not determined"
+    panel.set_title(title, loc="left")
+    panel.axhline(0, color=GRID, lw=0.8)
+    if is_determined:
+        panel.axhspan(-band, band, color=PARENT, alpha=0.15, lw=0)
+    # A dot is drawn as a line of length 0, because markers would make a large page.
+    for half, width in ((sigmas, 0.8), (0 * sigmas, 3.2)):
+        ends = np.stack([values - half, values + half, np.full(len(days), np.nan)], axis=1)
+        for group, colour, cap in ((~is_apart, INK, "round"), (is_apart, BAD, "projecting")):
+            line = panel.plot(np.repeat(days[group], 3), ends[group].ravel(), color=colour)
+            line[0].set(lw=width, solid_capstyle=cap)
 
 
 def _values(row: Document) -> list[str]:
