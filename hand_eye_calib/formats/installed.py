@@ -31,7 +31,7 @@ _DESCRIPTIONS = (".urdf", ".xml", ".xacro")
 _DOCUMENTS = (".yaml", ".yml", ".json", ".txt", ".calib")
 _EXPECTED = (
     f"a calibration: extrinsic.yaml of this package, or a file of {', '.join(EXPORT_FORMATS)}; "
-    "parameters of PX4 have a position and no rotation, give six numbers instead"
+    "parameters of PX4 have a position but no rotation; set six numbers instead"
 )
 
 

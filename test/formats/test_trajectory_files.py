@@ -180,7 +180,7 @@ def test_without_a_header_the_columns_must_be_named(file):
     [
         ("t,x,y,z,roll,pitch,a,b", "no column for qx, qy, qz, qw among t, x, .*, b; name all col"),
         ("t,x,y,z,rx [deg],ry [deg],rz [deg],e", NO_QUATERNION),
-        ("t,ax,ay,az,gx,gy,gz,temperature", "gz, temperature .accelerations show no pose.; na"),
+        ("t,ax,ay,az,gx,gy,gz,temperature", "gz, temperature .accelerations contain no pose.; na"),
         ("t,north,east,down,qx,qy,qz,qw", "no column for x, y, z among"),
         (f"t,time,{XYZW[2:]}", "line 1: names 9 columns, but the rows have 8 cells; write one"),
         ("t,time,x,y,z,qx,qy,qz", "columns t, time could all be t; name them|no column for qw"),

@@ -139,7 +139,7 @@ _OTHERS = {
     "halves": (
         "the two halves of the recording disagree",
         "this result claims",
-        "check that both mounts are tight and record again; what the halves agree on holds",
+        "check that both mounts are tight and record again; only axes on which the halves agree are right",
     ),
     "methods": (
         "robust least squares disagrees",
@@ -454,7 +454,7 @@ def _targets(axes: Sequence["_Axis"]) -> str:
 # Faults that no check detects in streams of this quantity, and what the user should do.
 _UNSEEN = {
     "rotations": (
-        "smoothing and slow drift of rotations alone cannot be seen",
+        "smoothing and slow drift of rotations alone cannot be detected",
         "compare with another recording",
     ),
 }

@@ -140,7 +140,7 @@ class Table:
         if missing := [name for name in quantities if name not in columns]:
             listed = self._listed(self.names)
             has_accelerations = re.search(r", a(cc\w*)?_?x", listed)
-            no_pose = " (accelerations show no pose)" if has_accelerations else ""
+            no_pose = " (accelerations contain no pose)" if has_accelerations else ""
             raise InputError(
                 f"{self.path}: no column for {', '.join(missing)} among "
                 f"{listed}{no_pose}; name all columns with `columns`, such as "
