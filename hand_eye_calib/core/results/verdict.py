@@ -139,7 +139,7 @@ _OTHERS = {
     "halves": (
         "the two halves of the recording disagree",
         "this result claims",
-        "check that both mounts are tight and record again; only axes on which the halves agree are right",
+        "check that both mounts are tight and record again; use only axes on which both agree",
     ),
     "methods": (
         "robust least squares disagrees",

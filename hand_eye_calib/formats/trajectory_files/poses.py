@@ -286,10 +286,11 @@ def _of_quaternions(table: Table, names: Sequence[str], positions: FloatArray) -
     ways = {"last": quats, "first": np.roll(quats, -1, axis=1)}
     usual, other = ("first", "last") if names == SCALAR_FIRST else ("last", "first")
     fitting = _fitting(positions, ways)
-    # An odometry starts at the identity.
+    # The first orientation of an odometry is the identity.
     is_identity = {
         way: np.isclose(abs(quats_xyzw[0, 3]), 1.0, rtol=0.0) for way, quats_xyzw in ways.items()
     }
+    # Evidence for the other order than the usual one.
     reason = ""
     if fitting == [other]:
         reason = "the motion then has a steady direction"
