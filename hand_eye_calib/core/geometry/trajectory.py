@@ -525,8 +525,10 @@ def repetitions(trajectory: Trajectory, least_s: float) -> list[tuple[int, int]]
     least_s : float
         Shortest period that is returned, in seconds.
     """
-    is_same = np.abs(np.diff(trajectory.poses, axis=0)).max(axis=(1, 2)) < _SAME_POSE
-    edges = np.flatnonzero(np.diff(np.r_[False, is_same, False].astype(int)))
-    periods_ns = trajectory.stamps_ns[edges].reshape(-1, 2)
+    differences = np.abs(np.diff(trajectory.poses, axis=0))
+    is_same = differences.max(axis=(1, 2)) < _SAME_POSE
+    # A period begins where `is_same` becomes true, and ends where it becomes false.
+    changes = np.diff(np.r_[False, is_same, False].astype(int))
+    periods_ns = trajectory.stamps_ns[np.flatnonzero(changes)].reshape(-1, 2)
     is_long = np.diff(periods_ns, axis=1)[:, 0] >= least_s * 1e9
     return [(from_ns, until_ns) for from_ns, until_ns in periods_ns[is_long].tolist()]

@@ -236,8 +236,10 @@ def without_translation(Q: FloatArray) -> tuple[FloatArray, FloatArray]:
     (B, 3, 10) array
         Factors that map ``(vec R, 1)`` to the best translation (m) with its sign reversed.
     """
+    # The variables without the translation: vec R and 1.
     others = np.append(np.arange(9), 12)
     coupling = Q[:, 9:12][:, :, others]
+    # The pseudo-inverse of the translation block is zero along unobservable directions.
     values, vectors = np.linalg.eigh(Q[:, 9:12, 9:12])
     largest = np.maximum(values[:, -1:], np.finfo(float).tiny)
     is_observed = values > _RANK_TOLERANCE * largest

@@ -235,8 +235,10 @@ def _covariance(hessian: FloatArray, scores: FloatArray, pairs: MotionPairs) -> 
     curvature = 2.0 / 3.0 / _CAUCHY_UNIT**2 * np.einsum("pki,pkj->ij", scores, scores)
     n_poses = int(pairs.j[-1] - pairs.i[0])
     motion = median(pairs.j - pairs.i)
+    # Correlation time in poses, and the window of the sums in pairs.
     lasting = max(_LASTING_SHARE * n_poses, _LASTING_MOTIONS * motion)
-    window = min(max(round(lasting * len(pairs) / n_poses), 1), len(pairs) // 2 + 1)
+    window = round(lasting * len(pairs) / n_poses)
+    window = min(max(window, 1), len(pairs) // 2 + 1)
     # The six unknowns fit some of the errors, so residuals are smaller than errors. The factor
     # n / (n - 6) corrects this; n is the number of motions that do not overlap.
     n_motions = n_poses / motion
