@@ -43,9 +43,10 @@ def on_page_content(html, **_):
 
 def on_page_markdown(markdown, page, config, **_):
     """Links between this folder and the root, which are neighbours on the site; tables of studies
-    are not searched.
+    and the changelog are not searched.
     """
-    if config.not_in_nav.match_file(page.file.src_uri):
+    source = page.file.src_uri
+    if config.not_in_nav.match_file(source) or source == "CHANGELOG.md":
         page.meta["search"] = {"exclude": True}
     if page.file.src_uri in ROOT_PAGES:
         return markdown.replace("](docs/", "](")

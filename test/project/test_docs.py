@@ -9,6 +9,7 @@ import shlex
 import shutil
 
 import example_recording
+import numpy as np
 import pytest
 import yaml
 from source_code import ROOT
@@ -19,7 +20,7 @@ from hand_eye_calib.offline.cli.main import main
 DOCS = ROOT / "docs"
 RUNS_ALL = os.environ.get("HAND_EYE_CALIB_ALL_PAGES") == "1"
 FEW = ("how_to.md", "troubleshooting.md")
-# In all pages but the tables of studies: who reads 250 words a minute is through in two hours.
+# In all pages but the tables of studies: two hours at 250 words a minute.
 MOST_WORDS = 32_000
 # Where a command needs more than files: a node, ROS, a journal, a minute.
 ELSEWHERE = re.compile(r" (calibrator|watch|demo) ?|live/")
@@ -111,3 +112,59 @@ def test_every_public_name_is_on_the_reference_page():
     homes = {f"{public_name.__module__}.{public_name.__name__}" for public_name in public}
     missing = {home for home in homes - described if home.rpartition(".")[0] not in described}
     assert missing == set()
+
+
+# ---- facts that more than one page states, and how a page would contradict them
+
+FACTS = {
+    "a clock rate is estimated": r"constant offset only|rate of (?:a|the) clock cannot",
+    "the key of watch is the same at every start": r"new key (?:at|for) (?:each|every) start",
+    "the goal has an end": r"never (?:says|prints|shows) DONE",
+    "a covariance has the allowance": r"covariance (?:is|are) without the (?:floor|allowance)",
+    "a sigma has the allowance": r"sigmas? (?:is|are) without the (?:floor|allowance)",
+    "a prior has no allowance": r"(?:prior|axis) .{0,40} gets? the allowance",
+    "quaternions are x, y, z, w": r"quaternions? (?:is|are) (?:in the order )?w, ?x, ?y, ?z",
+}
+STATED = {
+    "limits.md": "the time offset must change at a constant rate",
+    "security.md": "The key is the same\n  at every start",
+    "cli.md": "DONE | the goal is reached",
+    "uncertainty.md": "An axis that a prior determines has no allowance",
+    "conventions.md": "x, y, z, w",
+}
+
+
+@pytest.mark.parametrize("fact", FACTS)
+def test_no_page_contradicts_a_fact(fact):
+    for path in (ROOT / "README.md", *DOCS.rglob("*.md")):
+        words = " ".join(path.read_text(encoding="utf-8").split())
+        assert not re.search(FACTS[fact], words, re.IGNORECASE), path.name
+
+
+@pytest.mark.parametrize("name", STATED)
+def test_the_page_of_a_fact_states_it(name):
+    assert STATED[name] in (DOCS / name).read_text(encoding="utf-8")
+
+
+# ---- colours of the site
+
+WHITE = "#ffffff"
+DARK = "#1e2129"  # background of Material's scheme slate
+
+
+def luminance(colour):
+    """Relative luminance of a colour, WCAG 2.2."""
+    channels = np.array([int(colour[start : start + 2], 16) for start in (1, 3, 5)]) / 255
+    linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def test_text_of_the_site_has_a_contrast_of_four_and_a_half():
+    css = (DOCS / "site.css").read_text(encoding="utf-8")
+    rules = re.findall(r"(\[data-md-color[^{]*)\{(.*?)\}", css, re.DOTALL)
+    assert len(rules) >= 4
+    for selector, body in rules:
+        background = luminance(DARK if "slate" in selector else WHITE)
+        for colour in re.findall(r": (#[0-9a-f]{6});", body):
+            lighter, darker = sorted([luminance(colour), background], reverse=True)
+            assert (lighter + 0.05) / (darker + 0.05) >= 4.5, (selector, colour)
