@@ -131,6 +131,10 @@ SEVERAL_RECORDINGS: Registry[Callable[..., int]] = Registry("way to join recordi
 #: installed transform; ``reason`` explains why it is unknown.
 MOUNT_MONITORS: Registry[Callable[..., Any]] = Registry("monitor of the mount")
 
+#: Functions ``compare(arguments)`` of the command ``compare`` for other files than results. They
+#: return the exit code, None for other files.
+COMPARISONS: Registry[Callable[[Any], int | None]] = Registry("comparison")
+
 #: Methods of a result that need a layer above the core: save, plot, report, export.
 RESULT_METHODS: Registry[Callable[..., Any]] = Registry("method of a result")
 

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.base.registry import COMPARISONS
 from hand_eye_calib.core.base.text import amount, distinct_names
 from hand_eye_calib.offline.cli.options import add_json_argument, print_result, waiting_for
 
@@ -17,6 +18,7 @@ examples:
   hand_eye_calib compare result --with robot.urdf
   hand_eye_calib compare result --with "0.40 0 1.85 0 0 -90deg"
   hand_eye_calib compare monday/ tuesday/ wednesday/     which one has moved?
+  hand_eye_calib compare live/digests/                   the history of a monitored mount
 
 exit codes: 0 same, 3 cannot tell, 4 moved; 1 bad input, 2 wrong usage"""
 
@@ -41,6 +43,10 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.core.assessment.comparison import compare
     from hand_eye_calib.formats.results import load_result
 
+    for compare_others in COMPARISONS.values():
+        code = compare_others(arguments)
+        if code is not None:
+            return code
     results = [load_result(path) for path in arguments.results]
     for path, result in zip(arguments.results, results, strict=True):
         if result.status.failure:

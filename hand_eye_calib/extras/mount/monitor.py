@@ -21,6 +21,7 @@ monitor detects.
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime
+from pathlib import Path
 
 import numpy as np
 
@@ -37,10 +38,11 @@ from hand_eye_calib.core.geometry.frames import Extrinsic
 from hand_eye_calib.core.geometry.se3 import sigmas_in_parent
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_between
 from hand_eye_calib.core.results.records import AXES
+from hand_eye_calib.extras.mount.digest import Digest, write_digest
 from hand_eye_calib.online.live.log import NodeLog
 from hand_eye_calib.online.live.progress import AXIS_KEYS
 from hand_eye_calib.online.live.session import LiveSession
-from hand_eye_calib.online.live.state import Level, MountState, by_axis
+from hand_eye_calib.online.live.state import Level, MountState, Outcome, by_axis
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,7 @@ _SECOND_NS = 1_000_000_000
 
 # Covariances of expected shifts: a translation, a rotation, or both. A shift that only rotates the
 # sensor is detected sooner with the second.
-_KNOCKS = np.array(
+KNOCKS = np.array(
     [moved.shift_covariance(radians=1e-6), moved.shift_covariance(1e-6), moved.shift_covariance()]
 )
 
@@ -199,6 +201,7 @@ class MountMonitor:
         self._last_s = -1
         self._motions_per_s = 0.0
         self.alarm: Alarm | None = None
+        self._start_ns = 0
         self.seconds = 0
         self.long_run = TUNING.assumed
 
@@ -216,6 +219,7 @@ class MountMonitor:
             if not _is_motion(second.motions, self._noise):
                 continue
             self.seconds += 1
+            self._start_ns = self._start_ns or second.stamp_ns
             if self.is_learning:
                 self._learn(second)
             else:
@@ -324,7 +328,7 @@ class MountMonitor:
         if len(self._stamps_ns) < _LAGS[0]:
             return
         lags, tables = self._shifts()
-        ratios = moved.log_ratio(tables, _KNOCKS[:, None]).max(axis=0)
+        ratios = moved.log_ratio(tables, KNOCKS[:, None]).max(axis=0)
         best = int(np.argmax(ratios))
         least_ratio = self.alarm.log_ratio if self.alarm else TUNING.threshold
         if ratios[best] < least_ratio:
@@ -367,6 +371,23 @@ class MountMonitor:
         tables = shift_evidence(since, offsets, covariances + self._wander)
         return np.append(lags, n_seconds), tables
 
+    def digest(self, parent_frame: str, child_frame: str) -> Digest | None:
+        """Return what the session says about the mount; None while the noise is learned."""
+        if self.is_learning:
+            return None
+        return Digest(
+            parent_frame=parent_frame,
+            child_frame=child_frame,
+            start_ns=self._start_ns,
+            end_ns=int(self._stamps_ns[-1]),
+            seconds=self.seconds,
+            installed=self._installed,
+            covariance=self._covariance,
+            wander=self._wander,
+            evidence=(self._old + self._seconds.total) / self.long_run,
+            alarm=str(self.alarm) if self.alarm else "",
+        )
+
     def visible(self, seconds: float) -> FloatArray:
         """Return the shifts (6,) that are detected in nine of ten cases.
 
@@ -392,7 +413,7 @@ class MountMonitor:
         covariance = root @ root.T + cov_before
         # The ratio of a shift of z standard deviations along or about an axis is
         # (z^2 - log_volume) / 2.
-        volumes = np.eye(6) + _KNOCKS[:2] @ np.linalg.inv(covariance)
+        volumes = np.eye(6) + KNOCKS[:2] @ np.linalg.inv(covariance)
         log_volumes = np.linalg.slogdet(volumes)[1]
         detected_sigmas = np.sqrt(2.0 * TUNING.threshold + log_volumes) + NINE_TIMES_OUT_OF_TEN
         sigmas = sigmas_in_parent(se3.rotation_of(self._installed), covariance)
@@ -473,6 +494,7 @@ class MountWatch:
         self._why_unknown = why_unknown
         self._monitor: MountMonitor | None = None
         self._last_ns = -1
+        self._frames = ("", "")
 
     def restart(self) -> None:
         """Start again after the stamps have jumped back, without loss of what was learned."""
@@ -489,11 +511,27 @@ class MountWatch:
             snapshot = calibrator.snapshot()
             installed = self._installed(snapshot.parent_frame, snapshot.child_frame)
             if installed is not None:
+                self._frames = snapshot.parent_frame, snapshot.child_frame
                 self._monitor = MountMonitor(installed.T_parent_child, installed.covariance)
         if self._monitor is not None and len(pairs):
             self._last_ns = int(pairs.stamps_ns[-1])
             if alarm := self._monitor.add(pairs):
                 self._log.error(str(alarm))
+
+    def save(self, directory: Path) -> Outcome:
+        """Write the digest of the session; return whether it is written, and a line about it."""
+        digest = self._monitor.digest(*self._frames) if self._monitor else None
+        if digest is None:
+            return False, "no digest of the mount yet: the noise is being learned"
+        try:
+            path = write_digest(directory, digest)
+        except OSError as error:
+            text = f"the digest of the mount is not saved: {error}"
+            self._log.error(text)
+            return False, text
+        text = f"digest of the mount saved to {path}"
+        self._log.info(text)
+        return True, text
 
     def state(self) -> MountState:
         """Return whether the mount has moved, and the shifts that are visible on this robot."""

@@ -135,7 +135,10 @@ class CalibratorNode(ManagedNode):
             return True
         self._cycle.stop(timeout_s)
         is_saved = True
-        if self._cycle.result is not None:
+        if self._mount is not None and self._options.node.output_directory:
+            # A session that is too short for a digest is no failure.
+            self._save_digest()
+        elif self._cycle.result is not None:
             if self._options.node.output_directory:
                 is_saved, _ = self._saver.save(self._options.node)
             else:
@@ -341,7 +344,17 @@ class CalibratorNode(ManagedNode):
         self._publish()
         return response
 
+    def _save_digest(self) -> Outcome:
+        """Write the digest of a monitored session."""
+        directory = self._options.node.output_directory
+        if self._mount is None or not directory:
+            return False, "the digest is not saved: output_directory is not set"
+        saved: Outcome = self._mount.save(output_path(directory))
+        return saved
+
     def _save(self, request: Trigger.Request) -> Outcome:
+        if self._mount is not None:
+            return self._save_digest()
         return self._saver.save(self._options.node)
 
     def _reset(self, request: Trigger.Request) -> Outcome:

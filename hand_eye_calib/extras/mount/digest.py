@@ -1,0 +1,144 @@
+"""Digests of monitored sessions: what a session says about the mount, in a file below 10 kB.
+
+A digest has the evidence ``[H S]`` of the whole session on a shift d of the child sensor from the
+installed extrinsic (:mod:`hand_eye_calib.core.assessment.moved`), divided by its long-run variance.
+Digests of several sessions can be added, and a change between them can be found.
+"""
+
+import json
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.base.plain import from_plain, plain
+
+# Directory of the digests, in the output directory of the node.
+FOLDER = "digests"
+
+# First key of a file, which distinguishes it from other JSON.
+_KIND = "mount_digest"
+
+# Shapes of the arrays.
+_SHAPES = {"installed": (4, 4), "covariance": (6, 6), "wander": (6, 6), "evidence": (6, 7)}
+
+# Largest size of a file (bytes) that is read.
+_LARGEST = 100_000
+
+
+@dataclass(frozen=True, eq=False)
+class Digest:
+    """What one monitored session says about the mount.
+
+    Attributes
+    ----------
+    parent_frame, child_frame : str
+    start_ns, end_ns : int
+        Stamps of the session's motion (ns).
+    seconds : int
+        Seconds of motion.
+    installed : (4, 4) array
+        The installed pose of the child in the parent.
+    covariance : (6, 6) array
+        Covariance of the offset from the installed extrinsic before a shift, in the child's frame.
+    wander : (6, 6) array
+        Covariance of the common-mode error from session to session, in the child's frame.
+    evidence : (6, 7) array
+        ``[H S]`` on a shift in the child's frame.
+    alarm : str
+        Sentence of the monitor's alarm; empty without an alarm.
+    """
+
+    parent_frame: str
+    child_frame: str
+    start_ns: int
+    end_ns: int
+    seconds: int
+    installed: FloatArray
+    covariance: FloatArray
+    wander: FloatArray
+    evidence: FloatArray
+    alarm: str = ""
+
+    @property
+    def day(self) -> str:
+        """Day and time of the session's start (UTC)."""
+        start = datetime.fromtimestamp(self.start_ns * 1e-9, UTC)
+        return start.strftime("%Y-%m-%d %H:%M")
+
+
+def write_digest(directory: Path, digest: Digest) -> Path:
+    """Write a digest into the folder ``digests`` of an output directory, and return its path.
+
+    The name of the file is the time of the session's start, so that files of later sessions follow.
+    """
+    folder = directory / FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    start = datetime.fromtimestamp(digest.start_ns * 1e-9, UTC)
+    path = folder / f"{start:%Y%m%d_%H%M%S}.json"
+    path.write_text(json.dumps({_KIND: 1, **plain(digest)}), encoding="utf-8")
+    return path
+
+
+def read_digest(path: Path) -> Digest | None:
+    """Return the digest in a file; None for any other file.
+
+    Raises
+    ------
+    InputError
+        If the file is a digest that cannot be used.
+    """
+    if not path.is_file() or path.stat().st_size > _LARGEST or path.suffix != ".json":
+        return None
+    try:
+        document: Any = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    if not isinstance(document, dict) or document.pop(_KIND, None) != 1:
+        return None
+    try:
+        for name, shape in _SHAPES.items():
+            document[name] = np.array(document[name], dtype=float)
+            if document[name].shape != shape or not np.isfinite(document[name]).all():
+                raise ValueError(f"{name} must be {shape} finite numbers")
+        digest: Digest = from_plain(Digest, document)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path} is no usable digest: {error}") from None
+    return digest
+
+
+def read_digests(paths: list[Path]) -> list[Digest] | None:
+    """Return the digests in files and folders, the earliest first; None if there is another file.
+
+    Raises
+    ------
+    InputError
+        If a digest cannot be used, or if they are of different mounts.
+    """
+    digests = []
+    for path in paths:
+        folder = path / FOLDER if (path / FOLDER).is_dir() else path
+        files = sorted(folder.glob("*.json")) if folder.is_dir() else [folder]
+        read = [read_digest(file) for file in files]
+        if not read or None in read:
+            return None
+        digests += [digest for digest in read if digest is not None]
+    digests.sort(key=lambda digest: digest.start_ns)
+    first = digests[0]
+    for digest in digests[1:]:
+        frames = digest.parent_frame, digest.child_frame
+        if frames != (first.parent_frame, first.child_frame):
+            raise InputError(
+                f"digests of different mounts: {first.child_frame} in {first.parent_frame}, and "
+                f"{digest.child_frame} in {digest.parent_frame}"
+            )
+        if not np.allclose(digest.installed, first.installed, atol=1e-9):
+            raise InputError(
+                f"the installed transform changed before {digest.day}: compare the digests since "
+                "then"
+            )
+    return digests

@@ -1,0 +1,161 @@
+"""Digests of monitored sessions, and the history of a mount that ``compare`` makes of them."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.pairing.motion_pairs import PosePairs
+from hand_eye_calib.extras.mount.digest import read_digest, read_digests, write_digest
+from hand_eye_calib.extras.mount.history import compare_digests, find_changes
+from hand_eye_calib.extras.mount.monitor import MountMonitor
+
+MOUNT = se3.exp(np.array([0.4, -0.2, 0.7, 0.3, -1.2, 0.6]))
+START_NS = 1_700_000_000_000_000_000
+WEEK_NS = 7 * 86_400 * 1_000_000_000
+
+
+def forklift(duration_s, seed, rate_hz=5.0, mount=MOUNT):
+    """Poses of a forklift on a floor with some slope, and of its sensor with noise."""
+    rng = np.random.default_rng(seed)
+    s = np.arange(0.0, duration_s, 1.0 / rate_hz)
+    turns = np.stack(
+        [
+            0.02 * np.sin(0.31 * s + 1.0),
+            0.03 * np.sin(0.23 * s),
+            1.5 * np.sin(0.11 * s) + 0.4 * np.sin(0.43 * s),
+        ],
+        axis=1,
+    )
+    yaw = turns[:, 2]
+    steps = 1.2 / rate_hz * np.stack([np.cos(yaw), np.sin(yaw), 0.02 * np.sin(0.2 * s)], axis=1)
+    parent = se3.from_rotation_translation(se3.rotation_exp(turns), np.cumsum(steps, axis=0))
+    noise = rng.normal(size=(2, len(s), 6)) * np.repeat([0.003, 0.0008], 3)
+    parent_measured = parent @ se3.exp(noise[0])
+    child = parent @ mount @ se3.exp(noise[1])
+    stamps_ns = START_NS + np.round(s * 1e9).astype(np.int64)
+    return PosePairs(stamps_ns, parent_measured, child)
+
+
+@pytest.fixture(scope="module")
+def session():
+    """Digest of a session of a forklift, ten minutes long."""
+    monitor = MountMonitor(MOUNT, np.zeros((6, 6)))
+    monitor.add(forklift(600.0, seed=1))
+    digest = monitor.digest("lidar", "camera")
+    assert digest is not None
+    return digest
+
+
+def weeks(session, seed, shift=None, since=60, n_weeks=100):
+    """Digests of sessions a week apart, drawn from the evidence of one session.
+
+    The offset of a session has the common-mode error of the digest; its score has the variance of
+    the evidence.
+    """
+    rng = np.random.default_rng(seed)
+    H = session.evidence[:, :6]
+    root = np.linalg.cholesky(H + 1e-9 * np.trace(H) * np.eye(6))
+    wander = np.linalg.cholesky(session.wander)
+    constant = np.linalg.cholesky(session.covariance) @ rng.normal(size=6)
+    digests = []
+    for week in range(n_weeks):
+        offset = constant + wander @ rng.normal(size=6)
+        if shift is not None and week >= since:
+            offset = offset + shift
+        S = H @ offset + root @ rng.normal(size=6)
+        start_ns = START_NS + week * WEEK_NS
+        evidence = np.concatenate([H, S[:, None]], axis=1)
+        changes = {"start_ns": start_ns, "end_ns": start_ns, "evidence": evidence}
+        digests.append(dataclasses.replace(session, **changes))
+    return digests
+
+
+def about_parent(axis, degrees):
+    """Shift (6,) in the child's frame of a rotation about an axis of the parent."""
+    turn = np.zeros(3)
+    turn["xyz".index(axis)] = np.radians(degrees)
+    return np.r_[np.zeros(3), MOUNT[:3, :3].T @ turn]
+
+
+def test_a_digest_is_small_and_read_as_it_was_written(session, tmp_path):
+    path = write_digest(tmp_path, session)
+    assert path.parent == tmp_path / "digests"
+    assert path.stat().st_size < 10_000
+    loaded = read_digest(path)
+    for name in ("installed", "covariance", "wander", "evidence"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(session, name))
+    assert (loaded.child_frame, loaded.seconds, loaded.day) == (
+        "camera",
+        session.seconds,
+        session.day,
+    )
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+def test_a_shift_of_300_mdeg_in_week_60_is_found_within_three_sessions(session, axis):
+    for seed in range(7):
+        digests = weeks(session, 100 + seed, about_parent(axis, 0.3))
+        first = next(n for n in range(1, 101) if find_changes(digests[:n]))
+        assert 60 < first <= 63, (axis, seed, first)
+        changes = find_changes(digests)
+        assert [changepoint.index for changepoint in changes] == [60]
+        row = changes[0].shift.axes[{"x": "roll", "y": "pitch", "z": "yaw"}[axis]]
+        assert row.difference == pytest.approx(np.radians(0.3), abs=3.3 * row.sigma)
+
+
+def test_no_false_alarm_in_20_histories_of_100_weeks(session):
+    for seed in range(20):
+        digests = weeks(session, seed)
+        assert not any(find_changes(digests[:n]) for n in range(1, 101)), seed
+
+
+def test_sessions_of_the_monitor_itself_show_when_the_mount_moved():
+    turned = MOUNT @ se3.exp(about_parent("z", 0.5))
+    digests = []
+    for week, mount in enumerate([MOUNT] * 4 + [turned] * 2):
+        monitor = MountMonitor(MOUNT, np.zeros((6, 6)))
+        monitor.add(forklift(400.0, seed=10 + week, mount=mount))
+        digest = monitor.digest("lidar", "camera")
+        digests.append(dataclasses.replace(digest, start_ns=START_NS + week * WEEK_NS))
+    assert find_changes(digests[:4]) == []
+    (changepoint,) = find_changes(digests)
+    assert changepoint.index == 4
+    assert changepoint.shift.axes["yaw"].difference == pytest.approx(np.radians(0.5), abs=0.002)
+
+
+def test_two_changes_are_found(session):
+    digests = weeks(session, 3, about_parent("z", 0.5), since=30, n_weeks=60)
+    back = weeks(session, 3, None, n_weeks=60)
+    digests[45:] = back[45:]
+    assert [changepoint.index for changepoint in find_changes(digests)] == [30, 45]
+
+
+def test_compare_prints_the_history_of_a_folder(session, tmp_path, capsys):
+    for digest in weeks(session, 5, about_parent("z", 0.5), since=6, n_weeks=10):
+        write_digest(tmp_path, digest)
+    code = compare_digests(SimpleNamespace(results=[str(tmp_path)]))
+    lines = capsys.readouterr().out.splitlines()
+    assert code == 4
+    assert lines[0].startswith("Mount of camera on lidar: moved before 2023-12-26 22:13: ")
+    assert "(10 sessions)" in lines[0]
+    assert len([line for line in lines if line.startswith("  -- moved before")]) == 1
+    assert len(lines) == 1 + 1 + 10 + 1
+
+
+def test_other_files_are_left_to_compare_and_unusable_digests_are_named(session, tmp_path):
+    other = tmp_path / "extrinsic.yaml"
+    other.write_text("a: 1\n")
+    assert compare_digests(SimpleNamespace(results=[str(other)])) is None
+    path = write_digest(tmp_path, session)
+    path.write_text(path.read_text().replace('"seconds"', '"minutes"'))
+    with pytest.raises(InputError, match="is no usable digest"):
+        read_digest(path)
+    moved = dataclasses.replace(session, installed=np.eye(4), start_ns=START_NS + WEEK_NS)
+    write_digest(tmp_path / "b", session)
+    write_digest(tmp_path / "b", moved)
+    with pytest.raises(InputError, match="the installed transform changed before 2023-11-21"):
+        read_digests([tmp_path / "b"])
