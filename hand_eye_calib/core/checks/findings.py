@@ -61,6 +61,12 @@ LIMITS = {
     "late": Limits(4.5, 0.008, 0.008, 0.05),
     # Shift of positions, m. The standard deviation does not contain the noise of the columns.
     "smoothed": Limits(8.0, 0.008, 0.008, 0.02),
+    # Largest distance of a chord from its arc, m.
+    "interpolated": Limits(0.0, 0.0, 0.0, 0.02),
+    # Size of a correction, m of a place 1 m from the sensor.
+    "propagated": Limits(0.0, 0.008, 0.008, 0.03),
+    # Shift of positions by the scatter of the stamps, m. The scatter averages out for the most.
+    "arrival": Limits(0.0, 0.008, 0.008, _NEVER),
     # Factor, less 1.
     "rotation_gain": Limits(6.0, 0.003, 0.003, 0.03),
     # Symmetric part of the matrix between the rates, rad: the error of the rotation is as large.

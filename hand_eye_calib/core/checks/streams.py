@@ -9,6 +9,7 @@ from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.stats import median, quantile
 from hand_eye_calib.core.checks.findings import LIMITS, Finding, finding, graded
+from hand_eye_calib.core.checks.sampling import check_sampling, step_excess
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory, repetitions
 from hand_eye_calib.core.pairing.motion_pairs import find_leap
@@ -104,24 +105,14 @@ def check_stream(
     findings = check_positions(trajectory, stream, max_gap_s)
     if any(finding.code != "gaps" for finding in findings):
         return findings
-    interval_s = np.diff(trajectory.stamps_ns) * 1e-9
-    poses = trajectory.poses
-    translations = np.einsum(
-        "kji,kj->ki", poses[:-1, :3, :3], np.diff(se3.translation_of(poses), axis=0)
-    )
-    rotations = se3.rotation_log(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
-    are_jumps = np.zeros(len(interval_s), dtype=bool)
-    for steps in (translations, rotations):
-        velocities = steps / interval_s[:, None]
-        padded = np.concatenate([velocities[2:0:-1], velocities, velocities[-2:-4:-1]])
-        shifted = [padded[shift : shift + len(velocities)] for shift in range(5)]
-        around = np.partition(shifted, 2, axis=0)[2]
-        excess = np.linalg.norm(velocities - around, axis=1)
-        speed = np.linalg.norm(velocities, axis=1)
+    are_jumps = np.zeros(len(trajectory) - 1, dtype=bool)
+    excesses = step_excess(trajectory)
+    for excess, speed in excesses:
         of_motion = _JUMP_STEPS * quantile(speed, USUAL)
         are_jumps |= excess > max(_JUMP_SIGMAS * (median(excess) + 1e-12), of_motion)
     share = float(are_jumps.mean())
     jumps = graded("jumps", stream, share, options={"method": "dnlo"}, share=share)
+    findings += check_sampling(trajectory, [excess for excess, _ in excesses], stream)
     return [*findings, jumps] if jumps else findings
 
 

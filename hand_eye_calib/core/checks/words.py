@@ -68,6 +68,25 @@ WORDS = {
         "give each its own topic, and calibrate one",
         "two sensors, or two programs, publish on one topic",
     ),
+    "interpolated": FindingWords(
+        "{share:.0%} of {whose} positions lie on straight lines between their neighbours: they are "
+        "interpolated between few measured ones",
+        "give the positions as they were measured",
+    ),
+    "propagated": FindingWords(
+        "{whose} poses are corrected every {interval_s:.2g} s, by {size_m:.2g} m or rad: between "
+        "the corrections they are predicted",
+        "give the poses at the corrections alone, or those of a smoother",
+        "propagation by an IMU or at constant velocity between fixes",
+        severity=Severity.WARNING,
+    ),
+    "arrival": FindingWords(
+        "{whose} stamps scatter by {scatter_ms:.0f} ms, and {share:.0%} follow the stamp before at "
+        "once: at this speed poses are off by {shift_m:.2g} m",
+        "give the stamps of the measurements (header stamps), or a local line through the stamps",
+        "stamps of the arrival of messages that waited in a queue",
+        severity=Severity.WARNING,
+    ),
     "coarse_positions": FindingWords(
         "{whose} positions are multiples of {step_m:.3g} m",
         "write positions with 64 bits and all digits, or relative to a near origin",

@@ -33,6 +33,7 @@ from hand_eye_calib.core.checks.findings import (
     gravest_first,
 )
 from hand_eye_calib.core.checks.response import Regression
+from hand_eye_calib.core.checks.sampling import check_interpolated
 from hand_eye_calib.core.checks.stream_pair import MAX_ROTATION_RAD, MIN_PAIRS
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
@@ -77,14 +78,6 @@ _LAG_S = 0.02
 # Share of the squared residuals that faults must explain, to be reported for positions on another
 # path than the poses.
 _NAMES_UNRELATED = 0.6
-
-# Positions are interpolated if more than this share lies on the line through both neighbours.
-_STRAIGHT_SHARE = 0.5
-# Largest distance from that line (m). Recorded positions scatter more, also on a motorway.
-_STRAIGHT_M = 1e-5
-
-# Shortest step that has a direction (m).
-_MOVES_M = 1e-3
 
 # Largest number of motions in a regression of rotations.
 _MOST_MOTIONS = 3000
@@ -381,21 +374,6 @@ def _lag_of_axis(fitted: PositionFit, stream: str) -> _Suspect:
 def _copied(evidence: str, **residual: Any) -> list[Finding]:
     """Return the finding that one stream was computed from the other."""
     return [finding("not_independent", "both", Severity.ERROR, evidence=evidence, **residual)]
-
-
-def check_interpolated(positions: FloatArray, stream: str) -> list[Finding]:
-    """Detect positions (N, 3) that were interpolated between few measured positions."""
-    steps = np.diff(positions, axis=0)
-    lengths_m = np.linalg.norm(steps, axis=1)
-    is_moving = np.minimum(lengths_m[1:], lengths_m[:-1]) > _MOVES_M
-    if is_moving.sum() < MIN_PAIRS:
-        return []
-    # Distance of each position from the line through its two neighbours.
-    chords = steps[1:] + steps[:-1]
-    areas = np.linalg.norm(se3.cross(steps[:-1], chords), axis=1)
-    distances_m = areas / np.maximum(np.linalg.norm(chords, axis=1), 1e-12)
-    share = float((distances_m[is_moving] < _STRAIGHT_M).mean())
-    return [finding("interpolated", stream, share=share)] if share > _STRAIGHT_SHARE else []
 
 
 def _copied_rotations(pairs: PosePairs, T_parent_child: FloatArray) -> list[Finding]:

@@ -33,11 +33,6 @@ WORDS = {
         "such as the rates of the parent's own gyroscope",
         code="same_frame",
     ),
-    "interpolated": FindingWords(
-        "{share:.0%} of {whose} positions lie on straight lines between their neighbours: they are "
-        "interpolated between few measured ones",
-        "give the positions as they were measured",
-    ),
     "unchecked": FindingWords(
         "{whose} positions are too few to detect delays and smoothing",
         "record longer, or at a higher rate",

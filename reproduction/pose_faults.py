@@ -1,0 +1,282 @@
+"""Two streams of poses with faults of sampling and of dependence, on simulated machines.
+
+``python -m reproduction.pose_faults --seeds 3`` prints a row for each fault: verdicts, findings,
+and results beyond 3.3 standard deviations (with the allowance) that may be used.
+"""
+
+import argparse
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+import hand_eye_calib as hec
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.core.results.records import Severity
+from hand_eye_calib.offline.cli.main import exit_code_of
+from reproduction.coverage.classes import LIDAR_ODOMETRY, VIO, stamps_ns
+from reproduction.coverage.sensor_errors import SensorErrors, draw, sigmas
+from reproduction.part_faults import FAR_SIGMAS, PLATFORMS
+from reproduction.writing import markdown_table, study_parser
+
+_CAMERA = SensorErrors(white=sigmas(0.001, 0.04), walk=sigmas(0.006, 0.05))
+_STEREO = SensorErrors(white=sigmas(0.004, 0.02), walk_by_metre=sigmas(0.004, 0.01))
+
+# Odometry of the child of each platform, and its rate (Hz).
+_CHILDREN: Mapping[str, tuple[SensorErrors, float]] = {
+    "car": (_STEREO, 10.0),
+    "excavator": (VIO, 20.0),
+    "hand": (_CAMERA, 20.0),
+    "drone": (_CAMERA, 20.0),
+    "drone_slam": (VIO, 20.0),
+    "agv": (LIDAR_ODOMETRY, 10.0),
+}
+
+# Targets that a person would set: m and deg.
+_TARGETS = {
+    "car": (0.15, 1.0),
+    "excavator": (0.05, 1.0),
+    "hand": (0.01, 0.5),
+    "drone": (0.05, 0.5),
+    "drone_slam": (0.05, 0.5),
+    "agv": (0.05, 1.0),
+}
+
+# The assumed mount of a computed or fused stream is wrong by 8 cm and 3.5 deg.
+_WRONG_MOUNT = se3.exp(
+    np.array([0.05, -0.05, 0.04, *(np.radians(3.5) * np.array([0.6, -0.48, 0.64]))])
+)
+
+# Standard deviations of the biases of an IMU: m/s^2 and rad/s.
+_IMU_BIAS = np.repeat([0.9, np.radians(1.5)], 3)
+# Time over which a velocity is estimated (s).
+_VELOCITY_S = 0.1
+# Shortest time between two stamps of arrival (s).
+_TOGETHER_S = 0.0008
+
+
+class Streams(NamedTuple):
+    """Streams on one clock, and the extrinsic (4, 4) between them."""
+
+    parent: Trajectory
+    child: Trajectory
+    T_parent_child: FloatArray
+
+
+_Random: TypeAlias = np.random.Generator
+_Damage: TypeAlias = Callable[[Streams, _Random], Streams]
+
+
+def clean(platform: str, seed: int) -> Streams:
+    """Two independent odometries of a platform, with stamps of their own."""
+    kind = PLATFORMS[platform]
+    seeds = (seed, sorted(PLATFORMS).index(platform), 902)
+    motion_rng, mount_rng, parent_rng, child_rng = np.random.default_rng(seeds).spawn(4)
+    motion = kind.motion(motion_rng, kind.duration_s)
+    rotation = se3.rotation_exp(mount_rng.uniform(-1.7, 1.7, 3))
+    lever_arm = kind.lever_m * mount_rng.standard_normal(3) * [1.0, 1.0, 0.7]
+    X = se3.from_rotation_translation(rotation, lever_arm)
+    streams = []
+    errors, rate_hz = _CHILDREN[platform]
+    # Seconds at the start and the end that only the parent has.
+    margin_s = 0.3 + 0.37 / rate_hz
+    for of_sensor, hz, mount, start_s, random in (
+        (kind.odometry, kind.rate_hz, np.eye(4), 0.0, parent_rng),
+        (errors, rate_hz, X, margin_s, child_rng),
+    ):
+        n_poses = round((kind.duration_s - 1.0 - 2.0 * start_s) * hz)
+        times_s: FloatArray = start_s + np.arange(n_poses) / hz
+        twists = motion.twists(times_s) @ se3.adjoint(se3.inverse(mount)).T
+        drawn = draw(of_sensor, motion.at(times_s) @ mount, twists, 1.0 / hz, random)
+        streams.append(Trajectory(stamps_ns(times_s), drawn.poses))
+    return Streams(streams[0], streams[1], X)
+
+
+def _posed(streams: Streams, child: FloatArray) -> Streams:
+    return streams._replace(child=replace(streams.child, poses=child))
+
+
+def interpolated(rate_hz: float) -> _Damage:
+    """Positions of the child at a lower rate, interpolated to its orientations."""
+
+    def damage(streams: Streams, _: _Random) -> Streams:
+        poses = streams.child.poses.copy()
+        rows = np.arange(len(poses))
+        measured = rows[:: max(round(1.0 / (rate_hz * streams.child.interval_s)), 2)]
+        for axis in range(3):
+            poses[:, axis, 3] = np.interp(rows, measured, poses[measured, axis, 3])
+        return _posed(streams, poses)
+
+    return damage
+
+
+def at_constant_velocity(fix_hz: float) -> _Damage:
+    """Poses of the child are predicted at constant velocity between fixes."""
+
+    def damage(streams: Streams, _: _Random) -> Streams:
+        poses = streams.child.poses
+        interval_s = streams.child.interval_s
+        rows = np.arange(len(poses))
+        fixes = rows - rows % round(1.0 / (fix_hz * interval_s))
+        before = np.maximum(fixes - round(_VELOCITY_S / interval_s), 0)
+        twists = se3.log(se3.inverse(poses[before]) @ poses[fixes])
+        twists /= np.maximum(fixes - before, 1)[:, None]
+        return _posed(streams, poses[fixes] @ se3.exp(twists * (rows - fixes)[:, None]))
+
+    return damage
+
+
+def by_imu(fix_hz: float) -> _Damage:
+    """Poses of the child are predicted by an IMU with biases between fixes."""
+
+    def damage(streams: Streams, random: _Random) -> Streams:
+        bias = _IMU_BIAS * random.standard_normal(6)
+        rows = np.arange(len(streams.child))
+        n_between = round(1.0 / (fix_hz * streams.child.interval_s))
+        since_s = (rows % n_between)[:, None] * streams.child.interval_s
+        errors = np.concatenate([0.5 * bias[:3] * since_s**2, bias[3:] * since_s], axis=1)
+        return _posed(streams, streams.child.poses @ se3.exp(errors))
+
+    return damage
+
+
+def late(scatter_s: float) -> _Damage:
+    """Stamps of the child are those of arrival, after delays and in order."""
+
+    def damage(streams: Streams, random: _Random) -> Streams:
+        stamps = streams.child.stamps_ns + np.round(
+            1e9 * random.exponential(scatter_s, len(streams.child))
+        ).astype(np.int64)
+        together_ns = round(1e9 * _TOGETHER_S) * np.arange(len(stamps))
+        stamps = np.maximum.accumulate(stamps - together_ns) + together_ns
+        return streams._replace(child=replace(streams.child, stamps_ns=stamps))
+
+    return damage
+
+
+def computed(noise_m: float) -> _Damage:
+    """The child is computed from the parent through a wrong mount, with noise of its own."""
+
+    def damage(streams: Streams, random: _Random) -> Streams:
+        poses = streams.parent.at(streams.child.stamps_ns, straight=True)
+        noise = noise_m * random.standard_normal((len(poses), 6))
+        noise[:, 3:] *= 0.5
+        return _posed(streams, poses @ streams.T_parent_child @ _WRONG_MOUNT @ se3.exp(noise))
+
+    return damage
+
+
+def _filtered(stream: Trajectory, aims: FloatArray, tau_s: float) -> Trajectory:
+    """Poses of a stream that a filter corrects towards others (N, 4, 4)."""
+    gain = 1.0 - np.exp(-stream.interval_s / tau_s)
+    steps = se3.inverse(stream.poses[:-1]) @ stream.poses[1:]
+    poses = [aims[0]]
+    for step, aim in zip(steps, aims[1:], strict=True):
+        predicted = poses[-1] @ step
+        poses.append(predicted @ se3.exp(gain * se3.log(se3.inverse(predicted) @ aim)))
+    return replace(stream, poses=np.array(poses))
+
+
+def fused(tau_s: float) -> _Damage:
+    """A filter corrects the child by the parent through a wrong mount."""
+
+    def damage(streams: Streams, _: _Random) -> Streams:
+        aims = streams.parent.at(streams.child.stamps_ns)
+        aims = aims @ streams.T_parent_child @ _WRONG_MOUNT
+        return streams._replace(child=_filtered(streams.child, aims, tau_s))
+
+    return damage
+
+
+#: Damage of each fault, and the codes of the findings that name it.
+FAULTS: Mapping[str, tuple[_Damage, frozenset[str]]] = {
+    "positions at 1 Hz interpolated": (interpolated(1.0), frozenset({"interpolated"})),
+    "positions at 2 Hz interpolated": (interpolated(2.0), frozenset({"interpolated"})),
+    "positions at 5 Hz interpolated": (interpolated(5.0), frozenset({"interpolated"})),
+    "predicted at constant velocity, 2 Hz": (at_constant_velocity(2.0), frozenset({"propagated"})),
+    "predicted by an IMU, 1 Hz": (by_imu(1.0), frozenset({"propagated"})),
+    "predicted by an IMU, 2 Hz": (by_imu(2.0), frozenset({"propagated"})),
+    "stamps of arrival, 30 ms": (late(0.03), frozenset({"arrival"})),
+    "computed from the parent": (computed(0.0), frozenset({"not_independent"})),
+    "computed, noise of 3 mm": (computed(0.003), frozenset({"not_independent"})),
+    "corrected by the parent, 0.3 s": (fused(0.3), frozenset({"not_independent"})),
+    "corrected by the parent, 2 s": (fused(2.0), frozenset({"not_independent"})),
+}
+
+
+def faulty(platform: str, fault: str, seed: int) -> Streams:
+    """Streams of a platform with a fault of :data:`FAULTS`; "clean" has none."""
+    streams = clean(platform, seed)
+    if fault == "clean":
+        return streams
+    return FAULTS[fault][0](streams, np.random.default_rng((seed, 903)))
+
+
+def distance(result: Calibration, truth: FloatArray) -> float:
+    """Largest error of a known axis over its standard deviation with the allowance."""
+    T = result.T_parent_child
+    turned = se3.rotation_log(T[:3, :3] @ truth[:3, :3].T)
+    errors = np.concatenate([T[:3, 3] - truth[:3, 3], turned])
+    is_known = np.isfinite(result.sigmas)
+    return float(np.abs(errors[is_known] / result.sigmas[is_known]).max(initial=0.0))
+
+
+def rows(faults: Sequence[str], seeds: Sequence[int]) -> Iterator[dict[str, object]]:
+    """Rows of the table, one for each fault."""
+    for fault in faults:
+        verdicts = Counter[str]()
+        codes = Counter[str]()
+        distances = []
+        n_named = 0
+        n_far = 0
+        for platform, (metres, degrees) in _TARGETS.items():
+            for seed in seeds:
+                streams = faulty(platform, fault, seed)
+                result = hec.calibrate(
+                    streams.parent,
+                    streams.child,
+                    target_translation=metres,
+                    target_rotation=float(np.radians(degrees)),
+                )
+                verdicts[result.verdict.value] += 1
+                serious = {
+                    found.code for found in result.findings if found.severity is not Severity.NOTE
+                }
+                codes.update(serious)
+                n_named += fault != "clean" and bool(serious & FAULTS[fault][1])
+                if result.verdict is not hec.Verdict.DO_NOT_USE:
+                    distances.append(distance(result, streams.T_parent_child))
+                    n_far += result.verdict is hec.Verdict.USE and distances[-1] > FAR_SIGMAS
+        yield {
+            "Fault": fault,
+            "Named": f"{n_named} of {verdicts.total()}",
+            "Verdicts": ", ".join(f"{name} {count}" for name, count in verdicts.most_common()),
+            "Findings": ", ".join(f"{name} {count}" for name, count in codes.most_common()),
+            "USE beyond 3.3 sigma": n_far,
+            "Largest z that is not DO NOT USE": f"{max(distances, default=0.0):.1f}",
+        }
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the table; returns the exit code."""
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    print(markdown_table(rows(arguments.faults or ["clean", *FAULTS], seeds)))
+    return 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the study; returns the exit code."""
+    parser = study_parser("reproduction.pose_faults", __doc__)
+    parser.add_argument("faults", nargs="*", help="rows of the table. Default: all")
+    parser.add_argument("--seeds", type=int, default=1, help="recordings of a kind. Default: 1")
+    parser.add_argument("--first-seed", type=int, default=100, help="Default: 100")
+    return exit_code_of(lambda: run(parser.parse_args(argv)))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
