@@ -9,6 +9,7 @@ import hashlib
 import random
 import re
 import time
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +23,7 @@ import hand_eye_calib as hec
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.stops.closed_form import Stops
-from hand_eye_calib.extras.stops.robot_world import solve
+from hand_eye_calib.extras.stops.robot_world import RobotWorld, solve
 from hand_eye_calib.extras.stops.samples import read_arm_samples
 from reproduction.recordings import between
 from reproduction.writing import markdown_table, study_parser
@@ -116,12 +117,12 @@ def ethz(folder: Path) -> Iterator[Row]:
         A = hand[[i for _, i, _ in fitted]]
         B = eye[[row for _, _, row in fitted]]
         started = time.process_time()
-        fit = solve(Stops.of_one(A, B))
+        fit = solve(Stops(A, B))
         seconds.append(time.process_time() - started)
         A = hand[[i for _, i, _ in held]]
         B = eye[[row for _, _, row in held]]
-        X = fit.Ts_parent_child[0]
-        Z = fit.Ts_world_world[0]
+        X = fit.T_parent_child
+        Z = fit.T_world_world
         motions.append(closure_of_motions(X, A, B))
         poses.append(closure(A, X, Z, B))
     source = f"{names[0]} {digest(files[0])}, {same} of 5 splits"
@@ -142,7 +143,7 @@ def camodocal(folder: Path) -> Iterator[Row]:
     samples = read_arm_samples(path)
     A = samples.robot
     B = samples.tracking
-    X = solve(Stops.of_one(A, B)).Ts_parent_child[0]
+    X = solve(Stops(A, B)).T_parent_child
     motions = [se3.inverse(Ts[:-1]) @ Ts[1:] for Ts in (A, B)]
     angle_deg, apart_mm = closure(motions[0], X, X, motions[1])
     figure = "closure between neighbours"
@@ -155,7 +156,7 @@ def moveit(folder: Path) -> Iterator[Row]:
     """The samples of MoveIt's tests, eye to hand: the camera in the robot's base."""
     path = folder / "independent" / "moveit_samples" / "pose_samples.json"
     samples = read_arm_samples(path)
-    T_base_camera = solve(Stops.of_one(samples.robot, samples.tracking)).Ts_world_world[0]
+    T_base_camera = solve(Stops(samples.robot, samples.tracking)).T_world_world
     published = Rotation.from_euler("XYZ", [0.230, -2.540, 1.950]).as_matrix()
     turned = published.T @ T_base_camera[:3, :3]
     values = " ".join(f"{value:.4f}" for value in T_base_camera[:3, 3])
@@ -165,35 +166,37 @@ def moveit(folder: Path) -> Iterator[Row]:
 
 
 def wise(folder: Path) -> Iterator[Row]:
-    """Eight cameras that see sixteen tags: X of the tags and Z of the cameras in one solve."""
+    """Eight cameras that see sixteen tags: Z of a camera from each of its tags."""
     files = sorted((folder / "independent" / "wise_8_cameras").glob("*_A.csv"))
-    keys = [tuple(int(x) for x in re.findall(r"\d+", path.name)) for path in files]
-    tags, cameras = (sorted({key[side] for key in keys}) for side in (0, 1))
-    parts = []
-    for path, (tag, camera) in zip(files, keys, strict=True):
-        A, B = (_poses_wxyz(path.with_name(path.name.replace("_A", side))) for side in ("_A", "_B"))
-        which = np.full(len(A), tags.index(tag)), np.full(len(A), cameras.index(camera))
-        parts.append((A, B, *which))
-    stops = Stops(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    fits_of_camera: dict[int, list[RobotWorld]] = defaultdict(list)
+    n_stops = 0
     started = time.process_time()
-    fit = solve(stops)
+    for path in files:
+        _, camera = (int(number) for number in re.findall(r"\d+", path.name))
+        A, B = (_poses_wxyz(path.with_name(path.name.replace("_A", side))) for side in ("_A", "_B"))
+        n_stops += len(A)
+        if len(A) < _MIN_STOPS:
+            continue
+        fit = solve(Stops(A, B))
+        if not fit.undetermined().size:
+            fits_of_camera[camera].append(fit)
     seconds = time.process_time() - started
-    sigmas_m = np.sqrt(np.diag(fit.covariance)).reshape(-1, 6)[len(tags) :, :3].mean(axis=1)
-    ours = f"{seconds:.1f} s, sigma {1e3 * sigmas_m.min():.1f}-{1e3 * sigmas_m.max():.1f} mm"
-    figure = f"{len(stops)} stops, {len(cameras)} cameras, {len(tags)} tags in one solve"
-    yield Row("Wise et al.", figure, ours, "none readable", f"{len(files)} pairs of files")
+    sigmas_m = []
     chi2 = []
-    for camera in range(len(cameras)):
-        own = [stops for stops in parts if stops[3][0] == camera and len(stops[0]) >= _MIN_STOPS]
-        fits = [solve(Stops.of_one(A, B)) for A, B, _, _ in own]
-        fits = [fit for fit in fits if not fit.undetermined().size]
-        if len(fits) > 1:
-            weights = np.linalg.inv([fit.covariance[6:, 6:] for fit in fits])
-            Zs = np.array([fit.Ts_world_world[0] for fit in fits])
-            apart = se3.log(se3.inverse(Zs[0]) @ Zs)
-            apart -= np.linalg.solve(weights.sum(axis=0), np.einsum("kij,kj->i", weights, apart))
-            whole = float(np.einsum("ki,kij,kj->", apart, weights, apart))
-            chi2.append(whole / (6.0 * (len(fits) - 1)))
+    for fits in fits_of_camera.values():
+        weights = np.linalg.inv([fit.covariance[6:, 6:] for fit in fits])
+        covariance = np.linalg.inv(weights.sum(axis=0))
+        sigmas_m.append(np.sqrt(np.diag(covariance))[:3].mean())
+        if len(fits) == 1:
+            continue
+        Zs = np.array([fit.T_world_world for fit in fits])
+        apart = se3.log(se3.inverse(Zs[0]) @ Zs)
+        apart -= covariance @ np.einsum("kij,kj->i", weights, apart)
+        whole = float(np.einsum("ki,kij,kj->", apart, weights, apart))
+        chi2.append(whole / (6.0 * (len(fits) - 1)))
+    ours = f"{seconds:.1f} s, sigma {1e3 * min(sigmas_m):.1f}-{1e3 * max(sigmas_m):.1f} mm"
+    figure = f"{n_stops} stops, {len(fits_of_camera)} cameras: mean of the poses from their tags"
+    yield Row("Wise et al.", figure, ours, "none readable", f"{len(files)} pairs of files")
     figure = f"poses of a camera from tags of {_MIN_STOPS} stops and more, chi-square per degree"
     ours = f"{np.median(chi2):.1f} ({min(chi2):.1f}-{max(chi2):.1f})"
     yield Row("Wise et al.", figure, ours, "", f"median of {len(chi2)} cameras")

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.geometry import se3
 
 # Starts from a few random stops each: two in three are clean with a tenth of outliers.
@@ -29,28 +28,16 @@ class Stops:
         A_i, in the parent's world.
     Ts_world_child : (N, 4, 4) array
         B_i, in the child's world.
-    child, world : (N,) int arrays
-        Numbers of the child sensor (camera) and of its world (target); zeros if there is one.
     """
 
     Ts_world_parent: FloatArray
     Ts_world_child: FloatArray
-    child: IntArray
-    world: IntArray
-
-    @classmethod
-    def of_one(cls, Ts_world_parent: FloatArray, Ts_world_child: FloatArray) -> "Stops":
-        """Return stops of one child and one world of it."""
-        zeros = np.zeros(len(Ts_world_parent), dtype=np.int64)
-        return cls(Ts_world_parent, Ts_world_child, zeros, zeros)
 
     def __len__(self) -> int:
-        return len(self.child)
+        return len(self.Ts_world_parent)
 
     def __getitem__(self, rows: IntArray | BoolArray) -> "Stops":
-        A = self.Ts_world_parent[rows]
-        B = self.Ts_world_child[rows]
-        return Stops(A, B, self.child[rows], self.world[rows])
+        return Stops(self.Ts_world_parent[rows], self.Ts_world_child[rows])
 
 
 def closest_rotations(
@@ -74,43 +61,8 @@ def closest_rotations(
     return X, Z
 
 
-def start_poses(stops: Stops, counts: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return X (C, 4, 4) of all children and Z (W, 4, 4) of all worlds.
-
-    The pair with most stops is first; then pairs follow of which one side has a pose.
-
-    Raises
-    ------
-    NotEnoughDataError
-        If some pairs share no child or world with the others, directly or through further ones.
-    """
-    n_children, n_worlds = counts.shape
-    Xs = np.zeros((n_children, 4, 4))
-    Zs = np.zeros((n_worlds, 4, 4))
-    has_X = np.zeros(n_children, dtype=bool)
-    has_Z = np.zeros(n_worlds, dtype=bool)
-    while not (has_X.all() and has_Z.all()):
-        is_next = has_X[:, None] ^ has_Z
-        next_counts = np.where(is_next, counts, 0) if has_X.any() else counts
-        if not next_counts.any():
-            raise NotEnoughDataError("the stops of some sensors or targets are tied to no others")
-        child, world = np.unravel_index(np.argmax(next_counts), counts.shape)
-        pair = stops[(stops.child == child) & (stops.world == world)]
-        A = pair.Ts_world_parent
-        B = pair.Ts_world_child
-        if has_X[child]:
-            Zs[world] = _most_central(A @ Xs[child] @ se3.inverse(B))
-        elif has_Z[world]:
-            Xs[child] = _most_central(se3.inverse(A) @ Zs[world] @ B)
-        else:
-            Xs[child], Zs[world] = _robust_start(pair)
-        has_X[child] = True
-        has_Z[world] = True
-    return Xs, Zs
-
-
 def _closed_form(stops: Stops) -> tuple[FloatArray, FloatArray]:
-    """Return X and Z (4, 4) of one child and one world."""
+    """Return X and Z (4, 4) by least squares."""
     R_A = se3.rotation_of(stops.Ts_world_parent)
     R_B = se3.rotation_of(stops.Ts_world_child)
     R_X, R_Z = closest_rotations(R_A, R_B)
@@ -125,7 +77,7 @@ def _closed_form(stops: Stops) -> tuple[FloatArray, FloatArray]:
     return X, Z
 
 
-def _robust_start(stops: Stops) -> tuple[FloatArray, FloatArray]:
+def robust_start(stops: Stops) -> tuple[FloatArray, FloatArray]:
     """Return the best of the closed forms of all stops and of a few, by the median error."""
     random = np.random.default_rng(0)
     n = len(stops)
@@ -139,12 +91,6 @@ def _robust_start(stops: Stops) -> tuple[FloatArray, FloatArray]:
         between = se3.inverse(stops.Ts_world_child) @ se3.inverse(Z)
         errors.append(between @ stops.Ts_world_parent @ X)
     return candidates[int(np.argmin(_logs_of_medians(np.stack(errors))))]
-
-
-def _most_central(Ts: FloatArray) -> FloatArray:
-    """Return the transform (4, 4) of (N, 4, 4) with the smallest median distance to the others."""
-    between = se3.inverse(Ts)[:, None] @ Ts
-    return Ts[int(np.argmin(_logs_of_medians(between)))]
 
 
 def _logs_of_medians(errors: FloatArray) -> FloatArray:

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import ConfigError, InputError, located
@@ -29,6 +30,9 @@ from hand_eye_calib.core.base.text import shown_value
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import pose_stack
 from hand_eye_calib.formats.files import read_text
+
+# Axes of the angles as SciPy names them: small letters are fixed axes, capitals moving ones.
+_AXES = {"fanuc": "xyz", "kawasaki": "ZYZ", "kuka": "ZYX", "yaskawa": "xyz"}
 
 #: Robots whose angles are known.
 ROBOTS = ("abb", "fanuc", "kawasaki", "kuka", "ur", "yaskawa")
@@ -73,16 +77,8 @@ def _rotations(angles: FloatArray, robot: str) -> FloatArray:
     """Return the rotations (N, 3, 3) of three angles (N, 3)."""
     if robot == "ur":
         return se3.rotation_exp(angles)
-    if robot == "kawasaki":
-        y, z = np.eye(3)[1:]
-        first, second, third = [
-            se3.rotation_exp(angle_rad[:, None] * axis)
-            for angle_rad, axis in zip(np.radians(angles.T), (z, y, z), strict=True)
-        ]
-        return np.asarray(first @ second @ third)
-    # KUKA begins with the angle about z.
-    rpy_deg = angles[:, ::-1] if robot == "kuka" else angles
-    return se3.rotation_from_rpy(np.radians(rpy_deg))
+    rotations = Rotation.from_euler(_AXES[robot], angles, degrees=True)
+    return np.asarray(rotations.as_matrix())
 
 
 def read_robot_poses(path: Path, robot: str) -> FloatArray:

@@ -6,7 +6,6 @@ together break this, and so do Euler angles that were read as rotation vectors.
 """
 
 from collections.abc import Callable, Iterator
-from operator import attrgetter
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -135,21 +134,16 @@ def _check_shifted_block(of_parent: FloatArray, of_child: FloatArray) -> Iterato
         Angles between the stops of each side, rad.
     """
     blocks = [_likeliest_block(of_parent, of_child), _likeliest_block(of_child, of_parent)]
-    best = max(blocks, key=attrgetter("gain"))
-    if best.gain > _LEAST_BLOCK_GAIN:
-        text = f"from row {best.first_row + 1} on if one side is moved by one row"
+    gain, first_row = max(blocks)
+    if gain > _LEAST_BLOCK_GAIN:
+        text = f"from row {first_row + 1} on if one side is moved by one row"
         yield finding("rows", text=text)
 
 
-class _Block(NamedTuple):
-    """Rows from ``first_row`` on that are shifted, and the gain of log likelihood per pair."""
+def _likeliest_block(of_one: FloatArray, of_other: FloatArray) -> tuple[float, int]:
+    """Return gain and first row of the likeliest block in which row i belongs to row i + 1.
 
-    first_row: int
-    gain: float
-
-
-def _likeliest_block(of_one: FloatArray, of_other: FloatArray) -> _Block:
-    """Return the likeliest block of rows in which row i of one side belongs to row i + 1.
+    The gain is that of the log likelihood, per pair of stops.
 
     Differences of the angles (N, N) between stops have a Cauchy distribution. Its scale is the
     20 % quantile in place or shifted by one row: whichever is smaller.
@@ -168,9 +162,8 @@ def _likeliest_block(of_one: FloatArray, of_other: FloatArray) -> _Block:
     for first in range(n):
         cost = in_place[:first, :first].sum() + shifted[first:, first:].sum()
         costs.append(cost + 2.0 * across[:first, first:].sum())
-    first_row = int(np.argmin(costs))
-    gain = (in_place.sum() - costs[first_row]) / (n * (n - 1))
-    return _Block(first_row, float(gain))
+    gain = (in_place.sum() - min(costs)) / (n * (n - 1))
+    return float(gain), int(np.argmin(costs))
 
 
 # ------------------------------------------------------------------ angles read otherwise

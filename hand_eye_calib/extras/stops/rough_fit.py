@@ -82,7 +82,7 @@ class StopPoses:
             B = se3.inverse(B)
         if mistakes.is_inverse:
             A = se3.inverse(A)
-        return Stops.of_one(A, B)
+        return Stops(A, B)
 
 
 @dataclass(frozen=True)

@@ -307,7 +307,7 @@ def _is_not_one(poses: StopPoses, free: Reading, as_given: Reading) -> bool:
     """Return whether an estimated scale is certainly not 1, by the ratio of likelihoods."""
     if abs(np.log(free.scale)) < _SCALE_SHARE:
         return False
-    least_gain = 0.5 * _SCALE_SIGMAS**2 * free.fit.inflation
+    least_gain = 0.5 * _SCALE_SIGMAS**2 * free.fit.scale_inflation
     gain = as_given.fit.objective - free.fit.objective
     if free.scale < 1.0 and gain > least_gain:
         gain = _gain_in_measured_lengths(poses, free, as_given)
