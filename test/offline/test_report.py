@@ -278,7 +278,8 @@ def test_stops_have_a_page(tmp_path):
     stops = hec.calibrate_stops(poses, disturbed(child_of(poses), 1, 1e-3, 1e-3))
     page = Page(stops.report(tmp_path / "report.html").read_text(encoding="utf-8"))
     assert page.errors == []
-    assert [a["id"] for a in page.all("figure")] == ["figure-views", "figure-residuals"]
+    names = [a["id"] for a in page.all("figure")]
+    assert names == ["figure-views", "figure-stops", "figure-residuals"]
     assert "Half of the 40 stops agree with the result to" in page.text
 
 

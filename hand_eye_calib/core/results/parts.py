@@ -85,9 +85,23 @@ class Part:
         """Return lines of text about the part of a result."""
         return self._details(value, result) if self._details else []
 
+    def facts(self, value: Any, result: Any) -> list[str]:
+        """Return further lines, which are printed if a person asks for all details."""
+        return []
+
+    def advice(self, value: Any, result: Any) -> str:
+        """Return what to record next, for a result that is not USE; empty without advice."""
+        return ""
+
     def headline(self, value: Any) -> str:
         """Return a note on the part for the headline of a usable result; empty without a note."""
         return ""
+
+
+def advice_of(result: Any) -> list[str]:
+    """Return what to record next, by the parts of a result that have advice."""
+    advice = [part(name).advice(value, result) for name, value in result.parts.items()]
+    return [text for text in advice if text]
 
 
 @cache

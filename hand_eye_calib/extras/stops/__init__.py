@@ -22,6 +22,7 @@ def register() -> None:
     """Register the command ``arm``, and stops for ``calibrate``."""
     COMMANDS["arm"] = Command("calibrate the camera of an arm from its stops", _arm)
     RESULT_PARTS["worlds"] = _worlds
+    RESULT_PARTS["stops"] = _stops
     FINDING_WORDS["stops"] = _words
     PUBLIC_NAMES["calibrate_arm"] = "hand_eye_calib.extras.stops.calibrate"
     PUBLIC_NAMES["calibrate_stops"] = "hand_eye_calib.extras.stops.calibrate"
@@ -111,6 +112,12 @@ def _worlds() -> Any:
     from hand_eye_calib.extras.stops.worlds import WorldsPart
 
     return WorldsPart()
+
+
+def _stops() -> Any:
+    from hand_eye_calib.extras.stops.stop_table import StopsPart
+
+    return StopsPart()
 
 
 def _words() -> Any:

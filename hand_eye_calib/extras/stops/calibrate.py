@@ -1,6 +1,7 @@
 """Calibrations from stops of an arm or of two sensors: ``A X = Z B`` checked, solved and judged."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,9 +20,11 @@ from hand_eye_calib.core.geometry.frames import pose_stack
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.records import Residuals
 from hand_eye_calib.extras.stops.checks import LEAST_LEAD
+from hand_eye_calib.extras.stops.next_stops import advice_in_words, next_stops
 from hand_eye_calib.extras.stops.robot_world import MIN_STOPS, RobotWorld
 from hand_eye_calib.extras.stops.rough_fit import StopPoses
 from hand_eye_calib.extras.stops.solving import Reading, SolvedStops, solve_checked
+from hand_eye_calib.extras.stops.stop_table import StopTable, stop_table
 from hand_eye_calib.extras.stops.worlds import SETUPS, Worlds
 
 # Options that stops obey, and the beginnings of the names of further ones.
@@ -257,7 +260,7 @@ def _is_copy(fit: RobotWorld) -> bool:
     Both sides then hold the same poses: camera and target cannot both be exactly at the origins of
     hand and base.
     """
-    offsets = np.r_[se3.log(fit.Ts_parent_child[0]), se3.log(fit.Ts_world_world[0])]
+    offsets = np.r_[se3.log(fit.T_parent_child), se3.log(fit.T_world_world)]
     sigmas = np.sqrt(np.diag(fit.covariance))
     return bool(np.all(np.abs(offsets) < np.maximum(_IDENTITY, _IDENTITY_SIGMAS * sigmas)))
 
@@ -279,8 +282,8 @@ def _check_distances(reading: Reading, frames: Mapping[str, str]) -> list[Findin
     fit = reading.fit
     if fit.undetermined().size or not se3.translation_of(reading.stops.Ts_world_child).any():
         return []
-    on_hand_m = float(np.linalg.norm(se3.translation_of(fit.Ts_parent_child[0])))
-    from_base_m = float(np.linalg.norm(se3.translation_of(fit.Ts_world_world[0])))
+    on_hand_m = float(np.linalg.norm(se3.translation_of(fit.T_parent_child)))
+    from_base_m = float(np.linalg.norm(se3.translation_of(fit.T_world_world)))
     moving = frames["camera"]
     fixed = frames["target"]
     if reading.is_inverse:
@@ -338,8 +341,8 @@ def _calibration_of(solved: SolvedStops, warnings: Sequence[str], frames: _Frame
     config = solved.config
     if solved.is_usable:
         solved = solved.adding(*_check_left_out(fit.weights))
-    X = fit.Ts_parent_child[0]
-    Z = fit.Ts_world_world[0]
+    X = fit.T_parent_child
+    Z = fit.T_world_world
     covariance_X = fit.covariance[:6, :6]
     covariance_Z = fit.covariance[6:, 6:]
     unknown = fit.undetermined()
@@ -358,6 +361,9 @@ def _calibration_of(solved: SolvedStops, warnings: Sequence[str], frames: _Frame
         end_ns=rows,
     )
     worlds = Worlds(Z, covariance_Z, frames.parent_world, frames.child_world, frames.setup)
+    table = StopTable(stop_table(errors, fit.weights, stops.Ts_world_child))
+    if solved.is_usable:
+        table = _with_advice(table, solved, frames)
     return calibration_of(
         fit,
         fused,
@@ -374,8 +380,22 @@ def _calibration_of(solved: SolvedStops, warnings: Sequence[str], frames: _Frame
         scale_sigma=solved.reading.scale_sigma,
         parent_frame=config.parent_frame or frames.parent,
         child_frame=config.child_frame or frames.child,
-        parts={"worlds": worlds},
+        parts={"worlds": worlds, "stops": table},
     )
+
+
+def _with_advice(table: StopTable, solved: SolvedStops, frames: _Frames) -> StopTable:
+    """Return the table of stops with advice on the next ones."""
+    config = solved.config
+    is_beside = frames.setup == "beside"
+    hand = config.parent_frame or frames.parent
+    if is_beside:
+        hand = frames.parent_world
+    targets = np.repeat([config.target_translation, config.target_rotation], 3)
+    reading = solved.reading
+    start, following = next_stops(reading.stops, reading.fit, hand, is_beside, targets)
+    advice = advice_in_words(start + 1, following)
+    return replace(table, start=start + 1, next=following, advice=advice)
 
 
 def _without_positions(covariance: FloatArray) -> FloatArray:

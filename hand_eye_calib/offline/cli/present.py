@@ -21,7 +21,7 @@ from hand_eye_calib.core.results.document import (
     transforms_of,
     usable_numbers,
 )
-from hand_eye_calib.core.results.parts import part
+from hand_eye_calib.core.results.parts import advice_of, part
 from hand_eye_calib.core.results.records import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.core.results.verdict import shown
 from hand_eye_calib.offline.cli.options import (
@@ -160,6 +160,8 @@ def as_lines(
         )
     if with_details:
         details += [f"{name}: {value}" for name, value in summary(calibration).items()]
+        for name, value in calibration.parts.items():
+            details += part(name).facts(value, calibration)
     if details:
         lines.append("Details")
     for detail in details:
@@ -250,6 +252,7 @@ def next_steps(
             if motion := what_is_missing(excitation(snapshot.pose_pairs), calibration):
                 steps.append(motion)
         extra += [f"--prior {axis}=VALUE+/-SIGMA" for axis in calibration.hidden[:3]]
+    steps += advice_of(calibration)
     if extra:
         typed = shlex.join(arguments.typed)
         steps.append(f"hand_eye_calib {typed} {' '.join(dict.fromkeys(extra))}")

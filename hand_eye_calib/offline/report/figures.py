@@ -215,6 +215,8 @@ def figures_of(calibration: Calibration, evidence: Evidence | None) -> list[Draw
         figures.append(figure_of_views([calibration]))
         if evidence:
             figures.append(_trajectories(calibration, evidence))
+        if "stops" in calibration.parts:
+            figures.append(_figure_of_stops(calibration))
     if calibration.motion_residuals:
         figures.append(_residuals(calibration, calibration.motion_residuals))
     if evidence:
@@ -229,6 +231,39 @@ def figure_of_views(calibrations: Sequence[Calibration]) -> Drawn:
     figure, panels = _figure(3.1, 1, 3, gap=0.36)
     draw_views(panels, *calibrations)
     return as_drawn(figure, "views", "The sensors in space", caption_of_views(*calibrations))
+
+
+@page_style()
+def _figure_of_stops(calibration: Calibration) -> Drawn:
+    """Draw the places and viewing directions of the child at all stops, in its world."""
+    rows = calibration.parts["stops"].rows
+    positions = np.array([row.position_m for row in rows])
+    directions = np.array([row.direction for row in rows])
+    is_used = np.array([row.is_used for row in rows])
+    # A line of the viewing direction is a quarter of the usual distance.
+    line_m = 0.25 * float(np.median(np.linalg.norm(positions, axis=1)))
+    child = calibration.child_frame
+    world = calibration.parts["worlds"].child_world_frame
+    figure, panels = _figure(3.6, 1, 3, bottom=0.85, gap=0.36)
+    for panel, axes in zip(panels, _VIEWS, strict=True):
+        shown = ["xyz".index(axis) for axis in axes]
+        ends = positions + line_m * directions
+        lines = np.stack([positions, ends], axis=1)[:, :, shown]
+        panel.plot(*lines.T, color=MUTED, lw=0.7)
+        points = positions[:, shown]
+        panel.plot(*points[is_used].T, "o", color=CHILD, ms=3.5, label=plain_label(child))
+        if not is_used.all():
+            panel.plot(*points[~is_used].T, "x", color=BAD, ms=5.5, label="left out")
+        panel.plot(0.0, 0.0, "s", color=PARENT, ms=6, label=plain_label(world))
+        panel.set(xlabel=f"{axes[0]} (m)", ylabel=f"{axes[1]} (m)")
+        panel.set_aspect("equal", adjustable="datalim")
+    handles = panels[0].get_legend_handles_labels()
+    figure.legend(*handles, loc="lower center", ncols=3, borderaxespad=0)
+    caption = (
+        f"Places of {child} at the {len(rows)} stops in the axes of {world}; a line is the viewing "
+        f"direction (z of {child}). Good stops view {world} from several sides."
+    )
+    return as_drawn(figure, "stops", "The stops", caption)
 
 
 @page_style()

@@ -21,13 +21,16 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
 from hand_eye_calib.core.results.document import (
+    Notation,
     allowance_in_words,
+    extra_transforms,
     parts_of_sigmas,
     printed_numbers,
     summary,
     transforms_of,
     usable_numbers,
 )
+from hand_eye_calib.core.results.parts import advice_of
 from hand_eye_calib.core.results.records import ROTATIONS
 from hand_eye_calib.core.results.verdict import shown, target_of
 from hand_eye_calib.offline.report.evidence import Evidence, gather, summarise
@@ -128,6 +131,8 @@ def render(
     advice = ""
     if evidence and calibration.verdict is not Verdict.DO_NOT_USE:
         advice = what_is_missing(evidence.excitation, calibration)
+    if calibration.verdict is not Verdict.USE:
+        advice = "; ".join(filter(None, [advice, *advice_of(calibration)]))
     parent_is_positions = evidence is not None and evidence.has_positions_of_parent
     return page(
         _FOLDER / "report.html",
@@ -142,6 +147,8 @@ def render(
         rotating=child if parent_is_positions else parent,
         kind=_kind_of_result(calibration),
         directions=[*transforms_of(calibration).values()][:2],
+        others=_other_transforms(calibration),
+        stops=calibration.parts.get("stops"),
         numbers_of=partial(printed_numbers, out_of_reach=calibration.out_of_reach, sign="±"),
         parts_of=parts_of_sigmas,
         axes=list(_axes(calibration)),
@@ -167,6 +174,15 @@ def render_brief(calibration: Calibration) -> str:
         allowance=allowance_in_words(calibration),
         views=figure_of_views([calibration]),
     )
+
+
+def _other_transforms(calibration: Calibration) -> list[tuple[Notation, tuple[str, str]]]:
+    """Return the transforms of parts, such as the target in the base, with source and target."""
+    transforms = transforms_of(calibration)
+    return [
+        (transforms[name], (printable(extra.source), printable(extra.target)))
+        for name, extra in extra_transforms(calibration).items()
+    ]
 
 
 def _kind_of_result(calibration: Calibration) -> str:
