@@ -1,4 +1,4 @@
-"""Positions alone and rates alone with faults made on purpose, on simulated machines.
+"""Positions, rates or rotations alone with faults made on purpose, on simulated machines.
 
 ``python -m reproduction.part_faults positions --seeds 3`` prints a row for each fault: verdicts,
 findings, and results beyond 3.3 standard deviations (with the allowance) that may be used.
@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.arrays import FloatArray
@@ -67,6 +68,8 @@ _BIAS = 0.01
 _RATE_NOISE = np.radians(0.1)
 _BIAS_WALK = np.radians(0.002)
 _LATE_S = 0.005
+# Steps of a coarse gyroscope (rad/s).
+_RATE_STEP = np.radians(2.0)
 
 # The rotation of the child's rates turns by this (rad) when the mount moves.
 _TURNED = np.radians(2.0) * np.array([0.6, 0.48, 0.64])
@@ -215,18 +218,42 @@ def _moved(rates: FloatArray) -> FloatArray:
     return np.concatenate([rates[:half], rates[half:] @ se3.rotation_exp(_TURNED)])
 
 
+def _clipped(rates: FloatArray) -> FloatArray:
+    limit = 0.6 * np.abs(rates).max()
+    return np.clip(rates, -limit, limit)
+
+
+def _stepped(rates: FloatArray) -> FloatArray:
+    return np.round(rates / _RATE_STEP) * _RATE_STEP
+
+
+def _smoothed(values: FloatArray) -> FloatArray:
+    return gaussian_filter1d(values, 0.25 * _FINE_HZ, 0, mode="nearest")
+
+
 # What a fault makes of the rates (N, 3) of a gyroscope.
 _OF_RATES: Mapping[str, Callable[[FloatArray], FloatArray]] = {
     "clean": lambda rates: rates,
     "own rates": lambda rates: rates,
+    "copied, turned": lambda rates: rates,
     "axis misaligned 3 deg": _misaligned,
     "gain of an axis 1.03": lambda rates: rates * [1.03, 1.0, 1.0],
-    "delayed 150 ms": lambda rates: rates,
+    "delayed 100 ms": lambda rates: rates,
     "mount moved 2 deg": _moved,
     "two axes swapped": lambda rates: rates[:, [1, 0, 2]],
     "sign of an axis": lambda rates: rates * [-1.0, 1.0, 1.0],
     "bias walks": lambda rates: rates,
-    "low-passed 100 ms": lambda rates: _low_passed(rates, 0.1),
+    "low-passed 200 ms": lambda rates: _low_passed(rates, 0.2),
+    "smoothed 250 ms": _smoothed,
+    "clipped": lambda rates: rates,
+    "steps of 2 deg/s": lambda rates: rates,
+    "degrees": lambda rates: np.degrees(rates),
+}
+
+# What a fault makes of measured rates (N, 3), with bias and noise.
+_OF_MEASURED_RATES: Mapping[str, Callable[[FloatArray], FloatArray]] = {
+    "clipped": _clipped,
+    "steps of 2 deg/s": _stepped,
 }
 
 OF_RATES = tuple(_OF_RATES)
@@ -240,6 +267,8 @@ def rates(platform: str, fault: str, seed: int) -> Recording:
     motion = kind.motion(motion_rng, kind.duration_s)
     rotation = se3.rotation_exp(mount_rng.uniform(-1.7, 1.7, 3))
     parent = _odometry(kind, motion, odometry_rng)
+    if fault == "copied, turned":
+        return Recording(parent, _differentiated(parent, rotation), rotation)
     fine_s = np.arange(round(kind.duration_s * _FINE_HZ)) / _FINE_HZ
     own = motion.twists(fine_s)[:, 3:]
     measured = _OF_RATES[fault](own if fault == "own rates" else own @ rotation)
@@ -248,12 +277,113 @@ def rates(platform: str, fault: str, seed: int) -> Recording:
     walk = _BIAS_WALK * (30.0 if fault == "bias walks" else 1.0)
     steps = random.standard_normal(measured.shape) / np.sqrt(_FINE_HZ)
     measured += walk * np.cumsum(steps, axis=0)
-    late_s = 0.15 if fault == "delayed 150 ms" else _LATE_S
+    if fault in _OF_MEASURED_RATES:
+        measured = _OF_MEASURED_RATES[fault](measured)
+    late_s = 0.1 if fault == "delayed 100 ms" else _LATE_S
     child = Trajectory.from_rates(stamps_ns(fine_s - late_s), measured, "imu")
     return Recording(parent, child, rotation)
 
 
-KINDS = {"positions": (positions, OF_POSITIONS), "rates": (rates, OF_RATES)}
+def _differentiated(parent: Trajectory, rotation: FloatArray) -> Trajectory:
+    """Rates that were computed from the orientations of the parent, as a TF tree does."""
+    orientations = parent.poses[:, :3, :3] @ rotation
+    steps = se3.rotation_log(np.swapaxes(orientations[:-1], 1, 2) @ orientations[1:])
+    intervals_s = np.diff(parent.stamps_ns) * 1e-9
+    middles_ns = (parent.stamps_ns[:-1] + parent.stamps_ns[1:]) // 2
+    return Trajectory.from_rates(middles_ns, steps / intervals_s[:, None], "imu")
+
+
+# Orientations of an attitude sensor: rate (Hz), white noise (rad), drift (rad per root s).
+_ATTITUDE_HZ = 50.0
+_ATTITUDE_NOISE = np.radians(0.1)
+_ATTITUDE_WALK = np.radians(0.02)
+
+# Matrix that exchanges x and y: orientations about left-handed axes.
+_SWAPPED = np.eye(3)[[1, 0, 2]]
+
+
+def _yaws(rotations: FloatArray) -> FloatArray:
+    return np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0])
+
+
+def _about_z(angles: FloatArray) -> FloatArray:
+    return se3.rotation_exp(angles[:, None] * [0.0, 0.0, 1.0])
+
+
+def _filtered(rotations: FloatArray, of_values: Callable[[FloatArray], FloatArray]) -> FloatArray:
+    flat = of_values(rotations.reshape(-1, 9))
+    return se3.nearest_rotation(flat.reshape(-1, 3, 3))
+
+
+def _put_wrong(rotations: FloatArray, **convention: str) -> FloatArray:
+    poses = se3.from_rotation_translation(rotations, np.zeros(3))
+    return se3.rotation_of(se3.put_right(poses, **convention))
+
+
+# What a fault makes of the orientations (N, 3, 3) of an attitude sensor at the fine rate.
+_OF_ROTATIONS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
+    "clean": lambda rotations: rotations,
+    "copied": lambda rotations: rotations,
+    "copied, turned": lambda rotations: rotations,
+    "delayed 100 ms": lambda rotations: rotations,
+    "low-passed 200 ms": lambda rotations: _filtered(rotations, lambda x: _low_passed(x, 0.2)),
+    "smoothed 250 ms": lambda rotations: _filtered(rotations, _smoothed),
+    "mount moved 2 deg": lambda rotations: np.concatenate(
+        [
+            rotations[: len(rotations) // 2],
+            rotations[len(rotations) // 2 :] @ se3.rotation_exp(_TURNED),
+        ]
+    ),
+    "two axes swapped": lambda rotations: _SWAPPED @ rotations @ _SWAPPED,
+    "inverse": lambda rotations: _put_wrong(rotations, invert="orientations"),
+    "order w x y z": lambda rotations: _put_wrong(rotations, quaternion="wxyz"),
+    "yaw only": lambda rotations: _about_z(_yaws(rotations)),
+    "yaw gain 1.05": lambda rotations: _about_z(0.05 * np.unwrap(_yaws(rotations))) @ rotations,
+    "yaw wanders": lambda rotations: rotations,
+    "steps of 1 deg": lambda rotations: rotations,
+}
+
+OF_ROTATIONS = tuple(_OF_ROTATIONS)
+
+
+def rotations(platform: str, fault: str, seed: int) -> Recording:
+    """Poses of an odometry, and orientations with a fault of :data:`OF_ROTATIONS`."""
+    kind = PLATFORMS[platform]
+    seeds = (seed, sorted(PLATFORMS).index(platform), 79)
+    motion_rng, mount_rng, odometry_rng, random = np.random.default_rng(seeds).spawn(4)
+    motion = kind.motion(motion_rng, kind.duration_s)
+    mount = se3.rotation_exp(mount_rng.uniform(-1.7, 1.7, 3))
+    parent = _odometry(kind, motion, odometry_rng)
+    if fault.startswith("copied"):
+        turned = mount if fault == "copied, turned" else np.eye(3)
+        poses = parent.poses @ se3.from_rotation_translation(turned, np.zeros(3))
+        return Recording(
+            parent, Trajectory(parent.stamps_ns, poses, "ahrs", "", "rotations"), mount
+        )
+    fine_s = np.arange(round((kind.duration_s - 1.0) * _FINE_HZ)) / _FINE_HZ
+    own = motion.at(fine_s)[:, :3, :3] @ mount
+    stride = round(_FINE_HZ / _ATTITUDE_HZ)
+    measured = _OF_ROTATIONS[fault](own)[::stride]
+    drift = np.cumsum(random.standard_normal((len(measured), 3)), axis=0) / _ATTITUDE_HZ**0.5
+    walk = _ATTITUDE_WALK * np.ones(3)
+    if fault == "yaw wanders":
+        walk[2] *= 30.0
+    noise = _ATTITUDE_NOISE * random.standard_normal((len(measured), 3))
+    measured = se3.rotation_exp(walk * drift) @ measured @ se3.rotation_exp(noise)
+    if fault == "steps of 1 deg":
+        vectors = Rotation.from_matrix(measured).as_euler("ZYX", degrees=True)
+        measured = Rotation.from_euler("ZYX", np.round(vectors), degrees=True).as_matrix()
+    late_s = 0.1 if fault == "delayed 100 ms" else _LATE_S
+    poses = se3.from_rotation_translation(measured, np.zeros(3))
+    child = Trajectory(stamps_ns(fine_s[::stride] + late_s), poses, "ahrs", "", "rotations")
+    return Recording(parent, child, mount)
+
+
+KINDS = {
+    "positions": (positions, OF_POSITIONS),
+    "rates": (rates, OF_RATES),
+    "rotations": (rotations, OF_ROTATIONS),
+}
 
 
 def distance(kind: str, result: Calibration, truth: FloatArray) -> float:

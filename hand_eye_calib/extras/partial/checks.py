@@ -40,7 +40,7 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.noise.increments import without_rate_bias
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs, pairs_over, synchronise
 from hand_eye_calib.core.results.calibration import Calibration
-from hand_eye_calib.extras.partial.columns import PositionFit, fit
+from hand_eye_calib.extras.partial.position_columns import PositionFit, fit_positions
 from hand_eye_calib.extras.partial.positions import solve, unexplained_share
 
 # A lever arm is zero if each axis is below this distance (m) or below ``_ZERO_SIGMAS``.
@@ -166,15 +166,15 @@ def _check_moving(
     if stream == "child":
         poses = pairs.Ts_pw_p
         positions = se3.translation_of(pairs.Ts_cw_c)
-        fitted = fit(pairs.stamps_ns, poses, positions, lever_arm)
+        fitted = fit_positions(pairs.stamps_ns, poses, positions, lever_arm)
     else:
         poses = pairs.Ts_cw_c
         positions = se3.translation_of(pairs.Ts_pw_p)
-        fitted = fit(pairs.stamps_ns, poses, positions, -lever_arm)
+        fitted = fit_positions(pairs.stamps_ns, poses, positions, -lever_arm)
     no_lever_arm = [] if is_unrelated else check_position(lever_arm, sigmas, priors)
     if fitted and _is_copied(fitted, positions):
         copied = "The positions agree with the poses to rounding"
-        return _as_errors(no_lever_arm) or _copied(copied, residual_m=fitted.residual_m)
+        return _as_errors(no_lever_arm) or _copied(copied, residual_m=fitted.residual)
     if findings := [*interpolated, *no_lever_arm]:
         return findings
     if is_unrelated and _is_mirrored(pairs.stamps_ns, poses, positions):
@@ -198,7 +198,7 @@ def _is_mirrored(stamps_ns: IntArray, poses: FloatArray, positions: FloatArray) 
 def _is_copied(fitted: PositionFit, positions: FloatArray) -> bool:
     """Return whether positions were computed from the poses: only rounding differs."""
     moved_m = median(np.linalg.norm(np.diff(positions, axis=0), axis=1))
-    return fitted.residual_m < min(_COPIED_M, _COPIED_SHARE * moved_m)
+    return fitted.residual < min(_COPIED_M, _COPIED_SHARE * moved_m)
 
 
 def _as_errors(findings: list[Finding]) -> list[Finding]:
@@ -340,7 +340,7 @@ def _scale_of_axis(fitted: PositionFit, stream: str) -> _Suspect:
     coordinate that does not change at all was not measured.
     """
     axis, size, sigma = largest_deviation(*fitted.estimate("scales"))
-    noise = 3.0 * fitted.residual_m**2 * (1.0 - fitted.explained_share)
+    noise = 3.0 * fitted.residual**2 * (1.0 - fitted.explained_share)
     spurious = (_DRIFT * fitted.path_m) ** 2 + noise
     shrinks = agreement.BIASES * spurious / fitted.spreads_m[axis] ** 2
     if abs(size) < shrinks and not fitted.is_constant[axis]:

@@ -1,48 +1,35 @@
-"""Regression of positions beside poses on columns of possible faults.
+"""Regression of windows of a recording on columns of possible faults.
 
-In a window of some seconds, the measured positions are
+In a window of some seconds, the residuals of a measured stream are
 
-    q_i = A (R_i l + t_i) + a + sum_k f_k c_ki + noise
+    e_i = sum_k c_ki f_k + nuisances + noise.
 
-with the poses (R_i, t_i) of the odometry, the lever arm l, and the pose (A, a) of its world in the
-world of the positions. Errors of (A, a) are projected out of each window. The column c_k is what a
-fault f_k adds: the coordinates for a wrong scale of an axis, the velocities for a delay, the
-accelerations for smoothing. Any low-pass filter has the response ``1 - i w d - w^2 c`` at low
-angular frequencies w, with a delay d and a smoothing c.
-
-Accelerations come from the poses, and those of the measured positions are their instrument: the
-noise of both is independent, so that neither noise nor drift looks like smoothing (W. Greene,
-*Econometric Analysis*, 2012, chapter 8).
+The first columns belong to the extrinsic, the others to faults. Each window has nuisances of its
+own, such as the pose of its world: they are projected out. Instruments replace columns with noise:
+the same columns, computed from the other stream (W. Greene, *Econometric Analysis*, 2012, chapter
+8). Weights of windows are robust. A jackknife over blocks of windows estimates the covariance.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.base.blocks import Blocks
 from hand_eye_calib.core.base.stats import median, robust_weights
-from hand_eye_calib.core.geometry import se3
 
-# Duration of a window (s): an odometry drifts little in it, and a machine turns.
-_WINDOW_S = 10.0
-# Shortest window (s), for short recordings, and fewest positions of a window.
+# Shortest window (s), for short recordings, and fewest samples of a window.
 _SHORTEST_WINDOW_S = 4.0
-_LEAST_POSITIONS = 12
+_LEAST_SAMPLES = 12
 # Windows of a recording that has enough of them, and fewest windows.
 _ENOUGH_WINDOWS = 16
 _LEAST_WINDOWS = 6
 
-# Step (s) of the differences that accelerations come from; one interval if that is longer.
-_STEP_S = 0.2
 # Stamps of four steps may be off by this share of their duration: others are beside a gap.
 _TOLERANCE = 0.3
-
-# Range below which a coordinate is constant (m).
-_CONSTANT_M = 1e-6
 
 # Rounds of the robust weights of windows, and the residual with half the weight, in usual ones.
 _ROUNDS = 4
@@ -50,34 +37,6 @@ _HALF_WEIGHT = 2.0
 
 # Largest number of blocks of the jackknife.
 _MOST_BLOCKS = 16
-
-
-class _Windows(NamedTuple):
-    """Aligned windows (W, K) of positions, in the world of the positions.
-
-    Attributes
-    ----------
-    is_used : (W, K) bool array
-        Positions without a gap nearby.
-    rotations : (W, K, 3, 3) array
-        Of the sensor with poses.
-    path : (W, K, 3) array
-        Predicted positions less their mean.
-    residuals : (W, K, 3) array
-        Measured less predicted positions.
-    velocities, accelerations : (W, K, 3) array
-        Of the predicted positions.
-    measured_accelerations : (W, K, 3) array
-        Of the measured positions.
-    """
-
-    is_used: BoolArray
-    rotations: FloatArray
-    path: FloatArray
-    residuals: FloatArray
-    velocities: FloatArray
-    accelerations: FloatArray
-    measured_accelerations: FloatArray
 
 
 class Column(NamedTuple):
@@ -90,34 +49,71 @@ class Column(NamedTuple):
     rows : callable
         Columns (W, K, 3, m) of windows.
     instrument : callable, optional
-        The same columns from the measured positions.
+        The same columns from the measured stream.
     """
 
     sigma: float
-    rows: Callable[[_Windows], FloatArray]
-    instrument: Callable[[_Windows], FloatArray] | None = None
+    rows: Callable[[Any], FloatArray]
+    instrument: Callable[[Any], FloatArray] | None = None
 
 
-def _by_axis(vectors: FloatArray) -> FloatArray:
+def by_axis(vectors: FloatArray) -> FloatArray:
     """Return one column (..., 3, 3) for each coordinate of vectors (..., 3)."""
     return np.asarray(vectors[..., None] * np.eye(3))
 
 
-#: Columns by the names of the faults.
-COLUMNS = {
-    # Metres.
-    "lever_arm": Column(100.0, lambda windows: windows.rotations),
-    # Factor of each coordinate, less 1.
-    "scales": Column(1.0, lambda windows: _by_axis(windows.path)),
-    # Delay of each coordinate, s.
-    "delays": Column(1.0, lambda windows: _by_axis(-windows.velocities)),
-    # Smoothing, s^2.
-    "smoothing": Column(
-        0.1,
-        lambda windows: windows.accelerations[..., None],
-        lambda windows: windows.measured_accelerations[..., None],
-    ),
-}
+class Split(NamedTuple):
+    """Division of N samples into W windows of K samples.
+
+    Attributes
+    ----------
+    size : int
+        K.
+    is_enough : (W', ) bool array
+        Windows with enough used samples, of all windows W'.
+    is_used : (W, K) bool array
+        Samples without a gap nearby.
+    """
+
+    size: int
+    is_enough: BoolArray
+    is_used: BoolArray
+
+    def __call__(self, values: FloatArray) -> FloatArray:
+        """Return values (W, K, ...) of windows from values (N, ...)."""
+        n_windows = len(self.is_enough)
+        whole = values[: n_windows * self.size]
+        return whole.reshape(n_windows, self.size, *values.shape[1:])[self.is_enough]
+
+
+def split(stamps_s: FloatArray, spans_s: FloatArray, step: int, longest_s: float) -> Split | None:
+    """Divide a recording into windows; return None if it is too short.
+
+    Parameters
+    ----------
+    stamps_s : (N,) array
+    spans_s : (N,) array
+        Duration of the four steps around each sample.
+    step : int
+        Samples of a step.
+    longest_s : float
+        Duration of a window of a recording that is long enough.
+    """
+    interval_s = median(np.diff(stamps_s))
+    duration_s = interval_s * len(stamps_s)
+    window_s = min(longest_s, max(duration_s / _ENOUGH_WINDOWS, _SHORTEST_WINDOW_S))
+    size = max(round(window_s / interval_s), _LEAST_SAMPLES)
+    n_windows = len(stamps_s) // size
+    if n_windows < _LEAST_WINDOWS:
+        return None
+    usual_s = 4 * step * interval_s
+    is_regular = np.abs(spans_s - usual_s) < _TOLERANCE * usual_s
+    is_used = is_regular[: n_windows * size].reshape(n_windows, size)
+    # Windows with few samples beside gaps do not reveal anything.
+    is_enough = is_used.sum(axis=1) >= _LEAST_SAMPLES // 2
+    if is_enough.sum() < _LEAST_WINDOWS:
+        return None
+    return Split(size, is_enough, is_used[is_enough])
 
 
 class Estimate(NamedTuple):
@@ -128,44 +124,37 @@ class Estimate(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PositionFit:
-    """Regression of positions on the columns of all faults.
+class Fit:
+    """Regression of a stream on the columns of all faults.
 
     Attributes
     ----------
     blocks : Blocks
         Products of the columns in blocks of time, in units of the noise.
     places : dict
-        Places of the columns of each fault.
-    residual_m : float
-        Usual residual with a lever arm and without a fault, m.
-    is_constant : (3,) bool array
-        Coordinates that are the same in all measured positions.
-    path_m : float
-        Root mean square distance from the mean of a window.
-    spreads_m : (3,) array
-        The same along each coordinate, without what the other columns explain.
-    speeds_m_s : (3,) array
-        Root mean square speed along each coordinate.
-    acceleration_m_s2 : float
-        Root mean square acceleration.
+        Places of the columns of each fault. The first are those of the extrinsic.
+    weights : (W,) array
+        Weights of the windows.
+    residual : float
+        Usual residual with the extrinsic and without a fault.
     """
 
     blocks: Blocks
     places: dict[str, list[int]]
-    residual_m: float
-    is_constant: BoolArray
-    path_m: float
-    spreads_m: FloatArray
-    speeds_m_s: FloatArray
-    acceleration_m_s2: float
+    weights: FloatArray
+    residual: float
+
+    @property
+    def _of_extrinsic(self) -> list[int]:
+        return next(iter(self.places.values()))
 
     @property
     def _every_column(self) -> list[int]:
         return list(range(self.blocks.sums.shape[-1] - 1))
 
     @cached_property
-    def _whole(self) -> Estimate:
+    def whole(self) -> Estimate:
+        """Values of all columns."""
         return self._solved(self._every_column)
 
     def _solved(self, columns: list[int]) -> Estimate:
@@ -175,13 +164,13 @@ class PositionFit:
     def estimate(self, name: str) -> Estimate:
         """Return the values of a fault, if all other faults are possible too."""
         places = self.places[name]
-        return Estimate(self._whole.values[places], self._whole.sigmas[places])
+        return Estimate(self.whole.values[places], self.whole.sigmas[places])
 
     @property
     def explained_share(self) -> float:
-        """Share of the squared residuals with a lever arm alone that the faults explain."""
+        """Share of the squared residuals with the extrinsic alone that the faults explain."""
         costs = []
-        for columns in (self.places["lever_arm"], self._every_column):
+        for columns in (self._of_extrinsic, self._every_column):
             x = np.append(-self.blocks.solve(columns), 1.0)
             used = [*columns, -1]
             costs.append(float(x @ self.blocks.total[np.ix_(used, used)] @ x))
@@ -189,45 +178,56 @@ class PositionFit:
 
     @property
     def open_covariance(self) -> FloatArray:
-        """Covariance (3, 3) of the lever arm that possible faults leave open, m^2.
+        """Covariance (3, 3) of the extrinsic that possible faults leave open.
 
-        The lever arm moves if all faults are possible, and it is less certain then.
+        The extrinsic moves if all faults are possible, and it is less certain then.
         """
-        moved = self.estimate("lever_arm")
-        alone = self._solved(self.places["lever_arm"])
-        added = np.maximum(moved.sigmas**2 - alone.sigmas**2, 0.0)
-        return np.asarray(np.outer(moved.values, moved.values) + np.diag(added))
+        columns = self._of_extrinsic
+        values = self.whole.values[columns]
+        sigmas = self.whole.sigmas[columns]
+        alone = self._solved(columns)
+        added = np.maximum(sigmas**2 - alone.sigmas**2, 0.0)
+        return np.asarray(np.outer(values, values) + np.diag(added))
 
 
-def fit(
-    stamps_ns: IntArray, poses: FloatArray, positions: FloatArray, lever_arm: FloatArray
-) -> PositionFit | None:
-    """Fit positions with a lever arm and all faults.
+def fit_columns(
+    columns: Mapping[str, Column],
+    windows: Any,
+    is_used: BoolArray,
+    residuals: FloatArray,
+    nuisances: FloatArray,
+) -> Fit:
+    """Fit windows with columns of the extrinsic and of all faults.
 
     Parameters
     ----------
-    stamps_ns : (N,) int64 array
-    poses : (N, 4, 4) array
-        Poses of the other sensor.
-    positions : (N, 3) array
-        At the same stamps, in the same unit.
-    lever_arm : (3,) array
-        Best estimate, m. The values of the regression are relative to this estimate.
-
-    Returns
-    -------
-    PositionFit or None
-        None if the recording is too short.
+    columns : mapping of str to Column
+        The first columns are those of the extrinsic.
+    windows : object
+        What the columns are computed from.
+    is_used : (W, K) bool array
+    residuals : (W, K, 3) array
+    nuisances : (W, K, 3, n) array
+        Columns that each window has for itself.
     """
-    stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
-    windows = _windows(stamps_s, poses, positions, lever_arm)
-    if windows is None:
-        return None
-    rows, instruments = _rows(windows)
-    products = np.einsum("wkp,wkq->wpq", instruments, rows)
-    counts = 3.0 * windows.is_used.sum(axis=1)
-    places = _places()
-    known = [*places["lever_arm"], -1]
+    rows = [column.rows(windows) for column in columns.values()]
+    instruments = [(column.instrument or column.rows)(windows) for column in columns.values()]
+    places: dict[str, list[int]] = {}
+    information: list[float] = []
+    for name, row in zip(columns, rows, strict=True):
+        start = len(information)
+        information += [columns[name].sigma ** -2] * row.shape[3]
+        places[name] = list(range(start, len(information)))
+    prior = np.diag([*information, 0.0])
+    basis = np.linalg.qr(_flat([nuisances], is_used))[0]
+    target = residuals[..., None]
+    projected = []
+    for table in (rows, instruments):
+        flat = _flat([*table, target], is_used)
+        projected.append(flat - basis @ (np.swapaxes(basis, 1, 2) @ flat))
+    products = np.einsum("wkp,wkq->wpq", projected[1], projected[0])
+    counts = 3.0 * is_used.sum(axis=1)
+    known = [*next(iter(places.values())), -1]
     weights = np.ones(len(products))
     for _ in range(_ROUNDS):
         total = Blocks(weights[:, None, None] * products)
@@ -237,130 +237,11 @@ def fit(
         weights = robust_weights("cauchy", squares / usual / _HALF_WEIGHT**2) / usual
     blocks = Blocks(weights[:, None, None] * products)
     blocks = blocks.merged(min(len(products), _MOST_BLOCKS))
-    information = blocks.total[:-1, :-1] + _prior()[:-1, :-1]
-    own = 1.0 / np.abs(np.diag(np.linalg.inv(information)))
-    return PositionFit(
-        blocks=Blocks(blocks.sums + _prior() / len(blocks.sums)),
-        places=places,
-        residual_m=float(np.sqrt(usual)),
-        is_constant=np.ptp(positions, axis=0) < _CONSTANT_M,
-        path_m=float(np.linalg.norm(_root_mean_square(windows.path, windows.is_used))),
-        spreads_m=np.sqrt(own[places["scales"]] / (weights @ counts / 3.0)),
-        speeds_m_s=_root_mean_square(windows.velocities, windows.is_used),
-        acceleration_m_s2=float(
-            np.linalg.norm(_root_mean_square(windows.accelerations, windows.is_used))
-        ),
-    )
+    with_prior = Blocks(blocks.sums + prior / len(blocks.sums))
+    return Fit(with_prior, places, weights, float(np.sqrt(usual)))
 
 
-def _root_mean_square(vectors: FloatArray, is_used: BoolArray) -> FloatArray:
-    """Return the root mean square (3,) of used vectors (W, K, 3)."""
-    return np.asarray(np.sqrt((vectors[is_used] ** 2).mean(axis=0)))
-
-
-def _places() -> dict[str, list[int]]:
-    """Return the places of the columns of each fault."""
-    places: dict[str, list[int]] = {}
-    start = 0
-    for name in COLUMNS:
-        size = 1 if name == "smoothing" else 3
-        places[name] = list(range(start, start + size))
-        start += size
-    return places
-
-
-def _prior() -> FloatArray:
-    """Return the products (p + 1, p + 1) of the prior: all values are zero."""
-    information = []
-    for name, places in _places().items():
-        information += [COLUMNS[name].sigma ** -2] * len(places)
-    return np.diag([*information, 0.0])
-
-
-def _rows(windows: _Windows) -> tuple[FloatArray, FloatArray]:
-    """Return rows and instruments (W, 3 K, p + 1) without the pose of each window's world."""
-    residuals = windows.residuals[..., None]
-    columns = [column.rows(windows) for column in COLUMNS.values()]
-    instruments = [(column.instrument or column.rows)(windows) for column in COLUMNS.values()]
-    used = windows.is_used[..., None, None]
-    world = np.concatenate(
-        [np.broadcast_to(np.eye(3), windows.rotations.shape), se3.skew(windows.path)], axis=3
-    )
-    n_windows = len(used)
-    flat = [
-        (used * np.concatenate(table, axis=3)).reshape(
-            n_windows, -1, sum(t.shape[3] for t in table)
-        )
-        for table in ([world], [*columns, residuals], [*instruments, residuals])
-    ]
-    basis = np.linalg.qr(flat[0])[0]
-    projected = [table - basis @ (np.swapaxes(basis, 1, 2) @ table) for table in flat[1:]]
-    return projected[0], projected[1]
-
-
-def _windows(
-    stamps_s: FloatArray, poses: FloatArray, positions: FloatArray, lever_arm: FloatArray
-) -> _Windows | None:
-    """Return aligned windows, or None if the recording is too short."""
-    interval_s = median(np.diff(stamps_s))
-    duration_s = interval_s * len(stamps_s)
-    window_s = min(_WINDOW_S, max(duration_s / _ENOUGH_WINDOWS, _SHORTEST_WINDOW_S))
-    size = max(round(window_s / interval_s), _LEAST_POSITIONS)
-    n_windows = len(stamps_s) // size
-    if n_windows < _LEAST_WINDOWS:
-        return None
-    step = max(round(_STEP_S / interval_s), 1)
-    rotations = se3.rotation_of(poses)
-    predicted = se3.times(rotations, lever_arm) + se3.translation_of(poses)
-    spans_s, velocities, accelerations = _derivatives(stamps_s, predicted, step)
-    measured_accelerations = _derivatives(stamps_s, positions, step)[2]
-    usual_s = 4 * step * interval_s
-    is_used = np.abs(spans_s - usual_s) < _TOLERANCE * usual_s
-
-    def split(values: Any) -> Any:
-        return values[: n_windows * size].reshape(n_windows, size, *values.shape[1:])
-
-    used = split(is_used)
-    # Windows with few positions beside gaps do not reveal anything.
-    enough = used.sum(axis=1) >= _LEAST_POSITIONS // 2
-    if enough.sum() < _LEAST_WINDOWS:
-        return None
-    used = used[enough]
-    path = _centred(split(predicted)[enough], used)
-    measured = _centred(split(positions)[enough], used)
-    products = np.einsum("wki,wkj,wk->wij", measured, path, used)
-    to_world = se3.nearest_rotation(products)[:, None]
-    path = se3.times(to_world, path)
-    return _Windows(
-        is_used=used,
-        rotations=to_world @ split(rotations)[enough],
-        path=path,
-        residuals=measured - path,
-        velocities=se3.times(to_world, split(velocities)[enough]),
-        accelerations=se3.times(to_world, split(accelerations)[enough]),
-        measured_accelerations=split(measured_accelerations)[enough],
-    )
-
-
-def _centred(vectors: FloatArray, used: BoolArray) -> FloatArray:
-    """Return vectors (W, K, 3) less the mean of the used ones of each window."""
-    counts = used.sum(axis=1)[:, None]
-    means = (vectors * used[..., None]).sum(axis=1) / counts
-    return np.asarray(vectors - means[:, None])
-
-
-def _derivatives(
-    stamps_s: FloatArray, path: FloatArray, step: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return durations of four steps (N,), velocities and accelerations (N, 3) of a path (N, 3).
-
-    Accelerations do not contain the noise of the position itself.
-    """
-    rows = np.arange(len(path))
-    last = len(path) - 1
-    before_2, before, after, after_2 = (np.clip(rows + k * step, 0, last) for k in (-2, -1, 1, 2))
-    spans_s = stamps_s[after_2] - stamps_s[before_2]
-    step_s = np.maximum(spans_s / 4.0, 1e-9)[:, None]
-    velocities = (path[after] - path[before]) / (2.0 * step_s)
-    bends = path[after_2] - path[after] - path[before] + path[before_2]
-    return spans_s, velocities, bends / (3.0 * step_s**2)
+def _flat(tables: list[FloatArray], is_used: BoolArray) -> FloatArray:
+    """Join tables (W, K, 3, m) of columns to one table (W, 3 K, p), zero where not used."""
+    joined = is_used[..., None, None] * np.concatenate(tables, axis=3)
+    return joined.reshape(len(joined), -1, joined.shape[3])

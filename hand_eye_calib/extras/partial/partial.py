@@ -29,8 +29,8 @@ from hand_eye_calib.core.noise import increments
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, motion_pairs
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.core.results.records import Residuals
-from hand_eye_calib.extras.partial import columns
 from hand_eye_calib.extras.partial import positions as of_positions
+from hand_eye_calib.extras.partial.position_columns import fit_positions
 from hand_eye_calib.extras.partial.rate_bias import RateBias
 
 # Share of the path of positions above which it is suspect that the poses do not explain it: at most
@@ -89,7 +89,7 @@ class _Paths:
     def open_covariance(self, solution: of_positions.LeverArmSolution) -> FloatArray:
         """Return the covariance (3, 3) of the lever arm that possible faults leave open."""
         scaled = solution.scale * self.positions
-        fitted = columns.fit(self.stamps_ns, self.poses, scaled, solution.lever_arm)
+        fitted = fit_positions(self.stamps_ns, self.poses, scaled, solution.lever_arm)
         return fitted.open_covariance if fitted else np.zeros((3, 3))
 
     def child_scale(self, scale: float) -> float:

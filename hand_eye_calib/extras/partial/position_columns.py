@@ -1,0 +1,203 @@
+"""Regression of positions beside poses on columns of possible faults.
+
+In a window of some seconds, the measured positions are
+
+    q_i = A (R_i l + t_i) + a + sum_k f_k c_ki + noise
+
+with the poses (R_i, t_i) of the odometry, the lever arm l, and the pose (A, a) of its world in the
+world of the positions. Errors of (A, a) are projected out of each window. The column c_k is what a
+fault f_k adds: the coordinates for a wrong scale of an axis, the velocities for a delay, the
+accelerations for smoothing. Any low-pass filter has the response ``1 - i w d - w^2 c`` at low
+angular frequencies w, with a delay d and a smoothing c.
+
+Accelerations come from the poses, and those of the measured positions are their instrument: the
+noise of both is independent, so that neither noise nor drift looks like smoothing.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.core.base.stats import median
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.extras.partial.columns import Column, Fit, by_axis, fit_columns, split
+
+# Duration of a window (s): an odometry drifts little in it, and a machine turns.
+_WINDOW_S = 10.0
+
+# Step (s) of the differences that accelerations come from; one interval if that is longer.
+_STEP_S = 0.2
+
+# Range below which a coordinate is constant (m).
+_CONSTANT_M = 1e-6
+
+
+class _Windows(NamedTuple):
+    """Aligned windows (W, K) of positions, in the world of the positions.
+
+    Attributes
+    ----------
+    is_used : (W, K) bool array
+        Positions without a gap nearby.
+    rotations : (W, K, 3, 3) array
+        Of the sensor with poses.
+    path : (W, K, 3) array
+        Predicted positions less their mean.
+    residuals : (W, K, 3) array
+        Measured less predicted positions.
+    velocities, accelerations : (W, K, 3) array
+        Of the predicted positions.
+    measured_accelerations : (W, K, 3) array
+        Of the measured positions.
+    """
+
+    is_used: BoolArray
+    rotations: FloatArray
+    path: FloatArray
+    residuals: FloatArray
+    velocities: FloatArray
+    accelerations: FloatArray
+    measured_accelerations: FloatArray
+
+
+# Columns by the names of the faults.
+_COLUMNS = {
+    # Metres.
+    "lever_arm": Column(100.0, lambda windows: windows.rotations),
+    # Factor of each coordinate, less 1.
+    "scales": Column(1.0, lambda windows: by_axis(windows.path)),
+    # Delay of each coordinate, s.
+    "delays": Column(1.0, lambda windows: by_axis(-windows.velocities)),
+    # Smoothing, s^2.
+    "smoothing": Column(
+        0.1,
+        lambda windows: windows.accelerations[..., None],
+        lambda windows: windows.measured_accelerations[..., None],
+    ),
+}
+
+
+@dataclass(frozen=True)
+class PositionFit(Fit):
+    """Regression of positions on the columns of all faults.
+
+    Attributes
+    ----------
+    is_constant : (3,) bool array
+        Coordinates that are the same in all measured positions.
+    path_m : float
+        Root mean square distance from the mean of a window.
+    spreads_m : (3,) array
+        The same along each coordinate, without what the other columns explain.
+    speeds_m_s : (3,) array
+        Root mean square speed along each coordinate.
+    acceleration_m_s2 : float
+        Root mean square acceleration.
+    """
+
+    is_constant: BoolArray
+    path_m: float
+    spreads_m: FloatArray
+    speeds_m_s: FloatArray
+    acceleration_m_s2: float
+
+
+def fit_positions(
+    stamps_ns: IntArray, poses: FloatArray, positions: FloatArray, lever_arm: FloatArray
+) -> PositionFit | None:
+    """Fit positions with a lever arm and all faults.
+
+    Parameters
+    ----------
+    stamps_ns : (N,) int64 array
+    poses : (N, 4, 4) array
+        Poses of the other sensor.
+    positions : (N, 3) array
+        At the same stamps, in the same unit.
+    lever_arm : (3,) array
+        Best estimate, m. The values of the regression are relative to this estimate.
+
+    Returns
+    -------
+    PositionFit or None
+        None if the recording is too short.
+    """
+    stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
+    windows = _windows(stamps_s, poses, positions, lever_arm)
+    if windows is None:
+        return None
+    is_used = windows.is_used
+    moving = np.broadcast_to(np.eye(3), windows.rotations.shape)
+    world = np.concatenate([moving, se3.skew(windows.path)], axis=3)
+    fitted = fit_columns(_COLUMNS, windows, is_used, windows.residuals, world)
+    information = fitted.blocks.total[:-1, :-1]
+    own = 1.0 / np.abs(np.diag(np.linalg.inv(information)))
+    weight = fitted.weights @ is_used.sum(axis=1)
+    return PositionFit(
+        **vars(fitted),
+        is_constant=np.ptp(positions, axis=0) < _CONSTANT_M,
+        path_m=float(np.linalg.norm(_root_mean_square(windows.path, is_used))),
+        spreads_m=np.sqrt(own[fitted.places["scales"]] / weight),
+        speeds_m_s=_root_mean_square(windows.velocities, is_used),
+        acceleration_m_s2=float(np.linalg.norm(_root_mean_square(windows.accelerations, is_used))),
+    )
+
+
+def _root_mean_square(vectors: FloatArray, is_used: BoolArray) -> FloatArray:
+    """Return the root mean square (3,) of used vectors (W, K, 3)."""
+    return np.asarray(np.sqrt((vectors[is_used] ** 2).mean(axis=0)))
+
+
+def _windows(
+    stamps_s: FloatArray, poses: FloatArray, positions: FloatArray, lever_arm: FloatArray
+) -> _Windows | None:
+    """Return aligned windows, or None if the recording is too short."""
+    step = max(round(_STEP_S / median(np.diff(stamps_s))), 1)
+    rotations = se3.rotation_of(poses)
+    predicted = se3.times(rotations, lever_arm) + se3.translation_of(poses)
+    spans_s, velocities, accelerations = _derivatives(stamps_s, predicted, step)
+    measured_accelerations = _derivatives(stamps_s, positions, step)[2]
+    in_windows = split(stamps_s, spans_s, step, _WINDOW_S)
+    if in_windows is None:
+        return None
+    is_used = in_windows.is_used
+    path = _centred(in_windows(predicted), is_used)
+    measured = _centred(in_windows(positions), is_used)
+    products = np.einsum("wki,wkj,wk->wij", measured, path, is_used)
+    to_world = se3.nearest_rotation(products)[:, None]
+    path = se3.times(to_world, path)
+    return _Windows(
+        is_used=is_used,
+        rotations=to_world @ in_windows(rotations),
+        path=path,
+        residuals=measured - path,
+        velocities=se3.times(to_world, in_windows(velocities)),
+        accelerations=se3.times(to_world, in_windows(accelerations)),
+        measured_accelerations=in_windows(measured_accelerations),
+    )
+
+
+def _centred(vectors: FloatArray, used: BoolArray) -> FloatArray:
+    """Return vectors (W, K, 3) less the mean of the used ones of each window."""
+    counts = used.sum(axis=1)[:, None]
+    means = (vectors * used[..., None]).sum(axis=1) / counts
+    return np.asarray(vectors - means[:, None])
+
+
+def _derivatives(
+    stamps_s: FloatArray, path: FloatArray, step: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return durations of four steps (N,), velocities and accelerations (N, 3) of a path (N, 3).
+
+    Accelerations do not contain the noise of the position itself.
+    """
+    rows = np.arange(len(path))
+    last = len(path) - 1
+    before_2, before, after, after_2 = (np.clip(rows + k * step, 0, last) for k in (-2, -1, 1, 2))
+    spans_s = stamps_s[after_2] - stamps_s[before_2]
+    step_s = np.maximum(spans_s / 4.0, 1e-9)[:, None]
+    velocities = (path[after] - path[before]) / (2.0 * step_s)
+    bends = path[after_2] - path[after] - path[before] + path[before_2]
+    return spans_s, velocities, bends / (3.0 * step_s**2)
