@@ -298,9 +298,6 @@ _ATTITUDE_HZ = 50.0
 _ATTITUDE_NOISE = np.radians(0.1)
 _ATTITUDE_WALK = np.radians(0.02)
 
-# Matrix that exchanges x and y: orientations about left-handed axes.
-_SWAPPED = np.eye(3)[[1, 0, 2]]
-
 
 def _yaws(rotations: FloatArray) -> FloatArray:
     return np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0])
@@ -315,9 +312,9 @@ def _filtered(rotations: FloatArray, of_values: Callable[[FloatArray], FloatArra
     return se3.nearest_rotation(flat.reshape(-1, 3, 3))
 
 
-def _put_wrong(rotations: FloatArray, **convention: str) -> FloatArray:
-    poses = se3.from_rotation_translation(rotations, np.zeros(3))
-    return se3.rotation_of(se3.put_right(poses, **convention))
+def _reordered(rotations: FloatArray) -> FloatArray:
+    quats_xyzw = Rotation.from_matrix(rotations).as_quat()
+    return Rotation.from_quat(np.roll(quats_xyzw, 1, axis=1)).as_matrix()
 
 
 # What a fault makes of the orientations (N, 3, 3) of an attitude sensor at the fine rate.
@@ -334,9 +331,8 @@ _OF_ROTATIONS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
             rotations[len(rotations) // 2 :] @ se3.rotation_exp(_TURNED),
         ]
     ),
-    "two axes swapped": lambda rotations: _SWAPPED @ rotations @ _SWAPPED,
-    "inverse": lambda rotations: _put_wrong(rotations, invert="orientations"),
-    "order w x y z": lambda rotations: _put_wrong(rotations, quaternion="wxyz"),
+    "inverse": lambda rotations: np.swapaxes(rotations, 1, 2),
+    "order w x y z": lambda rotations: _reordered(rotations),
     "yaw only": lambda rotations: _about_z(_yaws(rotations)),
     "yaw gain 1.05": lambda rotations: _about_z(0.05 * np.unwrap(_yaws(rotations))) @ rotations,
     "yaw wanders": lambda rotations: rotations,
@@ -366,9 +362,12 @@ def rotations(platform: str, fault: str, seed: int) -> Recording:
     measured = _OF_ROTATIONS[fault](own)[::stride]
     drift = np.cumsum(random.standard_normal((len(measured), 3)), axis=0) / _ATTITUDE_HZ**0.5
     walk = _ATTITUDE_WALK * np.ones(3)
+    noise = _ATTITUDE_NOISE * random.standard_normal((len(measured), 3))
     if fault == "yaw wanders":
         walk[2] *= 30.0
-    noise = _ATTITUDE_NOISE * random.standard_normal((len(measured), 3))
+    if fault == "yaw only":
+        walk[:2] = 0.0
+        noise[:, :2] = 0.0
     measured = se3.rotation_exp(walk * drift) @ measured @ se3.rotation_exp(noise)
     if fault == "steps of 1 deg":
         vectors = Rotation.from_matrix(measured).as_euler("ZYX", degrees=True)

@@ -74,7 +74,6 @@ CASES = {
     "outliers": dict(n_pairs=100, n_inliers=65),
     "target": dict(observability_measured=observed(x=0.04, yaw=0.02)),
     "floor": dict(T_parent_child=np.eye(4), covariance_allowance=FLOOR),
-    "part_of_poses": dict(measured="rotations"),
 }
 
 

@@ -89,16 +89,45 @@ def test_the_covariance_contains_smoothing_that_is_too_weak_for_a_finding():
     assert part_faults.distance("positions", result, recording.truth) < 2.5
 
 
-@pytest.mark.parametrize("platform", ["drone", "excavator"])
-def test_a_misaligned_axis_of_a_gyroscope_is_named(platform):
-    result = solved("rates", "axis misaligned 3 deg", platform)
-    assert "misaligned" in [*codes(result), *codes(result, "warning")]
+# Faults of rates and rotations, and the code of the finding on machines that move in other ways.
+OF_ROTATIONS = [
+    ("rates", "axis misaligned 3 deg", "misaligned", ["drone", "agv"]),
+    ("rates", "gain of an axis 1.03", "rotation_gain", ["car"]),
+    ("rates", "low-passed 200 ms", "smoothed_rates", ["hand"]),
+    ("rates", "smoothed 250 ms", "smoothed_rates", ["agv"]),
+    ("rates", "clipped", "clipped_rates", ["drone"]),
+    ("rates", "steps of 2 deg/s", "coarse_rates", ["hand"]),
+    ("rates", "bias walks", "bias_drift", ["car"]),
+    ("rates", "degrees", "rate_unit", ["hand"]),
+    ("rates", "two axes swapped", "left_handed", ["hand", "car"]),
+    ("rates", "sign of an axis", "left_handed", ["drone"]),
+    ("rotations", "copied, turned", "not_independent", ["car"]),
+    ("rotations", "low-passed 200 ms", "smoothed_orientations", ["drone"]),
+    ("rotations", "smoothed 250 ms", "smoothed_orientations", ["car"]),
+    ("rotations", "mount moved 2 deg", "mount_moved", ["agv"]),
+    ("rotations", "inverse", "inverse_orientation", ["car"]),
+    ("rotations", "order w x y z", "inverse_orientation", ["drone"]),
+    ("rotations", "yaw only", "flat", ["drone"]),
+    ("rotations", "yaw gain 1.05", "rotation_gain", ["car"]),
+    ("rotations", "yaw wanders", "world_drift", ["hand"]),
+]
+
+
+@pytest.mark.parametrize(
+    ("kind", "fault", "code", "platform"),
+    [
+        (kind, fault, code, platform)
+        for kind, fault, code, names in OF_ROTATIONS
+        for platform in names
+    ],
+)
+def test_a_fault_of_rotations_is_named_and_its_error_is_within_sigma(kind, fault, code, platform):
+    result = solved(kind, fault, platform)
+    assert code in [*codes(result), *codes(result, "warning")]
     assert result.verdict is not hec.Verdict.USE
-
-
-@pytest.mark.parametrize("fault", ["two axes swapped", "sign of an axis"])
-def test_rates_about_left_handed_axes_are_named(fault):
-    assert "left_handed" in codes(solved("rates", fault, "drone"))
+    if result.verdict is hec.Verdict.USE_WITH_CARE:
+        truth = part_faults.KINDS[kind][0](platform, fault, SEED).truth
+        assert part_faults.distance(kind, result, truth) < 2.5
 
 
 @pytest.mark.parametrize("platform", part_faults.PLATFORMS)
@@ -109,14 +138,13 @@ def test_clean_positions_have_no_finding_and_may_be_used(platform):
     assert result.verdict is hec.Verdict.USE
 
 
-@pytest.mark.parametrize("platform", ["drone", "hand"])
-def test_clean_rates_have_no_finding_and_say_what_cannot_be_seen(platform):
-    result = solved("rates", "clean", platform)
+@pytest.mark.parametrize("kind", ["rates", "rotations"])
+@pytest.mark.parametrize("platform", part_faults.PLATFORMS)
+def test_clean_rotations_have_no_finding_and_may_be_used(kind, platform):
+    result = solved(kind, "clean", platform)
     assert codes(result) == []
     assert codes(result, "warning") == []
-    assert "part_of_poses" in [reason.rule for reason in result.reasons]
-    assert result.verdict is hec.Verdict.USE_WITH_CARE
-    assert "cannot be seen" in result.headline
+    assert result.verdict is hec.Verdict.USE
 
 
 @pytest.mark.parametrize("stream", ["parent", "child"])

@@ -69,6 +69,8 @@ LIMITS = {
     "arrival": Limits(0.0, 0.008, 0.008, _NEVER),
     # Factor, less 1.
     "rotation_gain": Limits(6.0, 0.003, 0.003, 0.03),
+    # Factor of the rates about an axis of a sensor, less 1.
+    "gain_of_axis": Limits(6.0, 0.003, 0.003, 0.03),
     # Symmetric part of the matrix between the rates, rad: the error of the rotation is as large.
     # The visual-inertial odometries of three tango devices differ by up to 0.016.
     "misaligned": Limits(6.0, 0.004, 0.004, 0.0175),

@@ -128,7 +128,7 @@ FEWEST_OF_MODEL = 0.9
 
 # Rules about a limit of the recording. Reasons of all other rules are suspicions.
 _KINDS = dict.fromkeys(
-    ("nothing_known", "unobservable", "unconfirmed", "target", "floor", "part_of_poses"),
+    ("nothing_known", "unobservable", "unconfirmed", "target", "floor"),
     "physics",
 )
 _NO_FAULT = " (a limit of the recording; no fault was found)"
@@ -195,8 +195,6 @@ class Judged(Result):
             text = f"all but {hidden}; measure {them} by hand"
             if others:
                 text += f"; {others[0].sentence}"
-        elif first.rule == "part_of_poses" and not others:
-            text = f"{what_is_known(self)}; {first.sentence}"
         else:
             text = first.sentence
             if others:
@@ -451,20 +449,6 @@ def _targets(axes: Sequence["_Axis"]) -> str:
     return listing([*dict.fromkeys(amount(axis.name, axis.target) for axis in axes)])
 
 
-# Faults that no check detects in streams of this quantity, and what the user should do.
-_UNSEEN = {
-    "rotations": (
-        "smoothing and slow drift of rotations alone cannot be detected",
-        "compare with another recording",
-    ),
-}
-
-
-def _part_of_poses(result: Result) -> Iterator[Ground]:
-    if result.measured in _UNSEEN:
-        yield Ground(*_UNSEEN[result.measured])
-
-
 class _Axis(NamedTuple):
     """An axis that the streams can determine.
 
@@ -574,12 +558,6 @@ _OWN_RULES = (
         _CARE,
         "an axis is worse than its target only together with the allowance for constant errors",
         _floor,
-    ),
-    Rule(
-        "part_of_poses",
-        _CARE,
-        "the streams have only rotations or rates, which have few checks",
-        _part_of_poses,
     ),
 )
 

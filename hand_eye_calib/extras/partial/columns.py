@@ -18,8 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
-from hand_eye_calib.core.base.blocks import Blocks
+from hand_eye_calib.core.base.blocks import Blocks, inverse
 from hand_eye_calib.core.base.stats import median, robust_weights
+from hand_eye_calib.core.geometry import se3
 
 # Shortest window (s), for short recordings, and fewest samples of a window.
 _SHORTEST_WINDOW_S = 4.0
@@ -137,12 +138,18 @@ class Fit:
         Weights of the windows.
     residual : float
         Usual residual with the extrinsic and without a fault.
+    n_samples : float
+        Number of samples, those of windows with less weight counted less.
+    nuisances : (W, n) array
+        Nuisances of each window, if all faults are possible.
     """
 
     blocks: Blocks
     places: dict[str, list[int]]
     weights: FloatArray
     residual: float
+    n_samples: float
+    nuisances: FloatArray
 
     @property
     def _of_extrinsic(self) -> list[int]:
@@ -165,6 +172,14 @@ class Fit:
         """Return the values of a fault, if all other faults are possible too."""
         places = self.places[name]
         return Estimate(self.whole.values[places], self.whole.sigmas[places])
+
+    def biases(self, name: str) -> FloatArray:
+        """Return the bias (m,) that noise of the columns can cause in the values of a fault.
+
+        The noise is assumed to be as large as the noise of the residuals.
+        """
+        covariance = np.linalg.inv(self.blocks.total[:-1, :-1])
+        return np.asarray(self.n_samples * np.abs(np.diag(covariance)[self.places[name]]))
 
     @property
     def explained_share(self) -> float:
@@ -219,13 +234,12 @@ def fit_columns(
         information += [columns[name].sigma ** -2] * row.shape[3]
         places[name] = list(range(start, len(information)))
     prior = np.diag([*information, 0.0])
-    basis = np.linalg.qr(_flat([nuisances], is_used))[0]
+    basis, triangle = np.linalg.qr(_flat([nuisances], is_used))
     target = residuals[..., None]
-    projected = []
-    for table in (rows, instruments):
-        flat = _flat([*table, target], is_used)
-        projected.append(flat - basis @ (np.swapaxes(basis, 1, 2) @ flat))
-    products = np.einsum("wkp,wkq->wpq", projected[1], projected[0])
+    joined = [_flat([*table, target], is_used) for table in (rows, instruments)]
+    absorbed = [np.swapaxes(basis, 1, 2) @ table for table in joined]
+    projected, probes = (table - basis @ part for table, part in zip(joined, absorbed, strict=True))
+    products = np.einsum("wkp,wkq->wpq", probes, projected)
     counts = 3.0 * is_used.sum(axis=1)
     known = [*next(iter(places.values())), -1]
     weights = np.ones(len(products))
@@ -238,10 +252,19 @@ def fit_columns(
     blocks = Blocks(weights[:, None, None] * products)
     blocks = blocks.merged(min(len(products), _MOST_BLOCKS))
     with_prior = Blocks(blocks.sums + prior / len(blocks.sums))
-    return Fit(with_prior, places, weights, float(np.sqrt(usual)))
+    values = with_prior.solve(range(len(information)))
+    of_windows = absorbed[0] @ np.append(-values, 1.0)
+    return Fit(
+        blocks=with_prior,
+        places=places,
+        weights=weights,
+        residual=float(np.sqrt(usual)),
+        n_samples=float(usual * weights @ counts / 3.0),
+        nuisances=se3.times(inverse(triangle), of_windows),
+    )
 
 
 def _flat(tables: list[FloatArray], is_used: BoolArray) -> FloatArray:
     """Join tables (W, K, 3, m) of columns to one table (W, 3 K, p), zero where not used."""
     joined = is_used[..., None, None] * np.concatenate(tables, axis=3)
-    return joined.reshape(len(joined), -1, joined.shape[3])
+    return np.reshape(joined, (len(joined), -1, joined.shape[3]))

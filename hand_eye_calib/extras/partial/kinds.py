@@ -18,7 +18,7 @@ from hand_eye_calib.core.engine.kinds import Kind, kind_of
 from hand_eye_calib.core.engine.snapshot import MOST_MOVED_S, UNASKED_S, Snapshot
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import Calibration
-from hand_eye_calib.extras.partial.checks import check_solved
+from hand_eye_calib.extras.partial import position_checks, rotation_checks
 from hand_eye_calib.extras.partial.partial import estimate_lever_arm, estimate_rotation
 
 # Allowed values of options that only affect full poses.
@@ -93,12 +93,28 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
     if not len(snapshot.kept):
         findings += _check_aligned(snapshot, calibration, known_s)
     hidden = calibration.hidden if calibration else []
+    late: list[Finding] = []
     if len(hidden) == 3 or any(found.code == "unrelated" for found in findings):
-        findings += _check_clock(parent, child, known_s, snapshot)
+        late = _check_clock(parent, child, known_s, snapshot)
+    if late:
+        # The clock replaces the finding that nothing is explained.
+        findings = [found for found in findings if found.code != "unrelated"] + late
     codes = {found.code for found in findings}
     is_unrelated = "unrelated" in codes
-    if calibration and (len(hidden) < 3 or is_unrelated) and "time_offset" not in codes:
-        findings += check_solved(parent, child, calibration, config, is_unrelated)
+    if calibration and "time_offset" not in codes:
+        of_solve: list[Finding] = []
+        if calibration.measured == "rotations":
+            of_solve = rotation_checks.check_solved(
+                parent, child, calibration, config, is_unrelated
+            )
+            if is_unrelated and of_solve:
+                # The cause replaces the finding that nothing is explained.
+                findings = [found for found in findings if found.code != "unrelated"]
+        elif len(hidden) < 3 or is_unrelated:
+            of_solve = position_checks.check_solved(
+                parent, child, calibration, config, is_unrelated
+            )
+        findings += of_solve
     if hidden and not any(found.makes_unusable for found in findings):
         findings.append(checking.unseen(hidden))
     # Lengths in another unit come first: they cause the findings of the solve.

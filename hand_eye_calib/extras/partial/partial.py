@@ -14,7 +14,8 @@ from functools import partial
 import numpy as np
 
 from hand_eye_calib.core.assessment import covariance
-from hand_eye_calib.core.assessment.prior import fuse
+from hand_eye_calib.core.assessment.prior import fuse, widened
+from hand_eye_calib.core.assessment.second_opinion import excess_covariance, second_opinions
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import InputError
@@ -26,12 +27,14 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.noise import estimator as adaptive_estimator
 from hand_eye_calib.core.noise import increments
-from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, motion_pairs
+from hand_eye_calib.core.pairing.motion_pairs import PosePairs, motion_pairs
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.core.results.records import Residuals
 from hand_eye_calib.extras.partial import positions as of_positions
 from hand_eye_calib.extras.partial.position_columns import fit_positions
 from hand_eye_calib.extras.partial.rate_bias import RateBias
+from hand_eye_calib.extras.partial.rotation_checks import measured_stream
+from hand_eye_calib.extras.partial.rotation_columns import fit_pairs
 
 # Share of the path of positions above which it is suspect that the poses do not explain it: at most
 # 0.05 if both are of one body.
@@ -45,9 +48,6 @@ _UNRELATED_ROTATION = 0.5
 _SPAN = 10
 # Quantile of the rotation angles above which motions count: a sensor may stand still for long.
 _TURNING = 0.75
-
-# Rates in degrees instead of radians have a ratio within this share of 57.3.
-_UNIT_WITHIN = 0.2
 
 # A scale explains a path if it reduces the unexplained share below this factor.
 _MENDED_PATH = 0.5
@@ -275,12 +275,18 @@ def estimate_rotation(
     has_rates = "rates" in (config.parent_measures, config.child_measures)
     solution, Ts_cw_c = _solve_rotation(stamps_ns, Ts_pw_p, as_read, has_rates)
     findings = _check_rotation(Ts_pw_p, Ts_cw_c, solution.T_parent_child)
-    if findings and has_rates:
-        findings = _check_rate_unit(motion_pairs(Ts_pw_p, as_read, "B1"), config) or findings
     rotations = replace(pose_pairs, Ts_pw_p=Ts_pw_p, Ts_cw_c=Ts_cw_c)
+    child = Trajectory(stamps_ns, Ts_cw_c).shifted(solution.time_offset_s)
+    on_one_clock = replace(rotations, Ts_cw_c=child.at(stamps_ns, extrapolate=True))
+    of_model = covariance.assess_rotation(Ts_pw_p, solution)
+    opinions = second_opinions(Ts_pw_p, on_one_clock.Ts_cw_c, solution.T_parent_child)
+    assessment = of_model
+    if not findings:
+        open_covariance = _open_covariance(on_one_clock, solution.T_parent_child, config)
+        assessment = widened(of_model, open_covariance)
     solved = estimation.Solved(
         solution=solution,
-        assessment=covariance.assess_rotation(Ts_pw_p, solution),
+        assessment=assessment,
         method="adaptive",
         reference="increments",
         measured="rotations",
@@ -288,6 +294,8 @@ def estimate_rotation(
         weights=(~solution.jumps).astype(float),
         stamps_ns=stamps_ns,
         config=config,
+        opinions=opinions,
+        excess=excess_covariance(of_model, opinions),
     )
     floor = estimation.floor_of(solved, rotations, config) * np.repeat([0.0, 1.0], 3)
     solved = replace(solved, floor=floor)
@@ -296,6 +304,23 @@ def estimate_rotation(
     if not has_rates:
         return result
     return result.with_part("rate_bias", _rate_bias(solution, config))
+
+
+def _open_covariance(
+    pairs: PosePairs, T_parent_child: FloatArray, config: CalibratorConfig
+) -> FloatArray:
+    """Return the covariance (6, 6) of the rotation that possible faults leave open."""
+    whole = np.zeros((6, 6))
+    rotation = se3.rotation_of(T_parent_child)
+    name = measured_stream(config.parent_measures, config.child_measures)
+    has_rates = "rates" in (config.parent_measures, config.child_measures)
+    fitted = fit_pairs(pairs, rotation, name, has_rates)
+    if fitted:
+        covariance_of_fit = fitted.axes_covariance
+        if name == "parent":
+            covariance_of_fit = rotation.T @ covariance_of_fit @ rotation
+        whole[3:, 3:] = covariance_of_fit
+    return whole
 
 
 def _rotations_of(Ts: FloatArray) -> FloatArray:
@@ -352,22 +377,3 @@ def _check_rotation(
         return ()
     share = min(share, 1.0)
     return (finding("unrelated_rotations", share=share),)
-
-
-def _check_rate_unit(steps: MotionPairs, config: CalibratorConfig) -> tuple[Finding, ...]:
-    """Detect rates of one stream in degrees per second and of the other in radians."""
-    ratio = _large_angle(steps.Ts_childi_childj) / _large_angle(steps.Ts_parenti_parentj)
-    stream = "child"
-    if config.child_measures != "rates":
-        ratio = _large_angle(steps.Ts_parenti_parentj) / _large_angle(steps.Ts_childi_childj)
-        stream = "parent"
-    degrees = float(np.degrees(1.0))
-    if min(abs(ratio / degrees - 1.0), abs(ratio * degrees - 1.0)) >= _UNIT_WITHIN:
-        return ()
-    unit, read_as = ("deg/s", "rad/s") if ratio > 1.0 else ("rad/s", "deg/s")
-    return (finding("rate_unit", stream, ratio=ratio, unit=unit, read_as=read_as),)
-
-
-def _large_angle(motions: FloatArray) -> float:
-    """Return a large rotation angle (rad) of motions (K, 4, 4), above zero."""
-    return max(float(np.quantile(se3.rotation_angle(se3.rotation_of(motions)), _TURNING)), 1e-12)

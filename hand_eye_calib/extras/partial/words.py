@@ -49,8 +49,58 @@ WORDS = {
         code="left_handed",
     ),
     "misaligned": FindingWords(
-        "two axes of {whose} rates are not perpendicular, by {degrees:.2f} deg",
+        "the {axes} axes of {whose} rates are not perpendicular, by {degrees:.2f} deg",
         "calibrate the axes of the gyroscope first",
         "a misaligned axis of a gyroscope",
+    ),
+    "gain_of_axis": FindingWords(
+        "{whose} rotations about its {axis} axis are {gain:.4f} +/- {sigma:.4f} times too large",
+        "calibrate that scale first",
+        "a gyroscope with a wrong scale",
+        code="rotation_gain",
+    ),
+    "smoothed_rotations": FindingWords(
+        "{whose} {part} are smoothed over about {smoothing_s:.2f} s, the other's are not",
+        "use the {part} before that filter",
+        "a low-pass or smoothing filter",
+        severity=Severity.WARNING,
+        code="smoothed_{part}",
+    ),
+    "coarse_rates": FindingWords(
+        "{whose} rates are multiples of {step_rad_s:.3g} rad/s",
+        "write rates with all digits",
+        "rounding in a file",
+        severity=Severity.WARNING,
+    ),
+    "clipped_rates": FindingWords(
+        "{whose} rates about {axis} are clipped at {limit_deg_s:.0f} deg/s ({share:.1%} of the "
+        "time)",
+        "set a larger range of the gyroscope, or turn more slowly",
+        severity=Severity.WARNING,
+    ),
+    "bias_drift": FindingWords(
+        "the bias of {whose} rates drifts by about {deg_s:.2f} deg/s",
+        "let the gyroscope warm up, or use a better one",
+        severity=Severity.WARNING,
+    ),
+    "turning_drift": FindingWords(
+        "the worlds of both streams turn against each other, at rates that vary by {deg_s:.2f} "
+        "deg/s",
+        "give orientations that are not corrected by a compass",
+        "a heading that is disturbed",
+        severity=Severity.WARNING,
+        code="world_drift",
+    ),
+    "inverse_rotations": FindingWords(
+        "the orientations of {name} are inverted, or their quaternions are in the order w x y z",
+        "correct that stream by its option (such as child_invert orientations, or child_quaternion "
+        "wxyz)",
+        code="inverse_orientation",
+    ),
+    "unchecked_rotations": FindingWords(
+        "{whose} rotations are too few to detect misaligned axes, gains and smoothing",
+        "record longer, or at a higher rate",
+        severity=Severity.WARNING,
+        code="unchecked",
     ),
 }

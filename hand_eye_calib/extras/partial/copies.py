@@ -1,0 +1,17 @@
+"""Findings about a stream that was computed from the other one."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from hand_eye_calib.core.checks.findings import Finding, Severity, finding
+
+
+def copied(evidence: str, **residual: Any) -> list[Finding]:
+    """Return the finding that one stream was computed from the other."""
+    return [finding("not_independent", "both", Severity.ERROR, evidence=evidence, **residual)]
+
+
+def as_errors(findings: Sequence[Finding]) -> list[Finding]:
+    """Return the same findings as errors."""
+    return [replace(found, severity=Severity.ERROR) for found in findings]

@@ -1,0 +1,271 @@
+"""Checks of positions of one sensor beside poses of another.
+
+The regression of :mod:`~hand_eye_calib.extras.partial.position_columns` detects a wrong scale of a
+coordinate, a delay of a coordinate, and smoothing.
+"""
+
+from collections.abc import Collection
+from typing import NamedTuple
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import FloatArray, IntArray
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.stats import median
+from hand_eye_calib.core.base.text import length
+from hand_eye_calib.core.checks import agreement
+from hand_eye_calib.core.checks.agreement import largest_deviation
+from hand_eye_calib.core.checks.findings import Finding, Severity, finding, graded
+from hand_eye_calib.core.checks.sampling import check_interpolated
+from hand_eye_calib.core.checks.stream_pair import MIN_PAIRS
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.pairing.motion_pairs import PosePairs, synchronise
+from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.extras.partial.copies import as_errors, copied
+from hand_eye_calib.extras.partial.position_columns import PositionFit, fit_positions
+from hand_eye_calib.extras.partial.positions import solve, unexplained_share
+
+# A lever arm is zero if each axis is below this distance (m) or below ``_ZERO_SIGMAS``.
+_ZERO_M = 0.005
+# Standard deviations below which a lever arm is zero.
+_ZERO_SIGMAS = 3.0
+
+# A zero lever arm is an error if the upper bounds of two axes are below this distance (m): two
+# housings hardly fit closer. An upper bound is the value plus two standard deviations.
+_HOUSING_M = 0.03
+# Limit of the upper bound of the third axis (m). Without two axes below this limit, the lever arm
+# is unknown rather than zero.
+_UNKNOWN_M = 0.06
+
+# Median residual (m) below which positions were computed from the poses: no receiver or total
+# station measures to a twentieth of a millimetre.
+_COPIED_M = 5e-5
+# The same limit as a share of the median motion, for slow streams.
+_COPIED_SHARE = 0.01
+
+# Standard deviations from which on smoothing or a late coordinate is clear. They are those of a
+# jackknife of at most 16 blocks, whose distribution has heavy tails.
+_CLEAR_SIGMAS = 6.0
+# Smallest smoothing of positions that is an error (s^2): that of a filter of 0.13 s. Streams
+# without a filter have up to 0.006 (simulated machines with seeds 77 and 78, and NTU VIRAL).
+_SMOOTHING_S2 = 0.008
+# Drift of an odometry along a coordinate, as a share of the distance.
+_DRIFT = 0.02
+# Smallest delay of a coordinate against the others (s).
+_LAG_S = 0.02
+# Share of the squared residuals that faults must explain, to be reported for positions on another
+# path than the poses.
+_NAMES_UNRELATED = 0.6
+
+# Share of a mirrored path below which a lever arm explains the path.
+_MIRRORED_PATH = 0.1
+
+
+def check_solved(
+    parent: Trajectory,
+    child: Trajectory,
+    calibration: Calibration,
+    config: CalibratorConfig,
+    is_unrelated: bool = False,
+) -> list[Finding]:
+    """Check positions and poses against their result.
+
+    Parameters
+    ----------
+    parent, child : Trajectory
+        Each on its own clock.
+    calibration : Calibration
+        The result from both streams.
+    config : CalibratorConfig
+        The options of that result.
+    is_unrelated : bool
+        Whether positions are on another path than the poses.
+
+    Returns
+    -------
+    list of Finding
+    """
+    child = child.shifted(calibration.time_offset_s)
+    pairs = synchronise(parent, child, config.max_gap).child_scaled(calibration.scale)
+    if len(pairs) < MIN_PAIRS:
+        return []
+    stream = "parent" if child.measures == "poses" else "child"
+    priors = {*config.prior()}
+    measured = {"parent": parent, "child": child}[stream]
+    interpolated = check_interpolated(se3.translation_of(measured.poses), stream)
+    return _check_moving(pairs, calibration, stream, priors, is_unrelated, interpolated)
+
+
+def _check_moving(
+    pairs: PosePairs,
+    calibration: Calibration,
+    stream: str,
+    priors: Collection[str],
+    is_unrelated: bool,
+    interpolated: list[Finding],
+) -> list[Finding]:
+    """Check positions; return the findings of the first check that has any."""
+    lever_arm = se3.translation_of(calibration.T_parent_child)
+    sigmas = calibration.sigmas_measured[:3]
+    if stream == "child":
+        poses = pairs.Ts_pw_p
+        positions = se3.translation_of(pairs.Ts_cw_c)
+        fitted = fit_positions(pairs.stamps_ns, poses, positions, lever_arm)
+    else:
+        poses = pairs.Ts_cw_c
+        positions = se3.translation_of(pairs.Ts_pw_p)
+        fitted = fit_positions(pairs.stamps_ns, poses, positions, -lever_arm)
+    no_lever_arm = [] if is_unrelated else check_position(lever_arm, sigmas, priors)
+    if fitted and _is_copied(fitted, positions):
+        evidence = "The positions agree with the poses to rounding"
+        return as_errors(no_lever_arm) or copied(evidence, residual_m=fitted.residual)
+    if findings := [*interpolated, *no_lever_arm]:
+        return findings
+    if is_unrelated and _is_mirrored(pairs.stamps_ns, poses, positions):
+        return [finding("mirrored_positions", stream)]
+    if not fitted:
+        return [] if is_unrelated else [finding("unchecked", stream)]
+    return check_positions(fitted, stream, is_unrelated)
+
+
+def _is_mirrored(stamps_ns: IntArray, poses: FloatArray, positions: FloatArray) -> bool:
+    """Return whether a lever arm explains positions only if one coordinate has the other sign."""
+    mirrored = positions * [1.0, 1.0, -1.0]
+    try:
+        solution = solve(stamps_ns, poses, mirrored)
+    except np.linalg.LinAlgError:
+        return False
+    share = unexplained_share(poses, mirrored, solution.lever_arm, solution.scale)
+    return share < _MIRRORED_PATH
+
+
+def _is_copied(fitted: PositionFit, positions: FloatArray) -> bool:
+    """Return whether positions were computed from the poses: only rounding differs."""
+    moved_m = median(np.linalg.norm(np.diff(positions, axis=0), axis=1))
+    return fitted.residual < min(_COPIED_M, _COPIED_SHARE * moved_m)
+
+
+def check_position(
+    lever_arm: FloatArray, sigmas: FloatArray, priors: Collection[str]
+) -> list[Finding]:
+    """Detect a lever arm of zero, which suggests that positions were copied between the streams.
+
+    Parameters
+    ----------
+    lever_arm, sigmas : (3,) array
+        Lever arm and its standard deviations (m), infinite for unobservable axes.
+    priors : collection of str
+        Axes with a prior; they are not checked.
+    """
+    axes = [k for k, axis in enumerate("xyz") if np.isfinite(sigmas[k]) and axis not in priors]
+    if len(axes) < 2:
+        return []
+    lengths_m = np.abs(lever_arm[axes])
+    sigmas_m = sigmas[axes]
+    if (lengths_m > np.maximum(_ZERO_M, _ZERO_SIGMAS * sigmas_m)).any():
+        return []
+    uppers_m = np.sort(lengths_m + 2.0 * sigmas_m)
+    if uppers_m[1] > _UNKNOWN_M:
+        return []
+    # Two axes are not enough for an error: an antenna may be right above the other sensor.
+    is_sure = len(axes) == 3 and uppers_m[1] < _HOUSING_M and uppers_m[2] < _UNKNOWN_M
+    severity = Severity.ERROR if is_sure else Severity.WARNING
+    distance_m = float(np.linalg.norm(lengths_m))
+    size = f"{length(distance_m)} +/- {length(float(sigmas_m.max()))}"
+    return [finding("no_lever_arm", "both", severity, size=size, translation_m=distance_m)]
+
+
+def check_positions(fitted: PositionFit, stream: str, is_unrelated: bool) -> list[Finding]:
+    """Detect the fault of a stream of positions that is most significant.
+
+    Parameters
+    ----------
+    fitted : PositionFit
+        The regression of the positions on the columns of all faults.
+    stream : {"parent", "child"}
+        The stream of positions.
+    is_unrelated : bool
+        Whether the positions are on another path than the poses. A fault is reported then only if
+        it explains why.
+
+    Returns
+    -------
+    list of Finding
+        At most one finding.
+    """
+    if is_unrelated and fitted.explained_share < _NAMES_UNRELATED:
+        return []
+    suspects = [
+        _smoothing(fitted, stream),
+        _scale_of_axis(fitted, stream),
+        _lag_of_axis(fitted, stream),
+    ]
+    ranked = sorted(suspects, key=lambda suspect: suspect.sigmas, reverse=True)
+    return [suspect.found for suspect in ranked if suspect.found][:1]
+
+
+class _Suspect(NamedTuple):
+    """A fault that is possible: its size in standard deviations, and its finding if it is clear."""
+
+    sigmas: float
+    found: Finding | None
+
+
+def _smoothing(fitted: PositionFit, stream: str) -> _Suspect:
+    """Return how clear it is that positions are smoothed.
+
+    Smoothed positions are an error, because the lever arm follows from the positions in turns.
+    """
+    values, sigmas = fitted.estimate("smoothing")
+    smoothing_s2 = float(values[0])
+    n_sigmas = smoothing_s2 / max(float(sigmas[0]), 1e-12)
+    if smoothing_s2 < _SMOOTHING_S2 or n_sigmas < _CLEAR_SIGMAS:
+        return _Suspect(n_sigmas, None)
+    found = finding(
+        "smoothed",
+        stream,
+        Severity.ERROR,
+        part="positions",
+        smoothing_s=smoothing_s2**0.5,
+        shift_m=smoothing_s2 * fitted.acceleration_m_s2,
+    )
+    return _Suspect(n_sigmas, found)
+
+
+def _scale_of_axis(fitted: PositionFit, stream: str) -> _Suspect:
+    """Return how clear it is that a coordinate has another scale than the others.
+
+    Drift and noise of the odometry along a coordinate that hardly changes shrink its factor. A
+    coordinate that does not change at all was not measured.
+    """
+    axis, size, sigma = largest_deviation(*fitted.estimate("scales"))
+    noise = 3.0 * fitted.residual**2 * (1.0 - fitted.explained_share)
+    spurious = (_DRIFT * fitted.path_m) ** 2 + noise
+    shrinks = agreement.BIASES * spurious / fitted.spreads_m[axis] ** 2
+    if abs(size) < shrinks and not fitted.is_constant[axis]:
+        return _Suspect(0.0, None)
+    factor = 1.0 + size
+    values = {"axis": "xyz"[axis], "factor": factor, "sigma": sigma}
+    return _Suspect(abs(size) / sigma, graded("axis_scale", stream, size, sigma, **values))
+
+
+def _lag_of_axis(fitted: PositionFit, stream: str) -> _Suspect:
+    """Return how clear it is that a coordinate is late against the others."""
+    axis, lag_s, sigma_s = largest_deviation(*fitted.estimate("delays"))
+    n_sigmas = lag_s / sigma_s
+    if lag_s < _LAG_S or n_sigmas < _CLEAR_SIGMAS:
+        return _Suspect(n_sigmas, None)
+    shift_m = lag_s * float(fitted.speeds_m_s[axis])
+    found = graded(
+        "late",
+        stream,
+        shift_m,
+        delay_s=lag_s,
+        sigma_s=sigma_s,
+        shift_m=shift_m,
+        code="axis_lag",
+        part=f"{'xyz'[axis]} coordinates",
+        others="others",
+    )
+    return _Suspect(n_sigmas, found)

@@ -1,0 +1,436 @@
+"""Checks of rotations or angular rates of two sensors.
+
+The regression of :mod:`~hand_eye_calib.extras.partial.rotation_columns` detects wrong gains,
+misaligned axes and smoothing. Other checks detect wrong conventions, copies, a moved mount, and
+rates that are clipped, coarse, or have a bias that drifts.
+"""
+
+from collections.abc import Collection
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from hand_eye_calib.core.assessment.covariance import BLOCKS
+from hand_eye_calib.core.assessment.moved import find_change
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.stats import median
+from hand_eye_calib.core.base.text import angle
+from hand_eye_calib.core.checks import agreement
+from hand_eye_calib.core.checks.findings import (
+    Finding,
+    Severity,
+    finding,
+    graded,
+)
+from hand_eye_calib.core.checks.stream_pair import MAX_ROTATION_RAD, MIN_PAIRS
+from hand_eye_calib.core.checks.streams import check_flat
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.noise.increments import without_rate_bias
+from hand_eye_calib.core.pairing.motion_pairs import PosePairs, pairs_over, synchronise
+from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
+from hand_eye_calib.extras.partial.copies import as_errors, copied
+from hand_eye_calib.extras.partial.rotation_columns import PLANES, RotationFit, fit_pairs
+
+# Standard deviations below which a rotation is zero.
+_ZERO_SIGMAS = 3.0
+
+# Median residual (rad) below which rotations were computed from those of the other stream. It
+# corresponds to quaternions with five digits.
+_COPIED_RAD = 2e-5
+# The same limit as a share of the median motion, for slow streams.
+_COPIED_SHARE = 0.01
+
+# Largest number of motions.
+_MOST_MOTIONS = 3000
+
+# Rates have left-handed axes if the residual of the best reflection is below this share of the
+# residual of the best rotation. Noise alone makes both about equal.
+_MIRRORED = 0.5
+# Least residual of the best rotation of such rates, as a share of the rotation vectors. If all
+# motion is about one axis, a reflection only changes the sign of the noise about the others.
+_UNMIRRORED = 0.06
+# Duration (s) of these rotation vectors: those of a second are too long to be mirrored by a matrix.
+_MIRRORED_S = 0.5
+
+# Orientations in another convention leave less than this share of the rotation unexplained.
+_EXPLAINED = 0.1
+# Orientations as they were read leave at least so many times as much.
+_DECISIVE = 3.0
+
+# Rates in degrees instead of radians have a ratio within this share of 57.3.
+_UNIT_WITHIN = 0.2
+# Quantile of the rates that are compared: a sensor may stand still for long.
+_TURNING = 0.75
+
+# Standard deviations from which on smoothing is clear. They are those of a jackknife of at most 16
+# blocks, whose distribution has heavy tails.
+_CLEAR_SIGMAS = 6.0
+# Smallest smoothing (s^2): that of a filter of 63 ms.
+_SMOOTHING_S2 = 0.004
+
+# Rates are coarse if their number of levels is below this share of their number.
+_FEW_LEVELS = 0.1
+# Fewest levels of rates that turn.
+_LEAST_LEVELS = 5
+# Rounding of integrated rates (rad/s).
+_ROUNDING_RAD_S = 1e-9
+# Smallest step of coarse rates (rad/s). Those of a gyroscope with 16 bits are 0.001.
+_STEP_RAD_S = 0.005
+
+# Rates are clipped if at least so many are equal to the largest rate, ...
+_LEAST_CLIPPED = 20
+# ... and no more are below by at most this share of the largest rate.
+_NEAR_LIMIT = 0.02
+
+# Largest usual change of the bias of rates, or of the drift of a world, between windows (rad/s).
+_DRIFT_RAD_S = float(np.radians(0.1))
+
+
+class _Streams(NamedTuple):
+    """Streams of rotations, each on its own clock, and their pairs on one clock.
+
+    Attributes
+    ----------
+    parent, child : Trajectory
+    pairs : PosePairs
+    name : {"parent", "child"}
+        The stream to which faults are attributed: that with rates.
+    has_rates : bool
+        Whether this stream has rates.
+    """
+
+    parent: Trajectory
+    child: Trajectory
+    pairs: PosePairs
+    name: str
+    has_rates: bool
+
+    @property
+    def measured(self) -> Trajectory:
+        """The stream to which faults are attributed."""
+        return self.child if self.name == "child" else self.parent
+
+
+def measured_stream(parent_measures: str, child_measures: str) -> str:
+    """Return the stream to which faults are attributed: the one that measures least."""
+    order = ("rates", "rotations", "poses")
+    is_parent = order.index(parent_measures) < order.index(child_measures)
+    return "parent" if is_parent else "child"
+
+
+def check_solved(
+    parent: Trajectory,
+    child: Trajectory,
+    calibration: Calibration,
+    config: CalibratorConfig,
+    is_unrelated: bool = False,
+) -> list[Finding]:
+    """Check rotations or rates against their result; return the findings of the first failed check.
+
+    Parameters
+    ----------
+    parent, child : Trajectory
+        Each on its own clock.
+    calibration : Calibration
+        The result from both streams.
+    config : CalibratorConfig
+        The options of that result.
+    is_unrelated : bool
+        Whether one stream does not explain the other.
+
+    Returns
+    -------
+    list of Finding
+    """
+    pairs = synchronise(parent, child.shifted(calibration.time_offset_s), config.max_gap)
+    if len(pairs) < MIN_PAIRS:
+        return []
+    name = measured_stream(parent.measures, child.measures)
+    has_rates = "rates" in (parent.measures, child.measures)
+    streams = _Streams(parent, child, pairs, name, has_rates)
+    findings = check_flat(parent.scaled(0.0), child.scaled(0.0))
+    findings = findings or _check_unit(streams) or _check_conventions(streams)
+    if findings or is_unrelated:
+        return findings or _check_handedness(streams)
+    rotation = se3.rotation_of(calibration.T_parent_child)
+    sigmas = calibration.sigmas_measured[3:]
+    parallel = check_rotation(rotation, sigmas, {*config.prior()}, has_rates)
+    if copy := _copied_rotations(pairs, rotation):
+        return as_errors(parallel) or copy
+    findings = parallel or _check_handedness(streams) or _check_levels(streams)
+    if findings:
+        return findings
+    streams = streams._replace(pairs=_without_bias(pairs, calibration))
+    return _check_mount(streams.pairs, rotation) or _check_response(streams, rotation)
+
+
+def _without_bias(pairs: PosePairs, calibration: Calibration) -> PosePairs:
+    """Remove the estimated gyroscope bias from pose pairs."""
+    rate_bias = calibration.parts.get("rate_bias")
+    if not rate_bias:
+        return pairs
+    bias = np.array(rate_bias.rad_per_s)
+    if rate_bias.of == "parent":
+        return replace(pairs, Ts_pw_p=without_rate_bias(pairs.stamps_ns, pairs.Ts_pw_p, bias))
+    return replace(pairs, Ts_cw_c=without_rate_bias(pairs.stamps_ns, pairs.Ts_cw_c, bias))
+
+
+def check_rotation(
+    rotation: FloatArray, sigmas: FloatArray, priors: Collection[str], has_rates: bool
+) -> list[Finding]:
+    """Detect a rotation of zero, which suggests that both streams come from one sensor.
+
+    Parameters
+    ----------
+    rotation : (3, 3) array
+    sigmas : (3,) array
+        Standard deviations (rad), infinite for unobservable axes.
+    priors : collection of str
+        Axes with a prior. With a prior about a rotation, nothing is checked.
+    has_rates : bool
+        Whether a stream has rates. The finding is an error then, otherwise a warning: the axes of
+        two cameras may well be parallel.
+    """
+    limit_rad = agreement.MAX_SIGMA_RAD
+    # The standard deviations must be small on all axes: if two level sensors turn only about the
+    # vertical, yaw is unobservable, and roll and pitch are zero for any two sensors.
+    if {"roll", "pitch", "yaw"} & {*priors} or not sigmas.max() < limit_rad:
+        return []
+    angles_rad = np.abs(se3.rotation_log(rotation))
+    if (angles_rad > np.maximum(agreement.SAME_RAD, _ZERO_SIGMAS * sigmas)).any():
+        return []
+    angle_rad = float(np.linalg.norm(angles_rad))
+    severity = Severity.ERROR if has_rates else Severity.WARNING
+    return [finding("parallel_axes", "both", severity, size=angle(angle_rad), angle_rad=angle_rad)]
+
+
+def _copied_rotations(pairs: PosePairs, rotation: FloatArray) -> list[Finding]:
+    """Detect rotations that were computed from the other stream: only rounding differs."""
+    of_parent, of_child = _rotation_vectors(pairs)
+    if len(of_parent) < MIN_PAIRS:
+        return []
+    residual_rad = median(np.linalg.norm(of_child @ rotation.T - of_parent, axis=1))
+    usual_rad = median(np.linalg.norm(of_parent, axis=1))
+    if residual_rad > min(_COPIED_RAD, _COPIED_SHARE * usual_rad):
+        return []
+    return copied("The rotations of both streams agree to rounding", residual_rad=residual_rad)
+
+
+def _rotation_vectors(
+    pairs: PosePairs, lag_s: float = agreement.SHORT_S
+) -> tuple[FloatArray, FloatArray]:
+    """Rotation vectors (K, 3) of parent and child over a time, each in its own sensor frame."""
+    motions = pairs_over(pairs, lag_s, _MOST_MOTIONS)
+    of_parent = se3.rotation_log(se3.rotation_of(motions.Ts_parenti_parentj))
+    of_child = se3.rotation_log(se3.rotation_of(motions.Ts_childi_childj))
+    angles = np.maximum(np.linalg.norm(of_parent, axis=1), np.linalg.norm(of_child, axis=1))
+    is_usable = angles < MAX_ROTATION_RAD
+    return of_parent[is_usable], of_child[is_usable]
+
+
+def _check_unit(streams: _Streams) -> list[Finding]:
+    """Detect rates of one stream in degrees per second and of the other in radians."""
+    if not streams.has_rates:
+        return []
+    other = streams.parent if streams.name == "child" else streams.child
+    ratio = _large_rate(streams.measured) / _large_rate(other)
+    degrees = float(np.degrees(1.0))
+    if min(abs(ratio / degrees - 1.0), abs(ratio * degrees - 1.0)) >= _UNIT_WITHIN:
+        return []
+    unit, read_as = ("deg/s", "rad/s") if ratio > 1.0 else ("rad/s", "deg/s")
+    return [finding("rate_unit", streams.name, ratio=ratio, unit=unit, read_as=read_as)]
+
+
+def _rates(stream: Trajectory) -> FloatArray:
+    """Return the rates (N - 1, 3) between the rotations of a stream, rad/s."""
+    rotations = se3.rotation_of(stream.poses)
+    turns = se3.rotation_log(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:])
+    return np.asarray(turns / (np.diff(stream.stamps_ns) * 1e-9)[:, None])
+
+
+def _large_rate(stream: Trajectory) -> float:
+    """Return a large angular rate of a stream, rad/s, above zero."""
+    rates = np.linalg.norm(_rates(stream), axis=1)
+    return max(float(np.quantile(rates, _TURNING)), 1e-12)
+
+
+def _check_conventions(streams: _Streams) -> list[Finding]:
+    """Detect orientations of one stream that are inverted, or quaternions in another order.
+
+    Rotations do not reveal which: reading w x y z as x y z w inverts the rotations and turns both
+    frames. Without rates, they do not reveal the stream either.
+    """
+    pairs = streams.pairs
+    inverted = replace(pairs, Ts_pw_p=se3.put_right(pairs.Ts_pw_p, invert="orientations"))
+    if streams.name == "parent":
+        inverted = replace(pairs, Ts_cw_c=se3.put_right(pairs.Ts_cw_c, invert="orientations"))
+    share = _unexplained(inverted)
+    if share > min(_EXPLAINED, _unexplained(pairs) / _DECISIVE):
+        return []
+    if not streams.has_rates:
+        return [finding("inverse_rotations", "both", name="one stream")]
+    stream = "child" if streams.name == "parent" else "parent"
+    return [finding("inverse_rotations", stream, name=f"the {stream}")]
+
+
+def _unexplained(pairs: PosePairs) -> float:
+    """Return the share of the rotations that no extrinsic rotation explains."""
+    motions = pairs_over(pairs, agreement.SHORT_S, _MOST_MOTIONS)
+    of_parent, of_child = _rotation_vectors(pairs)
+    residuals = of_child @ align_rotation_vectors(motions).T - of_parent
+    usual_rad = max(median(np.linalg.norm(of_parent, axis=1)), 1e-12)
+    return median(np.linalg.norm(residuals, axis=1)) / usual_rad
+
+
+def _check_handedness(streams: _Streams) -> list[Finding]:
+    """Detect rates about left-handed axes: a reflection fits far better than any rotation."""
+    of_parent, of_child = _rotation_vectors(streams.pairs, _MIRRORED_S)
+    if len(of_parent) < BLOCKS * MIN_PAIRS:
+        return []
+    # Subtract the mean, which contains the bias: a wrong rotation spoils the estimate of the bias.
+    of_parent = of_parent - of_parent.mean(axis=0)
+    of_child = of_child - of_child.mean(axis=0)
+    left, _, right = np.linalg.svd(of_child.T @ of_parent)
+    rotating = np.diag([1.0, 1.0, np.linalg.det(left @ right)])
+    mirroring = rotating * [1.0, 1.0, -1.0]
+    residuals_rad = []
+    for signs in (rotating, mirroring):
+        errors = of_child @ left @ signs @ right - of_parent
+        residuals_rad.append(median(np.linalg.norm(errors, axis=1)))
+    by_rotation, by_mirror = residuals_rad
+    usual = median(np.linalg.norm(of_parent, axis=1))
+    is_mirrored = by_mirror < _MIRRORED * by_rotation and by_rotation > _UNMIRRORED * usual
+    return [finding("mirrored_rates", streams.name)] if is_mirrored else []
+
+
+def _check_levels(streams: _Streams) -> list[Finding]:
+    """Detect rates in coarse steps, or clipped at the limit of a gyroscope."""
+    if streams.measured.measures != "rates":
+        return []
+    rates = _rates(streams.measured)
+    for axis, column in zip("xyz", rates.T, strict=True):
+        levels = np.unique(np.round(column / _ROUNDING_RAD_S)) * _ROUNDING_RAD_S
+        if _LEAST_LEVELS <= len(levels) < _FEW_LEVELS * len(column):
+            # The mean of two rates has half the steps.
+            step_rad_s = 2.0 * median(np.diff(levels))
+            if step_rad_s > _STEP_RAD_S:
+                return [finding("coarse_rates", streams.name, step_rad_s=step_rad_s)]
+            continue
+        limit = np.abs(column).max()
+        n_clipped = int((np.abs(column) > limit - _ROUNDING_RAD_S).sum())
+        n_near = int((np.abs(column) > (1.0 - _NEAR_LIMIT) * limit).sum()) - n_clipped
+        if n_clipped >= max(_LEAST_CLIPPED, n_near):
+            share = n_clipped / len(column)
+            limit_deg_s = float(np.degrees(limit))
+            return [
+                finding(
+                    "clipped_rates", streams.name, axis=axis, share=share, limit_deg_s=limit_deg_s
+                )
+            ]
+    return []
+
+
+def _check_mount(pairs: PosePairs, rotation: FloatArray) -> list[Finding]:
+    """Detect a mount that has moved."""
+    if len(_rotation_vectors(pairs)[0]) < BLOCKS * MIN_PAIRS:
+        return []
+    still = np.zeros(3)
+    turning = PosePairs(
+        pairs.stamps_ns,
+        se3.from_rotation_translation(se3.rotation_of(pairs.Ts_pw_p), still),
+        se3.from_rotation_translation(se3.rotation_of(pairs.Ts_cw_c), still),
+    )
+    change = find_change(turning, se3.from_rotation_translation(rotation, still))
+    moved = agreement.moved_mount(change, int(pairs.stamps_ns[0])) if change else None
+    return [moved] if moved else []
+
+
+class _Suspect(NamedTuple):
+    """A fault that is possible: its size in standard deviations, and its finding if it is clear."""
+
+    sigmas: float
+    found: Finding | None
+
+
+def _check_response(streams: _Streams, rotation: FloatArray) -> list[Finding]:
+    """Detect the fault that is most significant in the regression on all faults."""
+    is_rate = streams.measured.measures == "rates"
+    fitted = fit_pairs(streams.pairs, rotation, streams.name, is_rate)
+    if not fitted:
+        return [finding("unchecked_rotations", streams.name)]
+    suspects = [_smoothing(fitted, streams), _gain(fitted, streams)]
+    if is_rate:
+        suspects.append(_shear(fitted, streams))
+    ranked = sorted(suspects, key=lambda suspect: suspect.sigmas, reverse=True)
+    findings = [suspect.found for suspect in ranked if suspect.found][:1]
+    if findings or fitted.drift < _DRIFT_RAD_S:
+        return findings
+    key = "bias_drift" if is_rate else "turning_drift"
+    return [finding(key, streams.name, deg_s=float(np.degrees(fitted.drift)))]
+
+
+def _smoothing(fitted: RotationFit, streams: _Streams) -> _Suspect:
+    """Return how clear it is that one stream is smoothed against the other."""
+    values, sigmas = fitted.estimate("smoothing")
+    smoothing_s2 = float(values[0])
+    n_sigmas = abs(smoothing_s2) / max(float(sigmas[0]), 1e-12)
+    if abs(smoothing_s2) < _SMOOTHING_S2 or n_sigmas < _CLEAR_SIGMAS:
+        return _Suspect(n_sigmas, None)
+    name = streams.name
+    if smoothing_s2 < 0.0:
+        name = "parent" if name == "child" else "child"
+    stream = streams.child if name == "child" else streams.parent
+    part = "rates" if stream.measures == "rates" else "orientations"
+    seconds = abs(smoothing_s2) ** 0.5
+    return _Suspect(n_sigmas, finding("smoothed_rotations", name, part=part, smoothing_s=seconds))
+
+
+class _Largest(NamedTuple):
+    """The most significant of three values of a fault."""
+
+    place: int
+    value: float
+    sigma: float
+
+
+def _largest(fitted: RotationFit, name: str) -> _Largest | None:
+    """Return the most significant value of a fault that noise of the columns does not explain.
+
+    The columns are integrals of rates, and contain the noise of the orientations.
+    """
+    values, sigmas = fitted.estimate(name)
+    is_real = np.abs(values) > agreement.BIASES * fitted.biases(name)
+    n_sigmas = np.where(is_real, np.abs(values) / sigmas, 0.0)
+    place = int(np.argmax(n_sigmas))
+    if not is_real[place]:
+        return None
+    return _Largest(place, float(values[place]), float(sigmas[place]))
+
+
+def _gain(fitted: RotationFit, streams: _Streams) -> _Suspect:
+    """Return how clear it is that rates about an axis are too large or too small."""
+    largest = _largest(fitted, "gains")
+    if not largest:
+        return _Suspect(0.0, None)
+    place, gain, sigma = largest
+    found = graded(
+        "gain_of_axis", streams.name, gain, sigma, axis="xyz"[place], gain=1.0 + gain, sigma=sigma
+    )
+    return _Suspect(abs(gain) / sigma, found)
+
+
+def _shear(fitted: RotationFit, streams: _Streams) -> _Suspect:
+    """Return how clear it is that two axes of a gyroscope are not perpendicular."""
+    largest = _largest(fitted, "shears")
+    if not largest:
+        return _Suspect(0.0, None)
+    place, shear, sigma = largest
+    first, second = ("xyz"[axis] for axis in PLANES[place])
+    degrees = float(np.degrees(2.0 * abs(shear)))
+    axes = f"{first} and {second}"
+    found = graded("misaligned", streams.name, shear, sigma, axes=axes, degrees=degrees)
+    return _Suspect(abs(shear) / sigma, found)

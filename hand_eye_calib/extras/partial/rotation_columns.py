@@ -1,0 +1,245 @@
+"""Regression of rotations of two sensors on columns of possible faults.
+
+G_i are the orientations of the reference in the axes of the measured sensor, by the extrinsic
+rotation, and Q_i those of the measured stream. In a window, their errors in the world are
+
+    e_i = Log(W' Q_i G_i') = G_i phi + int G S w dt - G_i w_i d + c (...) + nuisances + noise
+
+with the rotation W between the worlds, the error phi of the extrinsic rotation (right perturbation,
+axes of the measured sensor), and the angular rates w about the measured sensor's axes. The
+symmetric matrix S has the gains of the axes on its diagonal, and their misalignment off the
+diagonal (D. Tedaldi, A. Pretto, E. Menegatti, *A robust and easy to implement method for IMU
+calibration without external equipments*, 2014). Any low-pass filter has a delay d and a smoothing c
+at low frequencies: of rates ``c (G w' - int G (w x w') dt)`` with the angular acceleration w', of
+orientations ``c G w'``.
+
+The nuisances of a window are the error of W, and a constant bias of rates (of orientations: a drift
+of the world): neither bias nor drift looks like a fault. Rates of one stream are the instruments of
+those of the other.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import FloatArray, IntArray
+from hand_eye_calib.core.base.stats import MEDIAN_NORMAL, median
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.pairing.motion_pairs import PosePairs
+from hand_eye_calib.extras.partial.columns import Column, Fit, fit_columns, split
+
+# Duration of a window (s): a bias is constant in it, and a machine turns.
+_WINDOW_S = 20.0
+
+# Step (s) of the differences that rates come from; one interval if that is longer.
+_STEP_S = 0.1
+
+# Planes of two axes that may be misaligned, in the order of the third axis.
+PLANES = ((1, 2), (0, 2), (0, 1))
+
+
+class _Motion(NamedTuple):
+    """Columns of one stream in windows (W, K), in the world of the reference.
+
+    Attributes
+    ----------
+    rates : (W, K, 3) array
+        Angular rates.
+    bends : (W, K, 3) array
+        What smoothing adds.
+    gains, shears : (W, K, 3, 3) array
+        Integrals of the rate about each axis, and of the rates of each plane, exchanged.
+    """
+
+    rates: FloatArray
+    bends: FloatArray
+    gains: FloatArray
+    shears: FloatArray
+
+
+class _Windows(NamedTuple):
+    """Windows of both streams. ``orientations`` (W, K, 3, 3) are those of the reference."""
+
+    orientations: FloatArray
+    reference: _Motion
+    measured: _Motion
+
+
+# Columns by the names of the faults.
+_COLUMNS = {
+    # Radians.
+    "rotation": Column(1.0, lambda windows: windows.orientations),
+    # Factor of the rate about each axis, less 1.
+    "gains": Column(
+        0.03,
+        lambda windows: windows.reference.gains,
+        lambda windows: windows.measured.gains,
+    ),
+    # Half the error of the angle between two axes, rad.
+    "shears": Column(
+        float(np.radians(0.5)),
+        lambda windows: windows.reference.shears,
+        lambda windows: windows.measured.shears,
+    ),
+    # Seconds.
+    "delay": Column(
+        1.0,
+        lambda windows: -windows.reference.rates[..., None],
+        lambda windows: -windows.measured.rates[..., None],
+    ),
+    # Smoothing, s^2.
+    "smoothing": Column(
+        0.1,
+        lambda windows: windows.reference.bends[..., None],
+        lambda windows: windows.measured.bends[..., None],
+    ),
+}
+
+
+@dataclass(frozen=True)
+class RotationFit(Fit):
+    """Regression of rotations on the columns of all faults."""
+
+    @property
+    def axes_covariance(self) -> FloatArray:
+        """Covariance (3, 3) of the extrinsic rotation that possible faults leave open, rad^2.
+
+        If two axes of a sensor are not perpendicular, its frame is uncertain by the same angle.
+        """
+        shears, sigmas = self.estimate("shears")
+        return self.open_covariance + np.diag(np.maximum(shears**2 - sigmas**2, 0.0))
+
+    @property
+    def drift(self) -> float:
+        """Largest usual deviation (rad/s) between windows of a bias, or of the drift of a world."""
+        drifts = self.nuisances[:, 3:]
+        deviations = np.abs(drifts - np.median(drifts, axis=0))
+        return float(np.median(deviations, axis=0).max() / MEDIAN_NORMAL)
+
+
+def fit_pairs(
+    pairs: PosePairs, rotation: FloatArray, stream: str, has_rates: bool
+) -> RotationFit | None:
+    """Fit the rotations of pose pairs with the extrinsic rotation and all faults.
+
+    Parameters
+    ----------
+    pairs : PosePairs
+        On one clock. The positions are ignored.
+    rotation : (3, 3) array
+        Best estimate of the extrinsic rotation. The values of the regression are relative to it.
+    stream : {"parent", "child"}
+        The measured stream, to which faults are attributed.
+    has_rates : bool
+        Whether this stream has rates.
+    """
+    of_parent = se3.rotation_of(pairs.Ts_pw_p)
+    of_child = se3.rotation_of(pairs.Ts_cw_c)
+    if stream == "child":
+        return fit_rotations(pairs.stamps_ns, of_parent @ rotation, of_child, has_rates)
+    return fit_rotations(pairs.stamps_ns, of_child @ rotation.T, of_parent, has_rates)
+
+
+def fit_rotations(
+    stamps_ns: IntArray, reference: FloatArray, measured: FloatArray, has_rates: bool
+) -> RotationFit | None:
+    """Fit rotations with the extrinsic rotation and all faults.
+
+    Parameters
+    ----------
+    stamps_ns : (N,) int64 array
+    reference : (N, 3, 3) array
+        Orientations of the reference, rotated to the axes of the measured sensor.
+    measured : (N, 3, 3) array
+        Orientations, or integrated rates, of the measured sensor.
+    has_rates : bool
+        Whether the measured sensor has rates.
+
+    Returns
+    -------
+    RotationFit or None
+        None if the recording is too short.
+    """
+    stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
+    interval_s = median(np.diff(stamps_s))
+    step = max(round(_STEP_S / interval_s), 1)
+    rows = np.arange(len(stamps_s))
+    last = len(rows) - 1
+    spans_s = stamps_s[np.minimum(rows + 2 * step, last)] - stamps_s[np.maximum(rows - 2 * step, 0)]
+    in_windows = split(stamps_s, spans_s, step, _WINDOW_S)
+    if in_windows is None:
+        return None
+    is_used = in_windows.is_used
+    # Errors in the world of the reference, about the mean of each window.
+    between = in_windows(measured) @ np.swapaxes(in_windows(reference), 2, 3)
+    worlds = se3.nearest_rotation((between * is_used[..., None, None]).sum(axis=1))
+    errors = se3.rotation_log(np.swapaxes(worlds, 1, 2)[:, None] @ between)
+    orientations = in_windows(reference)
+    moving = np.broadcast_to(np.eye(3), orientations.shape)
+    drifting = _integral(stamps_s, reference[:-1] if has_rates else moving[0, :1])
+    motions = []
+    for stream in (reference, measured):
+        whole = _motion(stamps_s, stream, reference, step, has_rates)
+        motions.append(_Motion(*[in_windows(columns) for columns in whole]))
+    windows = _Windows(orientations, *motions)
+    nuisances = np.concatenate([moving, in_windows(drifting)], axis=3)
+    fitted = fit_columns(_COLUMNS, windows, is_used, errors, nuisances)
+    return RotationFit(**vars(fitted))
+
+
+def _integral(stamps_s: FloatArray, values: FloatArray) -> FloatArray:
+    """Return the integral (N, ...) over time of values (N - 1, ...) between the stamps (N,)."""
+    intervals_s = np.diff(stamps_s).reshape(-1, *[1] * (values.ndim - 1))
+    return np.cumsum(np.concatenate([0.0 * values[:1], intervals_s * values]), axis=0)
+
+
+def _motion(
+    stamps_s: FloatArray,
+    stream: FloatArray,
+    orientations: FloatArray,
+    step: int,
+    has_rates: bool,
+) -> _Motion:
+    """Return the columns of a stream from its rotations and the orientations of the reference.
+
+    Parameters
+    ----------
+    stamps_s : (N,) array
+    stream, orientations : (N, 3, 3) array
+    step : int
+        Samples of a step of differences.
+    has_rates : bool
+        Whether the measured stream has rates.
+    """
+    rows = np.arange(len(stream))
+    last = len(rows) - 1
+    before_2, before, after, after_2 = (np.clip(rows + k * step, 0, last) for k in (-2, -1, 1, 2))
+    step_s = np.maximum(stamps_s[after_2] - stamps_s[before_2], 1e-9)[:, None] / 4.0
+    rates = _turns(stream[before], stream[after]) / (2.0 * step_s)
+    turns = _turns(stream[after], stream[after_2]) - _turns(stream[before_2], stream[before])
+    accelerations = turns / (3.0 * step_s**2)
+    bends = se3.times(orientations, accelerations)
+    turns = _turns(stream[:-1], stream[1:])
+    steps = turns / np.diff(stamps_s)[:, None]
+    halfway = orientations[:-1] @ se3.rotation_exp(0.5 * turns)
+    if has_rates:
+        between = 0.5 * (accelerations[:-1] + accelerations[1:])
+        bends = bends - _integral(stamps_s, se3.times(halfway, se3.cross(steps, between)))
+    gains = halfway * steps[:, None, :]
+    shears = np.zeros_like(halfway)
+    for column, (k, m) in enumerate(PLANES):
+        shears[..., column] = (
+            halfway[..., k] * steps[:, m, None] + halfway[..., m] * steps[:, k, None]
+        )
+    return _Motion(
+        rates=se3.times(orientations, rates),
+        bends=bends,
+        gains=_integral(stamps_s, gains),
+        shears=_integral(stamps_s, shears),
+    )
+
+
+def _turns(start: FloatArray, end: FloatArray) -> FloatArray:
+    """Return the rotation vectors (N, 3) from orientations (N, 3, 3) to others."""
+    return se3.rotation_log(np.swapaxes(start, 1, 2) @ end)
