@@ -10,7 +10,8 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.formats.transforms import PoseFields
 from hand_eye_calib.online.live import cycle as cycle_module
 from hand_eye_calib.online.live import input as module
-from hand_eye_calib.online.live.cycle import SolveCycle, pause_of
+from hand_eye_calib.online.live.cycle import SolveCycle
+from hand_eye_calib.online.live.describing import pause_of
 from hand_eye_calib.online.live.input import PoseInput
 from hand_eye_calib.online.live.log import NodeLog
 from hand_eye_calib.online.live.session import LiveSession

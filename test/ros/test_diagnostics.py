@@ -172,11 +172,12 @@ def test_a_dead_publisher_pauses_the_session_and_a_second_one_is_named(start_nod
     def only_the_parent_goes_on(document):
         made = message(publishers[0].msg_type, next(later_ns), Ts_pw_p[-1], "lidar")
         publishers[0].publish(made)
-        return document.progress.is_paused
+        paused = "Paused: no pose of child (/child_odom) for "
+        return document.progress.text.startswith(paused)
 
     child = state(only_the_parent_goes_on, "the pause")
+    assert child.progress.is_paused
     assert child.progress.level is Level.WARN
-    assert child.progress.text.startswith("Paused: no pose of child (/child_odom) for ")
     gone = "it has no publisher any more"
     child = state(
         lambda document: gone in document.inputs["child"].text, "the end of the publisher"

@@ -51,7 +51,7 @@ def test_every_option_is_a_described_parameter_changes_are_applied_or_rejected(s
         ("max_pairs", 3, "max_pairs out of range. Min: 10"),
         ("threshold", 1, "Wrong parameter type"),
         ("scale", "huge", "scale must be none or "),
-        ("scale", -2.0, "scale must be at least"),
+        ("scale", -2.0, "scale out of range Min: 1e-06"),
         ("parent_frame", "lidar", "read-only"),
     ]:
         before = peer.parameter(name)

@@ -1,28 +1,34 @@
 """Solves and stream checks of the node: their schedule, their results, and the waiting callers."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
 
 from hand_eye_calib.core.assessment.excitation import Excitation, what_is_missing
-from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.base.plain import plain
-from hand_eye_calib.core.base.text import duration, listing, parse_targets
+from hand_eye_calib.core.base.text import duration, parse_targets
 from hand_eye_calib.core.engine.attempts import with_options
 from hand_eye_calib.core.engine.calibrator import Calibrator
 from hand_eye_calib.core.engine.snapshot import Snapshot
-from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.calibration import Calibration, SolveStatus, Verdict
 from hand_eye_calib.core.results.context import Comparison
-from hand_eye_calib.core.results.records import AXES
+from hand_eye_calib.online.live.describing import (
+    describe,
+    is_refuted,
+    is_too_little,
+    priors_of,
+    state_of_result,
+    too_little_in_words,
+    with_axis_keys,
+    with_newest_halves,
+)
 from hand_eye_calib.online.live.goal import Goal
 from hand_eye_calib.online.live.log import GOES_ON_S, ONCE_S, NodeLog
-from hand_eye_calib.online.live.progress import AXIS_KEYS
 from hand_eye_calib.online.live.session import LiveSession
 from hand_eye_calib.online.live.solving import NO_MOTION, Answer, Failure, Job, SolvingProcess
 from hand_eye_calib.online.live.state import (
@@ -31,13 +37,10 @@ from hand_eye_calib.online.live.state import (
     BroadcastState,
     Condition,
     ExtrinsicState,
-    InputState,
     Level,
     Outcome,
     ProgressState,
-    ResultState,
     Standing,
-    as_printed,
 )
 from hand_eye_calib.online.live.stream_checks import RAW_POSE_CODES, StreamChecks, merged
 
@@ -46,10 +49,6 @@ OnSolved: TypeAlias = Callable[[bool, str], None]
 
 # Least time between two stream checks (s). A check takes one or two seconds.
 _CHECK_PERIOD_S = 30.0
-
-# Least motion (s) or rotation (rad) of a result. Before, estimates and advice jump.
-_LEAST_MOTION_S = 20.0
-_LEAST_ROTATION_RAD = float(np.radians(30.0))
 
 # Options that change the verdict on a result, but not the result.
 _TARGETS = ("target_translation", "target_rotation", "target_axes")
@@ -272,22 +271,17 @@ class SolveCycle:
         self._rest_until_s = time.monotonic() + answer.seconds
         self._take_motion(answer)
         self._take_check(answer)
-        is_early = self.result is None and _is_too_little(self._motion)
+        calibration = answer.calibration
         self._failure = answer.failure
-        if is_early and answer.failure is None:
-            self._failure = Failure(_too_little_in_words(self._motion), is_early=True)
-        if self._failure is not None:
-            text = self._report(self._failure)
-            if is_early or answer.calibration is None:
-                missing = what_is_missing(self._motion) if self._motion.n_poses else ""
-                advice = self._failure.what if is_early else missing
-                self._keep_result(advice or self._failure.what)
-                return False, text
-        assert answer.calibration is not None
-        warnings = tuple(dict.fromkeys((*self._option_warnings, *answer.calibration.warnings)))
-        for warning in warnings:
-            self._log.warning(warning)
-        newest = self._with_findings(replace(answer.calibration, warnings=warnings))
+        if self.result is None and is_too_little(self._motion):
+            calibration = None
+            text = too_little_in_words(self._motion)
+            self._failure = self._failure or Failure(text, is_early=True)
+        text = self._report(self._failure) if self._failure is not None else ""
+        if calibration is None:
+            self._keep_result(self._why_no_calibration())
+            return False, text
+        newest = self._with_warnings(calibration)
         if newest.status is SolveStatus.CONTRADICTED:
             return self._refute(newest)
         if newest.status.failure:
@@ -295,6 +289,19 @@ class SolveCycle:
             self._keep_result(f"No usable result: {newest.status.failure}.")
             return False, self._describe(newest)
         return self._take(self._complete(newest))
+
+    def _why_no_calibration(self) -> str:
+        """Return the motion that is missing, or why the newest solve has failed."""
+        missing = "" if is_too_little(self._motion) else what_is_missing(self._motion)
+        failure = self._failure.what if self._failure is not None else ""
+        return missing or failure
+
+    def _with_warnings(self, calibration: Calibration) -> Calibration:
+        """Return a calibration with the findings and the warnings of the session, and log these."""
+        warnings = tuple(dict.fromkeys((*self._option_warnings, *calibration.warnings)))
+        for warning in warnings:
+            self._log.warning(warning)
+        return self._with_findings(replace(calibration, warnings=warnings))
 
     def _take_motion(self, answer: Answer) -> None:
         """Store motion and clock offset of an answer."""
@@ -354,7 +361,7 @@ class SolveCycle:
             warning = f"{reason}: {describe(newest)}"
             self._log.info(warning, ONCE_S, key="kept")
             result = replace(result, warnings=(*result.warnings, warning))
-            result = _with_newest_halves(result, newest)
+            result = with_newest_halves(result, newest)
         result = self._with_findings(result)
         self._set_result(result)
         if not progress.is_faulty and progress.sentence:
@@ -426,7 +433,7 @@ class SolveCycle:
         level, text = self._condition(accepts_poses, tf_static)
         result = None
         if self.result is not None:
-            result = _state_of(self.result, time.monotonic() - self._solved_at_s)
+            result = state_of_result(self.result, time.monotonic() - self._solved_at_s)
         return ExtrinsicState(
             level=level,
             text=text,
@@ -485,7 +492,8 @@ class SolveCycle:
             Reason why the result is not compared with the installed transform; empty if no
             comparison was requested.
         pause : tuple of Level and str
-            Severity and reason if no poses arrive; see :func:`pause_of`.
+            Severity and reason if no poses arrive, of
+            :func:`~hand_eye_calib.online.live.describing.pause_of`.
         """
         progress = self.goal.progress
         needs_change = progress.is_faulty or progress.will_not_get_there
@@ -510,116 +518,5 @@ class SolveCycle:
     def _comparison(self, why_not: str) -> Comparison | None:
         """Return the comparison with the installed transform, or why there is none yet."""
         if self.result is not None and self.result.comparison is not None:
-            return _with_axis_keys(self.result.comparison)
+            return with_axis_keys(self.result.comparison)
         return Comparison(sentence=f"not compared yet: {why_not}") if why_not else None
-
-
-def pause_of(inputs: Mapping[str, InputState], accepts_poses: bool) -> Condition:
-    """Return severity and reason if no poses arrive; level OK and an empty text otherwise."""
-    if not accepts_poses:
-        return (
-            Level.WARN,
-            "Paused: poses are not accepted; call ~/set_enabled, or activate the node.",
-        )
-    paused = {name: state for name, state in inputs.items() if state.is_paused}
-    if not paused:
-        return Level.OK, ""
-    level = Level.WARN
-    if len(paused) == len(inputs):
-        level = max(state.level for state in paused.values())
-    remedy = "continue to drive, or save" if level is Level.OK else "start its source again"
-    streams = listing([f"{name} ({state.topic})" for name, state in paused.items()])
-    longest_s = max(state.silent_s or 0.0 for state in paused.values())
-    return level, f"Paused: no pose of {streams} for {duration(longest_s)}; {remedy}."
-
-
-def _is_too_little(motion: Excitation) -> bool:
-    """Whether the motion is too short for a result."""
-    has_rotated = motion.rotation.max() >= _LEAST_ROTATION_RAD
-    return bool(motion.motion_s < _LEAST_MOTION_S and not has_rotated)
-
-
-def _too_little_in_words(motion: Excitation) -> str:
-    """Return what a first result needs, and the motion so far."""
-    rotation_deg = np.degrees(motion.rotation.max())
-    return (
-        f"Move the sensors: a first result takes {_LEAST_MOTION_S:g} s of motion or a rotation of "
-        f"{np.degrees(_LEAST_ROTATION_RAD):.0f} deg, so far {motion.motion_s:.0f} s and "
-        f"{rotation_deg:.0f} deg."
-    )
-
-
-def _with_newest_halves(kept: Calibration, newest: Calibration) -> Calibration:
-    """Return the kept result with the newest comparison of both halves of the recording."""
-    if newest.cross_check is None or kept.cross_check is None:
-        return kept
-    rows = {}
-    for axis, row in kept.cross_check.items():
-        newer = newest.cross_check[axis]
-        excess = newer.excess_of_halves
-        rows[axis] = replace(row, of_halves=newer.of_halves, excess_of_halves=excess)
-    return replace(kept, cross_check=rows)
-
-
-def _with_axis_keys(comparison: Comparison) -> Comparison:
-    """Return the comparison with its differences by ``AXIS_KEYS``."""
-    differences = []
-    for difference in comparison.differences:
-        axes = {AXIS_KEYS[axis]: row for axis, row in difference.axes.items()}
-        differences.append(replace(difference, axes=axes))
-    return replace(comparison, differences=tuple(differences))
-
-
-def is_refuted(result: Calibration) -> bool:
-    """Whether the solve failed, or an error in the streams makes every axis unusable."""
-    return bool(result.status.failure) or any(finding.makes_unusable for finding in result.findings)
-
-
-def priors_of(config: CalibratorConfig) -> dict[str, str]:
-    """Return the priors of the options by axis, as typed by the user."""
-    priors = {axis: getattr(config, f"prior_{axis}") for axis in AXES}
-    return {axis: text for axis, text in priors.items() if text}
-
-
-def _state_of(result: Calibration, age_s: float) -> ResultState:
-    """Return the diagnostics of a result of an age (s)."""
-    pose = se3.xyz_rpy(result.T_parent_child)
-    sigmas = result.sigmas_printed
-    return ResultState(
-        parent_frame=result.parent_frame,
-        child_frame=result.child_frame,
-        verdict=result.verdict.value,
-        status=result.status.value,
-        reasons=tuple(f"{reason.sentence}: {reason.what_to_do}" for reason in result.reasons),
-        pose=as_printed(np.where(np.isfinite(sigmas), pose, np.nan)),
-        pose_sigma=as_printed(sigmas),
-        warnings=result.warnings,
-        n_poses=result.n_poses,
-        time_offset_s=result.time_offset_s,
-        scale=result.scale,
-        age_s=age_s,
-    )
-
-
-def describe(calibration: Calibration) -> str:
-    """Return a log line with verdict, pose, standard deviations and amount of data."""
-    pose = se3.xyz_rpy(calibration.T_parent_child)
-    sigmas = calibration.sigmas_printed
-    xyz = _listed(pose[:3], 4)
-    rpy = _listed(np.degrees(pose[3:]), 3)
-    mm = _listed(1000 * sigmas[:3], 1)
-    deg = _listed(np.degrees(sigmas[3:]), 3)
-    return (
-        f"{calibration.headline.rstrip('.')}. "
-        f"{calibration.child_frame} in {calibration.parent_frame}: "
-        f"xyz = ({xyz}) m +/- ({mm}) mm, rpy = ({rpy}) deg +/- ({deg}) deg; "
-        f"status {calibration.status.value}; {calibration.method} {calibration.reference}"
-        f": {calibration.n_poses} poses, {calibration.n_pairs} pairs, "
-        f"{calibration.n_inliers} inliers"
-    )
-
-
-def _listed(values: FloatArray, decimals: int) -> str:
-    """Return numbers with commas; infinity is "unknown"."""
-    texts = [f"{value:.{decimals}f}" for value in values]
-    return ", ".join(texts).replace("inf", "unknown")

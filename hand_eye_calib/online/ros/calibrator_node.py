@@ -25,7 +25,8 @@ from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.registry import MOUNT_MONITORS
 from hand_eye_calib.core.base.text import listing
 from hand_eye_calib.formats.transforms import TfSource
-from hand_eye_calib.online.live.cycle import SolveCycle, pause_of, priors_of
+from hand_eye_calib.online.live.cycle import SolveCycle
+from hand_eye_calib.online.live.describing import pause_of, priors_of
 from hand_eye_calib.online.live.input import PoseInput
 from hand_eye_calib.online.live.journal import FLUSH_PERIOD_S
 from hand_eye_calib.online.live.log import GOES_ON_S, NodeLog

@@ -267,7 +267,6 @@ def _conditions(state: NodeState) -> Iterator[tuple[Tone, str, Level, Part | Non
     """Yield conditions with the level at which the part of the node meets them, gravest first."""
     extrinsic = state.extrinsic
     checks = state.checks
-    at = state.progress
     # Further child sensors have lines of their own, but no headline.
     inputs = [stream for name, stream in state.inputs.items() if name in ("parent", "child")]
     yield Tone.BAD, "BROKEN", Level.ERROR, extrinsic
@@ -276,16 +275,21 @@ def _conditions(state: NodeState) -> Iterator[tuple[Tone, str, Level, Part | Non
         yield Tone.BAD, "CHECK THE PRIOR", Level.WARN, extrinsic
     for stream in inputs:
         yield Tone.BAD, "BAD INPUT", Level.ERROR, stream
-    # A crash loses nothing once the final result is saved.
-    is_safe = at and at.progress.done and state.saved
-    yield Tone.BAD, "BROKEN", Level.ERROR, None if is_safe else state.journal
+    yield Tone.BAD, "BROKEN", Level.ERROR, None if _is_saved(state) else state.journal
     for stream in inputs:
-        yield Tone.ACT, "PAUSED" if at and stream.is_paused else "CHECK INPUT", Level.WARN, stream
+        is_paused = stream.is_paused and state.progress is not None
+        yield Tone.ACT, "PAUSED" if is_paused else "CHECK INPUT", Level.WARN, stream
     if checks and checks.age_s is not None:
         yield Tone.ACT, "CHECK THE STREAMS", Level.WARN, checks
     if state.standing is Standing.OUTDATED:
         yield Tone.ACT, "OLD RESULT", Level.WARN, extrinsic
     yield Tone.ACT, "NOT WATCHING", Level.WARN, state.mount
+
+
+def _is_saved(state: NodeState) -> bool:
+    """Whether the final result is saved, so that a crash loses nothing."""
+    is_done = state.progress is not None and state.progress.progress.done
+    return is_done and state.saved is not None
 
 
 def _activity(state: NodeState) -> Headline:
@@ -389,13 +393,7 @@ def _facts(state: NodeState, is_old: bool) -> str:
 
 
 def _bar(axis: str, at: ProgressState, extrinsic: ExtrinsicState | None) -> Bar:
-    key = AXIS_KEYS[axis]
-    row = at.progress.axes[key]
-    # An axis with a prior is good enough with any standard deviation.
-    is_enough = row.seconds_left == 0 and math.isfinite(row.sigma)
-    share = 1.0
-    if not is_enough and row.sigma > row.target:
-        share = (row.target / row.sigma) ** 2
+    row = at.progress.axes[AXIS_KEYS[axis]]
     target = amount(axis, row.target)
     if extrinsic and extrinsic.contradicted:
         tone = Tone.UNKNOWN
@@ -403,21 +401,36 @@ def _bar(axis: str, at: ProgressState, extrinsic: ExtrinsicState | None) -> Bar:
         against = f"wanted: {target}"
     elif math.isfinite(row.sigma):
         tone, word = _progress_in_words(row, at, axis)
-        against = f"± {amount(axis, row.sigma)} of {target}"
-        if is_enough and row.sigma > row.target:
-            against = f"± {amount(axis, row.sigma)}, from the prior"
+        against = f"± {amount(axis, row.sigma)}"
+        against += ", from the prior" if _is_by_hand(row) else f" of {target}"
     else:
         tone = Tone.UNKNOWN
         # A time left without a standard deviation: these streams never observe the axis.
         is_out_of_reach = math.isfinite(row.seconds_left)
         word = "out of reach" if is_out_of_reach else "not seen yet"
         against = "" if is_out_of_reach else f"wanted: {target}"
-    difference = ""
-    if at.comparison and at.comparison.differences:
-        moved = at.comparison.differences[0].axes[key]
-        difference = change(axis, moved.difference, moved.sigma)
     meaning = _ON_A_VEHICLE[axis] if extrinsic and extrinsic.has_vehicle_axes else ""
-    return Bar(_NAMES[axis], meaning, share, tone, word, against, difference)
+    return Bar(_NAMES[axis], meaning, _share_of(row), tone, word, against, _difference(axis, at))
+
+
+def _is_by_hand(row: AxisProgress) -> bool:
+    """Whether an axis is good enough although its target is not reached: it has a prior."""
+    return row.seconds_left == 0 and row.target < row.sigma < math.inf
+
+
+def _share_of(row: AxisProgress) -> float:
+    """Return the share of the information that the target needs."""
+    if row.sigma <= row.target or _is_by_hand(row):
+        return 1.0
+    return (row.target / row.sigma) ** 2
+
+
+def _difference(axis: str, at: ProgressState) -> str:
+    """Return the difference from the installed transform; empty if unknown."""
+    if at.comparison is None or not at.comparison.differences:
+        return ""
+    row = at.comparison.differences[0].axes[AXIS_KEYS[axis]]
+    return change(axis, row.difference, row.sigma)
 
 
 def _progress_in_words(row: AxisProgress, at: ProgressState, axis: str) -> tuple[Tone, str]:

@@ -1,0 +1,132 @@
+"""Words and values about the results of a session, for its state, its log and its topics."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from hand_eye_calib.core.assessment.excitation import Excitation
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.text import duration, listing
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.core.results.context import Comparison
+from hand_eye_calib.core.results.records import AXES
+from hand_eye_calib.online.live.progress import AXIS_KEYS
+from hand_eye_calib.online.live.state import Condition, InputState, Level, ResultState, as_printed
+
+# Least motion (s) or rotation (rad) of a result. Before, estimates and advice jump.
+_LEAST_MOTION_S = 20.0
+_LEAST_ROTATION_RAD = float(np.radians(30.0))
+
+
+def pause_of(inputs: Mapping[str, InputState], accepts_poses: bool) -> Condition:
+    """Return severity and reason if no poses arrive; level OK and an empty text otherwise."""
+    if not accepts_poses:
+        return (
+            Level.WARN,
+            "Paused: poses are not accepted; call ~/set_enabled, or activate the node.",
+        )
+    paused = {name: state for name, state in inputs.items() if state.is_paused}
+    if not paused:
+        return Level.OK, ""
+    level = Level.WARN
+    if len(paused) == len(inputs):
+        level = max(state.level for state in paused.values())
+    remedy = "continue to drive, or save" if level is Level.OK else "start its source again"
+    streams = listing([f"{name} ({state.topic})" for name, state in paused.items()])
+    longest_s = max(state.silent_s or 0.0 for state in paused.values())
+    return level, f"Paused: no pose of {streams} for {duration(longest_s)}; {remedy}."
+
+
+def is_too_little(motion: Excitation) -> bool:
+    """Whether the motion is too short for a result."""
+    has_rotated = motion.rotation.max() >= _LEAST_ROTATION_RAD
+    return bool(motion.motion_s < _LEAST_MOTION_S and not has_rotated)
+
+
+def too_little_in_words(motion: Excitation) -> str:
+    """Return what a first result needs, and the motion so far."""
+    rotation_deg = np.degrees(motion.rotation.max())
+    return (
+        f"Move the sensors: a first result takes {_LEAST_MOTION_S:g} s of motion or a rotation of "
+        f"{np.degrees(_LEAST_ROTATION_RAD):.0f} deg, so far {motion.motion_s:.0f} s and "
+        f"{rotation_deg:.0f} deg."
+    )
+
+
+def with_newest_halves(kept: Calibration, newest: Calibration) -> Calibration:
+    """Return the kept result with the newest comparison of both halves of the recording."""
+    if newest.cross_check is None or kept.cross_check is None:
+        return kept
+    rows = {}
+    for axis, row in kept.cross_check.items():
+        newer = newest.cross_check[axis]
+        excess = newer.excess_of_halves
+        rows[axis] = replace(row, of_halves=newer.of_halves, excess_of_halves=excess)
+    return replace(kept, cross_check=rows)
+
+
+def with_axis_keys(comparison: Comparison) -> Comparison:
+    """Return the comparison with its differences by ``AXIS_KEYS``."""
+    differences = []
+    for difference in comparison.differences:
+        axes = {AXIS_KEYS[axis]: row for axis, row in difference.axes.items()}
+        differences.append(replace(difference, axes=axes))
+    return replace(comparison, differences=tuple(differences))
+
+
+def is_refuted(result: Calibration) -> bool:
+    """Whether the solve failed, or an error in the streams makes every axis unusable."""
+    return bool(result.status.failure) or any(finding.makes_unusable for finding in result.findings)
+
+
+def priors_of(config: CalibratorConfig) -> dict[str, str]:
+    """Return the priors of the options by axis, as typed by the user."""
+    priors = {axis: getattr(config, f"prior_{axis}") for axis in AXES}
+    return {axis: text for axis, text in priors.items() if text}
+
+
+def state_of_result(result: Calibration, age_s: float) -> ResultState:
+    """Return the diagnostics of a result of an age (s)."""
+    pose = se3.xyz_rpy(result.T_parent_child)
+    sigmas = result.sigmas_printed
+    return ResultState(
+        parent_frame=result.parent_frame,
+        child_frame=result.child_frame,
+        verdict=result.verdict.value,
+        status=result.status.value,
+        reasons=tuple(f"{reason.sentence}: {reason.what_to_do}" for reason in result.reasons),
+        pose=as_printed(np.where(np.isfinite(sigmas), pose, np.nan)),
+        pose_sigma=as_printed(sigmas),
+        warnings=result.warnings,
+        n_poses=result.n_poses,
+        time_offset_s=result.time_offset_s,
+        scale=result.scale,
+        age_s=age_s,
+    )
+
+
+def describe(calibration: Calibration) -> str:
+    """Return a log line with verdict, pose, standard deviations and amount of data."""
+    pose = se3.xyz_rpy(calibration.T_parent_child)
+    sigmas = calibration.sigmas_printed
+    xyz = _listed(pose[:3], 4)
+    rpy = _listed(np.degrees(pose[3:]), 3)
+    mm = _listed(1000 * sigmas[:3], 1)
+    deg = _listed(np.degrees(sigmas[3:]), 3)
+    return (
+        f"{calibration.headline.rstrip('.')}. "
+        f"{calibration.child_frame} in {calibration.parent_frame}: "
+        f"xyz = ({xyz}) m +/- ({mm}) mm, rpy = ({rpy}) deg +/- ({deg}) deg; "
+        f"status {calibration.status.value}; {calibration.method} {calibration.reference}"
+        f": {calibration.n_poses} poses, {calibration.n_pairs} pairs, "
+        f"{calibration.n_inliers} inliers"
+    )
+
+
+def _listed(values: FloatArray, decimals: int) -> str:
+    """Return numbers with commas; infinity is "unknown"."""
+    texts = [f"{value:.{decimals}f}" for value in values]
+    return ", ".join(texts).replace("inf", "unknown")
