@@ -14,6 +14,8 @@
 #   make bench         benchmarks against the baseline; two minutes (BENCH_ARGS=--full: four)
 #   make bench-node    load, soak and crashes of the node; about four minutes
 #   make dist          wheel and sdist in dist/, checked (RELEASE=1: only if nothing is a placeholder)
+#   make try-dist      make dist, then install wheel and sdist in clean environments and calibrate
+#   make tested        write requirements/tested.txt: the versions in .venv
 #   make docs          the documentation site in site/; its links, and every command on its pages, are
 #                      tried; nothing is fetched
 #   make notebook      run the notebooks of examples/ again and keep their outputs
@@ -42,7 +44,7 @@ PYTEST := python -m pytest --numprocesses $(WORKERS)
 SETUP_FILES := setup.py setup.cfg pyproject.toml package.xml
 
 .PHONY: help demo test test-statistics test-oldest coverage coverage-study fuzz gate gate-quick paper bench \
-	bench-node lint format dist docs notebook clean
+	bench-node lint format dist try-dist tested docs notebook clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -104,6 +106,13 @@ dist: $(VENV)/.ready-release
 	rm -rf dist
 	$(VENV)/bin/python -m build --outdir dist .
 	$(VENV)/bin/twine check --strict dist/*
+
+try-dist: dist
+	sh requirements/try_dist.sh dist
+
+tested: $(VENV)/.ready-test
+	{ echo "# Versions with which the tests have passed, written by make tested."; \
+		$(VENV)/bin/python -m pip freeze --exclude-editable; } >requirements/tested.txt
 
 # ruff breaks the lines of long signatures.
 docs: export NO_MKDOCS_2_WARNING := 1

@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from source_code import ROOT
 
 from hand_eye_calib.core.base.registry import COMMANDS
@@ -191,6 +192,27 @@ def test_libraries_that_the_package_runs_with_have_an_upper_bound(declared):
         is_of_ros = requirement.name.startswith("ros-jazzy-")
         has_bound = any(specifier.operator == "<" for specifier in requirement.specifier)
         assert has_bound or is_of_ros, f"{requirement.name} has no upper bound"
+
+
+def test_licences_of_libraries_are_listed(declared):
+    page = (ROOT / "THIRD_PARTY.md").read_text(encoding="utf-8")
+    rows = dict(re.findall(r"^\| ([\w.-]+) \| [^|]+ \| ([^|]+) \|$", page, re.MULTILINE))
+    development = {"test", "lint", "coverage"}
+    needed = [*declared["install_requires"]]
+    for extra, requirements in declared["extras_require"].items():
+        if extra not in development:
+            needed += requirements
+    assert {Requirement(text).name for text in needed} <= rows.keys()
+    assert "see its page" not in rows.values()
+
+
+def test_the_versions_that_ci_ran_are_within_the_declared_bounds(declared):
+    lines = (ROOT / "requirements" / "tested.txt").read_text(encoding="utf-8").splitlines()
+    tested = dict(line.split("==") for line in lines if "==" in line)
+    tested = {canonicalize_name(name): version for name, version in tested.items()}
+    for text in declared["install_requires"]:
+        requirement = Requirement(text)
+        assert requirement.specifier.contains(tested[canonicalize_name(requirement.name)])
 
 
 def test_the_version_is_the_same_wherever_it_is_written(declared):
