@@ -14,6 +14,7 @@ from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive, values_of
 from hand_eye_calib.core.base.config import NodeConfig
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.calibration import DofObservability, DofVerdict
+from hand_eye_calib.extras.mount.digest import read_digest
 from hand_eye_calib.formats.results import load_result
 from hand_eye_calib.online.live.log import NodeLog
 from hand_eye_calib.online.ros import tf as module
@@ -88,6 +89,9 @@ def test_the_monitor_learns_then_is_quiet_and_raises_an_alarm_when_the_mount_mov
     since_s = (int(values["since_ns"]) - stamps_ns[1800]) * 1e-9
     assert abs(since_s) < 10.0
     node.wait_for_log("the mount has moved: ")
+    assert peer.trigger("save").success
+    (digest,) = (tmp_path / "digests").iterdir()
+    assert "the mount has moved" in read_digest(digest).alarm
     assert peer.trigger("reset").success
     peer.feed(publishers, stamps_ns[2400:], Ts_pw_p[2400:], Ts_cw_c[2400:])
     again, _ = status("mount", lambda status: "learning the noise" in status.message)

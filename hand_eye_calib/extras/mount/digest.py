@@ -1,8 +1,8 @@
-"""Digests of monitored sessions: what a session says about the mount, in a file below 10 kB.
+"""Digests of monitored sessions: the evidence of a session on the mount, in a file below 10 kB.
 
-A digest has the evidence ``[H S]`` of the whole session on a shift d of the child sensor from the
-installed extrinsic (:mod:`hand_eye_calib.core.assessment.moved`), divided by its long-run variance.
-Digests of several sessions can be added, and a change between them can be found.
+A digest contains the evidence ``[H S]`` of the whole session on a shift of the child sensor from
+the installed extrinsic (:mod:`hand_eye_calib.core.assessment.moved`). The evidence is divided by
+its long-run variance, so that the evidence of several sessions can be added.
 """
 
 import json
@@ -32,7 +32,7 @@ _LARGEST = 100_000
 
 @dataclass(frozen=True, eq=False)
 class Digest:
-    """What one monitored session says about the mount.
+    """Evidence of one monitored session on the mount.
 
     Attributes
     ----------

@@ -1,10 +1,12 @@
 """History of a mount from the digests of its sessions, with the changes in it.
 
-Session k says that the child is off the installed pose by d + u_k, with the evidence [H_k S_k] and
-the common-mode error u_k ~ N(0, W). After a change at session c the offset is d + s. The change is
-the c with the largest likelihood ratio of a shift s against none, as in the monitor
-(:mod:`hand_eye_calib.extras.mount.monitor`). Both parts are searched again (binary segmentation:
-A. Scott, M. Knott, *A cluster analysis method*, 1974).
+The offset of the child from the installed pose in session k is d + u_k, with the common-mode error
+u_k ~ N(0, W). The evidence [H_k S_k] of the session measures this offset. From session c on, after
+a change, the offset is d + s + u_k.
+
+The change is the c with the largest likelihood ratio of a shift s against none, as in the monitor
+(:mod:`hand_eye_calib.extras.mount.monitor`). The sessions before and after a change are searched
+again (binary segmentation: A. Scott, M. Knott, *A cluster analysis method*, 1974).
 """
 
 import argparse
@@ -23,7 +25,7 @@ from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.extras.mount.digest import Digest, read_digests
 from hand_eye_calib.extras.mount.monitor import KNOCKS, TUNING
 
-# Variances of an offset that nothing is known of.
+# Covariance of an unknown offset.
 _UNKNOWN = np.diag(change.UNKNOWN**2)
 
 

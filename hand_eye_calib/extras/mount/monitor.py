@@ -372,7 +372,7 @@ class MountMonitor:
         return np.append(lags, n_seconds), tables
 
     def digest(self, parent_frame: str, child_frame: str) -> Digest | None:
-        """Return what the session says about the mount; None while the noise is learned."""
+        """Return the evidence of the session on the mount; None while the noise is learned."""
         if self.is_learning:
             return None
         return Digest(

@@ -390,9 +390,9 @@ def _confirmation_after(motion_s: float) -> float:
 
 
 def _is_helpful(motion: Excitation, axis: str) -> bool:
-    """Whether the motion contains the rotation that reveals an axis and that a vehicle lacks.
+    """Whether the motion contains a rotation that reveals an axis and that a flat drive lacks.
 
-    That is a rotation across the axis other than the main rotation, which every drive has.
+    The rotation is across the axis. The main rotation does not count, because every drive has it.
     """
     main = int(np.argmax(motion.rotation))
     index = AXES.index(axis) % 3

@@ -23,7 +23,7 @@ _TEXT_M = 0.04
 
 # The ellipsoid has this many standard deviations.
 _SIGMAS = 3.0
-# Smallest and largest semi-axis of the ellipsoid, m: smaller ones cannot be seen, and the semi-axis
+# Smallest and largest semi-axis of the ellipsoid, m: smaller ones are invisible, and the semi-axis
 # of an unobservable axis would hide the scene.
 _SMALLEST_M = 1e-3
 _LARGEST_M = 1.0
