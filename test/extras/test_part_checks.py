@@ -109,7 +109,6 @@ OF_ROTATIONS = [
     ("rotations", "order w x y z", "inverse_orientation", ["drone"]),
     ("rotations", "yaw only", "flat", ["drone"]),
     ("rotations", "yaw gain 1.05", "rotation_gain", ["car"]),
-    ("rotations", "yaw wanders", "world_drift", ["hand"]),
 ]
 
 

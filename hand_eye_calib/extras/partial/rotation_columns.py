@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
-from hand_eye_calib.core.base.stats import MEDIAN_NORMAL, median
+from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.extras.partial.columns import Column, Fit, fit_columns, split
@@ -34,6 +34,9 @@ _WINDOW_S = 20.0
 
 # Step (s) of the differences that rates come from; one interval if that is longer.
 _STEP_S = 0.1
+
+# Parts of a recording whose biases are compared.
+_PARTS = 4
 
 # Planes of two axes that may be misaligned, in the order of the third axis.
 PLANES = ((1, 2), (0, 2), (0, 1))
@@ -111,11 +114,14 @@ class RotationFit(Fit):
         return self.open_covariance + np.diag(np.maximum(shears**2 - sigmas**2, 0.0))
 
     @property
-    def drift(self) -> float:
-        """Largest usual deviation (rad/s) between windows of a bias, or of the drift of a world."""
-        drifts = self.nuisances[:, 3:]
-        deviations = np.abs(drifts - np.median(drifts, axis=0))
-        return float(np.median(deviations, axis=0).max() / MEDIAN_NORMAL)
+    def bias_drift(self) -> float:
+        """Largest standard deviation (rad/s) of the bias of rates between parts of the recording.
+
+        The bias of a part is the mean of its windows, because noise differs from window to window.
+        """
+        biases = self.nuisances[:, 3:]
+        of_parts = [part.mean(axis=0) for part in np.array_split(biases, _PARTS)]
+        return float(np.std(of_parts, axis=0).max())
 
 
 def fit_pairs(

@@ -83,14 +83,6 @@ WORDS = {
         "let the gyroscope warm up, or use a better one",
         severity=Severity.WARNING,
     ),
-    "turning_drift": FindingWords(
-        "the worlds of both streams turn against each other, at rates that vary by {deg_s:.2f} "
-        "deg/s",
-        "give orientations that are not corrected by a compass",
-        "a heading that is disturbed",
-        severity=Severity.WARNING,
-        code="world_drift",
-    ),
     "inverse_rotations": FindingWords(
         "the orientations of {name} are inverted, or their quaternions are in the order w x y z",
         "correct that stream by its option (such as child_invert orientations, or child_quaternion "
