@@ -95,6 +95,7 @@ OF_ROTATIONS = [
     ("rates", "gain of an axis 1.03", "rotation_gain", ["car"]),
     ("rates", "low-passed 200 ms", "smoothed_rates", ["hand"]),
     ("rates", "smoothed 250 ms", "smoothed_rates", ["agv"]),
+    ("rates", "copied, turned", "not_independent", ["drone"]),
     ("rates", "clipped", "clipped_rates", ["drone"]),
     ("rates", "steps of 2 deg/s", "coarse_rates", ["hand"]),
     ("rates", "bias walks", "bias_drift", ["car"]),

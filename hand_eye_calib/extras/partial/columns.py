@@ -138,6 +138,8 @@ class Fit:
         Weights of the windows.
     residual : float
         Usual residual with the extrinsic and without a fault.
+    remaining : float
+        Usual residual if all faults are possible.
     n_samples : float
         Number of samples, those of windows with less weight counted less.
     nuisances : (W, n) array
@@ -148,6 +150,7 @@ class Fit:
     places: dict[str, list[int]]
     weights: FloatArray
     residual: float
+    remaining: float
     n_samples: float
     nuisances: FloatArray
 
@@ -253,12 +256,15 @@ def fit_columns(
     blocks = blocks.merged(min(len(products), _MOST_BLOCKS))
     with_prior = Blocks(blocks.sums + prior / len(blocks.sums))
     values = with_prior.solve(range(len(information)))
-    of_windows = absorbed[0] @ np.append(-values, 1.0)
+    x = np.append(-values, 1.0)
+    remaining = ((projected @ x) ** 2).sum(axis=1) / counts
+    of_windows = absorbed[0] @ x
     return Fit(
         blocks=with_prior,
         places=places,
         weights=weights,
         residual=float(np.sqrt(usual)),
+        remaining=float(np.sqrt(median(remaining))),
         n_samples=float(usual * weights @ counts / 3.0),
         nuisances=se3.times(inverse(triangle), of_windows),
     )

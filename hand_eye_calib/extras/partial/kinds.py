@@ -85,7 +85,6 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
     calibration : Calibration, optional
         A result from these streams. Its time offset and scale are not checked again.
     """
-    config = snapshot.config
     findings = [*calibration.findings] if calibration else []
     known_s = float(snapshot.resolved.config.time_offset)
     parent, child = snapshot.streams
@@ -100,26 +99,30 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
         # The clock replaces the finding that nothing is explained.
         findings = [found for found in findings if found.code != "unrelated"] + late
     codes = {found.code for found in findings}
-    is_unrelated = "unrelated" in codes
     if calibration and "time_offset" not in codes:
-        of_solve: list[Finding] = []
-        if calibration.measured == "rotations":
-            of_solve = rotation_checks.check_solved(
-                parent, child, calibration, config, is_unrelated
-            )
-            if is_unrelated and of_solve:
-                # The cause replaces the finding that nothing is explained.
-                findings = [found for found in findings if found.code != "unrelated"]
-        elif len(hidden) < 3 or is_unrelated:
-            of_solve = position_checks.check_solved(
-                parent, child, calibration, config, is_unrelated
-            )
+        of_solve = _check_solved(snapshot, calibration, is_unrelated="unrelated" in codes)
+        if of_solve and calibration.measured == "rotations":
+            # The cause replaces the finding that nothing is explained.
+            findings = [found for found in findings if found.code != "unrelated"]
         findings += of_solve
     if hidden and not any(found.makes_unusable for found in findings):
         findings.append(checking.unseen(hidden))
     # Lengths in another unit come first: they cause the findings of the solve.
     findings.sort(key=lambda found: found.code != "lengths")
     return CheckResult(gravest_first(_without_repetitions(findings)))
+
+
+def _check_solved(
+    snapshot: Snapshot, calibration: Calibration, is_unrelated: bool
+) -> list[Finding]:
+    """Check both streams against their result."""
+    parent, child = snapshot.streams
+    config = snapshot.config
+    if calibration.measured == "rotations":
+        return rotation_checks.check_solved(parent, child, calibration, config, is_unrelated)
+    if len(calibration.hidden) == 3 and not is_unrelated:
+        return []
+    return position_checks.check_solved(parent, child, calibration, config, is_unrelated)
 
 
 def _check_aligned(
