@@ -149,7 +149,7 @@ def in_other_order(rotations: FloatArray) -> FloatArray:
     """Correct rotations (N, 3, 3) whose Euler angles were read in the wrong convention.
 
     Roll, pitch and yaw were read as angles about fixed axes. Their source means angles about the
-    turning axes x, y, z, in this order.
+    moving axes x, y and z (intrinsic), in this order.
     """
     roll, pitch, yaw = _about_axes(rotation_to_rpy(rotations))
     return roll @ pitch @ yaw
