@@ -157,6 +157,11 @@ def export_text(result: Judged, name: str) -> str:
         return xacro_text(result)
     if name == "launch":
         return launch_text([result])
+    return _filled_layout(result, name)
+
+
+def _filled_layout(result: Judged, name: str) -> str:
+    """Return a calibration in a format of layouts.yaml, see :func:`export_text`."""
     frames = (result.parent_frame, result.child_frame)
     T = result.T_parent_child
     arrangement = arranged(formats()[name], *frames)

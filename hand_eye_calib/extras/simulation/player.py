@@ -39,7 +39,7 @@ def play(
     until_ns: int,
     check: Callable[[], None],
 ) -> FloatArray:
-    """Publish poses on the topics of their streams, and return the node's result.
+    """Publish poses on the topics of their streams; return ``T_parent_child`` (4, 4) of the node.
 
     Parameters
     ----------
@@ -53,11 +53,6 @@ def play(
     check : callable
         ``check()`` is called while waiting. It raises an error if the node has ended.
 
-    Returns
-    -------
-    (4, 4) array
-        ``T_parent_child`` of the node.
-
     Raises
     ------
     HandEyeCalibError
@@ -65,12 +60,11 @@ def play(
     """
     with _player_node() as (node, executor):
         results = [TransformStamped()]
-        publishers = {
-            name: node.create_publisher(Odometry, topics[name], _LOSSLESS) for name in topics
-        }
+        publishers = {}
+        for stream, topic in topics.items():
+            publishers[stream] = node.create_publisher(Odometry, topic, _LOSSLESS)
         solve = node.create_client(Trigger, "calibrator/solve")
         node.create_subscription(TransformStamped, "calibrator/extrinsic", results.append, LATCHED)
-
         wait = partial(_wait, executor, check)
 
         def are_subscribed() -> bool:
