@@ -318,6 +318,7 @@ class CalibratorConfig(OptionSet):
             If the streams cannot be calibrated together, such as two streams of positions.
         """
         words = (self.parent_measures, self.child_measures)
+        # Streams that do not measure whole poses.
         partial = [MEASURES[word] for word in words if word not in ("auto", "poses")]
         if not partial:
             return "poses"

@@ -115,6 +115,7 @@ def decide(readings: Readings, difference: float) -> int | None:
         # Without clear evidence, the streams stay as they are if nothing supports an inversion.
         is_inversion_supported = readings.shape >= 0.0 or by_noise > 0
         choice = 0 if is_inversion_supported else -1
+    # 1 is the second reading, -1 the first; 0 is unclear.
     return {1: 1, -1: 0}.get(choice)
 
 

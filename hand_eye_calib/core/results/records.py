@@ -229,6 +229,7 @@ class Finding:
             finding: Self = from_plain(cls, data)
             if finding._has_templates():
                 return finding
+        # Store the sentences among the values, with templates that only repeat them.
         values: Document = from_plain(dict[str, float], data.get("evidence", {}))
         sentences = {"cause": "", **data}
         for name in ("what", "advice", "cause"):

@@ -316,12 +316,8 @@ def _of_motive(data: bytes, choice: str | None) -> _Rows:
     kinds = next((row for row in range(1, last) if "Rigid Body" in head[row]), None)
     if kinds is None:
         raise ValueError("it contains no rigid bodies of Motive: export them")
-    places_of_bodies: dict[str, dict[str, int]] = {}
     columns = zip(head[kinds], head[kinds + 1], head[last - 1], head[last], strict=False)
-    for place, (kind, body, quantity, axis) in enumerate(columns):
-        prefix = {"Position": "", "Rotation": "q"}.get(quantity)
-        if kind == "Rigid Body" and prefix is not None:
-            places_of_bodies.setdefault(body, {})[f"{prefix}{axis.lower()}"] = place
+    places_of_bodies = _places_of_bodies(columns)
     body = _chosen(places_of_bodies, choice, "rigid bodies")
     place_of = places_of_bodies[body]
     if not place_of.keys() >= {*_POSE}:
@@ -333,6 +329,19 @@ def _of_motive(data: bytes, choice: str | None) -> _Rows:
     rows = ([cells[place] for place in places] for cells in table if len(cells) > max(places))
     header = ("t [s]", *(f"{axis} [{unit}]" for axis in POSITION), *QUATERNION)
     return _Rows(header, rows, [f"poses of rigid body {body}"])
+
+
+def _places_of_bodies(columns: Iterable[tuple[str, ...]]) -> dict[str, dict[str, int]]:
+    """Return the columns of x, y, z, qx, qy, qz and qw of each rigid body of Motive.
+
+    ``columns`` are the kind, the body, the quantity and the axis of each column.
+    """
+    places: dict[str, dict[str, int]] = {}
+    for place, (kind, body, quantity, axis) in enumerate(columns):
+        prefix = {"Position": "", "Rotation": "q"}.get(quantity)
+        if kind == "Rigid Body" and prefix is not None:
+            places.setdefault(body, {})[f"{prefix}{axis.lower()}"] = place
+    return places
 
 
 def _of_vicon(data: bytes, choice: str | None) -> _Rows:

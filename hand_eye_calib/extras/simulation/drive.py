@@ -130,7 +130,7 @@ def simulate_drive(
     rotation = se3.rotation_of(se3.from_quat_xyzw(np.zeros(3), extrinsic_rng.standard_normal(4)))
     offset = extrinsic_rng.uniform(-_LARGEST_OFFSET_M, _LARGEST_OFFSET_M, 3)
     T_parent_child = se3.from_rotation_translation(rotation, offset)
-    # Euler angles (rad) and translation (m) are each the difference of two uniform numbers.
+    # Yaw, pitch, roll (rad) and translation (m) are each the difference of two uniform numbers.
     angles, translation = extrinsic_rng.uniform(size=(2, 3)) - extrinsic_rng.uniform(size=(2, 3))
     T_pw_cw = se3.from_rotation_translation(se3.rotation_from_rpy(angles[::-1]), translation)
     Ts_cw_c = se3.inverse(T_pw_cw) @ Ts_pw_p_at_child @ T_parent_child

@@ -534,7 +534,7 @@ class MessageReader:
         if self._measures == "rotations":
             is_usable &= (values != 0.0).any(axis=1)
         self.n_left_out += int((~is_usable).sum())
-        poses = np.tile([0.0] * 6 + [1.0], (len(values), 1))
+        poses = np.tile([0.0] * 6 + [1.0], (len(values), 1))  # placeholders
         if is_usable.any():
             target = _COLUMNS["positions" if self._measures == "positions" else "rotations"]
             measured = self._measured(columns.stamps_ns[is_usable], values[is_usable])
