@@ -23,21 +23,21 @@ _SAMPLES = Path(__file__).parents[1] / "sample"
 
 # ---- all files
 
-#: Largest number of bytes of a trajectory file, and of the memory for reading a bag in a command.
+#: Bytes of the largest trajectory file, and of the memory for reading a bag in a command.
 LARGEST = 512 << 20
 
 # ---- bags
 
 #: Largest ratio of a file to its compressed size.
 LARGEST_RATIO = 256
-#: Largest number of bytes of the name of a topic, a type or a frame.
+#: Bytes of the longest name of a topic, a type or a frame.
 LONGEST_NAME = 1_024
-#: Number of bytes at which a block of messages is complete.
+#: Bytes at which a block of messages is complete.
 BLOCK_BYTES = 4 << 20
 
 # ---- YAML
 
-#: Largest number of bytes of a YAML file.
+#: Bytes of the largest YAML file.
 LARGEST_YAML = 1 << 20
 #: Whole numbers must be smaller than this, so that they fit into a signed integer of 64 bits.
 LARGEST_INT = 1 << 63
@@ -46,12 +46,12 @@ DEEPEST_YAML = 32
 
 # ---- .npz
 
-#: Largest number of bytes of all arrays of a file. The poses of 100,000 stops have 26 million.
+#: Bytes of all arrays of the largest file. The poses of 100,000 stops have 26 million.
 LARGEST_ARRAYS = 64 << 20
 
 # ---- trajectory files
 
-#: Largest number of characters of a line.
+#: Characters of the longest line.
 LONGEST_LINE = 65_536
 
 
