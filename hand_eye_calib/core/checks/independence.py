@@ -1,5 +1,7 @@
-"""Checks that two streams are independent: that neither was computed from the other, nor fused with
-it through an assumed transform. Such a result only returns that transform.
+"""Checks that two streams are independent.
+
+Streams are not independent if one stream was computed from the other, or fused with the other
+through an assumed transform. The result would then only return that transform.
 """
 
 import numpy as np
@@ -21,45 +23,50 @@ from hand_eye_calib.core.pairing.motion_pairs import (
 )
 from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
 
-# Orientations that are copies agree to this angle (rad), which is rounding to five digits, and to
-# this share of the rotation.
+# Largest angle (rad) between orientations that are copies: rounding to five digits.
 _ROUNDING_RAD = 0.01 * np.radians(0.08)
+# Largest such angle as a share of the rotation.
 _SMALL_SHARE = 0.005
 
-# Interpolation adds errors of its own, so that the instants nearest to a pose of both streams are
-# compared: a hundredth of them, at least and at most so many.
+# Interpolation adds errors of its own. Therefore the instants are compared at which both streams
+# have nearly a pose: a hundredth of all instants, but at least and at most these numbers.
 _NEAREST = (40, 300)
 
-# Limits of noise that both streams share, in the upper half of their spectra.
-# Ratio of the two quarters of that half, below which noise is white.
+# Noise that both streams share is measured in the upper half of their spectra.
+# Noise is white if both quarters of that half differ by less than this factor.
 _FLAT = 1.75
 # Accelerations of both streams above this number of medians are impulses, which are white as well.
 _ABRUPT = 4.0
-# Most noise of the orientations as a share of the squared rotation: more may be motion that is too
-# fast for the interval.
+# Largest noise of the orientations as a share of the squared rotation. Larger values may be motion
+# that is too fast for the interval.
 _LITTLE_NOISE = 1e-3
-# Noise of a stream over the noise of the difference of both, of positions and of orientations.
-# Sensors that shake together reach 1.2 and 16.
+# Largest ratio of the noise of a stream and of the difference of both streams: of positions and of
+# orientations. Sensors that shake together have 1.2 and 16.
 _SHARED = np.array([3.0, 30.0])
 
-# A filter that corrects one stream by the other through an assumed mount shows the true mount in
-# short motions and the assumed one in long motions. Durations (s) of both, most motions of each.
+# A filter may correct one stream by the other through an assumed mount. Short motions then contain
+# the true mount, and long motions the assumed mount. Durations of both, s:
 _SHORT_S = 0.05
 _LONG_S = 3.0
+# Largest number of motions of each duration.
 _MOST_MOTIONS = 6000
 
-# The two mounts differ from this angle (rad) and this many standard deviations (of the jackknife
-# over so many blocks of time) on. 177 clean recordings have at most 5.2 standard deviations.
+# Both mounts differ from this angle (rad) on.
 _OTHER_MOUNT_RAD = float(np.radians(0.04))
+# Both mounts differ from this number of standard deviations on. 177 clean recordings have at most
+# 5.2.
 _OTHER_MOUNT_SIGMAS = 6.5
+# Blocks of time of the jackknife for the standard deviations.
 _BLOCKS = 20
+# Rounds of robust weights.
 _ROUNDS = 4
 
-# Two odometries drift against each other: on a path at least this long (m, in steps of so many
-# seconds), positions differ by at least this share of it after alignment, in the median. Recordings
-# of two sensors have 5e-5 to 6e-3; two poses of one INS have 2e-8. Most poses that are compared.
+# Two odometries drift against each other. On a path of at least this length (m), the median
+# distance of aligned positions is at least the share below.
 _LONG_PATH_M = 400.0
+# Step of the path, s.
 _STEP_S = 1.0
+# Share of the path. Recordings of two sensors have 5e-5 to 6e-3; two poses of one INS have 2e-8.
 _LEAST_DRIFT = 2.5e-5
 # Streams do not drift if positions differ over the whole recording by less than this factor times
 # their distance within windows of _LONG_S: 1.58 at least in simulated and real recordings of two
@@ -68,32 +75,32 @@ _STEADY = 1.25
 # Shortest path (m) on which this is judged. Hand-held sensors in a motion capture room, which do
 # not drift either, have shorter paths (100 m).
 _STEADY_PATH_M = 190.0
+# Largest number of poses that are compared.
 _MOST_POSES = 2000
 
 
 def check_copies(given: StreamPair, aligned: StreamPair, are_exact: bool) -> list[Finding]:
-    """Find out whether one of two streams was computed from the other.
+    """Return the finding that one stream was computed from the other, or none.
 
-    Two sensors differ by their noise, whatever the extrinsic is. Poses that were computed from
-    others agree with them to the rounding of their numbers, on the transform that was used; with
-    noise of their own, they share more white noise than two sensors do. Orientations alone show
-    it: they follow from the other stream's if the poses do.
+    Two sensors differ by their noise, whatever the extrinsic is. Computed poses agree with their
+    source to the rounding of numbers. Computed poses with noise of their own share more white noise
+    with their source than two sensors do. Orientations suffice for both tests.
 
     Parameters
     ----------
     given, aligned : StreamPair
         Sound streams with their stamps as they are, and on one clock.
     are_exact : bool
-        The user called both streams exact, such as motion capture: only rounding counts.
+        Whether the user called both streams exact, as for motion capture: only rounding counts.
     """
-    # Programs interpolate at the stamps of the new stream.
+    # Programs interpolate at the stamps of the new stream, which may be either.
     pairs = [(streams.child, streams.parent) for streams in (given, aligned)]
-    pairs += [both[::-1] for both in pairs]
-    left_rad = min(_left_at_nearest(slow, fast) for slow, fast in pairs)
-    if left_rad < _ROUNDING_RAD:
+    pairs += [(streams.parent, streams.child) for streams in (given, aligned)]
+    residual_rad = min(_residual_at_nearest(slow, fast) for slow, fast in pairs)
+    if residual_rad < _ROUNDING_RAD:
         severity = Severity.WARNING if are_exact else Severity.ERROR
-        text = f"both streams agree to {angle(left_rad)}, which two sensors hardly do"
-        return [_doubt(text, severity, residual_rad=left_rad)]
+        text = f"both streams agree to {angle(residual_rad)}, which two sensors hardly do"
+        return [_doubt(text, severity, residual_rad=residual_rad)]
     if are_exact:
         return []
     more = max(_shared_noise(_second_half(slow, fast), fast) for slow, fast in pairs)
@@ -103,23 +110,25 @@ def check_copies(given: StreamPair, aligned: StreamPair, are_exact: bool) -> lis
 
 
 def check_fusion(pose_pairs: PosePairs, X: FloatArray, is_one_axis: bool) -> list[Finding]:
-    """Find out whether one of two odometries follows the other through an assumed transform.
+    """Return the finding that one odometry follows the other through an assumed mount, or none.
 
     Parameters
     ----------
     pose_pairs : PosePairs
-        On one clock, in one unit of length.
+        Pose pairs on one clock, in one unit of length.
     X : (4, 4) array
         The extrinsic.
     is_one_axis : bool
-        The sensors rotate about one axis only: their rotations do not show the mount.
+        Whether the sensors rotate about one axis only. Their rotations then do not determine the
+        mount.
     """
     other_mount = None if is_one_axis else _other_mount(pose_pairs)
-    found = other_mount or _no_drift(pose_pairs, X)
-    return [found] if found else []
+    doubt = other_mount or _no_drift(pose_pairs, X)
+    return [doubt] if doubt else []
 
 
 def _doubt(text: str, severity: Severity | None = None, **evidence: float) -> Finding:
+    """Return the finding "not_independent" with its evidence in words and in numbers."""
     return finding("not_independent", "both", severity, None, evidence=text, **evidence)
 
 
@@ -130,13 +139,15 @@ def _within(slow: Trajectory, fast: Trajectory) -> IntArray:
 
 
 def _second_half(slow: Trajectory, fast: Trajectory) -> Trajectory:
+    """Return poses of one stream from the middle of the common time on, a limited number."""
     rows = _within(slow, fast)
     return slow[rows[len(rows) // 2 :][: _NEAREST[1]]]
 
 
-def _left_at_nearest(slow: Trajectory, fast: Trajectory) -> float:
-    """Return the angle (rad) that remains between the rotations of both streams, of motions
-    between stamps of ``slow`` at which a pose of ``fast`` is nearest.
+def _residual_at_nearest(slow: Trajectory, fast: Trajectory) -> float:
+    """Return the residual angle (rad) between the rotations of both streams.
+
+    The rotations are those between stamps of ``slow`` at which a pose of ``fast`` is nearest.
     """
     rows = _within(slow, fast)
     after = np.clip(np.searchsorted(fast.stamps_ns, slow.stamps_ns[rows]), 1, len(fast) - 1)
@@ -146,11 +157,11 @@ def _left_at_nearest(slow: Trajectory, fast: Trajectory) -> float:
     slow = slow[rows[:: max(-(-len(rows) // _NEAREST[1]), 1)]]
     between = fast.at(slow.stamps_ns, straight=True)
     start = np.arange(len(slow) - 1)
-    return _left(pairs_between(between, slow.poses, start, start + 1))
+    return _residual(pairs_between(between, slow.poses, start, start + 1))
 
 
-def _left(motions: MotionPairs) -> float:
-    """Angle (rad) that remains between the rotations of both; infinite unless a small share."""
+def _residual(motions: MotionPairs) -> float:
+    """Return the usual residual angle (rad) of rotations, or infinity if it is no small share."""
     angles = se3.rotation_angle(se3.rotation_of(motions.Ts_parenti_parentj))
     is_clear = angles < MAX_ROTATION_RAD
     motions = motions[is_clear]
@@ -158,16 +169,18 @@ def _left(motions: MotionPairs) -> float:
     if len(motions) < MIN_PAIRS:
         return np.inf
     X = se3.from_rotation_translation(align_rotation_vectors(motions), np.zeros(3))
-    left_rad = quantile(np.linalg.norm(motions.residuals(X)[1], axis=1), USUAL)
-    return left_rad if left_rad < _SMALL_SHARE * quantile(angles, USUAL) else np.inf
+    residual_rad = quantile(np.linalg.norm(motions.residuals(X)[1], axis=1), USUAL)
+    return residual_rad if residual_rad < _SMALL_SHARE * quantile(angles, USUAL) else np.inf
 
 
 def _shared_noise(slow: Trajectory, fast: Trajectory) -> float:
-    """Return the noise that both streams share, over the largest that two sensors share.
+    """Return the noise that both streams share, over the largest noise that two sensors share.
 
-    Model: noise of two sensors is independent, so that the noise of the difference of both motions
-    is the sum of the noises of both. If one stream was computed from the other, the difference has
-    far less noise than either. 0 if the shared part may be motion, or if a pose is missing.
+    Model: the noise of two sensors is independent. The variance of the difference of both motions
+    is therefore the sum of both variances. If one stream was computed from the other, the
+    difference has far less noise than each stream.
+
+    The result is 0 if the shared noise may be motion, or if a pose is missing.
     """
     intervals_ns = np.diff(slow.stamps_ns)
     if len(slow) < _NEAREST[0] or intervals_ns.max() > 1.5 * median(intervals_ns):
@@ -198,23 +211,26 @@ def _shared_noise(slow: Trajectory, fast: Trajectory) -> float:
 
 
 def _second_differences(Ts: FloatArray) -> FloatArray:
-    """Second differences (N - 3, 2, 3) of the steps of poses (N, 4, 4): positions, rotations."""
+    """Return second differences (N - 3, 2, 3) of the steps of poses (N, 4, 4).
+
+    The second axis has positions and rotations.
+    """
     steps = se3.log(se3.inverse(Ts[:-1]) @ Ts[1:])
     return np.diff(steps, 2, axis=0).reshape(-1, 2, 3)
 
 
 def _is_calm(of_slow: FloatArray, of_fast: FloatArray) -> BoolArray:
-    """Whether (N,) at least one stream has no impulse, in positions and in rotations."""
+    """Return whether (N,) at least one stream has no impulse, in positions and in rotations."""
     sizes = np.linalg.norm([of_slow, of_fast], axis=3)
     usual = _ABRUPT * np.median(sizes, axis=1, keepdims=True)
     return np.asarray((sizes <= usual).any(axis=0).all(axis=1))
 
 
 def _upper_quarters(second_differences: FloatArray) -> FloatArray:
-    """Mean spectra (2, S, 2) of the third and the fourth quarter of frequencies.
+    """Return the mean spectra (2, S, 2) of the third and the fourth quarter of frequencies.
 
-    ``second_differences`` is (S, N, 2, 3). The spectra are those of poses: differences raise the
-    spectrum of poses with the frequency.
+    ``second_differences`` is (S, N, 2, 3). The spectra are those of poses: the rise of the spectrum
+    with the frequency, which differences cause, is removed.
     """
     spectra = (np.abs(np.fft.rfft(second_differences, axis=1)) ** 2).sum(axis=3)
     angles = np.linspace(1e-3, np.pi / 2.0, spectra.shape[1])
@@ -245,7 +261,8 @@ def _other_mount(pose_pairs: PosePairs) -> Finding | None:
 
 
 def _rotations_of_blocks(motions: MotionPairs, n_poses: int) -> FloatArray | None:
-    """Return rotations (1 + blocks, 3, 3) of X: by all motions, and without each block of time;
+    """Return rotations (1 + blocks, 3, 3) of X: by all motions, and without each block of time.
+
     None if there are too few motions.
     """
     of_parent = se3.rotation_log(se3.rotation_of(motions.Ts_parenti_parentj))
@@ -311,7 +328,9 @@ def _is_steady(pose_pairs: PosePairs, X: FloatArray) -> bool:
 
 def _apart_in_windows(stamps_ns: IntArray, points: FloatArray, others: FloatArray) -> float:
     """Return the median distance (m) of points (N, 3) that were aligned in windows of time."""
-    windows = (stamps_ns - stamps_ns[0]) // round(_LONG_S * 1e9)
+    # A window needs enough points, also of a long recording with few of its poses.
+    window_ns = max(round(_LONG_S * 1e9), round(2 * MIN_PAIRS * median(np.diff(stamps_ns))))
+    windows = (stamps_ns - stamps_ns[0]) // window_ns
     distances_m = [
         _after_alignment(points[windows == window], others[windows == window])
         for window in np.unique(windows)

@@ -17,82 +17,100 @@ from hand_eye_calib.core.pairing.motion_pairs import find_leap
 # An interval is a gap if it is longer than the limit and than this many median intervals.
 _GAP_INTERVALS = 5.0
 
-# A step is a jump if it differs from the steps around it by this many times the median difference,
-# and by this many times a fast step.
+# A step is a jump if its difference from the steps around it exceeds the median difference by the
+# first factor, and a fast step by the second factor.
 _JUMP_SIGMAS = 12.0
 _JUMP_STEPS = 3.0
 
-# Poses, heights and verticals (m, rad) this close are the same, to rounding.
+# Largest difference (m, rad) of positions, heights and verticals that are equal to rounding.
 _SAME = 1e-6
 
 # Smallest tilt of a stream that is not flat (rad).
 _TILTS = 0.02
 
-# Shortest time (s) for which a frozen stream repeats its pose, and the longest part of that time
-# that is asked for motion at once: a car may stand for a minute and then drive.
+# Shortest time (s) for which a frozen stream repeats its pose.
 _FROZEN_S = 1.0
+# The motion of the other sensor is judged in parts of about this duration (s): a car may stand for
+# a minute and then drive.
 _PART_S = 10.0
 
-# Smallest net motion of a sensor that does not stand: in m and rad, and as a share of the usual
-# speed times the duration. Odometry drifts by up to 6 cm and 0.05 rad while a car waits 42 s at
-# traffic lights.
+# Smallest net motion of a sensor that does not stand. Odometry drifts by up to 6 cm and 0.05 rad
+# while a car waits 42 s at traffic lights.
+# Distance, m.
 _MOVES_M = 0.02
+# Angle, rad.
 _MOVES_RAD = 0.1
+# Distance as a share of the usual speed times the duration.
 _MOVES_SHARE = 0.1
 
 # Motion must also exceed the noise of positions and angles by this factor. Noise is the median
-# second difference; of white noise the largest distance was 2.2 times that in 6,000 draws.
+# second difference. The largest distance of white noise was 2.2 times that in 6,000 draws.
 _MOVES_NOISES = 2.5
 
-# Two sensors take turns if a stream is this many times rougher from pose to pose than over some
-# longer lag (in poses), by at least so many metres. Repeated poses are another matter.
+# Two sensors take turns on one topic if the roughness from pose to pose exceeds the roughness over
+# some longer lag by this factor.
 _ALTERNATES = 2.0
+# Longest such lag, in poses.
 _MAX_PERIOD = 6
-_LEAST_LEVELS_M = 0.01
+# Smallest roughness from pose to pose, m.
+_MIN_ROUGHNESS_M = 0.01
+# Largest share of repeated positions. Streams that repeat poses are rough for another reason.
 _MAX_REPEATS = 0.1
-# Their levels are steady over so many turns, in the world or in the sensor's axes, and make up this
-# share of the roughness: a body that shakes, or walks, in step with the poses soon falls out of it.
+# The levels of both sensors are steady over this number of turns.
 _TURNS = 40
+# Smallest share of the roughness that the steady levels explain. A body that shakes or walks in
+# step with the poses soon falls out of step.
 _STEADY_SHARE = 0.6
 
-# Positions are on a grid if this share of so many differences, those of a few steps, are multiples
-# of the smallest, to this share of a step.
+# Positions are on a grid if most differences are multiples of the smallest difference.
+# Fewest differences.
 _MIN_GRID = 30
+# Smallest share of multiples among the differences.
 _ON_GRID = 0.98
+# Largest distance from a multiple, as a share of the step.
 _GRID_TOLERANCE = 0.06
+# Largest multiple that is judged.
 _MAX_MULTIPLE = 200.0
+# Steady motion has equal differences as well. A stream that nearly always moves must therefore have
+# this number of different multiples.
 _MIN_DIFFERENT = 5
+# Share of differences that are not zero from which on a stream nearly always moves.
 _MAX_MOVING = 0.9
 
-# No vehicle that calibrates its sensors by motion goes faster than sound (m/s), or bears five times
-# gravity in a tenth of all seconds (m/s^2). Recordings have 6 at most; arms, which move least, 0.1,
-# and so exceed that in millimetres; what hand-held sensors have exceeds it in centimetres.
+# Highest speed (m/s) of a vehicle that calibrates its sensors by motion: the speed of sound.
 _FASTEST = 340.0
+# Largest change of velocity within a second (m/s^2) that a tenth of all seconds may exceed: five
+# times gravity. Recordings have 6 at most. Arms move least and have 0.1, which exceeds the limit in
+# millimetres. Hand-held sensors exceed the limit in centimetres.
 _HARDEST = 49.0
-# A sensor more than 3 m from the other is on a car or a larger machine. Tyres and rails hold about
-# 8 m/s^2; simulated cars change their velocity by up to 7.2 m/s within a second.
+# A sensor farther than this (m) from the other sensor is on a car or a larger machine.
 _LONG_LEVER_M = 3.0
+# Largest change of velocity (m/s^2) of such machines. Tyres and rails transmit about 8 m/s^2.
+# Simulated cars change their velocity by up to 7.2 m/s within a second.
 _HARDEST_OF_LARGE = 9.8
-# Usual changes of velocity within a second (m/s): cars have the largest, arms the smallest, 0.1.
+# Largest usual change of velocity within a second (m/s): that of cars.
 _MOST_USUAL = 8.0
+# Smallest usual change of velocity within a second (m/s): that of arms.
 _LEAST_USUAL = 0.1
 # Slowest usual speed (m/s) of a sensor while it is calibrated. Arms have 0.05.
 _SLOWEST = 0.01
 
-# Velocities are over so long (s), so that noise adds little. A tenth of them may be of jumps.
+# Time over which velocities are computed (s), so that noise contributes little.
 _STEP_S = 1.0
+# Quantile of usual sizes. A tenth of the velocities may be those of jumps.
 USUAL = 0.9
 
 
 def coarse(trajectory: Trajectory, step_s: float) -> Trajectory:
-    """The first pose in every step of ``step_s`` seconds that has one."""
+    """Return the first pose of every step of ``step_s`` seconds, where a step has a pose."""
     steps = (trajectory.stamps_ns - trajectory.stamps_ns[0]) // round(step_s * 1e9)
     return trajectory[np.unique(steps, return_index=True)[1]]
 
 
 def are_gaps(intervals_s: FloatArray, max_gap_s: float) -> BoolArray:
-    """Which intervals (N,) between poses, s, are gaps: longer than may be interpolated across, and
-    than is usual in the stream.
+    """Return which intervals (N,) between poses, s, are gaps.
+
+    A gap is longer than interpolation may bridge, and longer than usual in the stream.
     """
     usual_s = median(intervals_s) if len(intervals_s) else 0.0
     return intervals_s > max(max_gap_s, _GAP_INTERVALS * usual_s)
@@ -101,15 +119,15 @@ def are_gaps(intervals_s: FloatArray, max_gap_s: float) -> BoolArray:
 def check_stream(
     trajectory: Trajectory, stream: str, max_gap_s: float = CalibratorConfig.max_gap
 ) -> list[Finding]:
-    """Findings about one stream, "parent" or "child": too short, a leap in time, gaps, jumps."""
+    """Return the findings about one stream of poses, "parent" or "child"."""
     findings = check_positions(trajectory, stream, max_gap_s)
-    if any(finding.code != "gaps" for finding in findings):
+    if any(found.code != "gaps" for found in findings):
         return findings
     are_jumps = np.zeros(len(trajectory) - 1, dtype=bool)
     excesses = step_excess(trajectory)
     for excess, speed in excesses:
-        of_motion = _JUMP_STEPS * quantile(speed, USUAL)
-        are_jumps |= excess > max(_JUMP_SIGMAS * (median(excess) + 1e-12), of_motion)
+        fast = _JUMP_STEPS * quantile(speed, USUAL)
+        are_jumps |= excess > max(_JUMP_SIGMAS * (median(excess) + 1e-12), fast)
     share = float(are_jumps.mean())
     jumps = graded("jumps", stream, share, options={"method": "dnlo"}, share=share)
     findings += check_sampling(trajectory, [excess for excess, _ in excesses], stream)
@@ -117,7 +135,7 @@ def check_stream(
 
 
 def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> list[Finding]:
-    """Findings about the stamps of one stream, and about its positions without its orientations."""
+    """Return the findings about the stamps and the positions of one stream."""
     if len(trajectory) < 4:
         return [finding("too_few_poses", stream, poses=str(len(trajectory)))]
     if leap := find_leap(trajectory.stamps_ns):
@@ -132,7 +150,7 @@ def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> li
     if apart_m := _interleaved(trajectory):
         return [*findings, finding("interleaved", stream, distance_m=apart_m)]
     step_m = max(_grid_step(column) for column in se3.translation_of(trajectory.poses).T)
-    # Of positions alone, rounding is noise like any other.
+    # Rounding of positions alone is noise like any other.
     most = np.inf if trajectory.has_rotations else LIMITS["coarse_positions"].error
     coarse = graded("coarse_positions", stream, min(step_m, most), step_m=step_m)
     return [*findings, coarse] if coarse else findings
@@ -160,7 +178,7 @@ def _interleaved(trajectory: Trajectory) -> float:
     roughness_m = [median(np.linalg.norm(vectors, axis=1)) for vectors in deviations]
     # Positions that alternate are rough from pose to pose, and smooth over whole periods.
     period = 2 + int(np.argmin(roughness_m[1:]))
-    if roughness_m[0] < max(_ALTERNATES * roughness_m[period - 1], _LEAST_LEVELS_M):
+    if roughness_m[0] < max(_ALTERNATES * roughness_m[period - 1], _MIN_ROUGHNESS_M):
         return 0.0
     in_world = deviations[0]
     in_sensor = np.einsum("kji,kj->ki", trajectory.poses[1:-1, :3, :3], in_world)
@@ -176,33 +194,35 @@ def _interleaved(trajectory: Trajectory) -> float:
 
 
 def _grid_step(values: FloatArray) -> float:
-    """Step (m) of which all differences (N - 1,) are multiples, 0 if there is none."""
+    """Return the step (m) of which all differences of values (N,) are multiples, or 0."""
     steps = np.abs(np.diff(values))
     differences = steps[steps > _SAME]
     if len(differences) < _MIN_GRID:
         return 0.0
     step = float(differences.min())
     multiples = differences / step
-    # Steady motion has equal steps, too, but not many different ones.
-    different = len({*np.round(multiples).tolist()})
-    if different < _MIN_DIFFERENT and len(differences) > _MAX_MOVING * len(steps):
+    n_different = len(np.unique(np.round(multiples)))
+    if n_different < _MIN_DIFFERENT and len(differences) > _MAX_MOVING * len(steps):
         return 0.0
-    off = np.abs(multiples - np.round(multiples))
-    few = multiples < _MAX_MULTIPLE
-    is_grid = few.mean() > 0.5 and (off[few] < _GRID_TOLERANCE).mean() > _ON_GRID
+    from_multiple = np.abs(multiples - np.round(multiples))
+    are_small = multiples < _MAX_MULTIPLE
+    are_on_grid = from_multiple[are_small] < _GRID_TOLERANCE
+    is_grid = are_small.mean() > 0.5 and are_on_grid.mean() > _ON_GRID
     return step if is_grid else 0.0
 
 
 def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
-    """Finding about a stream that has only x, y and yaw while the other tilts, or none."""
-    both = ("parent", parent), ("child", child)
-    for (name, flat), (other, whole) in (both, both[::-1]):
+    """Return the finding about a stream with only x, y and yaw while the other tilts, or none."""
+    for name, flat, other, whole in (
+        ("parent", parent, "child", child),
+        ("child", child, "parent", parent),
+    ):
         vertical = flat.poses[:, 2, 2]
         heights = flat.poses[:, 2, 3]
         if np.abs(vertical - vertical[0]).max() > _SAME or np.ptp(heights) > _SAME:
             continue
-        # The direction in the other sensor whose image in the world scatters least: its axis of
-        # rotation.
+        # The scatter in the world of the other sensor's axis of rotation: the direction in that
+        # sensor whose image in the world scatters least.
         mean = whole.poses[::10, :3, :3].mean(axis=0)
         tilt_rad = float(np.sqrt(max(np.linalg.eigvalsh(np.eye(3) - mean.T @ mean)[0], 0.0)))
         if tilt_rad > _TILTS:
@@ -211,7 +231,10 @@ def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
 
 
 def check_frozen(parent: Trajectory, child: Trajectory) -> list[Finding]:
-    """Findings about streams that repeat their pose while the other moves, on one clock."""
+    """Return the findings about a stream that repeats its pose while the other moves.
+
+    Both streams are on one clock.
+    """
     shares = {"parent": frozen_share(parent, child), "child": frozen_share(child, parent)}
     durations_s = {"parent": parent.duration_s, "child": child.duration_s}
     findings = (
@@ -244,7 +267,7 @@ def frozen_share(trajectory: Trajectory, other: Trajectory) -> float:
 
 
 def _moves(part: Trajectory, usual_m_s: float) -> bool:
-    """Return whether a sensor moves in a part of its stream: drift and noise are no motion."""
+    """Return whether a sensor moves in a part of its stream. Drift and noise are no motion."""
     if len(part) < 2:
         return False
     positions = se3.translation_of(part.poses)
@@ -262,15 +285,16 @@ def _exceeds(away: FloatArray, least: float) -> bool:
 
 
 def check_lengths(parent: Trajectory, child: Trajectory, lever_arm_m: float = 0.0) -> list[Finding]:
-    """Return a finding about motion that no vehicle has: two streams in millimetres agree, and only
-    their motion shows it.
+    """Return the finding about motion that no vehicle has, or none.
+
+    Two streams in millimetres agree with each other: only their motion reveals the unit.
 
     Parameters
     ----------
     parent, child : Trajectory
-        On one scale, if it is known.
+        Streams on one scale, if the scale is known.
     lever_arm_m : float
-        Distance of the sensors, at least; 0 if it is not known.
+        Smallest distance of the sensors; 0 if it is unknown.
     """
     if not is_too_fast(parent, lever_arm_m):
         return []
@@ -298,8 +322,9 @@ def check_lengths(parent: Trajectory, child: Trajectory, lever_arm_m: float = 0.
 
 
 def _unit_of_motion(speed: float, change: float) -> tuple[str, float]:
-    """Return the unit in words, and its size (m), in which a speed and the change of velocity
-    within a second are usual; millimetres where centimetres are possible as well.
+    """Return the unit in which a speed and a change of velocity are usual: in words and in m.
+
+    The size is that of millimetres if both millimetres and centimetres are possible.
     """
     if speed * 0.01 >= _FASTEST or change * 0.01 > _MOST_USUAL:
         return "millimetres", 0.001
@@ -309,8 +334,9 @@ def _unit_of_motion(speed: float, change: float) -> tuple[str, float]:
 
 
 def is_too_fast(trajectory: Trajectory, lever_arm_m: float = 0.0) -> bool:
-    """Whether no vehicle moves like this, so that the lengths are not in metres. The distance to
-    the other sensor shows the least size of the vehicle.
+    """Return whether no vehicle moves like this, so that the lengths are not in metres.
+
+    The distance to the other sensor is the smallest size of the vehicle.
     """
     speed, change = _usual_motion(trajectory)
     hardest = _HARDEST_OF_LARGE if lever_arm_m >= _LONG_LEVER_M else _HARDEST
@@ -318,20 +344,21 @@ def is_too_fast(trajectory: Trajectory, lever_arm_m: float = 0.0) -> bool:
 
 
 def is_too_slow(trajectory: Trajectory) -> bool:
-    """Whether hardly any sensor moves so slowly while it is calibrated by its motion."""
+    """Return whether a sensor moves more slowly than sensors do while they are calibrated."""
     speed, _ = _usual_motion(trajectory)
     return speed < _SLOWEST
 
 
 def _usual_motion(trajectory: Trajectory) -> tuple[float, float]:
-    """Return the speed (m/s) and the change of velocity (m/s^2) that nine tenths of all seconds do
-    not exceed; zeros for fewer than four seconds.
+    """Return the usual speed (m/s) and the usual change of velocity within a second (m/s^2).
+
+    Nine tenths of all seconds do not exceed them. They are zero for fewer than four seconds.
     """
-    few = coarse(trajectory, _STEP_S)
-    if len(few) < 4:
+    seconds = coarse(trajectory, _STEP_S)
+    if len(seconds) < 4:
         return 0.0, 0.0
-    intervals_s = np.diff(few.stamps_ns)[:, None] * 1e-9
-    velocities = np.diff(se3.translation_of(few.poses), axis=0) / intervals_s
+    intervals_s = np.diff(seconds.stamps_ns)[:, None] * 1e-9
+    velocities = np.diff(se3.translation_of(seconds.poses), axis=0) / intervals_s
     changes = np.diff(velocities, axis=0) / (0.5 * (intervals_s[1:] + intervals_s[:-1]))
     speed = quantile(np.linalg.norm(velocities, axis=1), USUAL)
     change = quantile(np.linalg.norm(changes, axis=1), USUAL)
