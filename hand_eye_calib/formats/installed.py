@@ -149,7 +149,7 @@ def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
             names, values = _of_sensors(nodes, layout.keys, {parent_frame, child_frame})
             is_fixed = layout.is_inverted is not None
             if is_fixed and child_frame not in names and parent_frame in names:
-                # The file names the frame of its child, and this frame is the parent here.
+                # The file names the frame of its child. Here, this sensor is the parent.
                 is_inverted = not is_inverted
             T = pose_of(*values)
             return se3.inverse(T) if is_inverted else T

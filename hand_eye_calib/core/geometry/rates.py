@@ -12,7 +12,7 @@ from hand_eye_calib.core.geometry import se3
 
 
 class RateIntegrator:
-    """Integrates the angular rates of one sensor, in parts of any length."""
+    """Integrator of the angular rates of one sensor. Rates are passed in blocks of any length."""
 
     def __init__(self) -> None:
         self._last: tuple[IntArray, FloatArray] | None = None

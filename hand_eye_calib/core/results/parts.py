@@ -54,7 +54,7 @@ class Part:
         return value
 
     def write(self, value: Any) -> Document:
-        """Return the fields of a document for the value of the part; None for a missing part."""
+        """Return the fields of a document for the part; ``value`` is None for a missing part."""
         return {self.name: value}
 
     def read(self, document: Mapping[str, Any]) -> Any:

@@ -109,10 +109,10 @@ class Rule(NamedTuple):
 
 
 # Other estimates contradict a result on an axis if their scatter about it exceeds this number of
-# joint standard deviations, and the share of the target below. They never lead to DO NOT USE,
-# because their methods have no model of time-correlated errors.
+# joint standard deviations, and CONTRADICTED_SHARE. They never lead to DO NOT USE, because their
+# methods have no model of time-correlated errors.
 CONTRADICTED_SIGMAS = 3.0
-# Share of the target, see above.
+# Share of the target that the scatter must exceed, too.
 CONTRADICTED_SHARE = 0.25
 
 # Estimates that are about as certain as the result also contradict it if their scatter exceeds

@@ -391,7 +391,7 @@ def table_of_object(source: Any, times: Any = None) -> Table:
     Raises
     ------
     InputError
-        If the source is neither. Also unless there is one number or datetime as stamp of each pose.
+        If the source is neither, or if the stamps are not one number or datetime for each pose.
     """
     if hasattr(source, "columns"):
         keys = [*source.columns]
