@@ -35,7 +35,7 @@ from hand_eye_calib.offline.report import evidence
 from hand_eye_calib.offline.report.figures import _VIEWS
 from hand_eye_calib.offline.report.report import render
 
-FIGURES = ("views", "trajectories", "residuals", "streams")
+FIGURES = ("views", "trajectories", "coordinates", "residuals", "streams")
 VOID = {"meta", "br", "hr", "img", "link", "input"}
 
 
@@ -209,7 +209,7 @@ def partial():
 @pytest.mark.parametrize("name", ["positions", "rates"])
 def test_results_of_positions_and_rates_have_a_page_of_what_they_show(partial, name):
     _calibration, _text, page = partial[name]
-    shown = [*FIGURES]
+    shown = [figure for figure in FIGURES if figure != "coordinates"]
     if name == "rates":
         shown = [figure for figure in shown if figure not in ("views", "trajectories")]
     assert [attributes["id"] for attributes in page.all("figure")] == [

@@ -108,6 +108,9 @@ class Evidence:
     parent, child : (N, 3) arrays
         Paths of one sensor, m: from its own stream, and from the other stream through the result.
         The sensor is the parent, in its world, or the sensor without orientations, in its frame.
+    angles : 2 x (N, 3) arrays, or None
+        Roll, pitch and yaw (rad) of the parent against its first pose, from both streams in this
+        order; None if a stream does not measure poses.
     excitation : Excitation
         Motion of the sensors.
     streams : StreamView
@@ -118,6 +121,7 @@ class Evidence:
     times_s: FloatArray
     parent: FloatArray
     child: FloatArray
+    angles: tuple[FloatArray, FloatArray] | None
     excitation: Excitation
     streams: StreamView
     has_positions_of_parent: bool
@@ -143,6 +147,7 @@ def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
         times_s=(pose_pairs.stamps_ns - pose_pairs.stamps_ns[0]) * 1e-9,
         parent=parent_path,
         child=child_path,
+        angles=_angles(calibration, pose_pairs) if calibration.measured == "poses" else None,
         excitation=excitation(oriented),
         streams=view_streams(parent, shifted, config.max_gap),
         has_positions_of_parent=parent_is_positions,
@@ -197,8 +202,26 @@ def _paths_of_poses(
     The mean rotation and the median shift of all poses align the worlds.
     """
     Ts_cw_p = pose_pairs.Ts_cw_c @ calibration.T_child_parent
-    rotations = se3.rotation_of(pose_pairs.Ts_pw_p) @ np.swapaxes(se3.rotation_of(Ts_cw_p), 1, 2)
     parent = se3.translation_of(pose_pairs.Ts_pw_p)
-    child = se3.translation_of(Ts_cw_p) @ se3.nearest_rotation(rotations.mean(axis=0)).T
+    child = se3.translation_of(Ts_cw_p) @ _between_worlds(pose_pairs, Ts_cw_p).T
     child = child + np.median(parent - child, axis=0)
     return parent - parent[0], child - parent[0]
+
+
+def _between_worlds(pose_pairs: PosePairs, Ts_cw_p: FloatArray) -> FloatArray:
+    """Return the mean rotation (3, 3) from the child's world to the parent's world."""
+    rotations = se3.rotation_of(pose_pairs.Ts_pw_p) @ np.swapaxes(se3.rotation_of(Ts_cw_p), 1, 2)
+    return se3.nearest_rotation(rotations.mean(axis=0))
+
+
+def _angles(calibration: Calibration, pose_pairs: PosePairs) -> tuple[FloatArray, FloatArray]:
+    """Return roll, pitch and yaw of the parent as measured, and as computed from the child."""
+    Ts_cw_p = pose_pairs.Ts_cw_c @ calibration.T_child_parent
+    measured = se3.rotation_of(pose_pairs.Ts_pw_p)
+    computed = _between_worlds(pose_pairs, Ts_cw_p) @ se3.rotation_of(Ts_cw_p)
+    first = measured[0].T
+    measured_rad = np.unwrap(se3.rotation_to_rpy(first @ measured), axis=0)
+    computed_rad = np.unwrap(se3.rotation_to_rpy(first @ computed), axis=0)
+    # Both begin on the same turn.
+    computed_rad -= 2 * np.pi * np.round((computed_rad[0] - measured_rad[0]) / (2 * np.pi))
+    return measured_rad, computed_rad

@@ -80,6 +80,8 @@ class Look(NamedTuple):
         Share of an unknown direction in a view below which its line is not drawn.
     points : int
         Most points of a line, and most single dots.
+    coordinate_points : int
+        Most points of a line of one coordinate over time.
     vehicles : int
         Most vehicles on the page of a batch.
     """
@@ -94,6 +96,7 @@ class Look(NamedTuple):
     bar_above: float = 1.0
     end_on: float = 0.1
     points: int = 1000
+    coordinate_points: int = 400
     vehicles: int = 4
 
 
@@ -217,6 +220,8 @@ def figures_of(calibration: Calibration, evidence: Evidence | None) -> list[Draw
             figures.append(_trajectories(calibration, evidence))
         if "stops" in calibration.parts:
             figures.append(_figure_of_stops(calibration))
+    if evidence and evidence.angles is not None:
+        figures.append(_coordinates(calibration, evidence))
     if calibration.motion_residuals:
         figures.append(_residuals(calibration, calibration.motion_residuals))
     if evidence:
@@ -363,6 +368,44 @@ def _trajectories(calibration: Calibration, evidence: Evidence) -> Drawn:
 
 
 @page_style()
+def _coordinates(calibration: Calibration, evidence: Evidence) -> Drawn:
+    """Draw position and angles of the parent over time, from both streams."""
+    assert evidence.angles is not None
+    rows = _downsample(len(evidence.times_s), LOOK.coordinate_points)
+    factor, unit = _time_axis(evidence.times_s[-1])
+    times = evidence.times_s[rows] * factor
+    measured = np.hstack([evidence.parent, np.degrees(evidence.angles[0])])
+    computed = np.hstack([evidence.child, np.degrees(evidence.angles[1])])
+    figure, panels = _figure(5.4, 3, 2, bottom=0.8, sharex=True)
+    labels = ("x (m)", "y (m)", "z (m)", "roll (deg)", "pitch (deg)", "yaw (deg)")
+    parent = calibration.parent_frame
+    child = calibration.child_frame
+    for column, label in enumerate(labels):
+        # Positions are the left panels of each row, angles the right ones.
+        panel = panels[2 * (column % 3) + column // 3]
+        panel.plot(times, measured[rows, column], color=PARENT, lw=3.2, label=plain_label(parent))
+        panel.plot(
+            times,
+            computed[rows, column],
+            color=CHILD,
+            lw=1.1,
+            label=plain_label(f"{child}, through the result"),
+        )
+        panel.set_ylabel(label, labelpad=2)
+    for panel in panels[-2:]:
+        panel.set_xlabel(f"time ({unit})")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="lower center", ncols=2)
+    apart = np.median(np.abs(measured - computed), axis=0)
+    caption = (
+        f"Position of {parent}, and its angles against the first pose: as measured, and computed "
+        f"from the poses of {child} and the result. Half of the time, the worst axis differs by "
+        f"less than {length(float(apart[:3].max()))} and "
+        f"{angle(float(np.radians(apart[3:].max())))}. That includes drift."
+    )
+    return as_drawn(figure, "coordinates", "Both streams over time, aligned", caption)
+
+
+@page_style()
 def _residuals(calibration: Calibration, residuals: Residuals) -> Drawn:
     """Draw the sizes of the residuals of a result, translations above rotations."""
     # An axis stands for the residuals that a result of this kind has.
@@ -428,9 +471,9 @@ def _time_axis(duration_s: float) -> tuple[float, str]:
     return (1.0, "s") if duration_s < 300 else (1 / 60, "min")
 
 
-def _downsample(count: int) -> IntArray:
+def _downsample(count: int, most: int = LOOK.points) -> IntArray:
     """Return the indices of the points that are drawn, with the first and the last."""
-    return np.unique(np.linspace(0, count - 1, min(count, LOOK.points)).round().astype(int))
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
 # ---- sensors in space
