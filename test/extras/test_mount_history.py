@@ -1,12 +1,13 @@
 """Digests of monitored sessions, and the history of a mount that ``compare`` makes of them."""
 
 import dataclasses
+import json
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.extras.mount.digest import read_digest, read_digests, write_digest
@@ -81,6 +82,10 @@ def about_parent(axis, degrees):
     return np.r_[np.zeros(3), MOUNT[:3, :3].T @ turn]
 
 
+def arguments(path, json=False, installed=None):
+    return SimpleNamespace(results=[str(path)], json=json, installed=installed)
+
+
 def test_a_digest_is_small_and_read_as_it_was_written(session, tmp_path):
     path = write_digest(tmp_path, session)
     assert path.parent == tmp_path / "digests"
@@ -137,19 +142,25 @@ def test_two_changes_are_found(session):
 def test_compare_prints_the_history_of_a_folder(session, tmp_path, capsys):
     for digest in weeks(session, 5, about_parent("z", 0.5), since=6, n_weeks=10):
         write_digest(tmp_path, digest)
-    code = compare_digests(SimpleNamespace(results=[str(tmp_path)]))
+    code = compare_digests(arguments(tmp_path))
     lines = capsys.readouterr().out.splitlines()
     assert code == 4
     assert lines[0].startswith("Mount of camera on lidar: moved before 2023-12-26 22:13: ")
     assert "(10 sessions)" in lines[0]
     assert len([line for line in lines if line.startswith("  -- moved before")]) == 1
     assert len(lines) == 1 + 1 + 10 + 1
+    assert compare_digests(arguments(tmp_path, json=True)) == 4
+    document = json.loads(capsys.readouterr().out)
+    assert len(document["sessions"]) == 10
+    assert [change["session"] for change in document["changes"]] == ["2023-12-26 22:13"]
+    with pytest.raises(ConfigError, match="omit --with"):
+        compare_digests(arguments(tmp_path, installed="robot.urdf"))
 
 
 def test_other_files_are_left_to_compare_and_unusable_digests_are_named(session, tmp_path):
     other = tmp_path / "extrinsic.yaml"
     other.write_text("a: 1\n")
-    assert compare_digests(SimpleNamespace(results=[str(other)])) is None
+    assert compare_digests(arguments(other)) is None
     path = write_digest(tmp_path, session)
     path.write_text(path.read_text().replace('"seconds"', '"minutes"'))
     with pytest.raises(InputError, match="is no usable digest"):

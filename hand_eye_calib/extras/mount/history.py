@@ -19,11 +19,14 @@ import numpy as np
 from hand_eye_calib.core.assessment import change, moved
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.blocks import Blocks, information, inverse, score, shift_evidence
+from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.base.plain import plain
 from hand_eye_calib.core.base.text import amount, counted
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.extras.mount.digest import Digest, read_digests
 from hand_eye_calib.extras.mount.monitor import KNOCKS, TUNING
+from hand_eye_calib.offline.cli.options import print_result
+from hand_eye_calib.online.live.progress import AXIS_KEYS
 
 # Covariance of an unknown offset.
 _UNKNOWN = np.diag(change.UNKNOWN**2)
@@ -114,13 +117,30 @@ def compare_digests(arguments: argparse.Namespace) -> int | None:
     """Print the history of a mount, and return the exit code of ``compare``.
 
     None is returned if the arguments are no digests.
+
+    Raises
+    ------
+    ConfigError
+        If the arguments name another installed transform than the digests.
     """
     digests = read_digests([Path(path) for path in arguments.results])
     if digests is None:
         return None
+    if arguments.installed:
+        raise ConfigError("digests contain their installed transform: omit --with")
     changes = find_changes(digests)
-    for line in _lines(digests, changes):
-        print(line)
+    document = None
+    if arguments.json:
+        rows = [
+            {
+                "session": digests[item.index].day,
+                "sentence": item.shift.what,
+                "axes": item.shift.axes,
+            }
+            for item in changes
+        ]
+        document = {"sessions": [digest.day for digest in digests], "changes": plain(rows)}
+    print_result(_lines(digests, changes), document)
     return 4 if changes else 0
 
 
@@ -135,7 +155,8 @@ def _lines(digests: Sequence[Digest], changes: Sequence[Changepoint]) -> Iterato
         yield f"{mount}: moved before {day}: {newest.shift.what} ({sessions})"
     else:
         yield f"{mount}: no change in {sessions}"
-    yield f"  {'session':<18}{'motion':>8}" + "".join(f"{axis:>20}" for axis in AXES)
+    names = "".join(f"{key.replace('_', ' '):>24}" for key in AXIS_KEYS.values())
+    yield f"  {'session':<18}{'motion':>8}{names}"
     by_index = {changepoint.index: changepoint for changepoint in changes}
     offset = np.zeros((6, 7))
     for index, digest in enumerate(digests):
@@ -149,4 +170,4 @@ def _lines(digests: Sequence[Digest], changes: Sequence[Changepoint]) -> Iterato
             f"{amount(axis, row.difference)} +/- {amount(axis, row.sigma)}"
             for axis, row in shift.axes.items()
         ]
-        yield f"  {digest.day:<18}{digest.seconds:>6} s" + "".join(f"{cell:>20}" for cell in cells)
+        yield f"  {digest.day:<18}{digest.seconds:>6} s" + "".join(f"{cell:>24}" for cell in cells)
