@@ -19,6 +19,8 @@ from hand_eye_calib.extras.stops.calibrate import calibrate_arm as calibrate_arm
 from hand_eye_calib.extras.stops.calibrate import calibrate_stops as calibrate_stops
 from hand_eye_calib.extras.stops.robot_angles import robot_poses as robot_poses
 from hand_eye_calib.extras.stops.samples import read_arm_samples as read_arm_samples
+from hand_eye_calib.extras.vehicle.calibrate import calibrate_vehicle as calibrate_vehicle
+from hand_eye_calib.extras.vehicle.wheel_files import wheel_trajectory as wheel_trajectory
 from hand_eye_calib.formats.results import load as load
 from hand_eye_calib.formats.results import save as save
 from hand_eye_calib.formats.trajectory_files.reading import read_trajectory as read_trajectory

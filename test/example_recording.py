@@ -8,6 +8,7 @@ from bag_making import JAZZY, TF, fix, imu, tf_message
 from motions import disturbed, geodetic, wandering_poses
 from rosbags import rosbag2
 from scipy.spatial.transform import Rotation
+from vehicle_making import simulate_machine
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.geometry import se3
@@ -37,7 +38,7 @@ _ROBOT = """\
 def make(folder: Path) -> None:
     """Fill a folder: ``my_drive/``, ``lidar.tum``, ``camera.tum``, ``camera.csv``, ``ins.csv``,
     ``gnss.csv``, ``imu.csv``, ``flange.tum``, ``camera_on_arm.tum``,
-    ``samples.yaml``, ``robot.urdf``, and results.
+    ``samples.yaml``, ``robot.urdf``, ``robot_lidar.tum``, ``wheels.csv``, and results.
 
     INS, antenna and IMU are where the camera is.
     """
@@ -53,6 +54,10 @@ def make(folder: Path) -> None:
     _write_ins(folder / "ins.csv", camera, places)
     times = camera.stamps_ns[:, None] * 1e-9
     _write_csv(folder / "gnss.csv", "time,latitude,longitude,height", np.hstack([times, places]))
+    robot = simulate_machine(7, duration_s=60.0)
+    hec.write_trajectory(folder / "robot_lidar.tum", robot.sensor)
+    columns = np.column_stack([robot.stamps_ns * 1e-9, robot.values])
+    _write_csv(folder / "wheels.csv", "time,left,right", columns)
     columns = np.column_stack([imu_ns * 1e-9, rates])
     _write_csv(folder / "imu.csv", "time,wx,wy,wz", columns)
 

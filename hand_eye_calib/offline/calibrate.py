@@ -32,7 +32,18 @@ from hand_eye_calib.formats.files import path_of
 MethodName: TypeAlias = Literal[
     "auto", "dnlo", "dnl", "park", "taylor", "zhuang", "ali", "adaptive", "robust"
 ]
-_Measures: TypeAlias = Literal["auto", "poses", "positions", "rotations", "rates"]
+_Measures: TypeAlias = Literal[
+    "auto",
+    "poses",
+    "positions",
+    "rotations",
+    "rates",
+    "wheels",
+    "wheel_odometry",
+    "steering",
+    "omni",
+    "driving",
+]
 _Invert: TypeAlias = Literal["none", "poses", "orientations"]
 _Kind: TypeAlias = Literal["odometry", "exact"]
 _Order: TypeAlias = Literal["xyzw", "wxyz", "yzwx"]

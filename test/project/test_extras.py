@@ -57,6 +57,7 @@ NEEDING = {
     ),
     "simulation": (["simulate"], "invalid choice: 'simulate'"),
     "stops": (["calibrate", *SAMPLE, "--order", "none"], "unknown '--order'"),
+    "vehicle": (["calibrate", SAMPLE[0], "--on-vehicle"], "unknown '--on-vehicle'"),
 }
 
 

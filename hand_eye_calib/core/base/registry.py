@@ -80,10 +80,13 @@ class Measure(NamedTuple):
         Kind of data of this stream together with a stream of poses: a name in ``KINDS``.
     needs_poses : str
         Reason why the other stream must measure poses; empty if it may measure the same quantity.
+    read_as : str
+        Quantity that is read from messages; empty for the measured one.
     """
 
     kind: str
     needs_poses: str = ""
+    read_as: str = ""
 
 
 class ExtraRule(NamedTuple):

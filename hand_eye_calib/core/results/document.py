@@ -264,7 +264,7 @@ def printed_numbers(
         (TRANSLATIONS, transform.translation, transform.sigma_translation, "m"),
         (ROTATIONS, transform.rpy_deg, transform.sigma_rpy_deg, "deg"),
     ):
-        if {*axes} & {*out_of_reach}:
+        if {*axes} <= {*out_of_reach}:
             texts[listing(axes)] = "not estimated"
             continue
         for axis, value, sigma in zip(axes, values.tolist(), sigmas.tolist(), strict=True):

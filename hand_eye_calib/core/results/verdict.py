@@ -249,7 +249,8 @@ def what_is_known(result: Result) -> str:
     within_reach = listing([axis.name for axis in axes])
     hidden = listing(result.out_of_reach)
     good_to = f"{within_reach} are good to {listing(texts)} (1 sigma)"
-    return f"{good_to}; {hidden} are out of reach of these streams"
+    verb = "is" if len(result.out_of_reach) == 1 else "are"
+    return f"{good_to}; {hidden} {verb} out of reach of these streams"
 
 
 def target_of(axis: str, result: Result) -> float:
@@ -283,8 +284,9 @@ def _contradicted(result: Result) -> Iterator[Ground]:
 
 
 def _nothing_known(result: Result) -> Iterator[Ground]:
-    if result.reference == "stops" and has_error(result.findings):
-        # If stops contradict each other, an error finding names the cause.
+    if result.reference in ("stops", "windows") and has_error(result.findings):
+        # If stops contradict each other, or a vehicle always drives the same curve, an error
+        # finding names the cause.
         return
     if all(axis.is_hidden for axis in _axes(result)):
         yield Ground(

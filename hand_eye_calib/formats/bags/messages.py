@@ -26,6 +26,7 @@ from hand_eye_calib.core.base.errors import (
     printable,
     required,
 )
+from hand_eye_calib.core.base.registry import MEASURES
 from hand_eye_calib.core.base.text import frame_name
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import are_null
@@ -267,7 +268,7 @@ def measured_as(message_type: str, wanted: str, source: object) -> str:
     possible = row.measures if row else _OF_POSES
     if wanted == "auto":
         return possible[0]
-    if wanted not in possible:
+    if (MEASURES[wanted].read_as or wanted) not in possible:
         raise ConfigError(
             f"{source} has messages of type {message_type or 'tf2_msgs/msg/TFMessage'}, which "
             f"measure {' or '.join(possible)}; asked for are {wanted}"
@@ -500,8 +501,8 @@ class MessageReader:
 
     def __init__(self, message_type: str, measures: str, origin: LocalOrigin | None = None) -> None:
         self._row = MESSAGE_TYPES[message_type]
-        self._measures = measures
-        self._are_poses = message_type in POSE_TYPES and measures == "poses"
+        self._measures = MEASURES[measures].read_as or measures
+        self._are_poses = message_type in POSE_TYPES and self._measures == "poses"
         self._rates = RateIntegrator()
         # Frames of the previous pose. The first value differs from the bytes of every message.
         self._frames = _Frames(data=b" ", end=0, world_frame="", sensor_frame=None)

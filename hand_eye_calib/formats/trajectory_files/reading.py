@@ -279,7 +279,11 @@ def read_trajectory_files(files: Sequence[tuple[Path, FileOptions]]) -> list[Fil
         readings[number] = _read(table, options, rows_of_tables[number], convention)
     names = _sensor_names([path for path, _ in files])
     return [
-        reading._replace(trajectory=replace(reading.trajectory, sensor_frame=name))
+        reading._replace(
+            trajectory=replace(
+                reading.trajectory, sensor_frame=reading.trajectory.sensor_frame or name
+            )
+        )
         for reading, name in zip(readings, names, strict=True)
     ]
 
@@ -392,7 +396,9 @@ def _read(
         trajectory = Trajectory.from_rates(stamps_ns[rows], values[0][rows])
     else:
         positions, quats_xyzw = values
-        trajectory = Trajectory.from_quat_xyzw(stamps_ns[rows], positions[rows], quats_xyzw[rows])
+        trajectory = Trajectory.from_quat_xyzw(
+            stamps_ns[rows], positions[rows], quats_xyzw[rows], table.sensor_frame
+        )
     if table.measures not in ("poses", "rates"):
         table.guess(f"{table.measures} only, by its columns")
     measures = table.measures if options.measures == AUTO else options.measures

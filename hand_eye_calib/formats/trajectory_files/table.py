@@ -79,6 +79,8 @@ class Table:
         Values of the quantities, row after row.
     images : list of str
         Names of images, from a column for these names.
+    sensor_frame : str
+        Name of the sensor's frame; empty for the name of the file.
     guesses : list of str
         Notes for the user about properties that the file does not state.
     conventions : list of str
@@ -113,6 +115,7 @@ class Table:
     stamps: list[Decimal] = field(default_factory=list)
     numbers: "array[float]" = field(default_factory=lambda: array("d"))
     images: list[str] = field(default_factory=list)
+    sensor_frame: str = ""
     guesses: list[str] = field(default_factory=list)
     conventions: list[str] = field(default_factory=list)
 

@@ -1,0 +1,82 @@
+"""A sensor in the frame of its vehicle, with the parameters of the wheels."""
+
+from typing import Any
+
+from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.base.registry import (
+    FILE_READERS,
+    FINDING_WORDS,
+    KINDS,
+    MEASURES,
+    OUT_OF_REACH,
+    PUBLIC_NAMES,
+    RESULT_PARTS,
+    ROUTES,
+    Measure,
+    Route,
+)
+
+
+def register() -> None:
+    """Register vehicles as a kind of data, their parameters, and readers of wheel data."""
+    for word in ("wheels", "wheel_odometry", "steering", "omni", "driving"):
+        MEASURES[word] = Measure("vehicle", "wheels need the poses of a sensor", "poses")
+    OUT_OF_REACH["vehicle"] = ("z",)
+    OUT_OF_REACH["vehicle_2d"] = ("z", "roll", "pitch")
+    OUT_OF_REACH["vehicle_alone"] = ("y", "z")
+    OUT_OF_REACH["vehicle_alone_2d"] = ("y", "z", "roll", "pitch")
+    KINDS["vehicle"] = _vehicle
+    RESULT_PARTS["wheels"] = _parameters
+    FINDING_WORDS["vehicle"] = _words
+    FILE_READERS["wheels"] = _wheels
+    PUBLIC_NAMES["calibrate_vehicle"] = "hand_eye_calib.extras.vehicle.calibrate"
+    PUBLIC_NAMES["wheel_trajectory"] = "hand_eye_calib.extras.vehicle.wheel_files"
+    ROUTES["vehicle"] = Route(_add_arguments, _is_alone, _calibrate)
+
+
+def _vehicle() -> Any:
+    from hand_eye_calib.extras.vehicle.kinds import VEHICLE
+
+    return VEHICLE
+
+
+def _parameters() -> Any:
+    from hand_eye_calib.core.results.parts import Part
+    from hand_eye_calib.extras.vehicle.parameters import VehicleParameters, details
+
+    return Part("wheels", lambda: VehicleParameters, details)
+
+
+def _words() -> Any:
+    from hand_eye_calib.extras.vehicle.words import WORDS
+
+    return WORDS
+
+
+def _wheels(*file: Any) -> Any:
+    from hand_eye_calib.extras.vehicle.wheel_files import table_of_wheels
+
+    return table_of_wheels(*file)
+
+
+def _add_arguments(parser: Any) -> None:
+    words = (
+        "the only PATH is the trajectory file of a sensor on a vehicle without wheel data: "
+        "estimate its x, roll, pitch and yaw on the rear axle"
+    )
+    parser.add_argument("--on-vehicle", action="store_true", help=words)
+
+
+def _is_alone(arguments: Any) -> bool:
+    if arguments.on_vehicle and len(arguments.paths) != 1:
+        raise ConfigError(
+            "--on-vehicle takes the trajectory file of one sensor; with wheel data leave it out: "
+            "calibrate WHEELS.csv SENSOR.tum"
+        )
+    return bool(arguments.on_vehicle)
+
+
+def _calibrate(arguments: Any, _: Any) -> int:
+    from hand_eye_calib.extras.vehicle.calibrate import calibrate_alone
+
+    return calibrate_alone(arguments)

@@ -1,0 +1,76 @@
+"""Calibrate a sensor in the frame of its vehicle."""
+
+from argparse import Namespace
+from dataclasses import replace
+from typing import Any
+
+from hand_eye_calib.core.engine.snapshot import whole_snapshot
+from hand_eye_calib.core.geometry.trajectory import Trajectory, TrajectoryLike
+from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.formats.trajectory_files.reading import read_trajectories
+from hand_eye_calib.offline.calibrate import calibrate
+from hand_eye_calib.offline.cli import reading
+from hand_eye_calib.offline.cli.options import note, options_from
+from hand_eye_calib.offline.cli.present import deliver
+
+
+def calibrate_vehicle(
+    sensor: TrajectoryLike, wheels: TrajectoryLike | None = None, **options: Any
+) -> Calibration:
+    """Estimate the pose of a sensor in the frame of its vehicle, and the size of the wheels.
+
+    The frame is that of the driven or rear axle: x ahead, y left, z up. A flat floor does not
+    determine z; without wheel data, y is unknown, too.
+
+    Parameters
+    ----------
+    sensor : Trajectory, path, array or DataFrame
+        Poses of the sensor in its own world, m.
+    wheels : Trajectory or path, optional
+        A csv file of wheel data, or :func:`hand_eye_calib.wheel_trajectory`. For the poses of
+        wheel odometry set ``parent_measures`` to ``wheel_odometry`` or ``omni``.
+    **options
+        Options of :func:`hand_eye_calib.calibrate`; the parent is the vehicle, the child the
+        sensor.
+
+    Returns
+    -------
+    Calibration
+        ``result.wheels`` has the parameters of the wheels.
+
+    Raises
+    ------
+    ConfigError, InputError, NotEnoughDataError
+        As :func:`hand_eye_calib.calibrate`.
+
+    Examples
+    --------
+    >>> hec.calibrate_vehicle("lidar.tum").out_of_reach  # doctest: +SKIP
+    ('y', 'z')
+    """
+    if wheels is not None:
+        return calibrate(wheels, sensor, **options)
+    if not isinstance(sensor, Trajectory):
+        (sensor,) = read_trajectories(sensor)
+    return calibrate(_driving(sensor), sensor, **options)
+
+
+def _driving(sensor: Trajectory) -> Trajectory:
+    """Return a parent stream that states only that the sensor is on a vehicle."""
+    return replace(sensor, sensor_frame="base_link", world_frame="", measures="driving")
+
+
+def calibrate_alone(arguments: Namespace) -> int:
+    """Calibrate the sensor of a trajectory file on its vehicle, and return the exit code."""
+    options = options_from(arguments)
+    files = reading.read_files(arguments, arguments.paths, options)
+    note(*files.repairs)
+    sensor = files.trajectories[0]
+    recording = reading.Recording(
+        whole_snapshot(_driving(sensor), sensor, options),
+        {"child": {"file": str(arguments.paths[0]), "poses": len(sensor)}},
+        [*arguments.paths],
+        tuple(files.warnings),
+    )
+    calibration = recording.solved(bool(arguments.out))
+    return deliver(calibration, recording.inputs, arguments, recording.snapshot)

@@ -1,0 +1,103 @@
+"""Read csv files of wheel data as the path of a unit vehicle."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hand_eye_calib.core.base.arrays import IntArray
+from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.extras.vehicle.wheels import UNIT_TRACK, trajectory_of
+from hand_eye_calib.formats.files import LONGEST_LINE
+from hand_eye_calib.formats.trajectory_files.reading import FileOptions
+from hand_eye_calib.formats.trajectory_files.stamps import stamps_in_ns
+from hand_eye_calib.formats.trajectory_files.table import Table
+
+# What a csv file measures, by the names of its columns behind that of the stamps.
+_COLUMNS = {
+    r"left\w*,right\w*": "wheels",
+    r"(speed|v|velocity)\w*,(steering|angle)\w*": "steering",
+    r"vx\w*,wz\w*": "wheel_odometry",
+    r"vx\w*,vy\w*,wz\w*": "omni",
+}
+
+# Forward speed, left speed and yaw rate of the unit vehicle, from wheel data.
+_RATES: dict[str, Callable[..., tuple[ArrayLike, ...]]] = {
+    "wheels": lambda left, right: ((left + right) / 2.0, 0.0 * left, (right - left) / UNIT_TRACK),
+    "steering": lambda speed, angle: (speed, 0.0 * speed, speed * np.tan(angle)),
+    "wheel_odometry": lambda speed, turn: (speed, 0.0 * speed, turn),
+    "omni": lambda forward, left, turn: (forward, left, turn),
+}
+
+_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+
+
+def wheel_trajectory(stamps_ns: IntArray, values: ArrayLike, measures: str) -> Trajectory:
+    """Return wheel data as a parent for :func:`hand_eye_calib.calibrate`.
+
+    Parameters
+    ----------
+    stamps_ns : (N,) int64 array
+    values : (N, 2) or (N, 3) array
+        Rates at the stamps: of the left and right wheel (``wheels``), speed and steering angle in
+        rad (``steering``), forward speed and yaw rate (``wheel_odometry``), or forward speed, left
+        speed and yaw rate (``omni``). Speeds may be rad/s of wheels or m/s.
+    measures : {"wheels", "steering", "wheel_odometry", "omni"}
+
+    Returns
+    -------
+    Trajectory
+        Path of a vehicle with wheels of radius 1, a track of 5 and a wheelbase of 1.
+
+    Raises
+    ------
+    InputError
+        If the stamps do not increase.
+
+    Examples
+    --------
+    >>> stamps_ns = np.arange(3) * 20_000_000
+    >>> hec.wheel_trajectory(stamps_ns, [[1.0, 1.0]] * 3, "wheels")
+    Trajectory(3 wheels over 0.040 s, sensor_frame='base_link')
+    """
+    values = np.asarray(values, dtype=float)
+    durations_s = np.diff(stamps_ns) * 1e-9
+    if not (durations_s > 0.0).all():
+        raise InputError("stamps of wheel data must increase; sort the rows, drop repeated stamps")
+    rates = _RATES[measures](*(values[:-1] + values[1:]).T / 2.0)
+    return trajectory_of(stamps_ns, np.stack(rates) * durations_s, measures)
+
+
+def table_of_wheels(path: str | Path, data: bytes, options: FileOptions) -> Table | None:
+    """Return the poses of the unit vehicle in a csv file of wheel data; None for other files.
+
+    Raises
+    ------
+    InputError
+        If a row cannot be read, or stamps do not increase.
+    """
+    first_line = data[:LONGEST_LINE].partition(b"\n")[0].decode(errors="replace")
+    line = (options.columns or first_line).strip("\ufeff#% \r").lower().replace(" ", "")
+    stamp, _, names = line.partition(",")
+    kinds = [kind for pattern, kind in _COLUMNS.items() if re.fullmatch(pattern, names)]
+    if not kinds:
+        return None
+    rows = []
+    for number, text in enumerate(data.decode().splitlines(), 1):
+        if text.strip() and (number > 1 or options.columns):
+            rows.append((number, [*text.split(","), "0"]))
+    n_values = names.count(",") + 1
+    rates = Table(path, (stamp, "x", "y", "z"), "positions")
+    rates.fill(rows, lambda cells: cells[:4])
+    values = rates.values()[:, :n_values]
+    if "deg" in names:
+        values[:, 1] = np.radians(values[:, 1])
+    wheels = wheel_trajectory(stamps_in_ns(rates, options.stamp_unit), values, kinds[0])
+    table = Table(path, (stamp, *_POSE), "poses", sensor_frame=wheels.sensor_frame)
+    table.fill_from_arrays(se3.to_rows(wheels.poses), rates.stamps)
+    table.measures = kinds[0]
+    return table

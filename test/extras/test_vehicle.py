@@ -1,0 +1,286 @@
+"""A sensor in the frame of its vehicle, on simulated machines."""
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+from rosbags import rosbag2
+from vehicle_making import simulate_machine
+
+import hand_eye_calib as hec
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.errors import ConfigError, InputError, NotEnoughDataError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.formats.bags.writer import write_streams
+from hand_eye_calib.offline.cli.main import main
+
+# Half of what three minutes of figures of eight reach by far: x, y (m), rotations (rad).
+POSE_TOLERANCES = [0.01, 0.01, np.radians(0.15), np.radians(0.15), np.radians(0.1)]
+# Share of each parameter, rad of a steering offset.
+PARAMETER_TOLERANCE = {"wheels": 0.004, "steering": 0.002, "omni": 0.005}
+
+
+@cache
+def machine(measures="wheels", course="eights", duration_s=120.0, noise=1.0):
+    return simulate_machine(11, measures, course, duration_s, noise)
+
+
+def pose_errors(result, truth):
+    """Errors of x, y (m) and of the rotations (rad) about the axes of the base."""
+    turn = result.T_parent_child[:3, :3] @ truth[:3, :3].T
+    return np.append((result.T_parent_child - truth)[:2, 3], se3.rotation_log(turn))
+
+
+@pytest.mark.parametrize("measures", PARAMETER_TOLERANCE)
+def test_pose_wheels_and_clock_of_a_machine(measures):
+    drive = machine(measures)
+    result = hec.calibrate_vehicle(drive.sensor, drive.wheels)
+    assert result.verdict.value != "DO NOT USE"
+    assert result.out_of_reach == ("z",)
+    assert (result.parent_frame, result.child_frame) == ("base_link", "lidar")
+    errors = np.abs(pose_errors(result, drive.T_base_sensor))
+    assert (errors < POSE_TOLERANCES).all()
+    assert (errors < 3.3 * result.sigmas[[0, 1, 3, 4, 5]]).all()
+    assert result.time_offset_s == pytest.approx(drive.clock_s, abs=0.008)
+    values = np.array([parameter.value for parameter in result.wheels.parameters])
+    sizes = np.array([1.0 if value == drive.parameters[2] else value for value in drive.parameters])
+    assert np.abs((values - drive.parameters) / sizes).max() < PARAMETER_TOLERANCE[measures]
+
+
+def test_without_noise_the_answer_is_exact():
+    drive = machine("omni", noise=0.0)
+    result = hec.calibrate_vehicle(drive.sensor, drive.wheels, child_kind="exact")
+    assert np.abs(pose_errors(result, drive.T_base_sensor)).max() < 1e-3
+
+
+def test_without_wheels_y_is_out_of_reach():
+    drive = machine()
+    result = hec.calibrate_vehicle(drive.sensor)
+    assert result.out_of_reach == ("y", "z")
+    assert result.wheels is None
+    assert np.abs(pose_errors(result, drive.T_base_sensor))[[0, 4]].max() < 0.01
+
+
+def test_a_prior_fills_what_is_out_of_reach():
+    drive = machine()
+    result = hec.calibrate_vehicle(drive.sensor, drive.wheels, prior={"z": (0.8, 0.01)})
+    assert result.out_of_reach == ()
+    assert result.translation[2] == pytest.approx(0.8, abs=0.02)
+
+
+@pytest.mark.parametrize("course", ["straight", "circle"])
+@pytest.mark.parametrize("has_wheels", [True, False])
+def test_a_drive_of_one_curve_is_refused(course, has_wheels):
+    drive = machine(course=course)
+    result = hec.calibrate_vehicle(drive.sensor, drive.wheels if has_wheels else None)
+    assert result.verdict.value == "DO NOT USE"
+    assert "x" in result.headline or "yaw" in result.headline
+    assert [found.code for found in result.findings] == ["one_motion"]
+    assert result.wheels is None
+    assert np.isinf(result.sigmas[[0, 1, 5]]).all()
+
+
+def test_wheels_of_another_drive_are_doubted():
+    # A clock offset makes two drives of figures of eight alike.
+    drive = machine()
+    reversed_values = drive.values[::-1]
+    other = hec.wheel_trajectory(drive.stamps_ns, reversed_values, "wheels")
+    result = hec.calibrate_vehicle(drive.sensor, other)
+    assert [found.code for found in result.findings] == ["unrelated"]
+    assert result.verdict.value != "USE"
+
+
+def test_a_wheel_that_turns_backwards_is_refused():
+    drive = machine()
+    backwards = hec.wheel_trajectory(drive.stamps_ns, drive.values * [1.0, -1.0], "wheels")
+    result = hec.calibrate_vehicle(drive.sensor, backwards)
+    assert [found.code for found in result.findings] == ["unrelated"]
+    assert result.verdict.value == "DO NOT USE"
+
+
+def test_a_mount_that_moved_is_a_warning():
+    drive = machine()
+    half = len(drive.sensor) // 2
+    poses = drive.sensor.poses.copy()
+    poses[half:] = poses[half:] @ se3.exp(np.array([0.1, 0.1, 0, 0, 0, 0.05]))
+    result = hec.calibrate_vehicle(hec.Trajectory(drive.sensor.stamps_ns, poses), drive.wheels)
+    assert result.verdict.value != "USE"
+
+
+def test_clocks_that_differ_by_seconds():
+    drive = machine()
+    result = hec.calibrate_vehicle(drive.sensor.shifted(-3.0), drive.wheels)
+    assert result.time_offset_s == pytest.approx(3.0 + drive.clock_s, abs=0.008)
+    assert np.abs(pose_errors(result, drive.T_base_sensor))[:2].max() < 0.01
+
+
+def test_two_dimensional_poses_have_no_roll_and_pitch():
+    drive = machine("omni", noise=0.0)
+    level = drive.T_base_sensor.copy()
+    level[:3, :3] = se3.rotation_from_rpy([0.0, 0.0, 0.4])
+    Ts_world_base = drive.sensor.poses @ se3.inverse(drive.T_base_sensor)
+    sensor = hec.Trajectory(drive.sensor.stamps_ns, Ts_world_base @ level)
+    result = hec.calibrate_vehicle(sensor, drive.wheels)
+    assert result.out_of_reach == ("z", "roll", "pitch")
+    assert result.translation[:2] == pytest.approx(level[:2, 3], abs=0.001)
+
+
+def test_odometry_of_two_wheels_gets_multipliers():
+    drive = machine()
+    left, right = drive.values.T
+    nominal = np.column_stack([0.1 * (left + right) / 2.0, 0.1 * (right - left) / 0.5])
+    odometry = hec.wheel_trajectory(drive.stamps_ns, nominal, "wheel_odometry")
+    result = hec.calibrate_vehicle(drive.sensor, odometry)
+    radius = (drive.parameters[0] + drive.parameters[1]) / 2.0
+    wheels = result.wheels
+    assert wheels["wheel_radius_multiplier"].value == pytest.approx(radius / 0.1, rel=0.004)
+    track = drive.parameters[2] / 0.5
+    assert wheels["wheel_separation_multiplier"].value == pytest.approx(track, rel=0.006)
+
+
+def test_too_short_a_drive_raises():
+    drive = machine()
+    with pytest.raises(NotEnoughDataError, match="figures of eight"):
+        hec.calibrate_vehicle(drive.sensor[:300], drive.wheels)
+
+
+def test_wheels_need_increasing_stamps():
+    with pytest.raises(InputError, match="increase"):
+        hec.wheel_trajectory(np.zeros(3, dtype=np.int64), np.ones((3, 2)), "wheels")
+
+
+# ------------------------------------------------------------------ options
+
+# A value of each option that is not the default, or None if another test sets it.
+OBEYED = {
+    "min_pairs": 10_000,
+    "max_pairs": 700,
+    "keyframe_min_translation": 1.0,
+    "keyframe_min_rotation": 0.1,
+    "keyframe_min_interval": 0.2,
+    "max_gap": 0.01,
+    "time_offset": 0.015,
+    "child_kind": "exact",
+    "child_invert": "poses",
+    "child_quaternion": "wxyz",
+    "target_translation": 1e-4,
+    "target_rotation": 1e-5,
+    "target_axes": "x=1mm",
+    "parent_frame": "axle",
+    "child_frame": "laser",
+    "prior": {"x": (0.1, 0.01)},
+}
+REFUSED = {
+    "method": "dnl",
+    "reference": "B3",
+    "backend": "ipopt",
+    "threshold": 1e-5,
+    "min_inlier_fraction": 0.999,
+    "scale": 1.1,
+    "parent_scale": 2.0,
+    "parent_kind": "exact",
+    "child_measures": "rotations",
+    "parent_invert": "poses",
+    "parent_quaternion": "wxyz",
+}
+
+
+def document_with(**options):
+    drive = machine()
+    try:
+        return str(hec.calibrate_vehicle(drive.sensor, drive.wheels, **options).to_dict())
+    except NotEnoughDataError as error:
+        return str(error)
+
+
+def test_every_option_is_in_a_table():
+    options = {name for name in CalibratorConfig().to_options() if "prior." not in name}
+    names = {name.replace(".", "_") for name in options}
+    assert names == ({*OBEYED, *REFUSED} - {"prior"}) | {"parent_measures"}
+
+
+@pytest.mark.parametrize("option", OBEYED)
+def test_an_option_is_obeyed(option):
+    assert document_with(**{option: OBEYED[option]}) != document_with()
+
+
+@pytest.mark.parametrize("option", REFUSED)
+def test_an_option_is_refused(option):
+    with pytest.raises(ConfigError):
+        document_with(**{option: REFUSED[option]})
+
+
+# ------------------------------------------------------------------ files and the command line
+
+HEADERS = {
+    "wheels": "t,left_rad_s,right_rad_s",
+    "steering": "t, speed_m_s, steering_angle_deg",
+    "omni": "t,vx,vy,wz",
+}
+
+
+def write_files(folder, measures):
+    drive = machine(measures)
+    values = drive.values
+    if measures == "steering":
+        values = values * [1.0, np.degrees(1.0)]
+    rows = np.column_stack([drive.stamps_ns * 1e-9, values])
+    header = HEADERS[measures]
+    np.savetxt(folder / "wheels.csv", rows, fmt="%.6f", delimiter=",", header=header, comments="")
+    hec.write_trajectory(folder / "lidar.tum", drive.sensor)
+    return str(folder / "wheels.csv"), str(folder / "lidar.tum")
+
+
+@pytest.mark.parametrize("measures", HEADERS)
+def test_files_give_the_result_of_arrays(tmp_path, measures):
+    wheels, lidar = write_files(tmp_path, measures)
+    drive = machine(measures)
+    with pytest.warns(UserWarning, match="by its columns"):
+        of_files = hec.calibrate_vehicle(lidar, wheels)
+    of_arrays = hec.calibrate_vehicle(drive.sensor, drive.wheels)
+    assert of_files.parent_frame == "base_link"
+    assert of_files.T_parent_child == pytest.approx(of_arrays.T_parent_child, abs=1e-4)
+
+
+def test_command_line(tmp_path, capsys):
+    wheels, lidar = write_files(tmp_path, "wheels")
+    out = tmp_path / "out"
+    assert main(["calibrate", wheels, lidar, "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "lidar in base_link" in printed
+    assert "wheel_separation: " in printed
+    urdf = (out / "extrinsic.urdf.xacro").read_text()
+    assert '<parent link="base_link"/>' in urdf
+    assert "MEASURE_Z_BY_HAND" in urdf
+    result = hec.load(out)
+    assert result.wheels["wheel_separation"].value == pytest.approx(0.5, rel=0.1)
+    assert result.inverse().wheels == result.wheels
+
+
+def test_command_line_without_wheels(tmp_path, capsys):
+    _, lidar = write_files(tmp_path, "wheels")
+    assert main(["calibrate", lidar, "--on-vehicle", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["parent_frame"] == "base_link"
+    assert document["measured"] == "vehicle_alone"
+    assert main(["calibrate", lidar, lidar, "--on-vehicle"]) == 2
+
+
+def test_odometry_of_a_bag(tmp_path):
+    drive = machine()
+    left, right = drive.values.T
+    nominal = np.column_stack([0.1 * (left + right) / 2.0, 0.1 * (right - left) / 0.5])
+    odometry = hec.wheel_trajectory(drive.stamps_ns, nominal, "wheel_odometry")
+    base = hec.Trajectory(odometry.stamps_ns, odometry.poses, "base_footprint", "odom")
+    lidar = hec.Trajectory(drive.sensor.stamps_ns, drive.sensor.poses, "lidar", "map")
+    bag = tmp_path / "bag"
+    with rosbag2.Writer(bag, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+        type_ = "nav_msgs/msg/Odometry"
+        write_streams(writer, {"/odom": (base, type_), "/lidar": (lidar, type_)}, "mcap")
+    arguments = ["--parent-topic", "/odom", "--child-topic", "/lidar"]
+    arguments += ["--parent-measures", "wheel_odometry", "--out", str(tmp_path / "out")]
+    assert main(["calibrate", str(bag), *arguments]) == 0
+    result = hec.load(tmp_path / "out")
+    assert result.parent_frame == "base_footprint"
+    assert np.abs(pose_errors(result, drive.T_base_sensor))[:2].max() < 0.01
