@@ -22,7 +22,15 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.extras.partial.columns import Column, Fit, by_axis, fit_columns, split
+from hand_eye_calib.extras.partial.columns import (
+    Column,
+    Fit,
+    Stencil,
+    by_axis,
+    fit_columns,
+    split,
+    stencil,
+)
 
 # Duration of a window (s): an odometry drifts little in it, and a machine turns.
 _WINDOW_S = 10.0
@@ -157,9 +165,10 @@ def _windows(
     step = max(round(_STEP_S / median(np.diff(stamps_s))), 1)
     rotations = se3.rotation_of(poses)
     predicted = se3.times(rotations, lever_arm) + se3.translation_of(poses)
-    spans_s, velocities, accelerations = _derivatives(stamps_s, predicted, step)
-    measured_accelerations = _derivatives(stamps_s, positions, step)[2]
-    in_windows = split(stamps_s, spans_s, step, _WINDOW_S)
+    around = stencil(stamps_s, step)
+    velocities, accelerations = _derivatives(predicted, around)
+    measured_accelerations = _derivatives(positions, around)[1]
+    in_windows = split(stamps_s, around.spans_s, step, _WINDOW_S)
     if in_windows is None:
         return None
     is_used = in_windows.is_used
@@ -186,18 +195,12 @@ def _centred(vectors: FloatArray, used: BoolArray) -> FloatArray:
     return np.asarray(vectors - means[:, None])
 
 
-def _derivatives(
-    stamps_s: FloatArray, path: FloatArray, step: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return durations of four steps (N,), velocities and accelerations (N, 3) of a path (N, 3).
+def _derivatives(path: FloatArray, around: Stencil) -> tuple[FloatArray, FloatArray]:
+    """Return velocities and accelerations (N, 3) of a path (N, 3).
 
     Accelerations do not contain the noise of the position itself.
     """
-    rows = np.arange(len(path))
-    last = len(path) - 1
-    before_2, before, after, after_2 = (np.clip(rows + k * step, 0, last) for k in (-2, -1, 1, 2))
-    spans_s = stamps_s[after_2] - stamps_s[before_2]
-    step_s = np.maximum(spans_s / 4.0, 1e-9)[:, None]
-    velocities = (path[after] - path[before]) / (2.0 * step_s)
+    before_2, before, after, after_2, _ = around
+    velocities = (path[after] - path[before]) / (2.0 * around.step_s)
     bends = path[after_2] - path[after] - path[before] + path[before_2]
-    return spans_s, velocities, bends / (3.0 * step_s**2)
+    return velocities, bends / (3.0 * around.step_s**2)

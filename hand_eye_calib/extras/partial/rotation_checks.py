@@ -324,7 +324,7 @@ def _check_handedness(streams: _Streams) -> list[Finding]:
 
 def _check_levels(streams: _Streams) -> list[Finding]:
     """Detect rates in coarse steps, or clipped at the limit of a gyroscope."""
-    if streams.measured.measures != "rates":
+    if not streams.has_rates:
         return []
     rates = _rates(streams.measured)
     for axis, column in zip("xyz", rates.T, strict=True):
@@ -373,19 +373,18 @@ class _Suspect(NamedTuple):
 
 def _check_response(streams: _Streams, rotation: FloatArray) -> list[Finding]:
     """Detect the fault that is most significant in the regression on all faults."""
-    is_rate = streams.measured.measures == "rates"
-    fitted = fit_pairs(streams.pairs, rotation, streams.name, is_rate)
+    fitted = fit_pairs(streams.pairs, rotation, streams.name, streams.has_rates)
     if not fitted:
         return [finding("unchecked_rotations", streams.name)]
-    if is_rate and not streams.are_exact and fitted.remaining < _COPIED_RATES_RAD:
+    if streams.has_rates and not streams.are_exact and fitted.remaining < _COPIED_RATES_RAD:
         evidence = "The rates agree with the orientations of the other sensor"
         return copied(evidence, residual_rad=fitted.remaining)
     suspects = [_smoothing(fitted, streams), _gain(fitted, streams)]
-    if is_rate:
+    if streams.has_rates:
         suspects.append(_shear(fitted, streams))
     ranked = sorted(suspects, key=lambda suspect: suspect.sigmas, reverse=True)
     findings = [suspect.found for suspect in ranked if suspect.found][:1]
-    if findings or not is_rate or fitted.bias_drift < _BIAS_DRIFT_RAD_S:
+    if findings or not streams.has_rates or fitted.bias_drift < _BIAS_DRIFT_RAD_S:
         return findings
     return [finding("bias_drift", streams.name, deg_s=float(np.degrees(fitted.bias_drift)))]
 

@@ -27,7 +27,7 @@ from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
-from hand_eye_calib.extras.partial.columns import Column, Fit, fit_columns, split
+from hand_eye_calib.extras.partial.columns import Column, Fit, Stencil, fit_columns, split, stencil
 
 # Duration of a window (s): a bias is constant in it, and a machine turns.
 _WINDOW_S = 20.0
@@ -170,10 +170,8 @@ def fit_rotations(
     stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
     interval_s = median(np.diff(stamps_s))
     step = max(round(_STEP_S / interval_s), 1)
-    rows = np.arange(len(stamps_s))
-    last = len(rows) - 1
-    spans_s = stamps_s[np.minimum(rows + 2 * step, last)] - stamps_s[np.maximum(rows - 2 * step, 0)]
-    in_windows = split(stamps_s, spans_s, step, _WINDOW_S)
+    around = stencil(stamps_s, step)
+    in_windows = split(stamps_s, around.spans_s, step, _WINDOW_S)
     if in_windows is None:
         return None
     is_used = in_windows.is_used
@@ -186,7 +184,7 @@ def fit_rotations(
     drifting = _integral(stamps_s, reference[:-1] if has_rates else moving[0, :1])
     motions = []
     for stream in (reference, measured):
-        whole = _motion(stamps_s, stream, reference, step, has_rates)
+        whole = _motion(stamps_s, stream, reference, around, has_rates)
         motions.append(_Motion(*[in_windows(columns) for columns in whole]))
     windows = _Windows(orientations, *motions)
     nuisances = np.concatenate([moving, in_windows(drifting)], axis=3)
@@ -204,7 +202,7 @@ def _motion(
     stamps_s: FloatArray,
     stream: FloatArray,
     orientations: FloatArray,
-    step: int,
+    around: Stencil,
     has_rates: bool,
 ) -> _Motion:
     """Return the columns of a stream from its rotations and the orientations of the reference.
@@ -213,18 +211,15 @@ def _motion(
     ----------
     stamps_s : (N,) array
     stream, orientations : (N, 3, 3) array
-    step : int
-        Samples of a step of differences.
+    around : Stencil
+        Rows of the differences.
     has_rates : bool
         Whether the measured stream has rates.
     """
-    rows = np.arange(len(stream))
-    last = len(rows) - 1
-    before_2, before, after, after_2 = (np.clip(rows + k * step, 0, last) for k in (-2, -1, 1, 2))
-    step_s = np.maximum(stamps_s[after_2] - stamps_s[before_2], 1e-9)[:, None] / 4.0
-    rates = _turns(stream[before], stream[after]) / (2.0 * step_s)
+    before_2, before, after, after_2, _ = around
+    rates = _turns(stream[before], stream[after]) / (2.0 * around.step_s)
     turns = _turns(stream[after], stream[after_2]) - _turns(stream[before_2], stream[before])
-    accelerations = turns / (3.0 * step_s**2)
+    accelerations = turns / (3.0 * around.step_s**2)
     bends = se3.times(orientations, accelerations)
     turns = _turns(stream[:-1], stream[1:])
     steps = turns / np.diff(stamps_s)[:, None]
