@@ -246,9 +246,29 @@ class TestWhichAnswerStands:
         reference = result.reference
         dnlo = hec.calibrate(*streams, method="dnlo", reference=reference, checks=False)
         np.testing.assert_array_equal(result.T_parent_child, dnlo.T_parent_child)
-        np.testing.assert_array_equal(result.covariance_measured, dnlo.covariance_measured)
         assert (result.method, result.noise) == ("dnlo", None)
         assert result.method_reason == f"auto: dnlo on reference {reference}, because {why}"
+
+    def test_dnlo_instead_of_the_noise_model_has_the_excess_of_second_opinions(self, monkeypatch):
+        solve = estimator.solve
+        monkeypatch.setattr(
+            estimation.adaptive_estimator,
+            "solve",
+            lambda *poses, **options: dataclasses.replace(
+                solve(*poses, **options), converged=False
+            ),
+        )
+        # Every second opinion differs by 1 cm and 0.01 rad more than the model expects.
+        monkeypatch.setattr(
+            estimation,
+            "excess_covariance",
+            lambda _, opinions: 1e-4 * np.eye(6) if opinions else np.zeros((6, 6)),
+        )
+        streams = noisy_streams()
+        result = hec.calibrate(*streams, method="auto", checks=False)
+        dnlo = hec.calibrate(*streams, method="dnlo", reference=result.reference, checks=False)
+        added = result.covariance_measured - dnlo.covariance_measured
+        np.testing.assert_allclose(np.diag(added), 1e-4, rtol=1e-3)
 
     def test_a_difference_from_dnlo_does_not_replace_the_better_answer(self):
         """Of this flight DNLO's answer is 20 mm and 1.7 deg off."""

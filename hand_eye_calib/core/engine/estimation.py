@@ -340,7 +340,7 @@ def _solve_stream(pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free
         reference = TUNING.start_reference
         dnlo = _solve_pairs(pose_pairs, replace(with_dnlo, reference=reference))
         reason = f"auto: dnlo on reference {reference}, because no noise model fits these poses"
-        return replace(dnlo, method_reason=reason)
+        return _with_opinions(dnlo, pose_pairs, reason)
     if not is_auto:
         return _of_model(pose_pairs, config, solution, "")
     if solution.converged and not solution.is_noise_dominated:
@@ -355,7 +355,14 @@ def _solve_stream(pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free
         reason = f"auto: adaptive, although {problem}: there are too few poses for dnlo"
         return _of_model(pose_pairs, config, solution, reason)
     reason = f"auto: dnlo on reference {dnlo.reference}, because {problem}"
-    return replace(dnlo, method_reason=reason)
+    return _with_opinions(dnlo, pose_pairs, reason)
+
+
+def _with_opinions(dnlo: Solved, pose_pairs: PosePairs, reason: str) -> Solved:
+    """Return an answer of DNLO that replaces one of the noise model, with second opinions on it."""
+    T_parent_child = dnlo.solution.T_parent_child
+    opinions = second_opinions(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, T_parent_child)
+    return replace(dnlo, method_reason=reason, opinions=opinions)
 
 
 def _of_model(
