@@ -212,6 +212,7 @@ class NoiseModel:
         mean[JITTER] = tuning.jitter
         # The jitter may differ by a factor of 10 (a level by 4.5).
         precision[JITTER] = 0.05
+        mean[TIME_CONSTANTS] = self._usual_log_tau
         precision[TIME_CONSTANTS] = tuning.tau_precision
         lower[TIME_CONSTANTS] = shortest
         # An error that lasts for more than a quarter of the recording is constant.
@@ -222,17 +223,21 @@ class NoiseModel:
         upper[TIME_CONSTANTS] = np.where(is_direction, longest_of_direction, longest)
         return Prior(mean, precision, lower, upper)
 
+    @property
+    def _usual_log_tau(self) -> float:
+        """Logarithm of the time constant (s) that a search starts at, which is its prior mean."""
+        shortest_s = self.tuning.first_tau * self.interval_s
+        longest_s = max(self.tuning.last_tau * self.duration_s, shortest_s)
+        return 0.5 * float(np.log(shortest_s * longest_s))
+
     def with_lasting(
         self, processes: tuple[Slow, ...], levels: FloatArray
     ) -> tuple[NoiseModel, FloatArray]:
         """Return the model with time-correlated errors, and log levels to start a search at."""
         tuning = self.tuning
-        shortest_s = tuning.first_tau * self.interval_s
-        longest_s = max(tuning.last_tau * self.duration_s, shortest_s)
-        log_tau = 0.5 * np.log(shortest_s * longest_s)
         variances = dict(zip(PARTS, whole(levels) + np.log(tuning.audible), strict=True))
         variances |= dict.fromkeys(PATH_PARTS, tuning.first_of_path)
-        starts = [[variances[part], log_tau] for _, part in processes]
+        starts = [[variances[part], self._usual_log_tau] for _, part in processes]
         return replace(self, slow=processes), np.r_[levels, np.ravel(starts)]
 
     def lasting(

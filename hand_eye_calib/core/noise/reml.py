@@ -13,9 +13,8 @@ Biometrics 51, 1995): ``1/2 f_k' P f_l`` with ``f_k = V_k P r``.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,7 +29,7 @@ from hand_eye_calib.core.noise.state_space import (
 )
 
 # Largest number of steps, and the shortest step of a log level.
-_MAX_STEPS = 20
+MAX_STEPS = 20
 _SHORTEST_STEP = 1e-3
 
 # Longest step of a log level: a variance changes by a factor of 4.5 at most.
@@ -55,16 +54,12 @@ class Prior(NamedTuple):
         return 0.5 * float((self.precision * (levels - self.mean) ** 2).sum())
 
 
-# Space, levels and prior without processes that do not matter; None if all matter.
-Reduced: TypeAlias = tuple[StateSpace, FloatArray, Prior] | None
-
-
 def fit(
     space: StateSpace,
     start: FloatArray,
     prior: Prior,
     settled_loss: float,
-    reduce: Callable[[FloatArray, FloatArray], Reduced] | None = None,
+    n_steps: int = MAX_STEPS,
 ) -> tuple[Posterior, FloatArray]:
     """Minimise the loss over the levels by Newton steps that are shortened if they overshoot.
 
@@ -76,9 +71,8 @@ def fit(
     prior : Prior
     settled_loss : float
         The search ends if a step promises to lower the loss by less.
-    reduce : callable, optional
-        Called with levels and information before each step. Returns the space, levels and prior
-        without processes that do not matter, or None if all matter.
+    n_steps : int
+        Largest number of steps.
 
     Returns
     -------
@@ -94,14 +88,8 @@ def fit(
     """
     posterior = Posterior(space, np.clip(start, prior.lower, prior.upper))
     loss = posterior.loss + prior.loss(posterior.levels)
-    for _ in range(_MAX_STEPS):
+    for _ in range(n_steps):
         gradient, information = derivatives(posterior)
-        reduced = reduce(posterior.levels, information) if reduce else None
-        if reduced:
-            space, levels, prior = reduced
-            posterior = Posterior(space, levels)
-            loss = posterior.loss + prior.loss(levels)
-            gradient, information = derivatives(posterior)
         gradient = gradient + prior.precision * (posterior.levels - prior.mean)
         curvature = information + np.diag(prior.precision + _ADDED_CURVATURE)
         step = _step(posterior.levels, gradient, curvature, prior)

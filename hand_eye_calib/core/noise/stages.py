@@ -60,6 +60,9 @@ from hand_eye_calib.core.solvers.registry import Method
 # Longest step of the translation of X (m). No lever arm is that long.
 _LONGEST_STEP_M = 1000.0
 
+# Steps of the search for time-correlated errors before processes without information are dropped.
+_FIRST_STEPS = 4
+
 # Longest step of X (m, rad) that is rounding.
 _ROUNDING_STEP = 1e-9
 
@@ -414,52 +417,51 @@ def tails(workspace: Workspace, fit: Fit) -> Fit:
 def lasting(workspace: Workspace, fit: Fit) -> Fit:
     """Add time-correlated errors to the model if the data ask for them.
 
-    The search begins with all processes, and drops a process once it makes no difference.
+    The search begins with all processes. Processes without information are dropped after some
+    steps, which makes the other steps faster, and again at the end.
     """
     problem = workspace.problem
     tuning = problem.tuning
     kept = sample(len(problem.streams), tuning)
+    # Large biases are possible here. Otherwise a bias would become drift and never be found.
+    free = replace(fit, sigmas=np.array(tuning.sizes))
+    loss_before = Posterior(problem.space(free, kept), fit.levels).loss
     # Neither white noise nor walk is too small to matter during the search.
     total = whole(fit.levels)
     levels = fit.levels.copy()
     levels[WHITES] = np.maximum(levels[WHITES], total + np.log(tuning.audible))
     levels[WALKS] = np.maximum(levels[WALKS], total + np.log(1e-3))
     model, levels = fit.model.with_lasting(LASTING, levels)
-    # Large biases are possible here. Otherwise a bias would become drift and never be found.
-    free = replace(fit, sigmas=np.array(tuning.sizes), model=model)
-    prior = model.prior(levels)
-    # Processes whose level has fallen since the start may be dropped.
-    faint_levels = levels - 0.2
-
-    def without_faint(levels: FloatArray, information: FloatArray) -> reml.Reduced:
-        """Drop processes that are below their faint level and carry little information.
-
-        None if all remain.
-        """
-        nonlocal free, prior, faint_levels
-        matters = np.diag(information)[VARIANCES] > tuning.least_information
-        matters |= (levels >= faint_levels)[VARIANCES]
-        if matters.all():
-            return None
-        is_kept = np.r_[np.ones(N_FAST, dtype=bool), np.repeat(matters, 2)]
-        slow = tuple(compress(free.model.slow, matters))
-        free = replace(free, model=replace(free.model, slow=slow))
-        prior = reml.Prior(*np.array(prior)[:, is_kept])
-        faint_levels = faint_levels[is_kept]
-        return problem.space(free, kept), levels[is_kept], prior
-
+    rival = replace(free, model=model, levels=levels)
     settled_loss = tuning.settled_loss * len(levels)
-    space = problem.space(free, kept)
-    fitted, information = reml.fit(space, levels, prior, settled_loss, without_faint)
-    before = replace(free, model=fit.model)
-    loss_before = Posterior(problem.space(before, kept), fit.levels).loss
+    for n_steps in (_FIRST_STEPS, reml.MAX_STEPS):
+        space = problem.space(rival, kept)
+        prior = rival.model.prior(rival.levels)
+        fitted, information = reml.fit(space, rival.levels, prior, settled_loss, n_steps)
+        rival = _without_faint(rival, fitted.levels, information, tuning.least_information)
     if loss_before - fitted.loss < tuning.least_gain:
         return fit
-    # The search has ended: the level of a process no longer counts.
-    faint_levels = np.full(len(fitted.levels), np.inf)
-    reduced = without_faint(fitted.levels, information)
-    levels = reduced[1] if reduced else fitted.levels
-    return replace(fit, model=free.model, levels=levels)
+    return replace(fit, model=rival.model, levels=rival.levels)
+
+
+def _without_faint(
+    fit: Fit, levels: FloatArray, information: FloatArray, least_information: float
+) -> Fit:
+    """Return the fit at levels (m,), without processes that the data have hardly information on.
+
+    Parameters
+    ----------
+    fit : Fit
+    levels : (m,) array
+    information : (m, m) array
+        On the levels.
+    least_information : float
+        About the level of a process.
+    """
+    matters = np.diag(information)[VARIANCES] > least_information
+    is_kept = np.r_[np.ones(N_FAST, dtype=bool), np.repeat(matters, 2)]
+    model = replace(fit.model, slow=tuple(compress(fit.model.slow, matters)))
+    return replace(fit, model=model, levels=levels[is_kept])
 
 
 class _Hypothesis(NamedTuple):
