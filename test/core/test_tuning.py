@@ -136,7 +136,6 @@ CHANGES = {
     "longest_gap": (1, "drive"),
     "jitter": (-12.0, "drive"),
     "tau_precision": (0.6, "drive"),
-    "caution": (20.0, "drive"),
     "settled_loss": (0.1, "bursts"),
     "outlier_rounds": (1, "target"),
     "false_alarms": (0.3, "drive"),

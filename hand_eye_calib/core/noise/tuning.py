@@ -37,9 +37,6 @@ class Tuning:
     jitter: float = -14.0
     # Prior precision of the levels of time constants.
     tau_precision: float = 0.3
-    # Steps of the child count as noise until their squared differences from their neighbours
-    # exceed the noise variance by this factor.
-    caution: float = 10.0
     # Newton steps of the levels end if a step promises to lower the loss by less: noise levels need
     # a few per cent. The search for time-correlated errors ends by less per level.
     settled_loss: float = 0.05
