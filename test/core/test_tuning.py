@@ -155,7 +155,6 @@ CHANGES = {
     "last_tau": (0.12, "drive"),
     "unseen_share": (0.1, "drive"),
     "sizes": (tuple(2.0 * size for size in TUNING.sizes), "drive"),
-    "first_sizes": (tuple(2.0 * size for size in TUNING.first_sizes), "drive"),
     "odds": (300.0, "drive"),
     "none": (2e-6, "drive"),
     "like_scale": (1.5, "sideways"),
