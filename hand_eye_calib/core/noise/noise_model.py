@@ -21,7 +21,7 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.noise.increments import PATH_PARTS, Linearisation, Streams
+from hand_eye_calib.core.noise.increments import PATH_PARTS, SCALE, Linearisation, Streams
 from hand_eye_calib.core.noise.normal import transposed
 from hand_eye_calib.core.noise.reml import Prior
 from hand_eye_calib.core.noise.state_space import WHITE, StateSpace
@@ -49,10 +49,12 @@ ROTATIONS = np.diag([0, 0, 0, 1.0, 1.0, 1.0])
 LOWEST_VARIANCE = 1e-14
 _HIGHEST_LEVEL = 14.0
 
-# Lower bounds of the log shares of white noise and of the walk in the whole. The precisions of both
+# Lower bound of the log shares of white noise and of the walk in the whole. The precisions of both
 # are added in one matrix.
-_LOWEST_WHITE = -14.0
-_LOWEST_WALK = -12.0
+_LOWEST_SHARE = -12.0
+
+# Longest time constant of a drifting direction of travel, in intervals.
+_LONGEST_OF_DIRECTION = 10.0
 
 # Bounds of the walk's variance over an increment, in units of a typical increment. Neither a gap
 # nor twin stamps may dominate.
@@ -202,33 +204,33 @@ class NoiseModel:
         """Return the prior of the levels for a search that starts at these levels."""
         tuning = self.tuning
         total = whole(levels)
-        shortest = np.log(self.interval_s)
+        shortest, longest = self._log_tau_bounds
         mean = levels.copy()
         precision = np.zeros(len(levels))
         lower = np.full(len(levels), np.log(LOWEST_VARIANCE))
         upper = np.full(len(levels), _HIGHEST_LEVEL)
-        lower[WHITES] = np.maximum(lower[WHITES], total + _LOWEST_WHITE)
-        lower[WALKS] = np.maximum(lower[WALKS], total + _LOWEST_WALK)
+        lower[WHITES] = np.maximum(lower[WHITES], total + _LOWEST_SHARE)
+        lower[WALKS] = np.maximum(lower[WALKS], total + _LOWEST_SHARE)
         mean[JITTER] = tuning.jitter
         # The jitter may differ by a factor of 10 (a level by 4.5).
         precision[JITTER] = 0.05
-        mean[TIME_CONSTANTS] = self._usual_log_tau
+        mean[TIME_CONSTANTS] = 0.5 * (shortest + longest)
         precision[TIME_CONSTANTS] = tuning.tau_precision
         lower[TIME_CONSTANTS] = shortest
-        # An error that lasts for more than a quarter of the recording is constant.
-        longest = max(np.log(0.25 * self.duration_s), shortest)
         # A direction that lasts is a bias or a rotated mount, which have parameters.
-        longest_of_direction = shortest + np.log(tuning.first_tau)
+        longest_of_direction = shortest + np.log(_LONGEST_OF_DIRECTION)
         is_direction = [part == "direction" for _, part in self.slow]
         upper[TIME_CONSTANTS] = np.where(is_direction, longest_of_direction, longest)
         return Prior(mean, precision, lower, upper)
 
     @property
-    def _usual_log_tau(self) -> float:
-        """Logarithm of the time constant (s) that a search starts at, which is its prior mean."""
-        shortest_s = self.tuning.first_tau * self.interval_s
-        longest_s = max(self.tuning.last_tau * self.duration_s, shortest_s)
-        return 0.5 * float(np.log(shortest_s * longest_s))
+    def _log_tau_bounds(self) -> tuple[float, float]:
+        """Bounds of the logarithms of time constants (s): an interval, and a share of the duration.
+
+        An error that lasts for more than a quarter of the recording is constant.
+        """
+        longest_s = max(0.25 * self.duration_s, self.interval_s)
+        return float(np.log(self.interval_s)), float(np.log(longest_s))
 
     def with_lasting(
         self, processes: tuple[Slow, ...], levels: FloatArray
@@ -236,8 +238,9 @@ class NoiseModel:
         """Return the model with time-correlated errors, and log levels to start a search at."""
         tuning = self.tuning
         variances = dict(zip(PARTS, whole(levels) + np.log(tuning.audible), strict=True))
-        variances |= dict.fromkeys(PATH_PARTS, tuning.first_of_path)
-        starts = [[variances[part], self._usual_log_tau] for _, part in processes]
+        variances |= dict.fromkeys(PATH_PARTS, 2.0 * np.log(tuning.sizes[SCALE]))
+        log_tau = 0.5 * sum(self._log_tau_bounds)
+        starts = [[variances[part], log_tau] for _, part in processes]
         return replace(self, slow=processes), np.r_[levels, np.ravel(starts)]
 
     def lasting(

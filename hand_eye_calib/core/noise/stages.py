@@ -345,7 +345,7 @@ def outliers(workspace: Workspace, fit: Fit) -> Fit:
     """Detect jumps and outlier poses, and fit the noise without them."""
     problem = workspace.problem
     tuning = problem.tuning
-    searched = _with_outliers(workspace, fit, tuning.outlier_rounds)
+    searched = _with_outliers(workspace, fit, tuning.max_rounds)
     if searched.outliers.differs_by(fit.outliers) > tuning.negligible:
         searched = _with_outliers(workspace, noise(workspace, searched), 1)
     spikes = searched.outliers.spikes
@@ -420,10 +420,10 @@ def lasting(workspace: Workspace, fit: Fit) -> Fit:
     kept = sample(len(problem.streams), tuning)
     loss_before = Posterior(problem.space(fit, kept), fit.levels).loss
     # Neither white noise nor walk is too small to matter during the search.
-    total = whole(fit.levels)
+    lowest = whole(fit.levels) + np.log(tuning.audible)
     levels = fit.levels.copy()
-    levels[WHITES] = np.maximum(levels[WHITES], total + np.log(tuning.audible))
-    levels[WALKS] = np.maximum(levels[WALKS], total + np.log(1e-3))
+    levels[WHITES] = np.maximum(levels[WHITES], lowest)
+    levels[WALKS] = np.maximum(levels[WALKS], lowest)
     model, levels = fit.model.with_lasting(LASTING, levels)
     rival = replace(fit, model=model, levels=levels)
     settled_loss = tuning.settled_loss * len(levels)

@@ -42,18 +42,14 @@ class Tuning:
     settled_loss: float = 0.05
 
     # -- Outliers and heavy tails --
-    # Largest number of rounds of detecting outliers.
-    outlier_rounds: int = 4
     # False alarms expected in a whole recording.
     false_alarms: float = 0.01
     # A large step of a walk with heavy tails is a jump if its chi-square exceeds the threshold of
     # false alarms by this factor.
     decisive: float = 2.5
-    # Tails are heavy if the fourth moment exceeds the square of the second by this factor (4/3 for
-    # normal errors): of the steps of the walk below the level of false alarms.
-    walk_kurtosis: float = 1.5
-    # The same of the white errors.
-    heavy_kurtosis: float = 1.7
+    # White errors, or ordinary steps of the walk, have heavy tails if the mean square of their
+    # chi-squares exceeds the square of the mean by this factor (4/3 for normal errors).
+    heavy_kurtosis: float = 1.6
     # First search for jumps: increments this many robust standard deviations out. The limit is wide
     # because the noise levels are not estimated yet.
     first_jump_sigmas: float = 5.0
@@ -75,15 +71,9 @@ class Tuning:
     least_gain: float = 4.0
     # A process makes no difference if the data have less information than this on its level.
     least_information: float = 0.3
-    # The search begins with processes of this share of the white and walking noise. White noise is
-    # at least as large then.
+    # The search begins with processes of this share of the white and walking noise. White noise
+    # and walk are at least as large then.
     audible: float = 0.1
-    # Level of a drifting scale and direction of travel at which the search begins.
-    first_of_path: float = -10.0
-    # The search begins at a time constant between this many intervals ...
-    first_tau: float = 10.0
-    # ... and this share of the recording.
-    last_tau: float = 0.06
     # Variance of undetected body-fixed errors, as a share of the variance of detected errors. Such
     # errors have all time scales (flicker). Errors about as long as the recording are not detected;
     # X contains their mean.
@@ -106,7 +96,7 @@ class Tuning:
     most_growth: float = 3.0
 
     # -- The end --
-    # Largest number of steps of X at the end.
+    # Largest number of rounds of detecting outliers, and of steps of X at the end.
     max_rounds: int = 6
     # X is settled if it moves by less than this share of its standard deviation.
     settled_sigmas: float = 0.1
