@@ -24,7 +24,7 @@ from hand_eye_calib.extras.simulation.drive import add_noise, simulate_drive
 from hand_eye_calib.extras.simulation.options import MIXTURE, DriveConfig
 
 VALUES = {
-    "none": np.zeros(0),
+    "absent_sigma": np.zeros(0),
     "scale": np.array([0.03]),
     "bias": np.array([0.0, -0.03, 0.0]),
     "time": np.array([0.02]),
@@ -239,7 +239,7 @@ def test_flicker_is_stated_beyond_what_was_found():
     error = sum(lasting(seed, 500, [0.004, 0.004], tau) for seed, tau in enumerate((3, 30, 300)))
     child = child_of(parent) @ se3.exp(error)
     stated = estimator.solve(stamps(500), parent, child)
-    without = replace(TUNING, unseen_share=0.0)
+    without = replace(TUNING, undetected_share=0.0)
     measured = estimator.solve(stamps(500), parent, child, tuning=without)
     unseen = stated.cov_parent_child_in_child - measured.cov_parent_child_in_child
     unseen_m = np.sqrt(np.diag(unseen)[:3])

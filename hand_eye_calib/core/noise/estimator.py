@@ -376,7 +376,7 @@ def _strided(problem: Problem, fit: Fit) -> IntArray:
     rotations = problem.streams.Ts_pw_p[sound_poses, :3, :3]
     for stride in tuning.strides:
         turns = transposed(rotations[:-stride]) @ rotations[stride:]
-        if noise_rad < tuning.noisy * median(se3.rotation_angle(turns)):
+        if noise_rad < tuning.noisy_share * median(se3.rotation_angle(turns)):
             return sound_poses[:: min(stride, longest_stride)]
     return sound_poses[::longest_stride]
 
@@ -404,13 +404,13 @@ def _solution(workspace: Workspace, fit: Fit) -> AdaptiveSolution:
     covariance = max(misfit, 1.0) * normal.covariance
     sigmas = np.zeros(N_SYSTEMATIC)
     sigmas[columns] = np.sqrt(np.diag(covariance)[6:])
-    is_present = fit.sigmas > problem.tuning.none
+    is_present = fit.sigmas > problem.tuning.absent_sigma
     parameters = np.where(is_present, final.parameters, 0.0)
     sigmas = np.where(is_present, sigmas, 0.0)
     undetected = np.zeros(6)
     for (kind, _), level in zip(fit.model.slow, fit.levels[VARIANCES], strict=True):
         if kind == "body":
-            undetected[:3] += problem.tuning.unseen_share * np.exp(level)
+            undetected[:3] += problem.tuning.undetected_share * np.exp(level)
     steps = np.diff(se3.translation_of(problem.streams.Ts_pw_p), axis=0)
     return AdaptiveSolution(
         T_parent_child=final.T,

@@ -138,7 +138,7 @@ class NoiseModel:
         rotations = 0.5 * (ROTATIONS + to_child @ ROTATIONS @ to_child.T)
         white_rotations = rotations[None]
         if self.centre != "sensors":
-            white_rotations = self._swing(streams, to_child)
+            white_rotations = self._rotations_about_origin(streams, to_child)
         jitter = twists[:, :, None] * twists[:, None]
         ahead = [np.zeros((len(intervals_s), 6, 0))]
         behind = [linearisation.adjoints]
@@ -165,7 +165,7 @@ class NoiseModel:
             prior=prior,
         )
 
-    def _swing(self, streams: Streams, to_child: FloatArray) -> FloatArray:
+    def _rotations_about_origin(self, streams: Streams, to_child: FloatArray) -> FloatArray:
         """Covariances (N, 6, 6) of c by rotation noise of 1 rad about the origin of a world."""
         poses = streams.Ts_cw_c if self.centre == "child" else streams.Ts_pw_p
         swing = np.zeros((len(poses), 6, 3))
@@ -195,15 +195,15 @@ class NoiseModel:
             S_parent = S_parent + to_child @ turning @ to_child.T
             S_child = S_child + turning
         elif self.centre == "child":
-            S_child = S_child + rotation * self._swing(streams, to_child)
+            S_child = S_child + rotation * self._rotations_about_origin(streams, to_child)
         else:
-            S_parent = S_parent + rotation * self._swing(streams, to_child)
+            S_parent = S_parent + rotation * self._rotations_about_origin(streams, to_child)
         return transposed(np.linalg.solve(S_parent + S_child, S_parent))
 
     def prior(self, levels: FloatArray) -> Prior:
         """Return the prior of the levels for a search that starts at these levels."""
         tuning = self.tuning
-        total = whole(levels)
+        total = increment_levels(levels)
         shortest, longest = self._log_tau_bounds
         mean = levels.copy()
         precision = np.zeros(len(levels))
@@ -237,7 +237,9 @@ class NoiseModel:
     ) -> tuple[NoiseModel, FloatArray]:
         """Return the model with time-correlated errors, and log levels to start a search at."""
         tuning = self.tuning
-        variances = dict(zip(PARTS, whole(levels) + np.log(tuning.audible), strict=True))
+        variances = dict(
+            zip(PARTS, increment_levels(levels) + np.log(tuning.start_share), strict=True)
+        )
         variances |= dict.fromkeys(PATH_PARTS, 2.0 * np.log(tuning.sizes[SCALE]))
         log_tau = 0.5 * sum(self._log_tau_bounds)
         starts = [[variances[part], log_tau] for _, part in processes]
@@ -270,6 +272,6 @@ def fast_sigmas(levels: FloatArray) -> FastSigmas:
     return FastSigmas(*np.exp(0.5 * levels)[:N_FAST].tolist())
 
 
-def whole(levels: FloatArray) -> FloatArray:
+def increment_levels(levels: FloatArray) -> FloatArray:
     """Log variances (2,) of increments of translation and rotation: white noise plus walk."""
     return np.logaddexp(levels[WALKS], levels[WHITES] + np.log(2.0))

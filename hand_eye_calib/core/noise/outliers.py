@@ -90,7 +90,7 @@ def first_outliers(
     limits = np.maximum(tuning.first_jump_sigmas * usual / MEDIAN_LENGTH, _SMALLEST_JUMP)
     jumps: BoolArray = np.asarray((sizes > limits).any(axis=1))
     spikes = np.r_[False, jumps[1:] & jumps[:-1], False]
-    if np.mean(spikes) > tuning.most_spikes:
+    if np.mean(spikes) > tuning.max_outlier_share:
         return Outliers(jumps, np.zeros(len(spikes), dtype=bool))
     jumps = jumps & ~(spikes[1:] | spikes[:-1])
     if spikes.any():
@@ -193,7 +193,7 @@ def _jump_factor(of_walk: FloatArray, alarming: float, tuning: Tuning) -> float:
     """
     ordinary = of_walk[of_walk < alarming]
     if not len(ordinary) or np.mean(ordinary**2) > tuning.heavy_kurtosis * np.mean(ordinary) ** 2:
-        return tuning.decisive
+        return tuning.heavy_jump_factor
     return float(max(median(ordinary) / CHI2[0.5][6], 1.0))
 
 

@@ -41,7 +41,7 @@ from hand_eye_calib.core.noise.noise_model import (
     WALKS,
     WHITES,
     NoiseModel,
-    whole,
+    increment_levels,
 )
 from hand_eye_calib.core.noise.normal import NormalEquations
 from hand_eye_calib.core.noise.outliers import (
@@ -115,7 +115,7 @@ class Problem:
     def is_noisy(self, fit: Fit) -> bool:
         """Whether rotation noise exceeds a share of the rotation between poses."""
         turns = se3.rotation_angle(se3.rotation_of(self.streams.motions_p))
-        return bool(np.exp(0.5 * fit.levels[ROTATION]) > self.tuning.noisy * median(turns))
+        return bool(np.exp(0.5 * fit.levels[ROTATION]) > self.tuning.noisy_share * median(turns))
 
 
 class Workspace:
@@ -274,7 +274,7 @@ def start(problem: Problem) -> Fit:
     outliers = first_outliers(streams, course, T, residuals, tuning)
     interval_s = median(np.diff(streams.stamps_s))
     duration_s = float(np.ptp(streams.stamps_s))
-    centre = _centre(streams, T, residuals, tuning.decisive_centre)
+    centre = _centre(streams, T, residuals, tuning.centre_ratio)
     left_out = outliers.jumps | outliers.spikes[1:] | outliers.spikes[:-1]
     return Fit(
         poses=bridged(streams, T, outliers.spikes),
@@ -346,10 +346,10 @@ def outliers(workspace: Workspace, fit: Fit) -> Fit:
     problem = workspace.problem
     tuning = problem.tuning
     searched = _with_outliers(workspace, fit, tuning.max_rounds)
-    if searched.outliers.differs_by(fit.outliers) > tuning.negligible:
+    if searched.outliers.differs_by(fit.outliers) > tuning.negligible_share:
         searched = _with_outliers(workspace, noise(workspace, searched), 1)
     spikes = searched.outliers.spikes
-    if np.mean(spikes) > tuning.most_spikes:
+    if np.mean(spikes) > tuning.max_outlier_share:
         # Whole stretches are noisy, and no single pose is wrong. All poses get less weight instead.
         searched = replace(
             searched,
@@ -376,7 +376,7 @@ def _with_outliers(workspace: Workspace, fit: Fit, rounds: int, with_spikes: boo
         if change:
             poses = bridged(problem.streams, fit.T, detected.spikes)
             fit = replace(fit, outliers=detected, poses=poses, error=np.zeros_like(fit.error))
-        if change <= tuning.negligible:
+        if change <= tuning.negligible_share:
             break
     if with_spikes:
         normal = of_white[~fit.outliers.spikes]
@@ -420,7 +420,7 @@ def lasting(workspace: Workspace, fit: Fit) -> Fit:
     kept = sample(len(problem.streams), tuning)
     loss_before = Posterior(problem.space(fit, kept), fit.levels).loss
     # Neither white noise nor walk is too small to matter during the search.
-    lowest = whole(fit.levels) + np.log(tuning.audible)
+    lowest = increment_levels(fit.levels) + np.log(tuning.start_share)
     levels = fit.levels.copy()
     levels[WHITES] = np.maximum(levels[WHITES], lowest)
     levels[WALKS] = np.maximum(levels[WALKS], lowest)
@@ -431,14 +431,14 @@ def lasting(workspace: Workspace, fit: Fit) -> Fit:
         space = problem.space(rival, kept)
         prior = rival.model.prior(rival.levels)
         fitted, information = reml.fit(space, rival.levels, prior, settled_loss, n_steps)
-        rival = _without_faint(rival, fitted.levels, information, tuning.least_information)
+        rival = _without_faint(rival, fitted.levels, information, tuning.min_information)
     if loss_before - fitted.loss < tuning.least_gain:
         return fit
     return replace(fit, model=rival.model, levels=rival.levels)
 
 
 def _without_faint(
-    fit: Fit, levels: FloatArray, information: FloatArray, least_information: float
+    fit: Fit, levels: FloatArray, information: FloatArray, min_information: float
 ) -> Fit:
     """Return the fit at levels (m,), without processes that the data have hardly information on.
 
@@ -448,10 +448,10 @@ def _without_faint(
     levels : (m,) array
     information : (m, m) array
         On the levels.
-    least_information : float
+    min_information : float
         About the level of a process.
     """
-    matters = np.diag(information)[VARIANCES] > least_information
+    matters = np.diag(information)[VARIANCES] > min_information
     is_kept = np.r_[np.ones(N_FAST, dtype=bool), np.repeat(matters, 2)]
     model = replace(fit.model, slow=tuple(compress(fit.model.slow, matters)))
     return replace(fit, model=model, levels=levels[is_kept])
@@ -484,10 +484,10 @@ def systematic(workspace: Workspace, fit: Fit) -> Fit:
         rival = _likeliest(problem, fit, posterior, [column])
         gain = plain.loss - rival.loss
         if column != SCALE:
-            gain *= tuning.like_scale
+            gain *= tuning.bias_gain_share
         ratios = plain_information @ rival.normal.covariance[:6, :6]
         growth = np.linalg.eigvals(ratios).real.max()
-        if growth < tuning.most_growth**2 and gain > largest_gain:
+        if growth < tuning.max_sigma_growth**2 and gain > largest_gain:
             best = rival
             largest_gain = gain
     step = best.normal.step
@@ -517,7 +517,7 @@ def _likeliest(
     for time_columns in choices_of_time:
         present = path_columns + time_columns
         is_present = [k in present or k in RATE for k in range(N_SYSTEMATIC)]
-        rival = replace(fit, sigmas=np.where(is_present, tuning.sizes, tuning.none))
+        rival = replace(fit, sigmas=np.where(is_present, tuning.sizes, tuning.absent_sigma))
         normal = NormalEquations(products + problem.prior(rival))
         loss = 2.0 * n_rows * np.log1p(max(float(normal.cost), 0.0) / n_rows)
         loss += float(normal.log_determinant + 2.0 * np.log(rival.sigmas).sum())

@@ -21,7 +21,7 @@ class Tuning:
     start_reference: str = "B3"
     # Rotation noise turns about the origin of a world if residuals at that origin are smaller
     # than this share of the residuals at the sensors.
-    decisive_centre: float = 0.7
+    centre_ratio: float = 0.7
 
     # -- Noise levels, which are logarithms of variances --
     # Largest number of poses to fit noise levels with.
@@ -46,7 +46,7 @@ class Tuning:
     false_alarms: float = 0.01
     # A large step of a walk with heavy tails is a jump if its chi-square exceeds the threshold of
     # false alarms by this factor.
-    decisive: float = 2.5
+    heavy_jump_factor: float = 2.5
     # White errors, or ordinary steps of the walk, have heavy tails if the mean square of their
     # chi-squares exceeds the square of the mean by this factor (4/3 for normal errors).
     heavy_kurtosis: float = 1.6
@@ -54,13 +54,13 @@ class Tuning:
     # because the noise levels are not estimated yet.
     first_jump_sigmas: float = 5.0
     # Largest share of poses that are outliers.
-    most_spikes: float = 0.2
+    max_outlier_share: float = 0.2
     # The noise levels are fitted again if more than this share of poses changed status.
-    negligible: float = 0.005
+    negligible_share: float = 0.005
 
     # -- Rotation noise that is large beside the rotation --
     # Rotation noise is not small if it exceeds this share of the rotation between poses.
-    noisy: float = 0.2
+    noisy_share: float = 0.2
     # Strides tried if rotation noise exceeds the rotation between poses. Without them, the
     # recording primesense is 20 mm off at a sigma of 2 mm.
     strides: tuple[int, ...] = (3, 10, 30)
@@ -70,14 +70,14 @@ class Tuning:
     # criterion and more.
     least_gain: float = 4.0
     # A process makes no difference if the data have less information than this on its level.
-    least_information: float = 0.3
+    min_information: float = 0.3
     # The search begins with processes of this share of the white and walking noise. White noise
     # and walk are at least as large then.
-    audible: float = 0.1
+    start_share: float = 0.1
     # Variance of undetected body-fixed errors, as a share of the variance of detected errors. Such
     # errors have all time scales (flicker). Errors about as long as the recording are not detected;
     # X contains their mean.
-    unseen_share: float = 0.05
+    undetected_share: float = 0.05
 
     # -- Systematic errors --
     # Prior standard deviations if the error is present: of a scale, of a bias along each axis
@@ -86,14 +86,14 @@ class Tuning:
     # Prior odds that a systematic error is present.
     odds: float = 0.03
     # Prior standard deviation of an error that is absent.
-    none: float = 1e-6
+    absent_sigma: float = 1e-6
     # A bias of the path counts with this share of its gain against a scale: a scale, or a bias
     # along the direction of travel, explains most of it.
-    like_scale: float = 0.75
+    bias_gain_share: float = 0.75
     # A systematic error is not modelled if the standard deviations of X grow by this factor with
     # it: the error and X are hardly separable then. A child that slips sideways on a road has 4 or
     # more, simulations have 2 or less.
-    most_growth: float = 3.0
+    max_sigma_growth: float = 3.0
 
     # -- The end --
     # Largest number of rounds of detecting outliers, and of steps of X at the end.
