@@ -27,8 +27,8 @@ from hand_eye_calib.core.noise.reml import Prior
 from hand_eye_calib.core.noise.state_space import WHITE, StateSpace
 from hand_eye_calib.core.noise.tuning import Tuning
 
-# Centres of white rotation noise: either sensor itself, or the origin of the child's or of the
-# parent's world, as of a camera that observes a target.
+# Centres of white rotation noise: the sensors themselves, or the origin of the child's or of the
+# parent's world. Rotation errors of a camera that observes a target turn about the target.
 CENTRES = ("sensors", "child", "parent")
 
 # Levels of the fast errors: white translation (m^2), white rotation (rad^2), jitter of stamps
@@ -37,7 +37,7 @@ N_FAST = 5
 TRANSLATION, ROTATION, JITTER, WALK_TRANSLATION, WALK_ROTATION = range(N_FAST)
 WHITES = slice(TRANSLATION, ROTATION + 1)
 WALKS = slice(WALK_TRANSLATION, WALK_ROTATION + 1)
-# Levels of time-correlated errors follow: of each process its variance, then its time constant (s).
+# Levels of time-correlated errors follow: the variance, then the time constant (s) of each process.
 VARIANCES = slice(N_FAST, None, 2)
 TIME_CONSTANTS = slice(N_FAST + 1, None, 2)
 
@@ -49,20 +49,21 @@ ROTATIONS = np.diag([0, 0, 0, 1.0, 1.0, 1.0])
 LOWEST_VARIANCE = 1e-14
 _HIGHEST_LEVEL = 14.0
 
-# Lower bound of the log shares of white noise and of the walk in the whole. The precisions of both
-# are added in one matrix.
+# Lower bound of the logarithms of the shares of white noise and of the walk in the variance of an
+# increment. A smaller share is lost to rounding, because one matrix contains both precisions.
 _LOWEST_SHARE = -12.0
 
-# Longest time constant of a drifting direction of travel, in intervals.
+# Longest time constant of a drifting direction of travel, in intervals. A direction that lasts
+# longer is a bias or a rotated mount, which have parameters.
 _LONGEST_OF_DIRECTION = 10.0
 
-# Bounds of the walk's variance over an increment, in units of a typical increment. Neither a gap
-# nor twin stamps may dominate.
+# Bounds of the variance of the walk over an increment, in units of a typical increment. Neither a
+# gap nor two almost equal stamps may dominate.
 _WALK_BOUNDS = (0.1, 100.0)
 
 
 class FastSigmas(NamedTuple):
-    """Standard deviations, per axis, of the errors that every model has."""
+    """Standard deviations per axis of white noise, jitter of stamps and walk."""
 
     translation_m: float
     rotation_rad: float
@@ -88,7 +89,7 @@ LASTING: tuple[Slow, ...] = (
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """The errors that are in the model, and how they enter the state space.
+    """Errors that are in the model, and their state space.
 
     Attributes
     ----------
@@ -166,42 +167,39 @@ class NoiseModel:
         )
 
     def _rotations_about_origin(self, streams: Streams, to_child: FloatArray) -> FloatArray:
-        """Covariances (N, 6, 6) of c by rotation noise of 1 rad about the origin of a world."""
+        """Return the covariances (N, 6, 6) of c for rotations of 1 rad about a world's origin."""
         poses = streams.Ts_cw_c if self.centre == "child" else streams.Ts_pw_p
-        swing = np.zeros((len(poses), 6, 3))
-        swing[:, :3] = se3.skew(se3.translation_of(se3.inverse(poses)))
-        swing[:, 3:] = np.eye(3)
+        by_rotation = np.zeros((len(poses), 6, 3))
+        by_rotation[:, :3] = se3.skew(se3.translation_of(se3.inverse(poses)))
+        by_rotation[:, 3:] = np.eye(3)
         if self.centre == "parent":
-            swing = to_child @ swing
-        return swing @ transposed(swing)
+            by_rotation = to_child @ by_rotation
+        return by_rotation @ transposed(by_rotation)
 
     def shares(
         self, levels: FloatArray, streams: Streams, T_parent_child: FloatArray
     ) -> FloatArray:
-        """Matrices (1 or N, 6, 6) that take white errors c to the parent's share of them.
+        """Return the matrices (1 or N, 6, 6) from white errors c to the parent's share of c.
 
         White errors are split by ``Ad(X^-1) a = S' (S' + S)^-1 c`` and ``b = -S (S' + S)^-1 c``
-        with the white covariances S' of the parent and S of the child, in the child's frame. With a
-        lever arm, the translation depends on which sensor rotated. Both sensors have half of the
-        noise, but rotation noise about a world's origin is that sensor's alone.
+        with the white covariances S' of the parent and S of the child, in the child's frame. A
+        rotation of the parent also moves the child by the lever arm. Each sensor has half of the
+        noise. Rotation noise about the origin of a world belongs to the sensor in this world.
         """
         to_child = se3.adjoint(se3.inverse(T_parent_child))
         translation, rotation = np.exp(levels[WHITES])
-        half = 0.5 * translation * TRANSLATIONS
-        turning = 0.5 * rotation * ROTATIONS
-        S_child = half[None]
-        S_parent = (to_child @ half @ to_child.T)[None]
+        S_child = 0.5 * translation * TRANSLATIONS[None]
         if self.centre == "sensors":
-            S_parent = S_parent + to_child @ turning @ to_child.T
-            S_child = S_child + turning
-        elif self.centre == "child":
+            S_child = S_child + 0.5 * rotation * ROTATIONS
+        S_parent = to_child @ S_child @ to_child.T
+        if self.centre == "child":
             S_child = S_child + rotation * self._rotations_about_origin(streams, to_child)
-        else:
+        elif self.centre == "parent":
             S_parent = S_parent + rotation * self._rotations_about_origin(streams, to_child)
         return transposed(np.linalg.solve(S_parent + S_child, S_parent))
 
     def prior(self, levels: FloatArray) -> Prior:
-        """Return the prior of the levels for a search that starts at these levels."""
+        """Return the prior of the levels (m,) for a search that starts at given levels (m,)."""
         tuning = self.tuning
         total = increment_levels(levels)
         shortest, longest = self._log_tau_bounds
@@ -212,12 +210,11 @@ class NoiseModel:
         lower[WHITES] = np.maximum(lower[WHITES], total + _LOWEST_SHARE)
         lower[WALKS] = np.maximum(lower[WALKS], total + _LOWEST_SHARE)
         mean[JITTER] = tuning.jitter
-        # The jitter may differ by a factor of 10 (a level by 4.5).
+        # The prior standard deviation of this level is 4.5: a factor of 10 of the jitter.
         precision[JITTER] = 0.05
         mean[TIME_CONSTANTS] = 0.5 * (shortest + longest)
         precision[TIME_CONSTANTS] = tuning.tau_precision
         lower[TIME_CONSTANTS] = shortest
-        # A direction that lasts is a bias or a rotated mount, which have parameters.
         longest_of_direction = shortest + np.log(_LONGEST_OF_DIRECTION)
         is_direction = [part == "direction" for _, part in self.slow]
         upper[TIME_CONSTANTS] = np.where(is_direction, longest_of_direction, longest)
@@ -235,7 +232,14 @@ class NoiseModel:
     def with_lasting(
         self, processes: tuple[Slow, ...], levels: FloatArray
     ) -> tuple[NoiseModel, FloatArray]:
-        """Return the model with time-correlated errors, and log levels to start a search at."""
+        """Add time-correlated errors to the model.
+
+        Returns
+        -------
+        NoiseModel
+        (m,) array
+            Levels to start a search at: the given levels, then those of the processes.
+        """
         tuning = self.tuning
         variances = dict(
             zip(PARTS, increment_levels(levels) + np.log(tuning.start_share), strict=True)
@@ -248,7 +252,14 @@ class NoiseModel:
     def lasting(
         self, states: FloatArray, streams: Streams, T_parent_child: FloatArray
     ) -> FloatArray:
-        """Time-correlated part (N, 6) of the error c at states (N, d), in the child's frame."""
+        """Return the time-correlated part (N, 6) of the error c, in the child's frame.
+
+        Parameters
+        ----------
+        states : (N, d) array
+        streams : Streams
+        T_parent_child : (4, 4) array
+        """
         to_child = se3.adjoint(se3.inverse(T_parent_child))
         error = np.zeros((len(states), 6))
         start = WHITE
@@ -261,7 +272,7 @@ class NoiseModel:
 
 
 def _directions(kind: str, part: str, streams: Streams, to_child: FloatArray) -> FloatArray:
-    """Matrices M (N, 6, 3) from a process to the error c."""
+    """Return the matrices M (N, 6, 3) from a process to the error c."""
     if kind == "body":
         return np.broadcast_to(np.eye(6)[:, PARTS[part]], (len(streams), 6, 3))
     return to_child[:, PARTS[part]] @ transposed(se3.rotation_of(streams.Ts_pw_p))
