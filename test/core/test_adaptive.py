@@ -24,7 +24,7 @@ from hand_eye_calib.extras.simulation.drive import add_noise, simulate_drive
 from hand_eye_calib.extras.simulation.options import MIXTURE, DriveConfig
 
 VALUES = {
-    "absent_sigma": np.zeros(0),
+    "none": np.zeros(0),
     "scale": np.array([0.03]),
     "bias": np.array([0.0, -0.03, 0.0]),
     "time": np.array([0.02]),

@@ -431,30 +431,28 @@ def lasting(workspace: Workspace, fit: Fit) -> Fit:
         space = problem.space(rival, kept)
         prior = rival.model.prior(rival.levels)
         fitted, information = reml.fit(space, rival.levels, prior, settled_loss, n_steps)
-        rival = _without_faint(rival, fitted.levels, information, tuning.min_information)
+        matters = np.diag(information)[VARIANCES] > tuning.min_information
+        if n_steps == _FIRST_STEPS:
+            # The level of a process without information may rise in the other steps.
+            matters |= (fitted.levels > rival.levels)[VARIANCES]
+        rival = _with_processes(rival, fitted.levels, matters)
     if loss_before - fitted.loss < tuning.least_gain:
         return fit
     return replace(fit, model=rival.model, levels=rival.levels)
 
 
-def _without_faint(
-    fit: Fit, levels: FloatArray, information: FloatArray, min_information: float
-) -> Fit:
-    """Return the fit at levels (m,), without processes that the data have hardly information on.
+def _with_processes(fit: Fit, levels: FloatArray, is_kept: BoolArray) -> Fit:
+    """Return the fit at levels (m,) with only some of its K time-correlated errors.
 
     Parameters
     ----------
     fit : Fit
     levels : (m,) array
-    information : (m, m) array
-        On the levels.
-    min_information : float
-        About the level of a process.
+    is_kept : (K,) bool array
     """
-    matters = np.diag(information)[VARIANCES] > min_information
-    is_kept = np.r_[np.ones(N_FAST, dtype=bool), np.repeat(matters, 2)]
-    model = replace(fit.model, slow=tuple(compress(fit.model.slow, matters)))
-    return replace(fit, model=model, levels=levels[is_kept])
+    model = replace(fit.model, slow=tuple(compress(fit.model.slow, is_kept)))
+    is_kept_level = np.r_[np.ones(N_FAST, dtype=bool), np.repeat(is_kept, 2)]
+    return replace(fit, model=model, levels=levels[is_kept_level])
 
 
 class _Hypothesis(NamedTuple):
