@@ -150,6 +150,7 @@ CHANGES = {
     "start_share": (0.2, "drive"),
     "undetected_share": (0.1, "drive"),
     "sizes": (tuple(2.0 * size for size in TUNING.sizes), "drive"),
+    "first_sizes": (tuple(2.0 * size for size in TUNING.first_sizes), "drive"),
     "odds": (300.0, "drive"),
     "absent_sigma": (2e-6, "drive"),
     "bias_gain_share": (1.5, "sideways"),

@@ -285,7 +285,7 @@ def start(problem: Problem) -> Fit:
         levels=rough_levels(residuals, left_out, tuning.jitter),
         outliers=outliers,
         weights=np.ones(len(streams)),
-        sigmas=np.array(tuning.sizes),
+        sigmas=np.array(tuning.first_sizes),
     )
 
 
@@ -418,14 +418,16 @@ def lasting(workspace: Workspace, fit: Fit) -> Fit:
     problem = workspace.problem
     tuning = problem.tuning
     kept = sample(len(problem.streams), tuning)
-    loss_before = Posterior(problem.space(fit, kept), fit.levels).loss
+    # Large biases are possible here. Otherwise a bias would become drift and never be found.
+    free = replace(fit, sigmas=np.array(tuning.sizes))
+    loss_before = Posterior(problem.space(free, kept), fit.levels).loss
     # Neither white noise nor walk is too small to matter during the search.
     lowest = increment_levels(fit.levels) + np.log(tuning.start_share)
     levels = fit.levels.copy()
     levels[WHITES] = np.maximum(levels[WHITES], lowest)
     levels[WALKS] = np.maximum(levels[WALKS], lowest)
     model, levels = fit.model.with_lasting(LASTING, levels)
-    rival = replace(fit, model=model, levels=levels)
+    rival = replace(free, model=model, levels=levels)
     settled_loss = tuning.settled_loss * len(levels)
     for n_steps in (_FIRST_STEPS, reml.MAX_STEPS):
         space = problem.space(rival, kept)

@@ -83,6 +83,8 @@ class Tuning:
     # Prior standard deviations if the error is present: of a scale, of a bias along each axis
     # (m/m), of a time offset (s), of a bias of rates (rad/s).
     sizes: tuple[float, ...] = (0.03, 0.03, 0.03, 0.03, 0.1, 1.0, 1.0, 1.0)
+    # The same before errors are selected: biases are usually small.
+    first_sizes: tuple[float, ...] = (0.03, 0.0026, 0.0026, 0.0026, 0.1, 1.0, 1.0, 1.0)
     # Prior odds that a systematic error is present.
     odds: float = 0.03
     # Prior standard deviation of an error that is absent.
