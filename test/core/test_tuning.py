@@ -146,7 +146,7 @@ CHANGES = {
     "noisy_share": (0.4, "target"),
     "strides": ((5,), "target"),
     "least_gain": (120.0, "drive"),
-    "min_information": (0.6, "drive"),
+    "min_information": (100.0, "drive"),
     "start_share": (0.2, "drive"),
     "undetected_share": (0.1, "drive"),
     "sizes": (tuple(2.0 * size for size in TUNING.sizes), "drive"),
