@@ -44,6 +44,8 @@ _TO_GREY = {
     "yuv422_yuy2": "YUV2GRAY_YUY2",
 }
 
+# A longer side of a square or tag (m) is a mistake of the unit.
+_LARGEST_SIZE_M = 100.0
 # An image with fewer corners of the target is skipped.
 _FEWEST_CORNERS = 8
 # An image with larger residuals (rms, pixels) is skipped.
@@ -108,13 +110,15 @@ class Target:
             size, marker = map(float, parts[1:3])
         except (IndexError, ValueError):
             raise _no_target(text) from None
-        is_possible = min(columns, rows) > 1 and marker > 0 and 0 < size < 100
-        if kind == "aprilgrid" and is_possible and len(parts) <= 4:
+        are_lengths = marker > 0.0 and 0.0 < size < _LARGEST_SIZE_M
+        if min(columns, rows) < 2 or not are_lengths or len(parts) > 4:
+            raise _no_target(text)
+        if kind == "aprilgrid":
             return cls(kind, columns, rows, size, marker, "APRILTAG_36h11")
-        if kind == "charuco" and is_possible and len(parts) <= 4 and marker < size:
-            dictionary = parts[3] if len(parts) > 3 else "4X4_50"
-            return cls(kind, columns, rows, size, marker, dictionary)
-        raise _no_target(text)
+        if kind != "charuco" or marker >= size:
+            raise _no_target(text)
+        dictionary = parts[3] if len(parts) > 3 else "4X4_50"
+        return cls(kind, columns, rows, size, marker, dictionary)
 
 
 def _no_target(text: str) -> ConfigError:

@@ -158,7 +158,7 @@ def calibrate_arm(
     config = _checked(config)
     if setup is not None and setup not in SETUPS:
         raise ConfigError(f"setup must be one of {', '.join(SETUPS)}; got {shown_value(setup)}")
-    named = {"base": "base", "hand": "hand", "camera": "camera", "target": "target"}
+    named = {name: name for name in ("base", "hand", "camera", "target")}
     named |= names or {}
     poses = _checked_poses({"robot": robot, "tracking": tracking}, config, is_arm=True)
     solved = solve_checked(poses, config, setup)
@@ -168,11 +168,7 @@ def calibrate_arm(
         if not setup:
             warnings.append(_reading_in_words(solved.reading))
         solved = solved.adding(*_check_distances(solved.reading, named))
-    if solved.reading.is_inverse:
-        frames = _Frames(named["base"], named["camera"], named["hand"], named["target"], "beside")
-    else:
-        frames = _Frames(named["hand"], named["camera"], named["base"], named["target"], "hand")
-    return _calibration_of(solved, warnings, frames)
+    return _calibration_of(solved, warnings, _frames_of_arm(named, solved.reading.is_inverse))
 
 
 # ------------------------------------------------------------------ options and poses
@@ -332,6 +328,13 @@ class _Frames(NamedTuple):
     parent_world: str
     child_world: str
     setup: str = ""
+
+
+def _frames_of_arm(names: Mapping[str, str], is_beside: bool) -> _Frames:
+    """Return the frames of an arm, by the names of base, hand, camera and target."""
+    if is_beside:
+        return _Frames(names["base"], names["camera"], names["hand"], names["target"], "beside")
+    return _Frames(names["hand"], names["camera"], names["base"], names["target"], "hand")
 
 
 def _calibration_of(solved: SolvedStops, warnings: Sequence[str], frames: _Frames) -> Calibration:

@@ -152,9 +152,7 @@ def _explain(sample: StopPoses) -> tuple[RoughFit, list[Mistakes]]:
     The fit is that without mistakes unless some are certain.
     """
     plain = [rough_fit(sample, Mistakes(is_inverse=way)) for way in sample.ways]
-    # Rotations decide whether the camera is on the hand; positions choose only where they do not.
-    largest_turning = CLEARLY_BETTER * min(fit.turning for fit in plain)
-    as_given = min((fit for fit in plain if fit.turning <= largest_turning), key=_UNEXPLAINED)
+    as_given = _best_without_mistakes(plain)
     if as_given.unexplained < EXPLAINED_SHARE or not sample.has_positions:
         return as_given, []
     objectives = {rival: _objective(sample, rival) for rival in _rivals(sample)}
@@ -169,6 +167,16 @@ def _explain(sample: StopPoses) -> tuple[RoughFit, list[Mistakes]]:
     if best.unexplained > LARGEST_SHARE:
         return as_given, []
     return best, [rival.mistakes for rival in good if rival is not best]
+
+
+def _best_without_mistakes(fits: Sequence[RoughFit]) -> RoughFit:
+    """Return the better fit of both setups.
+
+    Rotations decide whether the camera is on the hand; positions choose only where they do not.
+    """
+    largest_turning = CLEARLY_BETTER * min(fit.turning for fit in fits)
+    possible = [fit for fit in fits if fit.turning <= largest_turning]
+    return min(possible, key=_UNEXPLAINED)
 
 
 def _simplest(fits: Sequence[RoughFit]) -> list[RoughFit]:

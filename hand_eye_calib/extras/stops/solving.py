@@ -290,12 +290,15 @@ def _with_settled_scale(reading: Reading, repaired: _Repaired, setup: str | None
     is_size = 1.0 / _LARGEST_SIZE < free.scale < _LARGEST_SIZE
     scale = repaired.unit * free.scale
     sigma = repaired.unit * free.scale_sigma
-    if not (is_auto and is_size):
+    is_allowed = is_auto and is_size
+    if not is_allowed:
         issue = finding("target_scale", "child", scale=scale, sigma=sigma, times=1.0 / scale)
         repaired.findings.append(replace(issue, options={"scale": "estimate"}))
     if not is_size or config.is_known("scale"):
         return as_given
-    undo = "none" if repaired.unit == 1.0 or is_auto else repaired.unit
+    undo: object = "none"
+    if repaired.unit != 1.0 and not is_auto:
+        undo = repaired.unit
     repaired.warnings.append(
         f"solved with the child's lengths times {scale:.4f} +/- {sigma:.4f}; to take them as they "
         f"are, give scale {undo}"
