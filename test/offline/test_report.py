@@ -4,9 +4,12 @@ alone.
 
 import dataclasses
 import re
+import shutil
+import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 
+import browser
 import numpy as np
 import pytest
 import yaml
@@ -451,3 +454,24 @@ def test_an_unknown_direction_between_axes_is_drawn_as_it_is():
     assert slopes["xy"] == pytest.approx([0.0], abs=1e-6)
     assert slopes["xz"] == pytest.approx([0.8 / 0.6])
     assert slopes["yz"] == [np.inf]
+
+
+def test_a_report_is_printed_on_two_pages_and_with_its_details_if_they_are_open(tmp_path):
+    program = next(filter(None, map(shutil.which, browser.PROGRAMS)), None)
+    if program is None:
+        pytest.skip("no browser")
+    result = hec.calibrate("sample:lidar.tum", "sample:camera.tum")
+    page = result.report(tmp_path / "report.html")
+    assert printed_pages(program, page, tmp_path) == 2
+    opened = page.read_text(encoding="utf-8").replace("<details>", "<details open>")
+    page.write_text(opened, encoding="utf-8")
+    assert printed_pages(program, page, tmp_path) > 2
+
+
+def printed_pages(program, page, folder):
+    """Number of pages on which a browser prints a page."""
+    pdf = folder / "printed.pdf"
+    options = ("--headless", "--no-sandbox", "--disable-gpu", "--no-pdf-header-footer")
+    arguments = [program, *options, f"--print-to-pdf={pdf}", page.as_uri()]
+    subprocess.run(arguments, check=True, capture_output=True, timeout=browser.PATIENCE_S)
+    return len(re.findall(rb"/Type /Page\b", pdf.read_bytes()))
