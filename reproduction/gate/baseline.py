@@ -154,27 +154,30 @@ _FORMATS = {
 
 
 def _figures(scores: Sequence[Score]) -> dict[str, float]:
-    """Figures of one version."""
+    """Figures of one version; NaN without a recording that has the figure."""
     over_bound = [score.over_bound for score in scores if score.over_bound is not None]
     nees = [score.nees for score in scores if score.nees is not None]
-    axes = sum(score.axes for score in scores)
-    inside = sum(score.inside for score in scores)
-    inside_allowance = sum(score.inside_allowance for score in scores)
     over_robust = over_robust_least_squares(scores)
+    axes = sum(score.axes for score in scores) or np.nan
     return {
-        "error / bound": float(np.sqrt(np.median(over_bound) / MEDIAN_6)) if over_bound else np.nan,
-        "over robust": float(np.median(over_robust)) if len(over_robust) else np.nan,
-        "over robust, 90 %": float(np.quantile(over_robust, 0.9)) if len(over_robust) else np.nan,
-        "90 % covers": inside / axes if axes else np.nan,
-        "with allowance": inside_allowance / axes if axes else np.nan,
-        "NEES": float(np.median(nees)) if nees else np.nan,
+        "error / bound": float(np.sqrt(_quantile(over_bound, 0.5) / MEDIAN_6)),
+        "over robust": _quantile(over_robust, 0.5),
+        "over robust, 90 %": _quantile(over_robust, 0.9),
+        "90 % covers": sum(score.inside for score in scores) / axes,
+        "with allowance": sum(score.inside_allowance for score in scores) / axes,
+        "NEES": _quantile(nees, 0.5),
         "no answer": float(sum(not score.verdict for score in scores)),
         "USE but wrong": float(sum(score.is_wrong for score in scores)),
     }
 
 
-def over_robust_least_squares(scores: Sequence[Score]) -> FloatArray:
-    """Return errors (K,) over those of robust least squares on the same recordings.
+def _quantile(values: Sequence[float], share: float) -> float:
+    """Return a quantile of values; NaN without values."""
+    return float(np.quantile(values, share)) if len(values) else np.nan
+
+
+def over_robust_least_squares(scores: Sequence[Score]) -> list[float]:
+    """Return the errors over those of robust least squares on the same recordings.
 
     Translation and rotation of a recording are two ratios. Recordings without an error of either
     are skipped.
@@ -184,7 +187,7 @@ def over_robust_least_squares(scores: Sequence[Score]) -> FloatArray:
         for error, robust_error in zip(score.errors, score.robust_errors, strict=False):
             if error > 0.0 and robust_error > 0.0:
                 ratios.append(error / robust_error)
-    return np.array(ratios)
+    return ratios
 
 
 def error_ratio(now: Sequence[Score], before: Sequence[Score]) -> float:
