@@ -17,6 +17,7 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.rates import RateIntegrator
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.document import usable_numbers
+from hand_eye_calib.extras.partial.rotation_checks import measured_stream
 from hand_eye_calib.formats.bags.messages import MessageReader, unpack_poses
 from hand_eye_calib.formats.bags.writer import write_bag
 from hand_eye_calib.offline.cli.main import main
@@ -331,3 +332,19 @@ class TestMessages:
                 reader.columns([fix(0), fix(0, **place)], is_ros1=False)
             with pytest.raises(InputError, match=f"^found {message}"):
                 reader(fix(0, **place))
+
+
+@pytest.mark.parametrize(
+    ("parent_measures", "child_measures", "stream"),
+    [
+        ("auto", "rates", "child"),
+        ("rates", "auto", "parent"),
+        ("poses", "rotations", "child"),
+        ("rates", "rotations", "parent"),
+    ],
+)
+def test_faults_are_those_of_the_stream_that_measures_least(
+    parent_measures, child_measures, stream
+):
+    """The node sets only the option of a stream whose messages are no poses."""
+    assert measured_stream(parent_measures, child_measures) == stream

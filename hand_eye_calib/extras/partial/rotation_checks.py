@@ -125,8 +125,11 @@ class _Streams(NamedTuple):
 
 
 def measured_stream(parent_measures: str, child_measures: str) -> str:
-    """Return the stream to which faults are attributed: the one that measures least."""
-    order = ("rates", "rotations", "poses")
+    """Return the stream to which faults are attributed: the one that measures least.
+
+    A stream of the node whose option is ``auto`` has poses.
+    """
+    order = ("rates", "rotations", "poses", "auto")
     is_parent = order.index(parent_measures) < order.index(child_measures)
     return "parent" if is_parent else "child"
 
