@@ -14,6 +14,7 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.core.results.document import UNKNOWN_M
 
 # Shortest step (s) of a path length. Shorter steps would add up the noise.
 _PATH_STEP_S = 0.2
@@ -225,3 +226,21 @@ def _angles(calibration: Calibration, pose_pairs: PosePairs) -> tuple[FloatArray
     # Both begin on the same turn.
     computed_rad -= 2 * np.pi * np.round((computed_rad[0] - measured_rad[0]) / (2 * np.pi))
     return measured_rad, computed_rad
+
+
+def spread_of_position(calibration: Calibration) -> tuple[FloatArray, FloatArray]:
+    """Return covariance and unknown directions of the child's position, in the parent's axes.
+
+    The covariance (3, 3), m^2, is without the unknown directions, which are unit vectors (K, 3).
+    """
+    sigmas_m = calibration.sigmas[:3]
+    is_unknown = ~np.isfinite(sigmas_m)
+    covariance = calibration.covariance[:3, :3]
+    if np.isfinite(covariance).all():
+        R = se3.rotation_of(calibration.T_parent_child)
+        variances, directions = np.linalg.eigh(R @ covariance @ R.T)
+        is_vague = (variances > UNKNOWN_M**2) & is_unknown.any()
+        if is_vague.any() or not is_unknown.any():
+            known = directions[:, ~is_vague]
+            return (known * variances[~is_vague]) @ known.T, directions[:, is_vague].T
+    return np.diag(np.where(is_unknown, 0.0, sigmas_m) ** 2), np.eye(3)[is_unknown]

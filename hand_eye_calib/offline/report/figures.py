@@ -28,11 +28,9 @@ from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.errors import InputError, printable, require_type
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.text import amount, angle, length, listing, share
-from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.calibration import Calibration
-from hand_eye_calib.core.results.document import UNKNOWN_M
 from hand_eye_calib.core.results.records import Residuals
-from hand_eye_calib.offline.report.evidence import Evidence, StreamView
+from hand_eye_calib.offline.report.evidence import Evidence, StreamView, spread_of_position
 
 # ---- how every figure looks
 
@@ -567,7 +565,7 @@ def _draw_uncertainty(
     ``T`` are two rows of the child's pose, ``rows`` the axes of the view.
     """
     x, y = T[:, 3]
-    covariance, unknown = _spread_of_position(calibration)
+    covariance, unknown = spread_of_position(calibration)
     is_unknown = False
     for across, up in unknown[:, rows]:
         if math.hypot(across, up) > LOOK.end_on:
@@ -580,24 +578,6 @@ def _draw_uncertainty(
     width, height = 2 * LOOK.sigmas * np.sqrt(np.maximum(variances, 0.0))
     angle_deg = float(np.degrees(np.arctan2(axes[1, 0], axes[0, 0])))
     panel.add_patch(Ellipse((x, y), width, height, angle=angle_deg, color=CHILD, alpha=0.3))
-
-
-def _spread_of_position(calibration: Calibration) -> tuple[FloatArray, FloatArray]:
-    """Return covariance and unknown directions of the child's position, in the parent's axes.
-
-    The covariance (3, 3), m^2, is without the unknown directions, which are unit vectors (K, 3).
-    """
-    sigmas_m = calibration.sigmas[:3]
-    is_unknown = ~np.isfinite(sigmas_m)
-    covariance = calibration.covariance[:3, :3]
-    if np.isfinite(covariance).all():
-        R = se3.rotation_of(calibration.T_parent_child)
-        variances, directions = np.linalg.eigh(R @ covariance @ R.T)
-        is_vague = (variances > UNKNOWN_M**2) & is_unknown.any()
-        if is_vague.any() or not is_unknown.any():
-            known = directions[:, ~is_vague]
-            return (known * variances[~is_vague]) @ known.T, directions[:, is_vague].T
-    return np.diag(np.where(is_unknown, 0.0, sigmas_m) ** 2), np.eye(3)[is_unknown]
 
 
 def _draw_sensor(
