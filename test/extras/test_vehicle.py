@@ -139,6 +139,19 @@ def test_odometry_of_two_wheels_gets_multipliers():
     assert wheels["wheel_separation_multiplier"].value == pytest.approx(track, rel=0.006)
 
 
+@pytest.mark.parametrize(
+    ("measures", "n_columns", "error", "match"),
+    [
+        ("wheels", 3, InputError, r"wheels needs values of shape \(3, 2\)"),
+        ("omni", 2, InputError, r"omni needs values of shape \(3, 3\)"),
+        ("tracks", 2, ConfigError, "measures must be one of wheels, steering"),
+    ],
+)
+def test_wheel_data_of_another_shape_are_refused(measures, n_columns, error, match):
+    with pytest.raises(error, match=match):
+        hec.wheel_trajectory(np.arange(3) * 20_000_000, np.ones((3, n_columns)), measures)
+
+
 def test_too_short_a_drive_raises():
     drive = machine()
     with pytest.raises(NotEnoughDataError, match="figures of eight"):

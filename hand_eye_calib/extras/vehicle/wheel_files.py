@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hand_eye_calib.core.base.arrays import IntArray
-from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.base.arrays import IntArray, floats
+from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.extras.vehicle.wheels import UNIT_TRACK, trajectory_of
@@ -33,6 +33,8 @@ _RATES: dict[str, Callable[..., tuple[ArrayLike, ...]]] = {
     "omni": lambda forward, left, turn: (forward, left, turn),
 }
 
+_N_COLUMNS = {"wheels": 2, "steering": 2, "wheel_odometry": 2, "omni": 3}
+
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
@@ -56,7 +58,9 @@ def wheel_trajectory(stamps_ns: IntArray, values: ArrayLike, measures: str) -> T
     Raises
     ------
     InputError
-        If the stamps do not increase.
+        If the stamps do not increase, or the values have another number of columns.
+    ConfigError
+        If ``measures`` is no kind of wheel data.
 
     Examples
     --------
@@ -64,7 +68,15 @@ def wheel_trajectory(stamps_ns: IntArray, values: ArrayLike, measures: str) -> T
     >>> hec.wheel_trajectory(stamps_ns, [[1.0, 1.0]] * 3, "wheels")
     Trajectory(3 wheels over 0.040 s, sensor_frame='base_link')
     """
-    values = np.asarray(values, dtype=float)
+    if measures not in _N_COLUMNS:
+        raise ConfigError(f"measures must be one of {', '.join(_N_COLUMNS)}; got {measures!r}")
+    values = floats("values", values)
+    n_columns = _N_COLUMNS[measures]
+    if values.shape != (len(stamps_ns), n_columns):
+        raise InputError(
+            f"{measures} needs values of shape ({len(stamps_ns)}, {n_columns}), a row for each "
+            f"stamp; got {values.shape}"
+        )
     durations_s = np.diff(stamps_ns) * 1e-9
     if not (durations_s > 0.0).all():
         raise InputError("stamps of wheel data must increase; sort the rows, drop repeated stamps")
