@@ -167,7 +167,8 @@ def read_journal(directory: str | Path) -> Journal:
     """
     paths = {stream: Path(directory, f"{stream}.tum") for stream in _STREAMS}
     files = {stream: _read(path) for stream, path in paths.items() if os.path.lexists(path)}
-    # A node may just have renamed the directory.
+    # Checked after reading: a node may have renamed the directory meanwhile, so that its files are
+    # gone.
     if "parent" not in files:
         raise InputError(f"no session journal in {directory}")
     rows = np.concatenate([np.reshape(file.values, (-1, 8)) for file in files.values()])

@@ -234,7 +234,7 @@ def prior_fields(prior: Prior) -> dict[str, str]:
 
 
 def _prior_text(axis: str, pair: Any) -> str:
-    """Return the option's text of a value and its standard deviation."""
+    """Return a value and its standard deviation as the text of an option, ``VALUE+/-SIGMA``."""
     try:
         value, sigma = map(float, pair)
     except (TypeError, ValueError):

@@ -228,8 +228,9 @@ def widened_by_blocks(covariance: FloatArray, solution: ModelSolution, part: sli
     """Widen the model's covariance of a part of xi to the scatter of blocks.
 
     One factor serves all directions, the mean of their variance ratios: the ratio of a single
-    direction scatters too much. Rotations have a factor of their own if it is larger. Slow rotation
-    errors in a sensor's frame are easily taken for errors in a world, which motion averages.
+    direction scatters too much. Rotations use a factor of their own if it is larger, because the
+    noise model easily takes slow rotation errors fixed to a sensor for errors fixed to a world. The
+    latter average out while the sensor moves, so the model's covariance is then too small.
     """
     if len(solution.jumps) < BLOCKS * _LEAST_BLOCK_SIZE:
         return covariance
@@ -405,10 +406,12 @@ def _derivatives(pairs: MotionPairs, rotation: FloatArray) -> tuple[FloatArray, 
     Returns
     -------
     of_translation : (K, 3, 6) array
-        By xi.
+        Derivatives with respect to xi = (rho, phi).
     of_rotation : (K, 3, 3) array
-        By phi, in axes that rotate with each pair.
+        Derivatives with respect to phi, in axes that differ from pair to pair by a rotation. Such a
+        rotation does not change products J' J.
     """
+    # A chord is R_A - I.
     chords = se3.rotation_of(pairs.Ts_parenti_parentj) - np.eye(3)
     by_phi = rotation @ se3.skew(se3.translation_of(pairs.Ts_childi_childj))
     of_rotation = se3.rotation_of(pairs.Ts_childi_childj) - np.eye(3)

@@ -33,9 +33,10 @@ _STEP_TOLERANCE = 0.1
 def second_opinions(
     Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, T_parent_child: FloatArray
 ) -> tuple[Assessment, ...]:
-    """Solve motions over several numbers of poses by robust least squares.
+    """Solve by robust least squares, once for each of several strides.
 
-    Solutions that do not converge are left out.
+    A stride is the number of poses that a motion spans. Solutions that do not
+    converge are left out.
 
     Parameters
     ----------

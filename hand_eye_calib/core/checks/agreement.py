@@ -29,7 +29,8 @@ Suspect: TypeAlias = tuple[float, Finding | None]
 
 _STREAMS = ("child", "parent")
 
-# Factor by which a fault of the response must exceed the bias that noise of its columns may cause.
+# A fault that a Regression estimates (a gain, for example) is reported only if it exceeds this
+# multiple of the bias that noise of its regressors may cause.
 BIASES = 2.0
 
 # Drift of an odometry along one axis, as a share of the distance. On a flat floor this drift is
@@ -245,7 +246,7 @@ def rotation_gain(slow: Regression, axes: FloatArray, inverse: bool = False) -> 
     slow : Regression
         Regression with the columns "gain".
     axes : (3, 3) array
-        Axes of the gains in the parent sensor's frame, one a column.
+        Principal axes of rotation in the parent sensor's frame, one a column, the main axis first.
     inverse : bool
         Whether the gains are those of the parent's rotations.
     """
@@ -254,7 +255,8 @@ def rotation_gain(slow: Regression, axes: FloatArray, inverse: bool = False) -> 
     limits = LIMITS["rotation_gain"]
     noise = np.maximum(limits.sigmas * sigmas, BIASES * biases)
     ratios = np.abs(gains) / np.maximum(noise, limits.note)
-    # Axes with little rotation are skipped: noise biases their gains.
+    # A bias is in inverse proportion to the squared rotation about its axis. Axes with less than
+    # _LITTLE of the rotation about the main axis (the first) are skipped.
     ratios = np.where(biases < biases[0] / _LITTLE**2, ratios, 0.0)
     k = int(np.argmax(ratios))
     if ratios[k] < 1.0:

@@ -215,7 +215,7 @@ def _check_explained(
     sizes, fit = _check_sizes(right, explanation, offset.fit, arguments.scale)
     lengths = _lengths_of_explained(streams, right, fit, explanation)
     # Findings of an unclear reading: both streams may be inverse, or neither may be.
-    of_reading = explanation.findings if explanation.may_be_upright else ()
+    of_reading = explanation.findings if explanation.may_be_uninverted else ()
     readings = explanation.readings
     if readings and lengths:
         # Noise and shape decide between the readings only if the unit of length is known.
@@ -240,7 +240,7 @@ def _lengths_of_explained(
     """
     lever_arm_m = least_lever_arm(fit.T_parent_child, fit.sigmas[:3])
     lengths = check_lengths(right.parent, right.child, lever_arm_m)
-    if lengths and explanation.may_be_upright and explanation.findings:
+    if lengths and explanation.may_be_uninverted and explanation.findings:
         # If both streams are inverse, the lever arm is the distance of the worlds. The streams as
         # they are are judged without it.
         return check_lengths(streams.parent, streams.child)
@@ -260,7 +260,7 @@ def _preferred_reading(
     The streams ``right`` and ``fit`` are returned if only one reading is possible, or if the
     explanation has the reading of the known extrinsic: the streams as they are.
     """
-    has_other_reading = explanation.may_be_upright and not explanation.hypothesis.is_upright
+    has_other_reading = explanation.may_be_uninverted and not explanation.hypothesis.is_upright
     if not known or not has_other_reading:
         return right, fit
     upright = streams.shifted(offset.seconds)

@@ -210,8 +210,8 @@ class Explanation:
     readings: Readings | None = None
 
     @property
-    def may_be_upright(self) -> bool:
-        """Whether two readings are possible, and one of them does not invert the streams."""
+    def may_be_uninverted(self) -> bool:
+        """Whether two readings are possible, and the first one inverts neither stream."""
         return self.readings is not None and self.readings.hypotheses[0].is_upright
 
     @property

@@ -79,8 +79,9 @@ def cross_checked(solved: Solved, config: CalibratorConfig, pose_pairs: PosePair
         if dof.name in unconfirmed and dof.verdict is DofVerdict.OBSERVED:
             dof = replace(dof, verdict=DofVerdict.WEAK)
         observability.append(dof)
-    # The standard deviations of the result contain the scatter of the other estimates, so these
-    # could not contradict it. The comparison uses those of the noise model alone.
+    # The standard deviations of the result already contain the scatter of the other estimates. With
+    # them, no other estimate could contradict the result. So the comparison uses the standard
+    # deviations of the noise model alone.
     of_model = replace(solved, excess=np.zeros((6, 6))).calibration(replaced)
     return replace(
         result,
@@ -100,7 +101,10 @@ def _unconfirmed(result: Calibration, others: Sequence[Assessment]) -> BoolArray
 
 
 def answers_of_whole(result: Calibration, pose_pairs: PosePairs) -> tuple[Assessment, ...]:
-    """Estimate from motions over several numbers of poses, with the scale of the result."""
+    """Estimate once for each of several strides, with the scale of the result.
+
+    A stride is the number of poses that a motion spans.
+    """
     scaled = pose_pairs.child_scaled(result.scale)
     return second_opinions(scaled.Ts_pw_p, scaled.Ts_cw_c, result.T_parent_child)
 
@@ -137,26 +141,30 @@ def compare_answers(
     others : sequence of Assessment
         Estimates from the whole recording.
     halves : sequence of Assessment
-        Estimates from the first and the second half of the recording. Only two halves are
-        compared.
+        Estimates from the first and the second half of the recording. Ignored unless there are two.
     """
     sigmas = calibration.sigmas_measured
     allowance = calibration.allowance
-    apart = np.empty((len(others), 6))
-    joint = np.empty((len(others), 6))
+    differences = np.empty((len(others), 6))
+    joint_sigmas = np.empty((len(others), 6))
     for row, other in enumerate(others):
-        apart[row], joint[row] = _apart(calibration.T_parent_child, sigmas, other)
-    own = np.maximum(sigmas, _ROUNDING)
+        differences[row], joint_sigmas[row] = _apart(calibration.T_parent_child, sigmas, other)
+    own_sigmas = np.maximum(sigmas, _ROUNDING)
     of_others = np.reshape([other.sigmas for other in others], (-1, 6))
-    as_certain = np.where(of_others < _AS_CERTAIN * own, apart, np.nan)
+    # Only estimates that are about as certain as the result.
+    is_certain = of_others < _AS_CERTAIN * own_sigmas
+    differences_of_certain = np.where(is_certain, differences, np.nan)
+    scatter_of_certain = _robust_sigma(differences_of_certain, _MIN_AS_CERTAIN)
     of_halves, excess_of_halves = _scatter_of_halves(calibration, halves)
     columns = {
         "sigma": calibration.sigmas,
-        "of_methods": _robust_sigma(apart, _MIN_OTHERS),
+        "of_methods": _robust_sigma(differences, _MIN_OTHERS),
         "of_halves": of_halves,
-        "excess_of_methods": _robust_sigma(apart / np.hypot(joint, allowance), _MIN_OTHERS),
+        "excess_of_methods": _robust_sigma(
+            differences / np.hypot(joint_sigmas, allowance), _MIN_OTHERS
+        ),
         "excess_of_halves": excess_of_halves,
-        "excess_over_own": _robust_sigma(as_certain, _MIN_AS_CERTAIN) / np.hypot(own, allowance),
+        "excess_over_own": scatter_of_certain / np.hypot(own_sigmas, allowance),
     }
     unconfirmed = _unconfirmed(calibration, others)
     scatter = {}

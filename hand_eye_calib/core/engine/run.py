@@ -138,9 +138,10 @@ def _solved_and_checked(snapshot: Snapshot, checks: bool | None, report: Progres
 
 
 def _best(first: Attempt, settled: Collection[str], on_clock: Attempt | None) -> Attempt:
-    """Return the best attempt: the first one, or one with options from its check.
+    """Return the best attempt: the first one, or one solved again with options from its check.
 
-    ``on_clock`` is the attempt with an estimated time offset, if there is one already.
+    ``settled`` are options that must not be changed. ``on_clock`` is the attempt with
+    an estimated time offset, if there is one already.
     """
     reading = _reading_of(first.snapshot, first.check, settled, first.calibration.time_offset_s)
     first = first.with_findings(reading.findings)
@@ -208,9 +209,10 @@ def _clock_is_off(first: Attempt) -> bool:
 def _reading_of(
     snapshot: Snapshot, result: CheckResult, settled: Collection[str], known_s: float
 ) -> _Reading:
-    """Choose the reading of both streams, if two fit equally well.
+    """Decide whether both streams hold poses or inverse poses, if both readings fit equally well.
 
-    ``known_s`` is the time offset (s) that the streams had in the check.
+    ``known_s`` is the time offset (s) that was applied before the check. The check may have found a
+    further one.
     """
     if INVERSIONS & snapshot.config.given.union(settled):
         return _Reading(_without_readings(result))

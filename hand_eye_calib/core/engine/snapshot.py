@@ -178,7 +178,7 @@ class Snapshot:
     def pose_pairs(self) -> PosePairs:
         """Synchronised pose pairs: the kept pairs, and pairs of the buffered poses.
 
-        Errors as of :attr:`resolved`.
+        Raises the same errors as :attr:`resolved`.
         """
         if self.resolved is not self:
             return self.resolved.pose_pairs

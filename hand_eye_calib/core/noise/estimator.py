@@ -268,8 +268,10 @@ class AdaptiveSolution(ModelSolution):
         elif "time" in systematic:
             ms = 1000 * self.time_offset_s
             sigma = 1000 * self.time_offset_sigma_s
-            late = "early" if ms > 0 else "late"
-            sentences.append(f"the child's stamps are {abs(ms):.1f} +/- {sigma:.2g} ms {late}")
+            early_or_late = "early" if ms > 0 else "late"
+            sentences.append(
+                f"the child's stamps are {abs(ms):.1f} +/- {sigma:.2g} ms {early_or_late}"
+            )
         return sentences
 
 
@@ -407,6 +409,9 @@ def _solution(workspace: Workspace, fit: Fit) -> AdaptiveSolution:
     is_present = fit.sigmas > problem.tuning.absent_sigma
     parameters = np.where(is_present, final.parameters, 0.0)
     sigmas = np.where(is_present, sigmas, 0.0)
+    # Errors fixed to the body that last about as long as the recording are not detected: X contains
+    # their mean. Widen the translation by a share of the variance of the detected ones, which are
+    # all of translation.
     undetected = np.zeros(6)
     for (kind, _), level in zip(fit.model.slow, fit.levels[VARIANCES], strict=True):
         if kind == "body":

@@ -279,7 +279,7 @@ def _directions(kind: str, part: str, streams: Streams, to_child: FloatArray) ->
 
 
 def fast_sigmas(levels: FloatArray) -> FastSigmas:
-    """Return the standard deviations of white noise, jitter and walk at log levels."""
+    """Return the standard deviations of white noise, jitter and walk from their log variances."""
     return FastSigmas(*np.exp(0.5 * levels)[:N_FAST].tolist())
 
 

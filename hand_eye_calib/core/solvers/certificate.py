@@ -106,7 +106,8 @@ def _newton_step(solved: FloatArray, weight: float) -> tuple[FloatArray, float]:
     Parameters
     ----------
     solved : (15, 9, 9) array
-        The inverse of ``Z + t I`` times its derivatives by the 14 multipliers and t.
+        The inverse of ``Z + t I`` times its derivatives with respect to the 14
+        multipliers and t.
     weight : float
     """
     gradient = -np.trace(solved, axis1=1, axis2=2)
@@ -115,10 +116,10 @@ def _newton_step(solved: FloatArray, weight: float) -> tuple[FloatArray, float]:
     hessian[np.diag_indices_from(hessian)] += 1e-14 * np.trace(hessian)
     step = -np.linalg.solve(hessian, gradient)
     decrement = float(np.sqrt(max(-gradient @ step, 0.0)))
-    # The step reaches the edge of the cone at the share 1 / falling. Stop before the edge, but take
-    # at least the damped step, which always stays inside.
-    falling = -np.linalg.eigvals(np.tensordot(step, solved, 1)).real.min()
-    inside = 0.9 / falling if falling > 0 else 1.0
+    # Z + t I becomes singular after the fraction 1 / decay of the step (decay > 0). Stop before,
+    # but take at least the damped step, which always stays inside the cone.
+    decay = -np.linalg.eigvals(np.tensordot(step, solved, 1)).real.min()
+    inside = 0.9 / decay if decay > 0 else 1.0
     damped = 1.0 / (1.0 + decrement)
     return step * min(1.0, max(inside, damped)), decrement
 

@@ -94,7 +94,9 @@ def _condense(pairs: MotionPairs) -> FloatArray:
     k_B = _axes(se3.rotation_of(B))
     # Factors of (1, z) in f.
     f = np.concatenate([(k_A - k_B)[:, :, None], se3.skew(k_A + k_B)], axis=2)
-    # Factors of z_i t_j, with z_0 = t_0 = 1, in g. For z_1 to z_3 the skew matrix follows last.
+    # Coefficients of z_i t_j in g, with z_0 = t_0 = 1. Rearranged, this is
+    # g = (R_A - I) t + t_A - t_B - [z] ((R_A - I) t + t_A + t_B).
+    # The slices of z_1 to z_3 first contain the bracket; the einsum multiplies it by -[z].
     g = np.zeros((len(pairs), 3, 4, 4))
     g[..., 1:] = (se3.rotation_of(A) - np.eye(3))[:, :, None]
     g[:, :, 0, 0] = t_A - t_B
@@ -106,9 +108,9 @@ def _condense(pairs: MotionPairs) -> FloatArray:
 
 
 def _products(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the products (16,) of (1, z) and (1, t), and their derivatives (16, 6) by (z, t).
+    """Return the products (16,) of (1, z) and (1, t), and the derivatives (16, 6).
 
-    The index of t varies fastest.
+    The derivatives are with respect to (z, t). The index of t varies fastest.
     """
     one_z = np.append(1.0, parameters[:3])
     one_t = np.append(1.0, parameters[3:])

@@ -385,7 +385,7 @@ def _imprecise(squares: FloatArray, tuning: Tuning, least: float) -> BoolArray:
 
 
 def _level_prior(model: NoiseModel, levels: FloatArray) -> reml.Prior:
-    """Prior of the log levels for a search from these levels."""
+    """Return the prior of the log levels, for a search that starts at ``levels``."""
     prior = model.prior(levels)
     prior.lower[ROTATION] = prior.upper[ROTATION] = _ANY_ROTATION
     lowest, _, highest = model.tuning.rotation_walk
@@ -401,7 +401,9 @@ def _solution(
     normal = NormalEquations(_solved(posterior.products))
     n_evidence = len(state.walk_factors) - int(state.left_out.sum())
     misfit = float(normal.cost) / max(3 * n_evidence - 3 - len(_SHARED), 1)
-    # The covariance includes the response to acceleration, and the shift by its estimate.
+    # The lever arm is solved without the response to acceleration. Its covariance allows for a
+    # response: it is that of the solve with the response, plus the square of the shift of the lever
+    # arm that the response causes.
     with_response = posterior.normal
     covariance = max(misfit, 1.0) * with_response.covariance
     shift = (with_response.step[:-1] - normal.step)[:3]
@@ -409,7 +411,8 @@ def _solution(
     parameters = state.parameters.copy()
     sigmas[[*_SHARED, RESPONSE]] = np.sqrt(np.diag(covariance)[3:])
     parameters[[*_SHARED, RESPONSE]] += np.r_[normal.step[3:], with_response.step[-1]]
-    # An error that lasts for a share of the recording may last for all of it: X absorbs its mean.
+    # An error that is correlated over part of the recording may also have a part that is constant
+    # over all of it. X absorbs this part, so the variance of the error is added.
     lasting = float(np.exp(state.levels[N_FAST])) if state.model.slow else 0.0
     return LeverArmSolution(
         lever_arm=se3.translation_of(state.X) + normal.step[:3],

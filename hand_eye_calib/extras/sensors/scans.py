@@ -73,15 +73,17 @@ class Tuning:
     voxel_share: float = 0.03
     # Limits of the size of a voxel (m).
     voxel_limits_m: tuple[float, float] = (0.1, 0.4)
-    # Points that a local plane is fitted to. Fewer points are of one ring, on a line.
+    # Number of neighbours that a local plane is fitted to. Fewer may all be on one ring, which is a
+    # line.
     n_neighbours: int = 15
     # Rings by elevation, in half degrees.
     n_rings: int = 361
     # Scans between two estimates of the range errors of rings.
     learn_every: int = 10
-    # Weight of an estimate at the next estimate.
+    # Share of the sums of earlier scans that is kept at each new estimate (forgetting factor).
     kept_share: float = 0.95
-    # Prior that a ring has no range error, as a sum of squared cosines.
+    # Weight of the prior that a ring has no range error: it counts like measurements with this sum
+    # of squared cosines.
     prior_weight: float = 100.0
     # A voxel is a plane if its variance across is this share of its variance along.
     flat: float = 0.01

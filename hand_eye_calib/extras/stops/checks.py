@@ -54,12 +54,14 @@ _CONTRADICTING_RATIO = 12.0
 _CONTRADICTING_SHARE = 0.08
 
 # Hypotheses whose log likelihoods differ by less than this are equally good: a factor of 1100
-# between the likelihoods. Measured between both setups: simulated arms of four stops or more differ
-# by 95 at least, those of three stops by 0.0.
+# between the likelihoods. Measured on simulated arms: the log likelihoods of the two setups (camera
+# on the hand, camera beside the arm) differ by at least 95 with four or more stops, and by 0.0 with
+# three.
 LEAST_LEAD = 7.0
 
-# Largest number of mistakes that are solved: those with the best rough fits.
-_MOST_SOLVED = 6
+# Largest number of hypotheses (mistakes undone) that are solved in full: those with the best rough
+# fits. The others are dropped.
+_MOST_RIVALS = 6
 
 # Positions that spread over more than this (m) are not those of an arm in metres.
 _LARGEST_SPREAD_M = 3.0
@@ -125,14 +127,15 @@ def examine(poses: StopPoses, is_scale_free: bool) -> Examination:
         return Examination(tuple(findings))
     sample = poses.sample()
     if not turns_about_two_axes(poses.parent):
-        # The rotations do not determine where the positions belong.
+        # Rotations about one axis do not determine the conventions of the positions. Only their
+        # unit is checked.
         return _with_units(sample, Examination(), is_scale_free)
     chosen, rivals = _explain(sample)
     if axes := _check_axes(sample, chosen):
         return Examination((axes,))
     repairs = tuple(
         finding(code, stream, options=conventions(code, stream))
-        for code, stream in _streams(chosen.mistakes)
+        for code, stream in _codes_and_streams(chosen.mistakes)
     )
     findings = _check_conventions(sample, chosen.mistakes, rivals)
     if not (findings or repairs):
@@ -193,7 +196,7 @@ def _rivals(sample: StopPoses) -> list[RoughFit]:
         if not is_plain:
             rivals.append(rough_fit(sample, Mistakes(parent, child, is_inverse)))
     rivals.sort(key=lambda rival: -rival.log_likelihood)
-    return rivals[:_MOST_SOLVED]
+    return rivals[:_MOST_RIVALS]
 
 
 def _objective(sample: StopPoses, fit: RoughFit) -> float:
@@ -208,8 +211,8 @@ def _check_conventions(
     findings = []
     if mistakes.is_inverse and not poses.is_arm:
         findings.append(finding("inverse_stops", "child", options={"child_invert": "poses"}))
-    streams = _streams(mistakes)
-    others = [rival for rival in rivals if _streams(rival) != streams]
+    streams = _codes_and_streams(mistakes)
+    others = [rival for rival in rivals if _codes_and_streams(rival) != streams]
     if others:
         findings.append(_ambiguous(mistakes, others[0]))
     return findings
@@ -219,7 +222,8 @@ def _ambiguous(mistakes: Mistakes, rival: Mistakes) -> Finding:
     """Return the finding that two explanations fit equally well, with the options of both."""
     options = _options_of(mistakes)
     rival_options = _options_of(rival)
-    # Both name every option that one of them sets, so that the options decide.
+    # Each lists every option that either sets, with its default if need be. So the listed options
+    # select one explanation.
     first = options | defaults_of(name for name in rival_options if name not in options)
     second = rival_options | defaults_of(name for name in options if name not in rival_options)
     return finding(
@@ -233,12 +237,12 @@ def _ambiguous(mistakes: Mistakes, rival: Mistakes) -> Finding:
 def _options_of(mistakes: Mistakes) -> dict[str, float | str]:
     """Return the options that undo mistakes."""
     options: dict[str, float | str] = {}
-    for code, stream in _streams(mistakes):
+    for code, stream in _codes_and_streams(mistakes):
         options |= conventions(code, stream)
     return options
 
 
-def _streams(mistakes: Mistakes) -> list[tuple[str, str]]:
+def _codes_and_streams(mistakes: Mistakes) -> list[tuple[str, str]]:
     """Return code and stream of each mistake."""
     if mistakes.parent == mistakes.child:
         return [(mistakes.parent, "both")] if mistakes.parent else []

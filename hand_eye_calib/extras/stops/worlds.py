@@ -62,7 +62,7 @@ class WorldsPart(Part):
         return getattr(value, name)
 
     def write(self, value: Worlds | None) -> Document:
-        """Return the fields of a document; the transform is among the transforms."""
+        """Return the fields of a document, without T_world_world: :meth:`transforms` returns it."""
         if value is None:
             return {"parent_world_frame": "", "child_world_frame": ""}
         document: Document = {

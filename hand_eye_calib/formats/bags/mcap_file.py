@@ -69,7 +69,10 @@ class McapFile(Storage):
         self._kinds[channel.id] = kind_of(channel.topic, *description)
 
     def _scan(self, reason: Exception) -> None:
-        """Count the messages of a file without a usable index; ``reason`` is the error with it."""
+        """Count the messages of a file without a usable index.
+
+        ``reason`` is the error that reading the index raised.
+        """
         schemas = {}
         times_ns = []
         for record in self._records(self.losses):

@@ -1,4 +1,7 @@
-"""Commands for one job of ``calibrate``: its arguments, with a help of their own."""
+"""Commands that do one job with ``calibrate``.
+
+They take arguments of ``calibrate``, but have a short help of their own.
+"""
 
 import argparse
 from collections.abc import Callable

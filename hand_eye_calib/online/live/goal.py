@@ -23,13 +23,14 @@ from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.core.results.verdict import what_is_known
 from hand_eye_calib.online.live.progress import AXIS_KEYS, AxisProgress, Progress
 
-# Share of the motion so far during which every result must be within the targets.
+# Share of the motion so far, up to the newest result, in which every result must be within the
+# targets. All motion is measured in seconds of movement.
 _CONFIRMING_SHARE = 0.5
 # Shortest and longest motion (s) that confirms a result within the targets.
 _SHORTEST_CONFIRMATION_S = 20.0
 _LONGEST_CONFIRMATION_S = 75.0
 
-# Least motion (s) after which the motion may be called useless for an axis.
+# Shortest motion (s) after which the motion may be called useless for an axis.
 _JUDGED_FROM_S = 30.0
 
 # Times left that are reported (s). They only decrease, by one step for each result. Beyond the last

@@ -87,9 +87,9 @@ class StampGuard:
     """
 
     def __init__(self) -> None:
-        self._begin()
+        self._reset()
 
-    def _begin(self) -> None:
+    def _reset(self) -> None:
         # Until this time (steady, s), messages are older than the session.
         self._outdated_until_s = -math.inf
         self.last_ns: int | None = None
@@ -123,7 +123,7 @@ class StampGuard:
             Steady time (s), if the session begins because another stream has jumped back.
         """
         if now_s is None:
-            self._begin()
+            self._reset()
         elif self.last_ns is not None:
             self._outdated_until_s = now_s + SILENT_AFTER_S
             self._outdated_until_s += 2 * WITNESSES * self.period_ns() * 1e-9
@@ -166,12 +166,13 @@ class StampGuard:
         first_ns = messages[0][0]
         before_ns = statistics.median_low(self._recent_ns or [first_ns])
         is_back = first_ns < before_ns - NEAR_NS
-        # Another stream has jumped back before: the new session has begun already.
-        is_second = now_s < self._outdated_until_s
+        # True if another stream has jumped back shortly before, so that the session has begun
+        # already. Then only this guard is reset.
+        has_begun = now_s < self._outdated_until_s
         self._outdated_until_s = -math.inf
         if is_back:
-            self._begin()
-        return Judgement(self._accept(messages), jumped_back=is_back and not is_second)
+            self._reset()
+        return Judgement(self._accept(messages), jumped_back=is_back and not has_begun)
 
 
 class _Counts(NamedTuple):

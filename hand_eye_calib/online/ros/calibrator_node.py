@@ -46,11 +46,11 @@ class CalibratorNode(ManagedNode):
     Raises
     ------
     ConfigError
-        If a parameter of the start is unusable.
+        If a parameter given at the start is unusable.
     """
 
-    # The inputs report wrong QoS themselves. rclpy's own handlers for that cost as much as a
-    # message at every turn of the executor.
+    # The inputs report incompatible QoS themselves. rclpy's default event callbacks are off: they
+    # would cost, in every cycle of the executor, as much time as a message.
     create_publisher = partialmethod(
         Node.create_publisher,
         event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
