@@ -108,7 +108,7 @@ class SimilarityFit:
     scale_sigma, offset_sigma_s : float
         Standard deviations of s and d.
     sensitivity : (6, 2) array
-        Derivatives of (rho, phi) by log s and by d.
+        Derivatives of (rho, phi) with respect to log s and to d.
     offsets_of_blocks : (2, B) array
         Differences of d in each block of time at this X and s, and the weights of the differences.
         Zero without twists.
@@ -353,8 +353,8 @@ class _Problem:
         if twists is not None:
             self.free.append(_OFFSET)
         twists_i, twists_j = twists or (np.zeros((len(pairs), 6)),) * 2
-        # Derivatives of B by d: with d added to its stamps, the child is at every instant where it
-        # was d before.
+        # Derivatives of B with respect to d: with d added to its stamps, the child is at every
+        # instant where it was d before.
         rotated_i = np.einsum("kji,kj->ki", rotation_b, twists_i[:, 3:])
         self.rotation_by_offset = rotated_i - twists_j[:, 3:]
         moved_i = twists_i[:, :3] + se3.cross(twists_i[:, 3:], self.translation_b)

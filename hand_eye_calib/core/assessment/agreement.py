@@ -62,7 +62,7 @@ class Agreement:
     kind : str
         "single", "agree", "differ", "scatter", "one off" or "moved".
     apart : tuple of int
-        Indices of the results that do not belong to the others: the result that is off, or all
+        Indices of the results that differ from the others: the result that is off, or all
         results since the mount has moved.
     T_parent_child : (4, 4) array
         Common extrinsic of the others.
@@ -188,19 +188,23 @@ class _Common(NamedTuple):
 
 
 def _common(
-    Ts: FloatArray, covariances: FloatArray, usual: FloatArray, start: FloatArray
+    Ts: FloatArray, covariances: FloatArray, usual_scatter: FloatArray, start: FloatArray
 ) -> _Common:
-    """Estimate the common extrinsic of N results that belong together, from a start."""
+    """Estimate the common extrinsic of N results that belong together.
+
+    ``start`` (4, 4) is a first guess.
+    """
     factors = np.ones((1, 2))
-    if usual.any():
+    if usual_scatter.any():
         factors = np.array(list(itertools.product(_FACTORS, repeat=2)))
-    variances = (np.repeat(factors, 3, axis=1) * usual) ** 2
+    variances = (np.repeat(factors, 3, axis=1) * usual_scatter) ** 2
     spread = covariances + (variances[:, :, None] * np.eye(6))[:, None]
     weights = np.linalg.inv(spread)
     means_covariances = np.linalg.inv(weights.sum(axis=1))
     log_volumes = np.linalg.slogdet(spread)[1].sum(axis=1)
     log_volumes = log_volumes - np.linalg.slogdet(means_covariances)[1]
-    # Half-Cauchy density on a grid of logarithms.
+    # Half-Cauchy prior of each factor, per unit of its logarithm: the grid is uniform in the
+    # logarithm.
     log_prior = np.log(factors / (1.0 + factors**2)).sum(axis=1)
     T = start
     for _ in range(_ROUNDS):
@@ -237,7 +241,7 @@ def _without_unknown(covariance: FloatArray) -> FloatArray:
 
 
 class _Explanation(NamedTuple):
-    """Kind of agreement, mask (N,) of the results apart, and the test of all results together."""
+    """Kind of agreement, mask (N,) of the results that differ, and the test of all results."""
 
     kind: str
     apart: BoolArray

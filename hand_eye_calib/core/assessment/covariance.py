@@ -554,7 +554,7 @@ def open_scale_floor(by_scale: FloatArray, scale_variance: float) -> FloatArray:
     Parameters
     ----------
     by_scale : (6,) array
-        Derivative of the answer by the logarithm of the scale of the child's path.
+        Derivative of the answer with respect to the logarithm of the scale of the child's path.
     scale_variance : float
         Variance of this scale, by the data alone.
     """

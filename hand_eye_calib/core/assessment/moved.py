@@ -181,9 +181,10 @@ class MountChange:
 def residuals_and_jacobians(
     pairs: MotionPairs, T_parent_child: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return residuals e (K, 6) of motion pairs and their negative derivatives J (K, 6, 6).
+    """Return residuals e (K, 6) of motion pairs at an extrinsic X0, and J (K, 6, 6).
 
-    The derivatives are by a shift of the extrinsic.
+    If the mount has moved to ``X0 exp(xi)``, then ``e = -J xi + noise``. So J is the derivative of
+    e with respect to X0, and the negative derivative with respect to the true extrinsic.
     """
     Bs_inverse = se3.inverse(pairs.Ts_childi_childj)
     Bs_predicted = se3.inverse(T_parent_child) @ pairs.Ts_parenti_parentj @ T_parent_child
@@ -199,7 +200,7 @@ def evidence(
     ----------
     residuals : (K, 6) array
     jacobians : (K, 6, p) array
-        Negative derivatives of the residuals.
+        J of ``residuals = -J parameters + noise``.
     noise : (6, 6) array
         Covariance of the residuals.
     weights : (K,) array

@@ -131,8 +131,8 @@ def _whitened(
     inverse_root : (6, 6) array
         From deviations to coordinates of unit variance.
     targets : (6,) array
-        Result without a prior, in these coordinates: the translation along unknown directions is
-        zero.
+        Deviation, in these coordinates, of the result without a prior. It is zero along known
+        directions. Along unknown directions, it makes the translation of X zero.
     """
     values, vectors = np.linalg.eigh(unknown @ unknown.T)
     known = vectors[:, values < 0.5]
@@ -148,7 +148,10 @@ def _whitened(
 
 
 def _prior_residuals(T: FloatArray, prior: Prior) -> tuple[FloatArray, FloatArray]:
-    """Weighted residuals (P,) of the prior and their derivatives (P, 6) by (rho, phi)."""
+    """Return weighted residuals (P,) of the prior, and derivatives (P, 6).
+
+    The derivatives are with respect to (rho, phi).
+    """
     residuals = _weighted(T, prior)
     jacobian = np.zeros((len(prior), 6))
     for column, step in enumerate(_SMALL * np.eye(6)):

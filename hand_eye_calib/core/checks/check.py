@@ -260,7 +260,7 @@ def _preferred_reading(
     The streams ``right`` and ``fit`` are returned if only one reading is possible, or if the
     explanation has the reading of the known extrinsic: the streams as they are.
     """
-    has_other_reading = explanation.may_be_uninverted and not explanation.hypothesis.is_upright
+    has_other_reading = explanation.may_be_uninverted and not explanation.hypothesis.is_uninverted
     if not known or not has_other_reading:
         return right, fit
     upright = streams.shifted(offset.seconds)

@@ -88,7 +88,7 @@ class Hypothesis:
         return self.parent, self.child
 
     @property
-    def is_upright(self) -> bool:
+    def is_uninverted(self) -> bool:
         """Whether neither stream holds inverse poses."""
         return "inverse" not in self.parent and "inverse" not in self.child
 
@@ -173,13 +173,13 @@ class Readings:
     @property
     def is_clear(self) -> bool:
         """Whether the shape decides. A fixed camera beside an arm may explain it as well."""
-        is_fixed_camera = self.is_small and self.hypotheses[0].is_upright and self.shape > 0.0
+        is_fixed_camera = self.is_small and self.hypotheses[0].is_uninverted and self.shape > 0.0
         return self.by_shape != 0 and not is_fixed_camera
 
     def ordered(self) -> "Readings":
         """Return the readings with the upright one first."""
         first, second = self.hypotheses
-        if not second.is_upright:
+        if not second.is_uninverted:
             return self
         return replace(self, hypotheses=(second, first), shape=-self.shape, paths=-self.paths)
 
@@ -212,7 +212,7 @@ class Explanation:
     @property
     def may_be_uninverted(self) -> bool:
         """Whether two readings are possible, and the first one inverts neither stream."""
-        return self.readings is not None and self.readings.hypotheses[0].is_upright
+        return self.readings is not None and self.readings.hypotheses[0].is_uninverted
 
     @property
     def holds(self) -> bool:
@@ -470,8 +470,8 @@ def attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> E
     former = explanation.hypothesis
     explanation, is_settled = _steadier(explanation, streams, lag_s)
     hypothesis = explanation.hypothesis
-    is_upright_as_before = hypothesis.is_upright and hypothesis == former
-    if _has_one_reading(hypothesis) or (is_settled and is_upright_as_before):
+    is_uninverted_as_before = hypothesis.is_uninverted and hypothesis == former
+    if _has_one_reading(hypothesis) or (is_settled and is_uninverted_as_before):
         return replace(explanation, findings=findings_of(hypothesis))
     if is_settled:
         # A steady direction of travel is as clear evidence as paths can be.
@@ -483,7 +483,7 @@ def attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> E
         )
         return replace(explanation, findings=findings_of(hypothesis), readings=readings.ordered())
     readings = _readings(explanation, streams)
-    if hypothesis.is_upright and readings.shape < 0.0:
+    if hypothesis.is_uninverted and readings.shape < 0.0:
         findings = findings_of(hypothesis)
         is_doubtful = readings.shape > _SUSPICIOUS
         return replace(explanation, findings=findings, readings=readings if is_doubtful else None)
@@ -516,13 +516,13 @@ def _in_likelier_reading(
     """Return the explanation in the likelier of two readings, with its findings."""
     hypothesis = explanation.hypothesis
     likelier = readings.hypotheses[int(readings.shape > 0.0)]
-    if hypothesis.is_upright and not readings.is_clear:
+    if hypothesis.is_uninverted and not readings.is_clear:
         likelier = hypothesis
     if likelier is not hypothesis:
         explanation = _fitted(likelier, streams, lag_s)
     # Options are set only if the choice is clear.
-    findings = findings_of(likelier, has_options=readings.is_clear or likelier.is_upright)
-    if likelier.is_upright:
+    findings = findings_of(likelier, has_options=readings.is_clear or likelier.is_uninverted)
+    if likelier.is_uninverted:
         options = conventions("inverse", "both")
         findings += (finding("inverse_both", "both", Severity.WARNING, options),)
     return replace(explanation, findings=findings, readings=readings.ordered())

@@ -78,7 +78,7 @@ def choose(
     options = [_options_of(findings) for findings in findings_of_readings]
     difference = _loss_difference(pairs_of(options[0]), pairs_of(options[1]))
     index = decide(readings, difference)
-    can_be_right = readings.hypotheses[0].is_upright
+    can_be_right = readings.hypotheses[0].is_uninverted
     doubts: tuple[Finding, ...] = ()
     if index is None:
         answers = [answer_with(reading_options) for reading_options in options]
@@ -111,7 +111,7 @@ def decide(readings: Readings, difference: float) -> int | None:
     if abs(difference) > CLEAR_NOISE:
         by_noise = -int(np.sign(difference))
     choice = _vote(readings, by_noise)
-    if choice == 0 and readings.hypotheses[0].is_upright:
+    if choice == 0 and readings.hypotheses[0].is_uninverted:
         # Without clear evidence, the streams stay as they are if nothing supports an inversion.
         is_inversion_supported = readings.shape >= 0.0 or by_noise > 0
         choice = 0 if is_inversion_supported else -1
@@ -142,7 +142,7 @@ def _vote_in_small_space(readings: Readings, by_noise: int) -> int:
     if by_noise * readings.paths > _CLEAR_PATHS:
         return by_noise
     # Both readings invert a stream, so the streams cannot stay as they are.
-    if not readings.hypotheses[0].is_upright:
+    if not readings.hypotheses[0].is_uninverted:
         return by_shape or by_noise
     # Without evidence of the shape, the noise can only confirm the streams as they are.
     is_confirmed = by_noise < 0 and by_shape == 0

@@ -55,7 +55,7 @@ _CLEAR_SPREAD = 0.5
 
 @dataclass(frozen=True)
 class _Reading:
-    """Chosen reading of both streams.
+    """Chosen reading of both streams: as poses, or both as inverse poses.
 
     Attributes
     ----------
@@ -146,13 +146,15 @@ def _best(first: Attempt, settled: Collection[str], on_clock: Attempt | None) ->
     reading = _reading_of(first.snapshot, first.check, settled, first.calibration.time_offset_s)
     first = first.with_findings(reading.findings)
     settled = reading.settled.union(settled)
-    certain = _certain(first.check.findings, first.snapshot.config.given.union(settled))
-    if {*certain} & {*STREAM_REPAIRS}:
+    certain_options = _certain(first.check.findings, first.snapshot.config.given.union(settled))
+    if {*certain_options} & {*STREAM_REPAIRS}:
         verdict = first.calibration.verdict.value
-        repaired = _repaired(first.snapshot, first.check.findings, certain, settled, verdict)
+        repaired = _repaired(
+            first.snapshot, first.check.findings, certain_options, settled, verdict
+        )
         best = repaired or first
     else:
-        best = _estimated(first, certain, settled, on_clock)
+        best = _estimated(first, certain_options, settled, on_clock)
     return best.with_doubts(reading.doubts)
 
 
@@ -251,15 +253,15 @@ def _repaired_unsolved(snapshot: Snapshot) -> Attempt | None:
     """Repair streams that cannot be solved as given; None if no repair is certain."""
     result = check(snapshot)
     reading = _reading_of(snapshot, result, (), snapshot.config.given_time_offset_s)
-    certain = _certain(reading.findings, snapshot.config.given)
-    repaired = _repaired(snapshot, reading.findings, certain, (), "no result")
+    certain_options = _certain(reading.findings, snapshot.config.given)
+    repaired = _repaired(snapshot, reading.findings, certain_options, (), "no result")
     return repaired and repaired.with_doubts(reading.doubts)
 
 
 def _repaired(
     snapshot: Snapshot,
     findings: Collection[Finding],
-    certain: Options,
+    certain_options: Options,
     settled: Collection[str],
     verdict_as_given: str,
 ) -> Attempt | None:
@@ -268,9 +270,9 @@ def _repaired(
     A time offset or scale is estimated after the repair, or together with the repair if no poses
     can be paired otherwise.
     """
-    options = {name: value for name, value in certain.items() if value != "estimate"}
+    options = {name: value for name, value in certain_options.items() if value != "estimate"}
     second = _solved_with(snapshot, options) if options else None
-    if not second and "time_offset" in certain:
+    if not second and "time_offset" in certain_options:
         options["time_offset"] = "estimate"
         second = _solved_with(snapshot, options)
     if not second:
@@ -314,14 +316,14 @@ def _contradicts_repair(finding: Finding) -> bool:
 
 
 def _estimated(
-    first: Attempt, certain: Options, settled: Collection[str], on_clock: Attempt | None
+    first: Attempt, certain_options: Options, settled: Collection[str], on_clock: Attempt | None
 ) -> Attempt:
     """Return the attempt with an estimated time offset or scale, or the first attempt.
 
     A second solve is made if a check asks for it, and kept if its result is better.
     """
     fixed = first.snapshot.config.given.union(settled)
-    options = dict(certain)
+    options = dict(certain_options)
     if "time_offset" not in fixed and _clock_is_off(first):
         options = {**_ESTIMATED_CLOCK, **options}
     if not options:
@@ -332,7 +334,7 @@ def _estimated(
         return first
     if INVERSIONS & fixed:
         second = second.with_findings(_without_readings(second.check))
-    n_fewer = 1 if certain else 0
+    n_fewer = 1 if certain_options else 0
     if not (second.is_better_than(first, n_fewer) or second.is_sound):
         return first
     findings = first.check.findings
@@ -421,7 +423,7 @@ def _certain(findings: Collection[Finding], fixed: Collection[str]) -> dict[str,
     their uncertainty. A difference of lengths of a few per cent is only a warning, because odometry
     with a drifting scale has the same effect.
     """
-    certain: dict[str, float | str] = {}
+    certain_options: dict[str, float | str] = {}
     for finding in findings:
         for name, value in finding.options.items():
             is_clock_warning = name == "time_offset" and finding.severity is Severity.WARNING
@@ -430,5 +432,5 @@ def _certain(findings: Collection[Finding], fixed: Collection[str]) -> dict[str,
             if not is_certain or name in fixed:
                 continue
             if finding.makes_unusable or is_clock_warning:
-                certain[name] = "estimate" if finding.code in _ESTIMATED_CODES else value
-    return certain
+                certain_options[name] = "estimate" if finding.code in _ESTIMATED_CODES else value
+    return certain_options

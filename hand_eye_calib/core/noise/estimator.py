@@ -253,8 +253,9 @@ class AdaptiveSolution(ModelSolution):
             percent = 100 * (self.scale - 1)
             sigma = 100 * self.scale_sigma
             size = f"{abs(percent):.2f} +/- {sigma:.2g} %"
-            longer = "shorter" if percent > 0 else "longer"
-            sentences.append(f"the child's lengths are {size} {longer} than the parent's")
+            # A scale above 1 lengthens the child: its lengths are too short.
+            comparison = "shorter" if percent > 0 else "longer"
+            sentences.append(f"the child's lengths are {size} {comparison} than the parent's")
         if "bias" in systematic:
             bias = zip("xyz", 1000 * self.parameters[BIAS], strict=True)
             along = ", ".join(f"{axis} {value:.2g}" for axis, value in bias)

@@ -164,11 +164,13 @@ class Linearisation:
     Attributes
     ----------
     columns : (n, 6, 6 + k + 1) array
-        Derivatives of e by xi in ``X Exp(xi)`` and by k parameters of systematic errors; last, e.
+        Derivatives of e with respect to xi in ``X Exp(xi)`` and to k parameters of systematic
+        errors; last, e.
     adjoints : (n, 6, 6) array
         Ad(B^-1).
     by_path : dict of (n, 6, k) arrays
-        Derivatives by the scale, and by a rotation of the direction of travel against the child.
+        Derivatives with respect to the scale, and to a rotation of the direction of travel against
+        the child.
     """
 
     columns: FloatArray
@@ -240,7 +242,7 @@ def _child_motions(
     (n, 4, 4) array
         Motions.
     (n, 3, 3) array
-        Derivatives of their rotations by the bias of rates.
+        Derivatives of their rotations with respect to the bias of rates.
     """
     Ts_cw_c = streams.Ts_cw_c
     if parameters[TIME]:
@@ -254,9 +256,10 @@ def _child_motions(
 
 
 def _derivatives_by_rate_bias(rotations: FloatArray, intervals_s: FloatArray) -> FloatArray:
-    """Derivatives (n, 3, 3) of rotations (n, 3, 3) over each interval by a bias of rates (rad/s).
+    """Derivatives (n, 3, 3) of rotations (n, 3, 3) over each interval.
 
-    They are the interval times the mean of the body's axes at both ends, in the frame of the end.
+    The derivatives are with respect to a bias of rates (rad/s): the interval times
+    the mean of the body's axes at both ends, in the frame of the end.
     """
     mean_axes: FloatArray = 0.5 * (np.eye(3) + transposed(rotations))
     return intervals_s[:, None, None] * mean_axes

@@ -147,10 +147,12 @@ def _step(
 
 
 def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
-    """Return the gradient (m,) of the loss by the log levels and the average information (m, m).
+    """Return the gradient (m,) of the loss and the average information (m, m).
+
+    Both are with respect to the log levels.
 
     With S^-1 the precision of errors that have covariance S, and M the second moments of their
-    smoothed values, the derivative by the level of a basis is
+    smoothed values, the derivative with respect to the level of a basis is
     ``1/2 exp(level) tr((S^-1 - S^-1 M S^-1) basis)``.
     """
     space = posterior.space
@@ -175,9 +177,10 @@ def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
 
 
 def _group_gradient(posterior: Posterior, group: Markov, states: FloatArray) -> FloatArray:
-    """Numerical derivatives (2,) of the loss by the log variance and time constant of a group.
+    """Return numerical derivatives (2,) of the loss for one group.
 
-    The part of the loss that depends on them is ``1/2 (tr(Pi M) - log|Pi|)`` with the second
+    The derivatives are with respect to the log variance and the time constant of the group. The
+    part of the loss that depends on these two is ``1/2 (tr(Pi M) - log|Pi|)`` with the second
     moments M of the smoothed processes and their precision Pi.
     """
     covariance, below = posterior.factor.selected_inverse

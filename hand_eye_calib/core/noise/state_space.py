@@ -56,7 +56,7 @@ class StateSpace:
     walk_factors : (n,) array
         Variance of the walk over each increment, in units of a typical increment.
     columns : (n, 6, p + 1) array
-        ``[J e]``: derivatives by the parameters; last, residuals.
+        ``[J e]``: derivatives with respect to the parameters; last, residuals.
     ahead : (n, 6, d - 6) array
         H1 without the columns of the white error, where H1 is the identity.
     behind : (n, 6, d) array
@@ -176,9 +176,10 @@ class Markov:
         return forces
 
     def derivative_by_log_tau(self, values: FloatArray) -> FloatArray:
-        """Derivative by log tau of states (N, k): ``dC f`` with C = Pi^-1 and C f = values.
+        """Derivative of states (N, k) with respect to log tau: ``dC f`` with C f = values.
 
-        ``dC f = -C (dPi) values`` with the numerical derivative dPi of the precision.
+        With C = Pi^-1, ``dC f = -C (dPi) values``. The numerical derivative of the precision is
+        dPi.
         """
         change = np.array([0.0, LEVEL_CHANGE])
         forces = self.changed(change).forces(values) - self.changed(-change).forces(values)

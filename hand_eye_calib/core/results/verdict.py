@@ -412,7 +412,7 @@ def _worse_than_target(result: Result) -> Iterator[Ground]:
     if not rough:
         return
     names = tuple(axis.name for axis in rough)
-    sizes = [f"{axes_in_words([axis.name])} {axis.beside_target()}" for axis in rough]
+    sizes = [f"{axes_in_words([axis.name])} {axis.sigma_beside_target()}" for axis in rough]
     sentence = f"standard deviations above the target of {_targets(rough)}: {listing(sizes)}"
     allowances = [(axis, math.sqrt(axis.total**2 - axis.sigma**2)) for axis in rough]
     # A longer recording does not help if the allowance alone is above the target.
@@ -429,18 +429,19 @@ def _worse_than_target(result: Result) -> Iterator[Ground]:
 
 
 def _floor(result: Result) -> Iterator[Ground]:
-    rough = [axis for axis in _axes(result) if axis.sigma <= axis.target < axis.total]
-    if not rough:
+    """Yield the ground that the allowance alone puts axes above their target."""
+    above = [axis for axis in _axes(result) if axis.sigma <= axis.target < axis.total]
+    if not above:
         return
-    names = tuple(axis.name for axis in rough)
-    sizes = [f"{axes_in_words(names[:1])} is good to {rough[0].beside_target()}"]
-    sizes += [f"{axes_in_words([axis.name])} to {axis.beside_target()}" for axis in rough[1:]]
-    is_one = len({amount(axis.name, axis.target) for axis in rough}) == 1
+    names = tuple(axis.name for axis in above)
+    sizes = [f"{axes_in_words(names[:1])} is good to {above[0].sigma_beside_target()}"]
+    sizes += [f"{axes_in_words([axis.name])} to {axis.sigma_beside_target()}" for axis in above[1:]]
+    is_one = len({amount(axis.name, axis.target) for axis in above}) == 1
     target_is = "the target is" if is_one else "the targets are"
-    share = "Most" if all(axis.total**2 > 2.0 * axis.sigma**2 for axis in rough) else "Part"
+    share = "Most" if all(axis.total**2 > 2.0 * axis.sigma**2 for axis in above) else "Part"
     errors = "constant errors" if result.measured == "positions" else "constant odometry errors"
     sentence = (
-        f"{listing(sizes)}; {target_is} {_targets(rough)}. "
+        f"{listing(sizes)}; {target_is} {_targets(above)}. "
         f"{share} of it is an allowance for {errors}"
     )
     yield Ground(sentence, _FLOOR_ADVICE, names)
@@ -464,7 +465,7 @@ class _Axis(NamedTuple):
     is_hidden: bool
     is_known_by_hand: bool
 
-    def beside_target(self) -> str:
+    def sigma_beside_target(self) -> str:
         """Return the standard deviation with enough digits to distinguish it from the target."""
         return amount_beside(self.name, self.total, self.target)
 

@@ -129,7 +129,8 @@ class _Second:
     residuals : (K, 6) array
         At the installed extrinsic.
     jacobians : (K, 6, 7) array
-        Negative derivatives of the residuals by a shift and by the logarithm of the child's scale.
+        Negative derivatives of the residuals with respect to a shift and to the logarithm of the
+        child's scale.
     """
 
     stamp_ns: int

@@ -190,8 +190,8 @@ class Fit:
         return list(range(self.blocks.sums.shape[-1] - 1))
 
     @cached_property
-    def whole(self) -> Estimate:
-        """Values of all columns."""
+    def joint(self) -> Estimate:
+        """Estimate of the extrinsic and all faults together."""
         return self._solved(self._every_column)
 
     def _solved(self, columns: list[int]) -> Estimate:
@@ -201,7 +201,7 @@ class Fit:
     def estimate(self, name: str) -> Estimate:
         """Return the values of a fault, if all other faults are possible too."""
         places = self.places[name]
-        return Estimate(self.whole.values[places], self.whole.sigmas[places])
+        return Estimate(self.joint.values[places], self.joint.sigmas[places])
 
     def biases(self, name: str) -> FloatArray:
         """Return the bias (m,) that noise of the columns can cause in the values of a fault.
@@ -228,8 +228,8 @@ class Fit:
         The extrinsic moves if all faults are possible, and it is less certain then.
         """
         columns = self._of_extrinsic
-        values = self.whole.values[columns]
-        sigmas = self.whole.sigmas[columns]
+        values = self.joint.values[columns]
+        sigmas = self.joint.sigmas[columns]
         alone = self._solved(columns)
         added = np.maximum(sigmas**2 - alone.sigmas**2, 0.0)
         return np.asarray(np.outer(values, values) + np.diag(added))

@@ -92,17 +92,17 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
     if not len(snapshot.kept):
         findings += _check_aligned(snapshot, calibration, known_s)
     hidden = calibration.hidden if calibration else []
-    late: list[Finding] = []
+    of_clock: list[Finding] = []
     if len(hidden) == 3 or any(found.code == "unrelated" for found in findings):
-        late = _check_clock(parent, child, known_s, snapshot)
-    if late:
-        # The clock replaces the finding that nothing is explained.
-        findings = [found for found in findings if found.code != "unrelated"] + late
+        of_clock = _check_clock(parent, child, known_s, snapshot)
+    if of_clock:
+        # A wrong clock explains why the streams are unrelated: its finding replaces that one.
+        findings = [found for found in findings if found.code != "unrelated"] + of_clock
     codes = {found.code for found in findings}
     if calibration and "time_offset" not in codes:
         of_solve = _check_solved(snapshot, calibration, is_unrelated="unrelated" in codes)
         if of_solve and calibration.measured == "rotations":
-            # The cause replaces the finding that nothing is explained.
+            # A cause explains why the streams are unrelated: its finding replaces that one.
             findings = [found for found in findings if found.code != "unrelated"]
         findings += of_solve
     if hidden and not any(found.makes_unusable for found in findings):

@@ -31,12 +31,13 @@ _ZERO_M = 0.005
 # Standard deviations below which a lever arm is zero.
 _ZERO_SIGMAS = 3.0
 
-# A zero lever arm is an error if the upper bounds of two axes are below this distance (m): two
-# housings hardly fit closer. An upper bound is the value plus two standard deviations.
+# A zero lever arm is an error if the upper bounds of two axes are below _HOUSING_M and that of the
+# third is below _UNCERTAIN_M. An upper bound is the value plus two standard deviations.
+# Distance (m) below which two housings hardly fit.
 _HOUSING_M = 0.03
-# Limit of the upper bound of the third axis (m). Without two axes below this limit, the lever arm
-# is unknown rather than zero.
-_UNKNOWN_M = 0.06
+# Largest upper bound (m) of a zero lever arm. If fewer than two upper bounds are at most this, the
+# lever arm is too uncertain to be called zero: there is no finding.
+_UNCERTAIN_M = 0.06
 
 # Median residual (m) below which positions were computed from the poses: no receiver or total
 # station measures to a twentieth of a millimetre.
@@ -166,10 +167,10 @@ def check_position(
     if (lengths_m > np.maximum(_ZERO_M, _ZERO_SIGMAS * sigmas_m)).any():
         return []
     uppers_m = np.sort(lengths_m + 2.0 * sigmas_m)
-    if uppers_m[1] > _UNKNOWN_M:
+    if uppers_m[1] > _UNCERTAIN_M:
         return []
     # Two axes are not enough for an error: an antenna may be right above the other sensor.
-    is_sure = len(axes) == 3 and uppers_m[1] < _HOUSING_M and uppers_m[2] < _UNKNOWN_M
+    is_sure = len(axes) == 3 and uppers_m[1] < _HOUSING_M and uppers_m[2] < _UNCERTAIN_M
     severity = Severity.ERROR if is_sure else Severity.WARNING
     distance_m = float(np.linalg.norm(lengths_m))
     size = f"{length(distance_m)} +/- {length(float(sigmas_m.max()))}"

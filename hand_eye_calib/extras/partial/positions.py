@@ -246,9 +246,9 @@ class _State:
 
     @property
     def course(self) -> increments.Course:
-        """Course of the lever arm's end by the odometry, in the world of the positions.
+        """Path of the antenna (the lever arm's end) as the odometry predicts it.
 
-        It has no noise of the positions.
+        The path is rotated into the world of the positions, so it is free of their noise.
         """
         streams = self.streams
         course = increments.course_of(replace(streams, Ts_cw_c=streams.Ts_pw_p @ self.X), self.X)
@@ -261,7 +261,7 @@ class _State:
         )
 
     def linearised(self) -> increments.Linearisation:
-        """Linearise increments between poses by the lever arm and the parameters."""
+        """Linearise increments between poses with respect to lever arm and parameters."""
         accelerations = _accelerations(self.streams, self.X, self.tuning)
         linearisation = increments.linearise(
             self.streams, self.course, self.X, self.parameters[:RESPONSE], _SHARED

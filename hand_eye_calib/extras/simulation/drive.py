@@ -224,7 +224,7 @@ def surface(config: options.DriveConfig, x: FloatArray, y: FloatArray) -> tuple[
 
 
 def _peaks(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the height of three hills and three hollows, and its derivatives by x and y.
+    """Return the height of three hills and three hollows, and its derivatives along x and y.
 
     The arrays have the same shape and no unit. The ground is flat more than 3.5 from the origin.
     """

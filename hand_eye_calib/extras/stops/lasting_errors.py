@@ -43,12 +43,13 @@ def views_of(Ts_world_parent: FloatArray, Ts_world_child: FloatArray) -> FloatAr
 
 
 def rest_weights(views: FloatArray) -> FloatArray:
-    """Return weights (N,), 1 on average: consecutive stops at one place count as one stop.
+    """Return weights (N,), 1 on average, for the stops.
 
-    An arm that rests gives many of them.
+    Consecutive stops at one place count as one stop: a resting arm gives many such stops.
     """
+    # Length of the way up to each stop (rad of view).
     way_rad = views[:, 0]
-    first = np.searchsorted(way_rad, way_rad + -_RANGES_RAD[0])
+    first = np.searchsorted(way_rad, way_rad - _RANGES_RAD[0])
     end = np.searchsorted(way_rad, way_rad + _RANGES_RAD[0])
     weights = 1.0 / np.maximum(end - first, 1)
     return np.asarray(weights / weights.mean())
@@ -72,7 +73,7 @@ def kernel_weights(kernels: FloatArray, rows: FloatArray) -> FloatArray:
     ----------
     kernels : (K, N, N) array
     rows : (N, 6, M + 1) array
-        Derivatives of the errors by M values, and the errors in the last column.
+        Derivatives of the errors with respect to M values, and the errors in the last column.
     """
     n = len(rows)
     n_columns = rows.shape[2]

@@ -197,7 +197,9 @@ def _fit_without_outliers(
 def _linearise(
     stops: Stops, X: FloatArray, Z: FloatArray, in_world: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the errors (N, 6) of stops, and their derivatives (N, 6, 12) by X and Z.
+    """Return the errors (N, 6) of stops, and their derivatives (N, 6, 12).
+
+    The derivatives are with respect to X and Z.
 
     ``in_world`` chooses the frame of the errors: the world of the child, rather than the child.
     """
@@ -331,8 +333,8 @@ class _Stretch(NamedTuple):
         Share by which longer positions would fit best, and its standard deviation; infinite if the
         stops do not determine it.
     scores : (12, 12) array
-        Covariance that the unknown scale adds to the scores (the products of the derivatives by the
-        values and the errors).
+        Covariance that the unknown scale adds to the scores (the products of the errors and their
+        derivatives with respect to the values).
     inflation : float
         Factor of the variance for lasting errors.
     """
@@ -398,8 +400,8 @@ def _with_lasting_errors(
 def whitened_rows(stops: Stops, fit: RobotWorld, in_world: bool) -> FloatArray:
     """Return derivatives and errors (N, 6, 14) of stops, in units of their levels.
 
-    The columns are the derivatives by X and Z (12), by longer positions of the child (1), and the
-    errors (1).
+    The columns are the derivatives with respect to X and Z (12), that with respect to longer
+    positions of the child (1), and the errors (1).
     """
     errors, jacobian = _linearise(stops, fit.T_parent_child, fit.T_world_world, in_world)
     by_length = np.zeros((len(stops), 6))

@@ -116,7 +116,7 @@ class Drive:
     def rows(self, T: FloatArray, others: FloatArray) -> FloatArray:
         """Return the equations (K, C, U + 1) of a step of the unknowns: derivatives of e, and -e.
 
-        Derivatives by the pose do not need the wheels again.
+        Derivatives with respect to the pose do not need the wheels again.
         """
         predicted = self.predicted(T, others)
         residuals = predicted - self.measured(T)

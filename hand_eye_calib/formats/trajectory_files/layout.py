@@ -440,16 +440,16 @@ _POSES: tuple[tuple[str, ...], ...] = (
 # Poses with a rotation matrix in separate columns, which may be written row by row or column by
 # column.
 _TRANSPOSABLE = _POSES[3:5]
-# Numbers of columns of a covariance after the pose: its diagonal, one half, or all elements.
+# Column counts of a covariance after the pose: its diagonal, one half, or all elements.
 _COVARIANCES = (6, 21, 36)
-# Numbers of columns for which several formats are possible.
+# Column counts for which several formats are possible.
 _UNCLEAR = (4, 7)
 
 
 def _with_fitting_columns(
     layout: Layout, rows: Sequence[Sequence[str]], is_separated: bool
 ) -> Layout:
-    """Set the format and the columns of a layout without names by the numbers of its rows."""
+    """Set the format and the columns of a layout without names from the values in its rows."""
     n_columns = len(layout.row)
     columns = _fitting(layout.row, rows)
     may_be_stamped_pose = columns is None or columns[: len(TUM)] == STAMPED_POSE

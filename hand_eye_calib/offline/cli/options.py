@@ -315,7 +315,8 @@ def _read_config(path: Path) -> Options:
         elif option in _NODE_OPTIONS or option.partition(".")[0] in _ROS_OPTIONS:
             ignored.append(repr(option))
         elif value is not None or not option.endswith(_OF_ROS):
-            # The section of the parameters may be empty: then it is no option.
+            # An empty section ros__parameters appears here as a name without value. It is not an
+            # option.
             raise _unknown_option(path, option)
     if settings.other_nodes and not (options or ignored):
         nodes = ", ".join(settings.other_nodes)

@@ -224,7 +224,10 @@ def _failure(error: Exception) -> Failure:
 
 
 def main() -> None:
-    """Answer jobs until standard input ends, which the end of the node causes in any case."""
+    """Answer jobs until standard input ends.
+
+    It ends with the node, even if the node crashes.
+    """
     os.nice(_NICENESS)
     # A library may print: that goes to standard error, not into the pipe.
     outgoing = os.fdopen(os.dup(1), "wb")
