@@ -263,9 +263,9 @@ def _preferred_reading(
     has_other_reading = explanation.may_be_uninverted and not explanation.hypothesis.is_uninverted
     if not known or not has_other_reading:
         return right, fit
-    upright = streams.shifted(offset.seconds)
-    motions = _motions(upright.synchronised, MAX_PAIRS)
-    return upright, similarity.fit_similarity(motions, start=known[0])
+    uninverted = streams.shifted(offset.seconds)
+    motions = _motions(uninverted.synchronised, MAX_PAIRS)
+    return uninverted, similarity.fit_similarity(motions, start=known[0])
 
 
 def least_lever_arm(T_parent_child: FloatArray, sigmas: FloatArray) -> float:

@@ -149,7 +149,7 @@ class Readings:
     Attributes
     ----------
     hypotheses : tuple of two Hypothesis
-        An upright hypothesis is the first.
+        A hypothesis that inverts neither stream is the first.
     shape : float
         Evidence of the shape of the motion for the second hypothesis: the sum of the log ratios of
         paths and lever arms.
@@ -177,7 +177,7 @@ class Readings:
         return self.by_shape != 0 and not is_fixed_camera
 
     def ordered(self) -> "Readings":
-        """Return the readings with the upright one first."""
+        """Return the readings with the uninverted one first."""
         first, second = self.hypotheses
         if not second.is_uninverted:
             return self
