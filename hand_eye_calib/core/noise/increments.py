@@ -27,6 +27,7 @@ from functools import cached_property
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
+from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Columns
 from hand_eye_calib.core.noise.normal import transposed
@@ -48,6 +49,9 @@ SYSTEMATIC_OF_RATES = ("time", "rate")
 
 # Parts of a step that may drift: its length and its direction.
 PATH_PARTS = ("scale", "direction")
+
+# Smallest variance (m^2) of steps against their neighbours. Smaller ones are rounding.
+_ROUNDING_M2 = 1e-18
 
 
 def parameter_columns(names: Iterable[str]) -> list[int]:
@@ -118,7 +122,7 @@ class Course(Columns):
     along: FloatArray
 
 
-def course_of(streams: Streams, T_parent_child: FloatArray) -> Course:
+def course_of(streams: Streams, T_parent_child: FloatArray, noise_m2: float = np.inf) -> Course:
     """Smooth the motion of the child.
 
     The child's steps are the mean of both streams. The metres travelled come from the
@@ -128,6 +132,9 @@ def course_of(streams: Streams, T_parent_child: FloatArray) -> Course:
     ----------
     streams : Streams
     T_parent_child : (4, 4) array
+    noise_m2 : float
+        Variance per axis up to which differences between a step and its neighbours count as
+        noise. The larger the differences, the less the steps are smoothed.
     """
     R = se3.rotation_of(T_parent_child)
     lever_arm = se3.translation_of(T_parent_child)
@@ -135,8 +142,8 @@ def course_of(streams: Streams, T_parent_child: FloatArray) -> Course:
     chords = se3.rotation_of(streams.motions_p) @ lever_arm - lever_arm
     by_parent = (chords + se3.translation_of(streams.motions_p)) @ R
     intervals_s = np.diff(streams.stamps_s)
-    steps = _smoothed(0.5 * (by_child + by_parent), intervals_s)
-    metres = np.linalg.norm(_smoothed(by_parent, intervals_s), axis=1)
+    steps = _smoothed(0.5 * (by_child + by_parent), intervals_s, noise_m2)
+    metres = np.linalg.norm(_smoothed(by_parent, intervals_s, noise_m2), axis=1)
     axes_c = streams.Ts_cw_c[:-1, :3, :3]
     return Course(
         streams.twists,
@@ -145,11 +152,17 @@ def course_of(streams: Streams, T_parent_child: FloatArray) -> Course:
     )
 
 
-def _smoothed(steps: FloatArray, intervals_s: FloatArray) -> FloatArray:
-    """Return steps (n, 3) with the mean velocity of the steps two before and two after."""
+def _smoothed(steps: FloatArray, intervals_s: FloatArray, noise_m2: float) -> FloatArray:
+    """Smooth steps (n, 3) towards the mean velocity of the steps two before and two after.
+
+    Differences from this mean are kept by the share of their variance that is not noise.
+    """
     rates = steps / intervals_s[:, None]
     padded = np.concatenate([rates[:1], rates[:1], rates, rates[-1:], rates[-1:]])
-    return 0.5 * (padded[:-4] + padded[4:]) * intervals_s[:, None]
+    smooth = 0.5 * (padded[:-4] + padded[4:]) * intervals_s[:, None]
+    variance = max(median((steps - smooth) ** 2), _ROUNDING_M2)
+    share = max(1.0 - noise_m2 / variance, 0.0)
+    return smooth + share * (steps - smooth)
 
 
 def summed(steps: FloatArray) -> FloatArray:

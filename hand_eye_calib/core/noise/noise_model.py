@@ -212,13 +212,20 @@ class NoiseModel:
         mean[JITTER] = tuning.jitter
         # The prior standard deviation of this level is 4.5: a factor of 10 of the jitter.
         precision[JITTER] = 0.05
-        mean[TIME_CONSTANTS] = 0.5 * (shortest + longest)
+        mean[TIME_CONSTANTS] = self._usual_log_tau
         precision[TIME_CONSTANTS] = tuning.tau_precision
         lower[TIME_CONSTANTS] = shortest
         longest_of_direction = shortest + np.log(_LONGEST_OF_DIRECTION)
         is_direction = [part == "direction" for _, part in self.slow]
         upper[TIME_CONSTANTS] = np.where(is_direction, longest_of_direction, longest)
         return Prior(mean, precision, lower, upper)
+
+    @property
+    def _usual_log_tau(self) -> float:
+        """Logarithm of the time constant (s) that a search starts at, which is its prior mean."""
+        shortest_s = self.tuning.start_tau_intervals * self.interval_s
+        longest_s = max(self.tuning.start_tau_share * self.duration_s, shortest_s)
+        return 0.5 * float(np.log(shortest_s * longest_s))
 
     @property
     def _log_tau_bounds(self) -> tuple[float, float]:
@@ -245,7 +252,7 @@ class NoiseModel:
             zip(PARTS, increment_levels(levels) + np.log(tuning.start_share), strict=True)
         )
         variances |= dict.fromkeys(PATH_PARTS, 2.0 * np.log(tuning.sizes[SCALE]))
-        log_tau = 0.5 * sum(self._log_tau_bounds)
+        log_tau = self._usual_log_tau
         starts = [[variances[part], log_tau] for _, part in processes]
         return replace(self, slow=processes), np.r_[levels, np.ravel(starts)]
 

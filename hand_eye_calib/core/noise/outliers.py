@@ -192,7 +192,7 @@ def _jump_factor(of_walk: FloatArray, alarming: float, tuning: Tuning) -> float:
     walk with heavy tails needs more.
     """
     ordinary = of_walk[of_walk < alarming]
-    if not len(ordinary) or np.mean(ordinary**2) > tuning.heavy_kurtosis * np.mean(ordinary) ** 2:
+    if not len(ordinary) or np.mean(ordinary**2) > tuning.walk_kurtosis * np.mean(ordinary) ** 2:
         return tuning.heavy_jump_factor
     return float(max(median(ordinary) / CHI2[0.5][6], 1.0))
 

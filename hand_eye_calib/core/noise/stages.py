@@ -112,6 +112,11 @@ class Problem:
             self.prior(fit),
         )
 
+    def course(self, T_parent_child: FloatArray, levels: FloatArray) -> Course:
+        """Course of the streams, smoothed as far as noise of these levels requires."""
+        noise_m = float(np.exp(0.5 * increment_levels(levels)[0]))
+        return course_of(self.streams, T_parent_child, self.tuning.caution * noise_m**2)
+
     def is_noisy(self, fit: Fit) -> bool:
         """Whether rotation noise exceeds a share of the rotation between poses."""
         turns = se3.rotation_angle(se3.rotation_of(self.streams.motions_p))
@@ -337,7 +342,7 @@ def noise(workspace: Workspace, fit: Fit) -> Fit:
     xi_and_residual = [*range(6), -1]
     products_of_xi = fitted.products[np.ix_(xi_and_residual, xi_and_residual)]
     moved = fit.moved(NormalEquations(products_of_xi).step, [])
-    course = course_of(problem.streams, moved.T)
+    course = problem.course(moved.T, fitted.levels)
     return replace(moved, levels=fitted.levels, course=course)
 
 
@@ -492,7 +497,7 @@ def systematic(workspace: Workspace, fit: Fit) -> Fit:
             largest_gain = gain
     step = best.normal.step
     moved = best.fit.moved(step, problem.columns)
-    moved = replace(moved, course=course_of(problem.streams, moved.T))
+    moved = replace(moved, course=problem.course(moved.T, fit.levels))
     return moved.corrected(problem.streams, posterior.states_after(step))
 
 
