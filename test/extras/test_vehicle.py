@@ -152,6 +152,12 @@ def test_wheel_data_of_another_shape_are_refused(measures, n_columns, error, mat
         hec.wheel_trajectory(np.arange(3) * 20_000_000, np.ones((3, n_columns)), measures)
 
 
+def test_wheels_as_child_are_answered_with_the_other_order():
+    drive = machine()
+    with pytest.raises(ConfigError, match="exchange the streams, the one with wheels first"):
+        hec.calibrate(drive.sensor, drive.wheels)
+
+
 def test_too_short_a_drive_raises():
     drive = machine()
     with pytest.raises(NotEnoughDataError, match="figures of eight"):

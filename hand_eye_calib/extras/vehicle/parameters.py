@@ -5,6 +5,9 @@ from typing import Any
 
 from hand_eye_calib.core.base.text import with_sigma
 
+# Units of parameters, by the end of their names. Radii have none: see VehicleParameters.
+_UNITS = {"separation": " m", "wheelbase": " m", "offset": " rad", "curvature": " 1/m"}
+
 
 @dataclass(frozen=True)
 class VehicleParameter:
@@ -36,9 +39,11 @@ class VehicleParameters:
         return {parameter.name: parameter for parameter in self.parameters}[name]
 
 
-def details(value: VehicleParameters, result: Any) -> list[str]:
+def details(wheels: VehicleParameters, result: Any) -> list[str]:
     """Return lines about the wheels for a person."""
     lines = []
-    for parameter in value.parameters:
-        lines.append(f"{parameter.name}: {with_sigma(parameter.value, parameter.sigma, 4)}")
-    return [*lines, f"the wheels slip {value.slip_share:.1%} of the time"]
+    for parameter in wheels.parameters:
+        value_and_sigma = with_sigma(parameter.value, parameter.sigma, 4)
+        unit = _UNITS.get(parameter.name.rpartition("_")[2], "")
+        lines.append(f"{parameter.name}: {value_and_sigma}{unit}")
+    return [*lines, f"the wheels slip {wheels.slip_share:.1%} of the time"]
