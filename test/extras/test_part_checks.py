@@ -11,6 +11,7 @@ import hand_eye_calib as hec
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from reproduction import part_faults
+from reproduction.coverage import classes
 
 SEED = 31
 
@@ -109,7 +110,7 @@ OF_ROTATIONS = [
     ("rotations", "inverse", "inverse_orientation", ["car"]),
     ("rotations", "order w x y z", "inverse_orientation", ["drone"]),
     ("rotations", "yaw only", "flat", ["drone"]),
-    ("rotations", "yaw gain 1.05", "rotation_gain", ["car"]),
+    ("rotations", "yaw gain 1.05", "rotation_gain", ["hand"]),
 ]
 
 
@@ -229,3 +230,16 @@ def test_positions_of_a_short_recording_do_not_end_in_a_traceback():
     child = Trajectory.from_positions(stamps_ns, poses[:, :3, :3] @ [0.3, 0.1, 0.2], "antenna")
     result = hec.calibrate(parent, child)
     assert result.verdict is not hec.Verdict.USE
+
+
+def test_rates_on_a_flat_floor_are_good_to_the_usual_misalignment():
+    """About one axis, a misaligned gyroscope looks like a turned one: 0.5 deg is usual."""
+    drive = classes.make("flat_agv", 931)
+    steps = se3.log(se3.inverse(drive.child.poses[:-1]) @ drive.child.poses[1:])[:, 3:]
+    stamps_ns = drive.child.stamps_ns
+    rates = steps / (np.diff(stamps_ns)[:, None] * 1e-9)
+    rates += 0.001 * np.random.default_rng(SEED).standard_normal(rates.shape)
+    middles_ns = (stamps_ns[:-1] + stamps_ns[1:]) // 2
+    result = hec.calibrate(drive.parent, Trajectory.from_rates(middles_ns, rates))
+    assert 0.3 < np.degrees(result.sigmas[3]) < 3.0
+    assert not np.isfinite(result.sigmas[5])

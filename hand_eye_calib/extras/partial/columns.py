@@ -223,16 +223,21 @@ class Fit:
 
     @property
     def open_covariance(self) -> FloatArray:
-        """Covariance (3, 3) of the extrinsic that possible faults leave open.
+        """Covariance (3, 3) of the extrinsic that possible faults leave open."""
+        return self.open_to(self._every_column)
 
-        The extrinsic moves if all faults are possible, and it is less certain then.
+    def open_to(self, columns: list[int]) -> FloatArray:
+        """Return the covariance (3, 3) of the extrinsic that the faults of some columns leave open.
+
+        The extrinsic moves if these faults are possible, and it is less certain then. Both may have
+        one direction, such as the axis that a machine turns about.
         """
-        columns = self._of_extrinsic
-        values = self.joint.values[columns]
-        sigmas = self.joint.sigmas[columns]
-        alone = self._solved(columns)
-        added = np.maximum(sigmas**2 - alone.sigmas**2, 0.0)
-        return np.asarray(np.outer(values, values) + np.diag(added))
+        n_values = len(self._of_extrinsic)
+        values = self.blocks.solve(columns)[:n_values]
+        with_faults = self.blocks.jackknife(columns)[:n_values, :n_values]
+        variances, axes = np.linalg.eigh(with_faults - self.blocks.jackknife(self._of_extrinsic))
+        added = (axes * np.maximum(variances, 0.0)) @ axes.T
+        return np.asarray(np.outer(values, values) + added)
 
 
 def fit_columns(

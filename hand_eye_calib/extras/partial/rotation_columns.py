@@ -25,6 +25,7 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.stats import median
+from hand_eye_calib.core.checks.agreement import BIASES
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.extras.partial.columns import Column, Fit, Stencil, fit_columns, split, stencil
@@ -109,9 +110,31 @@ class RotationFit(Fit):
         """Covariance (3, 3) of the extrinsic rotation that possible faults leave open, rad^2.
 
         If two axes of a sensor are not perpendicular, its frame is uncertain by the same angle.
+        Faults without evidence are at most as large as usual.
         """
         shears, sigmas = self.estimate("shears")
-        return self.open_covariance + np.diag(np.maximum(shears**2 - sigmas**2, 0.0))
+        estimated = self.open_covariance + np.diag(np.maximum(shears**2 - sigmas**2, 0.0))
+        return min(estimated, self._usual_covariance, key=np.trace)
+
+    @property
+    def _usual_covariance(self) -> FloatArray:
+        """Covariance (3, 3) of the extrinsic rotation if faults without evidence are usual, rad^2.
+
+        About an axis without turns, the rates are noise, which is a weak instrument: its estimates
+        of gains and misalignments are arbitrary.
+        """
+        weak: list[int] = []
+        prior_sigmas: list[float] = []
+        for name in ("gains", "shears"):
+            is_weak = np.abs(self.estimate(name).values) <= BIASES * self.biases(name)
+            places = np.array(self.places[name])[is_weak]
+            weak += places.tolist()
+            prior_sigmas += [_COLUMNS[name].sigma] * len(places)
+        known = [column for column in self._every_column if column not in weak]
+        total = self.blocks.total
+        effects = np.linalg.solve(total[np.ix_(known, known)], total[np.ix_(known, weak)])[:3]
+        of_weak = effects * np.array(prior_sigmas)
+        return self.open_to(known) + of_weak @ of_weak.T
 
     @property
     def bias_drift(self) -> float:
