@@ -213,7 +213,8 @@ def assess_lever_arm(
     # Bound the white rotation noise per axis by the differences between steps about the two axes
     # with the smoothest rotation. Positions do not reveal it otherwise: noise of the orientation
     # would look like a small motion that does not move the lever arm.
-    steps = se3.rotation_log(np.swapaxes(Ts[:-1, :3, :3], 1, 2) @ Ts[1:, :3, :3])
+    rotations = se3.rotation_of(Ts)
+    steps = se3.rotations_between(rotations[:-1], rotations[1:])
     # Differences of steps have six times the variance of white noise.
     variances = np.median(np.diff(steps, axis=0) ** 2, axis=0) / CHI2[0.5][1] / 6.0
     white = float(np.sort(variances)[:2].mean())

@@ -248,7 +248,7 @@ def _other_mount(pose_pairs: PosePairs) -> Finding | None:
     if any(stack is None for stack in rotations):
         return None
     of_short, of_long = (stack for stack in rotations if stack is not None)
-    turns = se3.rotation_log(np.swapaxes(of_long, 1, 2) @ of_short)
+    turns = se3.rotations_between(of_long, of_short)
     covariance = jackknife_covariance(turns[1:]) + 1e-12 * np.eye(3)
     sigmas = float(np.sqrt(turns[0] @ np.linalg.solve(covariance, turns[0])))
     turn_rad = float(np.linalg.norm(turns[0]))

@@ -106,7 +106,7 @@ def _interpolated(trajectory: Trajectory, stream: str) -> Finding | None:
     Whole poses that were interpolated have constant rotation rates as well: they are consistent.
     """
     seconds = np.diff(trajectory.stamps_ns)[:, None] * 1e-9
-    rates = se3.rotation_log(_rotations(trajectory)) / seconds
+    rates = _turns(trajectory) / seconds
     change = np.linalg.norm(np.diff(rates, axis=0), axis=1)
     is_steady = change < _STEADY_RAD_S + _STEADY_SHARE * np.linalg.norm(rates[1:], axis=1)
     positions = se3.translation_of(trajectory.poses)
@@ -121,10 +121,10 @@ def _interpolated(trajectory: Trajectory, stream: str) -> Finding | None:
     return graded("interpolated", stream, displaced_m, share=share, displaced_m=displaced_m)
 
 
-def _rotations(trajectory: Trajectory) -> FloatArray:
-    """Return the rotations (N - 1, 3, 3) from pose to pose."""
+def _turns(trajectory: Trajectory) -> FloatArray:
+    """Return the rotation vectors (N - 1, 3) from pose to pose."""
     rotations = se3.rotation_of(trajectory.poses)
-    return np.asarray(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:])
+    return se3.rotations_between(rotations[:-1], rotations[1:])
 
 
 def step_excess(trajectory: Trajectory) -> tuple[tuple[FloatArray, FloatArray], ...]:
@@ -139,7 +139,7 @@ def step_excess(trajectory: Trajectory) -> tuple[tuple[FloatArray, FloatArray], 
     rotations = se3.rotation_of(trajectory.poses)
     displacements = np.diff(se3.translation_of(trajectory.poses), axis=0)
     translations = np.einsum("kji,kj->ki", rotations[:-1], displacements)
-    turns = se3.rotation_log(_rotations(trajectory))
+    turns = _turns(trajectory)
     return tuple(_excess(steps / seconds) for steps in (translations, turns))
 
 

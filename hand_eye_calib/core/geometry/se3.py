@@ -173,6 +173,11 @@ def rotation_log(rotation: ArrayLike) -> FloatArray:
     return quat_log(_scaled_quats(rotation.reshape(-1, 3, 3))).reshape(rotation.shape[:-1])
 
 
+def rotations_between(start: FloatArray, end: FloatArray) -> FloatArray:
+    """Return the rotation vectors (N, 3) from orientations (N, 3, 3) to others, in their axes."""
+    return rotation_log(np.swapaxes(start, 1, 2) @ end)
+
+
 def quat_log(quat_xyzw: FloatArray) -> FloatArray:
     """Return rotation vectors (N, 3), rad, of quaternions (N, 4) of any length and sign."""
     vector = quat_xyzw[:, :3]

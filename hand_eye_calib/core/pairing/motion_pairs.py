@@ -224,7 +224,7 @@ class MotionPairs(Columns):
         )
         via_parent = se3.rotation_of(self.Ts_parenti_parentj) @ rotation
         via_child = rotation @ se3.rotation_of(self.Ts_childi_childj)
-        return of_translation, se3.rotation_log(np.swapaxes(via_parent, 1, 2) @ via_child)
+        return of_translation, se3.rotations_between(via_parent, via_child)
 
 
 def motion_pairs(Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, reference: str) -> MotionPairs:

@@ -29,7 +29,7 @@ from hand_eye_calib.core.checks.streams import check_flat
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.noise.increments import without_rate_bias
-from hand_eye_calib.core.pairing.motion_pairs import PosePairs, pairs_over, synchronise
+from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over, synchronise
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
 from hand_eye_calib.extras.partial.copies import as_errors, copied
@@ -242,7 +242,11 @@ def _rotation_vectors(
     pairs: PosePairs, lag_s: float = agreement.SHORT_S
 ) -> tuple[FloatArray, FloatArray]:
     """Rotation vectors (K, 3) of parent and child over a time, each in its own sensor frame."""
-    motions = pairs_over(pairs, lag_s, _MOST_MOTIONS)
+    return _usable_vectors(pairs_over(pairs, lag_s, _MOST_MOTIONS))
+
+
+def _usable_vectors(motions: MotionPairs) -> tuple[FloatArray, FloatArray]:
+    """Rotation vectors (K, 3) of the motions of parent and child that have a clear axis."""
     of_parent = se3.rotation_log(se3.rotation_of(motions.Ts_parenti_parentj))
     of_child = se3.rotation_log(se3.rotation_of(motions.Ts_childi_childj))
     angles = np.maximum(np.linalg.norm(of_parent, axis=1), np.linalg.norm(of_child, axis=1))
@@ -266,7 +270,7 @@ def _check_unit(streams: _Streams) -> list[Finding]:
 def _rates(stream: Trajectory) -> FloatArray:
     """Return the rates (N - 1, 3) between the rotations of a stream, rad/s."""
     rotations = se3.rotation_of(stream.poses)
-    turns = se3.rotation_log(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:])
+    turns = se3.rotations_between(rotations[:-1], rotations[1:])
     return np.asarray(turns / (np.diff(stream.stamps_ns) * 1e-9)[:, None])
 
 
@@ -298,7 +302,7 @@ def _check_conventions(streams: _Streams) -> list[Finding]:
 def _unexplained(pairs: PosePairs) -> float:
     """Return the share of the rotations that no extrinsic rotation explains."""
     motions = pairs_over(pairs, agreement.SHORT_S, _MOST_MOTIONS)
-    of_parent, of_child = _rotation_vectors(pairs)
+    of_parent, of_child = _usable_vectors(motions)
     residuals = of_child @ align_rotation_vectors(motions).T - of_parent
     usual_rad = max(median(np.linalg.norm(of_parent, axis=1)), 1e-12)
     return median(np.linalg.norm(residuals, axis=1)) / usual_rad

@@ -240,11 +240,12 @@ def _motion(
         Whether the measured stream has rates.
     """
     before_2, before, after, after_2, _ = around
-    rates = _turns(stream[before], stream[after]) / (2.0 * around.step_s)
-    turns = _turns(stream[after], stream[after_2]) - _turns(stream[before_2], stream[before])
-    accelerations = turns / (3.0 * around.step_s**2)
+    rates = se3.rotations_between(stream[before], stream[after]) / (2.0 * around.step_s)
+    turn_after = se3.rotations_between(stream[after], stream[after_2])
+    turn_before = se3.rotations_between(stream[before_2], stream[before])
+    accelerations = (turn_after - turn_before) / (3.0 * around.step_s**2)
     bends = se3.times(orientations, accelerations)
-    turns = _turns(stream[:-1], stream[1:])
+    turns = se3.rotations_between(stream[:-1], stream[1:])
     steps = turns / np.diff(stamps_s)[:, None]
     halfway = orientations[:-1] @ se3.rotation_exp(0.5 * turns)
     if has_rates:
@@ -262,8 +263,3 @@ def _motion(
         gains=_integral(stamps_s, gains),
         shears=_integral(stamps_s, shears),
     )
-
-
-def _turns(start: FloatArray, end: FloatArray) -> FloatArray:
-    """Return the rotation vectors (N, 3) from orientations (N, 3, 3) to others."""
-    return se3.rotation_log(np.swapaxes(start, 1, 2) @ end)
