@@ -325,11 +325,21 @@ class CalibratorConfig(OptionSet):
         kinds = {measure.kind for measure in partial}
         reasons = [measure.needs_poses for measure in partial if measure.needs_poses]
         if len(kinds) == 1 and not (reasons and len(partial) == 2):
+            self._require_order()
             return kinds.pop()
         reason = reasons[0] if reasons else "these kinds of streams cannot be calibrated together"
         raise ConfigError(
             f"{reason}; the parent measures {self.parent_measures}, the child {self.child_measures}"
         )
+
+    def _require_order(self) -> None:
+        """Check that the child does not measure what only the parent may measure."""
+        measured = self.child_measures
+        if measured != "auto" and MEASURES[measured].is_parent:
+            raise ConfigError(
+                f"{measured} can only be the parent: exchange the streams, "
+                f"the one with {measured} first"
+            )
 
     def require_poses(self, request: str) -> None:
         """Check that both sensors measure whole poses.

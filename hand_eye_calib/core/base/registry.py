@@ -82,11 +82,14 @@ class Measure(NamedTuple):
         Reason why the other stream must measure poses; empty if it may measure the same quantity.
     read_as : str
         Quantity that is read from messages; empty for the measured one.
+    is_parent : bool
+        Whether only the parent may measure it.
     """
 
     kind: str
     needs_poses: str = ""
     read_as: str = ""
+    is_parent: bool = False
 
 
 class ExtraRule(NamedTuple):

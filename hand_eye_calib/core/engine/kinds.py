@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from hand_eye_calib.core.base.config import CalibratorConfig
-from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.registry import KINDS
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.results.calibration import Calibration
@@ -57,14 +56,8 @@ class Kind:
         """
         for name, values in self.allowed.items():
             value = getattr(config, name)
-            if value in values:
-                continue
-            if name == "child_measures":
-                raise ConfigError(
-                    f"{value} can only be the parent: exchange the streams, "
-                    f"the one with {value} first"
-                )
-            config.require_poses(f"{name} {value}")
+            if value not in values:
+                config.require_poses(f"{name} {value}")
 
 
 def kind_of(config: CalibratorConfig) -> Kind:

@@ -19,8 +19,9 @@ from hand_eye_calib.core.base.registry import (
 
 def register() -> None:
     """Register vehicles as a kind of data, their parameters, and readers of wheel data."""
+    needs = "wheels need the poses of a sensor"
     for word in ("wheels", "wheel_odometry", "steering", "omni", "driving"):
-        MEASURES[word] = Measure("vehicle", "wheels need the poses of a sensor", "poses")
+        MEASURES[word] = Measure("vehicle", needs, read_as="poses", is_parent=True)
     OUT_OF_REACH["vehicle"] = ("z",)
     OUT_OF_REACH["vehicle_2d"] = ("z", "roll", "pitch")
     OUT_OF_REACH["vehicle_alone"] = ("y", "z")

@@ -71,7 +71,6 @@ _ALLOWED: dict[str, tuple[object, ...]] = {
     "scale": ("none", "auto"),
     "parent_scale": (1.0,),
     "parent_kind": ("odometry",),
-    "child_measures": ("auto", "poses"),
 }
 
 

@@ -36,12 +36,12 @@ Y = 1
 TILT = (2, 3)
 YAW = 4
 CLOCK = 5
-SLIP = 6
-N_FIXED = 7
 
 # Prior standard deviations of these unknowns. They keep the iteration in bounds. That of the slip
 # angle is real: the rear axles of cars have 0.003 to 0.007 (2 to 4 deg per g).
 _PRIOR_SIGMAS = (3.0, 3.0, 1.0, 1.0, 1.0, 0.2, 0.005)
+# Number of unknowns before the parameters of the wheels.
+N_FIXED = len(_PRIOR_SIGMAS)
 # Prior standard deviation of a parameter of the wheels: a share of its start, and an offset.
 _PARAMETER_SHARE = 0.3
 _PARAMETER_SIGMA = 0.03
