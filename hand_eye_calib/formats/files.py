@@ -102,9 +102,21 @@ def reading_memory() -> Iterator[None]:
 
 
 def local_path(source: str | Path) -> Path:
-    """Return a source as path; ``sample:NAME`` is a recording in the package."""
-    name = str(source)
-    return _SAMPLES / name.removeprefix("sample:") if name.startswith("sample:") else Path(source)
+    """Return a source as path; ``sample:NAME`` is a recording in the package.
+
+    Raises
+    ------
+    InputError
+        If the package has no sample of this name.
+    """
+    scheme, _, name = str(source).partition(":")
+    if scheme != "sample":
+        return Path(source)
+    samples = sorted(path.name for path in _SAMPLES.iterdir())
+    if name not in samples:
+        wanted = printable(str(source))
+        raise InputError(f"there is no {wanted}; the samples are {', '.join(samples)}")
+    return _SAMPLES / name
 
 
 def path_of(name: str, value: Any) -> Path:

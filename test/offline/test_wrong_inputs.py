@@ -14,6 +14,9 @@ TABLE = """
 2 | calibrate lidar.tum | lidar.tum is one trajectory file: pass those of two sensors
 2 | calibrate lidar.tum lidar.tum | lidar.tum appears twice
 1 | calibrate lidr.tum camera.tum | did you mean lidar.tum?
+2 | calibrate sample:lidr.tum camera.tum | no sample:lidr.tum; the samples are arm.yaml, camera.tum
+2 | calibrate sample:../x camera.tum | there is no sample:../x; the samples are
+1 | info sample:nothing | there is no sample:nothing; the samples are
 1 | calibrate empty.tum camera.tum | empty.tum: the file contains no poses; expected lines of 8
 1 | calibrate comment.tum camera.tum | comment.tum: the file contains no poses
 1 | calibrate one.tum camera.tum | the streams do not overlap in time

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import hand_eye_calib.core.base.config as config
-from hand_eye_calib.core.base.errors import ConfigError, printable
+from hand_eye_calib.core.base.errors import ConfigError, InputError, printable
 from hand_eye_calib.core.base.option import Options, OptionValue, check_value, did_you_mean
 from hand_eye_calib.core.base.text import quantities
 from hand_eye_calib.formats.files import local_path
@@ -462,4 +462,9 @@ def add_json_argument(parser: argparse._ActionsContainer, or_verbose: bool = Fal
 
 def _path(text: str) -> Path | str:
     """Return a path; a URL stays a text, because a path would lose one of its two slashes."""
-    return text if "://" in text else local_path(text)
+    if "://" in text:
+        return text
+    try:
+        return local_path(text)
+    except InputError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
