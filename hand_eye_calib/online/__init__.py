@@ -1,4 +1,4 @@
-"""The live session, the ROS node around it, and its views for a person."""
+"""The live session, the ROS node that runs it, and the views of it in a terminal and a browser."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ from hand_eye_calib.core.base.registry import COMMANDS, RESULT_PARTS, Command
 
 
 def register() -> None:
-    """Register the commands ``calibrator`` and ``watch``, and the goal of a session."""
+    """Register the commands ``calibrator`` and ``watch``, and the part ``goal`` of a result."""
     RESULT_PARTS["goal"] = _goal
     COMMANDS["calibrator"] = Command("run the ROS 2 node", _calibrator)
     COMMANDS["watch"] = Command("display the live node on the terminal, or in a browser", _watch)

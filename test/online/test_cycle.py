@@ -102,7 +102,7 @@ def test_what_somebody_asks_for_is_checked_and_other_solves_are_every_half_minut
     for is_asked in (False, False, True):
         cycle._session.calibrator.add_pose("parent", len(cycle.jobs), [0, 0, 0], [0, 0, 0, 1])
         cycle.is_solving = False
-        cycle._asked = {}
+        cycle._waiting = {}
         cycle.ask(lambda good, text: None) if is_asked else cycle.start_if_due()
     assert [job.check for job in cycle.jobs] == [False, True, False, True]
 

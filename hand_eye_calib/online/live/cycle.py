@@ -1,4 +1,9 @@
-"""Solves and stream checks of the node: their schedule, their results, and the waiting callers."""
+"""Solves and stream checks of a live session: when they run, and what becomes of their results.
+
+Solves run in a process of their own, see ``solving.py``. A :class:`SolveCycle` sends a copy of the
+engine to this process as soon as there are new poses, receives the answer, and decides whether the
+new result becomes the result of the session.
+"""
 
 import time
 from collections.abc import Callable, Sequence
@@ -44,10 +49,10 @@ from hand_eye_calib.online.live.state import (
 )
 from hand_eye_calib.online.live.stream_checks import RAW_POSE_CODES, StreamChecks, merged
 
-# Callback with the success of a solve and a line of text about it.
+# Callback that receives the success of a solve and a line of text about the result.
 OnSolved: TypeAlias = Callable[[bool, str], None]
 
-# Least time between two stream checks (s). A check takes one or two seconds.
+# Shortest time between two stream checks (s). A check takes one or two seconds.
 _CHECK_PERIOD_S = 30.0
 
 # Options that change the verdict on a result, but not the result.
@@ -55,9 +60,9 @@ _TARGETS = ("target_translation", "target_rotation", "target_axes")
 
 
 class SolveCycle:
-    """Exchange of snapshots and answers with the solving process.
+    """Sends jobs to the solving process, and keeps the result of the session.
 
-    At most one job runs at a time. A result of an older session is dropped.
+    At most one job runs at a time. The answer to a job of an older session is dropped.
 
     Parameters
     ----------
@@ -76,9 +81,9 @@ class SolveCycle:
     ----------
     is_solving : bool
     result : Calibration or None
-        Result of the session: the newest usable result or, once the goal is reached, the result
-        that the goal keeps. The warnings explain why a newer result was not taken. If the motion
-        contradicts a prior, a result with the verdict DO NOT USE replaces it.
+        Result of the session: the newest usable result or, once the goal is reached, the best
+        result of the goal. If a newer result was worse, the warnings name its values. If the motion
+        contradicts a prior, this is a result with the verdict DO NOT USE.
     """
 
     def __init__(
@@ -100,16 +105,16 @@ class SolveCycle:
         # Earliest start of the next solve (steady time, s).
         self._rest_until_s = 0.0
         # Callbacks that wait for a solve, with the time of the request (steady time, s).
-        self._asked: dict[OnSolved, float] = {}
-        # Callbacks that the current job answers.
-        self._in_flight: tuple[OnSolved, ...] = ()
+        self._waiting: dict[OnSolved, float] = {}
+        # Callbacks that were waiting when the current job started; its answer goes to them.
+        self._in_job: tuple[OnSolved, ...] = ()
         self._process = SolvingProcess(wake)
         self.restart()
 
     def restart(self) -> None:
         """Begin a new session without a result."""
         self.result: Calibration | None = None
-        # Copy of the calibrator that was solved for the result, and options that checks had set.
+        # Copy of the engine from which the result was computed, and options that checks had set.
         self._solved: tuple[Calibrator, Options] | None = None
         self._solved_at_s = 0.0
         # Motion of the session so far.
@@ -120,12 +125,12 @@ class SolveCycle:
         self._failure: Failure | None = None
         # Time of the first failure (steady time, s) if every solve since the result has failed.
         self._failing_since_s: float | None = None
-        # Sentences of the reasons that were logged as warnings, by their rules.
+        # Sentences of the reasons for a verdict that were logged as warnings, by their rules.
         self._warned: dict[str, str] = {}
-        # Options that checks of this session set, and the warnings about them.
+        # Options that checks of this session have set, and the warnings about these options.
         self._check_options: Options = {}
         self._option_warnings: tuple[str, ...] = ()
-        # Whether there are poses that no check has used.
+        # Whether there are poses or options that no check has used.
         self._is_unchecked = False
         # Earliest time of the next check (steady time, s).
         self._check_due_s = 0.0
@@ -133,10 +138,15 @@ class SolveCycle:
         self.goal.restart()
 
     def follow(self, config: CalibratorConfig, before: CalibratorConfig) -> None:
-        """Start over with other options than before, and check at once.
+        """Apply changed options; check the streams again at once.
 
-        If only targets have changed, the result stays and gets a new verdict at once, because the
-        robot may be parked by now.
+        If only targets have changed, the result stays and its verdict is computed anew, because the
+        robot may be parked by now. Otherwise the goal starts over.
+
+        Parameters
+        ----------
+        config, before : CalibratorConfig
+            New and former options.
         """
         self._check_options = {}
         self._option_warnings = ()
@@ -190,13 +200,16 @@ class SolveCycle:
         )
 
     def result_to_save(self) -> Calibration | None:
-        """Return the result or None. A warning is added if all later solves have failed."""
+        """Return the result; None if there is none.
+
+        If every later solve has failed, the result has a warning about this failure.
+        """
         if self.result is None or self.standing is not Standing.OUTDATED:
             return self.result
         return replace(self.result, warnings=(*self.result.warnings, self.problem))
 
     def snapshot(self) -> Snapshot | None:
-        """Return the poses and options of the result; None without a result."""
+        """Return the poses and options from which the result was computed; None without one."""
         if self._solved is None:
             return None
         calibrator, options = self._solved
@@ -206,17 +219,20 @@ class SolveCycle:
 
     def ask(self, on_solved: OnSolved) -> None:
         """Solve as soon as possible, and call ``on_solved`` with the answer."""
-        self._asked[on_solved] = time.monotonic()
+        self._waiting[on_solved] = time.monotonic()
         if not self.is_solving:
             self._start()
 
     def answer_overdue(self) -> None:
-        """Answer callers that have waited too long; the solve continues. To be called often."""
+        """Answer the callers that have waited too long, while the solve goes on.
+
+        This method must be called often.
+        """
         now_s = time.monotonic()
-        for on_solved, asked_s in list(self._asked.items()):
+        for on_solved, asked_s in list(self._waiting.items()):
             if asked_s >= now_s - ANSWER_WITHIN_S:
                 continue
-            del self._asked[on_solved]
+            del self._waiting[on_solved]
             text = f"still solving after {ANSWER_WITHIN_S:g} s (is the processor busy?)"
             on_solved(False, f"{text}: the result will be in the log and on the topics")
 
@@ -229,16 +245,17 @@ class SolveCycle:
             self._start()
 
     def take_answers(self) -> None:
-        """Process the answers of the solving process and call the waiting callbacks."""
+        """Process the answers of the solving process, and call the callbacks of their jobs."""
         for answer in self._process.answers():
             is_good, text = self.conclude(answer)
             self.is_solving = False
             self._publish()
-            for on_solved in self._in_flight:
-                if self._asked.pop(on_solved, None) is not None:
+            for on_solved in self._in_job:
+                # A caller that has waited too long has an answer already.
+                if self._waiting.pop(on_solved, None) is not None:
                     on_solved(is_good, text)
-            self._in_flight = ()
-            if self._asked:
+            self._in_job = ()
+            if self._waiting:
                 self._start()
 
     def stop(self, timeout_s: float) -> None:
@@ -252,9 +269,10 @@ class SolveCycle:
         now_s = time.monotonic()
         self.is_solving = True
         self._is_unchecked |= self._session.has_new_poses
-        self._in_flight = tuple(self._asked)
+        self._in_job = tuple(self._waiting)
         # A requested result needs up-to-date findings, even if no check is due.
-        check = self._is_unchecked and (now_s >= self._check_due_s or bool(self._in_flight))
+        is_due = now_s >= self._check_due_s or bool(self._in_job)
+        check = self._is_unchecked and is_due
         if check:
             self._is_unchecked = False
             self._check_due_s = now_s + _CHECK_PERIOD_S
@@ -264,7 +282,7 @@ class SolveCycle:
     # ------------------------------------------------------------------ answers
 
     def conclude(self, answer: Answer) -> Outcome:
-        """Process an answer; return whether it is good, and a line of text about it."""
+        """Process an answer; return the success of the solve, and a line of text about it."""
         if answer.session != self._session.number:
             return False, "the session was reset during the solve: the result is dropped"
         # Pause for the duration of the solve, so that half of the processor time stays free.
@@ -279,7 +297,7 @@ class SolveCycle:
             self._failure = self._failure or Failure(text, is_early=True)
         text = self._report(self._failure) if self._failure is not None else ""
         if calibration is None:
-            self._keep_result(self._why_no_calibration())
+            self._keep_result(self._advice_after_failure())
             return False, text
         newest = self._with_warnings(calibration)
         if newest.status is SolveStatus.CONTRADICTED:
@@ -290,14 +308,14 @@ class SolveCycle:
             return False, self._describe(newest)
         return self._take(self._complete(newest))
 
-    def _why_no_calibration(self) -> str:
-        """Return the motion that is missing, or why the newest solve has failed."""
+    def _advice_after_failure(self) -> str:
+        """Return which motion is missing; if none, why the newest solve has failed."""
         missing = "" if is_too_little(self._motion) else what_is_missing(self._motion)
         failure = self._failure.what if self._failure is not None else ""
         return missing or failure
 
     def _with_warnings(self, calibration: Calibration) -> Calibration:
-        """Return a calibration with the findings and the warnings of the session, and log these."""
+        """Return a calibration with findings and warnings of the session; log the warnings."""
         warnings = tuple(dict.fromkeys((*self._option_warnings, *calibration.warnings)))
         for warning in warnings:
             self._log.warning(warning)
@@ -305,7 +323,7 @@ class SolveCycle:
 
     def _take_motion(self, answer: Answer) -> None:
         """Store motion and clock offset of an answer."""
-        # Keep the largest rotation so far: the measured rotation can decrease with more poses.
+        # The estimated rotation can decrease with more poses, so keep the largest so far.
         rotation = np.maximum(self._motion.rotation, answer.motion.rotation)
         self._motion = replace(answer.motion, rotation=rotation)
         self._newest_motion = answer.newest_motion
@@ -322,9 +340,9 @@ class SolveCycle:
             self._check_due_s = 0.0
 
     def _keep_result(self, advice: str) -> None:
-        """Keep the result after a failed solve, and mark it as outdated.
+        """Keep the result after a failed solve, and mark the result as outdated.
 
-        The advice becomes the progress of a session without a result.
+        Without a result, the advice becomes the progress of the session.
         """
         self.goal.wait(advice)
         if self._failing_since_s is None:
@@ -333,7 +351,7 @@ class SolveCycle:
     def _refute(self, newest: Calibration) -> Outcome:
         """Replace the result by a calibration whose prior the motion contradicts.
 
-        The earlier result is neither published nor saved any more.
+        From now on, the earlier result is neither published nor saved.
         """
         self.goal.add(newest, self._motion, self.checks.faults())
         self._solved = self._submitted, self._check_options
@@ -347,7 +365,7 @@ class SolveCycle:
         self._failing_since_s = None
 
     def _take(self, newest: Calibration) -> Outcome:
-        """Make a usable calibration the session's result, unless the goal keeps a better result."""
+        """Make a usable calibration the session's result, unless the goal has a better one."""
         was_done = self.goal.progress.done
         faults = self.checks.faults()
         progress = self.goal.add(newest, self._motion, faults, self._newest_motion)
@@ -371,10 +389,10 @@ class SolveCycle:
         return result.status is SolveStatus.OK, self._describe(result, every_s)
 
     def _describe(self, calibration: Calibration, every_s: float = GOES_ON_S) -> str:
-        """Return a line about a calibration with its reasons and warnings, and log what is new.
+        """Return a line about a calibration with its reasons and warnings; log what is new.
 
-        Reasons are logged only if more motion would not help; before, the progress names what to
-        do.
+        As long as more motion helps, the progress names what to do. So the reasons for the verdict
+        are logged only if more motion does not help.
         """
         texts = [describe(calibration)]
         progress = self.goal.progress
@@ -383,7 +401,7 @@ class SolveCycle:
         for reason in calibration.reasons:
             text = f"{reason.sentence}; {reason.what_to_do}"
             texts.append(text)
-            # Findings are in the log already.
+            # The stream checks have logged the findings.
             if is_final and not reason.is_finding:
                 self._log.warning(f"{reason.verdict.value}: {text}")
                 self._warned[reason.rule] = reason.sentence
@@ -395,8 +413,8 @@ class SolveCycle:
     def _with_findings(self, calibration: Calibration) -> Calibration:
         """Return the calibration with the findings of the stream checks.
 
-        A calibration from positions, rotations or rates keeps its own findings. Only findings about
-        the received poses are added.
+        A calibration from positions, rotations or rates has findings of its own. To these, only
+        findings about the received poses are added.
         """
         findings = self.checks.findings
         if calibration.measured != "poses":
@@ -426,8 +444,9 @@ class SolveCycle:
         Parameters
         ----------
         accepts_poses : bool
+            Whether the inputs accept poses.
         tf_static : tuple of Broadcast and str
-            Whether the result is broadcast on /tf_static, and the reason.
+            Whether the result is broadcast on /tf_static, and the reason if it is not.
         """
         motion = self._motion
         level, text = self._condition(accepts_poses, tf_static)
@@ -460,8 +479,8 @@ class SolveCycle:
         if failure is not None and failure.details:
             return Level.ERROR, f"the solve failed unexpectedly, see the log: {failure.what}"
         if result is not None and self.problem:
-            joint = ": " if self.standing is Standing.REFUTED else ", but "
-            return Level.WARN, f"{result.verdict.value}{joint}{self.problem}"
+            separator = ": " if self.standing is Standing.REFUTED else ", but "
+            return Level.WARN, f"{result.verdict.value}{separator}{self.problem}"
         if not accepts_poses:
             return Level.WARN, "poses are not accepted: call ~/set_enabled, or activate the node"
         if result is None:
@@ -484,7 +503,7 @@ class SolveCycle:
     ) -> ProgressState:
         """Return the diagnostics of the progress towards the targets.
 
-        The level is WARN if a person should do something else than continue the motion.
+        The level is OK if the person should continue the motion, otherwise WARN.
 
         Parameters
         ----------
@@ -492,7 +511,7 @@ class SolveCycle:
             Reason why the result is not compared with the installed transform; empty if no
             comparison was requested.
         pause : tuple of Level and str
-            Severity and reason if no poses arrive, of
+            Level and reason if no poses arrive, as returned by
             :func:`~hand_eye_calib.online.live.describing.pause_of`.
         """
         progress = self.goal.progress

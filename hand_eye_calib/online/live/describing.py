@@ -1,4 +1,4 @@
-"""Words and values about the results of a session, for its state, its log and its topics."""
+"""Texts and values about the results of a session, for the state of the node and the log."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -16,13 +16,17 @@ from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.online.live.progress import AXIS_KEYS
 from hand_eye_calib.online.live.state import Condition, InputState, Level, ResultState, as_printed
 
-# Least motion (s) or rotation (rad) of a result. Before, estimates and advice jump.
-_LEAST_MOTION_S = 20.0
-_LEAST_ROTATION_RAD = float(np.radians(30.0))
+# Motion (s) or rotation (rad) from which on a first result is accepted: one of them suffices. With
+# less of both, estimates and advice jump.
+_MIN_MOTION_S = 20.0
+_MIN_ROTATION_RAD = float(np.radians(30.0))
 
 
 def pause_of(inputs: Mapping[str, InputState], accepts_poses: bool) -> Condition:
-    """Return severity and reason if no poses arrive; level OK and an empty text otherwise."""
+    """Return level and reason if no poses arrive; otherwise level OK and an empty text.
+
+    The level is OK if every input rests and its state permits that: the robot is parked.
+    """
     if not accepts_poses:
         return (
             Level.WARN,
@@ -41,35 +45,38 @@ def pause_of(inputs: Mapping[str, InputState], accepts_poses: bool) -> Condition
 
 
 def is_too_little(motion: Excitation) -> bool:
-    """Whether the motion is too short for a result."""
-    has_rotated = motion.rotation.max() >= _LEAST_ROTATION_RAD
-    return bool(motion.motion_s < _LEAST_MOTION_S and not has_rotated)
+    """Whether the motion is too short for a first result."""
+    has_rotated = motion.rotation.max() >= _MIN_ROTATION_RAD
+    return bool(motion.motion_s < _MIN_MOTION_S and not has_rotated)
 
 
 def too_little_in_words(motion: Excitation) -> str:
-    """Return what a first result needs, and the motion so far."""
+    """Return a sentence about the motion that a first result needs, and the motion so far."""
     rotation_deg = np.degrees(motion.rotation.max())
     return (
-        f"Move the sensors: a first result takes {_LEAST_MOTION_S:g} s of motion or a rotation of "
-        f"{np.degrees(_LEAST_ROTATION_RAD):.0f} deg, so far {motion.motion_s:.0f} s and "
+        f"Move the sensors: a first result takes {_MIN_MOTION_S:g} s of motion or a rotation of "
+        f"{np.degrees(_MIN_ROTATION_RAD):.0f} deg, so far {motion.motion_s:.0f} s and "
         f"{rotation_deg:.0f} deg."
     )
 
 
 def with_newest_halves(kept: Calibration, newest: Calibration) -> Calibration:
-    """Return the kept result with the newest comparison of both halves of the recording."""
+    """Return the kept result with the newest difference between both halves of the recording.
+
+    The cross-check solves both halves apart. Its newest values contain all poses so far.
+    """
     if newest.cross_check is None or kept.cross_check is None:
         return kept
     rows = {}
     for axis, row in kept.cross_check.items():
-        newer = newest.cross_check[axis]
-        excess = newer.excess_of_halves
-        rows[axis] = replace(row, of_halves=newer.of_halves, excess_of_halves=excess)
+        newest_row = newest.cross_check[axis]
+        excess = newest_row.excess_of_halves
+        rows[axis] = replace(row, of_halves=newest_row.of_halves, excess_of_halves=excess)
     return replace(kept, cross_check=rows)
 
 
 def with_axis_keys(comparison: Comparison) -> Comparison:
-    """Return the comparison with its differences by ``AXIS_KEYS``."""
+    """Return the comparison with its differences by the axis names of topics, ``AXIS_KEYS``."""
     differences = []
     for difference in comparison.differences:
         axes = {AXIS_KEYS[axis]: row for axis, row in difference.axes.items()}
@@ -83,13 +90,13 @@ def is_refuted(result: Calibration) -> bool:
 
 
 def priors_of(config: CalibratorConfig) -> dict[str, str]:
-    """Return the priors of the options by axis, as typed by the user."""
+    """Return the priors that are set, by axis, as the user has typed them."""
     priors = {axis: getattr(config, f"prior_{axis}") for axis in AXES}
     return {axis: text for axis, text in priors.items() if text}
 
 
 def state_of_result(result: Calibration, age_s: float) -> ResultState:
-    """Return the diagnostics of a result of an age (s)."""
+    """Return the diagnostics of a result that was computed ``age_s`` seconds ago."""
     pose = se3.xyz_rpy(result.T_parent_child)
     sigmas = result.sigmas_printed
     return ResultState(
@@ -127,6 +134,6 @@ def describe(calibration: Calibration) -> str:
 
 
 def _listed(values: FloatArray, decimals: int) -> str:
-    """Return numbers with commas; infinity is "unknown"."""
+    """Return numbers as a text with commas; infinity becomes "unknown"."""
     texts = [f"{value:.{decimals}f}" for value in values]
     return ", ".join(texts).replace("inf", "unknown")

@@ -1,12 +1,15 @@
-"""Progress of a recording session.
+"""Goal of a recording session: every axis is within its target standard deviation.
 
-It has the distance to the target on each axis, the time left, the most helpful motion, and whether
-the present motion can reach the target.
+For each new result, the goal computes the time left on each axis, names the most helpful motion,
+and decides whether the present motion can reach the targets.
 
-A session has one scale: the standard deviation of an axis, allowance included, compared with the
-target of the axis. A single standard deviation below the target is no reason to stop, because a
-short recording does not contain the time-correlated errors yet. Further motion must confirm it. The
+An axis is within its target if its standard deviation is at most the target. The standard deviation
+includes the allowance for constant errors, which no motion reduces. A single result within the
+targets is no reason to stop: a short recording does not contain the time-correlated errors yet, so
+its standard deviations are too small. Results of further motion must confirm the first result. This
 rule was chosen on simulated recordings with known truth, see docs/session.md.
+
+All motion is measured in seconds during which the sensors move.
 """
 
 from collections.abc import Sequence
@@ -23,26 +26,25 @@ from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.core.results.verdict import what_is_known
 from hand_eye_calib.online.live.progress import AXIS_KEYS, AxisProgress, Progress
 
-# Share of the motion so far, up to the newest result, in which every result must be within the
-# targets. All motion is measured in seconds of movement.
+# Motion that confirms a first result within the targets, as a share of the motion of that result.
 _CONFIRMING_SHARE = 0.5
-# Shortest and longest motion (s) that confirms a result within the targets.
-_SHORTEST_CONFIRMATION_S = 20.0
-_LONGEST_CONFIRMATION_S = 75.0
+# Bounds of the confirming motion (s).
+_MIN_CONFIRMATION_S = 20.0
+_MAX_CONFIRMATION_S = 75.0
 
-# Shortest motion (s) after which the motion may be called useless for an axis.
-_JUDGED_FROM_S = 30.0
+# Shortest motion (s) of a session in which the motion may be called useless for an axis.
+_MIN_MOTION_TO_JUDGE_S = 30.0
 
-# Times left that are reported (s). They only decrease, by one step for each result. Beyond the last
-# finite step, the present motion cannot reach the target.
+# Values (s) to which a reported time left is rounded. The reported time decreases by one step for
+# each result. Beyond the last finite step, the present motion cannot reach the target.
 _STEPS_S = np.array([0.0, 15, 30, 60, 90, 120, 180, 240, 360, 600, 900, 1200, np.inf])
 
-# A time left that is this many steps longer than the last one is a new estimate.
-_NEW_STEPS = 3
+# Increase of a time left, in steps, from which on the reported time increases, too.
+_MIN_INCREASE_STEPS = 3
 
-# Largest ratio of standard deviations at which a newer result replaces the best result: standard
-# deviations are estimates, and the newer result has more motion.
-_AS_GOOD = 1.25
+# Largest ratio of standard deviations, newest to best result, at which the newest result replaces
+# the best. Standard deviations are estimates, and the newest result has more motion.
+_MAX_RATIO_TO_BEST = 1.25
 
 # Target standard deviations of x, y, z (m), roll, pitch and yaw (rad).
 Targets: TypeAlias = Sequence[float] | FloatArray
@@ -52,7 +54,17 @@ _NO_RESULT = "No result yet: move the sensors, with rotations."
 
 @dataclass(frozen=True)
 class _Result:
-    """Standard deviations of a result without the allowance, and whether the result is usable."""
+    """Result that may confirm a later result.
+
+    Attributes
+    ----------
+    motion_s : float
+        Motion of the session up to the result (s).
+    sigmas_measured : (6,) array
+        Standard deviations without the allowance (m, rad).
+    is_usable : bool
+        Whether the solve succeeded and the streams had no faults.
+    """
 
     motion_s: float
     sigmas_measured: FloatArray
@@ -60,10 +72,10 @@ class _Result:
 
 
 class Goal:
-    """Goal of a session, compared with each new result.
+    """Compares each new result of a session with the targets, and keeps the best result.
 
-    Once the goal is reached, it stays reached, unless a result is refuted or the options change.
-    ``best`` is the newest result within the targets, unless an earlier result is clearly better.
+    Once the goal is reached, it stays reached until the motion contradicts a prior or the options
+    change.
 
     Parameters
     ----------
@@ -73,7 +85,8 @@ class Goal:
     Attributes
     ----------
     best : Calibration or None
-        Best result that reaches the goal; None before the goal is reached.
+        Newest result within the targets, or an earlier one that is clearly better. None before
+        the goal is reached.
     progress : Progress
     """
 
@@ -83,37 +96,39 @@ class Goal:
 
     def restart(self) -> None:
         """Begin a new session."""
-        # Results of the newest motion, as far back as a confirmation needs them, each with more
-        # motion than the result before it.
+        # Results of the last minutes of motion, as many as a confirmation needs. The motion
+        # increases from result to result.
         self._results: list[_Result] = []
-        # Motion and faults of the newest result.
+        # Motion of the newest result, and faults of its streams.
         self._motion: Excitation | None = None
         self._faults: Sequence[str] = ()
         self._start_over(_NO_RESULT)
 
     def _start_over(self, sentence: str) -> None:
-        """Forget the progress towards the goal; the results stay."""
+        """Reset the best result and the progress; the list of results stays."""
         self.best: Calibration | None = None
+        # Standard deviation of the best result in units of the target, on its worst axis.
         self._best_ratio = np.inf
+        # Reported times left, of six axes and in all, as indices of _STEPS_S.
         self._steps = np.full(7, len(_STEPS_S) - 1)
         self.progress = self._nothing_yet(sentence)
 
     def wait(self, sentence: str) -> None:
-        """Store the reason why there is no result yet; ignored once there is a result."""
+        """Use a sentence as the progress of a session without a result; otherwise ignore it."""
         if self._motion is None:
             self.progress = self._nothing_yet(sentence)
 
     def follow(self, targets: Targets) -> None:
-        """Start over with these targets, because options have changed.
+        """Start over with new targets, because options have changed.
 
-        Earlier results still confirm the next result, because the robot may be parked by now.
+        The robot may be parked by now, so earlier results can still confirm the next result.
         """
         self._targets = np.asarray(targets, dtype=float)
         has_result = self._motion is not None
         self._start_over("Solving with the new options." if has_result else _NO_RESULT)
 
     def retarget(self, calibration: Calibration, targets: Targets) -> None:
-        """Compare the session's result with new targets; no other option has changed.
+        """Compare the session's result with new targets if no other option has changed.
 
         Parameters
         ----------
@@ -150,120 +165,127 @@ class Goal:
         if calibration.status is SolveStatus.CONTRADICTED:
             self._start_over(f"No usable result: {calibration.status.failure}.")
             return self.progress
-        needs = self._needs(calibration)
-        self._update_best(calibration, needs)
+        ratios = self._variance_ratios(calibration)
+        self._update_best(calibration, ratios)
         if self.best is not None:
-            self.progress = self._done(self.best)
+            self.progress = self._progress_at_goal(self.best)
         else:
-            self.progress = self._not_done(calibration, needs, newest_motion or motion)
+            last_minute = newest_motion or motion
+            self.progress = self._progress_before_goal(calibration, ratios, last_minute)
         return self.progress
 
     def _append(self, calibration: Calibration, motion_s: float) -> None:
-        """Store a result for the confirmation of later results.
+        """Store a result that may confirm later results.
 
-        Without more motion a result replaces the newest result, because the robot is parked.
+        If the robot is parked, the motion is the same: the result then replaces the newest one.
         """
         if self._results and motion_s <= self._results[-1].motion_s:
             motion_s = self._results.pop().motion_s
         is_usable = not self._faults and not calibration.status.failure
         self._results.append(_Result(motion_s, calibration.sigmas_measured, is_usable))
-        # The newest result that is old enough for the longest confirmation stays, too.
-        start_s = motion_s - _LONGEST_CONFIRMATION_S
+        # A confirmation also needs the last result before the longest confirming motion.
+        start_s = motion_s - _MAX_CONFIRMATION_S
         while len(self._results) > 1 and self._results[1].motion_s <= start_s:
             del self._results[0]
 
-    def _needs(self, newest: Calibration, sigmas_measured: FloatArray | None = None) -> FloatArray:
-        """Return the measured variances (6,) as multiples of the variances that the targets allow.
+    def _variance_ratios(
+        self, newest: Calibration, sigmas_measured: FloatArray | None = None
+    ) -> FloatArray:
+        """Return measured variances (6,) divided by ``target**2 - allowance**2``.
 
-        A target is reached at 1. Its variance includes the allowance, which no motion reduces. The
-        multiple is infinite if the allowance alone exceeds the target.
+        An axis is within its target if the ratio is at most 1. The ratio is infinite if the
+        allowance alone exceeds the target. It is 0 if more motion cannot improve the axis: the axis
+        has a prior, or the streams do not measure it.
 
         Parameters
         ----------
         newest : Calibration
-            Its allowance and priors count, because options may have changed in between.
+            Its allowance and priors are used, because options may have changed since an earlier
+            result.
         sigmas_measured : (6,) array, optional
-            Of an earlier result. Default: those of the newest result.
+            Standard deviations of an earlier result. Default: those of the newest result.
         """
         if sigmas_measured is None:
             sigmas_measured = newest.sigmas_measured
         allowed = self._targets**2 - newest.allowance**2
-        needs = np.full(6, np.inf)
-        np.divide(sigmas_measured**2, allowed, out=needs, where=allowed > 0.0)
-        # Motion improves neither an axis with a prior nor one out of reach of the streams.
-        needs[np.isin(AXES, newest.out_of_reach)] = 0.0
-        needs[[dof.verdict is DofVerdict.PRIOR for dof in newest.observability]] = 0.0
-        return needs
+        ratios = np.full(6, np.inf)
+        np.divide(sigmas_measured**2, allowed, out=ratios, where=allowed > 0.0)
+        ratios[np.isin(AXES, newest.out_of_reach)] = 0.0
+        ratios[[dof.verdict is DofVerdict.PRIOR for dof in newest.observability]] = 0.0
+        return ratios
 
-    def _update_best(self, newest: Calibration, needs: FloatArray) -> None:
+    def _update_best(self, newest: Calibration, ratios: FloatArray) -> None:
         """Make the newest result the best result if it reaches the goal and is not clearly worse.
 
         Parameters
         ----------
         newest : Calibration
-        needs : (6,) array
-            See :meth:`_needs`.
+        ratios : (6,) array
+            See :meth:`_variance_ratios`.
         """
         is_usable = newest.status is SolveStatus.OK and newest.verdict is not Verdict.DO_NOT_USE
-        if not is_usable or self._faults or needs.max() > 1.0:
+        if not is_usable or self._faults or ratios.max() > 1.0:
             return
         if self.best is None and self._confirmation_s(newest) > 0.0:
             return
-        ratio = float((newest.sigmas / self._targets)[needs > 0.0].max(initial=0.0))
-        if ratio <= _AS_GOOD * self._best_ratio:
+        # Axes that motion cannot improve do not count.
+        ratio = float((newest.sigmas / self._targets)[ratios > 0.0].max(initial=0.0))
+        if ratio <= _MAX_RATIO_TO_BEST * self._best_ratio:
             self.best = newest
             self._best_ratio = min(ratio, self._best_ratio)
 
     def _confirmation_s(self, newest: Calibration) -> float:
         """Return the further motion (s) that confirms the newest result; 0 if it is confirmed."""
         motion_s = self._results[-1].motion_s
-        # Motion (s) since which every result is within the targets.
-        since_s = motion_s
+        # Motion (s) of the first result in the latest run of results within the targets.
+        first_s = motion_s
         for result in reversed(self._results):
-            is_within = self._needs(newest, result.sigmas_measured).max() <= 1.0
+            is_within = self._variance_ratios(newest, result.sigmas_measured).max() <= 1.0
             if not is_within or not result.is_usable:
                 break
-            since_s = result.motion_s
-        return max(since_s + _confirmation_after(since_s) - motion_s, 0.0)
+            first_s = result.motion_s
+        return max(first_s + _confirming_motion(first_s) - motion_s, 0.0)
 
-    def _time_left(self, newest: Calibration, needs: FloatArray) -> FloatArray:
+    def _time_left(self, newest: Calibration, ratios: FloatArray) -> FloatArray:
         """Return the times (6,) of further motion (s) until each axis is within its target.
 
-        The information of an axis, the inverse of its variance, grows at the rate of the session
-        so far or of the last minute, whichever is higher: the present motion may be a better one.
+        The information of an axis is the inverse of its variance. It is assumed to grow at the
+        average rate of the session, or at that of the last minute if this rate is higher, because
+        the motion may have improved.
         """
         oldest = self._results[0]
         motion_s = self._results[-1].motion_s
-        # Shares of the information that the targets need, now and before the last minute.
-        share = 1.0 / np.maximum(needs, 1.0)
-        share_before = 1.0 / np.maximum(self._needs(newest, oldest.sigmas_measured), 1.0)
+        # Information, as a share of what the target needs, at the newest and the oldest result.
+        share = 1.0 / np.maximum(ratios, 1.0)
+        oldest_ratios = self._variance_ratios(newest, oldest.sigmas_measured)
+        oldest_share = 1.0 / np.maximum(oldest_ratios, 1.0)
         rate = share / max(motion_s, 1e-6)
         minute_s = motion_s - oldest.motion_s
-        if minute_s >= _SHORTEST_CONFIRMATION_S:
-            rate = np.maximum(rate, (share - share_before) / minute_s)
+        if minute_s >= _MIN_CONFIRMATION_S:
+            rate = np.maximum(rate, (share - oldest_share) / minute_s)
         left_s = np.full(6, np.inf)
         np.divide(1.0 - share, rate, out=left_s, where=rate > 0.0)
         return left_s
 
-    def _not_done(
-        self, newest: Calibration, needs: FloatArray, newest_motion: Excitation
+    def _progress_before_goal(
+        self, newest: Calibration, ratios: FloatArray, newest_motion: Excitation
     ) -> Progress:
         """Return the progress before the goal is reached.
 
         Parameters
         ----------
         newest : Calibration
-        needs : (6,) array
-            See :meth:`_needs`.
+        ratios : (6,) array
+            See :meth:`_variance_ratios`.
         newest_motion : Excitation
             The motion of the last minute.
         """
         motion_s = self._results[-1].motion_s
-        left_s = self._time_left(newest, needs)
+        left_s = self._time_left(newest, ratios)
         total_s = float(left_s.max())
         if total_s > 0.0:
             # The confirmation begins when the last axis is within its target.
-            total_s += _confirmation_after(motion_s + total_s)
+            total_s += _confirming_motion(motion_s + total_s)
         else:
             total_s = self._confirmation_s(newest)
         *axes_left_s, total_s = self._in_steps(np.append(left_s, total_s))
@@ -274,8 +296,8 @@ class Goal:
             is_faulty=bool(self._faults),
             axes=axes,
         )
-        if needs.max() > 1.0:
-            progress = self._with_advice(progress, newest, needs, newest_motion)
+        if ratios.max() > 1.0:
+            progress = self._with_advice(progress, newest, ratios, newest_motion)
         reason = self._reason_to_stop(newest)
         return replace(progress, sentence=reason) if reason else progress
 
@@ -283,19 +305,20 @@ class Goal:
         self,
         progress: Progress,
         newest: Calibration,
-        needs: FloatArray,
+        ratios: FloatArray,
         newest_motion: Excitation,
     ) -> Progress:
-        """Return the progress with the axis that is farthest from its target, and what helps.
+        """Return the progress with its limiting axis, and with the motion that helps this axis.
 
-        An axis whose target is below the allowance counts only if all others are within theirs.
+        The limiting axis is the one farthest from its target. An axis whose allowance exceeds its
+        target is chosen only if all other axes are within their targets.
         """
-        is_too_small = newest.allowance >= self._targets
-        reachable = np.where(is_too_small, 0.0, needs)
-        limiting = int(np.argmax(reachable if reachable.max() > 1.0 else needs))
+        is_out_of_reach = newest.allowance >= self._targets
+        reachable = np.where(is_out_of_reach, 0.0, ratios)
+        limiting = int(np.argmax(reachable if reachable.max() > 1.0 else ratios))
         axis = AXES[limiting]
         row = progress.axes[AXIS_KEYS[axis]]
-        if is_too_small[limiting]:
+        if is_out_of_reach[limiting]:
             return replace(
                 progress,
                 sentence=_too_small_in_words(axis, row.target, newest.allowance[limiting]),
@@ -303,16 +326,16 @@ class Goal:
                 will_not_get_there=True,
                 target_is_too_small=True,
             )
-        is_right = _is_helpful(newest_motion, axis)
-        is_long = self._results[-1].motion_s >= _JUDGED_FROM_S
-        will_not_get_there = is_long and row.seconds_left == np.inf and not is_right
+        is_helpful = _is_helpful(newest_motion, axis)
+        is_long = self._results[-1].motion_s >= _MIN_MOTION_TO_JUDGE_S
+        will_not_get_there = is_long and row.seconds_left == np.inf and not is_helpful
         assert self._motion is not None
         motion = helpful_motion([axis], self._motion)
         axis_text = axes_in_words([axis])
         if will_not_get_there:
             sentence = f"This motion will not determine {axis_text} well enough: {motion}."
         else:
-            if is_right:
+            if is_helpful:
                 motion = "this motion is right, more of it"
             if np.isfinite(progress.seconds_left):
                 left = duration(progress.seconds_left)
@@ -326,8 +349,8 @@ class Goal:
             will_not_get_there=will_not_get_there,
         )
 
-    def _done(self, best: Calibration) -> Progress:
-        """Return the progress after the goal is reached, with the axes of the kept result."""
+    def _progress_at_goal(self, best: Calibration) -> Progress:
+        """Return the progress after the goal is reached, with the axes of the best result."""
         precision = what_is_known(best)
         return Progress(
             sentence=self._reason_to_stop(best) or f"Done: {precision}. Stop and save.",
@@ -339,26 +362,28 @@ class Goal:
         )
 
     def _in_steps(self, left_s: FloatArray) -> list[float]:
-        """Round times left (7,), of each axis and in all, to steps that decrease one by one.
+        """Round times left (7,), of six axes and in all, to steps that decrease one by one.
 
-        Estimates jump; only a much longer time is a new estimate.
+        Estimates of the time left jump from result to result. So the reported time increases only
+        if the new time is longer by several steps, unknown, or follows an unknown time.
         """
         before = self._steps
-        far = len(_STEPS_S) - 1
+        infinite = len(_STEPS_S) - 1
         # 5 % tolerance: a time slightly above a step is rounded down to it.
         steps = np.searchsorted(_STEPS_S, 0.95 * left_s)
-        is_new = (before == far) | (steps == far) | (steps == 0) | (steps >= before + _NEW_STEPS)
-        # An axis that was within its target may be beyond it again by the smallest step.
+        has_infinite = (before == infinite) | (steps == infinite)
+        is_new = has_infinite | (steps == 0) | (steps >= before + _MIN_INCREASE_STEPS)
+        # An axis that was within its target may exceed it again by the smallest step.
         slower = np.clip(steps, before - 1, np.maximum(before, 1))
         self._steps = np.where(is_new, steps, slower)
         return [float(seconds) for seconds in _STEPS_S[self._steps]]
 
     def _nothing_yet(self, sentence: str) -> Progress:
-        """Progress without a result."""
+        """Return the progress of a session without a result."""
         return Progress(sentence=sentence, axes=self._by_axis(np.full(6, np.inf), [np.inf] * 6))
 
     def _by_axis(self, sigmas: FloatArray, left_s: Sequence[float]) -> dict[str, AxisProgress]:
-        """Progress by axis from standard deviations (6,) and times left."""
+        """Return the progress by axis from standard deviations (6,) and times left (6,) (s)."""
         keys = AXIS_KEYS.values()
         columns = zip(keys, sigmas.tolist(), self._targets.tolist(), left_s, strict=True)
         return {
@@ -367,7 +392,10 @@ class Goal:
         }
 
     def _reason_to_stop(self, newest: Calibration) -> str:
-        """Return the sentence to stop if the streams or the result are unusable; else empty."""
+        """Return why the session cannot continue like this; empty if streams and result are fine.
+
+        With faulty streams, the person must stop. After a failed solve, the session waits.
+        """
         if self._faults:
             return f"Stop: the streams are faulty: {self._faults[0]}."
         if newest.status.failure:
@@ -376,7 +404,11 @@ class Goal:
 
 
 def _own_faults(calibration: Calibration) -> list[str]:
-    """Errors among the findings of a result from positions, rotations or rates."""
+    """Return the findings of a result that make it unusable.
+
+    Only results from positions, rotations or rates contain findings. For poses, the stream checks
+    have them.
+    """
     return [
         reason.sentence
         for reason in calibration.reasons
@@ -384,16 +416,17 @@ def _own_faults(calibration: Calibration) -> list[str]:
     ]
 
 
-def _confirmation_after(motion_s: float) -> float:
-    """Return the motion (s) that confirms results within the targets since this motion (s)."""
+def _confirming_motion(motion_s: float) -> float:
+    """Return the motion (s) that confirms a first result within the targets at ``motion_s``."""
     share_s = _CONFIRMING_SHARE * motion_s
-    return min(max(share_s, _SHORTEST_CONFIRMATION_S), _LONGEST_CONFIRMATION_S)
+    return min(max(share_s, _MIN_CONFIRMATION_S), _MAX_CONFIRMATION_S)
 
 
 def _is_helpful(motion: Excitation, axis: str) -> bool:
-    """Whether the motion contains a rotation that reveals an axis and that a flat drive lacks.
+    """Whether the motion has a rotation that observes an axis and that a flat drive lacks.
 
-    The rotation is across the axis. The main rotation does not count, because every drive has it.
+    Rotations about the two other axes observe it. The axis with the most rotation does not count,
+    because every drive has this rotation.
     """
     main = int(np.argmax(motion.rotation))
     index = AXES.index(axis) % 3

@@ -1,8 +1,9 @@
 """One input of the session: counts its messages, checks their stamps and passes their poses on.
 
 A message whose stamp is near the last stamps is accepted at once. Any other message is held back.
-Six held messages in sequence are a real change: a gap, a bag that loops, or a clock that was reset.
-Fewer held messages have corrupt stamps; they are dropped when the stream goes on as before.
+Six messages that are held in sequence are a real change: a gap, a bag that loops, or a clock that
+was reset. If the stream goes on as before after fewer messages, the stamps of the held messages
+were corrupt, and these messages are dropped.
 """
 
 import itertools
@@ -24,24 +25,29 @@ from hand_eye_calib.online.live.session import LiveSession
 from hand_eye_calib.online.live.state import REPORT_PERIOD_S, Condition, InputState, Level
 
 # Share of lost messages from which on a person should act.
-_MUCH_LOST = 0.01
-# Share of repeated stamps from which on the stamps are useless.
-_MUCH_REPEATED = 0.5
-# Fewest messages for a share of repeated stamps.
-_FEWEST_TO_JUDGE = 20
-# Reports, one a second, over which rates and shares are computed, and a bad message is reported.
+_MAX_LOST_SHARE = 0.01
+# Share of repeated stamps above which the publisher does not set its stamps.
+_MAX_REPEATED_SHARE = 0.5
+# Fewest messages from which a share of repeated stamps is computed.
+_MIN_MESSAGES = 20
+# Number of reports, one a second, over which rates and shares are computed. A bad message is
+# reported for as many seconds.
 _REPORTS = 10
 
-# Held messages in sequence that are a real change. Fewer corrupt stamps than this come together.
+# Number of messages, held in sequence, from which on the change of their stamps is real. Corrupt
+# stamps come in shorter sequences.
 WITNESSES = 6
-# Largest distance (ns) of stamps that are near each other. A larger jump back starts a new session.
+# Largest difference (ns) of stamps that are near each other. A larger jump back begins a new
+# session.
 NEAR_NS = 1_000_000_000
-# Periods of a stream within which stamps are near each other, and after which it is paused.
+# Stamps are also near each other within this many periods of their stream. A stream that pauses for
+# longer is reported as paused.
 _PERIODS = 5
-# Longest distance (ns) of two held messages in sequence.
-_LONGEST_PAUSE_NS = 60_000_000_000
+# Longest interval (ns) between two messages that are held in sequence.
+_MAX_PAUSE_NS = 60_000_000_000
 
-# Least ratio of a gap between stamps to the time in which it arrived for a step of the clock.
+# A gap between stamps is a step of the clock if it is longer than the time in which it arrived, by
+# this factor.
 _STEP_RATIO = 2.0
 
 # Time (s) without a message after which a stream is silent. After one stream has jumped back, old
@@ -57,18 +63,18 @@ Stamped: TypeAlias = tuple[int, Any]
 
 
 class Judgement(NamedTuple):
-    """Consequences of a message.
+    """Decision of a :class:`StampGuard` about a message and about the messages it holds.
 
     Attributes
     ----------
     taken : sequence of (int, message)
-        Stamps and messages to use now, some of which were held back.
+        Stamps and messages to use now: the message, or all messages that were held.
     dropped : sequence of int
-        Corrupt stamps of held messages.
+        Corrupt stamps of held messages that are dropped.
     jumped_back : bool
         Whether the messages to use are the first of a new session.
     repeated : sequence of int
-        The stamp of a message that repeats the stamp of the last held message.
+        The message's stamp, if it repeats the stamp of the last held message.
     """
 
     taken: Sequence[Stamped] = ()
@@ -78,7 +84,7 @@ class Judgement(NamedTuple):
 
 
 class StampGuard:
-    """Checks the stamps of one stream.
+    """Checks the stamps of one stream, and holds messages until their stamps are confirmed.
 
     Attributes
     ----------
@@ -93,7 +99,8 @@ class StampGuard:
         # Until this time (steady, s), messages are older than the session.
         self._outdated_until_s = -math.inf
         self.last_ns: int | None = None
-        # The last accepted stamps. At most WITNESSES - 1 corrupt stamps come together: never half.
+        # The last accepted stamps. At most WITNESSES - 1 corrupt stamps come in sequence, so the
+        # median of these stamps is a correct one.
         self._recent_ns: deque[int] = deque(maxlen=2 * WITNESSES - 1)
         self._held: list[Stamped] = []
 
@@ -108,7 +115,7 @@ class StampGuard:
             step_ns = abs(stamp_ns - self._held[-1][0])
             if step_ns == 0:
                 return Judgement(repeated=[stamp_ns])
-            if step_ns > _LONGEST_PAUSE_NS:
+            if step_ns > _MAX_PAUSE_NS:
                 dropped = self._drop_held()
         self._held.append((stamp_ns, message))
         judgement = self._accept_held(now_s) if len(self._held) >= WITNESSES else Judgement()
@@ -120,7 +127,8 @@ class StampGuard:
         Parameters
         ----------
         now_s : float, optional
-            Steady time (s), if the session begins because another stream has jumped back.
+            Steady time (s), if the session begins because another stream has jumped back. This
+            stream's messages from before the jump are then dropped for some seconds.
         """
         if now_s is None:
             self._reset()
@@ -135,8 +143,9 @@ class StampGuard:
             self._recent_ns.append(last_ns)
 
     def period_ns(self) -> float:
-        """Return the median interval of the last accepted stamps."""
-        intervals = [late - early for early, late in itertools.pairwise(sorted(self._recent_ns))]
+        """Return the median interval (ns) of the last accepted stamps; 0 if there are too few."""
+        stamps_ns = sorted(self._recent_ns)
+        intervals = [later - earlier for earlier, later in itertools.pairwise(stamps_ns)]
         return statistics.median(intervals) if intervals else 0.0
 
     def _is_near(self, stamp_ns: int) -> bool:
@@ -146,6 +155,7 @@ class StampGuard:
         return distance_ns <= NEAR_NS or distance_ns <= _PERIODS * self.period_ns()
 
     def _accept(self, messages: list[Stamped]) -> list[Stamped]:
+        """Store the stamps of messages as accepted, and return the messages."""
         stamps_ns = [stamp_ns for stamp_ns, _ in messages]
         self._recent_ns.extend(stamps_ns)
         if self.last_ns is not None:
@@ -160,13 +170,13 @@ class StampGuard:
         return dropped
 
     def _accept_held(self, now_s: float) -> Judgement:
-        """Accept the held messages as a real change."""
+        """Accept the held messages: the change of their stamps is real."""
         messages = self._held
         self._held = []
         first_ns = messages[0][0]
         before_ns = statistics.median_low(self._recent_ns or [first_ns])
         is_back = first_ns < before_ns - NEAR_NS
-        # True if another stream has jumped back shortly before, so that the session has begun
+        # Another stream may have jumped back shortly before, so that the new session has begun
         # already. Then only this guard is reset.
         has_begun = now_s < self._outdated_until_s
         self._outdated_until_s = -math.inf
@@ -176,7 +186,7 @@ class StampGuard:
 
 
 class _Counts(NamedTuple):
-    """Messages of an input up to a time (steady, s)."""
+    """Messages of an input up to a steady time ``at_s``; ``null`` ones have no pose."""
 
     at_s: float
     arrived: int
@@ -224,7 +234,7 @@ class PoseInput:
         self._session = session
         self._log = log
         self._on_jump_back = on_jump_back
-        # Kind of measurements, by the options.
+        # What the stream measures, by the options: "auto" or one of registry.MEASURES.
         self._wanted = "auto"
         self._guard = StampGuard()
         self._refused = Counter[str]()
@@ -232,8 +242,9 @@ class PoseInput:
         self._lost = 0
         self._reports = deque([_Counts(time.monotonic(), 0, 0, 0)], maxlen=_REPORTS + 1)
         self._next_number: int | None = None
-        # Times (steady, s) of the last message and of the last bad message, with its fault.
+        # Time (steady, s) of the last message.
         self._arrived_s: float | None = None
+        # Time (steady, s) and fault of the last message that was refused.
         self._bad_at_s = -math.inf
         self._bad = ""
         self.restart()
@@ -283,7 +294,7 @@ class PoseInput:
         """
         expected = self._next_number
         self._next_number = None if sequence_number is None else sequence_number + 1
-        # The number is smaller after a restart of the publisher.
+        # After a restart of the publisher, its numbers begin anew.
         if expected is not None and sequence_number is not None:
             self._lost += max(sequence_number - expected, 0)
 
@@ -299,9 +310,8 @@ class PoseInput:
         if judgement.jumped_back:
             jump_s = ((last_ns or 0) - judgement.taken[0][0]) * 1e-9
             self._log.warning(
-                f"{self.topic} jumped back by {jump_s:.3f} s (a bag that "
-                "loops? a clock that was reset?): new session, earlier poses "
-                "discarded"
+                f"{self.topic} jumped back by {jump_s:.3f} s (a bag that loops? a clock that was "
+                "reset?): new session, earlier poses discarded"
             )
             self._on_jump_back(self)
         elif judgement.taken and last_ns is not None:
@@ -318,7 +328,7 @@ class PoseInput:
             self._log.info(f"first pose on {self.topic}, stamp {first_s:.3f} s")
 
     def _take_gap(self, gap_ns: int, now_s: float) -> None:
-        """Store the interval (ns) before an accepted stamp, and report a step of its clock."""
+        """Store the gap (ns) before an accepted stamp, and report it if the clock has stepped."""
         self._longest_gap_ns = max(self._longest_gap_ns, gap_ns)
         gap_s = gap_ns * 1e-9
         silent_s = self.silent_s(now_s)
@@ -329,7 +339,17 @@ class PoseInput:
             )
 
     def refuse(self, message: str, reason: str, text: str) -> None:
-        """Count and log a message that cannot be used."""
+        """Count and log a message that cannot be used.
+
+        Parameters
+        ----------
+        message : str
+            Name of the message in the log, see :func:`with_stamp`.
+        reason : str
+            Category under which the message is counted.
+        text : str
+            Fault and remedy.
+        """
         self._refused[reason] += 1
         self._bad = text
         self._bad_at_s = time.monotonic()
@@ -337,11 +357,12 @@ class PoseInput:
         self._log.debug(f"{self.topic}: message {message} refused: {text}")
 
     def leave_out(self, message: str, reason: NoPoseError) -> None:
-        """Count a message that states that it has no pose, such as that of a lost tracker."""
+        """Count a message that has no pose on purpose, such as that of a tracker that is lost."""
         self._refused["no pose"] += 1
         self._log.debug(f"{self.topic}: message {message} is left out: {reason}")
 
     def _refuse_stamp(self, stamp_ns: int, text: str) -> None:
+        """Refuse a message because of its stamp."""
         self.refuse(with_stamp(stamp_ns), "corrupt stamp", text if stamp_ns else _STAMP_IS_0)
 
     def _take(self, stamp_ns: int, read: Callable[[], PoseFields]) -> None:
@@ -363,9 +384,9 @@ class PoseInput:
             self.refuse(with_stamp(stamp_ns), "unusable", str(error))
 
     def _check_frames(self, pose: PoseFields) -> None:
-        """Pass names of frames on if they have changed; the engines refuse another sensor.
+        """Pass changed names of frames on to the engines, which refuse another sensor.
 
-        A name that is empty from the start is no change: parameters or a default name the frame.
+        As long as the name is empty, a parameter or a default names the frame.
         """
         sensor = pose.sensor_frame
         has_new_sensor = sensor is not None and sensor != self._sensor_frame
@@ -383,7 +404,7 @@ class PoseInput:
     # ----------------------------------------------------------------- state
 
     def is_silent(self, steady_s: float) -> bool:
-        """Whether messages came once, but no longer."""
+        """Whether messages have arrived, but arrive no longer."""
         return self._arrived_s is not None and steady_s - self._arrived_s > SILENT_AFTER_S
 
     def silent_s(self, steady_s: float) -> float | None:
@@ -391,14 +412,14 @@ class PoseInput:
         return None if self._taken_s is None else steady_s - self._taken_s
 
     def is_paused(self, steady_s: float) -> bool:
-        """Whether poses came once, but no longer."""
+        """Whether poses have arrived in this session, but arrive no longer."""
         silent_s = self.silent_s(steady_s)
         if silent_s is None or not self.is_enabled:
             return False
         return silent_s > max(PAUSED_AFTER_S, _PERIODS * self._guard.period_ns() * 1e-9)
 
     def state(self, steady_s: float, may_rest: bool) -> InputState:
-        """Return the diagnostics; to be called at least once a second.
+        """Return the diagnostics. This method must be called at least once a second.
 
         Parameters
         ----------
@@ -408,18 +429,20 @@ class PoseInput:
             Whether silence is normal: there is a result, and the other input is silent too.
         """
         now = _Counts(steady_s, self._arrived, self._lost, self._refused["no pose"])
-        first = self._reports[0]
+        oldest = self._reports[0]
         if steady_s - self._reports[-1].at_s > REPORT_PERIOD_S / 2:
             self._reports.append(now)
-        seconds = steady_s - first.at_s
-        arrived = now.arrived - first.arrived
-        lost = now.lost - first.lost
+        seconds = steady_s - oldest.at_s
+        arrived = now.arrived - oldest.arrived
+        lost = now.lost - oldest.lost
         rate_hz = arrived / seconds if seconds > 0 else 0.0
-        level, text = self._condition(steady_s, rate_hz, lost / max(arrived + lost, 1), may_rest)
+        lost_share = lost / max(arrived + lost, 1)
+        null_share = (now.null - oldest.null) / max(arrived, 1)
+        level, text = self._condition(steady_s, rate_hz, lost_share, may_rest)
         accepted = self._session.engines.statistics(self.name)
         if level is Level.OK and self._longest_gap_ns > NEAR_NS:
             text = f"{text}, longest gap {duration(self._longest_gap_ns * 1e-9)}"
-        advice = self._advice((now.null - first.null) / max(arrived, 1), accepted)
+        advice = self._advice(null_share, accepted)
         if level is Level.OK and advice:
             self._log.warning(f"{self.topic}: {advice}")
             level = Level.WARN
@@ -444,16 +467,15 @@ class PoseInput:
         )
 
     def _advice(self, null_share: float, accepted: StreamStatistics) -> str:
-        """Return advice for messages without a pose or without own stamps; empty if few."""
+        """Return advice if many messages have no pose or repeat a stamp; empty otherwise."""
         if null_share > MUCH_NULL:
             return (
-                f"{share(null_share)} of the messages have no pose (null, not "
-                "finite or without a fix): check whether the source loses "
-                "track"
+                f"{share(null_share)} of the messages have no pose (null, not finite or without a "
+                "fix): check whether the source loses track"
             )
         n_repeated = accepted.refused_duplicate
         n_messages = n_repeated + accepted.received
-        if n_messages < _FEWEST_TO_JUDGE or n_repeated <= _MUCH_REPEATED * n_messages:
+        if n_messages < _MIN_MESSAGES or n_repeated <= _MAX_REPEATED_SHARE * n_messages:
             return ""
         return repeated_stamps(accepted.last_stamp_ns or 0)
 
@@ -474,13 +496,12 @@ class PoseInput:
         if self.publishers is not None and len(self.publishers) > 1:
             names = listing(sorted(self.publishers))
             text = (
-                f"{self.topic} has {len(self.publishers)} publishers, "
-                f"{names}: poses of several sources mix; stop all but one, or "
-                "use a topic for each, and reset"
+                f"{self.topic} has {len(self.publishers)} publishers, {names}: poses of several "
+                "sources mix; stop all but one, or use a topic for each, and reset"
             )
             self._log.warning(text)
             return Level.WARN, text
-        if lost_share < _MUCH_LOST:
+        if lost_share < _MAX_LOST_SHARE:
             return Level.OK, f"{rate_hz:.1f} Hz"
         advice = "free processor time for the node, or publish at a lower rate"
         text = f"{lost_share:.1%} of the messages are lost: {advice}"
@@ -488,7 +509,7 @@ class PoseInput:
         return Level.WARN, f"{rate_hz:.1f} Hz; {text}"
 
     def _why_paused(self, steady_s: float, arrived_s: float) -> str:
-        """Return the reason why poses no longer come; empty if they come, or if unknown."""
+        """Return why poses no longer arrive; empty if they arrive, or if the reason is unknown."""
         if self._taken_s is not None and not self.is_paused(steady_s):
             return ""
         silent_s = steady_s - arrived_s
@@ -499,18 +520,17 @@ class PoseInput:
             return ""
         without_s = steady_s - self._taken_s
         return (
-            f"{self.topic} has messages, but no new pose for {without_s:.0f} "
-            "s: their stamps repeat or are too late, or their poses are "
-            "null; check the source"
+            f"{self.topic} has messages, but no new pose for {without_s:.0f} s: their stamps "
+            "repeat or are too late, or their poses are null; check the source"
         )
 
 
 def repeated_stamps(stamp_ns: int) -> str:
-    """Return fault and remedy of a stream whose stamps repeat, such as ``stamp_ns``."""
+    """Return fault and remedy of a stream whose stamps repeat; ``stamp_ns`` is one of them."""
     kind = "repeat" if stamp_ns % STAMP_UNITS["s"] else "have whole seconds only"
     return f"the stamps {kind}: set header.stamp in the publisher for every message"
 
 
 def with_stamp(stamp_ns: int) -> str:
-    """Return the name of a message in the log."""
+    """Return the name by which the log refers to a message."""
     return f"with stamp {stamp_ns * 1e-9:.9f} s"

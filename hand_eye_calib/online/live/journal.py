@@ -1,6 +1,6 @@
-"""The journal of the live session.
+"""The journal of the live session: its poses on disk, so that a crash does not lose them.
 
-A thread of its own writes it, so that a slow or full disk never delays a message.
+A thread of its own writes the journal, so that a slow or full disk never delays a message.
 """
 
 import fcntl
@@ -16,10 +16,10 @@ from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.formats import journal
 from hand_eye_calib.online.live.log import NodeLog
 
-# Period (s) at which poses are written to the disk: a crash loses no more.
+# Period (s) at which poses are written to the disk. A crash loses the poses of one period.
 FLUSH_PERIOD_S = 0.25
 
-# Batches of poses that wait at most for a disk that does not answer: one minute.
+# Number of jobs in the queue from which on the disk counts as dead: one minute of batches.
 _MAX_WAITING = 240
 
 # Stream, stamp (ns), position (m) and quaternion (x, y, z, w).
@@ -32,8 +32,8 @@ def lock_directory(directory: Path) -> int | None:
     Returns
     -------
     int or None
-        Descriptor that has the lock until it is closed, or until the process ends. None if the
-        directory cannot be made: the journal reports that.
+        File descriptor of the directory. The lock lasts until the descriptor is closed or the
+        process ends. None if the directory cannot be made; the journal reports this failure.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def lock_directory(directory: Path) -> int | None:
             "stop the other calibrator, or choose another directory"
         ) from None
     except OSError:
-        # Some disks have no locks.
+        # Some file systems have no locks.
         pass
     return descriptor
 
@@ -68,22 +68,23 @@ class SessionJournal:
     ----------
     directory : path
     about : callable
-        Returns options, topic, frame and origin of each stream.
+        Returns topic, options, frames and origin of each stream, which the journal stores, too.
     log : NodeLog
     resumed : Journal, optional
-        The session in the directory, if it is continued. Otherwise a session there is kept aside.
+        The session in the directory, to continue it. By default the session there is kept aside,
+        and a new one begins.
 
     Attributes
     ----------
     poses : list
-        Poses to write, to be appended by the caller.
+        Poses that are not written yet; the caller appends new poses.
     error : str
         Reason why the journal cannot be written; empty otherwise.
 
     Raises
     ------
     ConfigError
-        If another node uses the directory above.
+        If another node uses the parent directory, which is the node's output directory.
     """
 
     def __init__(
@@ -107,7 +108,7 @@ class SessionJournal:
         self._thread.start()
 
     def flush(self) -> None:
-        """Pass new poses on to the thread; to be called often."""
+        """Pass new poses on to the thread. This method must be called often."""
         poses = self.poses
         self.poses = []
         if self._jobs.qsize() > _MAX_WAITING and not self.error:
@@ -116,14 +117,14 @@ class SessionJournal:
             self._jobs.put(partial(self._write, poses, self._about()))
 
     def begin(self) -> None:
-        """Start a new session without poses, and keep the present session aside."""
+        """Begin a new session without poses, and keep the files of the present session aside."""
         self.flush()
         self.error = ""
         self._jobs.put(self._close)
         self._jobs.put(partial(self._open, self._about()))
 
     def stop(self, timeout_s: float) -> None:
-        """Write the last poses and end the thread, but wait no longer than ``timeout_s``."""
+        """Write the last poses and end the thread; wait at most ``timeout_s``."""
         self.flush()
         self._jobs.put(self._close)
         self._jobs.put(None)
@@ -132,7 +133,7 @@ class SessionJournal:
             os.close(self._lock)
 
     def _give_up(self, reason: str) -> None:
-        """Write no more, and leave the files as they are."""
+        """Stop writing until the next session; leave the files as they are."""
         self.error = reason
         self._log.warning(
             f"cannot write the session journal in {self.directory}: {reason}; "
@@ -142,19 +143,21 @@ class SessionJournal:
     # ------------------------------------------------------------ in the thread
 
     def _run(self) -> None:
+        """Process jobs until one is None."""
         while (job := self._jobs.get()) is not None:
             try:
                 job()
-            # The node reports defects, too, and continues without a journal.
+            # Even a defect of the program must not end the node, only the journal.
             except Exception as error:
                 self._writer = None
                 reason = str(error) if isinstance(error, OSError) else repr(error)
                 self._give_up(getattr(error, "strerror", None) or reason)
 
     def _open(self, about: journal.About, resumed: journal.Journal | None = None) -> None:
+        """Start to write; a session in the directory is kept aside, unless it is continued."""
         if resumed is None and journal.is_used(self.directory):
             n_poses = journal.count_poses(self.directory)
-            # An empty journal is that of a node that received nothing: overwrite it.
+            # A journal without poses is overwritten.
             if n_poses != 0:
                 count = "" if n_poses is None else f" ({n_poses} poses)"
                 aside = journal.keep_aside(self.directory)

@@ -9,17 +9,18 @@ from hand_eye_calib.core.base.errors import printable
 # Time (s) within which a warning or an error is not written again, unless a new session begins.
 ONCE_S = 1800.0
 
-# Time (s) within which news of a process that goes on, such as a better result, is not repeated.
+# Time (s) within which news that come again and again, such as a better result, are not repeated.
 GOES_ON_S = 60.0
 
 _NUMBERS = re.compile(r"[\d.,+-]+")
 
 
 class NodeLog:
-    """Log with a throttle by text; the throttle of a ROS logger does not distinguish two topics.
+    """Log that does not repeat a text within a time.
 
-    The methods take a text and the time (s) within which it is not written again. Texts that differ
-    only in their numbers are the same, and so are all texts with the same ``key``.
+    The throttle of a ROS logger works by line of code, so it would mix the warnings of two topics.
+    Here, texts that differ only in their numbers count as the same text, and so do all texts with
+    the same ``key``. ``every_s`` is the time (s) within which a text is not repeated.
     """
 
     def __init__(self, logger: Any) -> None:
@@ -32,7 +33,7 @@ class NodeLog:
 
     # rclpy ties a line of code to one severity, so every method calls the logger itself.
     def debug(self, text: str) -> None:
-        """Write a detail for whoever looks for a fault."""
+        """Write a detail that helps to find a fault."""
         self._logger.debug(_escaped(text))
 
     def info(self, text: str, every_s: float = 0.0, key: str = "") -> None:
@@ -51,15 +52,16 @@ class NodeLog:
             self._logger.error(_escaped(text))
 
     def _is_due(self, text: str, every_s: float) -> bool:
+        """Whether a text may be written now; if so, store the time."""
         key = _NUMBERS.sub("", text)
         now_s = time.monotonic()
         is_due = now_s - self._written_at_s.get(key, -float("inf")) >= every_s
-        # The number of lines in memory is bounded.
+        # Bound the memory: a sound session has far fewer different texts.
         if is_due and len(self._written_at_s) < 10_000:
             self._written_at_s[key] = now_s
         return is_due
 
 
 def _escaped(text: str) -> str:
-    """Return a text whose only control characters are line ends."""
+    """Return a text with all control characters escaped, except line ends."""
     return "\n".join(map(printable, text.split("\n")))

@@ -1,4 +1,4 @@
-"""The process that writes the pages of a session, apart from the node."""
+"""The process that writes report and rig of a session, so that the node does not wait for them."""
 
 import os
 import pickle
@@ -9,14 +9,16 @@ from hand_eye_calib.core.base.errors import HandEyeCalibError, printable
 from hand_eye_calib.core.base.registry import SESSION_PAGES
 from hand_eye_calib.core.engine.session_result import SessionResult
 
-# Priority of the process. The pages took half a minute with 15, while other programs were busy.
+# Nice value of the process (0 is normal, 19 the lowest priority). With 15, the pages took half a
+# minute while other programs were busy.
 _NICENESS = 3
 
 
 def write_session() -> None:
-    """Write the pages of a session into the directory that is the only argument of this process.
+    """Read a session from standard input, and write its pages into a directory.
 
-    The result comes from standard input, as ``online/live/saving.py`` writes it.
+    The directory is the only argument of the process. ``online/live/saving.py`` starts the process
+    and passes a pickled SessionResult.
     """
     os.nice(_NICENESS)
     session: SessionResult = pickle.load(sys.stdin.buffer)

@@ -20,10 +20,10 @@ class AxisProgress:
     sigma : float
         Standard deviation with the allowance (m or rad).
     target : float
-        Standard deviation that is wanted (m or rad).
+        Target of the standard deviation (m or rad).
     seconds_left : float
-        Time of similar motion until the target is reached (s); infinite if the motion does not
-        observe the axis.
+        Time until the target is reached if the motion goes on like this (s); infinite if the motion
+        does not observe the axis.
     """
 
     sigma: float
@@ -38,24 +38,25 @@ class Progress:
     Attributes
     ----------
     sentence : str
-        Next step of the person who moves the robot.
+        What the person who moves the robot should do next.
     done : bool
         Whether the goal is reached.
     seconds_left : float
-        Time of similar motion until the goal is reached (s), in coarse steps; infinite if unknown.
+        Time until the goal is reached if the motion goes on like this (s), in coarse steps;
+        infinite if unknown.
     precision : str
         Precision of the best result, in words; empty before the goal is reached.
     is_faulty : bool
         Whether the streams have faults that make a calibration impossible.
     limiting_axis : str
-        Of ``AXIS_KEYS``: the axis that is farthest from its target; empty if every axis is within
-        its target, or without a result.
+        Name, from ``AXIS_KEYS``, of the axis that is farthest from its target. Empty without a
+        result, or if every axis is within its target.
     will_not_get_there : bool
-        Whether more of the present motion is useless for the limiting axis.
+        Whether more of the present motion cannot bring the limiting axis to its target.
     target_is_too_small : bool
         Whether the allowance for constant errors alone exceeds the target of the limiting axis.
     axes : mapping of str to AxisProgress
-        By ``AXIS_KEYS``.
+        Progress of each axis; the keys are the values of ``AXIS_KEYS``.
     """
 
     sentence: str
@@ -70,5 +71,5 @@ class Progress:
 
 
 def details(goal: Progress, result: object) -> list[str]:
-    """Return a line about the session of a result, for a person."""
+    """Return the lines about the session that the terminal prints with a result."""
     return [f"the session: {goal.sentence}"]

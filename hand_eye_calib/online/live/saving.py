@@ -1,4 +1,4 @@
-"""Saving of the session's result: files at once, report and rig in a process of their own."""
+"""Save the session's result: data files at once, report and rig in a process of their own."""
 
 import pickle
 import subprocess
@@ -20,10 +20,11 @@ _PAGES = "from hand_eye_calib.online.live.pages import write_session; write_sess
 
 
 class Saver:
-    """Saves the result of the session, and keeps the files of an earlier session once.
+    """Saves the result of the session.
 
-    The process that writes report and rig may end after the node. A newer save ends it, because
-    only the newest result counts.
+    Before the first save into a directory, files of an earlier session are kept aside. The process
+    that writes report and rig may run longer than the node. A newer save kills this process,
+    because only the newest result counts.
 
     Attributes
     ----------
@@ -36,12 +37,12 @@ class Saver:
         self._session = session
         self._cycle = cycle
         self._log = log
-        # Directory whose earlier results are kept already.
+        # Directory in which earlier results are kept aside already.
         self._earlier_kept_in = ""
         self._process: subprocess.Popen[bytes] | None = None
 
     def save(self, options: NodeConfig) -> Outcome:
-        """Write the result files; return whether that worked, and a line of text, also logged."""
+        """Write the result files; return the success and a line of text, which is also logged."""
         try:
             text = self._save(options)
         except (OSError, HandEyeCalibError) as error:
@@ -52,6 +53,17 @@ class Saver:
         return True, text
 
     def _save(self, options: NodeConfig) -> str:
+        """Write the result files, start the process for the pages, and return the line of text.
+
+        Raises
+        ------
+        ConfigError
+            If there is no output directory.
+        NotEnoughDataError
+            If there is no result.
+        OSError
+            If a file cannot be written.
+        """
         directory = options.output_directory
         if not directory:
             raise ConfigError("set the parameter output_directory to a directory")
@@ -92,8 +104,8 @@ class Saver:
     def _write_pages(self, directory: str, session: SessionResult, files: str) -> str:
         """Start the process that writes report and rig; return a sentence about the files.
 
-        The start takes milliseconds. A file without a name passes the result on: no other program
-        can change it, and the end of the node need not wait for a pipe.
+        The start takes milliseconds. The process reads the result from a file without a name. No
+        other program can change this file, and the node can end without waiting for a pipe.
         """
         self._process = None
         try:

@@ -1,4 +1,4 @@
-"""The live session: its engines, its number, and its journal on disk."""
+"""The live session: the engines that collect the poses, and the journal on disk."""
 
 from collections.abc import Sequence
 from copy import deepcopy
@@ -18,7 +18,7 @@ from hand_eye_calib.online.live.state import GRACE_S, JournalState, Level
 
 
 class LiveSession:
-    """The engines that accept the poses, and the journal that stores the accepted poses on disk.
+    """Engines that collect the poses of a session, and the journal that stores them on disk.
 
     Parameters
     ----------
@@ -32,11 +32,12 @@ class LiveSession:
     engines : dict of str to Calibrator
         Engine of each child sensor with the parent: "child", and the further child sensors.
     number : int
-        Number of the session, which grows with every new session. A result of another number is
-        out of date.
+        Number of the session, which grows with every new session. A solve that was started in
+        another session is out of date.
     topics : dict of str to str
         Topic of each stream, for the journal.
     journal : SessionJournal or None
+        None if no journal is written.
     """
 
     def __init__(self, log: NodeLog, config: CalibratorConfig, others: Sequence[str] = ()) -> None:
@@ -46,12 +47,13 @@ class LiveSession:
         self.topics: dict[str, str] = {}
         self.journal: SessionJournal | None = None
         self._log = log
-        # Whether the poses are solved; the monitor of the mount only takes the pairs.
+        # False for the monitor of the mount, which takes the pairs and needs no solve.
         self._is_solved = True
         # Number of poses of the last solve.
         self._n_solved = 0
-        # Options with what the streams measure, by their message types.
+        # Options parent_measures and child_measures that follow from the message types.
         self._measures: Document = {}
+        # Local origins of the streams with latitudes and longitudes.
         self._origins: dict[str, LocalOrigin] = {}
 
     @property
@@ -70,7 +72,7 @@ class LiveSession:
         return deepcopy(self.calibrator)
 
     def watch_only(self, limits: BufferLimits | None) -> None:
-        """Never solve, and store few poses, because the caller takes the pairs as they are made.
+        """Never solve, and store few poses. The caller takes the pairs as soon as they are made.
 
         Parameters
         ----------
@@ -89,12 +91,12 @@ class LiveSession:
         ----------
         stream : str
         measures : str
-            One of ``registry.MEASURES``.
+            One of ``registry.MEASURES``, such as "poses" or "positions".
 
         Raises
         ------
         ConfigError
-            If the session cannot use such a stream, or not together with the other stream.
+            If the session cannot use such a stream, or cannot use it with the other stream.
         """
         is_pair = stream in STREAMS
         if measures != "poses" and not (is_pair and self._is_solved):
@@ -109,11 +111,14 @@ class LiveSession:
         self.reconfigure(self.calibrator.config)
 
     def origin(self, stream: str) -> LocalOrigin:
-        """Return the local origin of a stream's latitudes and longitudes; resumed if possible."""
+        """Return the local origin of a stream's latitudes and longitudes.
+
+        A resumed session has the origin of its journal; otherwise the first position becomes it.
+        """
         return self._origins.setdefault(stream, LocalOrigin())
 
     def reconfigure(self, config: CalibratorConfig) -> None:
-        """Apply other options; the poses stay and will be solved again."""
+        """Apply changed options; the poses stay and will be solved again."""
         for name, engine in self.engines.items():
             if name != "child":
                 engine.reconfigure(_for_other_child(config))
@@ -146,19 +151,19 @@ class LiveSession:
         Raises
         ------
         ConfigError
-            If there is no directory to resume from, or another node writes there.
+            If no directory is set to resume from, or another node writes there.
         """
         self.stop_journal()
         is_resuming = is_first and options.journal == "resume"
         if is_resuming and not options.output_directory:
-            raise ConfigError("journal resume needs output_directory, which contains the session")
+            raise ConfigError("journal resume needs output_directory: set the session's directory")
         if options.output_directory and options.journal != "off" and not options.monitor:
             directory = output_path(options.output_directory).resolve() / "journal"
             resumed = self._resume(directory) if is_resuming else None
             self.journal = SessionJournal(directory, self._about, self._log, resumed)
 
     def flush_journal(self) -> None:
-        """Write new poses to the disk; to be called often."""
+        """Write new poses to the disk. This method must be called often."""
         if self.journal is not None:
             self.journal.flush()
 
@@ -188,7 +193,10 @@ class LiveSession:
         return JournalState(level=level, text=text, directory=directory)
 
     def _resume(self, directory: Path) -> Journal | None:
-        """Return the session in a directory to continue it; None if that is impossible."""
+        """Fill the engines from the session in a directory, and return the session.
+
+        None if there is no session, or if the journal cannot be read.
+        """
         if not has_session(directory):
             self._log.info(f"no session to resume in {directory}: a new session begins")
             return None
@@ -229,10 +237,10 @@ class LiveSession:
 
 
 def _for_other_child(config: CalibratorConfig) -> CalibratorConfig:
-    """Return the options for a further child sensor: defaults for all values of the child."""
+    """Return the options for a further child sensor: without the values of the first child."""
     names = {item.name for item in fields(config) if item.name.startswith(("prior_", "child_"))}
     for name in ("time_offset", "scale"):
-        # A text such as "estimate" applies to all child sensors.
+        # A number belongs to the first child; a text such as "estimate" applies to all children.
         if not isinstance(getattr(config, name), str):
             names.add(name)
     return replace(config, given=config.given - names, **defaults_of(names))
@@ -244,8 +252,8 @@ def output_path(directory: str, base: Path | None = None) -> Path:
     Raises
     ------
     ConfigError
-        If the user of ``~`` is unknown, or if the path is neither ``base`` nor below it. Any
-        participant may set the directory while the node runs, but must not write elsewhere.
+        If the user of ``~`` is unknown, or if the path is neither ``base`` nor below it. While the
+        node runs, any program may set its parameters, so writing is limited to ``base``.
     """
     try:
         path = Path(directory).expanduser()

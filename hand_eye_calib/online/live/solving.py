@@ -1,8 +1,9 @@
 """The solving process of the node: its jobs, its answers, and both ends of its pipes.
 
-A solve in a thread would share the interpreter with the callbacks: on a slow machine their latency
-rises to a second. The process imports the engine and nothing of ROS. Jobs and answers are pickles,
-which is safe because both ends are the same program, and no other program has the pipes.
+A solve in a thread would share the interpreter with the callbacks of the node: on a slow machine,
+their latency rises to a second. The process imports the engine and nothing of ROS. Jobs and answers
+are pickles. Pickles are safe here, because both ends of a pipe are this program, and no other
+program can write into the pipe.
 """
 
 import contextlib
@@ -37,35 +38,37 @@ from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.online.live.state import GRACE_S
 from hand_eye_calib.online.live.stream_checks import merged
 
-# Not `-m`: the classes would belong to the module __main__, which the node does not have.
+# Code of the process. With `python -m`, the classes of its answers would belong to the module
+# __main__, and the node could not unpickle them.
 _SOLVE = "from hand_eye_calib.online.live.solving import main; main()"
 
-# Priority of the process: other programs get twice its share of a processor. A higher value makes a
-# solve take minutes while other programs are busy. The latency of callbacks does not depend on it.
+# Nice value of the process: other programs get twice its share of a processor. With a higher value,
+# a solve takes minutes while other programs are busy. The callbacks are as fast with any value.
 _NICENESS = 3
 
 # Time (s) after which a job counts as hung: live sessions are solved in seconds.
 HANGS_AFTER_S = 600.0
 
-# Time (ns) of the motion that the advice to a person is about.
+# Length (ns) of the newest part of the session. Advice about the motion refers to this part.
 _NEWEST_NS = 60_000_000_000
 
-# Fewest poses of a stream, not paired yet, for a check of its received poses.
-_FEWEST_RAW = 200
+# Fewest poses, received and not paired yet, with which a stream is checked.
+_MIN_UNPAIRED = 200
 
 NO_MOTION = excitation(PosePairs.empty())
 
 
 @dataclass(frozen=True)
 class Failure:
-    """An error.
+    """Error of a job.
 
     Attributes
     ----------
     what : str
         The error in one line.
     details : str
-        Text for the log; only if the error is a defect of the program.
+        Further text for the log, such as a traceback; empty unless the error is a defect of the
+        program.
     is_early : bool
         Whether there is too little data.
     """
@@ -79,7 +82,8 @@ class Failure:
 class Job:
     """Poses to solve.
 
-    The process makes the trajectories, because that would delay the callbacks of the node.
+    The job contains the engine's buffers. The process makes trajectories from them, because this
+    work would delay the callbacks of the node.
 
     Attributes
     ----------
@@ -88,7 +92,7 @@ class Job:
     calibrator : Calibrator
         Copy of the engine.
     check : bool
-        Whether to check the streams, too.
+        Whether to check the streams after the solve.
     options : Options
         Options that an earlier check has set.
     """
@@ -112,11 +116,12 @@ class Answer:
     motion : Excitation
         Motion of the sensors.
     calibration : Calibration or None
-        With the options that the check has set.
+        Result with the options that the check has set.
     time_offset : TimeOffset or None
+        Estimate of the clock offset between the streams.
     failure : Failure or None
     is_checked : bool
-        Whether the job has requested a check.
+        Whether the job requested a check.
     check : CheckResult or None
         None if the motion is too short for a check, or has too little rotation.
     options : Options
@@ -141,13 +146,13 @@ class Answer:
 
 
 def answer(job: Job) -> Answer:
-    """Solve, then check the streams if the job requests it.
+    """Solve, then check the streams if the job requests a check.
 
-    The calibration has the options that the check has set.
+    If the check sets options, the calibration is one with these options. Every error becomes a
+    failure in the answer, and what was computed before the error stays.
     """
     start_s = time.monotonic()
     result = Answer(job.session, 0.0, is_checked=job.check)
-    # The node reports all errors.
     try:
         received = job.calibrator.snapshot()
         configured = with_options(received, job.options)
@@ -190,23 +195,24 @@ def _checked(result: Answer, snapshot: Snapshot, options: Options) -> Answer:
 
 
 def with_raw_findings(result: CheckResult, snapshot: Snapshot) -> CheckResult:
-    """Add errors in the newest poses as they were received, if older poses are paired already.
+    """Add errors in the received poses to a check of the pairs, if older poses are paired already.
 
-    A check of a session uses the pairs, for which one stream is interpolated. Interpolation hides
-    poses of two sources that alternate. None of 232 windows of sound recordings has such an error.
-    Warnings are left to the check of the pairs, because 1 of 15 windows has enough jumps for one.
+    Pairing interpolates one stream, and this hides poses of two sources that alternate. So the
+    poses that are not paired yet are checked as they were received. Only errors are added: none of
+    232 windows of sound recordings has one, while 1 of 15 windows has enough jumps for a warning.
     """
     if not len(snapshot.kept):
         return result
     config = snapshot.config
     errors: list[Finding] = []
     for stream, trajectory in zip(STREAMS, snapshot.unpaired, strict=True):
-        if len(trajectory) < _FEWEST_RAW or trajectory.duration_s < MIN_DURATION_S / 2:
+        if len(trajectory) < _MIN_UNPAIRED or trajectory.duration_s < MIN_DURATION_S / 2:
             continue
         if config.measured == "poses":
             findings = check_stream(trajectory, stream, config.max_gap)
         else:
-            # Unless both streams have positions, the positions of a stream are no measurements.
+            # A stream measures its positions only if the streams have positions. Otherwise, the
+            # scale 0 removes them from the check.
             scale = 1.0 if config.measured == "positions" else 0.0
             findings = check_positions(trajectory.scaled(scale), stream, config.max_gap)
         errors += [finding for finding in answered(findings, config) if finding.makes_unusable]
@@ -214,6 +220,7 @@ def with_raw_findings(result: CheckResult, snapshot: Snapshot) -> CheckResult:
 
 
 def _failure(error: Exception) -> Failure:
+    """Return an error as a failure; with its traceback if the error is a defect of the program."""
     if isinstance(error, HandEyeCalibError):
         return Failure(str(error), is_early=isinstance(error, NotEnoughDataError))
     details = "".join(traceback.format_exception(error))
@@ -226,10 +233,10 @@ def _failure(error: Exception) -> Failure:
 def main() -> None:
     """Answer jobs until standard input ends.
 
-    It ends with the node, even if the node crashes.
+    Standard input ends with the node, even if the node crashes.
     """
     os.nice(_NICENESS)
-    # A library may print: that goes to standard error, not into the pipe.
+    # Standard output is the pipe. What a library prints goes to standard error instead.
     outgoing = os.fdopen(os.dup(1), "wb")
     os.dup2(sys.stderr.fileno(), 1)
     jobs: queue.SimpleQueue[Job] = queue.SimpleQueue()
@@ -237,7 +244,8 @@ def main() -> None:
     while True:
         pickle.dump(answer(jobs.get()), outgoing, pickle.HIGHEST_PROTOCOL)
         outgoing.flush()
-        # References to the arrays of a job form cycles: memory grew by a half in 60 solves.
+        # The arrays of a job are in reference cycles. Without a collection, the memory of the
+        # process grew by a half in 60 solves.
         gc.collect()
 
 
@@ -270,14 +278,14 @@ def start(code: str, *arguments: str, stdin: Any, stdout: Any) -> "subprocess.Po
 class SolvingProcess:
     """A process that answers one job at a time.
 
-    The process starts at once. It starts again after it has died or has been killed because it
-    hung; its job has failed then. The end of the node ends it in any case. The threads in this
-    class only wait for the pipes.
+    The process starts at once. If the process dies, or hangs and is killed, its job fails and a new
+    process starts. The process ends with the node in any case. The threads of this class only wait
+    for the pipes.
 
     Parameters
     ----------
     on_answer : callable
-        Called in another thread when an answer is ready; one call may stand for two answers.
+        Called in another thread when an answer is ready; :meth:`answers` returns it.
     command : str
         Python code that the process runs.
     """
@@ -288,13 +296,13 @@ class SolvingProcess:
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._is_stopping = False
         self._start()
-        # Only a thread that was started can be joined.
+        # A thread that does nothing: stop() joins the thread of the last job, if any.
         self._thread = threading.Thread()
         self._thread.start()
 
     def submit(self, job: Job) -> None:
-        """Send a job; the last job must have been answered."""
-        # A daemon, because a pipe that hangs must not delay the end of the node.
+        """Send a job. The answer to the last job must have arrived."""
+        # A daemon thread: a pipe that hangs must not delay the end of the node.
         self._thread = threading.Thread(target=self._run, args=(job,), name="solving", daemon=True)
         self._thread.start()
 
@@ -307,7 +315,7 @@ class SolvingProcess:
         self._is_stopping = True
         self._thread.join(timeout_s)
         self._process.kill()
-        # The pipe of the thread has ended.
+        # The thread ends, because its pipe has ended.
         self._thread.join(GRACE_S)
         self._process.communicate()
 
@@ -315,6 +323,7 @@ class SolvingProcess:
         self._process = start(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
 
     def _run(self, job: Job) -> None:
+        """Send a job, wait for the answer, and store the answer; kill a process that hangs."""
         to_process: Any = self._process.stdin
         from_process: Any = self._process.stdout
         result = None
@@ -337,7 +346,7 @@ class SolvingProcess:
             self._on_answer()
 
     def _restart(self, has_hung: bool) -> Failure:
-        """Start the process again after its end, and return how it ended."""
+        """Start the process again after its end, and return a failure that names how it ended."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(GRACE_S)
         self._process.kill()

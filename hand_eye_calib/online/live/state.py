@@ -1,8 +1,8 @@
 """The state of the node as one document.
 
-It is published as JSON, and ``/diagnostics`` and ``watch`` are made from it. All values are in SI
-units. Mappings by axis have x, y, z, about_x, about_y and about_z, those of a pose as printed roll,
-pitch and yaw. None means unknown.
+The node publishes the state as JSON; ``/diagnostics`` and ``watch`` are made from the same state.
+All values are in SI units; None means unknown. Mappings by axis have the keys x, y, z, about_x,
+about_y and about_z. Those of a printed pose have roll, pitch and yaw in place of the last three.
 """
 
 from collections.abc import Iterator, Mapping
@@ -19,7 +19,7 @@ from hand_eye_calib.online.live.progress import AXIS_KEYS, Progress
 # Period (s) at which the node publishes its state.
 REPORT_PERIOD_S = 1.0
 
-# Longest time (s) for which a disk, a running solve or a slow listener delays the end of the node.
+# Longest time (s) that the end of the node waits for a disk, a running solve or a slow subscriber.
 GRACE_S = 0.4
 
 # Time (s) within which a request for a solve is answered, even on a busy computer.
@@ -41,7 +41,7 @@ def by_axis(values: FloatArray) -> AxisValues:
 class Level(IntEnum):
     """Level of diagnostic_msgs/DiagnosticStatus.
 
-    WARN if a person should act, ERROR if something is broken.
+    WARN: a person should act. ERROR: something is broken.
     """
 
     OK = 0
@@ -58,7 +58,7 @@ class Broadcast(Enum):
     REFUSED = "refused"
 
 
-# Level of a condition and its text.
+# Level of a condition of the node, and a line of text about the condition.
 Condition: TypeAlias = tuple[Level, str]
 
 # Whether the result is broadcast, and the reason if it is not.
@@ -159,16 +159,17 @@ class ExtrinsicState(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class ProgressState(Part):
-    """Progress of the session towards its goal; the text is the next step of a person.
+    """Progress of the session towards its goal; the text is what a person should do next.
 
     Attributes
     ----------
     is_paused : bool
-        Whether poses do not arrive although the goal is not reached.
+        Whether no poses arrive although the goal is not reached.
     progress : Progress
-        Its standard deviations are along and about the axes of the parent sensor's frame.
+        Standard deviations are along and about the axes of the parent sensor's frame.
     comparison : Comparison or None
-        Comparison with the installed transform; only a sentence while it is impossible.
+        Comparison of the result with the installed transform, or only a sentence why it is not
+        possible yet. None if no comparison is requested.
     """
 
     is_paused: bool = False
@@ -183,17 +184,20 @@ class InputState(Part):
     Attributes
     ----------
     messages, poses_taken : int
-        Received messages, and poses that the engine has accepted.
+        Number of received messages, and of poses that the engine has accepted.
     refused : mapping of str to int
-        Refused messages, by reason.
+        Number of refused messages, by reason.
     lost : int or None
-        Messages that were published and never arrived; None if the middleware does not count.
+        Number of messages that were published and never arrived; None if the middleware does not
+        number messages.
     longest_gap_s : float
         Longest interval between two stamps (s).
     publishers : int or None
-        Publishers of the topic; None for transforms.
+        Number of publishers of the topic; None for transforms.
     is_paused : bool
-        Whether poses have come, but none for ``silent_s`` (s).
+        Whether poses have arrived in this session, but arrive no longer.
+    silent_s : float or None
+        Time since the last pose (s); None before the first pose of the session.
     """
 
     topic: str
@@ -218,24 +222,32 @@ class ChecksState(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class JournalState(Part):
-    """Whether a crash would lose the session."""
+    """The journal on disk, from which a session continues after a crash.
+
+    Attributes
+    ----------
+    directory : str
+        Directory of the journal; empty without a journal.
+    """
 
     directory: str
 
 
 @dataclass(frozen=True, kw_only=True)
 class MountState(Part):
-    """A monitored mount.
+    """A mount that is monitored for a shift of the child sensor.
 
     Attributes
     ----------
     shift, shift_sigma : mapping of str to float or None
-        Shift of the alarm and its standard deviation, by axis.
+        Shift that the alarm reports, and its standard deviation, by axis (m, rad).
     visible_10min : mapping of str to float or None
-        Smallest shift that ten minutes of motion would reveal, by axis; None if no shift would be
-        revealed.
-    since_ns, newest_ns : int or None
-        Stamps at which the shift began, and of the newest motion (ns).
+        Smallest shift that ten minutes of motion would detect, by axis (m, rad); None if no shift
+        would be detected.
+    since_ns : int or None
+        Stamp at which the shift began (ns).
+    newest_ns : int or None
+        Stamp of the newest motion (ns).
     """
 
     is_learning: bool = False
@@ -249,7 +261,17 @@ class MountState(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class SavedState:
-    """Directory, time (seconds since 1970), headline and verdict of a saved result."""
+    """A saved result.
+
+    Attributes
+    ----------
+    directory : str
+    at_s : float
+        Time of the save, in seconds since 1970 (Unix time).
+    text : str
+        Headline of the result, with the reason if the result is outdated.
+    verdict : str
+    """
 
     directory: str
     at_s: float
@@ -261,17 +283,19 @@ class SavedState:
 class NodeState:
     """The whole state of the node.
 
-    A node that monitors the mount has ``mount`` in place of ``extrinsic``, ``progress``, ``checks``
-    and ``journal``.
+    A node that monitors the mount has ``mount``. Any other node has ``extrinsic``, ``progress``,
+    ``checks`` and ``journal``.
 
     Attributes
     ----------
     node : str
         Fully qualified name of the node.
     inputs : mapping of str to InputState
-        By name: parent, child, child2 and so on.
+        State of each input, by name: parent, child, child2 and so on.
     saved : SavedState or None
-        Newest saved result of the session.
+        Newest save of the session.
+    has_ended : bool
+        Whether the node ends, so that this is its last state.
     """
 
     node: str
@@ -295,7 +319,7 @@ class NodeState:
         return self.extrinsic.standing if self.extrinsic else Standing.NONE
 
     def parts(self) -> Iterator[tuple[str, Part]]:
-        """Yield the parts of the node, by their names on ``/diagnostics``."""
+        """Yield the parts that the node has, with their names on ``/diagnostics``."""
         parts = {
             "extrinsic": self.extrinsic,
             "progress": self.progress,

@@ -11,8 +11,8 @@ from hand_eye_calib.core.checks.findings import Finding, Severity, answered, gra
 from hand_eye_calib.online.live.log import NodeLog
 from hand_eye_calib.online.live.state import ChecksState, Level
 
-#: Codes of findings about the received poses of one stream. After pairing, which interpolates the
-#: poses, a check cannot detect these faults.
+#: Codes of findings about the received poses of one stream. Pairing interpolates the poses, so a
+#: check of the pairs cannot detect these faults.
 RAW_POSE_CODES = frozenset({"leap", "interleaved", "frozen", "coarse_positions"})
 
 
@@ -20,8 +20,8 @@ class StreamChecks:
     """Findings of the stream checks of a session.
 
     An error counts at once. Any other finding counts if two checks in a row report it, because
-    odometry may be wrong by some per cent over a short recording. An error of the received poses
-    lasts for the whole session, because the session keeps these poses.
+    odometry may be wrong by some per cent over a short recording. An error in the received poses
+    counts until the end of the session, because the session keeps these poses.
     """
 
     def __init__(self, log: NodeLog) -> None:
@@ -32,40 +32,42 @@ class StreamChecks:
         """Begin a new session without findings."""
         self._result: CheckResult | None = None
         self._checked_at_s = 0.0
-        self._suspected: set[tuple[str, str]] = set()
+        # A finding is identified by its code and its stream. These are the findings of the last
+        # check, the findings that count, and among those the errors in the received poses.
+        self._reported: set[tuple[str, str]] = set()
         self._faults: dict[tuple[str, str], Finding] = {}
-        self._lasting: dict[tuple[str, str], Finding] = {}
+        self._pose_errors: dict[tuple[str, str], Finding] = {}
 
     def follow(self, config: CalibratorConfig) -> None:
-        """Drop lasting findings that are no errors with the new options."""
-        open_findings = {}
-        for key, finding in self._lasting.items():
+        """Drop errors in the received poses that are no errors with the new options."""
+        errors = {}
+        for key, finding in self._pose_errors.items():
             (graded,) = answered([finding], config)
             if graded.makes_unusable:
-                open_findings[key] = finding
-        self._lasting = open_findings
+                errors[key] = finding
+        self._pose_errors = errors
 
     def take(self, result: CheckResult) -> None:
-        """Store the result of a check, and log findings that are new or gone."""
+        """Store the result of a check, and log findings that begin or cease to count."""
         before = self._faults
         self._result = result
         self._checked_at_s = time.monotonic()
-        suspects = {
+        reported = {
             (finding.code, finding.stream): finding
             for finding in result.findings
             if finding.severity is not Severity.NOTE
         }
         self._faults = {
             key: finding
-            for key, finding in suspects.items()
-            if finding.makes_unusable or key in self._suspected
+            for key, finding in reported.items()
+            if finding.makes_unusable or key in self._reported
         }
-        self._suspected = set(suspects)
+        self._reported = set(reported)
         for key, finding in self._faults.items():
             if finding.makes_unusable and finding.code in RAW_POSE_CODES:
-                self._lasting[key] = finding
-        # Findings of this check replace lasting findings: their values are newer.
-        self._faults = {**self._lasting, **self._faults}
+                self._pose_errors[key] = finding
+        # Findings of this check have newer values than those of earlier checks.
+        self._faults = {**self._pose_errors, **self._faults}
         for key in self._faults.keys() - before.keys():
             self._log.warning(_in_parameters(self._faults[key]))
         for key in before.keys() - self._faults.keys():
@@ -73,22 +75,22 @@ class StreamChecks:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings that count against these streams, the gravest first."""
+        """Findings that count, the gravest first."""
         return tuple(self._faults.values())
 
     def faults(self) -> tuple[str, ...]:
-        """Text of the findings that count, one line each, with the parameters to set."""
+        """Return a line for each finding that counts, with the parameters to set."""
         return tuple(map(_in_parameters, self.findings))
 
     def state(self) -> ChecksState:
-        """Return the diagnostics of the last check, with lasting findings."""
+        """Return the diagnostics of the last check, with earlier errors in the received poses."""
         if self._result is None:
             text = (
                 f"not checked yet: that takes {MIN_DURATION_S:g} s of motion with rotations of "
                 f"{np.degrees(MIN_ROTATION_RAD):.0f} deg"
             )
             return ChecksState(level=Level.WARN, text=text)
-        findings = merged(self._result.findings, self._lasting.values())
+        findings = merged(self._result.findings, self._pose_errors.values())
         return ChecksState(
             level=Level.WARN if self._faults else Level.OK,
             text="; ".join(self.faults()) or "both streams can be of one rigid body",
@@ -100,9 +102,9 @@ class StreamChecks:
 
 
 def merged(newest: Sequence[Finding], earlier: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Return all findings except earlier ones that the newest repeat, the gravest first.
+    """Return the newest findings and all other earlier findings, the gravest first.
 
-    A finding repeats another one of the same code and stream.
+    An earlier finding is dropped if a newest finding has the same code and stream.
     """
     keys = {(finding.code, finding.stream) for finding in newest}
     kept = [finding for finding in earlier if (finding.code, finding.stream) not in keys]
@@ -110,6 +112,6 @@ def merged(newest: Sequence[Finding], earlier: Iterable[Finding]) -> tuple[Findi
 
 
 def _in_parameters(finding: Finding) -> str:
-    """Text of a finding in one line, with the parameters to set."""
+    """Return the text of a finding in one line, with the parameters to set."""
     remedies = (f": set {name} to {value}" for name, value in finding.options.items())
     return f"{finding}{''.join(remedies)}"
