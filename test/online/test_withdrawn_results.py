@@ -102,7 +102,7 @@ FAILURES = {
         {"newest": contradicted()},
         Standing.REFUTED,
         "CHECK THE PRIOR",
-        "the prior on z is 18.2 standard deviations from the estimate from the motion",
+        "the prior on z is 18 standard deviations from the estimate from the motion",
     ),
     "faulty streams": (
         {"newest": result(), "check": CheckResult((INVERSE,))},
@@ -229,7 +229,7 @@ def test_the_end_of_a_node_with_a_refuted_result_is_no_success(session, tmp_path
     board.take(dataclasses.replace(state_of(session), has_ended=True), 0.0)
     view = board.view(0.5)
     assert (view.word, view.tone) == ("ENDED", Tone.ACT)
-    assert "DO NOT USE: the prior on z is 18.2 standard deviations" in view.sentence
+    assert "DO NOT USE: the prior on z is 18 standard deviations" in view.sentence
 
 
 class TestOptions:

@@ -14,7 +14,14 @@ from typing import NamedTuple
 
 from hand_eye_calib.core.base.config import METHODS
 from hand_eye_calib.core.base.registry import EXTRA_RULES
-from hand_eye_calib.core.base.text import amount, amount_beside, axes_in_words, counted, listing
+from hand_eye_calib.core.base.text import (
+    amount,
+    amount_beside,
+    axes_in_words,
+    counted,
+    listing,
+    two_digits,
+)
 from hand_eye_calib.core.results.parts import part
 from hand_eye_calib.core.results.records import (
     ROTATIONS,
@@ -275,7 +282,8 @@ def _contradicted(result: Result) -> Iterator[Ground]:
         names = "the prior"
         if distances:
             texts = [
-                f"on {axis} is {d:.1f} standard deviations from" for axis, d in distances.items()
+                f"on {axis} is {two_digits(distance)} standard deviations from"
+                for axis, distance in distances.items()
             ]
             which = f"the prior {listing(texts)}"
             names = listing([f"prior.{axis}" for axis in distances])
