@@ -1,6 +1,7 @@
 """Cells of the lines of a text file: the separator between cells, and the numbers in cells.
 
-Every pattern matches a whole cell, in time proportional to its length.
+Every pattern matches a whole cell. Its time is proportional to the length of the cell, so that a
+hostile file cannot make it slow.
 """
 
 import csv
@@ -10,13 +11,13 @@ from math import nan
 
 from hand_eye_calib.formats.trajectory_files.dates import is_date_or_time
 
-#: Separator that stands for white space.
+#: Separator of a file whose cells are separated by white space.
 BLANKS = ""
-# Possible separators. The first of equally good separators is used.
+# Possible separators, the preferred one first if several of them fit equally well.
 _SEPARATORS = (";", "\t", ",", "|", BLANKS)
 _NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)(e[-+]?\d+)?|[-+]?nan|[-+]?inf", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(e[-+]?\d+)?", re.IGNORECASE)
-# Texts that programs write for a missing value.
+# Texts that programs write for a missing value, in lower case.
 _NULLS = {"", "nan", "-nan", "null", "none", "na", "n/a", "#n/a", "nil", "-", "--", "?"}
 # Degrees, minutes and seconds with their signs, and a hemisphere before or after the numbers.
 _ANGLE = re.compile(
@@ -26,11 +27,12 @@ _ANGLE = re.compile(
     r"(?P<behind>[NSEW]?)",
     re.ASCII,
 )
-# Largest number of characters of an angle.
+# Largest number of characters of a cell that may be an angle.
 _LONGEST_ANGLE = 40
-# Characters of angles that other cells with numbers do not have: hemispheres and signs.
+# Characters that occur in angles, but not in plain numbers: hemispheres and signs of units.
 _ANGLE_SIGNS = set("NSEW°º'′’\"″”:")
 
+# Function that splits a line into cells.
 CellsOf = Callable[[str], list[str]]
 
 
@@ -50,22 +52,22 @@ def is_null(cell: str) -> bool:
 
 
 def is_angle(cell: str) -> bool:
-    """Whether a cell is an angle in degrees, minutes and seconds, with a sign or a hemisphere."""
+    """Whether a cell is an angle in degrees, such as 52.1, 52 12 0.5 or 52d12m N."""
     return _degrees(cell) is not None
 
 
 def _is_marked_angle(cell: str) -> bool:
-    """Whether a cell is an angle with a hemisphere, a degree sign, a quote or a colon."""
+    """Whether a cell is an angle that a hemisphere, a degree sign, a quote or a colon marks."""
     return not _ANGLE_SIGNS.isdisjoint(cell) and is_angle(cell)
 
 
 def number(cell: str) -> float:
-    """Return the number in a cell; NaN for a missing value.
+    """Return the number in a cell; NaN for the mark of a missing value.
 
     Raises
     ------
     ValueError
-        If the cell has other text.
+        If the cell contains other text.
     """
     try:
         return float(cell)
@@ -78,12 +80,12 @@ def number(cell: str) -> float:
 
 
 def angle(cell: str) -> float:
-    """Return the number in a cell, or the degrees of an angle such as 52 12 0.5 N.
+    """Return the number in a cell; an angle such as 52 12 0.5 N is converted to degrees.
 
     Raises
     ------
     ValueError
-        If the cell has other text.
+        If the cell contains other text.
     """
     try:
         return number(cell)
@@ -95,16 +97,19 @@ def angle(cell: str) -> float:
 
 
 def _degrees(cell: str) -> float | None:
-    """Return the degrees of an angle in degrees, minutes and seconds; None for other text."""
+    """Return an angle in degrees, positive to the north and east; None if the text is no angle.
+
+    Minutes and seconds are optional, and must be below 60.
+    """
     text = cell.strip()
     match = _ANGLE.fullmatch(text) if len(text) <= _LONGEST_ANGLE else None
     if not match or (match["before"] and match["behind"]):
         return None
     numbers = match.group("degrees", "minutes", "seconds")
-    sizes = [abs(float(text.replace(",", "."))) for text in numbers if text]
-    if max(sizes[1:], default=0.0) >= 60:
+    magnitudes = [abs(float(digits.replace(",", "."))) for digits in numbers if digits]
+    if max(magnitudes[1:], default=0.0) >= 60:
         return None
-    total = sum(size / 60**power for power, size in enumerate(sizes))
+    total = sum(magnitude / 60**power for power, magnitude in enumerate(magnitudes))
     hemisphere = match["before"] or match["behind"]
     is_negative = match["degrees"].startswith("-") or hemisphere in ("S", "W")
     return -total if is_negative else total
@@ -126,6 +131,7 @@ def splitter(separator: str) -> CellsOf:
 
 
 def _split_at_blanks(line: str) -> list[str]:
+    """Return the cells of a line that are separated by white space outside quotes."""
     if '"' not in line:
         return line.split()
     cells = csv.reader([line.replace("\t", " ")], delimiter=" ", skipinitialspace=True)
@@ -133,9 +139,11 @@ def _split_at_blanks(line: str) -> list[str]:
 
 
 def separator_of(lines: Sequence[str]) -> str:
-    """Return the separator for which cells that are numbers contain the most digits.
+    """Return the separator of the cells in lines.
 
-    Without numbers, return the first possible separator that the first line contains.
+    A wrong separator leaves several numbers in one cell, which is then no number. So the separator
+    is used for which the cells that are numbers contain the most digits. If no cell is a number,
+    the first possible separator in the first line is used.
     """
     n_digits = {}
     for separator in _SEPARATORS:
@@ -148,38 +156,44 @@ def separator_of(lines: Sequence[str]) -> str:
 
 
 def _digits_in_numbers(cells: Sequence[str]) -> int:
-    numbers = (cell for cell in cells if is_number(cell) or _is_marked_angle(cell))
-    return sum(letter.isdigit() for cell in numbers for letter in cell)
+    """Return the number of digits in the cells that are numbers or angles."""
+    numbers = "".join(cell for cell in cells if is_number(cell) or _is_marked_angle(cell))
+    return sum(map(str.isdigit, numbers))
 
 
 def names_in(line: str, separator: str) -> list[list[str]]:
-    """Return possible names of columns in a line: a list for each way to split the line.
+    """Return the names of columns in a line, once for each way to split the line.
 
-    A line is split at the separator, at the separator outside brackets, at white space outside
-    brackets, at gaps of two or more spaces, and at other separators.
+    A header may be separated in another way than the rows. So the line is split at the separator
+    of the rows, at this separator outside brackets, at white space outside brackets, at gaps of two
+    or more spaces, and at the other separators, in this order.
     """
     text = line.lstrip("#/%").strip()
     between_gaps = [name.strip() for name in text.split("  ")]
-    ways = [
+    names_of_splits = [
         splitter(separator)(text),
         _outside_brackets(text, separator),
         _outside_brackets(text, BLANKS),
         [name for name in between_gaps if name],
     ]
-    return ways + [splitter(other)(text) for other in (",", ";", "\t") if other != separator]
+    for other in (",", ";", "\t"):
+        if other != separator:
+            names_of_splits.append(splitter(other)(text))
+    return names_of_splits
 
 
 def _outside_brackets(text: str, separator: str) -> list[str]:
-    """Split a line at a separator, but not inside brackets."""
+    """Split a line at a separator, but not at those inside brackets."""
     cells = [""]
+    # Number of brackets that are open at the letter.
     depth = 0
     for letter in text:
         if letter in "([{":
             depth += 1
         elif letter in ")]}" and depth:
             depth -= 1
-        is_end = letter == separator or (separator == BLANKS and letter.isspace())
-        if is_end and depth == 0:
+        is_separator = letter.isspace() if separator == BLANKS else letter == separator
+        if is_separator and depth == 0:
             cells.append("")
         else:
             cells[-1] += letter

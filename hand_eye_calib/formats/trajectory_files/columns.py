@@ -1,4 +1,9 @@
-"""Quantities, units and kind of data of a table's columns, recognised by the columns' names."""
+"""Quantities, units and kind of data of a table, recognised by the names of its columns.
+
+A quantity is what a column contains: "x", "qw", "lat" or "t", for example. Each quantity has a list
+of names that programs use for it. The kind of data is "poses", "positions", "rotations", "rates" or
+"twists".
+"""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,18 +18,18 @@ SCALAR_FIRST = ("q0", "q1", "q2", "q3")
 #: Coefficients of a quaternion whose order is not known.
 UNNAMED = ("q1", "q2", "q3", "q4")
 ROTATION_VECTOR = ("rotvec_x", "rotvec_y", "rotvec_z")
-#: First three rows of the matrix of a pose.
+#: Elements of the first three rows of the matrix of a pose, row by row; m14 is a translation.
 MATRIX = tuple(f"m{row}{column}" for row in "123" for column in "1234")
 ROTATION = tuple(f"m{row}{column}" for row in "123" for column in "123")
 TRANSLATION = tuple(f"m{row}4" for row in "123")
 LAST_ROW = tuple(f"m4{column}" for column in "1234")
 RATES = ("wx", "wy", "wz")
 TWIST = ("vx", "vy", "vz", *RATES)
-# Groups of quantities that are a position, the preferred group first.
+# Groups of quantities, each of which is a position; the preferred group first.
 _POSITIONS = (POSITION, ("lat", "lon", "height"), ("x", "y", "height"))
-#: Groups that are the position of a machine on a plane.
+#: Groups of quantities, each of which is the position of a vehicle on a plane.
 PLANAR_POSITIONS = (("x", "y"), ("lat", "lon"))
-# Groups of quantities that are an orientation, the preferred group first.
+# Groups of quantities, each of which is an orientation; the preferred group first.
 _ORIENTATIONS = (
     QUATERNION,
     SCALAR_FIRST,
@@ -39,21 +44,22 @@ _ORIENTATION_QUANTITIES = {
     name for group in (*_ORIENTATIONS, *_PLANAR_ORIENTATIONS) for name in group
 }
 
-# Names of the coordinate of a position. {0} is the axis, {1} its number, {2} the names of this axis
-# alone.
+# Names of a coordinate of a position. {0} is the axis (x), {1} its number (0), {2} the names that
+# only this axis has (easting).
 _POSITION_NAMES = (
     "{0} t{0} t_{0} p{0} p_{0} pos_{0} position_{0} translation_{0} position{1} "
     "actual_tcp_pose_{1} ecef_{0} {0}_ecef {0}_ecf {2}"
 )
 _DIRECTIONS = {"x": "easting pos_east", "y": "northing pos_north", "z": "altitude pos_up"}
-# Beginnings of the names of angular rates, velocities and quaternions. The axis follows.
+# Beginnings of the names of angular rates, velocities and quaternions. The name of the axis, or of
+# the coefficient of the quaternion, follows.
 _BEGINNINGS = {
     "w": "w w_ omega_ gyro_ gyr_ angvel_ ang_vel_ angular_velocity_ angular_rate_ rate_",
     "v": "v",
     "q": "q q_ o quat_ quaternion_ rot_ orientation_ rotation_",
 }
-# Names of each quantity, in lower case, with underscores between words. In files exported from
-# bags, a column has a whole path, such as .pose.pose.position.x; the end of the path is compared.
+# Names of each quantity, in lower case, with underscores between words. Files exported from bags
+# name a column by a whole path, such as .pose.pose.position.x: its end is compared with the names.
 _NAMES = {
     "header": "header_stamp",
     "t": "t ts time timestamp timestamps stamp gpstime gps_time sim_time tracking_timestamp "
@@ -94,17 +100,20 @@ _NAMES = {
     "rotvec_z": "rotvec_z actual_tcp_pose_5 rz",
     **{name: name for name in MATRIX},
 }
-# Names of a single word that may be the end of a path, such as gps_fix_latitude.
+# Names without an underscore that may be the end of a longer name, as in gps_fix_latitude. Other
+# such names ("x", "time") are too common at the end of names of other quantities.
 _ENDS = {"latitude", "longitude", "altitude", "itow", *QUATERNION, "tx", "ty", "tz"}
-# An element of a matrix: t_00, r11, rot_1_2, pose.T[0][3].
+# Names of an element of a matrix, at row and column: t_00, r11, rot_1_2, pose.T[0][3].
 _ELEMENT = re.compile(
     r"(?:^|_)(?:m|r|t|h|rot|mat|matrix|rotation|pose|transform|rotm)_?(\d)_?(\d)$"
 )
-# Signs of an orientation, and of a position, in the names of all columns joined by commas.
+# Parts of names that indicate an orientation in a table, even if no quantity was recognised. The
+# names of all columns are joined by commas.
 _ORIENTED = re.compile(
     r"(^|[^a-z])q(\d|uat|,|$)|orient|rot|angle|euler|attitude|"
     r"(^|,)(a,b,c|w,p,r|rx,ry,rz|ex,ey,ez|omega,phi,kappa)(,|$)"
 )
+# Parts of names that indicate a position.
 _PLACED = re.compile(r"(^|[^a-z])(pos(?!e)|loc|trans|coord|north|east|utm)")
 
 # Names of units, with a slash between words.
@@ -123,7 +132,8 @@ _UNIT_NAMES = {
     "ns": "ns nanosecond nanoseconds",
 }
 _UNITS = {name: unit for unit, names in _UNIT_NAMES.items() for name in names.split()}
-# Units in brackets. Some of them are not units as the last word of a name, such as stamp_sec.
+# Names of units in brackets. Some of them mean something else at the end of a name: stamp_sec is a
+# quantity, the whole seconds of a stamp.
 _UNITS_IN_BRACKETS = {
     **_UNITS,
     **dict.fromkeys(("sec", "secs"), "s"),
@@ -131,17 +141,18 @@ _UNITS_IN_BRACKETS = {
     # Degrees, minutes and seconds.
     **dict.fromkeys(("d/m/s", "+/-d/m/s", "dms", "d/m"), "deg"),
 }
-# Word in the name of a stamp that has a unit of time. "tow" and "sow" are seconds of a GPS week.
+# Words in the name of a column whose unit is a unit of time. "tow" and "sow" are the time and the
+# second of a GPS week.
 _TIME_WORD = re.compile(r"t|time.*|stamp.*|(?:gps|i)?(?:tow|sow)")
 # Brackets with their content; brackets without an end extend to the end of the name.
 _BRACKETS = re.compile(r"[\[(]([^\])]*)([\])]|$)")
 
 
 def named_columns(names: Sequence[str]) -> tuple[dict[str, list[int]], list[str]]:
-    """Return the columns of each quantity, and the unit in each name.
+    """Return the columns of each quantity, and the unit in the name of each column.
 
     A column belongs to a quantity if its name is one of the quantity's names. If a quantity has no
-    such column, names that end in one of the quantity's names are accepted.
+    such column, a column whose name ends in one of the quantity's names is accepted.
 
     Parameters
     ----------
@@ -150,9 +161,9 @@ def named_columns(names: Sequence[str]) -> tuple[dict[str, list[int]], list[str]
     Returns
     -------
     columns : dict of str to list of int
-        Quantities without a column are missing.
+        Indices of the columns of each quantity; quantities without a column are missing.
     units : (N,) list of str
-        Empty for a name without a unit.
+        Unit of each column; empty if the name has no unit.
     """
     split = [_split(name) for name in names]
     plain = [name for name, _ in split]
@@ -172,10 +183,10 @@ def named_columns(names: Sequence[str]) -> tuple[dict[str, list[int]], list[str]
 
 
 def _places_of(aliases: Sequence[str], plain: Sequence[str]) -> list[int]:
-    """Return the columns whose names are aliases; if there are none, those that end in an alias.
+    """Return the columns whose names are among the aliases of a quantity.
 
-    The end of a path is compared, such as position_x of pose.position_x. Most aliases of a single
-    word are too common at the end of other names; those of ``_ENDS`` are not.
+    If there are none, return the columns whose names end in an alias, such as pose_position_x for
+    the alias position_x. Aliases of one word are compared with ends only if they are in ``_ENDS``.
     """
     places = [place for place, name in enumerate(plain) if name in aliases]
     if places:
@@ -185,23 +196,24 @@ def _places_of(aliases: Sequence[str], plain: Sequence[str]) -> list[int]:
 
 
 def is_brief(name: str) -> bool:
-    """Whether a column is called rx, ry or rz.
+    """Whether a column has the name rx, ry or rz.
 
-    Universal Robots use these names for a rotation vector, other robots for angles.
+    Universal Robots uses these names for a rotation vector, other makers for Euler angles.
     """
     return plain_name(name) in ("rx", "ry", "rz")
 
 
 def _elements(plain: Sequence[str], columns: Mapping[str, list[int]]) -> dict[str, list[int]]:
-    """Return the columns of the elements of a matrix, empty without a whole rotation.
+    """Return the columns of the elements m11 to m34 of a pose; empty without a whole rotation.
 
-    Rows and columns of the matrix count from 0 or from 1. The translation may have the names of a
-    position.
+    The names may count the rows and columns of the matrix from 0 or from 1. The translation may
+    have the names of a position.
     """
     places_of: dict[tuple[int, int], list[int]] = {}
     for place, name in enumerate(plain):
         if match := _ELEMENT.search(name):
             places_of.setdefault((int(match[1]), int(match[2])), []).append(place)
+    # Names that count from 0 have an element 00.
     shift = 1 if (0, 0) in places_of else 0
     elements = {
         f"m{row + shift}{column + shift}": places for (row, column), places in places_of.items()
@@ -219,8 +231,7 @@ def measured(
 ) -> tuple[str, Sequence[str]]:
     """Return the kind of data in a table, and the quantities to read for this kind.
 
-    In doubt, the preferred quantities of poses are returned, so that an error names the missing
-    quantities.
+    The quantities may have no columns. Then the caller raises an error that names them.
 
     Parameters
     ----------
@@ -240,7 +251,8 @@ def measured(
     if measures == "poses":
         if has_matrix:
             return measures, MATRIX
-        # Only a machine on a plane, with a yaw or a heading, may have no height.
+        # A pose without a height is accepted only if its orientation is a yaw or a heading alone,
+        # as for a vehicle on a plane.
         if position in PLANAR_POSITIONS and orientation not in _PLANAR_ORIENTATIONS:
             position = ()
         return measures, (*(position or POSITION), *orientation)
@@ -262,7 +274,11 @@ def _first_group(
 
 
 def _kind_of(columns: Mapping[str, list[int]], names: Sequence[str]) -> str:
-    """Return the kind of data in columns without a matrix."""
+    """Return the kind of data in columns without a matrix.
+
+    Positions alone are "positions" only if no name indicates an orientation, and the same for
+    "rotations". Otherwise the table is "poses", so that an error reports the missing quantities.
+    """
     listed = ",".join(plain_name(name) for name in names)
     if _first_group((*_POSITIONS, *PLANAR_POSITIONS), columns):
         has_orientation = columns.keys() & _ORIENTATION_QUANTITIES or _ORIENTED.search(listed)
@@ -276,8 +292,9 @@ def _kind_of(columns: Mapping[str, list[int]], names: Sequence[str]) -> str:
     return "poses"
 
 
-# Groups of quantities that make a stamp, the preferred group first. The stamp of a message's header
-# is preferred to the time of its arrival, and a date with a time of day to a week of GPS.
+# Groups of quantities, each of which is a stamp; the preferred group first. "sow" is the second of
+# a GPS week, "mow" its millisecond. The stamp of a message's header is preferred to the time of its
+# arrival, and a date with a time of day to a GPS week.
 _STAMPS = (
     ("secs", "nsecs"),
     ("header",),
@@ -293,10 +310,10 @@ _STAMPS = (
 
 
 def stamp_columns(columns: Mapping[str, list[int]]) -> Sequence[str]:
-    """Return the quantities that make the stamp; empty without such quantities.
+    """Return the quantities whose columns together are the stamp; empty without such columns.
 
-    If there are a stamp, a week of GPS and a second of the week, the stamp is used, because it is
-    on the clock of the recording.
+    If there are a stamp "t", a GPS week and a second of the week, "t" is used, because it is on
+    the clock of the recording.
     """
     has_second = "sow" in columns or "mow" in columns
     if has_second and {"week", "t"} <= columns.keys():
@@ -316,16 +333,17 @@ def plain_name(name: str) -> str:
 
 
 def _split(name: str) -> tuple[str, str]:
-    """Return a column's name without its unit, and the unit; empty for a name without a unit.
+    """Return a column's name without its unit, and the unit, which may be empty.
 
     ``.pose.position.x [mm]`` becomes pose_position_x and mm; wx_deg_s becomes wx and deg/s.
     """
     name = name.strip().lower()
-    # The index of an element, such as q[0] or T[0][3], is not a unit in brackets.
+    # An index, as in q[0] or T[0][3], is not a unit in brackets: write it as q_0_.
     if re.search(r"\[\d\]$", name):
         name = re.sub(r"\[(\d)\]", r"_\1_", name)
-    # Remove names of frames, as in p_RS_R_x.
+    # Remove names of frames, as in p_RS_R_x of EuRoC and tx_world_device of Aria.
     name = re.sub(r"^([pqw])_[a-z]{2}(_[a-z])?_|_(world|odometry)_device$", r"\1_", name)
+    # Remove brackets with their content. Text after a bracket that is not closed is kept.
     outside = _BRACKETS.sub(lambda match: "" if match[2] else f" {match[1]}", name)
     words = re.findall("[a-z0-9°µμ]+", outside)
     in_brackets = [match[1] for match in _BRACKETS.finditer(name) if match[2]]
@@ -341,7 +359,11 @@ def _unit_in_brackets(text: str) -> str:
 
 
 def _split_words(words: list[str]) -> tuple[str, str]:
-    """Return the words of a name, joined without a unit at the end, and this unit."""
+    """Return the joined words of a name without a unit at its end, and this unit.
+
+    A unit of time belongs to a name with a word of time, and other units to names without one.
+    """
+    # The number of a coefficient or axis, as in q_0 and position_1, belongs to the name.
     if len(words) > 1 and words[-1].isdigit() and words[-2] in ("q", "position"):
         return "_".join(words[:-1]) + words[-1], ""
     is_time = any(_TIME_WORD.fullmatch(word) for word in words)

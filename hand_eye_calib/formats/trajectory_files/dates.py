@@ -1,6 +1,7 @@
 """Stamps in text: numbers, weeks of GPS, dates and times of day, without loss of digits.
 
-Every pattern is applied to at most :data:`_LONGEST` characters.
+Every pattern is applied to at most :data:`_LONGEST` characters, so that a hostile file cannot make
+it slow.
 """
 
 import math
@@ -18,7 +19,7 @@ GPS_TIME = "stamps are of GPS time, 18 s ahead of UTC since 2017"
 _NS = STAMP_UNITS["s"]
 # Largest number of characters of a date with time and zone, with some spaces.
 _LONGEST = 48
-# Number of the day 1970-01-01 in Python's calendar.
+# Ordinal of the day 1970-01-01 in :class:`datetime.date`.
 _EPOCH_DAY = date(1970, 1, 1).toordinal()
 #: Seconds in a day.
 DAY_S = 86_400
@@ -30,7 +31,7 @@ GPS_EPOCH_S = 315_964_800
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 _YEAR_FIRST = re.compile(r"(\d{4})([-/._ ])(\d\d?|[a-z]{3,9})\2(\d\d?)", re.IGNORECASE | re.ASCII)
 _YEAR_LAST = re.compile(r"(\d\d?)([-/. ])(\d\d?|[a-z]{3,9})\2(\d{4})", re.IGNORECASE | re.ASCII)
-# A date such as 20231114, with the groups of _YEAR_FIRST.
+# A date such as 20231114. Its groups have the numbers of those of _YEAR_FIRST.
 _PACKED = re.compile(r"(20\d\d)()(\d\d)(\d\d)", re.ASCII)
 # Text between a date and a time of day.
 _BETWEEN = re.compile(r"T|[ ,_-]{1,4}|", re.IGNORECASE)
@@ -40,16 +41,17 @@ _TIME = re.compile(
     re.IGNORECASE | re.ASCII,
 )
 _ZONE = re.compile(r"([-+])(\d\d):?(\d\d)?", re.ASCII)
-# Largest number of characters of a time of day that has its date in another column.
+# Number of characters from which a time is a complete stamp, so that no date from another column is
+# put before it.
 _LONGEST_TIME = len("HH:MM:SS.123456789ab")
 
 
 def seconds_of(text: str) -> Decimal:
     """Return the seconds since 1970 of a date with or without a time of day.
 
-    For a time of day alone, return the seconds of the day. A time without a zone is UTC. If the
-    fraction has the same separator as minutes and seconds, its digits are a number of milliseconds,
-    microseconds or nanoseconds.
+    For a time of day alone, the seconds since midnight are returned. A time without a zone is UTC.
+    The digits after the seconds are decimals. After a separator such as that between minutes and
+    seconds (12:30:05:25), the digits are a number of milliseconds, microseconds or nanoseconds.
 
     Raises
     ------
@@ -88,7 +90,7 @@ def is_date(text: str) -> bool:
 
 
 def is_ambiguous(text: str) -> bool:
-    """Whether a date remains valid if its day and month are exchanged."""
+    """Whether a date with slashes is another valid date if its day and month are exchanged."""
     match = _YEAR_LAST.match(text.strip()[:_LONGEST])
     if not match or match[2] != "/" or not match[3].isdigit():
         return False
@@ -107,7 +109,7 @@ def _day_and_rest(text: str) -> tuple[int | None, str]:
         return None, text
     day = match[1]
     month = match[3]
-    # In dates with slashes the month is first, unless the first number is too large for a month.
+    # Dates with slashes begin with the month, unless the first number is too large for a month.
     if match[2] == "/" and int(match[1]) <= 12:
         day = match[3]
         month = match[1]
@@ -131,14 +133,16 @@ def _time_of_day(text: str) -> Decimal:
     second = int(second_text or 0)
     if hour > 24 or minute > 59 or second > 60:
         raise ValueError("no time of day")
-    # With the separator of minutes and seconds, the digits are a number of ms, us or ns.
-    is_number = point == separator and point != "."
-    fraction = _fraction(digits, is_number) if digits else 0
+    fraction = Decimal(0)
+    if digits:
+        # After a separator as in 12:30:05:25, the digits are a number of ms, us or ns.
+        is_number = point == separator and point != "."
+        fraction = _fraction(digits, is_number)
     return Decimal(3600 * hour + 60 * minute + second - _zone_s(zone or "")) + fraction
 
 
 def _hour_of_day(hour: int, half: str | None) -> int:
-    """Return the hour of 24 for an hour of 12 with am or pm; other hours unchanged."""
+    """Return the hour from 0 to 23; ``half`` is "am", "pm", or None for an hour without either."""
     if half is None:
         return hour
     if not 1 <= hour <= 12:
@@ -147,7 +151,10 @@ def _hour_of_day(hour: int, half: str | None) -> int:
 
 
 def _fraction(digits: str, is_number: bool) -> Decimal:
-    """Return the seconds of the digits of a fraction, or of a number of ms, us or ns."""
+    """Return the fraction of a second in digits.
+
+    If the digits are a number, up to 3 of them are ms, up to 6 are us, and up to 9 are ns.
+    """
     n_decimals = 3 * math.ceil(len(digits) / 3) if is_number else len(digits)
     return Decimal(digits).scaleb(-n_decimals)
 
@@ -161,7 +168,7 @@ def _zone_s(zone: str) -> int:
     return -ahead_s if match[1] == "-" else ahead_s
 
 
-# ---- the stamp of a row
+# ---- stamp of a row
 
 
 def stamp_of(names: Sequence[str], cells: Sequence[str], unit: str = "") -> Decimal:
@@ -174,18 +181,18 @@ def stamp_of(names: Sequence[str], cells: Sequence[str], unit: str = "") -> Deci
     cells : sequence of str
     unit : str, optional
         Unit of the second of a GPS week, if the name of the column states it. By default, the
-        number is in seconds, or in milliseconds if it is too large for two weeks.
+        number is in seconds, or in milliseconds if it is more than the seconds of two weeks.
 
     Returns
     -------
     Decimal
-        For dates and weeks of GPS in seconds; for columns of seconds and nanoseconds in
-        nanoseconds; otherwise in the unit of the column.
+        In seconds for dates and GPS weeks; in nanoseconds for columns of seconds and nanoseconds;
+        otherwise in the unit of the column.
 
     Raises
     ------
     ValueError
-        If the cells have other text.
+        If a cell contains other text.
     """
     last = cells[-1]
     if len(cells) == 1:
@@ -196,7 +203,7 @@ def stamp_of(names: Sequence[str], cells: Sequence[str], unit: str = "") -> Deci
         second = _number(last)
         if second is not None and second.is_finite():
             return _stamp_in_week(cells[0], second, unit)
-    # Ignore the date if the other cell is a complete stamp.
+    # A longer cell is a complete stamp: ignore the date in the other column.
     if names[0] == "date" and ":" in last and len(last) < _LONGEST_TIME:
         return seconds_of(" ".join(cells))
     return _decimal(last)
@@ -205,7 +212,8 @@ def stamp_of(names: Sequence[str], cells: Sequence[str], unit: str = "") -> Deci
 def _stamp_in_week(week_text: str, second: Decimal, unit: str) -> Decimal:
     """Convert a GPS week and a second of the week to seconds since 1970, in GPS time.
 
-    A number that is too large for a second of a week is a whole stamp and returned unchanged.
+    A number that is too large for a second of two weeks, also in ms, is a complete stamp. It is
+    returned unchanged.
     """
     for possible_unit in (unit,) if unit else ("s", "ms"):
         second_of_week = second * STAMP_UNITS[possible_unit] / _NS
@@ -218,8 +226,8 @@ def _stamp_in_week(week_text: str, second: Decimal, unit: str) -> Decimal:
 
 
 def _number(text: str) -> Decimal | None:
-    """Return the number in a text; None for other text."""
-    # Decimal would ignore underscores, which are separators in stamps.
+    """Return the number in a text, with a decimal point or comma; None for other text."""
+    # Decimal ignores underscores, but in stamps they separate numbers.
     if "_" in text:
         return None
     for number in (text, text.replace(",", ".")):
@@ -231,7 +239,7 @@ def _number(text: str) -> Decimal | None:
 
 
 def _decimal(text: str) -> Decimal:
-    """Return a number in any unit, or the seconds of a date or time of day."""
+    """Return the number in a text, in an unknown unit, or the seconds of a date or time of day."""
     stamp = _number(text)
     if stamp is None and is_date_or_time(text):
         return seconds_of(text)
@@ -241,7 +249,10 @@ def _decimal(text: str) -> Decimal:
 
 
 def notes_on_stamps(names: Sequence[str], cells: Sequence[str]) -> list[str]:
-    """Return notes for the user on the stamps of a table, from the cells of one row."""
+    """Return notes for the user on the stamps of a table: GPS time, and ambiguous dates.
+
+    ``names`` are the quantities of the stamp, ``cells`` its cells in one row.
+    """
     notes = []
     if names and names[0] == "week":
         notes.append(GPS_TIME)

@@ -1,7 +1,8 @@
 """Layout of a text file with rows of numbers.
 
-The layout states where the rows begin, what separates their cells, and the quantity of each column.
-The quantities are recognised by the names above the rows, or by the numbers themselves.
+A layout contains the line where the rows begin, the separator of their cells, and the quantity of
+each column (x, qw, ...). The quantities are recognised by the names above the rows. Without names,
+they are recognised by the values: a quaternion has unit length, a rotation matrix is orthogonal.
 """
 
 import re
@@ -43,33 +44,36 @@ from hand_eye_calib.formats.trajectory_files.columns import (
 )
 from hand_eye_calib.formats.trajectory_files.dates import is_date, is_date_or_time
 
-#: Digits before the decimal point of stamps since 1970. Stamps in seconds have fewer.
-DIGITS = {"ns": 17, "us": 14, "ms": 11}
+#: Stamps since 1970 are in ns from 10**17, in us from 10**14, in ms from 10**11, and in seconds
+#: below. These are times in March 1973, so the unit of later stamps is clear.
+UNIT_EXPONENTS = {"ns": 17, "us": 14, "ms": 11}
 COMMENTS = ("#", "//")
 _LINE = re.compile(r"\S[^\r\n]*")
 
-# Largest number of lines from which the layout is recognised, without comments. Text above the
-# columns has some twenty lines, sometimes a hundred.
+# Largest number of lines from which the layout is recognised; comments do not count. Text above the
+# columns has about 20 lines, sometimes 100.
 _MOST_LINES = 300
-# Largest number of characters of these lines.
+# Largest number of characters from which the layout is recognised.
 _MOST_CHARACTERS = 1 << 19
-# Largest number of comments above these lines that may name the columns.
+# Largest number of comments, the last ones above the first row, in which column names are searched.
 _MOST_COMMENTS = 100
-# Largest number of rows whose numbers decide what a column is.
+# Largest number of rows from whose values the quantities of the columns are recognised.
 _MOST_ROWS = 100
-# Smallest share of values among the cells of a row. The other cells may be names of frames.
+# A line is a row of numbers if at least this share of its cells are values. The other cells may be
+# names of frames.
 _MIN_SHARE_OF_VALUES = 0.5
 
-#: Columns of a row in the format tum.
+#: Quantities of the columns in the format tum.
 TUM = ("t", *POSITION, "qx", "qy", "qz", "qw")
-#: Columns of a stamp and a pose whose quaternion may be in either order.
+#: Columns of a stamp and a pose whose quaternion may have its scalar first or last.
 STAMPED_POSE = ("t", *POSITION, *UNNAMED)
 # Columns of the state that FAST-LIO and related programs write: a stamp, a rotation vector, a
-# position, and six vectors of which the last is gravity.
+# position, and six more vectors (18 columns). The last vector is gravity.
 _FAST_LIO = ("t", *ROTATION_VECTOR, *POSITION, *[""] * 18)
-# Smallest and largest length of gravity (m/s^2).
+# Smallest and largest norm of gravity (m/s^2) in the state of FAST-LIO: 9.81, with room for errors
+# of its estimate.
 _GRAVITY_M_S2 = (9.6, 10.0)
-# Ten digits of seconds since 1970.
+# A stamp since 1970 in any unit: seconds have ten digits.
 _SINCE_1970 = re.compile(r"\d{10,}(\.\d*)?", re.ASCII)
 
 
@@ -80,7 +84,7 @@ class Layout:
     Attributes
     ----------
     rows_after : int
-        Number of the last line above the rows.
+        Number of the last line above the rows; lines count from 1. 0 if the rows begin at once.
     cells_of : callable
         Splits a row into cells.
     row : list of str
@@ -88,11 +92,11 @@ class Layout:
     names : tuple of str, optional
         Names of the columns, from a line above the rows.
     format : str
-        Format of the rows; "tum" in doubt, so that the reader of this format reports the problem.
+        Format of the rows. "tum" if no format fits: the error then describes a row of this format.
     columns : tuple of str, optional
-        Quantities of the columns in this format, if they are known.
+        Quantities of the columns; None if they are not known.
     is_transposable : bool
-        Whether the matrices may be written row by row or column by column.
+        Whether the elements of a rotation matrix may be in the order of its rows or of its columns.
     """
 
     rows_after: int
@@ -135,7 +139,8 @@ def layout_of(path: str | Path, text: str, needs_names: bool) -> Layout:
         Name of the text in messages.
     text : str
     needs_names : bool
-        Whether names above the rows must fit the columns, because no option names the columns.
+        Whether no option names the columns. A line above the rows with the names of more or fewer
+        columns is then an error.
 
     Raises
     ------
@@ -153,7 +158,7 @@ def layout_of(path: str | Path, text: str, needs_names: bool) -> Layout:
     row = _usual_row(cells[n_above:])
     header = _header_of(above, row, separator)
     if needs_names and header.names is None:
-        _refuse_other_number(path, lines[:n_above], _without_last(row), separator)
+        _refuse_other_number_of_names(path, lines[:n_above], _without_last(row), separator)
     cells_of = _merged(split, header.merge) if header.merge else split
     rows = [cells_of(line) for _, line in lines[n_above:]]
     rows_after = lines[n_above - 1][0] if n_above else 0
@@ -165,7 +170,7 @@ def layout_of(path: str | Path, text: str, needs_names: bool) -> Layout:
 
 
 def _layout_without_rows(lines: Sequence[tuple[int, str]], separator: str) -> Layout:
-    """Return the layout of a text without rows of numbers. Its last line may name columns."""
+    """Return the layout of a text without rows of numbers, whose last line may name the columns."""
     split = splitter(separator)
     if not lines:
         return Layout(0, split, [], None, "tum", STAMPED_POSE)
@@ -174,13 +179,16 @@ def _layout_without_rows(lines: Sequence[tuple[int, str]], separator: str) -> La
 
 
 def _usual_row(rows: Sequence[list[str]]) -> list[str]:
-    """Return the first row with the most frequent number of cells."""
+    """Return the first row that has the most frequent number of cells."""
     n_cells = Counter(map(len, rows)).most_common(1)[0][0]
     return next(row for row in rows if len(row) == n_cells)
 
 
 def _first_lines(path: str | Path, text: str) -> tuple[list[str], list[tuple[int, str]]]:
-    """Return the comments at the beginning, and the first numbered lines that are not comments."""
+    """Return the comments above the first other line, and the first lines that are not comments.
+
+    A line that is not a comment is returned with its number.
+    """
     comments: deque[str] = deque(maxlen=_MOST_COMMENTS)
     lines: list[tuple[int, str]] = []
     n_characters = 0
@@ -195,20 +203,19 @@ def _first_lines(path: str | Path, text: str) -> tuple[list[str], list[tuple[int
     return [*comments], lines
 
 
-def _lines_above_rows(cells: Sequence[Sequence[str]]) -> int | None:
+def _lines_above_rows(cells: Sequence[list[str]]) -> int | None:
     """Return the number of lines of text above the rows of numbers; None without rows."""
-    is_row = [_is_row(row) for row in cells]
-    n_cells = Counter(len(row) for row, has_values in zip(cells, is_row, strict=True) if has_values)
-    if not n_cells:
+    rows = [line for line, row in enumerate(cells) if _is_row(row)]
+    if not rows:
         return None
-    usual = n_cells.most_common(1)[0][0]
-    first = next(place for place, row in enumerate(cells) if is_row[place] and len(row) == usual)
-    # Rows with another number of cells may precede the first usual row. The text ends before them.
-    return 1 + max((place for place in range(first) if not is_row[place]), default=-1)
+    first = cells.index(_usual_row([cells[line] for line in rows]))
+    # Rows with another number of cells may precede the first usual row. They belong to the rows,
+    # so the text ends at the last line before the usual row that is not a row.
+    return 1 + max((line for line in range(first) if line not in rows), default=-1)
 
 
 def _is_row(cells: Sequence[str]) -> bool:
-    """Whether cells are a row of values rather than names or other text."""
+    """Whether a line is a row of numbers; at least half of its cells must be values."""
     filled = [cell for cell in cells if cell]
     n_values = sum(map(is_value, filled))
     has_number = any(is_number(cell) or is_date_or_time(cell) for cell in filled)
@@ -217,7 +224,7 @@ def _is_row(cells: Sequence[str]) -> bool:
 
 # ---- joining of cells
 
-# Joins cells of a row that belong to one column.
+# Function that joins the cells of a row that belong to one column, such as date and time of day.
 _Merge = Callable[[Sequence[str]], list[str]]
 
 
@@ -227,15 +234,15 @@ def _merged(split: CellsOf, merge: _Merge) -> CellsOf:
 
 
 def _without_last(cells: Sequence[str]) -> list[str]:
-    """Drop an empty cell after the last separator."""
+    """Return cells without the empty cell that a separator at the end of the line makes."""
     return [*cells] if cells[-1] else [*cells[:-1]]
 
 
 def _joining(widths: Sequence[int]) -> _Merge:
     """Return a function that joins neighbouring cells of a row into columns.
 
-    ``widths`` are the numbers of cells of the columns, some of them 0. Rows with another total
-    number of cells stay unchanged.
+    ``widths`` is the number of cells of each column; columns with 0 cells are skipped. The function
+    returns rows with another total number of cells unchanged.
     """
     ends = np.cumsum([width for width in widths if width]).tolist()
     spans = list(zip([0, *ends[:-1]], ends, strict=True))
@@ -264,10 +271,11 @@ class _Header(NamedTuple):
 
 
 def _header_of(above: Sequence[str], row: list[str], separator: str) -> _Header:
-    """Return the header of rows such as ``row``, from the lines above the rows."""
+    """Return the header for rows with as many cells as ``row``, from the lines above the rows."""
     header = _header_above(above, row, separator)
     if header:
         return header
+    # The rows may end with a separator, but the line of the names may not.
     if not row[-1]:
         header = _header_above(above, row[:-1], separator)
         return _Header(header.names if header else None, _without_last)
@@ -279,33 +287,33 @@ def _header_of(above: Sequence[str], row: list[str], separator: str) -> _Header:
 def _header_above(above: Sequence[str], row: Sequence[str], separator: str) -> _Header | None:
     """Return the header from the lines above the rows; None if no line fits the row.
 
-    The nearest line with known names is preferred. Without known names, the nearest line that fits
-    and is not a comment is used.
+    The nearest line with names of quantities is preferred. Without such a line, the nearest line
+    that fits and is not a comment is used.
     """
     unknown = None
-    for place in reversed(range(len(above))):
-        line = above[place]
+    below = ""
+    for line in reversed(above):
         is_comment = line.startswith(COMMENTS)
         for names in names_in(line, separator):
-            header = _fitted(names, row, is_comment)
+            header = _header_if_fitting(names, row, is_comment)
             if header is None or header.names is None:
                 continue
-            if _is_known(header.names):
-                below = above[place + 1] if place + 1 < len(above) else ""
+            if _are_names_of_quantities(header.names):
                 with_units = _with_units(header.names, below, separator)
                 return header._replace(names=_with_stamp(with_units, row))
             if unknown is None and not is_comment:
                 unknown = _Header(header.names)
+        below = line
     return unknown
 
 
-def _refuse_other_number(
+def _refuse_other_number_of_names(
     path: str | Path, lines: Sequence[tuple[int, str]], row: Sequence[str], separator: str
 ) -> None:
     """Raise an InputError if a line above the rows names more or fewer columns than a row has."""
     for line_number, line in lines:
         names = names_in(line, separator)[0]
-        if _is_known(names) and len(row) > 1:
+        if _are_names_of_quantities(names) and len(row) > 1:
             raise InputError(
                 f"{path}, line {line_number}: names {len(names)} columns, but "
                 f"the rows have {len(row)} cells; write one name for each "
@@ -313,17 +321,19 @@ def _refuse_other_number(
             )
 
 
-def _is_known(names: Sequence[str]) -> bool:
-    """Whether some of the names are those of a pose, of rates or of an orientation."""
+def _are_names_of_quantities(names: Sequence[str]) -> bool:
+    """Whether the names include those of a position, an orientation, rates or a pose."""
     columns = named_columns(names)[0].keys()
     return is_pose(columns) or {"x", "qw"} <= columns or {"roll", "pitch"} <= columns
 
 
-def _fitted(names: Sequence[str], row: Sequence[str], is_comment: bool) -> _Header | None:
-    """Return a header with one name for each cell of a row; None if the names do not fit.
+def _header_if_fitting(
+    names: Sequence[str], row: Sequence[str], is_comment: bool
+) -> _Header | None:
+    """Return a header with one name for each cell of a row; None if the numbers of both differ.
 
-    Cells may be joined to fit. If a comment has too many names, its last names are used, because
-    its first words may be text such as "format:".
+    Cells that belong to one quantity are joined. If a comment has more words than the row has
+    cells, the last words are the names: the first words may be text such as "format:".
     """
     # A separator at the end of the line makes an empty name.
     if len(names) == len(row) + 1 and not names[-1]:
@@ -335,7 +345,7 @@ def _fitted(names: Sequence[str], row: Sequence[str], is_comment: bool) -> _Head
         if sum(widths) == len(row):
             return _header_of_widths(names, widths, row)
     n_missing = len(row) - len(names)
-    if _is_open(names[-1]):
+    if _may_name_several_columns(names[-1]):
         # The last name stands for all further columns, which get empty names.
         if len(names) > 1 and n_missing >= -1:
             return _Header((*names[:-1], *[""] * (n_missing + 1)))
@@ -345,7 +355,7 @@ def _fitted(names: Sequence[str], row: Sequence[str], is_comment: bool) -> _Head
 
 
 def _header_of_widths(names: Sequence[str], widths: Sequence[int], row: Sequence[str]) -> _Header:
-    """Return the header of the names with cells, whose cells are joined by their widths."""
+    """Return the header of names that have ``widths`` cells in a row; names without cells go."""
     names = [name for name, width in zip(names, widths, strict=True) if width]
     if max(widths) == 1:
         return _Header(_with_degrees(names, row))
@@ -353,13 +363,13 @@ def _header_of_widths(names: Sequence[str], widths: Sequence[int], row: Sequence
     return _Header(_with_degrees(names, merge(row)), merge)
 
 
-def _is_open(name: str) -> bool:
-    """Whether the last name may belong to any number of columns, also to none."""
+def _may_name_several_columns(name: str) -> bool:
+    """Whether a name such as "cov" or "*" may stand for any number of columns, also for none."""
     return name.startswith("*") or name.endswith("...") or "cov" in name.lower()
 
 
-# Numbers of cells that a latitude may have: degrees; degrees, minutes and seconds; degrees and
-# minutes.
+# Possible numbers of cells of a latitude or longitude, in the order in which they are tried:
+# degrees; degrees, minutes and seconds; degrees and minutes.
 _ANGLE_CELLS = (1, 3, 2)
 _HEMISPHERES = {"N", "S", "E", "W"}
 
@@ -371,26 +381,28 @@ def _places_of(names: Sequence[str], *quantities: str) -> set[int]:
 
 
 def _widths(names: Sequence[str], row: Sequence[str], n_angle_cells: int) -> list[int]:
-    """Return the number of cells of each name in a row.
+    """Return the number of cells in a row that belong to each name.
 
-    A name has no cells if its cell is joined to the name before, such as the cell of a hemisphere.
+    A latitude or longitude has ``n_angle_cells`` cells, and one more for a hemisphere; a stamp may
+    have two cells, its date and its time of day. If there are as many names as cells, a name whose
+    cell belongs to the quantity before has no cells.
     """
     angles = _places_of(names, "lat", "lon")
     stamps = _places_of(names, "t", "date")
-    all_have_names = len(names) == len(row)
+    has_name_for_each_cell = len(names) == len(row)
     widths: list[int] = []
-    place = 0
+    n_used_cells = 0
     for column in range(len(names)):
         width = 1
-        if all_have_names and place > column:
+        if has_name_for_each_cell and n_used_cells > column:
             width = 0
         elif column in angles:
-            next_cell = row[place + n_angle_cells : place + n_angle_cells + 1]
-            width = n_angle_cells + len(_HEMISPHERES.intersection(next_cell))
-        elif column in stamps and not all_have_names and _is_split_stamp(row[place:]):
-            width = 2
+            end = n_used_cells + n_angle_cells
+            width = n_angle_cells + len(_HEMISPHERES.intersection(row[end : end + 1]))
+        elif column in stamps and not has_name_for_each_cell:
+            width = 2 if _is_split_stamp(row[n_used_cells:]) else 1
         widths.append(width)
-        place += width
+        n_used_cells += width
     return widths
 
 
@@ -437,13 +449,15 @@ _POSES: tuple[tuple[str, ...], ...] = (
     (*POSITION, *UNNAMED),
     (*UNNAMED, *POSITION),
 )
-# Poses with a rotation matrix in separate columns, which may be written row by row or column by
-# column.
+# Poses whose rotation matrix is separate from the translation. Programs write the elements of such
+# a matrix in the order of its rows or of its columns.
 _TRANSPOSABLE = _POSES[3:5]
-# Column counts of a covariance after the pose: its diagonal, one half, or all elements.
+# Possible numbers of columns of a covariance (6, 6) after a pose: the diagonal, one triangle, or
+# all elements.
 _COVARIANCES = (6, 21, 36)
-# Column counts for which several formats are possible.
-_UNCLEAR = (4, 7)
+# Numbers of columns that several kinds of data have: x y z with a stamp or a quaternion alone; a
+# pose without a stamp, or a stamp with position and angles.
+_AMBIGUOUS_COUNTS = (4, 7)
 
 
 def _with_fitting_columns(
@@ -451,7 +465,7 @@ def _with_fitting_columns(
 ) -> Layout:
     """Set the format and the columns of a layout without names from the values in its rows."""
     n_columns = len(layout.row)
-    columns = _fitting(layout.row, rows)
+    columns = _columns_of_rows(layout.row, rows)
     may_be_stamped_pose = columns is None or columns[: len(TUM)] == STAMPED_POSE
     is_long_enough = is_separated and n_columns >= len(TUM)
     if may_be_stamped_pose and is_long_enough and _is_in_ns(layout.row[0]):
@@ -466,13 +480,16 @@ def _with_fitting_columns(
             columns=columns,
             is_transposable=pose in _TRANSPOSABLE,
         )
-    return _in_doubt(layout, is_separated)
+    return _with_assumed_format(layout, is_separated)
 
 
-def _in_doubt(layout: Layout, is_separated: bool) -> Layout:
-    """Set the format of a layout whose numbers fit nothing, by the number of its columns."""
+def _with_assumed_format(layout: Layout, is_separated: bool) -> Layout:
+    """Set the format by the number of columns, because the values in the rows fit no pose.
+
+    Reading the rows then fails with an error that describes a row of this format.
+    """
     n_columns = len(layout.row)
-    if is_separated or n_columns in _UNCLEAR:
+    if is_separated or n_columns in _AMBIGUOUS_COUNTS:
         columns = STAMPED_POSE if n_columns == len(STAMPED_POSE) else None
         return replace(layout, format="csv", columns=columns)
     if n_columns == len(MATRIX):
@@ -480,18 +497,18 @@ def _in_doubt(layout: Layout, is_separated: bool) -> Layout:
     return replace(layout, format="tum", columns=STAMPED_POSE)
 
 
-def _fitting(row: Sequence[str], rows: Sequence[Sequence[str]]) -> tuple[str, ...] | None:
-    """Return columns that fit the numbers of the first rows; None if nothing fits.
+def _columns_of_rows(row: Sequence[str], rows: Sequence[Sequence[str]]) -> tuple[str, ...] | None:
+    """Return the quantities of the columns from the values in the first rows; None if none fit.
 
-    Cells of text have columns with empty names.
+    Columns that contain text have an empty name. ``row`` is a row with the usual number of cells.
     """
     places = [place for place, cell in enumerate(row) if is_value(cell)]
     if not places:
         return None
-    values = _complete(rows, places, len(row))
-    # Numbers of a file may be too large for their squares.
+    values = _values_in(rows, places, len(row))
+    # Squares of very large numbers overflow to infinity, which fits nothing.
     with np.errstate(all="ignore"):
-        columns = _columns_of(values) if len(values) else None
+        columns = _columns_of_values(values) if len(values) else None
     if columns is None:
         return None
     named = [""] * len(row)
@@ -500,10 +517,10 @@ def _fitting(row: Sequence[str], rows: Sequence[Sequence[str]]) -> tuple[str, ..
     return tuple(named)
 
 
-def _columns_of(values: FloatArray) -> tuple[str, ...] | None:
-    """Return columns that fit numbers (N, n); None if nothing fits.
+def _columns_of_values(values: FloatArray) -> tuple[str, ...] | None:
+    """Return the quantities of columns with these values (N, n); None if no quantities fit.
 
-    The columns are a pose with or without a stamp, or a stamped pose and further columns.
+    Possible are a pose with or without a stamp, and a stamped pose with further columns.
     """
     if values.shape[1] == len(_FAST_LIO) and _is_gravity(values[:, -3:]):
         return _FAST_LIO
@@ -511,7 +528,7 @@ def _columns_of(values: FloatArray) -> tuple[str, ...] | None:
 
 
 def _pose_alone(values: FloatArray) -> tuple[str, ...] | None:
-    """Return the columns of a pose with or without a stamp; None if numbers (N, n) do not fit."""
+    """Return the columns of a pose with or without a stamp; None if values (N, n) do not fit."""
     stamps: list[tuple[str, ...]] = [(), ("t",)]
     if _are_seconds_and_ns(values):
         stamps.append(("secs", "nsecs"))
@@ -524,20 +541,25 @@ def _pose_alone(values: FloatArray) -> tuple[str, ...] | None:
 
 
 def _pose_with_more(values: FloatArray) -> tuple[str, ...] | None:
-    """Return the columns of a stamped pose and further columns; None if numbers do not fit."""
+    """Return the columns of a stamped pose and more columns; None if values (N, n) do not fit.
+
+    The columns after the pose have empty names.
+    """
     for pose in _POSES:
         n_more = values.shape[1] - 1 - len(pose)
-        # Any number of columns may follow a position and a quaternion.
+        # Any number of columns may follow a position and a quaternion; only those of a covariance
+        # may follow other poses.
         may_have_more = pose == STAMPED_POSE[1:] or n_more in _COVARIANCES
         if n_more > 0 and may_have_more and _fits(pose, values[:, 1 : 1 + len(pose)]):
             return ("t", *pose, *[""] * n_more)
     return None
 
 
-def _complete(rows: Sequence[Sequence[str]], places: Sequence[int], n_columns: int) -> FloatArray:
-    """Return the numbers (N, n) of the first rows in which all n cells are numbers.
+def _values_in(rows: Sequence[Sequence[str]], places: Sequence[int], n_columns: int) -> FloatArray:
+    """Return the values (N, n) in the columns ``places`` of the first rows that have numbers there.
 
-    A first cell that is not a number, such as a date, becomes 0.
+    Rows with another number of columns than ``n_columns`` are skipped. A first cell that is not a
+    number, such as a date, becomes 0.
     """
     values: list[list[float]] = []
     for cells in islice((cells for cells in rows if len(cells) == n_columns), _MOST_ROWS):
@@ -552,7 +574,11 @@ def _complete(rows: Sequence[Sequence[str]], places: Sequence[int], n_columns: i
 
 
 def _fits(pose: Sequence[str], values: FloatArray) -> bool:
-    """Whether values (N, n) can be those of a pose with these columns."""
+    """Whether values (N, n) can be those of a pose with these columns.
+
+    Quaternions must have unit length, and rotation matrices must be orthogonal. Rows with zeros
+    only have no pose and are ignored, but at least one row must have a pose.
+    """
     if UNNAMED[0] in pose:
         norms = np.linalg.norm(_values_of(UNNAMED, pose, values), axis=1)
         is_unit = np.abs(norms - 1.0) <= QUATERNION_NORM_TOLERANCE
@@ -569,6 +595,7 @@ def _fits(pose: Sequence[str], values: FloatArray) -> bool:
 
 
 def _values_of(names: Sequence[str], pose: Sequence[str], values: FloatArray) -> FloatArray:
+    """Return the values (N, k) of k quantities; column i of ``values`` is the quantity pose[i]."""
     return values[:, [pose.index(name) for name in names]]
 
 
@@ -584,12 +611,12 @@ def _are_seconds_and_ns(values: FloatArray) -> bool:
 
 
 def _is_gravity(values: FloatArray) -> bool:
-    """Whether vectors (N, 3) have the length of gravity."""
+    """Whether all vectors (N, 3) have the norm of gravity."""
     lengths = np.linalg.norm(values, axis=1)
     shortest, longest = _GRAVITY_M_S2
     return bool(((lengths >= shortest) & (lengths <= longest)).all())
 
 
 def _is_in_ns(cell: str) -> bool:
-    """Whether a cell has nanoseconds since 1970."""
-    return cell.isdecimal() and len(cell) >= DIGITS["ns"]
+    """Whether a cell is a number of nanoseconds since 1970."""
+    return cell.isdecimal() and len(cell) >= UNIT_EXPONENTS["ns"]

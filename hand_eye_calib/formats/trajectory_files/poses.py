@@ -1,9 +1,10 @@
 """Poses from the numbers of a table.
 
-A file may not state the order of its quaternions or the convention of its angles. The motion then
-decides: a vehicle moves in a steady direction of its own body, usually forward. If orientations are
-read in a wrong convention, this direction changes as the vehicle turns. Hand-held sensors and
-drones move in all directions, so their motion does not distinguish conventions.
+A file may not state the order of its quaternions or the convention of its angles. Both are then
+inferred from the motion: a vehicle moves in a steady direction of its own body, usually forward. If
+its orientations are read in a wrong convention, this direction changes as the vehicle turns.
+Hand-held sensors and drones move in all directions, so their motion does not distinguish
+conventions; the usual convention is then assumed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,21 +42,24 @@ from hand_eye_calib.formats.trajectory_files.table import Table
 
 # Largest angle (rad) of a column without a unit: one turn, with room for rounding.
 _LARGEST_ANGLE_RAD = 2 * np.pi + 0.01
-# Units of lengths, angles and rates, as factors to m, rad and rad/s, and a limit. A column without
-# a unit is in the first unit, or in the second if a value exceeds the limit. The limit of rates is
-# 2,000 deg/s, the range of usual gyroscopes.
+# For each kind of quantity: units with their factors to m, rad and rad/s, and a limit in the first
+# unit. A column without a unit is in the first unit, or in the second if a value exceeds the limit.
+# The limit of rates is 2,000 deg/s in rad/s, the range of usual gyroscopes.
 _KINDS = {
     "length": ({"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}, np.inf),
     "angle": ({"rad": 1.0, "deg": np.pi / 180}, _LARGEST_ANGLE_RAD),
     "rate": ({"rad/s": 1.0, "deg/s": np.pi / 180}, 35.0),
 }
 
+# Conventions of roll, pitch and an angle about the vertical. Notes describe this angle so.
 _COMPASS = "clockwise from north"
 _MATHEMATICAL = "counterclockwise from x (east)"
-# Roll, pitch and yaw of the inverse rotation, as in the library pyboreas.
+# The angles are those of the inverse rotation, as in the library pyboreas.
 _INVERSE = "that of the world in the sensor's frame"
+# The rotations about x, y and z are applied in the opposite order.
 _OTHER_ORDER = "counterclockwise from x, about axes that roll and pitch have turned"
-# Largest scatter of the vertical direction in a level sensor: 1 minus the cosine of 2.5 deg.
+# A sensor remains level if the scatter of the vertical direction in its axes, 1 minus the length of
+# the mean direction, is at most this value: about 1 minus the cosine of 2.5 deg.
 _LEVEL = 1e-3
 
 # ---- poses and rates
@@ -64,24 +68,25 @@ _LEVEL = 1e-3
 def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, ...]:
     """Return the poses of a table, or its angular rates.
 
-    Notes about conventions that the file does not state are added to the table's ``guesses``.
+    Notes about conventions that were guessed are added to the table's ``guesses``.
 
     Parameters
     ----------
     table : Table
     convention : str, optional
-        Convention of the angles. By default, the motion decides.
+        Convention of the angles. By default, it is inferred from the motion.
 
     Returns
     -------
     positions : (N, 3) array
         Positions, m. For angular rates, the tuple has only one array (N, 3), rad/s.
     quats_xyzw : (N, 4) array
+        Orientations of the sensor in its world.
 
     Raises
     ------
     InputError
-        For invalid values; the message names their line.
+        For invalid values; the message contains their line number.
     """
     table.refuse(
         np.asarray(~np.isfinite(table.values()).all(axis=1)),
@@ -110,8 +115,8 @@ def _rotations_of(quats_xyzw: FloatArray) -> FloatArray:
 def _positions(table: Table) -> tuple[FloatArray, FloatArray | None]:
     """Return the positions (N, 3), m, of a table without matrices.
 
-    The second value is None, or for latitudes the rotations (N, 3, 3) from the axes east, north and
-    up of each position to the same axes of the first position.
+    For latitudes and longitudes, the second value is the rotations (N, 3, 3) from the axes east,
+    north and up at each position to those at the first position. Otherwise it is None.
     """
     positions = np.zeros((len(table.line_numbers), 3))
     to_first = None
@@ -138,7 +143,7 @@ def _refuse_far(table: Table, positions: FloatArray) -> None:
 def _of_matrices(table: Table) -> tuple[FloatArray, FloatArray]:
     """Return the positions (N, 3), m, and quaternions (N, 4), scalar last, of matrices.
 
-    The orientations are the rotations nearest to the matrices, whose numbers may have few digits.
+    The numbers may be rounded to few digits, so the nearest rotation of each matrix is used.
     """
     matrices = table.values(MATRIX).reshape(-1, 3, 4)
     positions = matrices[:, :, 3]
@@ -154,14 +159,14 @@ def _of_matrices(table: Table) -> tuple[FloatArray, FloatArray]:
     quats_xyzw = se3.to_quat_xyzw(nearest)
     if not table.is_transposable:
         return positions, quats_xyzw
-    ways = {
+    candidates = {
         "row by row": quats_xyzw,
         "column by column": se3.to_quat_xyzw(np.swapaxes(nearest, 1, 2)),
     }
-    fitting = _fitting(positions, ways)
+    fitting = _conventions_that_fit(positions, candidates)
     reason = ", because the motion fits that" if len(fitting) == 1 else ""
     table.guess(f"rotations and translations are in separate columns; read {fitting[0]}{reason}")
-    return positions, ways[fitting[0]]
+    return positions, candidates[fitting[0]]
 
 
 # Rotation from the axes north, east and down to the axes east, north and up.
@@ -169,47 +174,50 @@ _R_ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 def _in_axes_of_earth(table: Table, positions: FloatArray, quats_xyzw: FloatArray) -> FloatArray:
-    """Return quaternions (N, 4) in the earth's axes (ECEF), in which the positions (N, 3) are.
+    """Return the orientations (N, 4) in the earth's axes (ECEF), for positions (N, 3) in ECEF, m.
 
-    The orientations of the file may be relative to the earth's axes, to east, north and up, or to
-    north, east and down at each position. The motion decides. If several ways fit the motion, those
-    in which the vehicle remains level are preferred.
+    The orientations ``quats_xyzw`` (N, 4) of the file may be relative to the earth's axes, or to
+    the axes east, north and up (ENU) or north, east and down (NED) at each position. The convention
+    is inferred from the motion. Among conventions that fit the motion, those in which the vehicle
+    remains level are preferred.
     """
+    # Rotations (N, 3, 3) from the axes east, north and up at each position to those of the earth.
     axes = axes_of_places(positions)
     rotations = _rotations_of(quats_xyzw)
-    ways = {
+    candidates = {
         "the axes of the earth, too": quats_xyzw,
         "east, north and up of each place (ENU)": se3.to_quat_xyzw(axes @ rotations),
         "north, east and down of each place (NED)": se3.to_quat_xyzw(axes @ _R_ENU_NED @ rotations),
     }
-    fitting = _fitting(positions, ways)
+    fitting = _conventions_that_fit(positions, candidates)
     if len(fitting) > 1:
         up = axes[:, :, 2]
-        tilts = {way: _tilt(ways[way], up) for way in fitting}
-        largest = max(CLEARLY * min(tilts.values()), _LEVEL)
-        fitting = [way for way in fitting if tilts[way] <= largest]
-    reason = ", because the motion fits that" if len(fitting) < len(ways) else ""
+        scatters = {name: _scatter_in_sensor(candidates[name], up) for name in fitting}
+        largest = max(CLEARLY * min(scatters.values()), _LEVEL)
+        fitting = [name for name in fitting if scatters[name] <= largest]
+    reason = ", because the motion fits that" if len(fitting) < len(candidates) else ""
     table.guess(
         "positions count from the centre of the earth (ECEF); orientations read as relative to "
         f"{fitting[0]}{reason}"
     )
-    return ways[fitting[0]]
+    return candidates[fitting[0]]
 
 
-def _tilt(quats_xyzw: FloatArray, up: FloatArray) -> float:
-    """Return the scatter of directions (N, 3) in the axes of a sensor.
+def _scatter_in_sensor(quats_xyzw: FloatArray, up: FloatArray) -> float:
+    """Return the scatter of the directions ``up`` (N, 3) in the axes of a sensor.
 
-    The scatter is 1 minus the length of the mean direction; 0 for a constant direction.
+    The scatter is 1 minus the length of the mean direction: 0 if the sensor remains level.
     """
+    # R' up for each orientation R of the sensor.
     in_sensor = np.einsum("nji,nj->ni", _rotations_of(quats_xyzw), up)
     return 1.0 - float(np.linalg.norm(in_sensor.mean(axis=0)))
 
 
 def _on_earth(table: Table, up: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-    """Return positions (N, 3), m, along the axes east, north and up of the first position.
+    """Return positions (N, 3), m, along the axes east, north and up at the first position.
 
-    The second value is the rotations (N, 3, 3) from these axes of each position to the same axes of
-    the first position.
+    ``up`` is the column of heights, or empty. The second value is the rotations (N, 3, 3) from the
+    axes east, north and up at each position to those at the first position.
     """
     lat_rad, lon_rad = _in_si(table, ("lat", "lon"), "angle").T
     table.refuse(
@@ -227,9 +235,10 @@ def _on_earth(table: Table, up: Sequence[str]) -> tuple[FloatArray, FloatArray]:
 
 
 def _in_si(table: Table, names: Sequence[str], kind: str) -> FloatArray:
-    """Return columns (N, k) in m, rad or rad/s.
+    """Return k columns (N, k), converted to m, rad or rad/s.
 
-    The names of the columns state their unit; otherwise it is recognised from their values.
+    ``kind`` is "length", "angle" or "rate". If the names of the columns state no unit, it is
+    inferred from the magnitude of the values.
     """
     factors, largest_of_first = _KINDS[kind]
     values = table.values(names)
@@ -239,15 +248,16 @@ def _in_si(table: Table, names: Sequence[str], kind: str) -> FloatArray:
             f"{table.path}: columns {', '.join(names)} in {', '.join(sorted(units))}; expected one "
             f"of {', '.join(factors)}"
         )
-    sizes = np.abs(values).max(axis=1)
+    magnitudes = np.abs(values).max(axis=1)
     if kind != "length":
         table.refuse(
-            sizes > FARTHEST_M, lambda row: f"found {kind} {sizes[row]:.4g}; repair its source"
+            magnitudes > FARTHEST_M,
+            lambda row: f"found {kind} {magnitudes[row]:.4g}; repair its source",
         )
     if units:
         return values * factors[units.pop()]
     first, second, *_ = factors
-    largest = float(sizes.max())
+    largest = float(magnitudes.max())
     unit = second if largest > largest_of_first else first
     if kind != "length":
         table.guess(
@@ -277,42 +287,46 @@ def _orientations(table: Table, positions: FloatArray, convention: str) -> Float
 def _of_quaternions(table: Table, names: Sequence[str], positions: FloatArray) -> FloatArray:
     """Return the quaternions (N, 4) of a table, with the scalar last.
 
-    Without clear names of the columns, the coefficients are in the usual order, unless the motion
-    or the first orientation is evidence for the other order.
+    The names q0 to q3 usually mean the scalar first, and columns without names the scalar last.
+    These orders are assumed, unless the motion or the first orientation is evidence for the
+    opposite order.
     """
     quats = _unit_quaternions(table, names)
     if names == QUATERNION:
         return quats
-    ways = {"last": quats, "first": np.roll(quats, -1, axis=1)}
-    usual, other = ("first", "last") if names == SCALAR_FIRST else ("last", "first")
-    fitting = _fitting(positions, ways)
-    # The first orientation of an odometry is the identity.
-    is_identity = {
-        way: np.isclose(abs(quats_xyzw[0, 3]), 1.0, rtol=0.0) for way, quats_xyzw in ways.items()
+    # Quaternions with the scalar last, if the file has the scalar last or first.
+    candidates = {"last": quats, "first": np.roll(quats, -1, axis=1)}
+    usual, opposite = ("first", "last") if names == SCALAR_FIRST else ("last", "first")
+    fitting = _conventions_that_fit(positions, candidates)
+    # An odometry begins with the identity, whose scalar is 1 or -1.
+    begins_with_identity = {
+        order: np.isclose(abs(quats_xyzw[0, 3]), 1.0, rtol=0.0)
+        for order, quats_xyzw in candidates.items()
     }
-    # Evidence for the other order than the usual one.
+    # Evidence for the opposite order.
     reason = ""
-    if fitting == [other]:
+    if fitting == [opposite]:
         reason = "the motion then has a steady direction"
-    elif is_identity[other] and other in fitting:
+    elif begins_with_identity[opposite] and opposite in fitting:
         reason = "the first orientation is then the identity"
     if reason:
-        order = {"first": "qw qx qy qz", "last": "qx qy qz qw"}[other]
-        table.guess(f"quaternions read with the scalar {other}, t x y z {order}: {reason}")
-        return ways[other]
-    is_sure = fitting == [usual] or is_identity[usual]
-    if names == UNNAMED and table.format != "tum" and not is_sure:
+        columns = {"first": "qw qx qy qz", "last": "qx qy qz qw"}[opposite]
+        table.guess(f"quaternions read with the scalar {opposite}, t x y z {columns}: {reason}")
+        return candidates[opposite]
+    is_certain = fitting == [usual] or begins_with_identity[usual]
+    if names == UNNAMED and table.format != "tum" and not is_certain:
         table.guess(
             "the file does not name its columns or the order of the "
             "quaternion; read with the scalar last, t x y z qx qy qz qw; to "
             "change this, set `columns`"
         )
-    return ways[usual]
+    return candidates[usual]
 
 
 def _unit_quaternions(table: Table, names: Sequence[str]) -> FloatArray:
-    """Return the columns (N, 4) of quaternions; raise an InputError if one has no unit length."""
+    """Return the quaternions (N, 4) in columns; raise an InputError if a length is not 1."""
     quats = table.values(names)
+    # Squares of very large numbers overflow to infinity, which is rejected.
     with np.errstate(over="ignore"):
         norms = np.linalg.norm(quats, axis=1)
     table.refuse(
@@ -326,7 +340,10 @@ def _unit_quaternions(table: Table, names: Sequence[str]) -> FloatArray:
 
 
 def _require_rotation_vectors(table: Table) -> None:
-    """Raise an InputError if columns rx, ry, rz are angles in degrees, in an unknown order."""
+    """Raise an InputError if columns rx, ry, rz cannot be a rotation vector in rad.
+
+    They are then Euler angles in degrees, whose order is unknown.
+    """
     if not is_brief(table.names[table.at[ROTATION_VECTOR[0]]]):
         return
     lengths = np.linalg.norm(table.values(ROTATION_VECTOR), axis=1)
@@ -342,11 +359,12 @@ def _require_rotation_vectors(table: Table) -> None:
 
 
 def _of_angles(table: Table, positions: FloatArray, convention: str) -> FloatArray:
-    """Return quaternions (N, 4) of roll, pitch and yaw or heading.
+    """Return quaternions (N, 4), scalar last, of roll, pitch and yaw or heading.
 
     Angles are about the fixed axes x, y and z. The axes of the body are x forward, y left and z up,
-    in a frame with z up. Beside a heading, a positive pitch is nose up, as on aircraft and in INS.
-    Beside a yaw, the pitch is about y, as in REP 103.
+    in a world with z up. If the file has a heading, a positive pitch is nose up, as on aircraft and
+    in INS. If it has a yaw, the pitch is about y, as in REP 103. ``convention`` is used instead of
+    the convention inferred from the motion, unless it is empty.
     """
     names = [name for name in ("roll", "pitch", "yaw", "heading") if name in table.at]
     *tilt, angle = _in_si(table, names, "angle").T
@@ -355,39 +373,49 @@ def _of_angles(table: Table, positions: FloatArray, convention: str) -> FloatArr
     roll, pitch = tilt or np.zeros((2, len(angle)))
     as_compass = np.stack([roll, -pitch, np.pi / 2 - angle], axis=1)
     usual = se3.rotation_from_rpy(np.stack([roll, pitch, angle], axis=1))
-    ways = {
+    candidates = {
         _COMPASS: se3.to_quat_xyzw(se3.rotation_from_rpy(as_compass)),
         _MATHEMATICAL: se3.to_quat_xyzw(usual),
         _INVERSE: se3.to_quat_xyzw(np.swapaxes(usual, 1, 2)),
         _OTHER_ORDER: se3.to_quat_xyzw(se3.in_other_order(usual)),
     }
     expected = _COMPASS if names[-1] == "heading" else _MATHEMATICAL
-    # The other order comes last: on flat ground it makes no difference, so the motion always fits.
-    unlikely = {expected: 0, _OTHER_ORDER: 2}
-    table.conventions = sorted(_fitting(positions, ways), key=lambda way: unlikely.get(way, 1))
-    way = convention or table.conventions[0]
-    if expected == _COMPASS or way != expected:
+    # The expected convention comes first. The other order comes last: without roll and pitch it
+    # makes no difference, so on flat ground it fits every motion.
+    preference = {expected: 0, _OTHER_ORDER: 2}
+    table.conventions = sorted(
+        _conventions_that_fit(positions, candidates), key=lambda name: preference.get(name, 1)
+    )
+    used = convention or table.conventions[0]
+    if expected == _COMPASS or used != expected:
         reason = ""
         if convention:
             reason = ", because that fits the other file with the same columns, too"
-        elif way != expected:
+        elif used != expected:
             reason = ", because the motion fits that and not the usual"
         axes = "x forward, y left, z up"
-        if way == _INVERSE:
+        if used == _INVERSE:
             axes = "x, y, z of the world where all angles are 0"
-        table.guess(f"{names[-1]} read as {way}{reason}; axes of the sensor: {axes}")
-    return ways[way]
+        table.guess(f"{names[-1]} read as {used}{reason}; axes of the sensor: {axes}")
+    return candidates[used]
 
 
-def _fitting(positions: FloatArray, ways: Mapping[str, FloatArray]) -> list[str]:
-    """Return the ways to read orientations (N, 4) that fit the motion.
+def _conventions_that_fit(positions: FloatArray, candidates: Mapping[str, FloatArray]) -> list[str]:
+    """Return the conventions in which the direction of travel is steady in the sensor's axes.
 
-    A way does not fit if another way fits the motion clearly better. ``positions`` (N, 3) are those
-    of the sensor in its world.
+    If the direction is steady in none of them, return those whose scatter is near the smallest
+    scatter.
+
+    Parameters
+    ----------
+    positions : (N, 3) array
+        Positions of the sensor in its world, m.
+    candidates : mapping of str to (N, 4) array
+        Orientations xyzw of the sensor in its world, in each convention.
     """
     scatters = {
-        way: scatter_of_direction(se3.from_quat_xyzw(positions, quats_xyzw))
-        for way, quats_xyzw in ways.items()
+        convention: scatter_of_direction(se3.from_quat_xyzw(positions, quats_xyzw))
+        for convention, quats_xyzw in candidates.items()
     }
     largest = max(STEADY, CLEARLY * min(scatters.values()))
-    return [way for way, scatter in scatters.items() if scatter <= largest]
+    return [convention for convention, scatter in scatters.items() if scatter <= largest]

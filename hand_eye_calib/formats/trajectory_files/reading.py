@@ -1,7 +1,7 @@
 """Reading of trajectories from files, bags and numbers in memory.
 
-Files are in the formats TUM, KITTI or EuRoC, tables with named columns, or files of other programs
-(``foreign.py``).
+Files have the format TUM, KITTI or EuRoC, are tables with named columns, or come from programs with
+formats of their own (``extras/sensors/foreign.py``).
 """
 
 import warnings
@@ -46,10 +46,10 @@ from hand_eye_calib.formats.trajectory_files.stamps import (
 )
 from hand_eye_calib.formats.trajectory_files.table import Table, table_of_object
 
-#: Recognise the format from the lines.
+#: Value of the options ``format`` and ``measures``: recognise them from the content of the file.
 AUTO = "auto"
 
-# Columns of the formats with a fixed order of columns, and the description of a row in messages.
+# Formats whose columns have a fixed order: the columns, and the description of a row in messages.
 _FORMATS: dict[str, tuple[Sequence[str], str]] = {
     "tum": (TUM, f"8 numbers, {TUM_COLUMNS}"),
     "kitti": (MATRIX, "12 numbers, the first three rows of a pose"),
@@ -58,19 +58,21 @@ _FORMATS: dict[str, tuple[Sequence[str], str]] = {
         "8 numbers or more, timestamp, px, py, pz, qw, qx, qy, qz",
     ),
 }
+# Remedy in the message for a file that is not a text.
 _EXPECTED = (
     "lines of a trajectory: save the poses of MATLAB, HDF5, Arrow, spreadsheets, receivers and "
     "autopilots as csv, a model of COLMAP as text"
 )
-# Name of a file of stamps in the folder of a file of poses.
+# Name of the file with the stamps of the poses in another file of the same folder, as in KITTI.
 _TIMES = "times.txt"
-# Letters and signs of Latin-1 that may occur in headers: the degree sign, ...
+# Bytes of Latin-1 that may occur in headers: the signs for degree, squared and micro, and letters
+# with accents.
 _LATIN_1 = [bytes([code]) for code in (0xB0, 0xB2, 0xB5, *range(0xC0, 0x100))]
-# Printable characters of ASCII, and white space.
+# Bytes of the printable characters of ASCII, and of white space.
 _ASCII = bytes([*b"\t\n\r", *range(32, 127)])
-# Largest share of Latin-1 letters in a text.
+# Data is a text in Latin-1 only if less than this share of its bytes are not ASCII.
 _FEW_LETTERS = 0.05
-# Interval (ns) between poses that are paired without stamps.
+# Interval (ns) of the regular stamps that poses get if they are paired without stamps.
 _STEP_NS = 100_000_000
 
 
@@ -81,8 +83,8 @@ class FileOptions:
     Attributes
     ----------
     pair_by : str
-        "time"; or "row" or "name" (of images) to pair poses without stamps. Files that belong
-        together have the same value.
+        How the poses of several files are paired: by "time", or without stamps by "row" or by the
+        "name" of their images. All files of a calibration have the same value.
 
     Raises
     ------
@@ -117,7 +119,7 @@ def _refuse_unknown(setting: str, value: str, choices: Sequence[str]) -> None:
 
 
 class FileReading(NamedTuple):
-    """Trajectory of a file, with notes for the user.
+    """Trajectory from a file, with notes for the user.
 
     Attributes
     ----------
@@ -125,9 +127,9 @@ class FileReading(NamedTuple):
     repairs : list of str
         Notes about faults of the file that were repaired.
     guesses : list of str
-        Notes about properties that the file does not state, so that they were guessed.
+        Notes about properties that the file does not state and that were therefore guessed.
     warnings : list of str
-        Warnings for the result.
+        Warnings about the data, to be added to those of the calibration result.
     """
 
     trajectory: Trajectory
@@ -168,8 +170,8 @@ def read_trajectory(
         For kitti, the file of the stamps. For an object, the stamps as seconds, whole numbers or
         datetimes.
     stamp_unit : str, optional
-        "s", "ms", "us" or "ns". By default the unit is that of the header (``timestamp [ns]``), or
-        is recognised from the size of the stamps.
+        "s", "ms", "us" or "ns". By default, the unit is that of the header (``timestamp [ns]``).
+        Without it, the unit is inferred from the magnitude of the stamps.
     repair : bool
         Sort poses that are not in order of time, and drop poses with a repeated stamp; a
         ``UserWarning`` states their number. By default, such poses are an error.
@@ -180,9 +182,9 @@ def read_trajectory(
     Returns
     -------
     Trajectory
-        Stamps are the decimal numbers of the file in nanoseconds, without rounding. Frame names are
+        Stamps are the decimal numbers of the file, in nanoseconds without rounding. Frame names are
         those of the messages of a bag, otherwise empty. Latitude and longitude become metres east
-        and north of the first position. A ``UserWarning`` reports a guess.
+        and north of the first position. A ``UserWarning`` reports properties that were guessed.
 
     Raises
     ------
@@ -205,13 +207,14 @@ def read_trajectory(
     file_of_times = Path(times) if isinstance(times, str | PathLike) else None
     has_times_in_memory = times is not None and not file_of_times
     is_format_set = format not in (FileOptions.format, AUTO)
-    is_file_option_set = any([is_format_set, columns is not None, file_of_times])
+    has_file_options = any([is_format_set, columns is not None, file_of_times])
     if topic:
-        is_option_set = any([is_file_option_set, has_times_in_memory, stamp_unit, repair])
-        if is_option_set or not path:
+        has_other_options = any([has_file_options, has_times_in_memory, stamp_unit, repair])
+        if has_other_options or not path:
             raise ConfigError("topic is for bags and cannot be combined with options of text files")
         return _of_bag(path, topic, measures)
-    if has_times_in_memory if path else is_file_option_set:
+    has_unusable_options = has_times_in_memory if path else has_file_options
+    if has_unusable_options:
         raise ConfigError(
             "format, columns and a file of times apply to text files only; "
             "pass arrays of times for objects"
@@ -231,13 +234,19 @@ def read_trajectory(
 
 
 def _warn_of(reading: FileReading) -> None:
-    """Emit the notes of a reading as warnings at the caller of the public function."""
+    """Emit the notes of a reading as warnings.
+
+    Python reports the line that called the function from which this function is called.
+    """
     for text in (*reading.guesses, *reading.repairs, *reading.warnings):
         warnings.warn(text, UserWarning, stacklevel=3)
 
 
 def _of_bag(path: Path, topic: str, measures: str) -> Trajectory:
-    """Return the trajectory of a topic or of two frames in a bag, with warnings at the caller."""
+    """Return the trajectory of a topic, or of two frames ``world:sensor``, in a bag.
+
+    Notes on the data become warnings, for which Python reports the line of the caller's caller.
+    """
     from hand_eye_calib.formats.bags.reader import PoseBag
     from hand_eye_calib.formats.bags.sources import source_of
 
@@ -249,9 +258,10 @@ def _of_bag(path: Path, topic: str, measures: str) -> Trajectory:
 
 
 def read_trajectory_files(files: Sequence[tuple[Path, FileOptions]]) -> list[FileReading]:
-    """Read text files that belong together; the sensors are named after the files.
+    """Read the text files of one calibration; a sensor without a name gets that of its file.
 
-    Files with the same columns come from the same program, so their angles have one convention.
+    Files with the same columns come from the same program, so their angles have the same
+    convention.
 
     Parameters
     ----------
@@ -272,9 +282,9 @@ def read_trajectory_files(files: Sequence[tuple[Path, FileOptions]]) -> list[Fil
         _read(table, options, rows)
         for (_, options), table, rows in zip(files, tables, rows_of_tables, strict=True)
     ]
-    for number, convention in _other_conventions(tables).items():
+    for number, convention in _corrected_conventions(tables).items():
         path, options = files[number]
-        # Read the table again, because its notes are about the other convention.
+        # Read the table again, because its notes report the convention that it was read with.
         table = read_table(path, options)
         readings[number] = _read(table, options, rows_of_tables[number], convention)
     names = _sensor_names([path for path, _ in files])
@@ -288,10 +298,11 @@ def read_trajectory_files(files: Sequence[tuple[Path, FileOptions]]) -> list[Fil
     ]
 
 
-def _other_conventions(tables: Sequence[Table]) -> dict[int, str]:
-    """Return the common convention of angles for the tables that were read with another one.
+def _corrected_conventions(tables: Sequence[Table]) -> dict[int, str]:
+    """Return the convention of angles with which tables must be read again, by table number.
 
-    The keys are the numbers of these tables. Tables with the same columns have one convention.
+    Tables with the same columns must have the same convention. If they were read with different
+    ones, the first that fits the motion of all these tables is used.
 
     Raises
     ------
@@ -303,7 +314,7 @@ def _other_conventions(tables: Sequence[Table]) -> dict[int, str]:
         numbers = [number for number, table in enumerate(tables) if table.names == names]
         common = tables[numbers[0]].conventions
         for number in numbers:
-            common = [way for way in common if way in tables[number].conventions]
+            common = [name for name in common if name in tables[number].conventions]
         if not common:
             raise InputError(
                 f"{' and '.join(str(tables[number].path) for number in numbers)} "
@@ -319,7 +330,11 @@ def _other_conventions(tables: Sequence[Table]) -> dict[int, str]:
 
 
 def _sensor_names(paths: Sequence[Path]) -> list[str]:
-    """Return different names of sensors from the names of files; empty if the files are equal."""
+    """Return a name for the sensor of each file; empty names if two paths are the same.
+
+    The name is that of the file. If files have the same name, folders are added to distinguish
+    them.
+    """
     names = [path.stem for path in paths]
     if len({*names}) < len(names):
         names = distinct_names([str(path.with_suffix("")) for path in paths])
@@ -327,9 +342,9 @@ def _sensor_names(paths: Sequence[Path]) -> list[str]:
 
 
 def read_trajectories(*sources: TrajectoryLike) -> list[Trajectory]:
-    """Read trajectories that belong together, in the format that is recognised.
+    """Read the trajectories of one calibration, in formats that are recognised.
 
-    Guesses and repairs are reported as in :func:`read_trajectory`.
+    Warnings report guesses and repairs, as in :func:`read_trajectory`.
     """
     paths = [local_path(fspath(source)) for source in sources if isinstance(source, str | PathLike)]
     if len(paths) < len(sources):
@@ -341,26 +356,28 @@ def read_trajectories(*sources: TrajectoryLike) -> list[Trajectory]:
 
 
 def _rows_without_stamps(tables: Sequence[Table], pair_by: str) -> list[IntArray]:
-    """Return the rows of each table that belong together, by "row" or by "name" of the image.
+    """Pair the poses of several tables by their row, or by the name of their image.
 
-    A row without a pose in one of the tables is skipped in all tables.
+    For each table, the indices (N,) of its poses are returned; the poses at index i of all tables
+    are a pair. A row or name without a pose in one of the tables is skipped in all tables.
     """
     n_rows = [table.n_rows for table in tables]
     if pair_by == "row" and len({*n_rows}) > 1:
         raise InputError(
             f"pairing by row needs files with the same number of poses; found {n_rows}"
         )
-    places: list[dict[Any, int]] = []
+    # Index of the pose with each name, or from each row of the file.
+    indices: list[dict[Any, int]] = []
     for table in tables:
         keys: Sequence[Any] = table.images if pair_by == "name" else table.rows
-        places.append({key: place for place, key in enumerate(keys)})
-    common = sorted(set.intersection(*map(set, places)))
+        indices.append({key: index for index, key in enumerate(keys)})
+    common = sorted(set.intersection(*map(set, indices)))
     if not common:
         n_names = [len(table.rows) for table in tables]
         raise InputError(
             f"no image has a name that is in all files; found {n_names} names; pair by time or row"
         )
-    return [np.array([place_of[key] for key in common]) for place_of in places]
+    return [np.array([index_of[key] for key in common]) for index_of in indices]
 
 
 def _read(
@@ -373,14 +390,14 @@ def _read(
     table : Table
     options : FileOptions
     rows : (N,) array of int, optional
-        Rows that are paired without stamps; they get regular stamps. By default, all rows are used
-        with their own stamps.
+        Indices of the poses to use, if poses are paired without stamps. These poses get regular
+        stamps. By default, all poses are used with the stamps of the table.
     convention : str, optional
         Convention of the table's angles. By default, the motion decides.
     """
     if not table.line_numbers:
         raise InputError(f"{table.path}: the file contains no poses{_why_no_poses(table)}")
-    repairs, doubts = _notes_on_left_out(table)
+    repairs, doubts = _notes_on_skipped_rows(table)
     if rows is None:
         stamps_ns = stamps_in_ns(table, options.stamp_unit)
         refuse_coarse(table, stamps_ns, table.values())
@@ -408,6 +425,7 @@ def _read(
 
 
 def _why_no_poses(table: Table) -> str:
+    """Return the end of the message for a table without poses: no rows, or only unusable rows."""
     if not table.n_rows:
         return f"; expected lines of {table.expected}"
     return (
@@ -416,10 +434,10 @@ def _why_no_poses(table: Table) -> str:
     )
 
 
-def _notes_on_left_out(table: Table) -> tuple[list[str], list[str]]:
-    """Return the repairs and the warnings about rows without a pose.
+def _notes_on_skipped_rows(table: Table) -> tuple[list[str], list[str]]:
+    """Return notes on skipped rows without a pose: a list of repairs and a list of warnings.
 
-    A few such rows are a repair, many are a warning.
+    Skipping a few rows is a repair. If many were skipped, the note is a warning instead.
     """
     if not table.n_left_out:
         return [], []
@@ -446,7 +464,8 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
         table: Table | None = read(path, data, options)
         if table is not None:
             return table
-    # Texts contain no zero byte: replace zeros by a byte that cannot be decoded.
+    # A text contains no zero bytes. Replace them by a byte that is invalid in UTF-8, so that such a
+    # file is rejected.
     text = decoded(path, _in_utf8(data).replace(b"\0", b"\xff"), _EXPECTED)
     needs_names = not options.columns and options.format in (AUTO, "csv")
     layout = layout_of(path, text, needs_names)
@@ -467,7 +486,7 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
 
 
 def _in_utf8(data: bytes) -> bytes:
-    """Convert a text in UTF-16, or with some letters of Latin-1 such as °, to UTF-8.
+    """Convert a text in UTF-16, or in Latin-1 with a few letters such as °, to UTF-8.
 
     Other data is returned unchanged.
     """
@@ -492,7 +511,8 @@ def _with_options(layout: Layout, options: FileOptions) -> Layout:
         format = "csv"
         columns = tuple(name.strip() for name in options.columns.split(","))
     elif format == AUTO:
-        # Only the option `times` is set. It applies to poses without stamps.
+        # Only the option `times` is set, which is for poses without stamps. Keep a layout without a
+        # stamp; any other file must be in the format kitti.
         if layout.columns and not stamp_columns(named_columns(layout.columns)[0]):
             return layout
         format = "kitti"
@@ -503,7 +523,7 @@ def _with_options(layout: Layout, options: FileOptions) -> Layout:
 
 
 def _guesses_of(layout: Layout) -> list[str]:
-    """Return notes for the user on a layout that was recognised without options."""
+    """Return notes on the recognised format and columns. They are appended to the file's path."""
     if layout.format == "tum":
         return []
     order = ", qw qx qy qz" if layout.format == "euroc" else ""
@@ -520,7 +540,13 @@ def _guesses_of(layout: Layout) -> list[str]:
 
 
 def _empty_table(path: str | Path, layout: Layout, options: FileOptions) -> Table:
-    """Return the table for the rows of a layout."""
+    """Return a table without rows, whose columns are those of the layout.
+
+    Raises
+    ------
+    InputError
+        If the order of the columns is unknown.
+    """
     n_columns = len(layout.row)
     columns = layout.columns
     if columns is None and n_columns:
@@ -541,7 +567,7 @@ def _empty_table(path: str | Path, layout: Layout, options: FileOptions) -> Tabl
 def _add_times(table: Table, options: FileOptions) -> None:
     """Add stamps to poses without stamps, from the file of the option ``times``.
 
-    By default, the file times.txt in the folder of the poses is used if it exists.
+    If no option is set, the file times.txt in the folder of the poses is used if it exists.
     """
     if table.stamp_at:
         return
@@ -556,7 +582,7 @@ def _add_times(table: Table, options: FileOptions) -> None:
 
 
 def _stamps_of(times: str | Path, poses: Table) -> list[Decimal]:
-    """Return the stamps of poses from a file of stamps."""
+    """Return the stamp of each pose from a file with one stamp for each row of the poses."""
     lines = lines_of(times, read_text(times, "stamps"), after=0)
     table = Table(times, ["t"], "stamps", "a stamp")
     table.fill(lines, lambda text: text.split()[:1])

@@ -9,20 +9,22 @@ from hand_eye_calib.core.base.config import STAMP_UNITS
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.formats.trajectory_files.dates import DAY_S, WEEK_S, seconds, seconds_of
-from hand_eye_calib.formats.trajectory_files.layout import DIGITS
+from hand_eye_calib.formats.trajectory_files.layout import UNIT_EXPONENTS
 from hand_eye_calib.formats.trajectory_files.table import Table
 
 # Nanoseconds in a second.
 _NS = STAMP_UNITS["s"]
-# Longest median time between poses (s). A longer time means that the unit is probably wrong.
+# Largest median time between poses (s). If it is longer, the unit of the stamps is probably wrong.
 _LONGEST_INTERVAL_S = 10
-# Numbers such as 20231114221320.5 are dates with a time of day: first number, of 2000-01-01.
+# Numbers such as 20231114221320.5 are dates with a time of day. Smallest of these numbers: the
+# beginning of 2000-01-01.
 _FIRST_PACKED = Decimal(20_000_101_000_000)
-# End of these numbers, of 2100-01-01.
+# Dates with a time of day are below this number: the beginning of 2100-01-01.
 _END_OF_PACKED = Decimal(21_000_101_000_000)
-# Smallest share of poses with the stamp of the pose before, for stamps that lost their last digits.
+# Stamps have lost their last digits if at least this share of the poses have moved, but have the
+# stamp of the pose before.
 _COARSE_SHARE = 0.25
-# Largest difference of the numbers of equal poses: rounding.
+# Poses are equal if no number of them differs by more than this: rounding.
 _SAME = 1e-12
 
 
@@ -33,8 +35,8 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
     ----------
     table : Table
     stamp_unit : str or None
-        "s", "ms", "us" or "ns". If None, the unit is that in the column's name, or is recognised
-        from the size of the stamps.
+        "s", "ms", "us" or "ns". If None, the unit is that in the column's name. Without a unit in
+        the name, it is inferred from the magnitude of the stamps.
 
     Returns
     -------
@@ -54,36 +56,39 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
     stamps = table.stamps
     if not unit and min(stamps) >= _FIRST_PACKED and max(stamps) < _END_OF_PACKED:
         stamps = _unpacked(stamps)
-    sizes = np.abs(np.array(stamps, dtype=float))
-    recognised = unit or _unit_of_size(sizes.max())
+    magnitudes = np.abs(np.array(stamps, dtype=float))
+    recognised = unit or _unit_of_magnitude(magnitudes.max())
     factor = STAMP_UNITS[recognised]
     table.refuse(
-        np.asarray(sizes * factor >= float(np.iinfo(np.int64).max)),
+        np.asarray(magnitudes * factor >= float(np.iinfo(np.int64).max)),
         lambda index: (
             f"the timestamp {stamps[index]:.6g} is too large for "
             f"{recognised}; set its unit with `stamp_unit`"
         ),
     )
-    whole = (int((stamp * factor).to_integral_value()) for stamp in stamps)
-    stamps_ns = np.fromiter(whole, dtype=np.int64, count=len(stamps))
-    # The unit of stamps with a fraction is clear, because only seconds have one.
+    nanoseconds = (int((stamp * factor).to_integral_value()) for stamp in stamps)
+    stamps_ns = np.fromiter(nanoseconds, dtype=np.int64, count=len(stamps))
+    # Only stamps in seconds have decimals, so the unit of stamps with decimals is clear.
     if not unit and not any(stamp % 1 for stamp in stamps):
         _refuse_unclear_unit(table, stamps_ns, recognised)
     for period_s in (DAY_S, WEEK_S):
-        stamps_ns = _continued(stamps_ns, period_s)
+        stamps_ns = _without_restarts(stamps_ns, period_s)
     return stamps_ns
 
 
-def _unit_of_size(largest: float) -> str:
-    """Return the unit of stamps since 1970 from the largest stamp."""
-    for unit, digits in DIGITS.items():
+def _unit_of_magnitude(largest: float) -> str:
+    """Return the unit of stamps since 1970 whose largest stamp has this value."""
+    for unit, digits in UNIT_EXPONENTS.items():
         if largest >= 10.0**digits:
             return unit
     return "s"
 
 
 def _unpacked(stamps: list[Decimal]) -> list[Decimal]:
-    """Convert dates such as 20231114221320.5 to seconds; unchanged if a stamp is not a date."""
+    """Return the seconds since 1970 of dates such as 20231114221320.5.
+
+    If one of the stamps is not a date, all stamps are returned unchanged.
+    """
     try:
         return [seconds_of(f"{stamp:f}") for stamp in stamps]
     except ValueError:
@@ -91,7 +96,7 @@ def _unpacked(stamps: list[Decimal]) -> list[Decimal]:
 
 
 def _refuse_unclear_unit(table: Table, stamps_ns: IntArray, recognised: str) -> None:
-    """Raise an InputError if the poses are so far apart that the unit is probably wrong."""
+    """Raise an InputError if the time between poses is so long that the unit is probably wrong."""
     intervals_s = np.abs(np.diff(stamps_ns.astype(float))) * 1e-9
     if len(intervals_s) and median(intervals_s) > _LONGEST_INTERVAL_S:
         raise InputError(
@@ -101,11 +106,11 @@ def _refuse_unclear_unit(table: Table, stamps_ns: IntArray, recognised: str) -> 
         )
 
 
-def _continued(stamps_ns: IntArray, period_s: int) -> IntArray:
-    """Continue stamps of a day or a week that begin again at 0.
+def _without_restarts(stamps_ns: IntArray, period_s: int) -> IntArray:
+    """Return stamps that increase beyond the end of a day or of a week, where they restart at 0.
 
-    Stamps begin again if a stamp in the last tenth of the period is followed by a stamp in the
-    first tenth.
+    The stamps restart if a stamp in the last tenth of the period is followed by a stamp in the
+    first tenth. Stamps longer than one period are returned unchanged.
     """
     period_ns = period_s * _NS
     if not len(stamps_ns) or stamps_ns.min() < 0 or stamps_ns.max() > period_ns:
@@ -113,15 +118,14 @@ def _continued(stamps_ns: IntArray, period_s: int) -> IntArray:
     tenth_ns = period_ns // 10
     is_at_end = stamps_ns[:-1] > period_ns - tenth_ns
     is_at_start = stamps_ns[1:] < tenth_ns
-    begins_again = np.r_[False, is_at_end & is_at_start]
-    return stamps_ns + np.cumsum(begins_again) * period_ns
+    restarts = np.r_[False, is_at_end & is_at_start]
+    return stamps_ns + np.cumsum(restarts) * period_ns
 
 
 def refuse_coarse(table: Table, stamps_ns: IntArray, values: FloatArray) -> None:
-    """Raise an InputError if stamps (N,) have lost their last digits.
+    """Raise an InputError if the stamps (N,) of a table have lost their last digits.
 
-    The criterion is that many poses (N, k) have the same stamp as the pose before, but differ from
-    it.
+    The criterion: many poses have the stamp of the pose before, but other ``values`` (N, k).
     """
     if len(stamps_ns) < 2:
         return
@@ -144,7 +148,9 @@ def refuse_coarse(table: Table, stamps_ns: IntArray, values: FloatArray) -> None
 
 
 def in_order(table: Table, stamps_ns: IntArray, repair: bool) -> tuple[IntArray, list[str]]:
-    """Return the indices of poses sorted by time without repeated stamps, and notes on repairs.
+    """Return the indices of the poses in order of time, and notes on repairs.
+
+    Among poses with equal stamps, only the first is kept.
 
     Raises
     ------

@@ -1,8 +1,8 @@
 """Table of the numbers of a trajectory, before they become poses.
 
-A table contains the values of its quantities row by row. The names of its columns define the
-quantities. It is filled from the lines of a file or from numbers in memory. This module also writes
-files in the format tum.
+A table contains the values of its quantities ("x", "qw", ...) row by row. The names of the columns
+define the quantities. The rows come from the lines of a file or from numbers in memory. This module
+also writes files in the format tum.
 """
 
 import math
@@ -38,18 +38,18 @@ from hand_eye_calib.formats.trajectory_files.columns import (
 )
 from hand_eye_calib.formats.trajectory_files.dates import seconds, stamp_of
 
-# Quantities of an orientation. All are 0 in a row without orientation, such as a row of a tracker
-# that is lost.
+# Groups of quantities, each of which is an orientation. A tracker that is lost writes 0 for all
+# quantities of the group; a valid orientation is never all 0.
 _ORIENTATIONS = (QUATERNION, SCALAR_FIRST, UNNAMED, ROTATION)
 
-# Largest number of sensors in a column. A column with more names is about something else, such as
-# images.
+# Largest number of different names in a column of sensors. A column with more names is about
+# something else, such as images.
 _MOST_SENSORS = 20
 
 
 @dataclass
 class Table:
-    """Rows of a trajectory's numbers. Rows without a pose are skipped.
+    """Numbers of a trajectory, one row per pose. Rows without a pose are counted and skipped.
 
     A row has no pose if a value is missing or not finite, or if its orientation is all 0.
 
@@ -66,35 +66,35 @@ class Table:
         Description of a row for messages.
     format : str
     is_transposable : bool
-        Whether the matrices may be written row by row or column by column.
+        Whether the elements of a rotation matrix may be in the order of its rows or of its columns.
     line_numbers, rows : array
-        Line number of each row with a pose, and the number of this row among all rows, from 0.
+        Line number of each row with a pose, and the index of this row among all rows.
     n_rows : int
-        Number of all rows.
+        Number of all rows, with and without a pose.
     first_skipped : int or None
-        Line of the first row that was skipped.
+        Line number of the first row without a pose.
     stamps : list of Decimal
-        Empty without a column of stamps.
+        Stamp of each row with a pose; empty without a column of stamps.
     numbers : array of float
-        Values of the quantities, row after row.
+        Values of the quantities, row after row, for rows with a pose.
     images : list of str
-        Names of images, from a column for these names.
+        Name of the image of each row with a pose; empty without such a column.
     sensor_frame : str
-        Name of the sensor's frame; empty for the name of the file.
+        Name of the sensor's frame; if empty, the frame gets the name of the file.
     guesses : list of str
         Notes for the user about properties that the file does not state.
     conventions : list of str
-        Conventions of angles that fit the motion, the usual one first.
+        Conventions of the angles that fit the motion, the preferred one first.
     at : dict of str to int
         Column of each quantity, such as "x" or "qw".
     units : dict of str to str
-        Units of the quantities, if the names of their columns state them.
+        Units of the quantities; only those that the names of the columns state.
     stamp_names, stamp_at : sequence
-        Quantities that make the stamp, and their columns.
+        Quantities that together are the stamp, and their columns.
     stamp_unit : str
-        Unit of the stamps; empty if their size decides.
+        Unit of the stamps; if empty, it is inferred from their magnitude.
     second_unit : str
-        Unit of the second of a week of GPS; empty if no name states it.
+        Unit of the second of a GPS week; empty if the name of the column does not state it.
 
     Raises
     ------
@@ -160,7 +160,10 @@ class Table:
                 )
 
     def _set_stamp_units(self, units: Sequence[str]) -> None:
-        """Set the unit of the stamps and of the second of a week, from the units of all columns."""
+        """Set the units of the stamps and of the second of a GPS week.
+
+        ``units`` are the units that the names of all columns state.
+        """
         unit = units[self.stamp_at[-1]] if self.stamp_at else ""
         self.second_unit = unit if unit in STAMP_UNITS else ""
         if "mow" in self.stamp_names:
@@ -178,11 +181,11 @@ class Table:
         return self.n_rows - len(self.rows)
 
     def _listed(self, names: Iterable[str]) -> str:
-        """Return names of columns for a message."""
+        """Return the names of columns as text for a message, shortened if they are many."""
         return shortened(", ".join(names), LONGEST_NAME)
 
     def values(self, names: Iterable[str] = ()) -> FloatArray:
-        """Return an array (N, k) of the values of k quantities, or of all quantities."""
+        """Return the values (N, k) of k quantities; without names, those of all quantities."""
         quantities = [*self.at]
         all_values = np.asarray(self.numbers).reshape(-1, len(quantities))
         return all_values[:, [quantities.index(name) for name in names]] if names else all_values
@@ -202,8 +205,8 @@ class Table:
         Raises
         ------
         InputError
-            At the first line with another number of cells, or with text instead of a number. Also
-            if the poses are of several sensors.
+            At the first line with another number of cells, or with text instead of a number; and if
+            the poses are those of several sensors.
         """
         n_columns = len(self.names)
         for line_number, content in lines:
@@ -225,7 +228,7 @@ class Table:
         return self
 
     def fill_from_arrays(self, values: FloatArray, stamps: Sequence[Decimal | None] | None) -> None:
-        """Add the rows of values (N, k) with a pose; with ``stamps``, also those with a stamp."""
+        """Add the rows of values (N, k) that have a pose and, if ``stamps`` are given, a stamp."""
         is_pose = np.isfinite(values).all(axis=1)
         if self._orientation_at:
             is_pose &= values[:, self._orientation_at].any(axis=1)
@@ -244,7 +247,7 @@ class Table:
             self.first_skipped = int(np.argmin(is_pose)) + 1
 
     def _add(self, cells: Sequence[str], line_number: int) -> None:
-        """Add a row; a row without a pose is only counted.
+        """Add a row; if it has no pose, count it only.
 
         Raises
         ------
@@ -279,6 +282,15 @@ class Table:
         return True
 
     def _numbers_in(self, cells: Sequence[str]) -> list[float]:
+        """Return the values of the quantities in a row; NaN for missing values.
+
+        Raises
+        ------
+        ValueError
+            If a cell contains text instead of a number.
+        """
+        # float is fast and reads almost every row. The other functions also read decimal commas,
+        # marks of missing values, and angles in degrees, minutes and seconds.
         try:
             return [float(cells[column]) for column in self._value_at]
         except ValueError:
@@ -289,21 +301,21 @@ class Table:
 
     def _is_pose(self, values: Sequence[float]) -> bool:
         """Whether the values of a row are finite, and its orientation is not all 0."""
-        # A finite sum proves that all values are finite, in little time. The sum of large finite
-        # values may be infinite.
+        # Check the sum first, because this is fast: if it is finite, all values are. But the sum of
+        # large finite values may be infinite.
         if not math.isfinite(sum(values)) and not all(map(math.isfinite, values)):
             return False
         return not self._orientation_at or any(values[place] for place in self._orientation_at)
 
     def _padded(self, cells: Sequence[str], line_number: int, content: object) -> Sequence[str]:
-        """Return one cell for each column, for a row with another number of cells.
+        """Return the cells of a row with too few or too many cells, one for each column.
 
-        An empty cell at the end is dropped. Empty cells are appended to a row with only a stamp.
+        An empty cell at the end is dropped. Empty cells are appended to a row with a stamp only.
 
         Raises
         ------
         InputError
-            For any other row.
+            If the row has another number of cells for another reason.
         """
         n_missing = len(self.names) - len(cells)
         if n_missing == -1 and not cells[-1]:
@@ -330,6 +342,7 @@ class Table:
 
 # ---- numbers in memory
 
+# Kinds of data that can be read, for messages.
 _KINDS = (
     "a path, an array (N, 4, 4), (N, 8) of t, x, y, z, qx, qy, qz, qw or (N, 7), or a table with "
     "named columns"
@@ -350,7 +363,7 @@ def columns_of_array(source: Any) -> tuple[Sequence[str], FloatArray, list[str]]
     names : sequence of str
     values : (N, k) array
     notes : list of str
-        Notes for the user about the way in which the array was read.
+        Notes for the user about assumptions.
 
     Raises
     ------
@@ -371,7 +384,10 @@ def columns_of_array(source: Any) -> tuple[Sequence[str], FloatArray, list[str]]
 
 
 def _columns_of_matrices(matrices: FloatArray) -> tuple[Sequence[str], FloatArray, list[str]]:
-    """Return the columns of matrices (N, 3, 4) or (N, 4, 4); transposed matrices are corrected."""
+    """Return the columns of matrices (N, 3, 4) or (N, 4, 4), as :func:`columns_of_array` does.
+
+    Transposed matrices, whose last column is 0 0 0 1, are transposed back, with a note.
+    """
     notes = []
     if matrices.shape[1:] == (4, 4) and not _has_last_row(matrices):
         matrices = np.swapaxes(matrices, 1, 2)
@@ -382,7 +398,10 @@ def _columns_of_matrices(matrices: FloatArray) -> tuple[Sequence[str], FloatArra
 
 
 def _has_last_row(matrices: FloatArray) -> bool:
-    """Whether the last row of all finite matrices (N, 4, 4) is 0 0 0 1."""
+    """Whether the last row of all matrices (N, 4, 4) with a pose is 0 0 0 1.
+
+    Matrices that are not finite or all 0 contain no pose and are ignored.
+    """
     is_finite = np.isfinite(matrices).all(axis=(1, 2)) & matrices.any(axis=(1, 2))
     last_rows = matrices[is_finite, 3]
     return bool(np.allclose(last_rows, [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=ROTATION_TOLERANCE))
@@ -394,7 +413,8 @@ def table_of_object(source: Any, times: Any = None) -> Table:
     Raises
     ------
     InputError
-        If the source is neither, or if the stamps are not one number or datetime for each pose.
+        If the source is neither an array nor a DataFrame, or if there is not one stamp, a number or
+        datetime, for each pose.
     """
     if hasattr(source, "columns"):
         keys = [*source.columns]
@@ -418,7 +438,7 @@ def table_of_object(source: Any, times: Any = None) -> Table:
 
 
 def _times_of_columns(columns: Sequence[Any], table: Table) -> Any:
-    """Return the stamps from their columns in a DataFrame; None without such columns."""
+    """Return the stamps from the columns of a DataFrame that contain them; None without columns."""
     if len(columns) < 2:
         return columns[0] if columns else None
     rows = zip(*(map(str, column) for column in columns), strict=True)
@@ -426,10 +446,13 @@ def _times_of_columns(columns: Sequence[Any], table: Table) -> Any:
 
 
 def _stamps_of_objects(times: Any, table: Table, n_poses: int) -> list[Decimal | None]:
-    """Return the stamp of each pose; None for a missing time."""
+    """Return the stamp of each pose, from numbers or datetimes; None for a missing time.
+
+    For datetimes, this also sets the unit of the table's stamps to ns.
+    """
     if isinstance(times, list) and times and isinstance(times[0], Decimal):
         return [*times]
-    # Datetimes of pandas with a time zone.
+    # Pandas has datetimes with a time zone, which numpy does not: convert them to UTC.
     if getattr(getattr(times, "dtype", None), "tz", None) is not None:
         times = np.asarray(times, dtype="datetime64[ns]")
     stamps = np.asarray(times)
@@ -488,5 +511,5 @@ def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:
 
 
 def tum_line(stamp_ns: int, pose: Iterable[float]) -> str:
-    """Return the line of a pose x y z qx qy qz qw, with all digits."""
+    """Return the line of the format tum for a pose x y z qx qy qz qw, with all digits."""
     return f"{seconds(stamp_ns)} {' '.join(map(repr, pose))}"
