@@ -43,7 +43,7 @@ INF = float("inf")
 PATIENCE_S = 120.0  # how long a hang takes to fail a test, on a busy machine
 
 RESULT = ResultState(
-    parent_frame="lidar", child_frame="camera", verdict="USE WITH CARE", status="ok",
+    parent_frame="lidar", child_frame="camera", verdict="USE", status="ok",
     reasons=("a: b", "c: d"), warnings=("repaired",), n_poses=9,
     time_offset_s=0.0, scale=1.0, age_s=1.0,
     pose={"x": 0.42, "y": -0.13, "z": None, "roll": 0.01, "pitch": -0.02, "yaw": 1.5},
@@ -281,10 +281,11 @@ def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
         sentence="moved: z by +3 cm +/- 4 mm", verdict="moved", differences=(difference,)
     )
     done = {"at": {"done": True, "precision": "known"}}
-    view = view_of(state(comparison=comparison, **done))
+    careful = replace(EXTRINSIC, result=replace(RESULT, verdict="USE WITH CARE"))
+    view = view_of(state(comparison=comparison, extrinsic=careful, **done))
     assert (view.word, view.tone, view.buttons[0]) == ("DONE", Tone.ACT, "save")
     assert view.sentence == "camera HAS MOVED: z by +3 cm ± 4 mm."
-    assert view.advice == "Save."
+    assert view.advice == "Save. USE WITH CARE: a: b."
     assert view_of(state(**done)).text == "Known. Stop and save."
     saved = view_of(replace(state(**done), saved=SAVED))
     assert saved.text.startswith("Known. Saved at ")
@@ -308,6 +309,16 @@ def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
             assert (line.tone, line.name) == (expected, "on /tf_static")
             texts = "nothing" in line.text, f"{broadcast.value}: why" == line.text
             assert texts == (has_ended, not has_ended)
+
+
+def test_a_session_is_done_with_the_reason_of_its_verdict():
+    careful = replace(EXTRINSIC, result=replace(RESULT, verdict="USE WITH CARE"))
+    done = state(at={"done": True, "precision": "known"}, extrinsic=careful)
+    view = view_of(done)
+    assert (view.word, view.tone) == ("DONE", Tone.ACT)
+    assert view.text == "Known. Stop and save. USE WITH CARE: a: b."
+    saved = view_of(replace(done, saved=SAVED))
+    assert (saved.tone, saved.advice) == (Tone.ACT, "USE WITH CARE: a: b.")
 
 
 def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
@@ -387,7 +398,8 @@ def drawn(view, width):
 
 @pytest.mark.parametrize("width", [60, 120])
 def test_the_terminal_shows_words_and_signs_at_every_width(width):
-    text = drawn(view_of(state()), width)
+    careful = replace(EXTRINSIC, result=replace(RESULT, verdict="USE WITH CARE"))
+    text = drawn(view_of(state(extrinsic=careful)), width)
     words = ("▶ GO ON", "✓ enough", "! 25 s left", "0.420 m", "± 4 cm of 2 cm", "━━━", "20.0 Hz",
              "USE WITH CARE")  # fmt: skip
     for word in words:

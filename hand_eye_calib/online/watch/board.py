@@ -323,10 +323,16 @@ def _done(state: NodeState, at: ProgressState) -> Headline:
     """Return the headline of a session that has reached its goal.
 
     The sentence describes what has moved compared with the installed transform, or the precision.
+    The advice contains the gravest reason if the verdict is not ``USE``.
     """
     tone = Tone.GOOD
     sentence = _sentence(at.progress.precision)
     advice = "Stop and save."
+    caution = ""
+    if state.result and state.result.verdict != "USE":
+        tone = Tone.ACT
+        gravest = state.result.reasons[:1]
+        caution = _sentence(": ".join((state.result.verdict, *gravest)))
     if state.result and at.comparison and at.comparison.verdict == "moved":
         tone = Tone.ACT
         displacement = _typeset(at.comparison.differences[0].change)
@@ -335,7 +341,7 @@ def _done(state: NodeState, at: ProgressState) -> Headline:
     if state.saved:
         sentence = f"{sentence} Saved {_saved_at(state.saved)}."
         advice = ""
-    return Headline(tone, DONE, sentence, advice)
+    return Headline(tone, DONE, sentence, f"{advice} {caution}".strip())
 
 
 def _silence(state: NodeState, silent_s: float) -> Headline:
