@@ -13,6 +13,8 @@
 #   make gate-quick    the same on fewer recordings; one minute
 #   make bench         benchmarks against the baseline; two minutes (BENCH_ARGS=--full: four)
 #   make bench-node    load, soak and crashes of the node; about four minutes
+#   make sessions      eleven live sessions of the node, and whether all its surfaces agree; 20 minutes
+#                      (SESSIONS='"knock" "parked"' for some)
 #   make dist          wheel and sdist in dist/, checked (RELEASE=1: only if nothing is a placeholder)
 #   make try-dist      make dist, then install wheel and sdist in clean environments and calibrate
 #   make tested        write requirements/tested.txt: the versions in .venv
@@ -44,7 +46,7 @@ PYTEST := python -m pytest --numprocesses $(WORKERS)
 SETUP_FILES := setup.py setup.cfg pyproject.toml package.xml
 
 .PHONY: help demo test test-statistics test-oldest coverage coverage-study fuzz gate gate-quick paper bench \
-	bench-node lint format dist try-dist tested docs notebook clean
+	bench-node sessions lint format dist try-dist tested docs notebook clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -90,6 +92,9 @@ bench: $(VENV)/.ready-bench
 
 bench-node: $(VENV)/.ready-test
 	OMP_NUM_THREADS=1 $(VENV)/bin/python benchmarks/node_load.py $(BENCH_ARGS)
+
+sessions: $(VENV)/.ready-test
+	OMP_NUM_THREADS=1 $(VENV)/bin/python benchmarks/node_sessions.py $(SESSIONS)
 
 lint: $(VENV)/.ready-test
 	$(VENV)/bin/ruff check .

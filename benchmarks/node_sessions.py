@@ -1,0 +1,606 @@
+"""Ten live sessions of the real node: do all surfaces agree, second by second?
+
+    OMP_NUM_THREADS=1 python benchmarks/node_sessions.py [SESSION ...] [--out DIRECTORY]
+
+Each session is a minute or two of simulated driving, published in real time, with one accident
+(a knock, a stream that stops, a wrong ``installed`` ...). A witness records the state of the node,
+its topics, ``/diagnostics``, ``/tf_static``, the page of ``watch``, the log and the saved files.
+They are compared at every second. Prints a table and fails (exit code 1) at a contradiction, or if
+a session does not end as it should. With ``--out``, all headlines of the page are kept.
+"""
+
+import argparse
+import contextlib
+import dataclasses
+import http.client
+import itertools
+import math
+import multiprocessing
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from html import unescape
+from pathlib import Path
+
+import numpy as np
+
+PROJECT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(PROJECT), str(PROJECT / "benchmarks"), str(PROJECT / "test")]
+
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from geometry_msgs.msg import TransformStamped  # noqa: E402
+from nav_msgs.msg import Odometry  # noqa: E402
+from ros_harness import (  # noqa: E402
+    LATCHED,
+    NodeProcess,
+    Peer,
+    free_domain,
+    matrix,
+    message,
+    values_of,
+)
+from std_msgs.msg import String  # noqa: E402
+from suite.table import Table, show  # noqa: E402
+
+from hand_eye_calib.core.geometry import se3  # noqa: E402
+from hand_eye_calib.extras.simulation.drive import simulate_drive  # noqa: E402
+from hand_eye_calib.extras.simulation.options import HILLY_DRIVE, REALISTIC  # noqa: E402
+from hand_eye_calib.formats.results import load_result  # noqa: E402
+from hand_eye_calib.online.live.progress import AXIS_KEYS  # noqa: E402
+from hand_eye_calib.online.live.state import Broadcast, Standing  # noqa: E402
+from hand_eye_calib.online.watch.board import state_of  # noqa: E402
+
+# Seed of the drives.
+SEED = 5800
+
+# Time (s) after a state within which the page must display it: the page looks every 0.25 s, and
+# the machine may be loaded.
+SETTLED_S = 1.0
+
+# Time (s) that the publisher's process takes to start.
+START_S = 6.0
+
+# Motion before which there must be neither a verdict nor advice.
+MIN_MOTION_S = 20.0
+MIN_ROTATION_DEG = 30.0
+
+# Headlines that may replace DONE and GO ON at any time.
+ALARMS = ("CHECK", "BAD INPUT", "BROKEN", "OLD RESULT", "PAUSED", "CHANGE")
+
+
+@dataclass
+class Streams:
+    """Stamps (s from the start) and poses of both sensors."""
+
+    parent_s: np.ndarray
+    Ts_parent: np.ndarray
+    child_s: np.ndarray
+    Ts_child: np.ndarray
+    T_parent_child: np.ndarray
+
+
+@dataclass(frozen=True)
+class Session:
+    """One session: motion, accident, and the headline with which it must end.
+
+    Attributes
+    ----------
+    seconds : float
+        Duration of the drive (s).
+    ends_with : str
+        Regular expression for the last headline before the node is stopped.
+    rates_hz : (float, float)
+        Of parent and child.
+    parameters : dict
+        Of the node. An ``installed`` is replaced by a transform that is wrong by 15 cm and 4 deg.
+    accident : callable or None
+        Changes the streams.
+    load : int
+        Number of other programs that load the machine.
+    second_publisher_s : float
+        Time (s) from which a second program publishes on the child's topic.
+    must_appear : str
+        Regular expression for a headline or a line of the page that must have been displayed.
+    """
+
+    seconds: float
+    ends_with: str
+    rates_hz: tuple[float, float] = (10.0, 20.0)
+    parameters: dict = field(default_factory=dict)
+    accident: Callable[[Streams], None] | None = None
+    load: int = 0
+    second_publisher_s: float = math.inf
+    must_appear: str = ""
+
+
+# -------------------------------------------------------------------- accidents
+
+
+def knock(streams):
+    """Turn the child sensor on its mount by 3 deg after 60 s."""
+    turned = se3.exp(np.array([0.02, 0.0, 0.0, 0.0, 0.0, math.radians(3.0)]))
+    later = streams.child_s > 60.0
+    streams.Ts_child[later] = streams.Ts_child[later] @ turned
+
+
+def stop_child(streams):
+    """Silence the child from 25 to 45 s."""
+    keep = (streams.child_s < 25.0) | (streams.child_s > 45.0)
+    streams.child_s = streams.child_s[keep]
+    streams.Ts_child = streams.Ts_child[keep]
+
+
+def end_child(streams):
+    """Silence the child from 12 s on."""
+    keep = streams.child_s < 12.0
+    streams.child_s = streams.child_s[keep]
+    streams.Ts_child = streams.Ts_child[keep]
+
+
+def park(streams):
+    """Stand still from 25 to 55 s; the drive goes on from there."""
+    for name in ("parent", "child"):
+        times_s = getattr(streams, f"{name}_s")
+        Ts = getattr(streams, f"Ts_{name}")
+        moving_s = np.where(times_s < 25.0, times_s, np.maximum(25.0, times_s - 30.0))
+        nearest = np.searchsorted(times_s, moving_s).clip(max=len(Ts) - 1)
+        setattr(streams, f"Ts_{name}", Ts[nearest])
+
+
+def start_straight(streams):
+    """Drive straight on for the first 25 s."""
+    for name in ("parent", "child"):
+        times_s = getattr(streams, f"{name}_s")
+        Ts = getattr(streams, f"Ts_{name}")
+        # The body moves with 1.5 m/s along its x axis until it is where the drive begins.
+        to_start_m = 1.5 * np.minimum(times_s - 25.0, 0.0)
+        driven = np.searchsorted(times_s, times_s - 25.0).clip(max=len(Ts) - 1)
+        moved = Ts[np.where(times_s < 25.0, 0, driven)]
+        if name == "child":
+            T_child_parent = se3.inverse(streams.T_parent_child)
+            moved = moved @ T_child_parent
+        ahead = se3.from_rotation_translation(
+            np.eye(3), np.column_stack([to_start_m, 0 * to_start_m, 0 * to_start_m])
+        )
+        moved = moved @ ahead
+        if name == "child":
+            moved = moved @ streams.T_parent_child
+        setattr(streams, f"Ts_{name}", moved)
+
+
+QUIET = {"target.translation": 0.04, "target.rotation": 0.0105}
+
+SESSIONS = {
+    "10 and 20 Hz": Session(90.0, "DONE", parameters=QUIET),
+    "100 Hz, load 8": Session(90.0, "DONE", (100.0, 100.0), QUIET, load=8),
+    "50 and 7 Hz": Session(90.0, "DONE", (50.0, 7.0), QUIET),
+    "knock": Session(
+        120.0, "CHECK THE STREAMS|GO ON|DONE", accident=knock, must_appear="CHECK THE STREAMS"
+    ),
+    "wrong installed": Session(
+        90.0, "DONE", parameters=QUIET | {"installed": ""}, must_appear="HAS MOVED"
+    ),
+    "contradicted prior": Session(
+        60.0, "CHECK THE PRIOR", parameters={"prior.z": "1.5+/-0.01"}, must_appear="contradicts"
+    ),
+    "two publishers": Session(
+        60.0, "BAD INPUT|CHECK", second_publisher_s=30.0, must_appear="publishers"
+    ),
+    "straight start": Session(110.0, "DONE", parameters=QUIET, accident=start_straight),
+    "parked": Session(120.0, "DONE", parameters=QUIET, accident=park),
+    "child silent for 20 s": Session(
+        110.0, "DONE", parameters=QUIET, accident=stop_child, must_appear="PAUSED|CHECK INPUT"
+    ),
+    "child dies, Ctrl-C": Session(55.0, "PAUSED|CHECK INPUT", parameters=QUIET, accident=end_child),
+}
+
+
+def simulated(session, seed):
+    """Return the streams of a session, and the true extrinsic."""
+    parent_hz, child_hz = session.rates_hz
+    config = dataclasses.replace(
+        HILLY_DRIVE,
+        poses=round(session.seconds * parent_hz),
+        parent_rate=parent_hz,
+        child_rate=child_hz,
+        start_time=0.0,
+    )
+    drive = simulate_drive(seed, config, REALISTIC)
+    streams = Streams(
+        drive.parent.stamps_ns * 1e-9,
+        drive.parent.poses.copy(),
+        drive.child.stamps_ns * 1e-9,
+        drive.child.poses.copy(),
+        drive.T_parent_child,
+    )
+    if session.accident:
+        session.accident(streams)
+    return streams, drive.T_parent_child
+
+
+# ---------------------------------------------------------------------- witness
+
+
+@dataclass(frozen=True)
+class Page:
+    """The page of ``watch``, read back from its HTML."""
+
+    html: str
+
+    @property
+    def word(self):
+        """The headline in capitals."""
+        found = re.search(r"<h1><span[^>]*>.</span> ([^<]*)</h1>", self.html)
+        return unescape(found[1]) if found else ""
+
+    @property
+    def headline(self):
+        """Word, sentence and advice in one line."""
+        section = re.search(r'<section class="headline">(.*?)</section>', self.html)
+        paragraphs = re.findall(r'<p(?: class="advice")?>([^<]*)</p>', section[1])
+        return unescape(f"{self.word}: {' '.join(paragraphs)}")
+
+    @property
+    def shares(self):
+        """Share of each bar by the name of its axis."""
+        bars = re.findall(r'value="([\d.]+)" aria-label="([^"]+)"', self.html)
+        return {name: float(value) for value, name in bars}
+
+    @property
+    def values(self):
+        """Texts of the printed pose by axis."""
+        pairs = re.findall(r"<dt>([^<]*)</dt><dd>([^<]*)</dd>", self.html)
+        return {axis: unescape(text) for axis, text in pairs}
+
+    @property
+    def verdict(self):
+        found = re.search(r"<b>verdict</b> ([^<]*)</p>", self.html)
+        return found[1] if found else ""
+
+
+class Witness:
+    """Records every surface of the node with the time (s) at which something arrived."""
+
+    def __init__(self, peer, domain, folder):
+        self.states = []
+        self.diagnostics = []
+        self.transforms = []
+        self.broadcasts = []
+        self.pages = []
+        node = peer.node
+        self._subscribe(node, String, "/calibrator/progress", self._take_state)
+        self._subscribe(node, TransformStamped, "/calibrator/extrinsic", self.transforms)
+
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, 10)
+        with contextlib.suppress(ImportError):
+            from tf2_msgs.msg import TFMessage
+
+            self._subscribe(node, TFMessage, "/tf_static", self.broadcasts)
+        self._notes = folder / "watch.txt"
+        environment = {"ROS_DOMAIN_ID": str(domain), "XDG_STATE_HOME": str(folder)}
+        command = [sys.executable, "-m", "hand_eye_calib", "watch", "--web", "127.0.0.1:0"]
+        with self._notes.open("w") as notes:
+            self._watch = subprocess.Popen(
+                command,
+                stdout=subprocess.DEVNULL,
+                stderr=notes,
+                env=os.environ | environment | {"PYTHONPATH": os.pathsep.join(sys.path)},
+            )
+        threading.Thread(target=self._read_page, daemon=True).start()
+
+    def _subscribe(self, node, kind, topic, target):
+        take = target if callable(target) else lambda data: target.append((time.time(), data))
+        node.create_subscription(kind, topic, take, LATCHED)
+
+    def _take_state(self, text):
+        state = state_of(text.data)
+        assert state is not None, text.data
+        self.states.append((time.time(), state))
+
+    def _take_diagnostics(self, array):
+        by_name = {status.name.rpartition(": ")[2]: status for status in array.status}
+        self.diagnostics.append((time.time(), by_name))
+
+    def _read_page(self):
+        address = None
+        while address is None:
+            time.sleep(0.1)
+            address = re.search(r"http://127.0.0.1:(\d+)/\?key=(\S+)", self._notes.read_text())
+        connection = http.client.HTTPConnection("127.0.0.1", int(address[1]))
+        connection.request("GET", f"/events?key={address[2]}")
+        events = connection.getresponse()
+        while line := events.readline().decode():
+            html = line.removeprefix("data: ").strip()
+            if html:
+                self.pages.append((time.time(), Page(html)))
+
+    def close(self):
+        self._watch.send_signal(signal.SIGINT)
+        return self._watch.wait(60.0)
+
+
+def newest(records, at_s):
+    """Return time and newest record up to a time (s); None if there is none."""
+    earlier = [record for record in records if record[0] <= at_s]
+    return earlier[-1] if earlier else None
+
+
+# ------------------------------------------------------------------- comparison
+
+
+def contradictions(witness, start_s, end_s):
+    """Yield (second, text) for each second at which two surfaces disagree."""
+    for second in range(3, int(end_s - start_s)):
+        now_s = start_s + second
+        state_record = newest(witness.states, now_s)
+        page_record = newest(witness.pages, now_s)
+        if state_record is None or page_record is None:
+            continue
+        before = newest(witness.states, now_s - SETTLED_S)
+        after = newest(witness.states, now_s + SETTLED_S)
+        if before is None or not essence(before[1]) == essence(state_record[1]) == essence(
+            after[1]
+        ):
+            continue  # one surface may be ahead of another for a moment
+        yield from (
+            (second, text)
+            for text in itertools.chain(
+                compare_page(page_record[1], state_record[1]),
+                compare_topics(witness, state_record[1], now_s),
+            )
+        )
+
+
+def essence(state):
+    """Return what may not change while surfaces are compared."""
+    result = state.result
+    progress = state.progress.progress if state.progress else None
+    return (
+        result and (result.verdict, tuple(result.pose.values())),
+        progress and (progress.done, progress.sentence),
+        state.standing,
+        state.extrinsic and (state.extrinsic.tf_static, state.extrinsic.contradicted),
+        state.has_ended,
+    )
+
+
+def compare_page(page, state):
+    """Yield contradictions between the page and the state of the node."""
+    result = state.result
+    progress = state.progress.progress if state.progress else None
+    if (page.word == "DONE") and not (progress and progress.done):
+        yield "the page is DONE, the state is not"
+    if progress and progress.done and page.word != "DONE" and not page.word.startswith(ALARMS):
+        yield f"the state is done, the page is {page.word}"
+    verdict = result.verdict if result else "no result yet"
+    if page.verdict != verdict:
+        yield f"verdict {page.verdict!r} on the page, {verdict!r} in the state"
+    if progress and progress.axes and not state.extrinsic.contradicted:
+        full = [share >= 1.0 for share in page.shares.values()]
+        within = [
+            progress.axes[key].sigma <= progress.axes[key].target for key in AXIS_KEYS.values()
+        ]
+        by_hand = [progress.axes[key].seconds_left == 0 for key in AXIS_KEYS.values()]
+        if any(a != (b or c) for a, b, c in zip(full, within, by_hand, strict=True)):
+            yield f"full bars {full}, axes within their target {within}"
+        if progress.done and not all(full):
+            yield "DONE with a bar that is not full"
+        is_confirming = "onfirm" in page.headline
+        if all(full) and page.word == "GO ON" and not is_confirming:
+            yield f"all bars are full, and the page says {page.headline!r}"
+    if result and state.standing is not Standing.REFUTED:
+        for axis in "xyz":
+            value = result.pose[axis]
+            text = page.values.get(axis, "")
+            if value is not None and not text.startswith(f"{value:.3f} m"):
+                yield f"{axis} is {text!r} on the page, {value:.3f} m in the state"
+    motion_s = state.extrinsic.motion_s if state.extrinsic else 0.0
+    rotation_deg = (
+        max(state.extrinsic.rotation_deg.values(), default=0.0) if state.extrinsic else 0.0
+    )
+    is_early = motion_s < MIN_MOTION_S and rotation_deg < MIN_ROTATION_DEG
+    if is_early and page.word in ("CHANGE THE MOTION", "DONE"):
+        yield f"{page.word} after {motion_s:.0f} s and {rotation_deg:.0f} deg"
+
+
+def compare_topics(witness, state, now_s):
+    """Yield contradictions between topics and the state of the node."""
+    result = state.result
+    transform = newest(witness.transforms, now_s)
+    if result and transform and state.standing is Standing.CURRENT:
+        T = matrix(transform[1])
+        pose = [result.pose[axis] for axis in "xyz"]
+        known = [axis for axis in range(3) if pose[axis] is not None]
+        off_m = max((abs(T[axis, 3] - pose[axis]) for axis in known), default=0.0)
+        if off_m > 1e-6:
+            yield f"~/extrinsic differs by {1e3 * off_m:.3g} mm from the state"
+    diagnostics = newest(witness.diagnostics, now_s)
+    if diagnostics and now_s - diagnostics[0] < 1.5 and result:
+        status = diagnostics[1].get("extrinsic")
+        values = values_of(status) if status else {}
+        if values.get("verdict", result.verdict) != result.verdict:
+            yield f"verdict {values['verdict']!r} on /diagnostics, {result.verdict!r} in the state"
+    broadcast = newest(witness.broadcasts, now_s)
+    is_on = bool(state.extrinsic and state.extrinsic.tf_static is Broadcast.ON)
+    if is_on != bool(broadcast) and state.standing is Standing.CURRENT:
+        yield f"/tf_static is {state.extrinsic.tf_static.value}, transform sent: {bool(broadcast)}"
+    if is_on and broadcast and transform:
+        (sent,) = broadcast[1].transforms
+        if not np.allclose(matrix(sent), matrix(transform[1]), atol=1e-9):
+            yield "/tf_static and ~/extrinsic differ"
+
+
+def end_contradictions(witness, log, folder):
+    """Yield contradictions between the end of the session, its log and its files."""
+    if "Traceback" in log:
+        yield "a traceback in the log"
+    warnings = re.findall(r"\[WARN\] \[[\d.]+\] (.*)", log)
+    for text in {text for text in warnings if warnings.count(text) > 1}:
+        yield f"logged {warnings.count(text)} times: {text[:80]}"
+    page = witness.pages[-1][1]
+    if page.word != "ENDED":
+        yield f"the node has ended, the page says {page.word!r}"
+    file = folder / "out" / "extrinsic.yaml"
+    state = witness.states[-1][1]
+    if state.result and not file.exists():
+        yield "a result, but no file"
+    if file.exists() and witness.transforms and state.standing is Standing.CURRENT:
+        saved = load_result(file).T_parent_child
+        if not np.allclose(saved, matrix(witness.transforms[-1][1]), atol=1e-9):
+            yield "extrinsic.yaml and ~/extrinsic differ"
+
+
+# ---------------------------------------------------------------------- session
+
+
+def run(name, session, folder, seed):
+    """Run one session; return the row of the table, and its contradictions."""
+    streams, T_parent_child = simulated(session, seed)
+    domain = free_domain()
+    peer = Peer(domain)
+    parameters = {"output_directory": folder / "out", "publish_tf": "true", **session.parameters}
+    if "installed" in parameters:
+        wrong = T_parent_child @ se3.exp(np.array([0.15, 0.0, 0.0, 0.0, 0.0, math.radians(4.0)]))
+        numbers = " ".join(f"{number:.6f}" for number in se3.xyz_rpy(wrong))
+        parameters["installed"] = f"'{numbers}'"
+    arguments = [f"-p {key}:={value}" for key, value in parameters.items()]
+    witness = Witness(peer, domain, folder)
+    node = NodeProcess(domain, folder / "node.log", arguments, fresh=True)
+    busy = [
+        subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(session.load)
+    ]
+    try:
+        peer.spin_until(lambda: witness.pages and witness.states, "the page and the node")
+        start_s = time.time() + START_S
+        publishing = start_publishing(domain, streams, start_s, session)
+        peer.spin_until(lambda: time.time() > start_s + session.seconds + 4.0, "the last states")
+        end_s = time.time()
+        publishing.join()
+        last = witness.pages[-1][1]
+        code, _ = node.stop(signal.SIGINT)
+        peer.spin_until(lambda: time.time() > end_s + 4.0, "the end of the page")
+    finally:
+        for program in busy:
+            program.kill()
+            program.wait()
+        node.kill()
+        watch_code = witness.close()
+        peer.close()
+    problems = list(contradictions(witness, start_s, end_s))
+    problems += [(math.inf, text) for text in end_contradictions(witness, node.log, folder)]
+    if code or watch_code:
+        problems.append((math.inf, f"exit codes {code} of the node, {watch_code} of watch"))
+    if not re.match(session.ends_with, last.word):
+        problems.append((math.inf, f"ends with {last.headline!r}, not {session.ends_with}"))
+    shown = "\n".join(page.html for _, page in witness.pages)
+    if not re.search(session.must_appear, unescape(shown)):
+        problems.append((math.inf, f"the page has never displayed {session.must_appear!r}"))
+    return row_of(witness, start_s, end_s, last, T_parent_child), problems
+
+
+def publish(streams, start_s, session):
+    """Publish both streams in real time, in a process of its own that is never late."""
+    with contextlib.suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(2))
+    peer = Peer(int(os.environ["ROS_DOMAIN_ID"]))
+    publishers = peer.publishers(Odometry)
+    peer.wait_matched(*publishers)
+    rows = []
+    for publisher, times_s, Ts, frame in (
+        (publishers[0], streams.parent_s, streams.Ts_parent, "lidar"),
+        (publishers[1], streams.child_s, streams.Ts_child, "camera"),
+    ):
+        rows += [(time_s, publisher, T, frame) for time_s, T in zip(times_s, Ts, strict=True)]
+    second = None
+    for time_s, publisher, T, frame in sorted(rows, key=lambda row: row[0]):
+        time.sleep(max(0.0, start_s + time_s - time.time()))
+        stamp_ns = round((start_s + time_s) * 1e9)
+        publisher.publish(message(Odometry, stamp_ns, T, frame))
+        if time_s < session.second_publisher_s or frame == "lidar":
+            continue
+        if second is None:
+            second = peer.publisher(Odometry, "child_odom")
+        shifted = T @ se3.exp(np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.2]))
+        second.publish(message(Odometry, stamp_ns + 20_000_000, shifted, frame))
+    time.sleep(max(0.0, start_s + session.seconds - time.time()))
+    peer.close()
+
+
+def start_publishing(domain, streams, start_s, session):
+    """Start the publisher's process."""
+    os.environ["ROS_DOMAIN_ID"] = str(domain)
+    context = multiprocessing.get_context("spawn")
+    process = context.Process(target=publish, args=(streams, start_s, session))
+    process.start()
+    return process
+
+
+def row_of(witness, start_s, end_s, last, T_parent_child):
+    """Return the row of the table: times of the first result and DONE, flips, last headline."""
+    during = [(t, state) for t, state in witness.states if start_s <= t <= end_s]
+    first = next((t - start_s for t, state in during if state.result), math.nan)
+    done = next(
+        (t - start_s for t, s in during if s.progress and s.progress.progress.done), math.nan
+    )
+    verdicts = [state.result.verdict for _, state in during if state.result]
+    flips = sum(a != b for a, b in itertools.pairwise(verdicts))
+    words = [page.word for t, page in witness.pages if start_s <= t <= end_s]
+    changes = sum(a != b for a, b in itertools.pairwise(words))
+    error_mm = math.nan
+    if witness.transforms:
+        T = matrix(witness.transforms[-1][1])
+        error_mm = 1e3 * float(np.linalg.norm(T[:3, 3] - T_parent_child[:3, 3]))
+    return [
+        f"{int(end_s - start_s)}",
+        f"{first:.0f}",
+        f"{done:.0f}",
+        f"{flips}",
+        f"{changes}",
+        f"{error_mm:.0f}",
+        last.headline[:70],
+    ], witness
+
+
+HEADINGS = ["seconds", "result at", "DONE at", "verdicts", "headlines", "error mm", "last headline"]
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("sessions", nargs="*", metavar="SESSION", help=", ".join(SESSIONS))
+    parser.add_argument("--out", type=Path, help="directory for logs, pages and headlines")
+    arguments = parser.parse_args()
+    rows = []
+    all_problems = []
+    with tempfile.TemporaryDirectory() as scratch:
+        for number, name in enumerate(SESSIONS):
+            if arguments.sessions and name not in arguments.sessions:
+                continue
+            folder = (arguments.out or Path(scratch)) / f"session_{number}"
+            folder.mkdir(parents=True, exist_ok=True)
+            (row, witness), problems = run(name, SESSIONS[name], folder, SEED + number)
+            rows.append([name, *row, str(len(problems))])
+            all_problems += [f"{name}, {second} s: {text}" for second, text in problems]
+            seen = dict.fromkeys(page.headline for _, page in witness.pages)
+            (folder / "headlines.txt").write_text("\n".join(seen) + "\n")
+            for index, (_, page) in enumerate(one_page_per_word(witness.pages)):
+                (folder / f"page_{index}.html").write_text(page.html)
+            print(name, row, *problems[:5], sep="\n   ", flush=True)
+    show([Table("Live sessions", [*HEADINGS, "contradictions"], rows)])
+    print("\n".join(all_problems))
+    return bool(all_problems)
+
+
+def one_page_per_word(pages):
+    """Return the last page of each run of equal headline words."""
+    return [list(group)[-1] for _, group in itertools.groupby(pages, key=lambda row: row[1].word)]
+
+
+if __name__ == "__main__":
+    sys.exit(main())
