@@ -102,7 +102,7 @@ def test_unknown_names_in_the_file_are_warned_about(start_node, tmp_path):
                 "-p parent_type:=nav_msgs/msg/Odometry",
                 "-p qos_overrides./parent_odom.subscription.reliability:=sometimes",
             ],
-            *(1, "calibrator: cannot subscribe to /parent_odom with the QoS overrides given: "),
+            *(1, "calibrator: cannot subscribe to /parent_odom: "),
         ),
     ],
 )

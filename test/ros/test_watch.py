@@ -32,14 +32,14 @@ def test_of_ten_thousand_names_on_the_network_a_few_are_kept():
     heard = []
     watcher = Watcher.__new__(Watcher)
     watcher._board = Board()
-    watcher._heard = set()
+    watcher._sources = set()
     topics = [(f"/n{k}/progress", ["std_msgs/msg/String"]) for k in range(10_000)]
     watcher._node = SimpleNamespace(
         get_topic_names_and_types=lambda: topics,
         create_subscription=lambda kind, topic, *_: heard.append(topic),
     )
-    watcher._look()
-    assert 10 < len(heard) == len(watcher._heard) < 100
+    watcher._discover()
+    assert 10 < len(heard) == len(watcher._sources) < 100
 
 
 class Watch:

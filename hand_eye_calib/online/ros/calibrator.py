@@ -33,7 +33,7 @@ _PARAMETERS = "All parameters (-p NAME:=VALUE) are in config/calibrator.yaml, wi
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the usage of the command; its arguments are passed on to the node."""
+    """Declare usage and help of the command. The node itself reads its arguments."""
     parser.usage = "%(prog)s [--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO ...]"
     parser.set_defaults(brief=f"{_BRIEF}\n\n{_PARAMETERS}")
     epilog = f"{_BRIEF}\n\nparameters (-p NAME:=VALUE):\n"

@@ -1,7 +1,7 @@
 """The node: topics, services, parameters and timers around the live session.
 
-Solves run in a process of their own. All other code runs in the only thread of the executor, so
-nothing here needs a lock.
+Solves run in a process of their own. All other code runs in the one thread of the executor, so no
+lock is needed.
 """
 
 import time
@@ -164,7 +164,7 @@ class CalibratorNode(ManagedNode):
         Raises
         ------
         ConfigError
-            If two inputs have one topic.
+            If two inputs have the same topic.
         """
         topics = {source.name: source.topic for source in self._inputs}
         if len(set(topics.values())) < len(topics):
@@ -203,6 +203,7 @@ class CalibratorNode(ManagedNode):
         return make(self._session, robot.installed, lambda: robot.problem, self._log)
 
     def _make_input(self, name: str) -> TopicInput | TfInput:
+        """Return the input of a sensor: from transforms if an option names frames for it."""
         options = self._options.node
         parts = self._session, self._log, self._begin_session
         source: TopicInput | TfInput
@@ -215,30 +216,35 @@ class CalibratorNode(ManagedNode):
         return source
 
     def _serve(self) -> None:
-        # A long queue, because requests also come while the node is busy.
+        """Advertise the services."""
+        # A long queue, because requests also arrive while the node is busy.
         qos = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
         serve = partial(self.create_service, qos_profile=qos)
-        # While this callback awaits a solve, it would delay every other callback of its group.
+        # A group of its own: while this callback awaits a solve, no other callback of its group
+        # could run.
         serve(Trigger, "~/solve", self._on_solve, callback_group=ReentrantCallbackGroup())
         serve(Trigger, "~/save", partial(self._answer, self._save))
         serve(Trigger, "~/reset", partial(self._answer, self._reset))
         serve(SetBool, "~/set_enabled", partial(self._answer, self._set_enabled))
 
     def _start_timers(self) -> None:
-        # Steady time, which goes on while a bag, and with it simulated time, is paused.
+        """Start the timers for solves and for all other periodic tasks."""
+        # Steady time goes on while a bag, and with it simulated time, is paused.
         make_timer = partial(self.create_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._solve_timer = make_timer(self._options.node.solve_period, self._on_solve_timer)
-        # One task at a time: all at once would delay messages for long on a slow computer.
+        # The tasks of a second, in order: all at once would delay messages on a slow computer.
+        # Every second call flushes the journal; the calls between publish once and then discover.
         flush = self._session.flush_journal
         tasks = [flush, self._publish]
         for _ in range(round(REPORT_PERIOD_S / FLUSH_PERIOD_S) - 1):
             tasks += [flush, self._discover]
-        turns = cycle(tasks)
-        make_timer(FLUSH_PERIOD_S / 2, lambda: next(turns)())
+        next_tasks = cycle(tasks)
+        make_timer(FLUSH_PERIOD_S / 2, lambda: next(next_tasks)())
 
     # ---------------------------------------------------------------- timers
 
     def _discover(self) -> None:
+        """Look for publishers of the inputs, and for another node of the same name."""
         for source in self._inputs:
             source.discover()
         name = self.get_fully_qualified_name()
@@ -246,6 +252,7 @@ class CalibratorNode(ManagedNode):
             self._log.warning(f"another node is called {name}, too: start one with -r __node:=NAME")
 
     def _on_solve_timer(self) -> None:
+        """Log inputs without a pose, and start a solve if there are new poses."""
         silent = [source for source in self._inputs if not source.has_poses]
         if silent and silent[0].is_enabled:
             texts = [f"no pose yet on {source.topic}: {source.problem}" for source in silent]
@@ -253,12 +260,12 @@ class CalibratorNode(ManagedNode):
         self._cycle.start_if_due()
 
     def _publish(self, has_ended: bool = False) -> None:
-        """Publish result and state together, so that all topics agree at every time."""
+        """Publish result and state together, so that the topics always agree."""
         self._results.publish(self._cycle.published)
         self._tf.update(self._cycle.result, self._why_not_broadcast())
         if self._mount is not None:
             self._mount.look()
-        # The state counts messages that wait on a slow computer, too.
+        # Messages may wait in the queues on a slow computer: count them before the state is made.
         if not has_ended:
             self.take_messages()
         clock_ns = self.get_clock().now().nanoseconds
@@ -281,12 +288,13 @@ class CalibratorNode(ManagedNode):
         return "" if result.base_frame == base_frame else f"base_frame {base_frame} is not known"
 
     def _state(self) -> NodeState:
+        """Return the whole state of the node."""
         cycle = self._cycle
         name = self.get_fully_qualified_name()
         steady_s = time.monotonic()
         accepts_poses = self._inputs[0].is_enabled
-        # A robot may be parked once there is a result. A topic without a publisher is worth a look,
-        # unless the goal is reached.
+        # Once there is a result, the robot may be parked, and silent inputs are normal. An input
+        # without a publisher is reported all the same, until the goal is reached.
         silent = [source.is_silent(steady_s) for source in self._inputs[:2]]
         is_parked = cycle.published is not None and all(silent)
         is_done = cycle.goal.progress.done
@@ -334,19 +342,20 @@ class CalibratorNode(ManagedNode):
     async def _on_solve(
         self, request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
+        """Solve, and answer the request when the solve has ended."""
         solved = Future()
         self._cycle.ask(lambda is_good, text: solved.set_result((is_good, text)))
         response.success, response.message = await solved
         return response
 
     def _answer(self, act: Callable[[Any], Outcome], request: Any, response: Any) -> Any:
-        """Act on a request, and answer it with success and a line of text."""
+        """Call ``act`` with a request, and answer with its success and its line of text."""
         response.success, response.message = act(request)
         self._publish()
         return response
 
     def _save_digest(self) -> Outcome:
-        """Write the digest of a monitored session."""
+        """Write the digest of a monitored session; return the success and a line of text."""
         directory = self._options.node.output_directory
         if self._mount is None or not directory:
             return False, "the digest is not saved: output_directory is not set"
@@ -354,11 +363,13 @@ class CalibratorNode(ManagedNode):
         return saved
 
     def _save(self, request: Trigger.Request) -> Outcome:
+        """Save the result, or the digest of a monitored session."""
         if self._mount is not None:
             return self._save_digest()
         return self._saver.save(self._options.node)
 
     def _reset(self, request: Trigger.Request) -> Outcome:
+        """Begin a new session; the answer names the priors, which stay."""
         self._begin_session()
         text = "all poses discarded, new session"
         priors = priors_of(self._options.calibrator)
@@ -388,7 +399,7 @@ class CalibratorNode(ManagedNode):
             output_path(options.output_directory, self._output_base)
 
     def _follow_parameters(self, before: CalibratorConfig) -> None:
-        """Apply changed parameters; ``before`` has the options of the engine before the change."""
+        """Apply changed parameters; ``before`` are the options of the engine before the change."""
         if not self.is_configured:
             return
         options = self._options.node

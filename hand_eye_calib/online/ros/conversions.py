@@ -12,21 +12,22 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import turned
 from hand_eye_calib.core.results.calibration import Calibration
 
-# Length of a queue: seconds of a fast stream, and the last message of every publisher.
+# Length of a queue of messages: seconds of a fast stream. For /tf_static, this is the number of
+# publishers whose last message a late subscriber receives.
 _QUEUE = 1000
 
 _RELIABLE = ReliabilityPolicy.RELIABLE
-_LASTING = DurabilityPolicy.TRANSIENT_LOCAL
-# QoS of a publisher whose last message late subscribers receive.
-LATCHED = QoSProfile(depth=1, reliability=_RELIABLE, durability=_LASTING)
-# QoS of a subscription to the last messages of all publishers.
-LISTENING = QoSProfile(depth=_QUEUE, reliability=_RELIABLE, durability=_LASTING)
+_LATCHING = DurabilityPolicy.TRANSIENT_LOCAL
+# QoS of a latched publisher: late subscribers receive its last message.
+LATCHED = QoSProfile(depth=1, reliability=_RELIABLE, durability=_LATCHING)
+# QoS of a subscription that receives the last message of every latched publisher.
+LISTENING = QoSProfile(depth=_QUEUE, reliability=_RELIABLE, durability=_LATCHING)
 
 
 def quick() -> QoSProfile:
-    """Return a new best-effort QoS, which receives from reliable publishers, too.
+    """Return a new best-effort QoS, with which a subscription also receives reliable messages.
 
-    Every subscription needs a QoS of its own, because rclpy writes overrides into the QoS.
+    Every subscription needs its own object, because rclpy writes QoS overrides into the object.
     """
     return QoSProfile(
         depth=_QUEUE,
@@ -56,7 +57,8 @@ def to_transform(calibration: Calibration, is_mounting: bool = False) -> Transfo
     ----------
     calibration : Calibration
     is_mounting : bool
-        Replace the parent sensor's frame by the frame on which the child sensor is mounted.
+        Use ``calibration.mounting``: the pose in the frame on which the child sensor is mounted
+        (the base frame, if there is one) replaces the pose in the parent sensor's frame.
     """
     frame = calibration.parent_frame
     T = calibration.T_parent_child

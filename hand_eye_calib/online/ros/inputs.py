@@ -1,4 +1,4 @@
-"""The subscriptions of the node's inputs: poses from a topic or from transforms."""
+"""The inputs of the node: subscriptions to a topic of poses or to transforms."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -25,10 +25,10 @@ from hand_eye_calib.online.ros.tf import DYNAMIC_TOPIC, STATIC_TOPIC, message_ty
 
 _QOS_OVERRIDES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
 
-# Message types in the order of preference; the first entry of POSE_TYPES is "auto".
+# Message types in the order of preference, without the first entry of POSE_TYPES, "auto".
 _TYPES = POSE_TYPES[1:]
 
-# Errors of rclpy for QoS overrides that it cannot apply.
+# Errors that rclpy raises for QoS overrides that it cannot apply.
 _BAD_QOS = (ParameterException, InvalidQosOverridesError, RuntimeError, AssertionError, ValueError)
 
 # Arguments of PoseInput after name and topic.
@@ -47,16 +47,22 @@ class RosInput(PoseInput):
 
     def __init__(self, name: str, topic: str, parts: Parts) -> None:
         super().__init__(name, topic, *parts)
-        # Subscriptions and callbacks; a callback takes a message and information about the message.
+        # Subscriptions with their callbacks. The arguments of a callback are a message and rclpy's
+        # information about the message.
         self._subscribed: list[tuple[Subscription, Callable[[Any, Mapping[str, int]], None]]] = []
 
     def take_waiting(self) -> bool:
-        """Process the messages that wait in the queues; return whether there were any."""
+        """Process the messages that wait in the queues; return whether there were any.
+
+        Messages are taken from rclpy directly, because the executor needs much longer for one.
+        """
         before = self._arrived
         for subscription, callback in self._subscribed:
             handle = subscription.handle
             take = partial(handle.take_message, subscription.msg_type, subscription.raw)
             with handle:
+                # take() returns None at the end of the queue. The limit is for a queue that fills
+                # as fast as it is emptied.
                 for message in islice(iter(take, None), subscription.qos_profile.depth):
                     callback(*message)
         return self._arrived > before
@@ -70,7 +76,7 @@ class TopicInput(RosInput):
     node : rclpy.node.Node
     name : str
     wanted_type : str
-        Message type, or "auto" for the type of the publishers.
+        Message type, or "auto" for the type that the publishers have.
     parts : tuple
         See :class:`RosInput`.
     """
@@ -84,14 +90,15 @@ class TopicInput(RosInput):
         self._type_name = ""
 
     def discover(self) -> None:
-        """Subscribe as soon as the type is known; to be called often.
+        """Subscribe as soon as the message type is known. This method must be called often.
 
         Raises
         ------
         ConfigError
-            If the type of the options cannot be used. A type of publishers is refused in the log.
+            If the type that the options request cannot be used. If the type of the publishers
+            cannot be used, the log has an error instead.
         """
-        # This method of rclpy remaps the topic, unlike count_publishers.
+        # Unlike count_publishers, this method of rclpy applies remappings to the topic.
         publishers = self._node.get_publishers_info_by_topic(self._relative_topic)
         self._n_publishers = len(publishers)
         self.publishers = tuple(
@@ -126,22 +133,29 @@ class TopicInput(RosInput):
         return self._wanted_type
 
     def _wrong_qos(self, publishers: Sequence[TopicEndpointInfo]) -> str:
-        """Return why the middleware delivers no message of these publishers; empty otherwise."""
+        """Return why the middleware delivers no message of these publishers; empty if it does."""
         offered = {publisher.qos_profile.reliability for publisher in publishers}
         own = {subscription.qos_profile.reliability for subscription, _ in self._subscribed}
         if own != {ReliabilityPolicy.RELIABLE} or offered != {ReliabilityPolicy.BEST_EFFORT}:
             return ""
         return (
-            "it is published best effort, but qos_overrides ask for "
-            "reliable: remove these overrides"
+            "it is published best effort, but qos_overrides ask for reliable: remove these "
+            "overrides"
         )
 
     def _subscribe(self, type_name: str) -> None:
+        """Subscribe to messages of a type.
+
+        Raises
+        ------
+        ConfigError
+            If the type or the QoS overrides cannot be used.
+        """
         measures = messages.measured_as(type_name, self._wanted, self.topic)
         self._session.set_measures(self.name, measures)
         self._read = messages.MessageReader(type_name, measures, self._session.origin(self.name))
-        # rclpy passes the information, too, because the callback has two arguments; its annotations
-        # lack that.
+        # rclpy passes the information about a message to any callback with two arguments. The
+        # annotations of rclpy do not allow such a callback, hence Any.
         callback: Any = self._receive
         try:
             subscription = self._node.create_subscription(
@@ -149,21 +163,22 @@ class TopicInput(RosInput):
                 self._relative_topic,
                 callback,
                 quick(),
-                # Messages come as bytes. To make the objects of a message takes ten times as long
-                # as to read the pose from its bytes.
+                # The callback receives bytes. Reading the pose from the bytes takes a tenth of the
+                # time in which rclpy makes the objects of a message.
                 raw=True,
                 qos_overriding_options=QoSOverridingOptions(_QOS_OVERRIDES),
             )
         except _BAD_QOS as error:
             raise ConfigError(
-                f"cannot subscribe to {self.topic} with the QoS overrides given: {error}"
+                f"cannot subscribe to {self.topic}: {error}; correct its qos_overrides"
             ) from error
         self._subscribed = [(subscription, callback)]
         self._type_name = type_name
         self._log.info(f"subscribed to {self.topic} ({type_name}) for the {self.name} sensor")
 
     def _receive(self, data: bytes, info: Mapping[str, int]) -> None:
-        # Sequence numbers of several publishers are independent.
+        """Process a message in its serialized form."""
+        # With several publishers, the sequence numbers are useless: each publisher has its own.
         self.count(info["publication_sequence_number"] if self._n_publishers == 1 else None)
         try:
             stamp_ns = messages.Cursor(data, is_ros1=False).stamp_ns()
@@ -187,17 +202,23 @@ class TfInput(RosInput):
             self._subscribed.append((subscription, callback))
 
     def configure(self, config: CalibratorConfig) -> None:
-        """Apply the options."""
+        """Apply the options.
+
+        Raises
+        ------
+        ConfigError
+            If the options request measurements that are no poses.
+        """
         super().configure(config)
-        # Raises an error if the sensor does not measure poses.
         messages.measured_as("", self._wanted, self.topic)
         self._stream.max_gap_s = config.max_gap
 
     def discover(self) -> None:
-        """Update the reason why there are no poses; to be called often."""
+        """Update the reason why there are no poses. This method must be called often."""
         self.problem = self._stream.describe_missing()
 
     def _receive(self, topic: str, message: Any, info: Mapping[str, int]) -> None:
+        """Process the transforms of a message on ``/tf`` or ``/tf_static``."""
         for transform in map(messages.transform_of, message.transforms):
             try:
                 for pose in self._stream.add(transform, topic == STATIC_TOPIC):

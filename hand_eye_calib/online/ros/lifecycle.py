@@ -1,10 +1,12 @@
 """The node as a managed node: its transitions, as in the design of ROS 2 lifecycle nodes.
 
 =============  ==========================================================================
-unconfigured   parameters and the services of the life cycle, nothing else
-inactive       topics, services and journal; poses are not accepted
-active         poses are accepted
-finalized      nothing; a signal ends the process
+State          What the node has in this state
+=============  ==========================================================================
+unconfigured   only parameters and the services of the life cycle
+inactive       also topics, services and journal; poses are not accepted
+active         the same; poses are accepted
+finalized      nothing; the process waits for a signal to end
 =============  ==========================================================================
 
 ``cleanup`` and ``shutdown`` save the result, and end the session.
@@ -28,11 +30,12 @@ _DONE = TransitionCallbackReturn.SUCCESS
 class ManagedNode(LifecycleNodeMixin, Node):
     """A node that another program may configure, activate, deactivate and clean up.
 
-    A subclass builds everything that it needs in :meth:`configure`, and ends it in :meth:`stop`.
+    A subclass makes what it needs in :meth:`configure`, and ends its work in :meth:`stop`.
 
     Attributes
     ----------
     is_configured : bool
+        Whether :meth:`configure` has succeeded, and no cleanup has followed.
     """
 
     _log: NodeLog
@@ -40,11 +43,11 @@ class ManagedNode(LifecycleNodeMixin, Node):
     def __init__(self, name: str, **options: Any) -> None:
         Node.__init__(self, name, **options)
         self.is_configured = False
-        # Destroys what configure() has made.
+        # Closing this stack destroys what configure() has made.
         self._made = ExitStack()
 
     def manage(self) -> None:
-        """Serve the transitions; from now on, only they configure the node."""
+        """Serve the transitions. From now on, only transitions configure the node."""
         LifecycleNodeMixin.__init__(self)
 
     def configure(self) -> None:
@@ -58,7 +61,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         raise NotImplementedError
 
     def accept_poses(self, accept: bool) -> None:
-        """Accept poses, or no longer."""
+        """Accept or ignore the poses from now on."""
         raise NotImplementedError
 
     def stop(self, timeout_s: float) -> bool:
@@ -66,7 +69,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         raise NotImplementedError
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Make topics, services and timers; fail with the reason in the log."""
+        """Make topics, services and timers. If this fails, the log has the reason."""
         self._made = ExitStack()
         self._destroy_later()
         try:
@@ -84,14 +87,14 @@ class ManagedNode(LifecycleNodeMixin, Node):
         return _DONE
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Accept no poses; results stay published."""
+        """Ignore poses; results stay published."""
         self.accept_poses(False)
         return _DONE
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Save the result, end the session, and destroy topics, services and timers."""
         if self.is_configured:
-            # A result that cannot be saved is an error in the log.
+            # The log has a warning if the result cannot be saved.
             self.stop(GRACE_S)
         self.is_configured = False
         self._made.close()
@@ -106,7 +109,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         return self.on_cleanup(state)
 
     def _destroy_later(self) -> None:
-        """Register the destruction of publishers, subscriptions and so on that are made later."""
+        """Register the destruction of all publishers, subscriptions and so on made from now on."""
         kinds: dict[str, Callable[[Any], object]] = {
             "publishers": self.destroy_publisher,
             "subscriptions": self.destroy_subscription,

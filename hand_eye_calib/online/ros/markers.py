@@ -15,18 +15,18 @@ from hand_eye_calib.core.results.calibration import Calibration, Verdict
 from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.online.ros.conversions import fill, to_time
 
-# Length and width of the drawn axes of a sensor, m: those of config/calibrator.rviz.
+# Length and width (m) of the drawn axes of a sensor; config/calibrator.rviz draws frames alike.
 _AXIS_LENGTH_M = 0.2
 _AXIS_WIDTH_M = 0.01
-# Height of a line of text, m.
+# Height of a line of text (m).
 _TEXT_M = 0.04
 
-# The ellipsoid has this many standard deviations.
+# Radius of the ellipsoid, in standard deviations.
 _SIGMAS = 3.0
-# Smallest and largest semi-axis of the ellipsoid, m: smaller ones are invisible, and the semi-axis
-# of an unobservable axis would hide the scene.
-_SMALLEST_M = 1e-3
-_LARGEST_M = 1.0
+# Smallest radius (m) of the ellipsoid: a smaller one is invisible.
+_MIN_RADIUS_M = 1e-3
+# Largest radius (m) of the ellipsoid: that of an unobservable axis would hide the scene.
+_MAX_RADIUS_M = 1.0
 
 _RED = ColorRGBA(r=0.9, g=0.1, b=0.1, a=1.0)
 _GREEN = ColorRGBA(r=0.1, g=0.7, b=0.1, a=1.0)
@@ -43,14 +43,18 @@ _COLOURS = {
 def to_markers(calibration: Calibration | None) -> MarkerArray:
     """Return the markers of a result as visualization_msgs/MarkerArray.
 
-    The namespaces are ``parent`` and ``child``: axes of the sensors; ``uncertainty``: ellipsoid of
-    three standard deviations of the child's position; ``text``: verdict and numbers; ``installed``:
-    axes of the child sensor as installed, in grey, if the result was compared with that.
+    These are the namespaces of the markers:
 
-    Without a result, the markers delete all markers.
+    - ``parent`` and ``child``: axes of the sensors.
+    - ``uncertainty``: ellipsoid of three standard deviations of the child's position.
+    - ``text``: verdict and values.
+    - ``installed``: grey axes of the child sensor in its installed pose, if the result was compared
+      with this pose.
+
+    Without a result, the message only deletes the markers of earlier results.
     """
     message = MarkerArray()
-    # A receiver keeps a marker until it is deleted: the transform that is installed may be gone.
+    # RViz keeps a marker until it is deleted. The new result may have fewer markers.
     message.markers.append(Marker(action=Marker.DELETEALL))
     if calibration is not None:
         for marker in _markers(calibration):
@@ -77,7 +81,7 @@ def _markers(calibration: Calibration) -> Iterator[Marker]:
 
 
 def _axes(namespace: str, T_parent_sensor: FloatArray, colours: list[ColorRGBA]) -> Marker:
-    """Return the axes of a sensor as lines."""
+    """Return three lines of the colours: x, y and z axis of a sensor in the parent's frame."""
     marker = Marker(ns=namespace, type=Marker.LINE_LIST)
     marker.scale.x = _AXIS_WIDTH_M
     fill(marker.pose.position, marker.pose.orientation, T_parent_sensor)
@@ -89,14 +93,14 @@ def _axes(namespace: str, T_parent_sensor: FloatArray, colours: list[ColorRGBA])
 
 
 def _ellipsoid(calibration: Calibration) -> Marker:
-    """Return the ellipsoid of the child's position."""
+    """Return the ellipsoid of the child's position, in the colour of the verdict."""
     T_parent_child = calibration.T_parent_child
     covariance = turned(se3.rotation_of(T_parent_child), calibration.covariance)[:3, :3]
     variances, directions = np.linalg.eigh(covariance)
-    # The directions must be right-handed to be a rotation.
+    # Eigenvectors may be left-handed; a rotation is right-handed.
     directions[:, 2] *= np.linalg.det(directions)
     radii_m = _SIGMAS * np.sqrt(np.maximum(variances, 0.0))
-    diameters_m = 2.0 * np.clip(radii_m, _SMALLEST_M, _LARGEST_M)
+    diameters_m = 2.0 * np.clip(radii_m, _MIN_RADIUS_M, _MAX_RADIUS_M)
     marker = Marker(ns="uncertainty", type=Marker.SPHERE)
     T_parent_ellipsoid = se3.from_rotation_translation(
         directions, se3.translation_of(T_parent_child)
@@ -109,7 +113,7 @@ def _ellipsoid(calibration: Calibration) -> Marker:
 
 
 def _text(calibration: Calibration) -> Marker:
-    """Return verdict and numbers as a text above the child sensor."""
+    """Return frames, verdict and pose as a text above the child sensor."""
     lines = [
         f"{calibration.child_frame} in {calibration.parent_frame}",
         calibration.verdict.value,

@@ -14,11 +14,11 @@ import traceback
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-# One wait of the executor costs as much as ten messages. Messages that follow within this time (s)
-# are taken without the executor.
-_REST_S = 0.004
-# Longest time (s) without the executor.
-_TURN_S = 0.02
+# Pause (s) before waiting messages are taken without the executor. A wait of the executor takes as
+# much processor time as ten messages.
+_PAUSE_S = 0.004
+# Longest time (s) for which messages are taken without the executor.
+_MAX_WITHOUT_EXECUTOR_S = 0.02
 
 
 def main(args: list[str] | None = None) -> int:
@@ -35,15 +35,16 @@ def main(args: list[str] | None = None) -> int:
         Exit code: 0 stopped by a signal; 1 bad parameter, failure, or a result that could not be
         saved (reported on stderr); 2 wrong usage.
     """
-    # A signal only makes a pipe readable. So no KeyboardInterrupt interrupts a callback, rclpy does
-    # not shut down its context while a callback publishes, and a second Ctrl-C changes nothing.
+    # A signal only makes this pipe readable. So no KeyboardInterrupt interrupts a callback, rclpy
+    # does not shut down its context while a callback publishes, and a second Ctrl-C has no effect.
     readable, writable = os.pipe()
     os.set_blocking(writable, False)
     signal.set_wakeup_fd(writable, warn_on_full_buffer=False)
     for number in STOP_SIGNALS:
         signal.signal(number, lambda *_: None)
     code = _init(sys.argv[1:] if args is None else args) or _run_node(readable)
-    # The interpreter would restore the default handlers, and a late Ctrl-C change the exit code.
+    # At its end, the interpreter restores the default handlers. Ignore signals from now on, so that
+    # a late Ctrl-C does not change the exit code.
     for number in STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     return code
@@ -61,7 +62,7 @@ def _init(arguments: list[str]) -> int:
         print(f"calibrator: {text}", file=sys.stderr)
         return code
 
-    # rcl logs an error before it raises the same error with its cause.
+    # Silence rcl: it logs an error before it raises the same error with the cause.
     set_logger_level("rcl", LoggingSeverity.FATAL)
     try:
         if unknown := remove_ros_args(args=arguments):
@@ -84,13 +85,13 @@ def _run_node(signals: int) -> int:
     from hand_eye_calib.online.live.state import GRACE_S
     from hand_eye_calib.online.ros.calibrator_node import CalibratorNode
 
-    # Not the multi-threaded executor: it loses most messages of two 100 Hz streams.
+    # The multi-threaded executor would lose most messages of two 100 Hz streams.
     executor = SingleThreadedExecutor()
     stopping = threading.Event()
 
     def wait_for_signal() -> None:
         os.read(signals, 1)
-        # A task is needed: executor.wake() alone does not make spin_once() return.
+        # executor.wake() would not make spin_once() return; a task does.
         executor.create_task(stopping.set)
 
     threading.Thread(target=wait_for_signal, name="signals", daemon=True).start()
@@ -99,17 +100,17 @@ def _run_node(signals: int) -> int:
     try:
         node = CalibratorNode()
         executor.add_node(node)
-        # Without this, a collection visits all imported objects, and delays callbacks by 30 ms, on
-        # a slow computer by 250 ms.
+        # Exclude all objects that exist by now from garbage collections. With them, a collection
+        # delays callbacks by 30 ms, on a slow computer by 250 ms.
         gc.collect()
         gc.freeze()
-        # The thread of the journal delays a message no longer than this.
-        sys.setswitchinterval(_REST_S / 8)
+        # Longest time (s) for which the thread of the journal delays a message.
+        sys.setswitchinterval(_PAUSE_S / 8)
         while not stopping.is_set():
             executor.spin_once()
-            until_s = time.monotonic() + _TURN_S
+            until_s = time.monotonic() + _MAX_WITHOUT_EXECUTOR_S
             while node.take_messages() and time.monotonic() < until_s:
-                time.sleep(_REST_S)
+                time.sleep(_PAUSE_S)
         code = 0
     except HandEyeCalibError as error:
         print(f"calibrator: {error}", file=sys.stderr)

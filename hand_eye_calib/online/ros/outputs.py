@@ -1,4 +1,4 @@
-"""The publishers of the node: results and state."""
+"""The publishers of the node, for its results and its state."""
 
 import json
 from collections.abc import Iterator
@@ -26,20 +26,20 @@ from hand_eye_calib.online.ros.conversions import (
 from hand_eye_calib.online.ros.markers import to_markers
 
 PROGRESS_TOPIC = "progress"
-# Time for which the end of the node waits until listeners have its last state.
+# Longest time that the end of the node waits until subscribers have received its last state.
 _GRACE = Duration(seconds=GRACE_S)
 
-# Names of axes and of the values of a printed pose.
+# Keys of the mappings by axis: those of a printed pose, and those of all other mappings.
 _AXIS_NAMES = {*AXES, *AXIS_KEYS.values()}
 
-# Keys of the state that the names of values on /diagnostics omit.
+# Keys of the state that are not part of the names of values on /diagnostics.
 _OMITTED = ("progress", "axes", "result", "differences")
 
 
 class ResultTopics:
     """Publishes results on ``~/extrinsic``, ``~/extrinsic_with_covariance`` and ``~/markers``.
 
-    All topics are latched.
+    All topics are latched: late subscribers receive the last message.
     """
 
     def __init__(self, node: Node) -> None:
@@ -49,6 +49,7 @@ class ResultTopics:
         self._advertise()
 
     def _advertise(self) -> None:
+        """Make the publishers of the result."""
         # Whether ~/extrinsic has a message.
         self._has_transform = False
         make = self._node.create_publisher
@@ -56,11 +57,11 @@ class ResultTopics:
         self._pose = make(PoseWithCovarianceStamped, "~/extrinsic_with_covariance", LATCHED)
 
     def publish(self, calibration: Calibration | None) -> None:
-        """Publish a new result; withdraw the earlier result if there is none.
+        """Publish a result if it is new; None withdraws the earlier result.
 
-        The transform without a covariance is published only if the rotation and two axes of the
-        translation are determined, because undetermined axes are zero. A late subscriber receives
-        no withdrawn message.
+        Axes that are not determined are zero in the messages. So ``~/extrinsic``, which has no
+        covariance, is published only if the rotation and two axes of the translation are
+        determined. Late subscribers do not receive a message that was withdrawn.
         """
         if calibration is self._newest:
             return
@@ -78,6 +79,7 @@ class ResultTopics:
         self._pose.publish(to_pose_with_covariance(calibration))
 
     def _withdraw(self) -> None:
+        """Replace the publishers, so that late subscribers receive no message of the old ones."""
         for publisher in (self._transform, self._pose):
             self._node.destroy_publisher(publisher)
         self._advertise()
@@ -119,11 +121,12 @@ def diagnostics(state: NodeState, clock_ns: int) -> DiagnosticArray:
 
 
 def _values(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
-    """Yield names and texts of the values of a part.
+    """Yield the name and the text of each value in a part of the state.
 
-    A name consists of the keys that lead to the value, the axis last, such as ``sigma.x``.
+    A name consists of the keys that lead to the value, the axis last, such as ``sigma.x``. ``path``
+    are the keys that lead to ``value``.
     """
-    # The first difference of a comparison is that from the installed transform.
+    # The list is that of a comparison: its first difference is from the installed transform.
     if isinstance(value, list) and value and isinstance(value[0], dict):
         value = value[0]
     if isinstance(value, dict):

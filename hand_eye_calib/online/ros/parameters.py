@@ -26,17 +26,17 @@ _SYSTEM_PARAMETERS = ("use_sim_time", "start_type_description_service")
 class Parameters:
     """Declares the parameters on a node and stores them as option objects.
 
-    The node must have been made with ``automatically_declare_parameters_from_overrides=True``, so
-    that rclpy lists the values of files and of the command line, unknown names included.
+    The node must have been made with ``automatically_declare_parameters_from_overrides=True``. Then
+    rclpy lists the values of files and of the command line, also those with unknown names.
 
     Parameters
     ----------
     node : rclpy.node.Node
     on_change : callable
-        Called with the CalibratorConfig of before after parameters have changed; ``calibrator`` and
-        ``node`` are the new options by then.
+        Called after a change of parameters, with the former CalibratorConfig. The attributes
+        ``calibrator`` and ``node`` are the new options then.
     check : callable
-        ``check(NodeConfig)`` raises ConfigError for options that cannot be applied.
+        Called with a NodeConfig; raises ConfigError for options that cannot be applied.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Parameters:
     calibrator : CalibratorConfig
     node : NodeConfig
     unknown : list of str
-        One line for every name that does not exist, unless it is a QoS override.
+        One line for every parameter that does not exist and is not a QoS override.
 
     Raises
     ------
@@ -65,7 +65,7 @@ class Parameters:
             for name, parameter in declared.items()
             if name not in _SYSTEM_PARAMETERS
         }
-        # Declared again below, with descriptors.
+        # The parameters are declared again below, with descriptors.
         for name in overrides:
             node.undeclare_parameter(name)
         self.unknown = [
@@ -73,7 +73,7 @@ class Parameters:
             for name in overrides
             if name not in FIELDS and not name.startswith("qos_overrides.")
         ]
-        # YAML reads off without quotes as false.
+        # In YAML, the word off without quotes means false.
         if overrides.get("journal") is False:
             overrides["journal"] = "off"
         self.given = _checked(overrides)
@@ -88,11 +88,12 @@ class Parameters:
         node.add_post_set_parameters_callback(self._apply)
 
     def _proposed(self, parameters: list[Parameter]) -> Options:
-        """Return all options with changed parameters."""
+        """Return the values of all parameters after a change."""
         changes = {parameter.name: parameter.value for parameter in parameters}
         return {**self.given, **_checked(changes)}
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Accept or refuse a change, before it is applied."""
         try:
             _, node = _configs(self._proposed(parameters))
             self._check_node(node)
@@ -101,6 +102,7 @@ class Parameters:
         return SetParametersResult(successful=True)
 
     def _apply(self, parameters: list[Parameter]) -> None:
+        """Store a change that was accepted."""
         if any(parameter.name in FIELDS for parameter in parameters):
             before = self.calibrator
             self.given = self._proposed(parameters)
@@ -109,7 +111,7 @@ class Parameters:
 
 
 def _checked(values: Options) -> Options:
-    """Return the values of parameters of this node.
+    """Return the values of the parameters that this node has, in the right types.
 
     Raises
     ------
@@ -121,12 +123,14 @@ def _checked(values: Options) -> Options:
 
 
 def _configs(values: Options) -> tuple[CalibratorConfig, NodeConfig]:
+    """Return the option objects of parameters."""
     of_node = {name: value for name, value in values.items() if name in _OF_NODE}
     of_calibrator = {name: value for name, value in values.items() if name not in _OF_NODE}
     return CalibratorConfig.from_options(of_calibrator), NodeConfig.from_options(of_node)
 
 
 def _descriptor(field: OptionField) -> ParameterDescriptor:
+    """Return description, type and range of a parameter for ``ros2 param describe``."""
     meta = field.metadata
     words = meta["choices"]
     # A parameter that takes a word as well as a number has no single type.

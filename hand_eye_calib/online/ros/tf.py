@@ -35,8 +35,8 @@ TF = "tf"
 STATIC_TOPIC = "/tf_static"
 DYNAMIC_TOPIC = "/tf"
 
-# Time (s) for which the node listens to the transform tree before it broadcasts: discovery takes up
-# to 2.4 s.
+# Time (s) for which the node receives the transform tree before it broadcasts. Discovery of other
+# publishers takes up to 2.4 s.
 LOOK_S = 5.0
 
 
@@ -52,19 +52,19 @@ def message_type(wanted_by: str = "publish_tf") -> type[Any]:
         from tf2_msgs.msg import TFMessage
     except ImportError:
         raise ConfigError(
-            f"{wanted_by} needs the message package tf2_msgs, which is not "
-            "installed: install ros-jazzy-tf2-msgs, or omit the parameter"
+            f"{wanted_by} needs the message package tf2_msgs, which is not installed: install "
+            "ros-jazzy-tf2-msgs, or omit the parameter"
         ) from None
     return TFMessage
 
 
 class RobotTree(FrameTree):
-    """Edges that other nodes broadcast; the first parent of a frame counts.
+    """Edges that other nodes broadcast. If a frame gets a second parent, its first parent stays.
 
     Attributes
     ----------
     own : deque of TransformStamped
-        Transforms that this node has broadcast, which are ignored.
+        The last transforms that this node has broadcast. They are ignored when they are received.
     """
 
     def __init__(self, node: Node, log: NodeLog) -> None:
@@ -114,7 +114,7 @@ class RobotTree(FrameTree):
 
 
 class Robot:
-    """Frames of the robot: adds installed transform and base frame to results.
+    """Adds the installed transform and the base frame of the robot to results.
 
     The options ``installed`` and ``base_frame`` do not change while the node runs.
 
@@ -122,7 +122,7 @@ class Robot:
     ----------
     problem : str
         Reason why the installed transform or the base frame is unknown; empty if they are known, or
-        if no option asks for them.
+        if no option requests them.
 
     Raises
     ------
@@ -143,7 +143,7 @@ class Robot:
         self._read = from_tree if self._source in ("", TF) else open_installed(self._source)
 
     def installed(self, parent_frame: str, child_frame: str) -> Extrinsic | None:
-        """Return the installed transform; None if it is unknown, or if no option asks for it."""
+        """Return the installed transform; None if it is unknown, or if no option requests it."""
         frames = parent_frame, child_frame
         # Inverted poses exchange the frames of their stream.
         if frames != self._installed_for:
@@ -161,7 +161,8 @@ class Robot:
     def complete(self, calibration: Calibration) -> Calibration:
         """Return a usable result with its comparison and its pose in the base frame, if known.
 
-        A single axis of the translation that the motion cannot determine gets the installed value.
+        If one axis of the translation, and no other axis, is not observable, this axis gets its
+        installed value.
         """
         installed = self.installed(calibration.parent_frame, calibration.child_frame)
         if installed is not None:
@@ -178,27 +179,32 @@ class Robot:
 
     @property
     def why_not_compared(self) -> str:
-        """Reason why the result is not compared; empty if no option asks for a comparison."""
+        """Reason why the result is not compared; empty if no option requests a comparison."""
         return (self.problem or "no result yet") if self._source else ""
 
     def _report(self, problem: str) -> None:
+        """Store and log a problem."""
         self.problem = problem
         self._log.warning(problem)
 
 
 def _with_axis_of(installed: Extrinsic, calibration: Calibration) -> Calibration:
-    """Return a result whose only unobservable axis of translation has the installed value."""
-    hidden = calibration.unobservable()
-    if len(hidden) != 1:
+    """Return a result whose only unobservable axis has the installed value.
+
+    The result is returned as it is if several axes are unobservable, or an axis of rotation.
+    """
+    unobservable = calibration.unobservable()
+    if len(unobservable) != 1:
         return calibration
-    axis = hidden[0]
+    axis = unobservable[0]
     if axis in ROTATIONS or axis in calibration.out_of_reach:
         return calibration
     index = AXES.index(axis)
     T = calibration.T_parent_child.copy()
     covariance = turned(se3.rotation_of(T), calibration.covariance_measured)
     missing = float(installed.T_parent_child[index, 3] - T[index, 3])
-    # The other axes follow as far as the motion correlates them with this axis.
+    # The errors of the other axes are correlated with the error of this axis: shift each of them by
+    # its regression on this axis.
     T[:3, 3] += covariance[:3, index] / covariance[index, index] * missing
     warning = f"{axis} is that of the installed transform ({installed.origin})"
     return replace(calibration, T_parent_child=T, warnings=(*calibration.warnings, warning))
@@ -223,7 +229,7 @@ class TfBroadcaster:
         self._publisher: Any = None
 
     def switch(self, on: bool) -> None:
-        """Switch broadcasting on or off; a listener keeps the last edge until it restarts."""
+        """Switch broadcasting on or off. A subscriber keeps the last edge until it restarts."""
         if on == self._is_on:
             return
         self._is_on = on
@@ -235,7 +241,7 @@ class TfBroadcaster:
             self._tree.ignore(DYNAMIC_TOPIC)
 
     def update(self, result: Calibration | None, why_not: str) -> None:
-        """Broadcast the result if it is new and the tree permits it; to be called often.
+        """Broadcast a new result if the tree permits that. This method must be called often.
 
         Parameters
         ----------
@@ -243,7 +249,7 @@ class TfBroadcaster:
         why_not : str
             Reason why the result must not be broadcast yet; empty if it may.
         """
-        # Created before the first message, because discovery takes seconds.
+        # Discovery takes seconds, so the publisher is made before the first message.
         if self._is_on and self._publisher is None:
             self._publisher = self._node.create_publisher(message_type(), STATIC_TOPIC, LATCHED)
         was_on = self.state[0] is Broadcast.ON
@@ -251,15 +257,16 @@ class TfBroadcaster:
         if result is not None and self.state[0] is Broadcast.ON:
             self._broadcast(result, not was_on)
         elif was_on:
-            # New listeners receive nothing any more.
+            # Without a publisher, new subscribers do not receive the old edge.
             self._node.destroy_publisher(self._publisher)
             self._publisher = None
             self._log.warning(
-                "the edge on /tf_static is withdrawn; listeners that have "
-                "received it keep it until they restart"
+                "the edge on /tf_static is withdrawn; nodes that have received it keep it until "
+                "they restart"
             )
 
     def _decide(self, result: Calibration | None, why_not: str) -> BroadcastState:
+        """Return whether to broadcast a result, and the reason if not."""
         if not self._is_on:
             return Broadcast.OFF, ""
         if result is None:
@@ -272,25 +279,25 @@ class TfBroadcaster:
             return Broadcast.WAITING, why_not
         if result.verdict is Verdict.DO_NOT_USE:
             return Broadcast.REFUSED, result.headline
-        if hidden := result.unobservable():
-            return Broadcast.REFUSED, f"{axes_in_words(hidden)} not determined"
+        if unobservable := result.unobservable():
+            return Broadcast.REFUSED, f"{axes_in_words(unobservable)} not determined"
         if not was_checked:
             return Broadcast.WAITING, "the transform tree is checked first"
         return Broadcast.ON, ""
 
     def _what_forbids(self, result: Calibration) -> str:
-        """Return and log why the tree forbids the edge of a result; empty if it does not."""
+        """Return and log why the tree forbids the edge of a result; empty if it is allowed."""
         reason = self._tree.what_forbids(result.mounting[0], result.child_frame)
         if reason:
             self._log.error(
-                f"publish_tf is refused: {reason}. Copy the result into the "
-                "robot's description (extrinsic.urdf.xacro of ~/save), or "
-                "switch publish_tf off"
+                f"publish_tf is refused: {reason}. Copy the result into the robot's description "
+                "(extrinsic.urdf.xacro of ~/save), or switch publish_tf off"
             )
         return reason
 
     def _broadcast(self, result: Calibration, is_first: bool) -> None:
-        # The tree has been checked, and this topic may be fast.
+        """Publish the edge of a result if it is new, or the first one."""
+        # The tree is checked by now. /tf may be fast, so it is not received any longer.
         self._tree.ignore(DYNAMIC_TOPIC)
         own = self._tree.own
         transform = to_transform(result, True)

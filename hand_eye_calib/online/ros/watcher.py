@@ -1,4 +1,4 @@
-"""Connection of ``watch`` to the nodes: receives their states and sends requests."""
+"""Connection of ``watch`` to the nodes: receives their states and sends requests to them."""
 
 import os
 import time
@@ -25,23 +25,25 @@ from hand_eye_calib.online.ros.conversions import LATCHED
 from hand_eye_calib.online.ros.outputs import PROGRESS_TOPIC
 from hand_eye_calib.online.watch.board import Board, state_of
 
-# Largest number of nodes whose state is received, and of topics with poses in the list.
+# Largest number of nodes whose state is received, and of topics with poses that are listed.
 _MAX_NAMES = 20
 
-# Time (s) after which a request counts as unanswered.
-_PATIENCE_S = 3.0 * ANSWER_WITHIN_S
+# Longest wait (s) for the answer to a request: a node answers within ANSWER_WITHIN_S.
+_MAX_WAIT_S = 3.0 * ANSWER_WITHIN_S
 
 
 @dataclass
 class _Request:
-    """A call of a service that has not been answered.
+    """A service call without an answer yet.
 
     Attributes
     ----------
-    future : Future or None
-        The answer; None while the service is awaited.
+    message
+        The request message.
     start_s : float
         Time of the request (steady, s).
+    future : Future or None
+        Future of the answer; None until the service is available.
     """
 
     client: Client
@@ -65,11 +67,12 @@ class Watcher:
         )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        self._node.create_timer(REPORT_PERIOD_S, self._look)
+        self._node.create_timer(REPORT_PERIOD_S, self._discover)
         # Names of the nodes whose state is received.
-        self._heard: set[str] = set()
+        self._sources: set[str] = set()
+        # Calls without an answer, by the request of :meth:`ask`.
         self._requests: dict[str, _Request] = {}
-        self._look()
+        self._discover()
 
     def __enter__(self) -> Self:
         return self
@@ -80,19 +83,19 @@ class Watcher:
         rclpy.shutdown(context=self._context)
 
     def spin(self, seconds: float) -> None:
-        """Process messages for at most so many seconds."""
+        """Process messages for at most this time (s)."""
         self._executor.spin_once(timeout_sec=seconds)
         for name in list(self._requests):
             self._follow(name)
 
     def ask(self, request: str) -> None:
-        """Send a request to the displayed node; the board receives the answer.
+        """Send a request to the displayed node; the board receives the answer later.
 
         Parameters
         ----------
         request : str
-            Name of a service such as ``solve``, or a parameter such as
-            ``prior.z:=1.85m+/-0.02m``.
+            A service such as ``solve``, a parameter such as ``prior.z:=1.85m+/-0.02m``, or one of
+            ``acknowledge``, ``recalibrate`` and ``forget``.
         """
         if request == "acknowledge":
             self._board.acknowledge()
@@ -111,7 +114,7 @@ class Watcher:
         self._board.answer(request, None, "asked ...", now_s)
 
     def _parameters(self, request: str) -> list[Parameter]:
-        """Return the parameters that a request sets; none if it calls a service."""
+        """Return the parameters that a request sets; empty if the request calls a service."""
         name, is_parameter, value = request.partition(":=")
         if is_parameter:
             return [Parameter(name, value=value)]
@@ -121,25 +124,25 @@ class Watcher:
             return [Parameter(f"prior.{axis}", value="") for axis in self._board.priors or AXES]
         return []
 
-    def _look(self) -> None:
-        """Subscribe to new nodes, and list the topics with poses of other nodes.
+    def _discover(self) -> None:
+        """Subscribe to the states of new nodes, and list the topics with poses of other nodes.
 
-        Any program may publish on a topic of this name, so the number of nodes is limited. The list
-        helps a person whose input has no poses.
+        Any program may publish a topic called ``progress``, so the number of nodes is limited. The
+        list helps a person whose input has no poses.
         """
         topics = self._node.get_topic_names_and_types()
         for topic, types in topics:
             name, _, last = topic.rpartition("/")
             is_state = last == PROGRESS_TOPIC and name and "std_msgs/msg/String" in types
-            if is_state and name not in self._heard and len(self._heard) < _MAX_NAMES:
-                self._heard.add(name)
+            if is_state and name not in self._sources and len(self._sources) < _MAX_NAMES:
+                self._sources.add(name)
                 take = partial(self._take, name)
                 self._node.create_subscription(String, topic, take, LATCHED)
         poses = [
             (topic, type_name)
             for topic, types in topics
             for type_name in types
-            if type_name in POSE_TYPES and topic.rpartition("/")[0] not in self._heard
+            if type_name in POSE_TYPES and topic.rpartition("/")[0] not in self._sources
         ]
         lines = [self._describe(topic, type_name) for topic, type_name in poses[:_MAX_NAMES]]
         self._board.topics = tuple(lines or ["none is published here"])
@@ -154,12 +157,13 @@ class Watcher:
         return f"{topic} ({', '.join(texts)})"
 
     def _take(self, name: str, message: String) -> None:
+        """Pass the state of a node on to the board, unless it names another node."""
         state = state_of(message.data)
         if state is not None and state.node == name:
             self._board.take(state, time.monotonic())
 
     def _follow(self, name: str) -> None:
-        """Continue a request: await the service, then its answer."""
+        """Call the service of a request if it is available now; pass an answer on to the board."""
         request = self._requests[name]
         if request.future is None and request.client.service_is_ready():
             request.future = request.client.call_async(request.message)
@@ -170,9 +174,10 @@ class Watcher:
                 self._end(name, not refused, "; ".join(refused))
             else:
                 self._end(name, response.success, response.message)
-        elif time.monotonic() - request.start_s > _PATIENCE_S:
-            self._end(name, False, f"no answer within {_PATIENCE_S:.0f} s")
+        elif time.monotonic() - request.start_s > _MAX_WAIT_S:
+            self._end(name, False, f"no answer within {_MAX_WAIT_S:.0f} s")
 
-    def _end(self, name: str, good: bool, text: str) -> None:
+    def _end(self, name: str, is_good: bool, text: str) -> None:
+        """Remove a request, and pass its answer on to the board."""
         self._node.destroy_client(self._requests.pop(name).client)
-        self._board.answer(name, good, printable(text) or "done", time.monotonic())
+        self._board.answer(name, is_good, printable(text) or "done", time.monotonic())
