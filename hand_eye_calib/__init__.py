@@ -5,8 +5,8 @@
 >>> result.T_parent_child.shape, result.verdict.value
 ((4, 4), 'USE')
 
-Names are imported at their first use, so that ``import hand_eye_calib`` takes no time and needs
-only Python.
+A name is imported at its first use, so that ``import hand_eye_calib`` is quick and needs no other
+package.
 """
 
 from importlib import import_module
@@ -15,7 +15,7 @@ from typing import Any
 from hand_eye_calib import core, extras, formats, offline, online
 from hand_eye_calib.core.base.registry import PUBLIC_NAMES
 
-# Module of every public name of core, formats and offline; extras register their names.
+# Module of each public name of core, formats and offline. Extras register their own names.
 _MODULES = {
     "CalibratorConfig": "hand_eye_calib.core.base.config",
     "Calibrator": "hand_eye_calib.core.engine.calibrator",

@@ -1,4 +1,4 @@
-"""Calibrate and report recordings."""
+"""Calibrate recordings, and report the results: commands, Python functions and the report."""
 
 from pathlib import Path
 from typing import Any
@@ -7,7 +7,7 @@ from hand_eye_calib.core.base.registry import COMMANDS, RESULT_METHODS, SESSION_
 
 
 def register() -> None:
-    """Register the commands for recordings, and the methods of results."""
+    """Register the commands for recordings, the methods of results, and the report of a session."""
     COMMANDS["calibrate"] = Command(
         "calibrate from two trajectory files, a bag or a journal", _calibrate
     )

@@ -1,4 +1,4 @@
-"""Calibrate from two whole trajectories: the Python function :func:`calibrate`."""
+"""The Python functions :func:`calibrate` and :func:`cross_check`, for two whole trajectories."""
 
 import inspect
 import textwrap
@@ -88,30 +88,31 @@ def calibrate(
 ) -> Calibration:
     """Estimate the pose of the child sensor in the parent sensor's frame from two trajectories.
 
-    All pose pairs are used, up to 100,000, unless ``max_pairs`` is given. The streams are checked,
-    too. If a check is sure of a clock offset, a unit or inverse poses, the solve uses it unless it
-    was given, and the result has a warning.
+    At most 100,000 pose pairs are used; ``max_pairs`` changes this limit. The streams are checked,
+    too. If a check is certain of a clock offset, a unit or inverse poses, the solve uses this
+    option, and the result has a warning. An option that the caller sets is never changed.
 
     Parameters
     ----------
     parent, child : Trajectory, path, array or DataFrame
-        Poses of each sensor in its own world, m. :func:`hand_eye_calib.read_trajectory` reads
-        all but a Trajectory; the files name the sensors. One of them may be positions
-        (:meth:`Trajectory.from_positions`): the result is the lever arm. Either may be rotations
-        or angular rates (:meth:`Trajectory.from_rates`): the result is the rotation, with the bias
-        of the rates.
-        A bag of both sensors is given alone, as ``parent``.
+        Poses of each sensor in its own world, m. Anything but a Trajectory is read by
+        :func:`hand_eye_calib.read_trajectory`; the sensors are named after their files. One of both
+        may be positions (:meth:`Trajectory.from_positions`): the result is the lever arm. Either
+        may be rotations or angular rates (:meth:`Trajectory.from_rates`): the result is the
+        rotation, with the bias of the rates.
+        A bag with both sensors is passed as ``parent``, without ``child``.
     parent_topic, child_topic : str, optional
-        Topics of a bag, or frames such as "odom:lidar". Default: the obvious pair, if there is one.
+        Topics of a bag, or frames such as "odom:lidar". They may be omitted if only one pair of
+        streams is possible.
     prior : mapping of str to (float, float) or str, optional
         Value and standard deviation of x, y, z (m), roll, pitch or yaw (rad), such as
         ``{"z": (1.85, 0.02)}``; see :data:`~hand_eye_calib.core.base.text.Prior`.
     checks : bool, optional
         False: the streams are not checked, the result is not compared with other references and
         halves of the recording, and there is no second solve. True: the result is compared even
-        if a reference is given. Default: it is compared unless a reference is given.
+        if ``reference`` is set. Default: it is compared unless ``reference`` is set.
     progress : callable, optional
-        Called with the finished share, 0 to 1, and the name of the next step.
+        Called with the finished share of the work, 0 to 1, and the name of the next step.
     OPTIONS
 
     Raises
@@ -119,7 +120,7 @@ def calibrate(
     ConfigError
         If an option has a value that is not allowed.
     InputError
-        If an argument is no trajectory or both are of one sensor frame.
+        If an argument is no trajectory, or if both have the same sensor frame.
     NotEnoughDataError
         If too few poses can be paired.
 
@@ -134,26 +135,26 @@ def calibrate(
         raise InputError(f"progress must be a function; got {type(progress).__name__}")
     if checks is not None:
         require_type("checks", checks, bool)
-    first, second = _both(parent, child, {"parent": parent_topic, "child": child_topic})
+    first, second = _read_both(parent, child, {"parent": parent_topic, "child": child_topic})
     values |= prior_fields({} if prior is None else prior)
-    given = {
+    options = {
         option_name(field): values[field.name]
         for field in fields(CalibratorConfig)
         if field.name in values
     }
-    result = run(whole_snapshot(first, second, given), checks=checks, progress=progress)
+    result = run(whole_snapshot(first, second, options), checks=checks, progress=progress)
     return replace(result.calibration, recording=result.snapshot)
 
 
-def _both(
+def _read_both(
     parent: TrajectoryLike, child: TrajectoryLike | None, topics: Mapping[str, str | None]
 ) -> Sequence[Trajectory]:
-    """Return the trajectories of both sensors, from what can be read as one, or from a bag."""
+    """Return the trajectories of parent and child; without a child, ``parent`` is a bag."""
     if child is None:
-        return _both_of_bag(path_of("a bag without a child", parent), topics)
+        return _read_bag(path_of("a bag without a child", parent), topics)
     for stream, topic in topics.items():
         if topic is not None:
-            raise ConfigError(f"{stream}_topic chooses a topic of a bag; give the bag alone")
+            raise ConfigError(f"{stream}_topic is a topic of a bag: pass only the bag, no child")
     if isinstance(parent, Trajectory) and isinstance(child, Trajectory):
         return parent, child
     from hand_eye_calib.formats.trajectory_files.reading import read_trajectories
@@ -161,8 +162,8 @@ def _both(
     return read_trajectories(parent, child)
 
 
-def _both_of_bag(path: Path, topics: Mapping[str, str | None]) -> Sequence[Trajectory]:
-    """Return the trajectories of both streams of a bag; notes become warnings."""
+def _read_bag(path: Path, topics: Mapping[str, str | None]) -> Sequence[Trajectory]:
+    """Return the trajectories of both streams of a bag; notes become Python warnings."""
     from hand_eye_calib.formats.bags.reader import PoseBag
     from hand_eye_calib.formats.bags.sources import source_of
 
@@ -192,7 +193,7 @@ def _both_of_bag(path: Path, topics: Mapping[str, str | None]) -> Sequence[Traje
 
 
 def _options_in_words() -> str:
-    """Return the options of :func:`calibrate` for its docstring, from their declarations."""
+    """Return the parameters of :func:`calibrate` that are options, as text for its docstring."""
     names = inspect.signature(calibrate).parameters
     lines = []
     for field in fields(CalibratorConfig):
@@ -209,12 +210,13 @@ def _options_in_words() -> str:
     return "\n    ".join(lines)
 
 
-if calibrate.__doc__:  # not with python -OO
+# python -OO removes docstrings.
+if calibrate.__doc__:
     calibrate.__doc__ = calibrate.__doc__.replace("OPTIONS", _options_in_words())
 
 
 def prior_fields(prior: Prior) -> dict[str, str]:
-    """Return the options of a CalibratorConfig for a prior: attribute and text.
+    """Return a prior as options: names of attributes of CalibratorConfig, and texts.
 
     Raises
     ------
@@ -250,9 +252,9 @@ def cross_check(
     child: Trajectory,
     config: CalibratorConfig | None = None,
 ) -> CrossCheck:
-    """Compare a result with robust least squares, on the whole recording and on both halves.
+    """Compare a result with robust least squares on the whole recording and on both halves.
 
-    Every solve with method or reference auto includes this comparison.
+    A solve with the method or the reference ``auto`` makes this comparison itself.
 
     Parameters
     ----------
@@ -266,7 +268,7 @@ def cross_check(
     Raises
     ------
     ConfigError
-        If a stream is not one of poses.
+        If a stream has no poses.
     NotEnoughDataError
         If too few poses can be paired.
 

@@ -271,7 +271,7 @@ def solved():
         (lambda _: hec.calibrate(PARENT), "a bag without a child must be of type str or PathLike"),
         (lambda _: hec.calibrate("absent"), "no bag at absent"),
         (lambda _: hec.calibrate(PARENT, "absent.tum"), "cannot read absent.tum"),
-        (lambda _: hec.calibrate(PARENT, CHILD, parent_topic="/a"), "give the bag alone"),
+        (lambda _: hec.calibrate(PARENT, CHILD, parent_topic="/a"), "pass only the bag"),
         (
             lambda _: hec.calibrate("sample:drive.mcap", parent_topic=3),
             "must be of type str; got int",

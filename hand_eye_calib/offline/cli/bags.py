@@ -1,4 +1,4 @@
-"""Recordings in bags, in the parts of a recording, and in the journals of sessions."""
+"""Read a recording from a bag, from several bags that are its parts, or from a journal."""
 
 import dataclasses
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -24,17 +24,23 @@ from hand_eye_calib.offline.cli.options import (
 )
 from hand_eye_calib.offline.cli.reading import Recording
 
-# Longest pause (s) between the parts of a recording: a recorder can be restarted in less time.
-# Odometry seldom continues from one drive to the next.
-_LONGEST_PAUSE_S = 60.0
-# Longest overlap (s): a part may begin before the last poses of the part before it are written.
-_LONGEST_OVERLAP_S = 1.0
+# Longest pause (s) between the parts of a recording. A recorder can be restarted in less time.
+# After a longer pause, odometry has often been restarted, too.
+_MAX_PAUSE_S = 60.0
+# Longest overlap (s) of consecutive parts: the last poses of a part may be written after the next
+# part has begun.
+_MAX_OVERLAP_S = 1.0
 
 
 class SeveralRecordingsError(InputError):
     """Error for bags that are not parts of one recording.
 
-    ``groups`` are the bags of each recording.
+    Attributes
+    ----------
+    reason : str
+        Which bags are different recordings, and why.
+    groups : list of list of pathlib.Path
+        Bags of each recording.
     """
 
     def __init__(self, reason: str, groups: list[list[Path]]) -> None:
@@ -52,15 +58,15 @@ def read_recording(
     ----------
     paths : sequence of pathlib.Path
     wanted : mapping of str to str
-        Sources of the streams, and origins of their stamps; see options.sources_from. They are
-        needed if a bag has several candidates.
+        Sources and stamps of the streams, as returned by ``options.sources_from``. A source may be
+        absent if the bag has only one candidate.
     options : mapping
-        Options that the user set.
+        Options that the user has set.
 
     Raises
     ------
     SeveralRecordingsError
-        If the bags are not parts of one recording. Each journal is a recording of its own.
+        If the paths are not parts of one recording. Each journal is a recording.
     """
     journals = [journal for path in paths if (journal := journal_in(path))]
     journal = journals[0] if journals else None
@@ -80,7 +86,15 @@ def read_recording(
 def select(
     bag: PoseBag, wanted: Mapping[str, str], config: CalibratorConfig
 ) -> tuple[dict[str, Source], dict[str, str]]:
-    """Return the sources of "parent" and "child" in a bag, and their kinds of data."""
+    """Choose the sources of "parent" and "child" in a bag.
+
+    Returns
+    -------
+    sources : dict of str to Source
+        Topic or frames of each stream.
+    measures : dict of str to str
+        What each stream measures, such as "poses".
+    """
     named = {stream: source_of(wanted[stream]) for stream in STREAMS if stream in wanted}
     frames = {stream: getattr(config, f"{stream}_frame") for stream in STREAMS}
     parent, child = bag.select(named.get("parent"), named.get("child"), frames)
@@ -97,7 +111,7 @@ def select(
 
 
 def stamps_of(wanted: Mapping[str, str]) -> dict[str, str]:
-    """Return the origins of the stamps of "parent" and "child"."""
+    """Return the stamps to use for "parent" and "child": "header" or "receive"."""
     return {stream: wanted.get(f"{stream}_stamps", "header") for stream in STREAMS}
 
 
@@ -110,13 +124,13 @@ def read_sources(
     ----------
     bag : PoseBag
     measures : iterable of (Source, str, str)
-        Sources with their kinds of data and the origins of their stamps.
+        Sources, what they measure, and the stamps to use: "header" or "receive".
 
     Returns
     -------
     trajectories : list of Trajectory
     repairs : list of str
-        Notes on faults of the stamps.
+        Notes on stamps that were repaired.
     """
     trajectories = []
     repairs: list[str] = []
@@ -132,6 +146,7 @@ def read_sources(
 def _read_bags(
     paths: Sequence[Path], wanted: Mapping[str, str], config: CalibratorConfig
 ) -> Recording:
+    """Read the parts of one recording, and feed the poses to an engine."""
     with PoseBag(*paths) as bag:
         sources, measures = select(bag, wanted, config)
         refuse_recordings(paths, sources.values())
@@ -155,7 +170,7 @@ def _feed(calibrator: Calibrator, poses: PoseTable, topics: Mapping[str, Source]
     Raises
     ------
     InputError
-        For the first message that the engine refuses, with topic and stamp.
+        If the engine refuses a message; the error names topic and stamp.
     """
     for stream in STREAMS:
         worlds = poses.world_frames[poses.streams == stream]
@@ -176,51 +191,53 @@ def _feed(calibrator: Calibrator, poses: PoseTable, topics: Mapping[str, Source]
 def refuse_recordings(paths: Sequence[Path], sources: Collection[Source]) -> None:
     """Raise a SeveralRecordingsError for bags that are not parts of one recording.
 
-    Parts of one recording have different topics, or follow each other without a pause.
+    Two parts of one recording have different topics, or one part follows the other without a pause.
     """
     if len(paths) < 2:
         return
-    groups: list[list[_Part]] = []
+    recordings: list[list[_Bag]] = []
     reason = ""
-    for part in sorted(_Part.of(path, sources) for path in paths):
-        for group in groups:
-            same_topics = [other for other in group if other.has & part.has]
-            difference = part.difference_from(same_topics)
+    for bag in sorted(_Bag.of(path, sources) for path in paths):
+        for recording in recordings:
+            with_same_topics = [earlier for earlier in recording if earlier.sources & bag.sources]
+            difference = bag.difference_from(with_same_topics)
             if not difference:
-                group.append(part)
+                recording.append(bag)
                 break
             reason = difference
         else:
-            groups.append([part])
-    if len(groups) > 1:
-        raise SeveralRecordingsError(reason, [[part.path for part in group] for group in groups])
+            recordings.append([bag])
+    if len(recordings) > 1:
+        groups = [[bag.path for bag in recording] for recording in recordings]
+        raise SeveralRecordingsError(reason, groups)
 
 
-class _Part(NamedTuple):
-    """Time of a bag, and the sources that it has."""
+class _Bag(NamedTuple):
+    """Times of a bag (ns), and the sources that it contains. Bags are sorted by their times."""
 
     begin_ns: int
     end_ns: int
     path: Path
-    has: set[Source]
+    sources: set[Source]
 
     @classmethod
-    def of(cls, path: Path, sources: Collection[Source]) -> Self:
-        has = set()
+    def of(cls, path: Path, candidates: Collection[Source]) -> Self:
+        """Read the times of a bag, and which of the candidates it contains."""
+        sources = set()
         with PoseBag(path) as bag:
-            for source in sources:
+            for source in candidates:
                 with suppress(InputError):
                     bag.check(source)
-                    has.add(source)
-            return cls(bag.start_ns or 0, bag.end_ns or 0, path, has)
+                    sources.add(source)
+            return cls(bag.start_ns or 0, bag.end_ns or 0, path, sources)
 
-    def difference_from(self, earlier: "Sequence[_Part]") -> str:
-        """Return the reason for which the bag does not continue earlier bags; empty if it does."""
+    def difference_from(self, earlier: "Sequence[_Bag]") -> str:
+        """Return why the bag does not continue earlier bags; empty if it does."""
         if not earlier:
             return ""
-        latest = max(earlier, key=lambda part: part.end_ns)
+        latest = max(earlier, key=lambda bag: bag.end_ns)
         pause_s = (self.begin_ns - latest.end_ns) * 1e-9
-        if -_LONGEST_OVERLAP_S <= pause_s <= _LONGEST_PAUSE_S:
+        if -_MAX_OVERLAP_S <= pause_s <= _MAX_PAUSE_S:
             return ""
         reason = f"there is a pause of {pause_s:.0f} s between them"
         if pause_s < 0:
@@ -230,9 +247,9 @@ class _Part(NamedTuple):
 
 
 def journal_in(path: Path | str) -> Path | None:
-    """Return the directory of a session's journal at a path, or in the output directory there.
+    """Return the directory of the journal that a path names; None if the path is a bag.
 
-    None for bags.
+    The path is this directory itself, or the output directory of a node, which contains it.
     """
     if isinstance(path, str) or not path.is_dir():
         return None
@@ -242,13 +259,17 @@ def journal_in(path: Path | str) -> Path | None:
 
 
 def read_journal_of(directory: Path, options: Options) -> Recording:
-    """Read the journal of a session of the node. The options override those of the session."""
+    """Read the journal of a session of the node.
+
+    The options that the user has set override those of the session.
+    """
     from hand_eye_calib.formats.journal import read_journal, replay_journal
 
     with waiting_for(f"reading {directory}"):
         journal = read_journal(directory)
         session = journal.about["parent"]
-        # Skip empty options of an earlier version that no longer exist.
+        # The session may be of an earlier version. Skip options that no longer exist, unless they
+        # were set.
         before = {
             name: value
             for name, value in session.get("options", {}).items()

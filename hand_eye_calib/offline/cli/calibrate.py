@@ -1,8 +1,8 @@
 """``calibrate PATH ...``: calibrate from files, bags or journals.
 
-The paths are two trajectory files, a bag or its parts, the journal of a session, several
-recordings, the stops of an arm, or the files of three sensors or more. ``replay`` is the same for
-bags and journals only.
+The paths are one of these: two trajectory files; a bag or the parts of a bag; the journal of a
+session; several recordings; the stops of an arm; the files of three sensors or more. The command
+``replay`` is the same for bags and journals only.
 """
 
 import argparse
@@ -59,7 +59,7 @@ examples:
   hand_eye_calib calibrate my_bag --parent-topic /lidar/odometry --child-topic /camera/odometry
   hand_eye_calib calibrate gnss.csv slam.txt --time-offset estimate --prior z=1.85+/-0.02"""
 
-# Format of a row in the table of topics.
+# Format of a row in the table of topics: topic, type, count, rate, poses and frames.
 _ROW = "{:<32} {:<42} {:>8} {:>10}  {:<5}  {}"
 
 
@@ -103,6 +103,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @options.argument_type
 def _label(text: str) -> tuple[str, str]:
+    """Return name and value of a label, from ``NAME=VALUE``."""
     name, sign, value = text.partition("=")
     if not (name and sign and value):
         raise ConfigError(f"expected NAME=VALUE, such as vehicle=7; got {text!r}")
@@ -110,6 +111,7 @@ def _label(text: str) -> tuple[str, str]:
 
 
 def _add_installed(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments about the extrinsic that is installed on the robot."""
     add = parser.add_argument_group("what is installed").add_argument
     installed = (
         "compare the result with this: a URDF, an earlier extrinsic.yaml, a file of another "
@@ -131,6 +133,7 @@ def run(arguments: argparse.Namespace) -> int:
         return 2
     if is_batch and (arguments.paths or arguments.list):
         raise ConfigError("--batch cannot be combined with PATH or --list")
+    # A pattern in quotes is not expanded by the shell, and a pattern in a URL never.
     if any("*" in str(path) for path in arguments.paths):
         from hand_eye_calib.formats.bags.patterns import matching
 
@@ -138,23 +141,25 @@ def run(arguments: argparse.Namespace) -> int:
             type(path)(match) for path in arguments.paths for match in matching(str(path))
         ]
     if not any("://" in str(path) for path in arguments.paths):
-        return _run_here(arguments, lambda value: value)
+        return _run_locally(arguments, lambda value: value)
     from hand_eye_calib.formats.remote import local_copies
 
-    with local_copies(arguments.paths) as (arguments.paths, as_given):
-        return _run_here(arguments, as_given)
+    with local_copies(arguments.paths) as (arguments.paths, with_urls):
+        return _run_locally(arguments, with_urls)
 
 
-def _run_here(arguments: argparse.Namespace, as_given: "RestoreUrls") -> int:
+def _run_locally(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int:
     """Calibrate from local files, and return the exit code.
 
-    ``as_given`` replaces the paths of copies in plain values by their URLs.
+    ``with_urls`` replaces, in plain values, the paths of downloaded copies by their URLs.
     """
-    routes = [route for route in ROUTES.values() if route.takes(arguments)]  # or it raises
+    # A route is the way of an extra, such as the stops of an arm. takes() raises a ConfigError for
+    # arguments that exclude each other.
+    routes = [route for route in ROUTES.values() if route.takes(arguments)]
     if arguments.list:
-        return _list_topics(arguments, as_given)
+        return _list_topics(arguments, with_urls)
     if routes:
-        return routes[0].run(arguments, as_given)
+        return routes[0].run(arguments, with_urls)
     from hand_eye_calib.offline.cli import reading
     from hand_eye_calib.offline.cli.present import deliver
 
@@ -175,16 +180,16 @@ def _run_here(arguments: argparse.Namespace, as_given: "RestoreUrls") -> int:
             note(f"{several.reason}; they give one result, as recordings of one rig")
             return SEVERAL_RECORDINGS["one rig"](arguments, several.groups)
     calibration = recording.solved(with_fingerprints=bool(arguments.out))
-    calibration = dataclasses.replace(calibration, warnings=tuple(as_given(calibration.warnings)))
+    calibration = dataclasses.replace(calibration, warnings=tuple(with_urls(calibration.warnings)))
     bag = paths[0] if are_bags else None
-    return deliver(calibration, as_given(recording.inputs), arguments, recording.snapshot, bag)
+    return deliver(calibration, with_urls(recording.inputs), arguments, recording.snapshot, bag)
 
 
-def _list_topics(arguments: argparse.Namespace, as_given: "RestoreUrls") -> int:
+def _list_topics(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int:
     """Print the topics of a bag, and return the exit code.
 
-    Each row has the rate in the bag's time, the frames of the first messages, and whether the topic
-    has poses.
+    A row has, among others, the mean rate over the whole bag, whether the topic has poses, and the
+    frames of the first messages.
     """
     from hand_eye_calib.formats.bags.messages import MESSAGE_TYPES
     from hand_eye_calib.formats.bags.reader import PoseBag
@@ -209,7 +214,7 @@ def _list_topics(arguments: argparse.Namespace, as_given: "RestoreUrls") -> int:
             "topics": topics,
             "warnings": bag.warnings,
         }
-    document = as_given(document)
+    document = with_urls(document)
     note(*document["warnings"])
     lines = [f"{document['bag']}, {document['duration_s']:.1f} s"]
     lines.append(_ROW.format("topic", "type", "count", "rate", "poses", "frames"))

@@ -55,7 +55,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the findings, and return 1 if a result of these streams would be unusable, else 0."""
+    """Print the findings about both streams, and return the exit code.
+
+    The code is 1 if a result of these streams would be unusable, else 0.
+    """
     from hand_eye_calib.core.base.plain import plain
     from hand_eye_calib.core.checks.findings import finding, gravest_first
     from hand_eye_calib.core.engine.run import check
@@ -63,14 +66,15 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.offline.report.evidence import summarise
 
     settings = options.options_from(arguments)
-    opened = _opened(arguments, settings)
-    sources = opened.sources
-    parent, child = opened.trajectories
+    recording = _read_streams(arguments, settings)
+    sources = recording.sources
+    parent, child = recording.trajectories
     snapshot = whole_snapshot(parent, child, settings)
     with waiting_for("checking the streams"):
+        # Without poses, the findings come from a solve.
         has_poses = snapshot.config.measured == "poses"
         checked = check(snapshot, None if has_poses else snapshot.estimate())
-    repairs = [finding("disorder", text=text) for text in opened.repairs]
+    repairs = [finding("disorder", text=text) for text in recording.repairs]
     findings = gravest_first([*checked.findings, *repairs])
     streams = {
         stream: summarise(poses)
@@ -82,24 +86,31 @@ def run(arguments: argparse.Namespace) -> int:
     }
     document = None
     if arguments.json:
-        document = {"streams": summaries, "findings": [found.to_dict() for found in findings]}
-    lines = [_verdict(findings), "", *_table(findings), "", *_lines(sources, streams)]
+        document = {"streams": summaries, "findings": [item.to_dict() for item in findings]}
+    lines = [_verdict(findings), "", *_finding_lines(findings), ""]
+    lines += _stream_lines(sources, streams)
     print_result(lines, document)
     if findings and findings[0].makes_unusable:
         return fail(findings[0], 1)
     return 0
 
 
-class _Opened(NamedTuple):
-    """Sources of both streams, their poses, and notes on faults of their stamps."""
+class _Streams(NamedTuple):
+    """Both streams: files or topics by stream, trajectories, and notes on repaired stamps."""
 
     sources: dict[str, str]
     trajectories: "list[Trajectory]"
     repairs: list[str]
 
 
-def _opened(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> _Opened:
-    """Read both streams."""
+def _read_streams(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> _Streams:
+    """Read both streams from a bag or from two trajectory files.
+
+    Raises
+    ------
+    ConfigError
+        If the paths are neither one bag nor two trajectory files.
+    """
     from hand_eye_calib.offline.cli import reading
 
     paths = arguments.paths
@@ -110,7 +121,7 @@ def _opened(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> _Open
         options.refuse_stamps(arguments)
         names = dict(zip(STREAMS, map(str, paths), strict=True))
         files = reading.read_files(arguments, paths, settings)
-        return _Opened(names, files.trajectories, [*files.repairs, *files.warnings])
+        return _Streams(names, files.trajectories, [*files.repairs, *files.warnings])
     from hand_eye_calib.core.base.config import CalibratorConfig
     from hand_eye_calib.formats.bags.reader import PoseBag
     from hand_eye_calib.offline.cli import bags
@@ -122,11 +133,13 @@ def _opened(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> _Open
         stamps = bags.stamps_of(wanted)
         names = {stream: str(source) for stream, source in sources.items()}
         readings = [(sources[stream], measures[stream], stamps[stream]) for stream in STREAMS]
-        return _Opened(names, *bags.read_sources(bag, readings))
+        return _Streams(names, *bags.read_sources(bag, readings))
 
 
-def _lines(sources: Mapping[str, str], streams: "Mapping[str, StreamSummary]") -> Iterator[str]:
-    """Yield the lines of the table of both streams."""
+def _stream_lines(
+    sources: Mapping[str, str], streams: "Mapping[str, StreamSummary]"
+) -> Iterator[str]:
+    """Yield the source of each stream, and a table with the size and the motion of each stream."""
     yield from (f"{stream} is {source}" for stream, source in sources.items())
     yield "{:<8} {:>8} {:>9} {:>7} {:>12} {:>12} {:>10}".format(*_HEADINGS)
     for name, summary in streams.items():
@@ -139,7 +152,7 @@ def _lines(sources: Mapping[str, str], streams: "Mapping[str, StreamSummary]") -
 
 
 def _verdict(findings: "Sequence[Finding]") -> str:
-    """Return the consequence of the findings for a calibration, in one sentence."""
+    """Return the verdict that a calibration would get, and what to do, in one sentence."""
     from hand_eye_calib.core.results.verdict import Verdict
 
     serious = [finding for finding in findings if finding.severity.value != "note"]
@@ -154,8 +167,8 @@ def _verdict(findings: "Sequence[Finding]") -> str:
     return f"{verdict.value}: check these findings first: {codes}."
 
 
-def _table(findings: "Sequence[Finding]") -> Iterator[str]:
-    """Yield the lines of the findings, in their order."""
+def _finding_lines(findings: "Sequence[Finding]") -> Iterator[str]:
+    """Yield severity, code, stream, sentence and advice of each finding."""
     from hand_eye_calib.offline.cli.present import wrapped
 
     if not findings:

@@ -2,9 +2,7 @@
 
 import argparse
 
-from hand_eye_calib.core.base.config import EXPORT_FORMATS, ROBOT_FORMATS
-
-_FORMATS = (*ROBOT_FORMATS, *EXPORT_FORMATS)
+from hand_eye_calib.offline.cli.options import RESULT_FORMATS, add_result_argument
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -14,10 +12,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "examples:\n  hand_eye_calib export result urdf > camera.urdf.xacro\n"
         "  hand_eye_calib export result kalibr > camchain-imucam.yaml"
     )
-    result = "extrinsic.yaml, or the directory that contains it"
-    parser.add_argument("result", metavar="RESULT", help=result)
-    formats = f"one of {', '.join(_FORMATS)}"
-    parser.add_argument("format", metavar="FORMAT", choices=_FORMATS, help=formats)
+    add_result_argument(parser)
+    formats = f"one of {', '.join(RESULT_FORMATS)}"
+    parser.add_argument("format", metavar="FORMAT", choices=RESULT_FORMATS, help=formats)
 
 
 def run(arguments: argparse.Namespace) -> int:

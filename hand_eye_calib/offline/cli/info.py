@@ -2,10 +2,12 @@
 
 import argparse
 
-from hand_eye_calib.core.base.config import EXPORT_FORMATS, ROBOT_FORMATS
-from hand_eye_calib.offline.cli.options import add_json_argument, print_result
-
-_FORMATS = (*ROBOT_FORMATS, *EXPORT_FORMATS)
+from hand_eye_calib.offline.cli.options import (
+    RESULT_FORMATS,
+    add_json_argument,
+    add_result_argument,
+    print_result,
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -15,15 +17,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "examples:\n  hand_eye_calib info result\n  hand_eye_calib info result --json\n"
         "  hand_eye_calib info result --as kalibr > camchain-imucam.yaml"
     )
-    result = "extrinsic.yaml, or the directory that contains it"
-    parser.add_argument("result", metavar="RESULT", help=result)
-    formats = f"print it as the file of another program instead: {', '.join(_FORMATS)}"
-    parser.add_argument("--as", dest="format", choices=_FORMATS, metavar="FORMAT", help=formats)
+    add_result_argument(parser)
+    formats = f"print the result as the file of another program: {', '.join(RESULT_FORMATS)}"
+    parser.add_argument(
+        "--as", dest="format", choices=RESULT_FORMATS, metavar="FORMAT", help=formats
+    )
     add_json_argument(parser, or_verbose=True)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print a saved calibration, and return the exit code: 0 for every status of it."""
+    """Print a saved calibration, and return the exit code 0, whatever its status is."""
     from hand_eye_calib.formats.results import load_result
     from hand_eye_calib.offline.cli.present import as_lines
 

@@ -1,6 +1,6 @@
-"""Commands that do one job with ``calibrate``.
+"""Commands that run ``calibrate`` for one kind of input, such as ``arm`` and ``rig``.
 
-They take arguments of ``calibrate``, but have a short help of their own.
+Such a command has all arguments of ``calibrate``, and a short help of its own.
 """
 
 import argparse
@@ -11,7 +11,7 @@ from hand_eye_calib.offline.cli import calibrate
 
 
 class Job(NamedTuple):
-    """A command that hands its arguments to ``calibrate``.
+    """A command that passes its arguments on to ``calibrate``.
 
     Attributes
     ----------
@@ -20,8 +20,8 @@ class Job(NamedTuple):
     brief : str
         Help that fits on one screen.
     prepare : callable
-        Change the parsed arguments to those of ``calibrate``; raise ConfigError if they are not
-        those of the job.
+        Called with the parsed arguments. Changes them into arguments of ``calibrate``, and raises a
+        ConfigError if they do not fit the command.
     """
 
     usage: str

@@ -1,7 +1,8 @@
 """``hand_eye_calib COMMAND``: run a command, and turn errors into one line and an exit code.
 
-A command is a module with ``add_arguments(parser)`` and ``run(arguments) -> int``. It is imported
-only to run it, so that a missing optional package breaks no other command.
+A command is a module with ``add_arguments(parser)`` and ``run(arguments) -> int``. Only the module
+of the requested command is imported, so that an optional package that is missing disables no other
+command.
 """
 
 import argparse
@@ -34,12 +35,12 @@ examples:
 exit codes: 0 good, 1 bad input or failed, 2 wrong usage, 3 solved but something is
 unobservable or the verdict is DO NOT USE"""
 
-# Ends of the names of ROS 2's packages.
+# Endings of the names of Python packages that belong to ROS 2.
 _ROS_SUFFIXES = ("rclpy", "_msgs", "_srvs", "_interfaces", "tf2_ros")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; without one, print the help.
+    """Run a command; print the help if the arguments contain no command.
 
     Parameters
     ----------
@@ -61,12 +62,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def exit_code_of(run: Callable[[], int]) -> int:
-    """Run a function, and return its exit code.
+    """Run a function that returns an exit code, and return this code.
 
-    An error that the user can mend becomes one line on stderr and an exit code.
+    If the function raises an error that the user can mend, print the error in one line on stderr,
+    and return the exit code of the error.
     """
-    # The matrices are small: several threads would wait for each other, and need three times as
-    # long beside other programs.
+    # Use one thread for linear algebra. The matrices are small: threads would wait for each other,
+    # and take three times as long if other programs use the processor.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     limit_memory()
     try:
@@ -88,7 +90,8 @@ def exit_code_of(run: Callable[[], int]) -> int:
             )
         return fail(text)
     except BrokenPipeError:
-        # The reader of stdout has closed it: the interpreter must not flush it at exit.
+        # The program that reads stdout has closed it. Replace stdout, because the interpreter would
+        # raise another error when it flushes stdout at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return Exit.BROKEN_PIPE
     except OSError as error:
@@ -101,7 +104,10 @@ def exit_code_of(run: Callable[[], int]) -> int:
 
 
 def named_command() -> int:
-    """Run the command that the executable is called, as ``ros2 run hand_eye_calib replay`` does."""
+    """Run the command whose name the executable has.
+
+    ``ros2 run hand_eye_calib replay`` calls the executable ``replay``.
+    """
     return main([Path(sys.argv[0]).stem, *sys.argv[1:]])
 
 
@@ -120,10 +126,10 @@ class CommandParser(argparse.ArgumentParser):
 
 
 class _ShowHelp(argparse.Action):
-    """Print the help of a command.
+    """Action of ``--help``: print the help of a command.
 
-    A command with many options has a brief help of at most a screen, the default ``brief`` of its
-    parser. ``--help all`` prints all options.
+    A command with many options has a brief help that fits on a screen, stored as the default
+    ``brief`` of its parser. ``--help all`` prints all options.
     """
 
     def __call__(
@@ -144,6 +150,7 @@ class _ShowHelp(argparse.Action):
 
 
 def _run(argv: Sequence[str]) -> int:
+    """Parse the arguments, and run the command."""
     command = next((word for word in argv if not word.startswith("-")), None)
     parser = CommandParser(
         prog="hand_eye_calib",
@@ -177,7 +184,10 @@ def _run(argv: Sequence[str]) -> int:
 
 
 def _run_command(module: Any, arguments: argparse.Namespace) -> int:
-    """Run a command; an error about unclear streams gets the command that names them."""
+    """Run a command.
+
+    If the streams of a bag are unclear, the error ends with the command that names the streams.
+    """
     try:
         return int(module.run(arguments))
     except UnclearStreamsError as error:
@@ -197,7 +207,7 @@ def _description() -> str:
 
 def _add_commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
     """Add all commands to a parser, and return their parsers by name."""
-    # With the usage of the whole program, argparse would begin those of the commands.
+    # Without ``prog``, argparse would begin the usage of each command with that of the program.
     commands = parser.add_subparsers(
         dest="command", metavar="COMMAND", prog=parser.prog, help=argparse.SUPPRESS
     )
@@ -217,7 +227,7 @@ def _add_commands(parser: argparse.ArgumentParser) -> dict[str, argparse.Argumen
 
 
 def _refuse(rest: Sequence[str], parser: argparse.ArgumentParser) -> NoReturn:
-    """End with an error that names the first of the arguments that no option takes."""
+    """Exit with an error about the first unknown option, or else the first unused argument."""
     options = [word for word in rest if word.startswith("-")]
     option, _, _ = [*options, *rest][0].partition("=")
     parser.error(f"unknown {option!r}{did_you_mean(option, parser._option_string_actions)}")

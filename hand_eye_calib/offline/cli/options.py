@@ -1,9 +1,10 @@
-"""Arguments of the commands, and their notes, errors and progress on stderr.
+"""Arguments of the commands, and what the commands print: notes, errors, progress and results.
 
-The options of the engine are made from the option dataclasses. A configuration file sets the same
-options by name. Other arguments are about the input and the output.
+The options of the engine are declared once, as the fields of CalibratorConfig. From these fields
+this module makes the options of the command line and of a configuration file. All other arguments
+concern the input and the output.
 
-This module loads no library, so that ``--help`` is quick.
+This module imports no library outside of Python, so that ``--help`` is quick.
 """
 
 import argparse
@@ -27,14 +28,20 @@ _Item = TypeVar("_Item")
 STREAMS = ("parent", "child")
 OPTION_FIELDS = config.CalibratorConfig.by_name()
 
+# Options of a parameter file that only the node uses, and those that rclpy declares.
 _NODE_OPTIONS = config.NodeConfig.by_name()
 _ROS_OPTIONS = ("use_sim_time", "start_type_description_service", "qos_overrides")
+# Names of nodes in a parameter file whose section applies to the calibrator.
 _NODES = ("calibrator", "**", "*", "")
-_OF_ROS = "ros__parameters"
+# Key of the parameters of a node in a parameter file.
+_ROS_SECTION = "ros__parameters"
 _AXES = ", ".join(name.removeprefix("prior.") for name in OPTION_FIELDS if "prior." in name)
 
-# Options that most users set: they are first in the help.
+# Options that most users set. They are in the first group of the help.
 _COMMON = ("method", "reference", "time_offset", "scale", "parent_frame", "child_frame")
+
+# File formats in which a saved result can be printed.
+RESULT_FORMATS = (*config.ROBOT_FORMATS, *config.EXPORT_FORMATS)
 
 # Options to read a trajectory file, with their arguments for argparse.
 FILE_OPTIONS: dict[str, dict[str, Any]] = {
@@ -62,19 +69,22 @@ FILE_OPTIONS: dict[str, dict[str, Any]] = {
     },
 }
 
-# Origins of the stamps of a bag's poses.
+# Stamps of a bag's poses: from the messages' headers, or the times at which the recorder received
+# the messages.
 STAMPS = ("header", "receive")
 
-_OF_FILES = (*FILE_OPTIONS, "pair_by", "stamps")
+# Public names of all options that are translated in messages.
+_INPUT_OPTIONS = (*FILE_OPTIONS, "pair_by", "stamps")
 _OPTIONS = {
     *OPTION_FIELDS,
-    *_OF_FILES,
-    *(f"{stream}_{name}" for stream in STREAMS for name in _OF_FILES),
+    *_INPUT_OPTIONS,
+    *(f"{stream}_{name}" for stream in STREAMS for name in _INPUT_OPTIONS),
 }
 
-# Names of options in a text: in backticks; names that are no English words, such as max_gap and
-# prior.z; and scale before a value. Names in a path, after dashes or in quotes are none.
-_NAMES = re.compile(
+# Candidates for option names in a message: words in backticks; words with a dot or an underscore,
+# such as max_gap and prior.z; and scale before a value. Words in a path, after a dash or in quotes
+# are no candidates.
+_NAMES_IN_TEXT = re.compile(
     r"`([\w.]+)`|(?<![\w./\\='-])([a-z]+(?:[._]+[a-z]+)+|scale(?= (?:none|auto|estimate\b|\d)))"
     r"(?![\w/=-]|\.\w)( VALUE)?"
 )
@@ -86,8 +96,9 @@ _NAMES = re.compile(
 class Exit(IntEnum):
     """Exit codes of the commands.
 
-    FAILED is also for bad input. NOT_ALL is a solution with an unobservable axis or the verdict DO
-    NOT USE. The last two are the codes of a shell for SIGINT and SIGPIPE.
+    FAILED also means bad input. NOT_ALL means that a solve succeeded, but an axis is unobservable
+    or the verdict is DO NOT USE. INTERRUPTED and BROKEN_PIPE are the codes that a shell reports for
+    SIGINT and SIGPIPE.
     """
 
     GOOD = 0
@@ -98,24 +109,24 @@ class Exit(IntEnum):
     BROKEN_PIPE = 141
 
 
-# Styles of the verdict at the beginning of a line on a terminal: bold green, yellow, red.
+# Terminal styles of a verdict: bold green, bold yellow, bold red.
 _STYLES = {"USE": "\x1b[1;32m", "USE WITH CARE": "\x1b[1;33m", "DO NOT USE": "\x1b[1;31m"}
 
 
 def flag(name: str) -> str:
-    """Return the command-line option of a public option name, without the leading dashes."""
+    """Return a public option name as the command line has it, without the leading dashes."""
     return name.replace(".", "-").replace("_", "-")
 
 
 def typed_options(options: Iterable[tuple[str, object]]) -> str:
-    """Return options and values, by their public names, as a user types them."""
+    """Return pairs of public option name and value as a user types them on the command line."""
     return " ".join(f"--{flag(name)} {value}" for name, value in options)
 
 
 def as_typed(text: str) -> str:
-    """Return a message of the engine with its option names as a user types them.
+    """Return a message of the engine with option names as a user types them.
 
-    The engine has the names of Python and of the node: ``raise max_gap`` becomes ``raise
+    Messages of the engine contain public option names: ``raise max_gap`` becomes ``raise
     --max-gap``.
     """
 
@@ -128,24 +139,24 @@ def as_typed(text: str) -> str:
             return f"--prior {name.removeprefix('prior.')}{value.replace(' ', '=')}"
         return f"--{flag(name)}{value}"
 
-    return _NAMES.sub(typed, text)
+    return _NAMES_IN_TEXT.sub(typed, text)
 
 
 def note(*texts: object) -> None:
-    """Print notes for the user, one line each."""
+    """Print each text as a note to the user, in one line on stderr."""
     for text in texts:
         print(f"hand_eye_calib: note: {printable(as_typed(str(text)))}", file=sys.stderr)
 
 
 def fail(error: object, code: int = Exit.FAILED) -> int:
-    """Print an error in one line, and return ``code``."""
+    """Print an error in one line on stderr, and return ``code``."""
     print(f"hand_eye_calib: error: {printable(as_typed(str(error)))}", file=sys.stderr)
     return code
 
 
 @contextmanager
 def waiting_for(activity: str) -> Iterator[None]:
-    """Print the activity on a terminal while the block runs."""
+    """Display the activity while the block runs, if stderr is a terminal."""
     if not sys.stderr.isatty():
         yield
         return
@@ -162,7 +173,18 @@ def with_progress(
     doing: str,
     size: Callable[[_Item], int] = lambda item: 1,
 ) -> Iterator[_Item]:
-    """Yield items. On a terminal, print the finished share of their sizes and the time left."""
+    """Yield items; on a terminal, display the progress and the time left.
+
+    Parameters
+    ----------
+    items : iterable
+    total : int or None
+        Sum of the sizes of all items; None if unknown.
+    doing : str
+        Activity to display.
+    size : callable
+        Returns the size of an item, such as its number of bytes. Default: 1 for every item.
+    """
     if not sys.stderr.isatty():
         yield from items
         return
@@ -177,7 +199,7 @@ def with_progress(
 
 
 def print_result(lines: Iterable[str], document: object = None) -> None:
-    """Print the result of a command: its document as JSON, or else its lines.
+    """Print the result of a command on stdout: the document as JSON, or the lines without one.
 
     On a terminal, a verdict at the beginning of the lines is coloured.
     """
@@ -197,9 +219,10 @@ def print_result(lines: Iterable[str], document: object = None) -> None:
 
 
 def argument_type(parse: Callable[[str], Any], prefix: str = "") -> Callable[[str], Any]:
-    """Return the type of an argument, for argparse.
+    """Return a function that argparse can use as the type of an argument.
 
-    A ConfigError becomes wrong usage. Its message is printed without ``prefix``.
+    A ConfigError of ``parse`` becomes an error about wrong usage. ``prefix``, such as the name of
+    the option, is removed from the message, because argparse prints the name itself.
     """
 
     def parsed(text: str) -> Any:
@@ -227,7 +250,7 @@ def at_least(minimum: int) -> Callable[[str], int]:
 
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--config`` and an option for every field of CalibratorConfig."""
-    # Without this, argparse takes values such as -1e-3 and -90deg+/-2deg for options.
+    # Values may begin with a minus, such as -1e-3 and -90deg+/-2deg: they are no options.
     parser._negative_number_matcher = re.compile(r"-\.?\d")
     group = parser.add_argument_group("calibration options")
     rare = parser.add_argument_group("calibration options that are rarely needed")
@@ -243,7 +266,7 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
             dest="options",
             action="append",
             default=[],
-            type=argument_type(partial(_named, name), f"{name} "),
+            type=argument_type(partial(_checked_option, name), f"{name} "),
             metavar=f"{{{','.join(meta['choices'])}}}" if meta["choices"] else value,
             help=f"{meta['doc']}{unit}{default}".replace("%", "%%"),
         )
@@ -261,17 +284,23 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
 
 @argument_type
 def _prior(text: str) -> tuple[str, OptionValue]:
+    """Return the option of a prior and its checked value, from ``AXIS=VALUE+/-SIGMA``."""
     axis, equals, value = text.partition("=")
     name = f"prior.{axis}"
     if not equals or name not in OPTION_FIELDS:
         raise ConfigError(f"expected AXIS=VALUE+/-SIGMA with AXIS one of {_AXES}; got {text!r}")
-    return _named(name, value)
+    return _checked_option(name, value)
 
 
-def _named(name: str, value: object) -> tuple[str, OptionValue]:
-    """Return an option and its checked value, from text or from YAML.
+def _checked_option(name: str, value: object) -> tuple[str, OptionValue]:
+    """Return the name of an option and its checked value, from a text or from YAML.
 
-    Lengths and angles may have a unit.
+    In a text, lengths and angles may have a unit, such as ``5cm``.
+
+    Raises
+    ------
+    ConfigError
+        If the value is of the wrong type or out of range.
     """
     field = OPTION_FIELDS[name]
     kind = type(field.default)
@@ -279,27 +308,28 @@ def _named(name: str, value: object) -> tuple[str, OptionValue]:
     if isinstance(value, str) and kind in (int, float):
         if unit in ("m", "rad"):
             return name, check_value(field, *quantities(name, [unit], [value], ""))
-        with suppress(ValueError):  # check_value reports the expected value
+        # If the text is no number, check_value below reports what is expected.
+        with suppress(ValueError):
             value = kind(value)
     return name, check_value(field, value)
 
 
 def options_from(arguments: argparse.Namespace) -> Options:
-    """Return the options that the user set, by their public names.
+    """Return the options that the user has set, by their public names.
 
-    The command line overrides the file.
+    Options of the command line override those of the file of ``--config``.
 
     Raises
     ------
     ConfigError
-        For unknown options and bad values in the file.
+        If the file has an unknown option or a bad value.
     """
     file_options = _read_config(arguments.config) if arguments.config else {}
     return {**file_options, **dict(arguments.options)}
 
 
 def _read_config(path: Path) -> Options:
-    """Return the options of a file with names and values, or of a ROS parameter file."""
+    """Return the options of a YAML file with options by name, or of a ROS parameter file."""
     from hand_eye_calib.formats.yaml_files import read_yaml
 
     document = read_yaml(path)
@@ -309,12 +339,12 @@ def _read_config(path: Path) -> Options:
     settings = _settings_of_file(document or {})
     options: dict[str, OptionValue] = {}
     ignored = []
-    for option, value in settings.named:
+    for option, value in settings.values:
         if option in OPTION_FIELDS:
-            options |= [_named_in_file(path, option, value)]
+            options |= [_option_in_file(path, option, value)]
         elif option in _NODE_OPTIONS or option.partition(".")[0] in _ROS_OPTIONS:
             ignored.append(repr(option))
-        elif value is not None or not option.endswith(_OF_ROS):
+        elif value is not None or not option.endswith(_ROS_SECTION):
             # An empty section ros__parameters appears here as a name without value. It is not an
             # option.
             raise _unknown_option(path, option)
@@ -329,45 +359,46 @@ def _read_config(path: Path) -> Options:
 
 
 class _Settings(NamedTuple):
-    """Names and values of the calibrator in a file, and the names of other nodes."""
+    """Names and values that concern the calibrator in a file, and the names of other nodes."""
 
-    named: list[tuple[str, Any]]
+    values: list[tuple[str, Any]]
     other_nodes: list[str]
 
 
 def _settings_of_file(document: Mapping[str, Any]) -> _Settings:
-    """Return the settings of a file, without the sections of a ROS parameter file."""
-    named = []
+    """Return the settings of a file; names are without the sections of a ROS parameter file."""
+    values = []
+    # The keys of this mapping are a set that keeps the order.
     other_nodes: dict[str, None] = {}
     for name, value in _flat(document):
-        node, is_ros_parameter, option = name.rpartition(f"{_OF_ROS}.")
+        node, is_ros_parameter, option = name.rpartition(f"{_ROS_SECTION}.")
         if is_ros_parameter and re.split("[./]", node.rstrip("."))[-1] not in _NODES:
             other_nodes[f"/{node.strip('/.')}"] = None
         else:
-            named.append((option, value))
-    return _Settings(named, [*other_nodes])
+            values.append((option, value))
+    return _Settings(values, [*other_nodes])
 
 
-def _named_in_file(path: Path, option: str, value: object) -> tuple[str, OptionValue]:
+def _option_in_file(path: Path, option: str, value: object) -> tuple[str, OptionValue]:
     """Return the name and the checked value of an option; an error names the file."""
     try:
-        return _named(option, value)
+        return _checked_option(option, value)
     except ConfigError as error:
-        # In quotes the name keeps the spelling of the file.
+        # as_typed() does not change a name in quotes: it keeps the spelling of the file.
         text = str(error).replace(option, repr(option), 1)
         raise ConfigError(f"{path}: {text}") from None
 
 
 def _unknown_option(path: Path, option: str) -> ConfigError:
     """Return the error about an option of a file that does not exist."""
-    # In quotes the names keep the spelling of the file.
+    # as_typed() does not change names in quotes: they keep the spelling of the file.
     names = sorted(map(repr, OPTION_FIELDS))
     hint = did_you_mean(repr(option), names) or f"; known are {', '.join(names)}"
     return ConfigError(f"{path}: unknown option {option!r}{hint}")
 
 
 def _flat(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the values of nested mappings with dotted names."""
+    """Yield names and values of nested mappings; the keys of a name are joined by dots."""
     for name, value in mapping.items():
         if isinstance(value, dict):
             yield from _flat(value, f"{prefix}{name}.")
@@ -379,7 +410,7 @@ def _flat(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, A
 
 
 def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> None:
-    """Add the arguments of the input: paths, the streams of a bag, and options of files."""
+    """Add the arguments about the input: paths, streams of a bag, and options of files."""
     parser.add_argument("paths", metavar="PATH", nargs="*", type=_path, help=help_of_paths)
     group = parser.add_argument_group(
         "pose streams of a bag",
@@ -423,13 +454,19 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
 
 
 def sources_from(arguments: argparse.Namespace) -> dict[str, str]:
-    """Return the sources of a bag's streams that the user named.
+    """Return the sources of a bag's streams that the user has named.
 
     Returns
     -------
     dict of str to str
-        Topic, or frames WORLD:SENSOR, of "parent" and "child", and the origin of their stamps,
-        "parent_stamps" and "child_stamps".
+        "parent" and "child": topic, with its fields or target after a question mark, or frames
+        WORLD:SENSOR. "parent_stamps" and "child_stamps": one of ``STAMPS``. What the user has not
+        named is absent.
+
+    Raises
+    ------
+    ConfigError
+        If fields are named without a topic.
     """
     sources = {}
     for stream in STREAMS:
@@ -451,6 +488,12 @@ def refuse_stamps(arguments: argparse.Namespace) -> None:
             raise ConfigError(f"--{flag(name)} applies to bags only; omit it for trajectory files")
 
 
+def add_result_argument(parser: argparse.ArgumentParser) -> None:
+    """Add the path of a saved result."""
+    path = "extrinsic.yaml, or the directory that contains it"
+    parser.add_argument("result", metavar="RESULT", help=path)
+
+
 def add_json_argument(parser: argparse._ActionsContainer, or_verbose: bool = False) -> None:
     """Add ``--json``, and ``--verbose`` if there are details to print."""
     text = "print one JSON document on stdout instead of text"
@@ -461,7 +504,7 @@ def add_json_argument(parser: argparse._ActionsContainer, or_verbose: bool = Fal
 
 
 def _path(text: str) -> Path | str:
-    """Return a path; a URL stays a text, because a path would lose one of its two slashes."""
+    """Return a path. A URL stays a text, because a Path would drop one of its two slashes."""
     if "://" in text:
         return text
     try:

@@ -1,4 +1,4 @@
-"""Output of a calibration: as text for people, as JSON for programs, and as an exit code."""
+"""Output of a calibration: a text for people, JSON for programs, and the exit code."""
 
 import argparse
 import shlex
@@ -38,10 +38,11 @@ if TYPE_CHECKING:
     from hand_eye_calib.core.engine.snapshot import Snapshot
     from hand_eye_calib.core.results.document import Notation
 
+# Longest line of the text, in characters.
 _WIDTH = 100
 
-# Verdicts on an axis that more motion may change.
-_OPEN = (DofVerdict.UNOBSERVABLE, DofVerdict.WEAK)
+# Verdicts on an axis that more motion may improve.
+_IMPROVABLE = (DofVerdict.UNOBSERVABLE, DofVerdict.WEAK)
 
 
 def deliver(
@@ -57,12 +58,12 @@ def deliver(
     ----------
     calibration : Calibration
     inputs : dict
-        Origin of the data in plain values.
+        Origin of the data, such as paths and topics, in plain values.
     arguments : argparse.Namespace
     snapshot : Snapshot, optional
-        Poses and options of the calibration; None for stops.
+        Poses and options of the calibration; None for the stops of an arm.
     bag : pathlib.Path, optional
-        Bag whose transforms may have the base frame.
+        Bag whose transforms may contain the frame of ``--base-frame``.
     """
     if (arguments.installed or arguments.base_frame) and not calibration.status.failure:
         calibration = _with_robot(calibration, arguments, bag)
@@ -77,7 +78,8 @@ def deliver(
     document = calibration.to_dict() | {"inputs": inputs} if arguments.json else None
     try:
         print_result(as_lines(calibration, steps, arguments.verbose), document)
-    finally:  # even if the reader of stdout has closed it
+    # Write the report even if the program that reads stdout has closed it.
+    finally:
         if arguments.out and calibration.motion_residuals:
             from hand_eye_calib.offline.cli.reporting import write_report
 
@@ -88,7 +90,13 @@ def deliver(
 def _with_robot(
     calibration: Calibration, arguments: argparse.Namespace, bag: Path | None
 ) -> Calibration:
-    """Add the comparison with the installed extrinsic and the base frame, if requested."""
+    """Return the calibration with the comparison and the base frame that the user requests.
+
+    Raises
+    ------
+    ConfigError
+        If nothing contains the base frame.
+    """
     from hand_eye_calib.core.assessment.comparison import with_comparison
     from hand_eye_calib.formats.installed import frames_of_bag, open_installed, read_urdf
 
@@ -111,7 +119,7 @@ def _with_robot(
 
 
 def end(calibrations: Sequence[Calibration]) -> int:
-    """Print why solves have failed, and return the exit code of results."""
+    """Print an error for each failed solve, and return the exit code of all results."""
     for calibration in calibrations:
         if calibration.has_failed:
             reason = calibration.reasons[0]
@@ -121,16 +129,13 @@ def end(calibrations: Sequence[Calibration]) -> int:
 
 
 def gravest_code(codes: Iterable[int]) -> int:
-    """Return the gravest of exit codes: FAILED, NOT_ALL, GOOD."""
+    """Return the gravest of exit codes, in the order FAILED, NOT_ALL, GOOD."""
     distinct = {*codes}
     return Exit.FAILED if Exit.FAILED in distinct else max(distinct)
 
 
 def exit_code(calibration: Calibration) -> int:
-    """Return the exit code of a calibration.
-
-    GOOD, FAILED, or NOT_ALL if an axis is unobservable or the verdict is DO NOT USE.
-    """
+    """Return the exit code of a calibration: GOOD, FAILED or NOT_ALL, see :class:`Exit`."""
     if calibration.has_failed:
         return Exit.FAILED
     if calibration.hidden or calibration.verdict is Verdict.DO_NOT_USE:
@@ -141,11 +146,11 @@ def exit_code(calibration: Calibration) -> int:
 def as_lines(
     calibration: Calibration, steps: Sequence[str] = (), with_details: bool = False
 ) -> list[str]:
-    """Return the text of a calibration.
+    """Return the lines of a calibration for a person.
 
-    It has the verdict with its reasons, the extrinsic in both directions, the next steps, the
-    command that publishes it, and details: recordings, goal and comparison with the installed
-    extrinsic. With details, quaternions and facts about the solution are added.
+    The lines are, in this order: verdict and reasons, the extrinsic in both directions, the next
+    steps, the command that publishes the extrinsic, and details such as the comparison with the
+    installed extrinsic. ``with_details`` adds quaternions and facts about the solution.
     """
     lines = [*verdict_lines(calibration), *_extrinsic_lines(calibration, with_details)]
     if steps:
@@ -174,13 +179,14 @@ def publish_lines(calibration: Calibration) -> list[str]:
     command = calibration.static_transform_command()
     if not command:
         return []
+    # An unknown number of the command is a text, such as X, which the user must replace.
     by_hand = [number for number in usable_numbers(calibration).values() if isinstance(number, str)]
     condition = f", after you have replaced {listing(by_hand)}" if by_hand else ""
     return [f"To publish it ({calibration.verdict.value}{condition})", f"  {command}"]
 
 
 def _extrinsic_lines(calibration: Calibration, with_details: bool) -> list[str]:
-    """Return the lines of the extrinsic in both directions, and of its other transforms."""
+    """Return the lines of the extrinsic in both directions, and of further transforms."""
     parent = calibration.parent_frame
     child = calibration.child_frame
     frames = {
@@ -207,11 +213,11 @@ def _extrinsic_lines(calibration: Calibration, with_details: bool) -> list[str]:
 
 
 def verdict_lines(calibration: Calibration) -> Iterator[str]:
-    """Yield the headline, the reasons with their advice, and the notes."""
+    """Yield the headline, the reasons with their advice, and the warnings."""
     yield calibration.headline
     in_headline = calibration.reasons_in_headline
     for number, reason in enumerate(shown(calibration.reasons)):
-        # Only the advice follows the headline if that has the sentence of the first reason.
+        # If the headline contains the sentence of the first reason, only the advice follows.
         if number or reason not in in_headline:
             yield from wrapped(reason.sentence, "- ", "  ")
         advice = reason.what_to_do
@@ -223,7 +229,7 @@ def verdict_lines(calibration: Calibration) -> Iterator[str]:
 
 
 def wrapped(text: str, first: str, others: str) -> list[str]:
-    """Return the lines of a text, with the beginnings of the first line and of the others."""
+    """Return the lines of a text; ``first`` and ``others`` are the beginnings of the lines."""
     return textwrap.wrap(
         printable(as_typed(text)),
         _WIDTH,
@@ -237,7 +243,7 @@ def wrapped(text: str, first: str, others: str) -> list[str]:
 def next_steps(
     calibration: Calibration, arguments: argparse.Namespace, snapshot: "Snapshot | None"
 ) -> list[str]:
-    """Return the next steps in sentences and commands; empty if the result is usable."""
+    """Return sentences and commands that improve the result; empty if the verdict is USE."""
     if calibration.verdict is Verdict.USE:
         return []
     extra = []
@@ -245,8 +251,8 @@ def next_steps(
         extra += [typed_options([option]) for option in reason.options.items()]
     steps = []
     if calibration.verdict is not Verdict.DO_NOT_USE:
-        is_open = any(dof.verdict in _OPEN for dof in calibration.observability)
-        if is_open and snapshot is not None and calibration.measured == "poses":
+        is_improvable = any(dof.verdict in _IMPROVABLE for dof in calibration.observability)
+        if is_improvable and snapshot is not None and calibration.measured == "poses":
             from hand_eye_calib.core.assessment.excitation import excitation, what_is_missing
 
             if motion := what_is_missing(excitation(snapshot.pose_pairs), calibration):
@@ -260,7 +266,7 @@ def next_steps(
 
 
 def allowance_lines(calibration: Calibration) -> list[str]:
-    """Return lines on the allowance that the printed standard deviations contain, if any."""
+    """Return lines about the allowance in the printed standard deviations; none without one."""
     words = allowance_in_words(calibration)
     return wrapped(f"+/- is 1 sigma; {words}", "  ", "  ") if words else []
 
@@ -271,11 +277,12 @@ def transform_lines(
     """Yield a row for each number of a transform, with the parts of its standard deviation."""
     parts = parts_of_sigmas(transform)
     for axis, number in printed_numbers(transform, out_of_reach).items():
-        if "," in axis:  # a text about three axes
+        # Three axes at once, such as "x, y, z", have a text in place of a number.
+        if "," in axis:
             yield f"  {axis} are {number}"
         else:
-            explained = f"  ({parts[axis]})" if axis in parts else ""
-            yield f"  {axis:<5} {number:>22}{explained}"
+            sigma_parts = f"  ({parts[axis]})" if axis in parts else ""
+            yield f"  {axis:<5} {number:>22}{sigma_parts}"
     if with_quaternion:
         quaternion = "unknown"
         if transform.quat_xyzw is not None:
@@ -285,7 +292,7 @@ def transform_lines(
 
 
 def compact_lines(transform: "Notation", out_of_reach: Sequence[str] = ()) -> Iterator[str]:
-    """Yield a row for each axis: the translation along it and an angle."""
+    """Yield three rows with two columns: x, y, z and roll, pitch, yaw."""
     numbers = printed_numbers(transform, out_of_reach)
     translations = _column(numbers, TRANSLATIONS, 1)
     rotations = _column(numbers, ROTATIONS, 5)
@@ -294,7 +301,7 @@ def compact_lines(transform: "Notation", out_of_reach: Sequence[str] = ()) -> It
 
 
 def _column(numbers: Mapping[str, str], axes: Sequence[str], width: int) -> list[str]:
-    """Return the texts of three axes, or a text about all of them in the second row."""
+    """Return the column of three axes; a text about all three axes is in the second row."""
     if text := numbers.get(listing(axes)):
         return ["", f"{listing(axes)} are {text}", ""]
     return [f"{axis:<{width}} {numbers[axis]:>24}" for axis in axes]

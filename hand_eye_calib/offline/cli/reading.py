@@ -1,4 +1,4 @@
-"""Recordings for the engine, and the trajectory files of two or more sensors."""
+"""Read the trajectory files of two or more sensors, and solve a recording of two streams."""
 
 import dataclasses
 import re
@@ -29,7 +29,9 @@ from hand_eye_calib.offline.cli.options import (
 if TYPE_CHECKING:
     from hand_eye_calib.formats.trajectory_files.reading import FileOptions
 
+# Options that only the method dnlo uses.
 _OPTIONS_OF_DNLO = ("threshold", "min_inlier_fraction")
+# Endings of the files of a bag.
 _BAG_SUFFIXES = (".bag", ".db3", ".mcap", ".zstd")
 
 
@@ -42,7 +44,7 @@ class Recording:
     snapshot : Snapshot
         Streams with their options.
     inputs : dict
-        Origin of the data in plain values.
+        Origin of the data, such as paths and topics, in plain values.
     files : list of pathlib.Path
         Files that were read.
     warnings : tuple of str
@@ -55,10 +57,10 @@ class Recording:
     warnings: tuple[str, ...] = ()
 
     def solved(self, with_fingerprints: bool) -> Calibration:
-        """Solve, check the streams, and solve again if a check is certain of an option.
+        """Solve, check the streams, and solve again if a check sets an option.
 
-        The snapshot and the inputs get the options of the result. With fingerprints, the inputs
-        also get name, size and SHA-256 of the files.
+        The snapshot and the inputs of the recording are changed: they get the options of the
+        result. With fingerprints, the inputs also get name, size and SHA-256 of the files.
         """
         with waiting_for("solving, and checking the streams"):
             checked_run = run(self.snapshot)
@@ -76,7 +78,7 @@ class Recording:
 
 
 def _ignored_options(config: CalibratorConfig, method: str) -> list[str]:
-    """Return warnings about options of dnlo that differ from their defaults, for other methods."""
+    """Return a warning for each option that the user has changed but the method does not use."""
     if method == "dnlo":
         return []
     defaults = CalibratorConfig()
@@ -88,23 +90,25 @@ def _ignored_options(config: CalibratorConfig, method: str) -> list[str]:
 
 
 def are_bags(paths: Sequence[Path | str]) -> bool:
-    """Whether paths are bags or parts of one rather than trajectory files. A URL is a bag.
+    """Return True if all paths are bags, False if all are trajectory files. A URL is a bag.
 
     Raises
     ------
     ConfigError
-        If only some are bags, there is only one file, or a path is given twice.
+        If only some paths are bags, if there is only one trajectory file, or if a path appears
+        twice.
     """
-    _refuse_twice(paths)
-    bags = [path for path in paths if isinstance(path, str)]
+    _refuse_repeated_paths(paths)
+    urls = [path for path in paths if isinstance(path, str)]
     local_bags = [path for path in paths if isinstance(path, Path) and _looks_like_bag(path)]
-    n_bags = len(bags) + len(local_bags)
+    n_bags = len(urls) + len(local_bags)
+    # A single path that does not exist is opened as a bag, which reports the error.
     if n_bags == len(paths) or (len(paths) == 1 and not Path(paths[0]).is_file()):
         return True
     if n_bags:
         _refuse_folders_without_bag(local_bags)
         raise ConfigError(
-            f"{[*bags, *local_bags][0]} is a bag, and another path is not: "
+            f"{[*urls, *local_bags][0]} is a bag, and another path is not: "
             "pass two trajectory files, or the parts of one bag"
         )
     if len(paths) == 1:
@@ -114,20 +118,20 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
     return False
 
 
-def _refuse_twice(paths: Sequence[Path | str]) -> None:
-    """Raise ConfigError if a path appears twice."""
+def _refuse_repeated_paths(paths: Sequence[Path | str]) -> None:
+    """Raise a ConfigError if a path appears twice."""
     for path, count in Counter(map(str, paths)).items():
         if count > 1:
             raise ConfigError(f"{path} appears twice: pass the file of each sensor")
 
 
 def _refuse_folders_without_bag(folders: Sequence[Path]) -> None:
-    """Raise ConfigError if a folder contains no file of a bag."""
+    """Raise a ConfigError if a folder contains no file of a bag."""
     for folder in folders:
         if folder.is_dir() and not any(map(_looks_like_file_of_bag, folder.iterdir())):
             raise ConfigError(
-                f"{folder} is a folder without a bag: pass a trajectory file "
-                "of each sensor, or a bag"
+                f"{folder} is a folder without a bag: pass a trajectory file of each sensor, or a "
+                "bag"
             )
 
 
@@ -144,7 +148,7 @@ def _looks_like_bag(path: Path) -> bool:
 
 
 def read_pair(arguments: Namespace, options: Options) -> Recording:
-    """Return the recording of the trajectory files of parent and child."""
+    """Read the trajectory files of parent and child, the two paths of the arguments."""
     files = read_files(arguments, arguments.paths, options)
     note(*files.repairs)
     inputs: Document = {}
@@ -163,7 +167,7 @@ def read_pair(arguments: Namespace, options: Options) -> Recording:
 
 
 class FilesRead(NamedTuple):
-    """Trajectories of files, notes on their repairs, and warnings for the result."""
+    """Trajectories of files, notes on repairs of their stamps, and warnings for the result."""
 
     trajectories: list[Trajectory]
     repairs: list[str]
@@ -171,15 +175,17 @@ class FilesRead(NamedTuple):
 
 
 def read_files(arguments: Namespace, paths: Sequence[Path | str], options: Options) -> FilesRead:
-    """Read trajectory files, and print notes on what the files do not state.
+    """Read trajectory files; print notes on what was recognised from their content.
 
     Parameters
     ----------
     arguments : argparse.Namespace
-        Options of the files. With two files, the options of one file override those of both.
+        Options of the files. With two files, an option of one file, such as ``--child-format``,
+        overrides the option of both files, ``--format``.
     paths : sequence of path-like
     options : dict
-        Kind of data of each sensor, "parent_measures" and "child_measures".
+        Options of the engine. Only "parent_measures" and "child_measures", the kinds of data, are
+        used.
     """
     from hand_eye_calib.formats.trajectory_files.reading import read_trajectory_files
 
@@ -197,18 +203,19 @@ def read_files(arguments: Namespace, paths: Sequence[Path | str], options: Optio
         repairs += [text.replace(str(path), path.name) for text in reading.repairs]
         warnings += [text.replace(str(path), path.name) for text in reading.warnings]
         for text in reading.guesses:
-            if stream:  # name the option of this file alone
+            # With two files, replace an option of both files by that of this file.
+            if stream:
                 text = re.sub(f"`({'|'.join(FILE_OPTIONS)})`", rf"`{stream}_\1`", text)
             note(text.replace(str(path), path.name))
     return FilesRead([reading.trajectory for reading in readings], repairs, warnings)
 
 
 def _refuse_options_of_two_files(arguments: Namespace) -> None:
-    """Raise ConfigError if an option of the parent's or the child's file is set."""
+    """Raise a ConfigError if an option of the parent's or the child's file is set."""
     for name in (f"{stream}_{name}" for stream in STREAMS for name in FILE_OPTIONS):
         if getattr(arguments, name):
             raise ConfigError(
-                f"--{flag(name)} is for two files; a rig needs the option for all files"
+                f"--{flag(name)} is for two files; for a rig, set the option for all files"
             )
 
 

@@ -1,4 +1,4 @@
-"""Report pages, ``report.html``, of a calibration or of a session of the node."""
+"""Write ``report.html`` for a calibration or for a session of the node."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,16 +20,16 @@ REPORT = "report.html"
 def write_report(
     directory: Path, calibration: Calibration, snapshot: "Snapshot | None", inputs: Document
 ) -> None:
-    """Write the report of a result.
+    """Write the report of a result into a directory, and print its path.
 
     Parameters
     ----------
     directory : pathlib.Path
     calibration : Calibration
     snapshot : Snapshot or None
-        Poses and options of the result.
+        Poses and options of the result; None for the stops of an arm.
     inputs : dict
-        Origin of the data in plain values.
+        Origin of the data, such as paths and topics, in plain values.
     """
     from hand_eye_calib.offline.report.report import render
 
@@ -37,16 +37,17 @@ def write_report(
 
 
 def write_page(directory: Path, page: Callable[[], str]) -> None:
-    """Write the page that ``page()`` renders, and print its path."""
+    """Write the HTML that ``page()`` returns to ``report.html``, and print the path."""
     with waiting_for(f"writing {REPORT}"):
         path = save_text(directory / REPORT, page())
     note(f"wrote {path}")
 
 
 def write_session_report(directory: Path, session: SessionResult) -> None:
-    """Check the streams of a session, and write its result and its report with the findings.
+    """Check the streams of a session, then write its result and its report with the findings.
 
-    The checks are repeated because those of the session may be older than its result.
+    The last check of the session may be older than its result, so the check is repeated. Without
+    the option ``report``, nothing is written.
     """
     if not session.with_report:
         return
