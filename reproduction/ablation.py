@@ -43,7 +43,7 @@ def _with(**numbers: object) -> dict[str, Any]:
 VARIANTS: dict[str, dict[str, Any]] = {
     "outliers": {"without": ("outliers", "tails")},
     "heavy tails": {"without": ("tails",)},
-    "time-correlated errors": {"without": ("lasting",)},
+    "time-correlated errors": {"without": ("time_correlated",)},
     "rotation about a world's origin": _with(centre_ratio=0.0),
     "systematic errors": {"systematic": ()},
     "bias": {"systematic": ("scale", "time")},

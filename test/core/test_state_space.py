@@ -6,7 +6,7 @@ import pytest
 from hand_eye_calib.core.base.blocks import Blocks
 from hand_eye_calib.core.noise import reml
 from hand_eye_calib.core.noise.normal import Factor, NormalEquations
-from hand_eye_calib.core.noise.outliers import chi_squares, innovations
+from hand_eye_calib.core.noise.outliers import chi_squares, innovation_chi_squares
 from hand_eye_calib.core.noise.state_space import Posterior, StateSpace
 
 N_POSES = 15
@@ -24,12 +24,12 @@ def space_of(seed=1, cut=(4,)):
     adjoints = np.eye(6) + 0.2 * random.standard_normal((n, 6, 6))
     directions = random.standard_normal((N_POSES, 6, 9))
     directions[:, :, :3] = np.eye(6)[:, :3]
-    ahead = np.zeros((n, 6, N_STATES - 6))
-    behind = np.zeros((n, 6, N_STATES))
-    behind[:, :, :6] = adjoints
-    ahead[:, :, :9] = directions[1:]
-    behind[:, :, 6:15] = adjoints @ directions[:-1]
-    behind[:, :, 15] = random.standard_normal((n, 6))
+    h1_processes = np.zeros((n, 6, N_STATES - 6))
+    h0 = np.zeros((n, 6, N_STATES))
+    h0[:, :, :6] = adjoints
+    h1_processes[:, :, :9] = directions[1:]
+    h0[:, :, 6:15] = adjoints @ directions[:-1]
+    h0[:, :, 15] = random.standard_normal((n, 6))
     lever = random.standard_normal((3, 6))
     twists = random.standard_normal((N_POSES, 6))
     bases = np.diag([1.0, 1, 1, 0, 0, 0]), np.diag([0, 0, 0, 1.0, 1, 1]) + lever.T @ lever
@@ -41,8 +41,8 @@ def space_of(seed=1, cut=(4,)):
         intervals_s=intervals_s,
         walk_factors=intervals_s / 0.1,
         columns=columns,
-        ahead=ahead,
-        behind=behind,
+        h1_processes=h1_processes,
+        h0=h0,
         white_bases=(bases[0][None], bases[1][None], twists[:, :, None] * twists[:, None]),
         walk_bases=bases,
         group_sizes=SIZES,
@@ -64,7 +64,7 @@ LEVELS = np.random.default_rng(2).uniform(-1.0, 1.0, N_LEVELS)
 def dense_covariance(space, levels):
     """V (6 n, 6 n) by its definition, increments that are no evidence included."""
     variances = np.exp(levels)
-    n, _, d = space.behind.shape
+    n, _, d = space.h0.shape
     prior = np.zeros((N_POSES, d, N_POSES, d))
     for pose in range(N_POSES):
         bases = [basis[pose if len(basis) > 1 else 0] for basis in space.white_bases]
@@ -76,8 +76,8 @@ def dense_covariance(space, levels):
         prior[:, state, :, state] = variance * np.exp(-np.abs(times[:, None] - times) / tau_s)
     entries = np.zeros((n, 6, N_POSES, d))
     for i in range(n):
-        entries[i, :, i + 1, :6], entries[i, :, i + 1, 6:] = np.eye(6), space.ahead[i]
-        entries[i, :, i] = -space.behind[i]
+        entries[i, :, i + 1, :6], entries[i, :, i + 1, 6:] = np.eye(6), space.h1_processes[i]
+        entries[i, :, i] = -space.h0[i]
     entries = entries.reshape(6 * n, -1)
     walk = variances[3] * space.walk_bases[0] + variances[4] * space.walk_bases[1]
     return entries @ prior.reshape(N_POSES * d, -1) @ entries.T + np.kron(
@@ -141,7 +141,7 @@ def test_derivatives_of_the_likelihood_are_the_numerical_ones():
 
 def test_surprises_are_what_leaving_one_out_makes_of_it():
     space = space_of(cut=())
-    of_walk, _ = innovations(Posterior(space, LEVELS), np.zeros(N_POSES, dtype=bool))
+    of_walk, _ = innovation_chi_squares(Posterior(space, LEVELS), np.zeros(N_POSES, dtype=bool))
     V = dense_covariance(space, LEVELS)
     J, r = parameters_and_residuals(space)
     inverse = np.linalg.inv(V)
@@ -152,7 +152,7 @@ def test_surprises_are_what_leaving_one_out_makes_of_it():
         assert surprise == pytest.approx(u[i] @ np.linalg.solve(own, u[i]), rel=1e-5)
     # An increment that is no evidence is judged by the same number.
     without = space_of(cut=(6,))
-    again, _ = innovations(Posterior(without, LEVELS), np.zeros(N_POSES, dtype=bool))
+    again, _ = innovation_chi_squares(Posterior(without, LEVELS), np.zeros(N_POSES, dtype=bool))
     assert again[6] == pytest.approx(of_walk[6], rel=1e-5)
 
 

@@ -3,16 +3,30 @@
 Model, for poses i = 0 ... N - 1 and the increments from pose i to pose i + 1:
 
     e_i + J_i beta = c_{i+1} - Ad(B_i^-1) c_i + w_i
-    c_i = v_i + sum_k M_ik g_ik,      g_{i+1,k} = phi_ik g_ik + q_ik
+    c_i = v_i + sum_k M_ik g_ik
+    g_{i+1,k} = phi_ik g_ik + q_ik
 
-- e_i (6,): residual of an increment; B_i: motion of the child; J_i: derivatives of e_i.
-- beta: xi in ``X exp(xi)``, and the systematic errors scale, bias, time offset and bias of rates.
-- c_i (6,): error of a pair of poses in the child's frame; w_i: step of a random walk.
-- v_i: white error; g_ik: first-order Gauss-Markov processes; together the state x_i.
+- e_i (6,): residual ``Log(B_i^-1 X^-1 A_i X)`` of the motions A_i of the parent and B_i of the
+  child. All vectors of six are in the child's frame: translation (m), then rotation (rad).
+- beta (p,): corrections of the present estimate: xi of ``X Exp(xi)``, then the systematic errors
+  (scale, bias per metre of path, time offset, bias of angular rates).
+- J_i (6, p): derivatives of e_i with respect to beta.
+- c_i (6,): error of a pair of poses, one of each sensor at the same instant. v_i (6,): its white
+  part.
+- g_ik: time-correlated errors, which are first-order Gauss-Markov processes; q_ik: their white
+  driving noise. M_ik is the matrix from process k to c_i.
+- w_i (6,): step of a random walk, the drift of odometry.
+- x_i (d,): state of pose i, which is v_i followed by all g_ik.
 
-The states x and the walk w are marginalised exactly. The levels, which are the logarithms of all
-variances and time constants, are estimated by restricted maximum likelihood (REML), for which beta
-is marginalised, too. beta is estimated by generalised least squares at these levels.
+v, g and w are Gaussian. Their variances and the time constants of g are unknown: a *level* is the
+logarithm of one of them. The estimate has three parts:
+
+1. The states x and the walk w are marginalised exactly, by linear algebra in time linear in N.
+2. The levels maximise the restricted likelihood (REML), in which beta is marginalised, too.
+3. beta is estimated by generalised least squares at these levels, and e is linearised again.
+
+Jumps, outlier poses and the choice of processes and systematic errors are decided between these
+parts, in the order of the stages.
 
 Reading order: :mod:`~hand_eye_calib.core.noise.increments` (e and J),
 :mod:`~hand_eye_calib.core.noise.noise_model` (errors that are in the model),

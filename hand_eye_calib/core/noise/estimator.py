@@ -1,11 +1,10 @@
 """Adaptive estimator of X by generalised least squares.
 
-The noise model is estimated together with X, so that all increments are used with the right
-weights. White noise favours long baselines, drift favours short ones, time-correlated errors favour
-neither; a jump cuts the trajectory. The equations are in
-:mod:`~hand_eye_calib.core.noise.increments` and :mod:`~hand_eye_calib.core.noise.noise_model`, and
-the search is in :mod:`~hand_eye_calib.core.noise.stages`. docs/adaptive.md has the derivation and
-tests.
+The noise model is estimated together with X, so that the likelihood weights all increments. No
+distance between poses (reference) has to be chosen: white noise would need long distances, drift
+would need short ones. The model is in :mod:`hand_eye_calib.core.noise`, the stages of the search
+are in :mod:`~hand_eye_calib.core.noise.stages`. This module runs the stages and returns the
+solution with its noise in words. docs/adaptive.md has the derivation and tests.
 """
 
 from __future__ import annotations
@@ -53,56 +52,58 @@ from hand_eye_calib.core.noise.stages import (
 from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 from hand_eye_calib.core.results.records import CorrelatedError, Noise
 
-# Stages that a quick solve leaves out.
-_SLOW_STAGES = frozenset({"tails", "lasting"})
+# Stages that a quick solve skips.
+_SLOW_STAGES = frozenset({"tails", "time_correlated"})
 
-# Stages that find noise and outliers: noise, outliers, tails. A search without time-correlated
-# errors starts from their fit.
+# Stages noise, outliers and tails. If the search does not settle, it is repeated from their fit
+# without time-correlated errors.
 _FIRST_STAGES = STAGES[:3]
 _LAST_STAGES = STAGES[3:]
 
-# A systematic error is reported beyond this number of standard deviations.
-PLAIN_SIGMAS = 3.0
+# A systematic error is reported if it exceeds this number of standard deviations.
+MIN_REPORTED_SIGMAS = 3.0
 
 # Smallest jitter of stamps (ms) that is reported.
-_NOTABLE_JITTER_MS = 0.1
+_MIN_REPORTED_JITTER_MS = 0.1
 
 _FIXED_TO = {"body": "the child's body", "world": "the parent's world"}
 
 
 class NoiseModelError(InputError):
-    """No noise model fits the poses: a matrix is singular within rounding."""
+    """No noise model fits the poses, because a matrix is not positive definite to rounding."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelSolution:
-    """Common part of the solutions for poses and for positions.
+    """Common fields of the solutions for poses and for positions.
 
     Attributes
     ----------
     model : NoiseModel
     levels : (m,) array
-        Log levels of the model.
+        Levels of the model: log variances and log time constants.
     parameters, parameter_sigmas : (8 or more,) arrays
-        Parameters of all systematic errors, see
+        Estimates of all systematic errors, see
         :data:`~hand_eye_calib.core.noise.increments.PARAMETERS`, and their standard deviations;
-        zero for absent errors.
+        zero for errors that are absent.
     scale, scale_sigma : float
-        Factor from the child's lengths to the parent's, and its standard deviation.
+        Factor that converts the child's lengths to the parent's, and its standard deviation.
     time_offset_s, time_offset_sigma_s : float
-        Seconds to add to the child's stamps, and their standard deviation.
+        Seconds to be added to the child's stamps, and their standard deviation.
     jumps : (n,) bool array
-        Increments (from pose i to i + 1) across which a trajectory jumped for good.
+        Increments (from pose i to i + 1) across which a trajectory jumps and does not return.
     spikes : (n + 1,) bool array
-        Poses that are wrong by themselves, and left out.
+        Outlier poses, which were not used.
     misfit : float
-        Weighted squared residual over its degrees of freedom. The covariance contains this factor.
+        Weighted squared residual over its degrees of freedom. The covariance contains this factor
+        if it exceeds 1.
     part_products : (K, p + 1, p + 1) array
-        Contributions of the parts of the recording, see
+        Contributions of blocks of time to the normal equations, see
         :func:`~hand_eye_calib.core.noise.state_space.Posterior.part_products`.
     objective : float
         Negative log likelihood.
     converged : bool
+        Whether X has settled.
     """
 
     model: NoiseModel
@@ -121,7 +122,7 @@ class ModelSolution:
     converged: bool
 
     def events(self, stamps_ns: IntArray) -> list[str]:
-        """Describe jumps and outliers, with the times (s) of the first ones."""
+        """Return sentences about jumps and outliers, with the times (s) of the first five."""
         stamps_s = np.asarray(stamps_ns * 1e-9, dtype=np.float64)
         jumps_s = stamps_s[1:][self.jumps]
         outliers_s = stamps_s[self.spikes]
@@ -136,7 +137,7 @@ class ModelSolution:
 
 
 def _first_times(times_s: FloatArray) -> str:
-    """List up to five times (s)."""
+    """Return up to five times (s) as text."""
     times = ", ".join(f"{time_s:.3f}" for time_s in times_s[:5].tolist())
     return f"{times} ..." if len(times_s) > 5 else times
 
@@ -149,16 +150,17 @@ class AdaptiveSolution(ModelSolution):
     ----------
     T_parent_child : (4, 4) array
     cov_parent_child_in_child : (6, 6) array
-        Covariance of xi = (rho, phi) in ``X exp(xi)`` under the model, systematic errors and misfit
-        accounted for.
+        Covariance of xi = (rho, phi) in ``X exp(xi)``. It includes the uncertainty of systematic
+        errors, and the misfit.
     unseen : (6, U) array
-        Directions of xi for which no increment is evidence.
+        Unit vectors of xi along which no increment has information.
     weights : (n + 1,) array
-        Of the poses' white errors; other than 1 if tails are heavy.
-    is_noise_dominated : bool
-        Whether single poses are noisier than the rotation between them: only some were used.
+        Weights of the white errors of poses; other than 1 only if the errors have heavy tails.
     metres_per_pose : float
-        Path of the parent from pose to pose.
+        Mean distance (m) that the parent travels from pose to pose.
+    is_noise_dominated : bool
+        Whether the noise of single poses exceeds the rotation between them, so that only every k-th
+        pose was used.
     """
 
     T_parent_child: FloatArray
@@ -170,40 +172,42 @@ class AdaptiveSolution(ModelSolution):
 
     @property
     def systematic(self) -> str:
-        """Systematic errors beyond doubt, joined by ``+``; ``none`` without any."""
-        is_beyond_doubt = np.abs(self.parameters) > PLAIN_SIGMAS * self.parameter_sigmas
-        names = [name for name, columns in PARAMETERS.items() if is_beyond_doubt[columns].any()]
+        """Names of the significant systematic errors, joined by ``+``; ``none`` without any."""
+        is_significant = np.abs(self.parameters) > MIN_REPORTED_SIGMAS * self.parameter_sigmas
+        names = [name for name, columns in PARAMETERS.items() if is_significant[columns].any()]
         return "+".join(names) or "none"
 
     @property
     def rate_bias(self) -> FloatArray:
-        """Bias of rates (2, 3) in rad/s along the child's axes, and its standard deviations.
+        """Bias of the child's angular rates minus that of the parent's.
 
-        It is the bias of the child's rates minus the bias of the parent's rates.
+        The array is (2, 3) in rad/s along the child's axes: values, then standard deviations.
         """
         return np.stack([self.parameters[RATE], self.parameter_sigmas[RATE]])
 
     def rotation_variance(self, n_intervals: IntArray | int) -> FloatArray:
-        """Variance (rad^2) per axis of the rotation over a number of typical intervals."""
+        """Return the variance (rad^2) per axis of the measured rotation over some intervals.
+
+        It is the variance of the error, for a number of typical intervals between poses.
+        """
         white, walk = np.exp(self.levels[[ROTATION, WALK_ROTATION]])
         variance = 2 * white + n_intervals * walk
-        for slow in self.noise.lasting:
-            if slow.part == "rotation":
-                ratio = n_intervals * self.model.interval_s / slow.tau_s
-                variance = variance - 2 * slow.sigma**2 * np.expm1(-ratio)
+        for process in self.noise.lasting:
+            if process.part == "rotation":
+                ratio = n_intervals * self.model.interval_s / process.tau_s
+                variance = variance - 2 * process.sigma**2 * np.expm1(-ratio)
         return np.asarray(variance)
 
     @cached_property
     def noise(self) -> Noise:
-        """Standard deviations per axis, and names of systematic errors."""
+        """Noise in numbers: standard deviations per axis, and names of systematic errors."""
         sigmas = fast_sigmas(self.levels)
-        slow_sigmas = np.exp(0.5 * self.levels)[VARIANCES].tolist()
+        process_sigmas = np.exp(0.5 * self.levels[VARIANCES])
+        taus_s = np.exp(self.levels[TIME_CONSTANTS])
         lasting = []
-        for process, sigma, level in zip(
-            self.model.slow, slow_sigmas, self.levels[TIME_CONSTANTS], strict=True
+        for (kind, part), sigma, tau_s in zip(
+            self.model.processes, process_sigmas.tolist(), taus_s.tolist(), strict=True
         ):
-            kind, part = process
-            tau_s = float(np.exp(level))
             lasting.append(CorrelatedError(kind=kind, part=part, sigma=sigma, tau_s=tau_s))
         return Noise(
             in_words=(),
@@ -217,14 +221,17 @@ class AdaptiveSolution(ModelSolution):
         )
 
     def describe(self, stamps_ns: IntArray) -> Noise:
-        """Return the noise in numbers and in words, with the times of jumps and outliers."""
+        """Return the noise in numbers and in words, with the times of jumps and outliers.
+
+        ``stamps_ns`` (N,) are the stamps of the poses.
+        """
         sentences = self._noise_in_words() + self._systematic_in_words() + self.events(stamps_ns)
         return replace(self.noise, in_words=tuple(sentences))
 
     def _noise_in_words(self) -> list[str]:
-        """Describe white noise, drift, time-correlated errors and jitter."""
+        """Return sentences about white noise, drift, time-correlated errors and jitter."""
         sigmas = fast_sigmas(self.levels)
-        lasting = self.noise.lasting
+        processes = self.noise.lasting
         white = angle(sigmas.rotation_rad)
         drift = f"{angle(sigmas.walk_rotation_rad)} from pose to pose"
         if self.metres_per_pose:
@@ -234,26 +241,27 @@ class AdaptiveSolution(ModelSolution):
             turned_after_1_m = angle(sigmas.walk_rotation_rad / root_metres)
             drift = f"{after_1_m} and {turned_after_1_m} after 1 m, ten times that after 100 m"
         else:
-            lasting = tuple(slow for slow in lasting if slow.part == "rotation")
+            # Streams of rotations have no translations.
+            processes = tuple(process for process in processes if process.part == "rotation")
         sentences = [
             f"Noise: {white} per axis of each pose (both sensors together).",
             f"Drift: {drift}.",
-            *map(_slow_in_words, lasting),
+            *map(_process_in_words, processes),
         ]
         jitter_ms = 1e3 * sigmas.jitter_s
-        if jitter_ms > _NOTABLE_JITTER_MS:
+        if jitter_ms > _MIN_REPORTED_JITTER_MS:
             sentences.append(f"stamps jitter by {jitter_ms:.2g} ms")
         return sentences
 
     def _systematic_in_words(self) -> list[str]:
-        """Describe the systematic errors beyond doubt."""
+        """Return sentences about the significant systematic errors."""
         systematic = self.systematic.split("+")
         sentences = []
         if "scale" in systematic:
             percent = 100 * (self.scale - 1)
             sigma = 100 * self.scale_sigma
             size = f"{abs(percent):.2f} +/- {sigma:.2g} %"
-            # A scale above 1 lengthens the child: its lengths are too short.
+            # A scale above 1 makes the child's lengths longer: as measured, they are too short.
             comparison = "shorter" if percent > 0 else "longer"
             sentences.append(f"the child's lengths are {size} {comparison} than the parent's")
         if "bias" in systematic:
@@ -276,14 +284,15 @@ class AdaptiveSolution(ModelSolution):
         return sentences
 
 
-def _slow_in_words(slow: CorrelatedError) -> str:
-    """Describe a time-correlated error."""
-    if slow.part == "scale":
-        return f"the scale drifts by {100 * slow.sigma:.2g} % within {slow.tau_s:.2g} s"
-    if slow.part == "direction":
-        return f"the direction of travel drifts by {angle(slow.sigma)} within {slow.tau_s:.2g} s"
-    size = length(slow.sigma) if slow.part == "translation" else angle(slow.sigma)
-    return f"errors of {size} per axis last for {slow.tau_s:.2g} s, fixed to {_FIXED_TO[slow.kind]}"
+def _process_in_words(process: CorrelatedError) -> str:
+    """Return a sentence about a time-correlated error."""
+    duration = f"{process.tau_s:.2g} s"
+    if process.part == "scale":
+        return f"the scale drifts by {100 * process.sigma:.2g} % within {duration}"
+    if process.part == "direction":
+        return f"the direction of travel drifts by {angle(process.sigma)} within {duration}"
+    size = length(process.sigma) if process.part == "translation" else angle(process.sigma)
+    return f"errors of {size} per axis last for {duration}, fixed to {_FIXED_TO[process.kind]}"
 
 
 def solve(
@@ -304,14 +313,16 @@ def solve(
     Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
         Poses of both sensors in their own worlds at these stamps.
     systematic : sequence of str
-        Systematic errors in the model.
+        Systematic errors in the model, see
+        :data:`~hand_eye_calib.core.noise.increments.PARAMETERS`.
     quick : bool
-        Stop at white noise, drift and outliers: neither time-correlated errors nor heavy tails.
+        Skip the stages for heavy tails and time-correlated errors.
     is_clock_free : bool
         Whether the clock offset was estimated from these poses. If so, it has no prior.
     without : collection of str
-        Names of :data:`~hand_eye_calib.core.noise.stages.STAGES` to leave out.
+        Names of :data:`~hand_eye_calib.core.noise.stages.STAGES` that are skipped.
     tuning : Tuning
+        Numbers of the search.
 
     Returns
     -------
@@ -320,7 +331,7 @@ def solve(
     Raises
     ------
     NoiseModelError
-        If no noise model fits the poses to rounding.
+        If no noise model fits the poses, because a matrix is not positive definite to rounding.
     """
     problem = Problem(
         streams=Streams((stamps_ns - stamps_ns[0]) * 1e-9, Ts_pw_p, Ts_cw_c),
@@ -330,7 +341,7 @@ def solve(
         tuning=tuning,
     )
     try:
-        return _solved(problem)
+        return _search(problem)
     except np.linalg.LinAlgError:
         raise NoiseModelError(
             "no noise model fits these poses: check units, jumps and stamps, or use method dnlo "
@@ -338,41 +349,46 @@ def solve(
         ) from None
 
 
-def _solved(problem: Problem) -> AdaptiveSolution:
-    """Pass all stages; leave out poses or time-correlated errors if the search needs it."""
+def _search(problem: Problem) -> AdaptiveSolution:
+    """Run all stages, and return the solution.
+
+    Single poses of a camera that observes a target may be noisier than the rotation between them.
+    Then the search is repeated with every k-th pose. If X does not settle, the last stages are
+    repeated without time-correlated errors.
+    """
     workspace = Workspace(problem)
-    first = _passed(workspace, start(problem), _FIRST_STAGES)
-    # A camera that observes a target: its errors repeat, and exceed the rotation between poses.
+    first = _run_stages(_FIRST_STAGES, workspace, start(problem))
     if first.model.centre != "sensors" and problem.is_noisy(first):
-        kept = _strided(problem, first)
+        kept = _strided_poses(problem, first)
         if len(kept) < len(problem.streams):
             fewer = replace(problem, streams=problem.streams[kept])
-            return _at_all_poses(_solved(fewer), kept, first.outliers.spikes)
-    fit = _passed(workspace, first, _LAST_STAGES)
+            return _expand_to_all_poses(_search(fewer), kept, first.outliers.spikes)
+    fit = _run_stages(_LAST_STAGES, workspace, first)
     if not is_settled(workspace, fit):
-        workspace = Workspace(replace(problem, without=problem.without | {"lasting"}))
-        fit = _passed(workspace, first, _LAST_STAGES)
+        workspace = Workspace(replace(problem, without=problem.without | {"time_correlated"}))
+        fit = _run_stages(_LAST_STAGES, workspace, first)
     return _solution(workspace, fit)
 
 
-def _passed(workspace: Workspace, fit: Fit, stages: Sequence[Stage]) -> Fit:
-    """Return the fit after some stages."""
+def _run_stages(stages: Sequence[Stage], workspace: Workspace, fit: Fit) -> Fit:
+    """Return the fit after these stages, except those that the problem skips."""
     for stage in stages:
         if stage.__name__ not in workspace.problem.without:
             fit = stage(workspace, fit)
     return fit
 
 
-def _strided(problem: Problem, fit: Fit) -> IntArray:
-    """Return every k-th sound pose, for the smallest k whose rotation exceeds its noise clearly.
+def _strided_poses(problem: Problem, fit: Fit) -> IntArray:
+    """Return the indices of every k-th pose that is no outlier.
 
-    If no stride reaches this, it is the longest one that keeps enough poses.
+    The stride k is the shortest one in ``tuning.strides`` for which the rotation over k poses
+    clearly exceeds the rotation noise. It is at most the longest stride that keeps enough poses.
     """
     tuning = problem.tuning
     sound_poses = np.flatnonzero(~fit.outliers.spikes)
     longest_stride = 1
     for stride in tuning.strides:
-        # A solution needs some fifty poses.
+        # A solution needs about 50 poses.
         if len(sound_poses) >= stride * 50:
             longest_stride = max(stride, longest_stride)
     noise_rad = np.exp(0.5 * fit.levels[ROTATION])
@@ -384,8 +400,13 @@ def _strided(problem: Problem, fit: Fit) -> IntArray:
     return sound_poses[::longest_stride]
 
 
-def _at_all_poses(fewer: AdaptiveSolution, kept: IntArray, spikes: BoolArray) -> AdaptiveSolution:
-    """Expand the solution of a subset of poses to all poses."""
+def _expand_to_all_poses(
+    fewer: AdaptiveSolution, kept: IntArray, spikes: BoolArray
+) -> AdaptiveSolution:
+    """Expand the arrays of a solution for the subset ``kept`` (indices) to all poses.
+
+    ``spikes`` (N,) are the outliers that were detected in all poses.
+    """
     jumps = np.zeros(len(spikes) - 1, dtype=bool)
     spikes = spikes.copy()
     weights = np.ones(len(spikes))
@@ -396,25 +417,26 @@ def _at_all_poses(fewer: AdaptiveSolution, kept: IntArray, spikes: BoolArray) ->
 
 
 def _solution(workspace: Workspace, fit: Fit) -> AdaptiveSolution:
-    """Return the solution one step from where the search ended."""
+    """Return the solution: the last fit of the search, after one more step of all parameters."""
     problem = workspace.problem
     columns = problem.columns
     posterior = workspace.posterior(fit)
     normal = posterior.normal
     final = fit.moved(normal.step, columns)
     misfit = float(normal.cost) / _degrees_of_freedom(problem, fit)
-    # A misfit below 1 does not make the evidence of long baselines more certain.
+    # A misfit below 1 does not reduce the covariance: it is dominated by short distances between
+    # poses, and X by long ones.
     covariance = max(misfit, 1.0) * normal.covariance
     sigmas = np.zeros(N_SYSTEMATIC)
     sigmas[columns] = np.sqrt(np.diag(covariance)[6:])
     is_present = fit.sigmas > problem.tuning.absent_sigma
     parameters = np.where(is_present, final.parameters, 0.0)
     sigmas = np.where(is_present, sigmas, 0.0)
-    # Errors fixed to the body that last about as long as the recording are not detected: X contains
-    # their mean. Widen the translation by a share of the variance of the detected ones, which are
-    # all of translation.
+    # Translation errors fixed to the body that are constant for about as long as the recording are
+    # not detected, and X contains their mean. Their variance is assumed to be a share of the
+    # variance of the detected ones.
     undetected = np.zeros(6)
-    for (kind, _), level in zip(fit.model.slow, fit.levels[VARIANCES], strict=True):
+    for (kind, _), level in zip(fit.model.processes, fit.levels[VARIANCES], strict=True):
         if kind == "body":
             undetected[:3] += problem.tuning.undetected_share * np.exp(level)
     steps = np.diff(se3.translation_of(problem.streams.Ts_pw_p), axis=0)
@@ -442,12 +464,12 @@ def _solution(workspace: Workspace, fit: Fit) -> AdaptiveSolution:
 
 
 def _degrees_of_freedom(problem: Problem, fit: Fit) -> int:
-    """Number of residuals that are evidence, less the parameters; at least 1."""
+    """Return the number of residuals that are used, less that of parameters; at least 1."""
     streams = problem.streams
     positions = np.concatenate(
         [se3.translation_of(streams.Ts_pw_p), se3.translation_of(streams.Ts_cw_c)], axis=1
     )
     # Streams of rotations alone have constant positions.
     n_rows = 6 if np.ptp(positions, axis=0).any() else 3
-    n_evidence = int((~fit.outliers.jumps).sum()) - int(fit.outliers.spikes.sum())
-    return max(n_rows * n_evidence - 6 - len(problem.columns), 1)
+    n_used = int((~fit.outliers.jumps).sum()) - int(fit.outliers.spikes.sum())
+    return max(n_rows * n_used - 6 - len(problem.columns), 1)

@@ -1,21 +1,24 @@
-"""Increments of the error between two trajectories: residuals and their derivatives.
+"""Residuals of increments between poses, and their derivatives.
 
-Errors act on the right, in each sensor's own frame: ``T_pw_p Exp(a)`` and ``T_cw_c Exp(b)``. The
-common error in the child's frame is ``c = Ad(X^-1) a - b``. For the motions A, B between poses i
-and i + 1, errors w of the motions themselves, and ``X Exp(-xi)`` in place of X,
+The errors a of the parent and b of the child act on the right, in each sensor's own frame: the
+measured poses are ``T_pw_p Exp(a)`` and ``T_cw_c Exp(b)``. Their common error in the child's frame
+is ``c = Ad(X^-1) a - b``. A_i and B_i are the measured motions of parent and child from pose i to
+pose i + 1, w_i is the error of the motions themselves, and X is the present estimate, so that
+``X Exp(xi)`` is the true extrinsic. To first order,
 
-    e_i = Log(B_i^-1 X^-1 A_i X) = c_{i+1} - Ad(B_i^-1) c_i + w_i + (I - Ad(B_i^-1)) xi
+    e_i = Log(B_i^-1 X^-1 A_i X)
+    e_i + (I - Ad(B_i^-1)) xi = c_{i+1} - Ad(B_i^-1) c_i + w_i
 
-to first order. Systematic errors add columns of their own: a scale, a bias per metre of the path, a
-time offset, a bias of rates.
+The factor of xi is the derivative of e_i. Systematic errors have derivatives, too: a scale, a bias
+per metre of path, a time offset, a bias of angular rates.
 
-Derivatives are taken at poses without the errors estimated so far; the residuals contain these
-errors. Derivatives at noisy poses would be noisy themselves if noise is not much smaller than the
-motion from pose to pose, and would bias X (errors in variables).
+Derivatives are computed at poses from which the errors estimated so far were removed; the residuals
+contain these errors. Derivatives at noisy poses are noisy, too, and would bias X if the noise is
+not much smaller than the motion from pose to pose (errors in variables).
 
-The columns use steps without each increment's own noise: the mean of the steps two before and two
-after. Steps with the noise of the residuals would bias the scale: a child whose steps are smaller
-than their noise would seem to shrink.
+For the same reason, the derivatives with respect to scale and bias use smoothed steps of the child,
+which do not contain the noise of the increment's own residual. Otherwise the scale would be
+underestimated if steps are smaller than their noise.
 """
 
 from __future__ import annotations
@@ -33,29 +36,31 @@ from hand_eye_calib.core.geometry.trajectory import Columns
 from hand_eye_calib.core.noise.normal import transposed
 from hand_eye_calib.core.pairing.motion_pairs import motions
 
-# Columns of the parameters of each systematic error:
-# - scale: share by which the child's lengths are short;
+# Indices of the parameters of each systematic error:
+# - scale: the child's lengths must be multiplied by 1 + scale;
 # - bias: error per metre of the child's path, along the axes of the child (m/m);
-# - time: by how much the child's stamps are late (s);
-# - rate: bias of the child's rates minus bias of the parent's, along the child's axes (rad/s).
+# - time: delay of the child's stamps (s); positive if they are late;
+# - rate: bias of the child's angular rates minus bias of the parent's, along the child's axes
+#   (rad/s).
 PARAMETERS = {"scale": [0], "bias": [1, 2, 3], "time": [4], "rate": [5, 6, 7]}
 (SCALE,), BIAS, (TIME,), RATE = PARAMETERS.values()
 N_SYSTEMATIC = sum(map(len, PARAMETERS.values()))
 
-# Systematic errors of poses, of rotations, and of rotations that are integrated rates.
+# Systematic errors in the model for poses, for rotations, and for rotations that are integrated
+# angular rates.
 SYSTEMATIC = ("scale", "bias", "time")
 SYSTEMATIC_OF_ROTATIONS = ("time",)
 SYSTEMATIC_OF_RATES = ("time", "rate")
 
-# Parts of a step that may drift: its length and its direction.
+# Parts of a step of the child that may drift: its length (scale) and its direction.
 PATH_PARTS = ("scale", "direction")
 
-# Smallest variance (m^2) of steps against their neighbours. Smaller ones are rounding.
+# Lower bound of the variance (m^2) between steps and their neighbours. Smaller ones are rounding.
 _ROUNDING_M2 = 1e-18
 
 
 def parameter_columns(names: Iterable[str]) -> list[int]:
-    """Return the columns of the parameters of some systematic errors."""
+    """Return the indices of the parameters of the named systematic errors, see PARAMETERS."""
     columns = []
     for name in names:
         columns += PARAMETERS[name]
@@ -69,8 +74,9 @@ class Streams(Columns):
     Attributes
     ----------
     stamps_s : (N,) array
-        Since the first stamp.
+        Seconds since the first stamp.
     Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
+        Poses of parent and child in their own worlds.
     """
 
     stamps_s: FloatArray
@@ -91,30 +97,31 @@ class Streams(Columns):
     def twists(self) -> FloatArray:
         """Velocity (N, 6), m/s and rad/s, of the child in its own frame.
 
-        It is the mean of the middle two of the four motions nearest to a pose, component by
-        component. So a jump does not count as velocity.
+        Each component is the median of the four motions nearest to the pose, so that a jump does
+        not count as velocity.
         """
         rates = se3.log(self.motions_c) / np.diff(self.stamps_s)[:, None]
         padded = np.pad(rates, ((2, 2), (0, 0)), mode="edge")
         windows = np.lib.stride_tricks.sliding_window_view(padded, 4, axis=0)
-        first, second, third, fourth = np.moveaxis(windows, 2, 0)
-        lower = np.maximum(np.minimum(first, second), np.minimum(third, fourth))
-        upper = np.minimum(np.maximum(first, second), np.maximum(third, fourth))
-        return 0.5 * (lower + upper)
+        return np.asarray(np.median(windows, axis=2))
 
 
 @dataclass(frozen=True, eq=False)
 class Course(Columns):
-    """Motion of the child without each increment's own noise, summed over time.
+    """Smoothed motion of the child, for derivatives with respect to systematic errors.
+
+    The path and the products are sums over time, so that differences between any two poses are
+    those of the increment between them.
 
     Attributes
     ----------
     twists : (N, 6) array
         Velocity (m/s, rad/s) of the child in its own frame.
     path : (N, 3) array
-        Position (m) of the child in its world, from the first pose on.
+        Smoothed position (m) of the child in its world, relative to the first pose.
     along : (N, 3, 3) array
-        Sum of the metres travelled by the child times the axes of the child in its world.
+        Sum over all steps so far of the length of the step (m) times the child's orientation. Its
+        product with a bias per metre is the error of the position.
     """
 
     twists: FloatArray
@@ -125,65 +132,69 @@ class Course(Columns):
 def course_of(streams: Streams, T_parent_child: FloatArray, noise_m2: float = np.inf) -> Course:
     """Smooth the motion of the child.
 
-    The child's steps are the mean of both streams. The metres travelled come from the
-    parent's stream, which has no bias per metre.
+    The smoothed steps are the mean of the child's steps according to both streams. The lengths of
+    steps come from the parent's stream, which has no bias per metre.
 
     Parameters
     ----------
     streams : Streams
     T_parent_child : (4, 4) array
+        X.
     noise_m2 : float
-        Variance per axis up to which differences between a step and its neighbours count as
-        noise. The larger the differences, the less the steps are smoothed.
+        Noise variance of a step per axis. Differences between a step and its neighbours are
+        smoothed out if their variance is not larger. The larger it is, the less is smoothed.
     """
     R = se3.rotation_of(T_parent_child)
     lever_arm = se3.translation_of(T_parent_child)
-    by_child = se3.translation_of(streams.motions_c)
-    chords = se3.rotation_of(streams.motions_p) @ lever_arm - lever_arm
-    by_parent = (chords + se3.translation_of(streams.motions_p)) @ R
+    steps_by_child = se3.translation_of(streams.motions_c)
+    # Translation of A X relative to X, in the child's axes.
+    rotated = se3.rotation_of(streams.motions_p) @ lever_arm - lever_arm
+    steps_by_parent = (rotated + se3.translation_of(streams.motions_p)) @ R
     intervals_s = np.diff(streams.stamps_s)
-    steps = _smoothed(0.5 * (by_child + by_parent), intervals_s, noise_m2)
-    metres = np.linalg.norm(_smoothed(by_parent, intervals_s, noise_m2), axis=1)
-    axes_c = streams.Ts_cw_c[:-1, :3, :3]
+    steps = _smooth_steps(0.5 * (steps_by_child + steps_by_parent), intervals_s, noise_m2)
+    metres = np.linalg.norm(_smooth_steps(steps_by_parent, intervals_s, noise_m2), axis=1)
+    rotations_c = streams.Ts_cw_c[:-1, :3, :3]
     return Course(
         streams.twists,
-        summed(se3.times(axes_c, steps)),
-        summed(axes_c * metres[:, None, None]),
+        cumulative_sum(se3.times(rotations_c, steps)),
+        cumulative_sum(rotations_c * metres[:, None, None]),
     )
 
 
-def _smoothed(steps: FloatArray, intervals_s: FloatArray, noise_m2: float) -> FloatArray:
-    """Smooth steps (n, 3) towards the mean velocity of the steps two before and two after.
+def _smooth_steps(steps: FloatArray, intervals_s: FloatArray, noise_m2: float) -> FloatArray:
+    """Move steps (n, 3) towards the mean velocity of the steps two before and two after.
 
-    Differences from this mean are kept by the share of their variance that is not noise.
+    The difference from this mean is multiplied by the share of its variance that is not noise.
     """
-    rates = steps / intervals_s[:, None]
-    padded = np.concatenate([rates[:1], rates[:1], rates, rates[-1:], rates[-1:]])
+    velocities = steps / intervals_s[:, None]
+    padded = np.concatenate(
+        [velocities[:1], velocities[:1], velocities, velocities[-1:], velocities[-1:]]
+    )
     smooth = 0.5 * (padded[:-4] + padded[4:]) * intervals_s[:, None]
     variance = max(median((steps - smooth) ** 2), _ROUNDING_M2)
     share = max(1.0 - noise_m2 / variance, 0.0)
     return smooth + share * (steps - smooth)
 
 
-def summed(steps: FloatArray) -> FloatArray:
-    """Return the sums (N, ...) of the steps (N - 1, ...) up to each instant, from zero on."""
+def cumulative_sum(steps: FloatArray) -> FloatArray:
+    """Return the sums (N, ...) of the steps (N - 1, ...) before each instant; the first is zero."""
     return np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
 
 
 @dataclass(frozen=True)
 class Linearisation:
-    """Residuals and derivatives at one X.
+    """Residuals e and their derivatives at one X.
 
     Attributes
     ----------
     columns : (n, 6, 6 + k + 1) array
         Derivatives of e with respect to xi in ``X Exp(xi)`` and to k parameters of systematic
-        errors; last, e.
+        errors; the last column is e.
     adjoints : (n, 6, 6) array
-        Ad(B^-1).
-    by_path : dict of (n, 6, k) arrays
-        Derivatives with respect to the scale, and to a rotation of the direction of travel against
-        the child.
+        Ad(B_i^-1).
+    by_path : dict of str to array
+        Derivatives of e with respect to drifting errors of the path: "scale" (n, 6, 1), and
+        "direction" (n, 6, 3), a rotation (rad) of the steps in the child's frame.
     """
 
     columns: FloatArray
@@ -204,21 +215,21 @@ def linearise(
     columns: list[int],
     error: FloatArray | None = None,
 ) -> Linearisation:
-    """Compute residuals and derivatives.
+    """Compute residuals e and their derivatives.
 
     Parameters
     ----------
     streams : Streams
     course : Course
-        At the same poses.
+        Smoothed motion at the same poses.
     T_parent_child : (4, 4) array
         X.
     parameters : (8,) array
-        Of all systematic errors, see :data:`PARAMETERS`.
-    columns : sequence of int
-        Parameters whose derivatives are returned.
+        Present values of all systematic errors, see :data:`PARAMETERS`.
+    columns : list of int
+        Indices of the systematic errors whose derivatives are returned.
     error : (N, 6) array, optional
-        Errors c that were taken out of the poses.
+        Errors c that were removed from the poses; they are added to the residuals.
     """
     R_c_transposed = transposed(streams.Ts_cw_c[:-1, :3, :3])
     steps = se3.times(R_c_transposed, np.diff(course.path, axis=0))
@@ -248,14 +259,14 @@ def linearise(
 def _child_motions(
     streams: Streams, course: Course, parameters: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Compute motions of the child without its time offset and bias of rates.
+    """Compute motions of the child, corrected for its time offset and bias of rates.
 
     Returns
     -------
     (n, 4, 4) array
-        Motions.
+        Corrected motions.
     (n, 3, 3) array
-        Derivatives of their rotations with respect to the bias of rates.
+        Derivatives of the measured rotations (rad) with respect to the bias of rates (rad/s).
     """
     Ts_cw_c = streams.Ts_cw_c
     if parameters[TIME]:
@@ -269,22 +280,22 @@ def _child_motions(
 
 
 def _derivatives_by_rate_bias(rotations: FloatArray, intervals_s: FloatArray) -> FloatArray:
-    """Derivatives (n, 3, 3) of rotations (n, 3, 3) over each interval.
+    """Return derivatives (n, 3, 3), in s, of rotations (n, 3, 3) with respect to a bias of rates.
 
-    The derivatives are with respect to a bias of rates (rad/s): the interval times
-    the mean of the body's axes at both ends, in the frame of the end.
+    A constant bias (rad/s) along the body's axes turns the end of an interval by about its duration
+    times the mean of the axes at start and end, expressed in the frame of the end.
     """
     mean_axes: FloatArray = 0.5 * (np.eye(3) + transposed(rotations))
     return intervals_s[:, None, None] * mean_axes
 
 
 def without_rate_bias(stamps_ns: IntArray, Ts_cw_c: FloatArray, bias: FloatArray) -> FloatArray:
-    """Integrate rotations anew without a bias (3,), rad/s, of their rates.
+    """Remove a bias (3,), rad/s, of angular rates from the rotations integrated from them.
 
     Returns
     -------
     (N, 4, 4) array
-        Poses at the origin, from the identity on.
+        Poses with corrected rotations, relative to the first one, and zero translations.
     """
     child_motions = motions(Ts_cw_c[:-1], Ts_cw_c[1:])
     rotations = se3.rotation_of(child_motions)

@@ -1,14 +1,17 @@
 """Noise model of two trajectories.
 
-The error c of a pair of poses, in the child's frame, is the sum of these independent parts:
+The symbols are those of :mod:`hand_eye_calib.core.noise`. The model contains these independent
+errors:
 
-- a white error: translation, rotation, and along the velocity, for stamps that jitter;
-- a random walk of the motions: translation and rotation;
-- first-order Gauss-Markov processes g: ``c = M g`` with M constant for translations fixed to the
-  child's body, and ``M = Ad(X^-1) blkdiag(R_p', R_p')`` for translations and rotations fixed to the
-  parent's world. A drifting scale or direction of travel enters the increments instead.
+- white errors v of poses: translation, rotation, and a shift along the velocity, which is due to
+  jitter of stamps;
+- a random walk w of the motions: translation and rotation;
+- first-order Gauss-Markov processes g of poses, with ``c = M g``. For translations fixed to the
+  child's body, M is constant. For translations and rotations fixed to the parent's world,
+  ``M = Ad(X^-1) blkdiag(R_p', R_p')`` with the orientation R_p of the parent;
+- Gauss-Markov processes of increments: a drifting scale, or a drifting direction of travel.
 
-Each part has one variance for all axes. A level is the logarithm of a variance or of a time
+Each error has one variance for all axes. A level is the logarithm of a variance or of a time
 constant. Derivation: docs/adaptive.md.
 """
 
@@ -27,39 +30,45 @@ from hand_eye_calib.core.noise.reml import Prior
 from hand_eye_calib.core.noise.state_space import WHITE, StateSpace
 from hand_eye_calib.core.noise.tuning import Tuning
 
-# Centres of white rotation noise: the sensors themselves, or the origin of the child's or of the
-# parent's world. Rotation errors of a camera that observes a target turn about the target.
+# Points that white rotation errors turn about: the sensors themselves, or the origin of the child's
+# or of the parent's world. Errors of a camera that observes a target turn about the target, which
+# is the origin of its world.
 CENTRES = ("sensors", "child", "parent")
 
-# Levels of the fast errors: white translation (m^2), white rotation (rad^2), jitter of stamps
-# (s^2), walk of translation and of rotation.
+# Indices of the levels of white errors and of the walk. The variances are those of white
+# translation (m^2), white rotation (rad^2), jitter of stamps (s^2), and of the walk of translation
+# (m^2) and of rotation (rad^2) over a typical increment.
 N_FAST = 5
 TRANSLATION, ROTATION, JITTER, WALK_TRANSLATION, WALK_ROTATION = range(N_FAST)
 WHITES = slice(TRANSLATION, ROTATION + 1)
 WALKS = slice(WALK_TRANSLATION, WALK_ROTATION + 1)
-# Levels of time-correlated errors follow: the variance, then the time constant (s) of each process.
+# Levels of time-correlated errors follow: of each process the variance, then the time constant (s).
 VARIANCES = slice(N_FAST, None, 2)
 TIME_CONSTANTS = slice(N_FAST + 1, None, 2)
 
+# Rows of both parts of a vector of six.
 PARTS = {"translation": slice(0, 3), "rotation": slice(3, 6)}
+# Covariance bases of translations and of rotations of equal variance on all axes.
 TRANSLATIONS = np.diag([1.0, 1.0, 1.0, 0, 0, 0])
 ROTATIONS = np.diag([0, 0, 0, 1.0, 1.0, 1.0])
 
-# Bounds of variances (m^2, rad^2, s^2) and of log variances. Rounding is below the lower one.
-LOWEST_VARIANCE = 1e-14
-_HIGHEST_LEVEL = 14.0
+# Lower bound of all variances (m^2, rad^2, s^2). Smaller variances are rounding.
+MIN_VARIANCE = 1e-14
+# Upper bound of all log variances.
+_MAX_LEVEL = 14.0
 
-# Lower bound of the logarithms of the shares of white noise and of the walk in the variance of an
-# increment. A smaller share is lost to rounding, because one matrix contains both precisions.
-_LOWEST_SHARE = -12.0
+# Lower bound of the log variances of white noise and of the walk, relative to the log variance of
+# an increment. Smaller variances are lost to rounding, because one matrix contains the precisions
+# of white noise and walk.
+_MIN_LOG_SHARE = -12.0
 
-# Longest time constant of a drifting direction of travel, in intervals. A direction that lasts
-# longer is a bias or a rotated mount, which have parameters.
-_LONGEST_OF_DIRECTION = 10.0
+# Longest time constant of a drifting direction of travel, in intervals between poses. A direction
+# that is constant for longer is a bias or a rotated mount, which have parameters.
+_MAX_INTERVALS_OF_DIRECTION = 10.0
 
-# Bounds of the variance of the walk over an increment, in units of a typical increment. Neither a
-# gap nor two almost equal stamps may dominate.
-_WALK_BOUNDS = (0.1, 100.0)
+# Bounds of the variance of the walk over an increment, relative to a typical increment, so that
+# neither a gap nor two almost equal stamps dominate.
+_WALK_FACTOR_LIMITS = (0.1, 100.0)
 
 
 class FastSigmas(NamedTuple):
@@ -72,13 +81,15 @@ class FastSigmas(NamedTuple):
     walk_rotation_rad: float
 
 
-#: Kind and part of a process of time-correlated errors: ("body" or "world", "translation" or
-#: "rotation"), or ("path", "scale" or "direction").
-Slow: TypeAlias = tuple[str, str]
+#: Kind and part of a time-correlated error. Kind "body" is fixed to the child's body, "world" to
+#: the parent's world; the part is then "translation" or "rotation". Kind "path" is an error of the
+#: child's path, with the part "scale" or "direction".
+Process: TypeAlias = tuple[str, str]
 
-# There is no rotation fixed to the body, which is a mount that wanders: X would forget its
-# evidence, and no recording gains by it.
-LASTING: tuple[Slow, ...] = (
+# All time-correlated errors that the search tries. A rotation fixed to the body is missing: it
+# would be a mount that wanders, so that old data would not count for X. No recording has gained by
+# it.
+PROCESSES: tuple[Process, ...] = (
     ("body", "translation"),
     ("world", "translation"),
     ("world", "rotation"),
@@ -93,17 +104,17 @@ class NoiseModel:
 
     Attributes
     ----------
-    slow : tuple of Slow
+    processes : tuple of Process
         Time-correlated errors.
     centre : {"sensors", "child", "parent"}
-        Centre of white rotation noise, see :data:`CENTRES`.
+        Point that white rotation errors turn about, see :data:`CENTRES`.
     interval_s, duration_s : float
-        Typical interval and duration of the recording.
+        Typical interval between poses, and duration of the recording.
     tuning : Tuning
-        Numbers of the prior and of the levels that a search starts at.
+        Priors and starting values of the levels.
     """
 
-    slow: tuple[Slow, ...]
+    processes: tuple[Process, ...]
     centre: str
     interval_s: float
     duration_s: float
@@ -126,48 +137,54 @@ class NoiseModel:
         streams : Streams
         linearisation : Linearisation
         twists : (N, 6) array
-            Of the child, see :class:`~hand_eye_calib.core.noise.increments.Course`.
+            Velocity of the child, see :class:`~hand_eye_calib.core.noise.increments.Course`.
         T_parent_child : (4, 4) array
+            X.
         weights : (N,) array
         cut : (n,) bool array
         prior : (p + 1, p + 1) array
-            The last three as in :class:`~hand_eye_calib.core.noise.state_space.StateSpace`.
+            ``weights``, ``cut`` and ``prior`` are those of
+            :class:`~hand_eye_calib.core.noise.state_space.StateSpace`.
         """
         to_child = se3.adjoint(se3.inverse(T_parent_child))
         intervals_s = np.diff(streams.stamps_s)
-        # Half of the rotation noise is the parent's, which moves the child by the lever arm.
+        # Half of the rotation noise is that of the parent. It also shifts the child, by the
+        # rotation times the lever arm.
         rotations = 0.5 * (ROTATIONS + to_child @ ROTATIONS @ to_child.T)
         white_rotations = rotations[None]
         if self.centre != "sensors":
             white_rotations = self._rotations_about_origin(streams, to_child)
         jitter = twists[:, :, None] * twists[:, None]
-        ahead = [np.zeros((len(intervals_s), 6, 0))]
-        behind = [linearisation.adjoints]
-        for kind, part in self.slow:
+        h1_processes = [np.zeros((len(intervals_s), 6, 0))]
+        h0 = [linearisation.adjoints]
+        for kind, part in self.processes:
             if kind == "path":
                 by_path = linearisation.by_path[part]
-                ahead.append(np.zeros_like(by_path))
-                behind.append(-by_path)
+                h1_processes.append(np.zeros_like(by_path))
+                h0.append(-by_path)
             else:
                 M = _directions(kind, part, streams, to_child)
-                ahead.append(M[1:])
-                behind.append(linearisation.adjoints @ M[:-1])
+                h1_processes.append(M[1:])
+                h0.append(linearisation.adjoints @ M[:-1])
         return StateSpace(
             intervals_s=intervals_s,
-            walk_factors=np.clip(intervals_s / self.interval_s, *_WALK_BOUNDS),
+            walk_factors=np.clip(intervals_s / self.interval_s, *_WALK_FACTOR_LIMITS),
             columns=linearisation.columns,
-            ahead=np.concatenate(ahead, axis=2),
-            behind=np.concatenate(behind, axis=2) if self.slow else linearisation.adjoints,
+            h1_processes=np.concatenate(h1_processes, axis=2),
+            h0=np.concatenate(h0, axis=2) if self.processes else linearisation.adjoints,
             white_bases=(TRANSLATIONS[None], white_rotations, jitter),
             walk_bases=(TRANSLATIONS, rotations),
-            group_sizes=tuple(matrices.shape[2] for matrices in ahead[1:]),
+            group_sizes=tuple(matrices.shape[2] for matrices in h1_processes[1:]),
             weights=weights,
             cut=cut,
             prior=prior,
         )
 
     def _rotations_about_origin(self, streams: Streams, to_child: FloatArray) -> FloatArray:
-        """Return the covariances (N, 6, 6) of c for rotations of 1 rad about a world's origin."""
+        """Return the covariances (N, 6, 6) of c for rotations of 1 rad about a world's origin.
+
+        The world is that of the sensor in ``centre``.
+        """
         poses = streams.Ts_cw_c if self.centre == "child" else streams.Ts_pw_p
         by_rotation = np.zeros((len(poses), 6, 3))
         by_rotation[:, :3] = se3.skew(se3.translation_of(se3.inverse(poses)))
@@ -181,63 +198,67 @@ class NoiseModel:
     ) -> FloatArray:
         """Return the matrices (1 or N, 6, 6) from white errors c to the parent's share of c.
 
-        White errors are split by ``Ad(X^-1) a = S' (S' + S)^-1 c`` and ``b = -S (S' + S)^-1 c``
-        with the white covariances S' of the parent and S of the child, in the child's frame. A
-        rotation of the parent also moves the child by the lever arm. Each sensor has half of the
-        noise. Rotation noise about the origin of a world belongs to the sensor in this world.
+        The white covariances of parent and child, S_p and S_c, are in the child's frame. The
+        expected errors a of the parent and b of the child are
+
+            Ad(X^-1) a = S_p (S_p + S_c)^-1 c,      b = -S_c (S_p + S_c)^-1 c
+
+        Each sensor has half of the noise. Exception: rotation noise about the origin of a world is
+        that of the sensor in this world.
         """
         to_child = se3.adjoint(se3.inverse(T_parent_child))
         translation, rotation = np.exp(levels[WHITES])
-        S_child = 0.5 * translation * TRANSLATIONS[None]
+        S_c = 0.5 * translation * TRANSLATIONS[None]
         if self.centre == "sensors":
-            S_child = S_child + 0.5 * rotation * ROTATIONS
-        S_parent = to_child @ S_child @ to_child.T
+            S_c = S_c + 0.5 * rotation * ROTATIONS
+        S_p = to_child @ S_c @ to_child.T
         if self.centre == "child":
-            S_child = S_child + rotation * self._rotations_about_origin(streams, to_child)
+            S_c = S_c + rotation * self._rotations_about_origin(streams, to_child)
         elif self.centre == "parent":
-            S_parent = S_parent + rotation * self._rotations_about_origin(streams, to_child)
-        return transposed(np.linalg.solve(S_parent + S_child, S_parent))
+            S_p = S_p + rotation * self._rotations_about_origin(streams, to_child)
+        return transposed(np.linalg.solve(S_p + S_c, S_p))
 
     def prior(self, levels: FloatArray) -> Prior:
-        """Return the prior of the levels (m,) for a search that starts at given levels (m,)."""
+        """Return the prior of the levels for a search that starts at ``levels`` (m,)."""
         tuning = self.tuning
         total = increment_levels(levels)
         shortest, longest = self._log_tau_bounds
         mean = levels.copy()
         precision = np.zeros(len(levels))
-        lower = np.full(len(levels), np.log(LOWEST_VARIANCE))
-        upper = np.full(len(levels), _HIGHEST_LEVEL)
-        lower[WHITES] = np.maximum(lower[WHITES], total + _LOWEST_SHARE)
-        lower[WALKS] = np.maximum(lower[WALKS], total + _LOWEST_SHARE)
+        lower = np.full(len(levels), np.log(MIN_VARIANCE))
+        upper = np.full(len(levels), _MAX_LEVEL)
+        lower[WHITES] = np.maximum(lower[WHITES], total + _MIN_LOG_SHARE)
+        lower[WALKS] = np.maximum(lower[WALKS], total + _MIN_LOG_SHARE)
         mean[JITTER] = tuning.jitter
-        # The prior standard deviation of this level is 4.5: a factor of 10 of the jitter.
+        # A prior standard deviation of 4.5 of the log variance: a factor of 10 of the jitter.
         precision[JITTER] = 0.05
         mean[TIME_CONSTANTS] = self._usual_log_tau
         precision[TIME_CONSTANTS] = tuning.tau_precision
         lower[TIME_CONSTANTS] = shortest
-        longest_of_direction = shortest + np.log(_LONGEST_OF_DIRECTION)
-        is_direction = [part == "direction" for _, part in self.slow]
+        longest_of_direction = shortest + np.log(_MAX_INTERVALS_OF_DIRECTION)
+        is_direction = [part == "direction" for _, part in self.processes]
         upper[TIME_CONSTANTS] = np.where(is_direction, longest_of_direction, longest)
         return Prior(mean, precision, lower, upper)
 
     @property
     def _usual_log_tau(self) -> float:
-        """Logarithm of the time constant (s) that a search starts at, which is its prior mean."""
+        """Logarithm of the time constant (s) at the start of a search; also its prior mean."""
         shortest_s = self.tuning.start_tau_intervals * self.interval_s
         longest_s = max(self.tuning.start_tau_share * self.duration_s, shortest_s)
         return 0.5 * float(np.log(shortest_s * longest_s))
 
     @property
     def _log_tau_bounds(self) -> tuple[float, float]:
-        """Bounds of the logarithms of time constants (s): an interval, and a share of the duration.
+        """Bounds of the logarithms of time constants (s).
 
-        An error that lasts for more than a quarter of the recording is constant.
+        The lower bound is a typical interval between poses. The upper bound is a quarter of the
+        recording, because an error of longer duration is hardly different from a constant.
         """
         longest_s = max(0.25 * self.duration_s, self.interval_s)
         return float(np.log(self.interval_s)), float(np.log(longest_s))
 
-    def with_lasting(
-        self, processes: tuple[Slow, ...], levels: FloatArray
+    def with_processes(
+        self, processes: tuple[Process, ...], levels: FloatArray
     ) -> tuple[NoiseModel, FloatArray]:
         """Add time-correlated errors to the model.
 
@@ -245,7 +266,7 @@ class NoiseModel:
         -------
         NoiseModel
         (m,) array
-            Levels to start a search at: the given levels, then those of the processes.
+            Levels for the start of a search: the given levels, then those of the processes.
         """
         tuning = self.tuning
         variances = dict(
@@ -254,23 +275,26 @@ class NoiseModel:
         variances |= dict.fromkeys(PATH_PARTS, 2.0 * np.log(tuning.sizes[SCALE]))
         log_tau = self._usual_log_tau
         starts = [[variances[part], log_tau] for _, part in processes]
-        return replace(self, slow=processes), np.r_[levels, np.ravel(starts)]
+        return replace(self, processes=processes), np.r_[levels, np.ravel(starts)]
 
-    def lasting(
+    def process_errors(
         self, states: FloatArray, streams: Streams, T_parent_child: FloatArray
     ) -> FloatArray:
-        """Return the time-correlated part (N, 6) of the error c, in the child's frame.
+        """Return the time-correlated part ``sum_k M_k g_k`` (N, 6) of the error c.
+
+        Processes of the path are skipped: they are errors of increments, not of poses.
 
         Parameters
         ----------
         states : (N, d) array
         streams : Streams
         T_parent_child : (4, 4) array
+            X.
         """
         to_child = se3.adjoint(se3.inverse(T_parent_child))
         error = np.zeros((len(states), 6))
         start = WHITE
-        for kind, part in self.slow:
+        for kind, part in self.processes:
             if kind != "path":
                 M = _directions(kind, part, streams, to_child)
                 error += se3.times(M, states[:, start : start + 3])
@@ -279,7 +303,7 @@ class NoiseModel:
 
 
 def _directions(kind: str, part: str, streams: Streams, to_child: FloatArray) -> FloatArray:
-    """Return the matrices M (N, 6, 3) from a process to the error c."""
+    """Return the matrices M (N, 6, 3) from a process of kind "body" or "world" to the error c."""
     if kind == "body":
         return np.broadcast_to(np.eye(6)[:, PARTS[part]], (len(streams), 6, 3))
     return to_child[:, PARTS[part]] @ transposed(se3.rotation_of(streams.Ts_pw_p))
@@ -291,5 +315,31 @@ def fast_sigmas(levels: FloatArray) -> FastSigmas:
 
 
 def increment_levels(levels: FloatArray) -> FloatArray:
-    """Log variances (2,) of increments of translation and rotation: white noise plus walk."""
+    """Return the log variances (2,) of an increment: translation (m^2) and rotation (rad^2).
+
+    The variance of an increment is that of the walk plus twice the white variance of a pose.
+    """
     return np.logaddexp(levels[WALKS], levels[WHITES] + np.log(2.0))
+
+
+def rough_levels(residuals: FloatArray, left_out: BoolArray, jitter: float) -> FloatArray:
+    """Return levels (5,) for the start of a search: half of the variance is white, half is walk.
+
+    Parameters
+    ----------
+    residuals : (n, 6) array
+    left_out : (n,) bool array
+        Increments that are not used.
+    jitter : float
+        Log variance (s^2) of the jitter of stamps.
+    """
+    squares = (residuals[~left_out] ** 2).reshape(-1, 2, 3)
+    variances = np.zeros(2)
+    if len(squares):
+        variances = squares.mean(axis=(0, 2))
+    total = np.log(np.maximum(variances, 100 * MIN_VARIANCE))
+    levels = np.full(N_FAST, jitter)
+    # An increment has the white noise of two poses.
+    levels[WHITES] = total + np.log(0.25)
+    levels[WALKS] = total + np.log(0.5)
+    return levels

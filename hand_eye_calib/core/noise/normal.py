@@ -1,16 +1,17 @@
 """Normal equations, and Cholesky factorisation of block tridiagonal matrices.
 
-A symmetric positive definite matrix with blocks D_k on the diagonal and C_k below it is factorised
-by cyclic reduction (Golub; Heller, SIAM J. Numer. Anal. 13, 1976). A level eliminates every other
-block, from the second on:
+A symmetric positive definite matrix has blocks D_k on its diagonal; the block E_k is in row k + 1
+and column k. Cyclic reduction (Golub; Heller, SIAM J. Numer. Anal. 13, 1976) factorises the matrix
+in rounds. A round eliminates every second row of blocks, k = 1, 3, 5, ...:
 
-    D_k = L_k L_k',    before_k = L_k^-1 C_{k-1},    behind_k = L_k^-1 C_k'
-    D_{k-1} -= before_k' before_k,    D_{k+1} -= behind_k' behind_k,    C = -behind_k' before_k
+    D_k = L_k L_k',    before_k = L_k^-1 E_{k-1},    behind_k = L_k^-1 E_k'
+    D_{k-1} -= before_k' before_k,    D_{k+1} -= behind_k' behind_k
+    new block of row k + 1 and column k - 1: -behind_k' before_k
 
-The rest is block tridiagonal again, and half as long. The result is a Cholesky factorisation of the
-matrix with its rows and columns in another order. Time and memory are linear in the number of
-blocks. Each level is a few products of stacked matrices, so numpy's overhead grows with the
-logarithm of the number of blocks only.
+The remaining matrix is block tridiagonal again, and half as long. The result is a Cholesky
+factorisation of the matrix with its rows and columns in another order. Time and memory are linear
+in the number of blocks. A round is a few products of stacked matrices, so that the overhead of
+numpy grows only with the logarithm of the number of blocks.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray
 
-# Number of rows up to which the remaining blocks become one dense matrix. It is also the number of
-# triangular matrices from which on a row-wise inversion takes half the time of LAPACK.
+# Cyclic reduction ends if at most this number of rows remains; they become one dense matrix. Also:
+# number of triangular matrices from which on an inversion row by row takes half the time of LAPACK.
 _FEW = 64
 
-# Smallest eigenvalue that counts as information, of normal equations with ones on the diagonal.
-# Smaller ones are rounding.
-_SMALLEST_INFORMATION = 1e-12
+# Smallest eigenvalue of normal equations with ones on the diagonal that counts as information.
+# Smaller eigenvalues are rounding.
+_MIN_INFORMATION = 1e-12
 
 
 def transposed(blocks: FloatArray) -> FloatArray:
@@ -37,7 +38,7 @@ def transposed(blocks: FloatArray) -> FloatArray:
 
 
 def multiplied(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the products (k, l) of columns (n, d, k) with columns (n, d, l)."""
+    """Return the products (k, l) of columns (n, d, k) with columns (n, d, l), summed over n, d."""
     return first.reshape(-1, first.shape[2]).T @ second.reshape(-1, second.shape[2])
 
 
@@ -69,10 +70,11 @@ def inverse_roots(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
     return inverse, log_determinants
 
 
-class _Level(NamedTuple):
-    """Blocks of L of the poses that one level eliminates.
+class _Round(NamedTuple):
+    """Blocks of the factor that one round of cyclic reduction eliminates.
 
-    The block ``inverse`` is L_k^-1. The last eliminated block may have none behind it.
+    ``inverse`` (m, d, d) is L_k^-1. ``before`` (m, d, d) and ``behind`` (m or m - 1, d, d) couple
+    block k with its neighbours. The last eliminated block may have no neighbour behind it.
     """
 
     inverse: FloatArray
@@ -81,7 +83,7 @@ class _Level(NamedTuple):
 
 
 class Factor:
-    """Cholesky factor L of a positive definite matrix with permuted rows and columns.
+    """Cholesky factor L of a block tridiagonal matrix with permuted rows and columns.
 
     Parameters
     ----------
@@ -93,7 +95,7 @@ class Factor:
     Attributes
     ----------
     log_determinant : float
-        Of the matrix.
+        Log determinant of the matrix.
 
     Raises
     ------
@@ -102,19 +104,20 @@ class Factor:
     """
 
     def __init__(self, diagonal: FloatArray, below: FloatArray) -> None:
-        self._levels: list[_Level] = []
+        self._rounds: list[_Round] = []
         self.log_determinant = 0.0
         while len(diagonal) > 1 and diagonal.shape[0] * diagonal.shape[1] > _FEW:
             inverse, log_determinants = inverse_roots(diagonal[1::2])
             n_behind = (len(diagonal) - 1) // 2
             before = inverse @ below[::2]
             behind = inverse[:n_behind] @ transposed(below[1::2])
-            self._levels.append(_Level(inverse, before, behind))
+            self._rounds.append(_Round(inverse, before, behind))
             self.log_determinant += float(log_determinants.sum())
             diagonal = diagonal[::2].copy()
             diagonal[: len(before)] -= transposed(before) @ before
             diagonal[1 : 1 + n_behind] -= transposed(behind) @ behind
             below = -transposed(behind) @ before[:n_behind]
+        # The blocks that remain become one dense matrix.
         self._n_last, self._size, _ = diagonal.shape
         dense = np.zeros((self._n_last, self._size) * 2)
         blocks = np.arange(self._n_last)
@@ -125,10 +128,10 @@ class Factor:
         self._last = roots[0]
 
     def whiten(self, right: FloatArray) -> FloatArray:
-        """Return ``L^-1`` times columns (n, d, k), in the order of the elimination."""
+        """Return ``L^-1`` times columns (n, d, k), with the blocks in order of elimination."""
         whitened = np.empty(right.shape)
         start = 0
-        for inverse, before, behind in self._levels:
+        for inverse, before, behind in self._rounds:
             eliminated = inverse @ right[1::2]
             right = right[::2].copy()
             right[: len(eliminated)] -= transposed(before) @ eliminated
@@ -140,11 +143,15 @@ class Factor:
         return whitened
 
     def restore(self, whitened: FloatArray) -> FloatArray:
-        """Return ``L^-T`` times columns (n, d, k) that :meth:`whiten` returned."""
+        """Return ``L^-T`` times columns (n, d, k) that :meth:`whiten` returned.
+
+        The blocks of the result are in the order of the matrix. So ``restore(whiten(Z))`` is the
+        inverse of the matrix times Z.
+        """
         start = len(whitened) - self._n_last
         last = whitened[start:].reshape(len(self._last), -1)
         solved = (self._last.T @ last).reshape(whitened[start:].shape)
-        for inverse, before, behind in reversed(self._levels):
+        for inverse, before, behind in reversed(self._rounds):
             neighbours = solved
             end = start
             start -= len(inverse)
@@ -157,17 +164,18 @@ class Factor:
 
     @cached_property
     def selected_inverse(self) -> tuple[FloatArray, FloatArray]:
-        """Blocks of the inverse on the diagonal (n, d, d) and below it (n - 1, d, d)."""
+        """Blocks of the inverse matrix on the diagonal (n, d, d) and below it (n - 1, d, d)."""
         shape = (self._n_last, self._size) * 2
         dense = (self._last.T @ self._last).reshape(shape).transpose(0, 2, 1, 3)
         blocks = np.arange(self._n_last)
         diagonal = dense[blocks, blocks]
         below = dense[blocks[1:], blocks[:-1]]
-        for inverse, before, behind in reversed(self._levels):
+        for inverse, before, behind in reversed(self._rounds):
             n_eliminated = len(inverse)
             n_behind = len(behind)
             root = transposed(inverse)
-            # An eliminated block is these matrices times its neighbours, plus noise of its own.
+            # If the inverse is a covariance, an eliminated state is these matrices times its
+            # neighbours, plus independent noise of covariance root root'.
             to_before = -root @ before
             to_behind = -root[:n_behind] @ behind
             with_before = to_before @ diagonal[:n_eliminated]
@@ -188,37 +196,38 @@ class Factor:
 
 
 class NormalEquations:
-    """Generalised least squares of one system or of several.
+    """Generalised least squares solution of one system, or of a stack of systems.
 
     Parameters
     ----------
     products : (..., p + 1, p + 1) array
-        ``[J e]' V^-1 [J e]`` of derivatives J and residuals e.
+        ``[J e]' V^-1 [J e]`` of derivatives J, residuals e and their covariance V.
 
     Attributes
     ----------
     step : (..., p) array
-        Change of the parameters; zero along directions without information.
+        Change of the parameters that minimises the cost; zero along directions without information.
     covariance : (..., p, p) array
-        Zero along the same directions.
+        Covariance of the parameters; zero along directions without information.
     root : (..., p, p) array
-        R with covariance R R'.
+        Matrix R with ``R R' = covariance``.
     is_complete : (...) bool array
         Whether all directions have information.
     cost : (...) array
         Weighted squared residual after the step.
     log_determinant : (...) array
-        Of the information.
+        Log determinant of the information ``J' V^-1 J``, without directions that have none.
     """
 
     def __init__(self, products: FloatArray) -> None:
         information = products[..., :-1, :-1]
         gradient = products[..., :-1, -1]
         diagonal = np.einsum("...ii->...i", information)
+        # Scale the information to ones on the diagonal, because the units of parameters differ.
         rounding = np.finfo(float).eps * diagonal.max(axis=-1, keepdims=True)
         scale = 1.0 / np.sqrt(np.maximum(diagonal, rounding + np.finfo(float).tiny))
         values, vectors = np.linalg.eigh(scale[..., :, None] * information * scale[..., None, :])
-        self._is_observed = values > _SMALLEST_INFORMATION
+        self._is_observed = values > _MIN_INFORMATION
         values = np.where(self._is_observed, values, 1.0)
         self._axes = scale[..., :, None] * vectors
         self.root = self._axes * (self._is_observed / np.sqrt(values))[..., None, :]
@@ -230,6 +239,6 @@ class NormalEquations:
 
     @property
     def unseen(self) -> FloatArray:
-        """Directions (p, U) without information, of unit length; only for one system."""
+        """Unit vectors (p, U) of the U directions without information; only for one system."""
         axes = self._axes[:, ~self._is_observed]
         return np.asarray(axes / np.linalg.norm(axes, axis=0))

@@ -1,14 +1,16 @@
 """Jumps, outlier poses, and heavy tails.
 
-The smoothed walk of an increment, or the smoothed white error of a pose, is compared with its
-prediction from all other data. With the prior covariance S and the posterior covariance C of a
-smoothed value u, the covariance of u is S - C, and
+The test quantities are the smoothed step w of the walk of each increment, and the smoothed white
+error v of each pose. For v with prior covariance S and posterior covariance S_post, the covariance
+of the smoothed v is S - S_post. Then
 
-    chi-square = u' (S - C)^-1 u
+    chi-square = v' (S - S_post)^-1 v
 
-has six degrees of freedom if nothing is wrong. It equals ``(V^-1 r)_i' (V^-1)_ii^-1 (V^-1 r)_i``
-(de Jong, Penzer, J. Amer. Statist. Assoc. 93, 1998). An increment with a large chi-square is a
-jump, and a pose with a large chi-square is an outlier ("spike").
+has six degrees of freedom if nothing is wrong, and the same holds for w. It measures how far the
+data at this place are from their prediction by all other data: it equals
+``(V^-1 e)_i' (V^-1)_ii^-1 (V^-1 e)_i`` with residuals e of covariance V (de Jong, Penzer, J. Amer.
+Statist. Assoc. 93, 1998). An increment with a large chi-square is a jump, and a pose with a large
+chi-square is an outlier, in the code a "spike".
 """
 
 from __future__ import annotations
@@ -31,16 +33,17 @@ from hand_eye_calib.core.noise.normal import transposed
 from hand_eye_calib.core.noise.state_space import WHITE, Posterior, total_covariance
 from hand_eye_calib.core.noise.tuning import Tuning
 
-# Smallest jump (m, rad). Smaller ones are rounding.
-_SMALLEST_JUMP = 1e-6
+# Smallest residual (m, rad) that may be a jump. Smaller residuals are rounding.
+_MIN_JUMP = 1e-6
 
-# Share of its own, and variance (m^2, rad^2), by which the diagonal of S - C is raised. Rounding
-# must not make S - C indefinite.
-_RAISED_SHARE = 1e-9
-_RAISED_VARIANCE = 1e-18
+# The diagonal of S - S_post is increased by this share of the diagonal of S, so that rounding does
+# not make it indefinite ...
+_INCREASE_SHARE = 1e-9
+# ... and by this variance (m^2, rad^2), because S may be singular.
+_INCREASE_VARIANCE = 1e-18
 
-# Number of poses whose chi-squares are computed at once.
-_PART = 10_000
+# Number of poses whose chi-squares are computed at once. It limits the memory.
+_BATCH = 10_000
 
 
 @dataclass(frozen=True)
@@ -50,25 +53,25 @@ class Outliers:
     Attributes
     ----------
     jumps : (n,) bool array
-        Increments across which a trajectory jumps for good; they are no evidence.
+        Increments across which a trajectory jumps and does not return. They are not used.
     spikes : (N,) bool array
-        Outlier poses: wrong by themselves, and no evidence.
+        Outlier poses: a single pose is wrong, its neighbours are not. They are not used.
     """
 
     jumps: BoolArray
     spikes: BoolArray
 
     def across(self, kept: IntArray, longest_gap: int) -> Outliers:
-        """Return the outliers of a subset of poses.
+        """Return the outliers of the subset ``kept`` (indices of poses, ascending).
 
-        An increment between two kept poses is a jump if it contains a jump, or if it is longer than
-        ``longest_gap`` poses.
+        An increment between two kept poses is a jump if a jump is between them, or if they are
+        farther apart than ``longest_gap`` poses.
         """
         jumps = np.logical_or.reduceat(self.jumps[: kept[-1]], kept[:-1])
         return Outliers(jumps | (np.diff(kept) > longest_gap), self.spikes[kept])
 
     def differs_by(self, other: Outliers) -> float:
-        """Share of poses and increments that are outliers in only one of both sets."""
+        """Return the number of jumps and spikes in only one of two sets, over that of poses."""
         differing = np.sum(self.jumps != other.jumps) + np.sum(self.spikes != other.spikes)
         return float(differing) / len(self.spikes)
 
@@ -80,35 +83,45 @@ def first_outliers(
     residuals: FloatArray,
     tuning: Tuning,
 ) -> Outliers:
-    """Detect outliers in residuals (n, 6) without a noise model.
+    """Detect outliers in residuals (n, 6), before there is a noise model.
 
-    A pose between two large residuals is an outlier at first, and its increments are evidence. The
-    increment across the pose is a jump, too, if its residual is large once the pose is bridged.
+    A residual is large beyond a multiple of its robust standard deviation. A large residual is a
+    jump, but a pose between two large residuals is an outlier, and they are no jumps. If the
+    trajectory also jumped there, the residual is still large after the pose was replaced: then the
+    increment behind the pose is a jump, too.
     """
-    sizes = _part_sizes(residuals)
-    usual = np.array([median(part_sizes) for part_sizes in sizes.T])
-    limits = np.maximum(tuning.first_jump_sigmas * usual / MEDIAN_LENGTH, _SMALLEST_JUMP)
-    jumps: BoolArray = np.asarray((sizes > limits).any(axis=1))
-    spikes = np.r_[False, jumps[1:] & jumps[:-1], False]
+    lengths = _lengths(residuals)
+    usual_lengths = np.array([median(column) for column in lengths.T])
+    limits = np.maximum(tuning.first_jump_sigmas * usual_lengths / MEDIAN_LENGTH, _MIN_JUMP)
+    is_large: BoolArray = np.asarray((lengths > limits).any(axis=1))
+    spikes = np.r_[False, is_large[1:] & is_large[:-1], False]
     if np.mean(spikes) > tuning.max_outlier_share:
-        return Outliers(jumps, np.zeros(len(spikes), dtype=bool))
-    jumps = jumps & ~(spikes[1:] | spikes[:-1])
+        return Outliers(is_large, np.zeros(len(spikes), dtype=bool))
+    jumps = is_large & ~(spikes[1:] | spikes[:-1])
     if spikes.any():
-        poses = bridged(streams, T_parent_child, spikes)
+        poses = bridge_outliers(streams, T_parent_child, spikes)
         parameters = np.zeros(N_SYSTEMATIC)
-        bridging = linearise(poses, course, T_parent_child, parameters, []).residuals
-        jumps |= (_part_sizes(bridging) > limits).any(axis=1) & spikes[:-1]
+        bridged_residuals = linearise(poses, course, T_parent_child, parameters, []).residuals
+        is_still_large = (_lengths(bridged_residuals) > limits).any(axis=1)
+        jumps |= is_still_large & spikes[:-1]
     return Outliers(jumps, spikes)
 
 
-def _part_sizes(residuals: FloatArray) -> FloatArray:
-    """Lengths (n, 2) of translations and rotations of residuals (n, 6)."""
+def _lengths(residuals: FloatArray) -> FloatArray:
+    """Return the lengths (n, 2) of translation (m) and rotation (rad) of residuals (n, 6)."""
     return np.linalg.norm(residuals.reshape(-1, 2, 3), axis=2)
 
 
-def innovations(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Return the chi-squares of the increments (n,) and of the poses' white errors (N,)."""
+def innovation_chi_squares(
+    posterior: Posterior, spikes: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the chi-squares of the increments (n,) and of the white errors of poses (N,).
+
+    ``spikes`` (N,) are outlier poses, which were not used.
+    """
     space = posterior.space
+    # Column 0 is the posterior mean, the others are a root of the covariance that the uncertainty
+    # of the parameters adds.
     states, walk = posterior.smoothed()
     of_walk = chi_squares(
         walk[:, :, 0],
@@ -130,84 +143,88 @@ def innovations(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, Fl
 
 
 def chi_squares(
-    values: FloatArray, prior: FloatArray, posterior: FloatArray, left_out: BoolArray
+    values: FloatArray, prior: FloatArray, posterior: FloatArray, is_unused: BoolArray
 ) -> FloatArray:
     """Return the chi-squares (n,) of smoothed values (n, 6).
 
-    Their covariances are prior minus posterior (n, 6, 6); the sum of both for a value whose own
-    data are left out.
+    ``prior`` and ``posterior`` (n, 6, 6) are the covariances of the values. The covariance of a
+    smoothed value is prior minus posterior. A value whose data are not used (``is_unused``) is an
+    estimate from all other data: the covariance of its difference from zero is their sum.
     """
     squares = np.empty(len(values))
-    # In parts: temporary arrays of a long recording would need as much memory as its posterior.
-    for start in range(0, len(values), _PART):
-        part = slice(start, start + _PART)
-        are_left_out = left_out[part]
-        prior_part = prior[part]
-        covariances = prior_part - posterior[part]
-        covariances[are_left_out] = prior_part[are_left_out] + posterior[part][are_left_out]
-        # On the diagonal alone: the prior of jitter along one velocity is singular itself.
-        covariances += (_RAISED_SHARE * prior_part + _RAISED_VARIANCE) * np.eye(6)
-        weighted = np.linalg.solve(covariances, values[part, :, None])[:, :, 0]
-        squares[part] = (values[part] * weighted).sum(axis=1)
+    # In batches: temporary arrays of a long recording would need as much memory as its posterior.
+    for start in range(0, len(values), _BATCH):
+        batch = slice(start, start + _BATCH)
+        unused = is_unused[batch]
+        prior_batch = prior[batch]
+        covariances = prior_batch - posterior[batch]
+        covariances[unused] = prior_batch[unused] + posterior[batch][unused]
+        # Only on the diagonal: a prior of jitter, which acts along one velocity, is singular.
+        covariances += (_INCREASE_SHARE * prior_batch + _INCREASE_VARIANCE) * np.eye(6)
+        weighted = np.linalg.solve(covariances, values[batch, :, None])[:, :, 0]
+        squares[batch] = (values[batch] * weighted).sum(axis=1)
     return squares
 
 
-def judged(
+def detect_outliers(
     outliers: Outliers,
     of_walk: FloatArray,
     of_white: FloatArray,
     tuning: Tuning,
     with_spikes: bool = True,
 ) -> Outliers:
-    """Detect outliers by the chi-squares of increments (n,) and poses (N,).
+    """Detect jumps and outlier poses by their chi-squares.
 
-    An outlier has the largest chi-square of its neighbourhood. A step that the walk makes probable
-    is no jump.
+    A new jump or outlier has a larger chi-square than its neighbours, poses and increments.
 
     Parameters
     ----------
     outliers : Outliers
-        Detected before. Outlier poses stay outliers, jumps only if they are large.
+        Result of the previous detection. Outlier poses stay outliers; jumps stay jumps only while
+        their chi-square is large.
     of_walk, of_white : (n,) and (N,) arrays
+        Chi-squares of increments and of poses, see :func:`innovation_chi_squares`.
     tuning : Tuning
     with_spikes : bool
         Whether to detect new outlier poses.
     """
-    alarming = chi_square_quantile(tuning.false_alarms / len(of_white))
-    is_large = of_walk > _jump_factor(of_walk[~outliers.jumps], alarming, tuning) * alarming
-    of_poses = np.maximum(of_white[1:], of_white[:-1])
-    is_new = _is_peak(of_walk) & (of_walk >= of_poses) & ~outliers.jumps
-    jumps = is_large & (outliers.jumps | is_new)
+    # False alarms are expected in this share of all poses.
+    threshold = chi_square_quantile(tuning.false_alarms / len(of_white))
+    jump_threshold = _jump_factor(of_walk[~outliers.jumps], threshold, tuning) * threshold
+    at_either_end = np.maximum(of_white[1:], of_white[:-1])
+    is_new = _is_peak(of_walk) & (of_walk >= at_either_end) & ~outliers.jumps
+    jumps = (of_walk > jump_threshold) & (outliers.jumps | is_new)
     spikes = outliers.spikes
     if with_spikes:
-        of_increments = np.maximum(np.r_[0.0, of_walk], np.r_[of_walk, 0.0])
-        spikes = spikes | (of_white > alarming) & _is_peak(of_white) & (of_white > of_increments)
+        on_either_side = np.maximum(np.r_[0.0, of_walk], np.r_[of_walk, 0.0])
+        is_largest = _is_peak(of_white) & (of_white > on_either_side)
+        spikes = spikes | (of_white > threshold) & is_largest
     return Outliers(jumps, spikes)
 
 
-def _jump_factor(of_walk: FloatArray, alarming: float, tuning: Tuning) -> float:
-    """Factor of the alarming chi-square above which a step of the walk is a jump.
+def _jump_factor(of_walk: FloatArray, threshold: float, tuning: Tuning) -> float:
+    """Return the factor of the threshold above which a chi-square of the walk is a jump.
 
-    A walk with normal steps has jumps from the alarming level on, in units of its usual steps. A
-    walk with heavy tails needs more.
+    If the steps of the walk are normal, the factor is the ratio of their median chi-square to that
+    of the model, and at least 1. If the steps have heavy tails, the factor is larger.
     """
-    ordinary = of_walk[of_walk < alarming]
+    ordinary = of_walk[of_walk < threshold]
     if not len(ordinary) or np.mean(ordinary**2) > tuning.walk_kurtosis * np.mean(ordinary) ** 2:
         return tuning.heavy_jump_factor
     return float(max(median(ordinary) / CHI2[0.5][6], 1.0))
 
 
 def _is_peak(values: FloatArray) -> BoolArray:
-    """Return whether each value (n,) is larger than its neighbours."""
+    """Return a mask of the values (n,) that are larger than both neighbours."""
     padded = np.r_[0.0, values, 0.0]
     return (padded[1:-1] >= padded[:-2]) & (padded[1:-1] > padded[2:])
 
 
-def bridged(streams: Streams, T_parent_child: FloatArray, spikes: BoolArray) -> Streams:
-    """Replace outlier poses of the child by the pose before, moved as the parent moved.
+def bridge_outliers(streams: Streams, T_parent_child: FloatArray, spikes: BoolArray) -> Streams:
+    """Replace each outlier pose of the child by the pose before, moved as the parent moved.
 
-    An outlier pose is no evidence. The increments on both sides of it are linearised to first
-    order, so its large error must not be in them.
+    The state space ignores the error of an outlier pose. Yet the linearisation of the increments on
+    both sides is of first order, so that the large error must not be in the poses.
     """
     Ts_cw_c = streams.Ts_cw_c.copy()
     outlier_poses = np.flatnonzero(spikes[1:]) + 1
@@ -219,16 +236,17 @@ def bridged(streams: Streams, T_parent_child: FloatArray, spikes: BoolArray) -> 
 
 
 def tail_weights(posterior: Posterior) -> FloatArray:
-    """Return weights (N,) of the white errors w if these have Student's t distribution.
+    """Return weights (N,) of the white errors v for Student's t distribution with nu degrees.
 
-    ``u = (nu + 6) / (nu + E w' S^-1 w)`` with nu degrees of freedom and the white covariance S.
-    Smoothing removes a share of the expectation. This share is spread over the poses in inverse
-    proportion to their weights.
+    ``weight = (nu + 6) / (nu + E[v' S^-1 v])`` with the white covariance S. The expectation is that
+    of the smoothed v, plus a share that smoothing removes. This share is assumed to be in inverse
+    proportion to the weights of the poses.
     """
-    w = posterior.states_after(posterior.normal.step)[:, :WHITE]
-    squares = (w * se3.times(posterior.white_precision, w)).sum(axis=1)
+    v = posterior.states_after(posterior.normal.step)[:, :WHITE]
+    squares = (v * se3.times(posterior.white_precision, v)).sum(axis=1)
     weights = posterior.space.weights
-    is_free = weights == 0.0
-    share_kept = min(float(np.mean((weights * squares)[~is_free])) / WHITE, 1.0)
-    hidden = WHITE * (1.0 - share_kept) / np.where(is_free, 1.0, weights)
-    return robust_weights("student", np.where(is_free, 0.0, squares + hidden))
+    is_outlier = weights == 0.0
+    # The mean square of a white error that is not smoothed is 6.
+    remaining_share = min(float(np.mean((weights * squares)[~is_outlier])) / WHITE, 1.0)
+    removed = WHITE * (1.0 - remaining_share) / np.where(is_outlier, 1.0, weights)
+    return robust_weights("student", np.where(is_outlier, 0.0, squares + removed))

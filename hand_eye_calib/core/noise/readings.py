@@ -1,16 +1,17 @@
-"""Comparison of two readings of the same poses by the likelihood of their noise.
+"""Comparison of two readings of the same data by the likelihood of their noise.
 
-If every pose of both streams is inverted, the streams agree just as well: A Y = Y B then holds for
-the pose Y of one world in the other. Residuals cannot decide between these two readings, but the
-noise can. In the right reading, drift accumulates in the sensor frame, and rotation errors turn
-about the sensor, or about the target of a camera. In the wrong reading, the same errors grow with
-the distance from the origin of a world.
+A reading is an interpretation of both streams: as poses of the sensors, or as inverse poses. If all
+poses are inverted, A Y = Y B holds for the pose Y of one world in the other, and the residuals are
+as small as before. So residuals cannot decide between two readings, but the noise can. In the right
+reading, drift accumulates in the sensor frame, and rotation errors turn about the sensor, or about
+the target of a camera. In the wrong reading, the same errors grow with the distance from the origin
+of a world.
 
 The losses of two readings are comparable under these conditions:
 
-- The data are motions, not poses. Inverting the poses transforms the motions by an adjoint of
-  determinant 1, so the probability densities of both readings have the same unit.
-- Both readings skip the same jumps and outlier poses, and have no robust weights.
+- The data are motions, not poses. If the poses are inverted, the motions change by an adjoint of
+  determinant 1, so that the probability densities of both readings have the same unit.
+- Both readings ignore the same jumps and outlier poses, and have no robust weights.
 - Both readings have the same parameters with the same prior standard deviations.
 - Each reading has its best centre of rotation noise: a camera that observes a target has the same
   white noise as the inverted poses of a tracker.
@@ -27,11 +28,11 @@ from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.noise import stages
 from hand_eye_calib.core.noise.increments import SYSTEMATIC, Streams, parameter_columns
 from hand_eye_calib.core.noise.noise_model import CENTRES
-from hand_eye_calib.core.noise.outliers import Outliers, bridged
+from hand_eye_calib.core.noise.outliers import Outliers, bridge_outliers
 
-# Largest number of poses to compare, evenly spread. The search takes about 1 ms for each pose and
-# reading.
-MOST_POSES = 1500
+# Largest number of poses that are used, evenly spread. The search takes about 1 ms per pose for
+# each reading (measured).
+_MAX_POSES = 1500
 
 
 def loss_difference(
@@ -47,7 +48,7 @@ def loss_difference(
     ----------
     stamps_ns : (N,) int64 array
     first, second : tuples of two (N, 4, 4) arrays
-        Poses of parent and child at these stamps, in one unit of length.
+        Readings: poses of parent and child at these stamps, in the same unit of length.
 
     Returns
     -------
@@ -59,7 +60,8 @@ def loss_difference(
     numpy.linalg.LinAlgError
         If the noise model cannot be fitted to a reading.
     """
-    stride = -(-len(stamps_ns) // MOST_POSES)
+    # Rounded up.
+    stride = -(-len(stamps_ns) // _MAX_POSES)
     stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
     workspaces = []
     fits = []
@@ -70,26 +72,26 @@ def loss_difference(
         fit = stages.noise(workspace, stages.start(problem))
         fits.append(stages.outliers(workspace, fit))
         workspaces.append(workspace)
-    common = Outliers(
+    outliers_of_both = Outliers(
         fits[0].outliers.jumps | fits[1].outliers.jumps,
         fits[0].outliers.spikes | fits[1].outliers.spikes,
     )
     losses = []
     for workspace, fit in zip(workspaces, fits, strict=True):
-        losses.append(_smallest_loss(workspace, fit, common))
+        losses.append(_smallest_loss(workspace, fit, outliers_of_both))
     return losses[1] - losses[0]
 
 
 def _smallest_loss(workspace: stages.Workspace, start: stages.Fit, outliers: Outliers) -> float:
     """Return the smallest loss of a reading over all centres of rotation noise.
 
-    The fit has these outliers and no robust weights.
+    ``start`` is a fit of this reading. The search ignores ``outliers`` and has no robust weights.
     """
     streams = workspace.problem.streams
     n_poses = len(streams)
     plain = replace(
         start,
-        poses=bridged(streams, start.T, outliers.spikes),
+        poses=bridge_outliers(streams, start.T, outliers.spikes),
         error=np.zeros((n_poses, 6)),
         outliers=outliers,
         weights=np.ones(n_poses),
@@ -97,17 +99,17 @@ def _smallest_loss(workspace: stages.Workspace, start: stages.Fit, outliers: Out
     )
     fits = []
     for centre in CENTRES:
-        model = replace(start.model, slow=(), centre=centre)
+        model = replace(start.model, processes=(), centre=centre)
         with suppress(np.linalg.LinAlgError):
             fits.append(stages.noise(workspace, replace(plain, model=model)))
     if not fits:
         raise np.linalg.LinAlgError("no noise model fits these poses")
     best = min(fits, key=lambda fit: _loss(workspace, fit))
-    best = stages.lasting(workspace, best)
+    best = stages.time_correlated(workspace, best)
     return min(_loss(workspace, best), _loss(workspace, stages.polish(workspace, best)))
 
 
 def _loss(workspace: stages.Workspace, fit: stages.Fit) -> float:
-    """Return the restricted negative log likelihood, with the normalisation of the prior."""
+    """Return the restricted negative log likelihood, including the constant of the prior."""
     prior_sigmas = fit.sigmas[workspace.problem.columns]
     return workspace.posterior(fit).loss + float(np.log(prior_sigmas).sum())

@@ -1,14 +1,17 @@
 """Noise levels by restricted maximum likelihood (REML).
 
-The loss of levels theta, which are logarithms, is the restricted negative log likelihood of the
-residuals r under their covariance V (Patterson, Thompson, Biometrika 58, 1971):
+The symbols are those of :mod:`hand_eye_calib.core.noise`. theta are the levels, the logarithms of
+variances and of time constants; V is the covariance of the residuals e. The loss is the restricted
+negative log likelihood (Patterson, Thompson, Biometrika 58, 1971):
 
-    loss = 1/2 (log|V| + r'P r + log|J'V^-1 J|),    P = V^-1 - V^-1 J (J'V^-1 J)^-1 J'V^-1
-    d loss / d theta_k = 1/2 (tr(P V_k) - r'P V_k P r),    V_k = dV / d theta_k
+    loss = 1/2 (log|V| + e' P e + log|J' V^-1 J|)
+    P = V^-1 - V^-1 J (J' V^-1 J)^-1 J' V^-1
+    d loss / d theta_k = 1/2 (tr(P V_k) - e' P V_k P e),      V_k = dV / d theta_k
 
-The gradient is exact; it needs only the blocks of the states' covariance on the diagonal and beside
-it. The curvature is the average of observed and expected information (Gilmour, Thompson, Cullis,
-Biometrics 51, 1995): ``1/2 f_k' P f_l`` with ``f_k = V_k P r``.
+The gradient is exact. It needs only those blocks of the states' covariance that are on the diagonal
+and next to it. The curvature is the average information, the mean of observed and expected
+information (Gilmour, Thompson, Cullis, Biometrics 51, 1995): ``1/2 f_k' P f_l`` with
+``f_k = V_k P e``.
 """
 
 from __future__ import annotations
@@ -28,21 +31,22 @@ from hand_eye_calib.core.noise.state_space import (
     StateSpace,
 )
 
-# Largest number of steps, and the shortest step of a log level.
+# Largest number of Newton steps of one search.
 MAX_STEPS = 20
-_SHORTEST_STEP = 1e-3
 
-# Longest step of a log level: a variance changes by a factor of 4.5 at most.
-_LONGEST_STEP = 1.5
-# Factor of a step that did not lower the loss.
-_SHORTENED = 0.3
+# Longest step of a level: a variance changes by a factor of 4.5 at most.
+_MAX_STEP = 1.5
+# A step that did not lower the loss is multiplied by this factor and tried again ...
+_SHORTENING_FACTOR = 0.3
+# ... until it is shorter than this change of a level: a variance would change by 0.1 %.
+_MIN_STEP = 1e-3
 
-# Information added to every level. It bounds the step along levels that do not matter.
-_ADDED_CURVATURE = 0.05
+# Information added to every level. It bounds the step of levels that have no influence on the loss.
+_ADDED_INFORMATION = 0.05
 
 
 class Prior(NamedTuple):
-    """Prior of the log levels: means, precisions and bounds, (m,) each."""
+    """Gaussian prior of the levels, with bounds; arrays (m,)."""
 
     mean: FloatArray
     precision: FloatArray
@@ -50,7 +54,7 @@ class Prior(NamedTuple):
     upper: FloatArray
 
     def loss(self, levels: FloatArray) -> float:
-        """Negative log density without constants."""
+        """Return the negative log density at levels (m,), without constants."""
         return 0.5 * float((self.precision * (levels - self.mean) ** 2).sum())
 
 
@@ -61,7 +65,7 @@ def fit(
     settled_loss: float,
     n_steps: int = MAX_STEPS,
 ) -> tuple[Posterior, FloatArray]:
-    """Minimise the loss over the levels by Newton steps that are shortened if they overshoot.
+    """Minimise the loss plus that of the prior over the levels, by damped Newton steps.
 
     Parameters
     ----------
@@ -70,16 +74,16 @@ def fit(
         Levels at the start.
     prior : Prior
     settled_loss : float
-        The search ends if a step promises to lower the loss by less.
+        The search ends if a step is predicted to lower the loss by less than this.
     n_steps : int
         Largest number of steps.
 
     Returns
     -------
     Posterior
-        At the best levels.
+        Posterior at the best levels.
     (m, m) array
-        Average information on the levels.
+        Average information on the levels, before the last step.
 
     Raises
     ------
@@ -91,69 +95,69 @@ def fit(
     for _ in range(n_steps):
         gradient, information = derivatives(posterior)
         gradient = gradient + prior.precision * (posterior.levels - prior.mean)
-        curvature = information + np.diag(prior.precision + _ADDED_CURVATURE)
-        step = _step(posterior.levels, gradient, curvature, prior)
-        promised_gain = -float(gradient @ step + 0.5 * step @ curvature @ step)
-        if promised_gain < settled_loss:
+        curvature = information + np.diag(prior.precision + _ADDED_INFORMATION)
+        step = _newton_step(posterior.levels, gradient, curvature, prior)
+        predicted_gain = -float(gradient @ step + 0.5 * step @ curvature @ step)
+        if predicted_gain < settled_loss:
             break
-        posterior, gain = _moved(posterior, step, prior, loss)
+        posterior, gain = _search_along(posterior, step, prior, loss)
         loss -= gain
         if gain < 0.5 * settled_loss:
             break
     return posterior, information
 
 
-def _moved(
+def _search_along(
     posterior: Posterior, step: FloatArray, prior: Prior, loss: float
 ) -> tuple[Posterior, float]:
-    """Shorten a step until it lowers the loss.
+    """Take a step of the levels (m,), shortened until it lowers the loss.
 
     Returns
     -------
     Posterior
-        After the step; the same one if even the shortest step does not lower the loss.
+        Posterior after the step; ``posterior`` itself if even the shortest step does not help.
     float
         Decrease of the loss.
     """
-    while np.abs(step).max() > _SHORTEST_STEP:
+    while np.abs(step).max() > _MIN_STEP:
         with suppress(np.linalg.LinAlgError):
             rival = Posterior(posterior.space, posterior.levels + step)
             gain = loss - rival.loss - prior.loss(rival.levels)
             if gain > 0.0:
                 return rival, gain
-        step = _SHORTENED * step
+        step = _SHORTENING_FACTOR * step
     return posterior, 0.0
 
 
-def _step(
+def _newton_step(
     levels: FloatArray, gradient: FloatArray, curvature: FloatArray, prior: Prior
 ) -> FloatArray:
-    """Return the Newton step of the levels (m,), damped until it is within the longest step.
+    """Return the Newton step of the levels (m,), with damping so that no level exceeds _MAX_STEP.
 
-    Levels at a bound that the gradient pushes against do not move.
+    A level does not move if it is at a bound and its descent direction crosses this bound.
     """
-    is_free = (levels > prior.lower + 1e-9) | (gradient < 0)
-    is_free &= (levels < prior.upper - 1e-9) | (gradient > 0)
+    may_decrease = levels > prior.lower + 1e-9
+    may_increase = levels < prior.upper - 1e-9
+    is_free = (may_decrease | (gradient < 0)) & (may_increase | (gradient > 0))
     gradient = gradient[is_free]
     curvature = curvature[np.ix_(is_free, is_free)]
-    least_damping = 0.05 * np.abs(gradient).max(initial=0.0) / _LONGEST_STEP
+    added_damping = 0.05 * np.abs(gradient).max(initial=0.0) / _MAX_STEP
     step = np.zeros(len(levels))
     damping = 0.0
     while True:
         step[is_free] = -np.linalg.solve(curvature + damping * np.eye(len(gradient)), gradient)
-        if np.abs(step).max() <= _LONGEST_STEP:
+        if np.abs(step).max() <= _MAX_STEP:
             return np.clip(levels + step, prior.lower, prior.upper) - levels
-        damping = 2.0 * damping + least_damping
+        damping = 2.0 * damping + added_damping
 
 
 def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
-    """Return the gradient (m,) of the loss and the average information (m, m).
+    """Return the gradient (m,) of the loss and the average information (m, m) of the levels.
 
-    Both are with respect to the log levels.
-
-    With S^-1 the precision of errors that have covariance S, and M the second moments of their
-    smoothed values, the derivative with respect to the level of a basis is
-    ``1/2 exp(level) tr((S^-1 - S^-1 M S^-1) basis)``.
+    Let S be the prior covariance of errors v, and E[v v'] their posterior second moments. The
+    derivative of the loss with respect to the level of a basis of S is
+    ``1/2 exp(level) tr((S^-1 - S^-1 E[v v'] S^-1) basis)``, summed over all poses. The walk has a
+    derivative of the same form.
     """
     space = posterior.space
     states, walk = posterior.smoothed()
@@ -166,7 +170,7 @@ def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
     excess[space.weights == 0.0] = 0.0
     traces = [float((excess * basis).sum()) for basis in space.white_bases]
     moments = posterior.walk_covariances() + walk @ transposed(walk)
-    total = np.tensordot(posterior.evidence, moments, axes=1)
+    total = np.tensordot(posterior.walk_weights, moments, axes=1)
     walk_precision = posterior.walk_precision
     excess = (~space.cut).sum() * walk_precision - walk_precision @ total @ walk_precision
     traces += [float((excess * basis).sum()) for basis in space.walk_bases]
@@ -177,16 +181,17 @@ def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
 
 
 def _group_gradient(posterior: Posterior, group: Markov, states: FloatArray) -> FloatArray:
-    """Return numerical derivatives (2,) of the loss for one group.
+    """Return numerical derivatives (2,) of the loss with respect to the two levels of a group.
 
-    The derivatives are with respect to the log variance and the time constant of the group. The
-    part of the loss that depends on these two is ``1/2 (tr(Pi M) - log|Pi|)`` with the second
-    moments M of the smoothed processes and their precision Pi.
+    The levels are the log variance and the log time constant. The loss depends on them through
+    ``1/2 (tr(Pi E[g g']) - log|Pi|)``, summed over the processes g of the group. Pi is their prior
+    precision, E[g g'] are their posterior second moments. The moments are constant here.
     """
     covariance, below = posterior.factor.selected_inverse
     values = states[:, group.states]
     n_processes = values.shape[1]
-    # Second moments of each pose, and of each pose with the pose before.
+    # Second moments at each pose (N,), and between each pose and the pose before (n,), summed
+    # over the processes of the group.
     squares = np.einsum("nii->n", covariance[:, group.states, group.states])
     squares += np.einsum("nij,nij->n", values, values)
     products = np.einsum("nii->n", below[:, group.states, group.states])
@@ -202,11 +207,18 @@ def _group_gradient(posterior: Posterior, group: Markov, states: FloatArray) -> 
 
 
 def _average_information(posterior: Posterior, states: FloatArray, walk: FloatArray) -> FloatArray:
-    """Average information (m, m) at the smoothed states (N, d) and walk (n, 6)."""
+    """Return the average information (m, m) for the posterior means of states and walk.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    states : (N, d) array
+    walk : (n, 6) array
+    """
     space = posterior.space
     variances = np.exp(posterior.levels)
     n_white = len(space.white_bases)
-    # f_k through the states: their covariance's derivative times the forces on them.
+    # Levels of white errors and of processes: f_k = U (d Pi^-1 / d theta_k) Pi x.
     moved = np.zeros((*states.shape, len(variances)))
     forces = (posterior.white_precision @ states[:, :WHITE, None])[:, :, 0]
     forces[space.weights == 0.0] = 0.0
@@ -220,7 +232,7 @@ def _average_information(posterior: Posterior, states: FloatArray, walk: FloatAr
         moved[:, group.states, level] = values
         moved[:, group.states, level + 1] = group.derivative_by_log_tau(values)
     columns = space.apply_u(moved)
-    # f_k of the walk, which acts on the increments directly.
+    # Levels of the walk: f_k = (d W^-1 / d theta_k) W w.
     forces = walk @ posterior.walk_precision
     for level, basis in enumerate(space.walk_bases, start=n_white):
         columns[:, :, level] = variances[level] * forces @ basis

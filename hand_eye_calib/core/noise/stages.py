@@ -1,10 +1,16 @@
-"""Stages of the adaptive search, in order.
+"""Stages of the search for X, noise model, outliers and systematic errors, in their order.
 
-A :class:`Problem` holds the data and never changes. A :class:`Fit` is a state of the search: X, the
-noise model, outliers and systematic errors; a fit never changes either. A :class:`Workspace` keeps
-the factorisation for the last fit. :func:`start` makes the first fit. Each stage takes a workspace
-and a fit, and returns another fit. The order has reasons: outliers need noise levels,
-time-correlated errors must not explain outliers, and systematic errors need the noise model.
+:class:`Problem` contains the data. :class:`Fit` is one state of the search. Both are immutable.
+:class:`Workspace` stores the factorisation of the last fit. :func:`start` returns the first fit;
+each stage is a function that takes a workspace and a fit and returns the next fit:
+
+1. :func:`noise`: levels of white noise and walk;
+2. :func:`outliers`: jumps and outlier poses, which need noise levels;
+3. :func:`tails`: weights of white errors that have heavy tails;
+4. :func:`time_correlated`: Gauss-Markov processes, which must not explain outliers;
+5. :func:`systematic`: scale, bias and time offset, which need the whole noise model;
+6. :func:`polish`: X and all parameters, until X settles.
+
 docs/adaptive.md describes each stage.
 """
 
@@ -33,23 +39,23 @@ from hand_eye_calib.core.noise.increments import (
 )
 from hand_eye_calib.core.noise.noise_model import (
     CENTRES,
-    LASTING,
-    LOWEST_VARIANCE,
     N_FAST,
+    PROCESSES,
     ROTATION,
     VARIANCES,
     WALKS,
     WHITES,
     NoiseModel,
     increment_levels,
+    rough_levels,
 )
 from hand_eye_calib.core.noise.normal import NormalEquations
 from hand_eye_calib.core.noise.outliers import (
     Outliers,
-    bridged,
+    bridge_outliers,
+    detect_outliers,
     first_outliers,
-    innovations,
-    judged,
+    innovation_chi_squares,
     tail_weights,
 )
 from hand_eye_calib.core.noise.state_space import WHITE, Posterior, StateSpace
@@ -57,13 +63,14 @@ from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 from hand_eye_calib.core.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.core.solvers.registry import Method
 
-# Longest step of the translation of X (m). No lever arm is that long.
-_LONGEST_STEP_M = 1000.0
+# Longest accepted step of the translation of X (m). No lever arm is that long.
+_MAX_STEP_M = 1000.0
 
-# Steps of the search for time-correlated errors before processes without information are dropped.
+# Newton steps of the search for time-correlated errors before processes without information are
+# dropped for the first time.
 _FIRST_STEPS = 4
 
-# Longest step of X (m, rad) that is rounding.
+# A step of X (m, rad) that is shorter than this is rounding.
 _ROUNDING_STEP = 1e-9
 
 
@@ -75,12 +82,12 @@ class Problem:
     ----------
     streams : Streams
     columns : list of int
-        Parameters of the systematic errors in the model, see
+        Indices of the systematic errors in the model, see
         :data:`~hand_eye_calib.core.noise.increments.PARAMETERS`.
     is_clock_free : bool
-        Whether the time offset was estimated from the same poses.
+        Whether the time offset was estimated from the same poses. It has no prior then.
     without : frozenset of str
-        Names of the stages to leave out.
+        Names of the stages that are skipped.
     tuning : Tuning
     """
 
@@ -91,12 +98,12 @@ class Problem:
     tuning: Tuning = TUNING
 
     def prior(self, fit: Fit) -> FloatArray:
-        """Products (p + 1, p + 1) of the prior of the parameters."""
+        """Return the prior of the parameters (p + 1, p + 1), see :func:`prior_products`."""
         values = fit.parameters[self.columns]
         return prior_products(values, fit.sigmas[self.columns], 7 + len(values))
 
     def space(self, fit: Fit, kept: IntArray | None = None) -> StateSpace:
-        """State space of all poses, or of some."""
+        """Return the state space at a fit, of all poses or of the subset ``kept`` (indices)."""
         if kept is not None:
             fit = fit.at_poses(kept, self.tuning.longest_gap)
         linearisation = linearise(
@@ -113,18 +120,18 @@ class Problem:
         )
 
     def course(self, T_parent_child: FloatArray, levels: FloatArray) -> Course:
-        """Course of the streams, smoothed as far as noise of these levels requires."""
+        """Return the motion of the child, smoothed as much as the noise levels (m,) require."""
         noise_m = float(np.exp(0.5 * increment_levels(levels)[0]))
         return course_of(self.streams, T_parent_child, self.tuning.caution * noise_m**2)
 
     def is_noisy(self, fit: Fit) -> bool:
-        """Whether rotation noise exceeds a share of the rotation between poses."""
+        """Return whether rotation noise exceeds a share of the usual rotation between poses."""
         turns = se3.rotation_angle(se3.rotation_of(self.streams.motions_p))
         return bool(np.exp(0.5 * fit.levels[ROTATION]) > self.tuning.noisy_share * median(turns))
 
 
 class Workspace:
-    """A problem, and the factorisation for the last fit.
+    """Problem with a cache: the posterior of the last fit.
 
     Attributes
     ----------
@@ -133,14 +140,14 @@ class Workspace:
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
-        # Only the posterior of the last fit is stored, because a posterior of all poses is large.
+        # Only one posterior is stored, because the posterior of a long recording is large.
         self._fit: Fit | None = None
         self._posterior: Posterior | None = None
 
     def posterior(self, fit: Fit) -> Posterior:
-        """Return the posterior of all poses; solve only if the fit is not the last one."""
+        """Return the posterior of all poses at a fit; the same fit again costs nothing."""
         if self._posterior is None or self._fit is not fit:
-            # Release the memory of the last one first.
+            # Release the memory of the stored posterior before the next one is computed.
             self._posterior = None
             self._posterior = Posterior(self.problem.space(fit), fit.levels)
             self._fit = fit
@@ -154,23 +161,27 @@ class Fit:
     Attributes
     ----------
     poses : Streams
-        Without the errors estimated so far, outlier poses bridged.
+        Poses for linearisation: the errors estimated so far were removed, and outlier poses were
+        replaced by :func:`~hand_eye_calib.core.noise.outliers.bridge_outliers`.
     error : (N, 6) array
-        Errors c that were taken out of the poses.
+        Errors c that were removed from the poses.
     course : Course
+        Smoothed motion of the child.
     T : (4, 4) array
-        X.
+        X, which is T_parent_child.
     model : NoiseModel
     levels : (m,) array
-        Log levels of the model.
+        Levels of the model: log variances and log time constants.
     outliers : Outliers
     weights : (N,) array
-        Of white errors; other than 1 if tails are heavy.
+        Weights of white errors; other than 1 only if white errors have heavy tails.
     sigmas : (8,) array
         Prior standard deviations of systematic errors.
     has_heavy_tails : bool
+        Whether white errors have heavy tails.
     parameters : (8,) array
-        Of systematic errors.
+        Estimates of systematic errors, see
+        :data:`~hand_eye_calib.core.noise.increments.PARAMETERS`.
     """
 
     poses: Streams
@@ -186,7 +197,7 @@ class Fit:
     parameters: FloatArray = field(default_factory=lambda: np.zeros(N_SYSTEMATIC))
 
     def at_poses(self, kept: IntArray, longest_gap: int) -> Fit:
-        """Return the fit of a subset of poses, see :meth:`Outliers.across`."""
+        """Return the fit for a subset of poses (indices), see :meth:`Outliers.across`."""
         return replace(
             self,
             poses=self.poses[kept],
@@ -197,35 +208,44 @@ class Fit:
         )
 
     def moved(self, step: FloatArray, columns: list[int]) -> Fit:
-        """Return the fit after a step of xi and of the parameters of some columns.
+        """Return the fit after a step of the parameters beta.
 
-        X stays if the step is longer than any lever arm: noise along a direction that the motion
-        hardly excites.
+        ``step`` (6 + k,) contains xi, then changes of the k systematic errors in ``columns``. X
+        does not change if its step is longer than any lever arm: then the step is noise along a
+        direction that the motion hardly excites.
         """
         parameters = self.parameters.copy()
         parameters[columns] += step[6:]
-        if np.linalg.norm(step[:3]) >= _LONGEST_STEP_M:
+        if np.linalg.norm(step[:3]) >= _MAX_STEP_M:
             return replace(self, parameters=parameters)
         return replace(self, T=self.T @ se3.exp(step[:6]), parameters=parameters)
 
     def corrected(self, streams: Streams, states: FloatArray) -> Fit:
-        """Return the fit with the errors of states (N, d) taken out of the given poses.
+        """Return the fit with poses from which the estimated errors are removed.
 
-        White errors are split between the sensors by their covariances, which holds for errors of
-        these covariances only. A lasting error of some centimetres, split by white noise of a
-        millimetre, would become large and opposite rotations. So all other errors are split in
-        halves, and the errors of outlier poses, too.
+        White errors are split between both sensors in proportion to their covariances. All other
+        errors, and errors of outlier poses, are split in halves. The covariances of white noise do
+        not apply to them: an error of centimetres, split by covariances of millimetres, would
+        become large and opposite rotations of both sensors.
+
+        Parameters
+        ----------
+        streams : Streams
+            Measured poses.
+        states : (N, d) array
+            Expected states, see :mod:`~hand_eye_calib.core.noise.state_space`.
         """
         spikes = self.outliers.spikes
         T = self.T
         white_error = np.where(spikes[:, None], 0.0, states[:, :WHITE])
-        error = states[:, :WHITE] + self.model.lasting(states, self.poses, T)
+        error = states[:, :WHITE] + self.model.process_errors(states, self.poses, T)
         other_error = error - white_error
         shares = self.model.shares(self.levels, self.poses, T)
+        # Ad(X^-1) a of the parent, and b of the child, with c = Ad(X^-1) a - b.
         white_of_parent = se3.times(shares, white_error)
         of_parent = white_of_parent + 0.5 * other_error
         of_child = white_of_parent - white_error - 0.5 * other_error
-        measured = bridged(streams, T, spikes)
+        measured = bridge_outliers(streams, T, spikes)
         poses = Streams(
             streams.stamps_s,
             measured.Ts_pw_p @ se3.exp(-of_parent @ se3.adjoint(T).T),
@@ -235,16 +255,20 @@ class Fit:
 
 
 def prior_products(values: FloatArray, sigmas: FloatArray, size: int) -> FloatArray:
-    """Products (size, size) of a prior: parameters are zero with some standard deviations.
+    """Return a prior with mean zero as products that are added to ``[J e]' V^-1 [J e]``.
 
     Parameters
     ----------
     values : (k,) array
-        Present values of the last k parameters.
+        Present values of the last k parameters. The other parameters have no prior.
     sigmas : (k,) array
-        Prior standard deviations.
+        Prior standard deviations of the last k parameters.
     size : int
-        Number of all parameters, plus 1 for the residuals.
+        Number of rows of the products: that of all parameters, plus 1 for the residuals.
+
+    Returns
+    -------
+    (size, size) array
     """
     products = np.zeros((size, size))
     indices = np.arange(size - 1 - len(values), size - 1)
@@ -257,19 +281,22 @@ def prior_products(values: FloatArray, sigmas: FloatArray, size: int) -> FloatAr
 
 
 def sample(n_poses: int, tuning: Tuning) -> IntArray | None:
-    """Return poses to fit noise levels with: evenly spread bursts. None means all poses."""
+    """Return the indices of poses that noise levels are fitted to, or None for all poses.
+
+    The poses are in bursts that are spread evenly over the recording.
+    """
     if n_poses <= tuning.most_poses:
         return None
     burst = np.array(tuning.burst)
     n_bursts = tuning.most_poses // len(burst)
-    # A burst is at most twice as long as the time between the starts of two bursts.
+    # A burst is at most twice as long as the distance between the starts of two bursts.
     offsets = burst[2 * len(burst) * n_poses // tuning.most_poses > burst]
     starts = np.linspace(0, n_poses - 1 - offsets[-1], n_bursts).astype(int)
     return np.unique(starts[:, None] + offsets)
 
 
 def start(problem: Problem) -> Fit:
-    """Estimate X robustly, then jumps, noise levels and the centre of rotation noise."""
+    """Return the first fit: X by DNLO, first jumps and outliers, rough noise levels."""
     streams = problem.streams
     tuning = problem.tuning
     pairs = motion_pairs(streams.Ts_pw_p, streams.Ts_cw_c, tuning.start_reference)
@@ -279,10 +306,10 @@ def start(problem: Problem) -> Fit:
     outliers = first_outliers(streams, course, T, residuals, tuning)
     interval_s = median(np.diff(streams.stamps_s))
     duration_s = float(np.ptp(streams.stamps_s))
-    centre = _centre(streams, T, residuals, tuning.centre_ratio)
+    centre = _centre_of_rotations(streams, T, residuals, tuning.centre_ratio)
     left_out = outliers.jumps | outliers.spikes[1:] | outliers.spikes[:-1]
     return Fit(
-        poses=bridged(streams, T, outliers.spikes),
+        poses=bridge_outliers(streams, T, outliers.spikes),
         error=np.zeros((len(streams), 6)),
         course=course,
         T=T,
@@ -294,46 +321,26 @@ def start(problem: Problem) -> Fit:
     )
 
 
-def _centre(streams: Streams, T: FloatArray, residuals: FloatArray, decisive: float) -> str:
-    """Centre of white rotation noise, see :data:`~hand_eye_calib.core.noise.noise_model.CENTRES`.
+def _centre_of_rotations(
+    streams: Streams, T: FloatArray, residuals: FloatArray, max_ratio: float
+) -> str:
+    """Return the point of CENTRES that white rotation errors turn about.
 
-    It is the origin of a world if residuals at that origin are clearly smaller.
+    It is the origin of a world if the translations of residuals (n, 6) at this origin are smaller
+    than ``max_ratio`` times those at the sensors.
     """
-    worlds = {"child": streams.Ts_cw_c[1:], "parent": streams.Ts_pw_p[1:] @ T}
+    poses_of_child = {"child": streams.Ts_cw_c[1:], "parent": streams.Ts_pw_p[1:] @ T}
     sizes = {"sensors": median(np.linalg.norm(residuals[:, :3], axis=1))}
-    for centre, poses in worlds.items():
+    for world, poses in poses_of_child.items():
         to_origin = se3.translation_of(se3.inverse(poses))
         at_origin = residuals[:, :3] + np.cross(residuals[:, 3:], to_origin)
-        sizes[centre] = median(np.linalg.norm(at_origin, axis=1))
+        sizes[world] = median(np.linalg.norm(at_origin, axis=1))
     best = min(CENTRES, key=lambda centre: sizes[centre])
-    return best if sizes[best] < decisive * sizes["sensors"] else "sensors"
-
-
-def rough_levels(residuals: FloatArray, left_out: BoolArray, jitter: float) -> FloatArray:
-    """Return log levels (5,) to start at: half of each mean square is white noise, half is walk.
-
-    Parameters
-    ----------
-    residuals : (n, 6) array
-    left_out : (n,) bool array
-        Increments that are no evidence.
-    jitter : float
-        Log variance (s^2) of the jitter of stamps.
-    """
-    squares = (residuals[~left_out] ** 2).reshape(-1, 2, 3)
-    variances = np.zeros(2)
-    if len(squares):
-        variances = squares.mean(axis=(0, 2))
-    total = np.log(np.maximum(variances, 100 * LOWEST_VARIANCE))
-    levels = np.full(N_FAST, jitter)
-    # An increment has the white noise of two poses.
-    levels[WHITES] = total + np.log(0.25)
-    levels[WALKS] = total + np.log(0.5)
-    return levels
+    return best if sizes[best] < max_ratio * sizes["sensors"] else "sensors"
 
 
 def noise(workspace: Workspace, fit: Fit) -> Fit:
-    """Fit the levels of white noise and walk, then take one step of X."""
+    """Fit all levels of the model, then take one step of X. Systematic errors do not change."""
     problem = workspace.problem
     tuning = problem.tuning
     space = problem.space(fit, sample(len(problem.streams), tuning))
@@ -350,88 +357,89 @@ def outliers(workspace: Workspace, fit: Fit) -> Fit:
     """Detect jumps and outlier poses, and fit the noise without them."""
     problem = workspace.problem
     tuning = problem.tuning
-    searched = _with_outliers(workspace, fit, tuning.max_rounds)
-    if searched.outliers.differs_by(fit.outliers) > tuning.negligible_share:
-        searched = _with_outliers(workspace, noise(workspace, searched), 1)
-    spikes = searched.outliers.spikes
+    detected = _detect_in_rounds(workspace, fit, tuning.max_rounds)
+    if detected.outliers.differs_by(fit.outliers) > tuning.negligible_share:
+        detected = _detect_in_rounds(workspace, noise(workspace, detected), 1)
+    spikes = detected.outliers.spikes
     if np.mean(spikes) > tuning.max_outlier_share:
-        # Whole stretches are noisy, and no single pose is wrong. All poses get less weight instead.
-        searched = replace(
-            searched,
-            outliers=Outliers(searched.outliers.jumps, np.zeros_like(spikes)),
+        # Not single poses, but long stretches are noisy. Weights of heavy tails replace outliers.
+        detected = replace(
+            detected,
+            outliers=Outliers(detected.outliers.jumps, np.zeros_like(spikes)),
             poses=problem.streams,
             has_heavy_tails=True,
         )
-    return searched
+    return detected
 
 
-def _with_outliers(workspace: Workspace, fit: Fit, rounds: int, with_spikes: bool = True) -> Fit:
-    """Detect jumps and outlier poses alternately until few change.
+def _detect_in_rounds(workspace: Workspace, fit: Fit, rounds: int, with_spikes: bool = True) -> Fit:
+    """Detect jumps and outlier poses, at most ``rounds`` times, until few of them change.
 
-    Without spikes, detect only jumps: heavy tails have weights instead.
+    Without spikes, detect only jumps: outlier poses have small weights then.
     """
     problem = workspace.problem
     tuning = problem.tuning
     for _ in range(rounds):
         if problem.is_noisy(fit):
             fit = fit.corrected(problem.streams, _states_of(workspace, fit))
-        of_walk, of_white = innovations(workspace.posterior(fit), fit.outliers.spikes)
-        detected = judged(fit.outliers, of_walk, of_white, tuning, with_spikes)
+        of_walk, of_white = innovation_chi_squares(workspace.posterior(fit), fit.outliers.spikes)
+        detected = detect_outliers(fit.outliers, of_walk, of_white, tuning, with_spikes)
         change = detected.differs_by(fit.outliers)
         if change:
-            poses = bridged(problem.streams, fit.T, detected.spikes)
+            poses = bridge_outliers(problem.streams, fit.T, detected.spikes)
             fit = replace(fit, outliers=detected, poses=poses, error=np.zeros_like(fit.error))
         if change <= tuning.negligible_share:
             break
     if with_spikes:
-        normal = of_white[~fit.outliers.spikes]
-        is_heavy = np.mean(normal**2) > tuning.heavy_kurtosis * np.mean(normal) ** 2
+        of_sound = of_white[~fit.outliers.spikes]
+        is_heavy = np.mean(of_sound**2) > tuning.heavy_kurtosis * np.mean(of_sound) ** 2
         fit = replace(fit, has_heavy_tails=bool(is_heavy))
     return fit
 
 
 def _states_of(workspace: Workspace, fit: Fit) -> FloatArray:
-    """Return the expected states (N, d) after the next step of a fit.
+    """Return the expected states (N, d) after the next step of the parameters.
 
-    No caller needs a reference to the posterior then: two posteriors of a long recording would fill
-    the memory.
+    A function of its own, so that the caller has no reference to the posterior: two posteriors of a
+    long recording would fill the memory.
     """
     posterior = workspace.posterior(fit)
     return posterior.states_after(posterior.normal.step)
 
 
 def tails(workspace: Workspace, fit: Fit) -> Fit:
-    """Weight white errors with heavy tails."""
+    """Weight white errors by Student's t distribution if they have heavy tails."""
     if not fit.has_heavy_tails:
         return fit
     for _ in range(2):
         posterior = workspace.posterior(fit)
-        # Three rounds of weights at one model; the last weights are those of the next fit.
+        # Three rounds of weights at constant levels. The third weights are those of the next fit.
         for _ in range(2):
             weights = np.where(fit.outliers.spikes, 0.0, tail_weights(posterior))
             posterior = Posterior(replace(posterior.space, weights=weights), posterior.levels)
         fit = noise(workspace, replace(fit, weights=tail_weights(posterior)))
-    return _with_outliers(workspace, fit, 2, with_spikes=False)
+    return _detect_in_rounds(workspace, fit, 2, with_spikes=False)
 
 
-def lasting(workspace: Workspace, fit: Fit) -> Fit:
-    """Add time-correlated errors to the model if the data ask for them.
+def time_correlated(workspace: Workspace, fit: Fit) -> Fit:
+    """Add time-correlated errors to the model if they lower the loss enough.
 
-    The search begins with all processes. Processes without information are dropped after some
-    steps, which makes the other steps faster, and again at the end.
+    The search begins with all processes. Processes on which the data have no information are
+    dropped after some steps, so that the other steps are faster, and again at the end.
     """
     problem = workspace.problem
     tuning = problem.tuning
     kept = sample(len(problem.streams), tuning)
-    # Large biases are possible here. Otherwise a bias would become drift and never be found.
+    # The prior allows large biases here. Otherwise a process would explain a constant bias.
     free = replace(fit, sigmas=np.array(tuning.sizes))
     loss_before = Posterior(problem.space(free, kept), fit.levels).loss
-    # Neither white noise nor walk is too small to matter during the search.
+    # White noise and walk begin with a share of the variance of an increment at least, so that
+    # their levels have a gradient.
     lowest = increment_levels(fit.levels) + np.log(tuning.start_share)
     levels = fit.levels.copy()
     levels[WHITES] = np.maximum(levels[WHITES], lowest)
     levels[WALKS] = np.maximum(levels[WALKS], lowest)
-    model, levels = fit.model.with_lasting(LASTING, levels)
+    model, levels = fit.model.with_processes(PROCESSES, levels)
     rival = replace(free, model=model, levels=levels)
     settled_loss = tuning.settled_loss * len(levels)
     for n_steps in (_FIRST_STEPS, reml.MAX_STEPS):
@@ -440,7 +448,7 @@ def lasting(workspace: Workspace, fit: Fit) -> Fit:
         fitted, information = reml.fit(space, rival.levels, prior, settled_loss, n_steps)
         matters = np.diag(information)[VARIANCES] > tuning.min_information
         if n_steps == _FIRST_STEPS:
-            # The level of a process without information may rise in the other steps.
+            # A process whose level has risen may get information in the other steps.
             matters |= (fitted.levels > rival.levels)[VARIANCES]
         rival = _with_processes(rival, fitted.levels, matters)
     if loss_before - fitted.loss < tuning.least_gain:
@@ -449,21 +457,26 @@ def lasting(workspace: Workspace, fit: Fit) -> Fit:
 
 
 def _with_processes(fit: Fit, levels: FloatArray, is_kept: BoolArray) -> Fit:
-    """Return the fit at levels (m,) with only some of its K time-correlated errors.
+    """Return the fit at given levels, with a subset of its K time-correlated errors.
 
     Parameters
     ----------
     fit : Fit
     levels : (m,) array
+        Levels of all K processes and of the other errors.
     is_kept : (K,) bool array
     """
-    model = replace(fit.model, slow=tuple(compress(fit.model.slow, is_kept)))
+    model = replace(fit.model, processes=tuple(compress(fit.model.processes, is_kept)))
     is_kept_level = np.r_[np.ones(N_FAST, dtype=bool), np.repeat(is_kept, 2)]
     return replace(fit, model=model, levels=levels[is_kept_level])
 
 
 class _Hypothesis(NamedTuple):
-    """Systematic errors that may be present: the fit, its solution and its loss."""
+    """Set of systematic errors that may be present.
+
+    ``fit`` contains their prior standard deviations, ``normal`` is its solution, and ``loss`` is
+    minus twice the log evidence.
+    """
 
     fit: Fit
     normal: NormalEquations
@@ -471,10 +484,10 @@ class _Hypothesis(NamedTuple):
 
 
 def systematic(workspace: Workspace, fit: Fit) -> Fit:
-    """Choose the likeliest systematic errors, then take a step of X and of their parameters.
+    """Choose the likeliest set of systematic errors, then take a step of X and of these errors.
 
-    The child's path has a scale, or a bias along one of its axes, or neither. The step is taken at
-    poses without their errors.
+    The child's path has a scale, or a bias along one of its axes, or neither of them. Each of these
+    sets is tried with and without a time offset. The estimated errors are removed from the poses.
     """
     problem = workspace.problem
     tuning = problem.tuning
@@ -490,6 +503,7 @@ def systematic(workspace: Workspace, fit: Fit) -> Fit:
         gain = plain.loss - rival.loss
         if column != SCALE:
             gain *= tuning.bias_gain_share
+        # Largest ratio of the variances of X with and without the error, over all directions.
         ratios = plain_information @ rival.normal.covariance[:6, :6]
         growth = np.linalg.eigvals(ratios).real.max()
         if growth < tuning.max_sigma_growth**2 and gain > largest_gain:
@@ -504,16 +518,25 @@ def systematic(workspace: Workspace, fit: Fit) -> Fit:
 def _likeliest(
     problem: Problem, fit: Fit, posterior: Posterior, path_columns: list[int]
 ) -> _Hypothesis:
-    """Return the likelier hypothesis: errors of the path with or without a time offset.
+    """Return the likelier hypothesis: some errors of the path, with or without a time offset.
 
-    The loss is minus twice the log evidence. The noise levels may be those of other systematic
-    errors, so a common factor of all variances is integrated out: its prior counts as much as all
-    residuals, and makes the evidence one of Student's t distribution.
+    The noise levels were fitted with other systematic errors. So the evidence integrates over a
+    common factor of all variances, whose prior counts as much as all residuals. The evidence is
+    then that of Student's t distribution.
+
+    Parameters
+    ----------
+    problem : Problem
+    fit : Fit
+    posterior : Posterior
+        Posterior of the fit.
+    path_columns : list of int
+        Indices of the errors of the path that are present.
     """
     tuning = problem.tuning
     choices_of_time = [[], [TIME]] if TIME in problem.columns else [[]]
     if problem.is_clock_free:
-        # A time offset without a prior is present for sure.
+        # An estimated clock offset has an error for sure.
         choices_of_time = choices_of_time[-1:]
     products = posterior.products - problem.prior(fit)
     log_odds = np.log(tuning.odds)
@@ -521,6 +544,7 @@ def _likeliest(
     hypotheses = []
     for time_columns in choices_of_time:
         present = path_columns + time_columns
+        # A bias of rates is always present.
         is_present = [k in present or k in RATE for k in range(N_SYSTEMATIC)]
         rival = replace(fit, sigmas=np.where(is_present, tuning.sizes, tuning.absent_sigma))
         normal = NormalEquations(products + problem.prior(rival))
@@ -532,17 +556,17 @@ def _likeliest(
 
 
 def polish(workspace: Workspace, fit: Fit) -> Fit:
-    """Follow X until it settles, with derivatives at poses without their errors."""
+    """Take steps of X and of systematic errors until X settles or max_rounds is reached."""
     problem = workspace.problem
     for _ in range(problem.tuning.max_rounds - 1):
         if is_settled(workspace, fit):
             break
-        fit = _polished(workspace, fit)
+        fit = _take_step(workspace, fit)
     return fit
 
 
-def _polished(workspace: Workspace, fit: Fit) -> Fit:
-    """Take one step of all parameters, and take the expected errors out of the poses."""
+def _take_step(workspace: Workspace, fit: Fit) -> Fit:
+    """Take one step of all parameters, and remove the expected errors from the poses."""
     problem = workspace.problem
     posterior = workspace.posterior(fit)
     if fit.has_heavy_tails and "tails" not in problem.without:
@@ -553,9 +577,10 @@ def _polished(workspace: Workspace, fit: Fit) -> Fit:
 
 
 def is_settled(workspace: Workspace, fit: Fit) -> bool:
-    """Return whether the next step is a small share of its standard deviations.
+    """Return whether the next step of all parameters is small relative to their sigmas.
 
-    Translations that the motion does not excite need not settle.
+    A translation of X with a large standard deviation need not settle: the motion does not excite
+    its direction.
     """
     tuning = workspace.problem.tuning
     normal = workspace.posterior(fit).normal
@@ -568,6 +593,6 @@ def is_settled(workspace: Workspace, fit: Fit) -> bool:
     return bool((np.abs(steps) < limits).all())
 
 
-# A stage of the search.
+# Function of a stage of the search.
 Stage: TypeAlias = Callable[[Workspace, Fit], Fit]
-STAGES: tuple[Stage, ...] = (noise, outliers, tails, lasting, systematic, polish)
+STAGES: tuple[Stage, ...] = (noise, outliers, tails, time_correlated, systematic, polish)

@@ -1,19 +1,24 @@
 """Exact likelihood of increments under white errors, a random walk and time-correlated errors.
 
-The state x_i of pose i holds its white error and the values of first-order Gauss-Markov processes
-``g_{i+1} = phi_i g_i + q_i`` with ``phi_i = exp(-dt_i / tau)``. The residuals e of the increments,
-see :mod:`~hand_eye_calib.core.noise.increments`, depend on parameters beta and on a random walk w:
+The symbols are those of :mod:`hand_eye_calib.core.noise`. The state x_i of pose i consists of its
+white error v_i and of all processes g_ik, with ``phi_ik = exp(-dt_i / tau_k)``. In terms of states,
 
-    e_i + J_i beta = H1_i x_{i+1} - H0_i x_i + w_i          (in short: e + J beta = U x + w)
+    e_i + J_i beta = H1_i x_{i+1} - H0_i x_i + w_i,      for all increments: e + J beta = U x + w
 
-With the precision Pi of all states before the data and the precision W of the walk, the precision
-after the data is block tridiagonal. The covariance V of the increments follows from it:
+    H1_i = [I, M_{i+1}],      H0_i = Ad(B_i^-1) [I, M_i]
 
-    P = Pi + U' W U,       log|V| = log|P| - log|Pi| - log|W|,       V^-1 Z = W (Z - U P^-1 U' W Z)
+Pi is the prior precision of all states, W is the precision of w, and V is the covariance of
+``e + J beta``. The posterior precision Lambda of the states is block tridiagonal. For any matrix Z
+with the rows of e,
 
-One factorisation P = L L' yields the likelihood in time linear in the number of poses. Products
-need only the forward half of the solution: ``Z' V^-1 Z = Z' W Z - Y' Y`` with ``Y = L^-1 U' W Z``.
-This is the information form of the Kalman smoother (Rauch, Tung, Striebel, AIAA J. 3, 1965).
+    Lambda = Pi + U' W U
+    log|V| = log|Lambda| - log|Pi| - log|W|
+    V^-1 Z = W (Z - U Lambda^-1 U' W Z)
+
+One factorisation ``Lambda = L L'`` yields the likelihood in time linear in the number of poses.
+Products need only the forward half of the solution: ``Z' V^-1 Z = Z' W Z - Y' Y`` with
+``Y = L^-1 U' W Z``. This is the information form of the Kalman smoother (Rauch, Tung, Striebel,
+AIAA J. 3, 1965).
 """
 
 from __future__ import annotations
@@ -32,55 +37,56 @@ from hand_eye_calib.core.noise.normal import (
     transposed,
 )
 
-# States of a pose's white error: translation and rotation.
+# Number of states of a pose that are its white error: three of translation, three of rotation.
 WHITE = 6
 
-# Share by which the diagonal of P is raised. Rounding must not make P indefinite.
-_RAISED = 1e-13
+# Relative increase of the diagonal of Lambda, so that rounding does not make Lambda indefinite.
+_DIAGONAL_INCREASE = 1e-13
 
-# Change of a level for numerical derivatives: errors of the formula and of rounding are both about
-# 1e-10.
+# Change of a level for numerical derivatives. The errors of truncation and of rounding are both
+# about 1e-10 then.
 LEVEL_CHANGE = 1e-5
 
-# Number of parts of a recording for the jackknife.
-_N_PARTS = 20
+# Largest number of blocks of time that a recording is divided into for the jackknife.
+_MAX_BLOCKS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
 class StateSpace:
-    """Linear state space of N poses, n = N - 1 increments, d states and p parameters.
+    """Linear state space of N poses, n = N - 1 increments, d states per pose and p parameters.
 
     Attributes
     ----------
     intervals_s : (n,) array
+        Durations of the increments.
     walk_factors : (n,) array
-        Variance of the walk over each increment, in units of a typical increment.
+        Variance of the walk over each increment, divided by that over a typical increment.
     columns : (n, 6, p + 1) array
-        ``[J e]``: derivatives with respect to the parameters; last, residuals.
-    ahead : (n, 6, d - 6) array
-        H1 without the columns of the white error, where H1 is the identity.
-    behind : (n, 6, d) array
+        ``[J e]``: derivatives with respect to the parameters beta, then the residuals.
+    h1_processes : (n, 6, d - 6) array
+        Columns of H1 for the processes. The first six columns of H1 are the identity.
+    h0 : (n, 6, d) array
         H0.
     white_bases : tuple of (1 or N, 6, 6) arrays
-        The covariance of a white error is ``sum exp(level) basis``.
+        The covariance of a white error is ``sum exp(level) basis``, a basis for each level.
     walk_bases : tuple of (6, 6) arrays
-        The same of the walk.
+        The covariance of the walk over a typical increment is a sum of the same form.
     group_sizes : tuple of int
-        Numbers of Gauss-Markov processes that share a variance and a time constant, by group. The
-        states of the groups follow the white error.
+        Number of processes in each group. The processes of a group are independent and share a
+        variance and a time constant. In a state, the groups follow the white error in this order.
     weights : (N,) array
-        Factors of the precision of each pose's white error; zero for a pose that may be anywhere.
+        Factor of the precision of each white error; zero for an outlier pose.
     cut : (n,) bool array
-        Increments that are no evidence.
+        Increments without information: jumps, and long gaps between poses.
     prior : (p + 1, p + 1) array
-        Products that the prior of the parameters adds.
+        Prior of the parameters, as products that are added to ``[J e]' V^-1 [J e]``.
     """
 
     intervals_s: FloatArray
     walk_factors: FloatArray
     columns: FloatArray
-    ahead: FloatArray
-    behind: FloatArray
+    h1_processes: FloatArray
+    h0: FloatArray
     white_bases: tuple[FloatArray, ...]
     walk_bases: tuple[FloatArray, ...]
     group_sizes: tuple[int, ...]
@@ -89,7 +95,7 @@ class StateSpace:
     prior: FloatArray
 
     def white_precision(self, levels: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Invert the covariances of the white errors for weight 1.
+        """Invert the covariances of the white errors, without the weights of poses.
 
         Returns
         -------
@@ -102,37 +108,38 @@ class StateSpace:
         return transposed(roots) @ roots, log_determinants
 
     def apply_u(self, states: FloatArray) -> FloatArray:
-        """Return ``U x`` (n, 6, k) of states (N, d, k)."""
-        product = self.behind @ states[:-1]
+        """Return ``U x`` (n, 6, k) for k columns of states (N, d, k)."""
+        product = self.h0 @ states[:-1]
         return np.subtract(self.apply_h1(states[1:]), product, out=product)
 
     def apply_h1(self, blocks: FloatArray) -> FloatArray:
-        """Return H1 of every increment times blocks (n, d, k): (n, 6, k)."""
+        """Return the products (n, 6, k) of H1_i with blocks (n, d, k)."""
         white = blocks[:, :WHITE]
         if not self.group_sizes:
             return white
-        return white + self.ahead @ blocks[:, WHITE:]
+        return white + self.h1_processes @ blocks[:, WHITE:]
 
     def apply_u_transposed(self, columns: FloatArray) -> FloatArray:
-        """Return U' (N, d, k) times columns (n, 6, k)."""
-        states = np.empty((len(columns) + 1, self.behind.shape[2], columns.shape[2]))
-        np.matmul(-transposed(self.behind), columns, out=states[:-1])
+        """Return the product (N, d, k) of U' with columns (n, 6, k)."""
+        states = np.empty((len(columns) + 1, self.h0.shape[2], columns.shape[2]))
+        np.matmul(-transposed(self.h0), columns, out=states[:-1])
         states[-1] = 0.0
         states[1:, :WHITE] += columns
         if self.group_sizes:
-            states[1:, WHITE:] += transposed(self.ahead) @ columns
+            states[1:, WHITE:] += transposed(self.h1_processes) @ columns
         return states
 
 
 class Markov:
     """Group of independent Gauss-Markov processes with one variance and one time constant.
 
-    The precision Pi (N, N) of the values of one process at all poses is tridiagonal.
+    The block (N, N) of Pi for one process, its prior precision at all poses, is tridiagonal. Here,
+    Pi is this block.
 
     Parameters
     ----------
     states : slice
-        Of the state of a pose.
+        Places of the processes of this group in the state of a pose.
     levels : (2,) array
         Logarithms of the stationary variance and of the time constant (s).
     intervals_s : (n,) array
@@ -140,14 +147,15 @@ class Markov:
     Attributes
     ----------
     first : float
-        Contribution to Pi of the stationary variance of the first state.
+        Precision of the value at the first pose: the inverse of the stationary variance.
     after, between, before : (n,) arrays
-        Contributions of an increment to Pi: to the state after the increment, between both states,
-        and to the state before the increment.
+        Contributions of each increment to Pi: to the diagonal element of the pose after the
+        increment, to the element below the diagonal, and to the diagonal element of the pose
+        before the increment.
     diagonal : (N,) array
-        Diagonal of Pi; ``between`` is beside the diagonal.
+        Diagonal of Pi. The elements below the diagonal are ``between``.
     log_determinant : float
-        -log|Pi|.
+        Log determinant of the covariance of one process: -log|Pi|.
     """
 
     def __init__(self, states: slice, levels: FloatArray, intervals_s: FloatArray) -> None:
@@ -165,21 +173,20 @@ class Markov:
         self.log_determinant = float(levels[0] + np.log(variances_of_q).sum())
 
     def changed(self, change: FloatArray) -> Markov:
-        """Return the group after a change (2,) of the levels."""
+        """Return the same group at levels that differ by ``change`` (2,)."""
         return Markov(self.states, self._levels + change, self._intervals_s)
 
     def forces(self, values: FloatArray) -> FloatArray:
-        """Return ``Pi values`` (N, k) of states (N, k)."""
+        """Return ``Pi values`` (N, k) for the values (N, k) of k processes."""
         forces = self.diagonal[:, None] * values
         forces[1:] += self.between[:, None] * values[:-1]
         forces[:-1] += self.between[:, None] * values[1:]
         return forces
 
     def derivative_by_log_tau(self, values: FloatArray) -> FloatArray:
-        """Derivative of states (N, k) with respect to log tau: ``dC f`` with C f = values.
+        """Return ``(d Pi^-1 / d log tau) Pi values`` (N, k) for the values (N, k) of k processes.
 
-        With C = Pi^-1, ``dC f = -C (dPi) values``. The numerical derivative of the precision is
-        dPi.
+        It equals ``-Pi^-1 (d Pi / d log tau) values``; the derivative of Pi is numerical.
         """
         change = np.array([0.0, LEVEL_CHANGE])
         forces = self.changed(change).forces(values) - self.changed(-change).forces(values)
@@ -189,7 +196,7 @@ class Markov:
 
 
 class Posterior:
-    """States, parameters and likelihood of a state space at log levels.
+    """Posterior of states and parameters, and their likelihood, at given levels.
 
     Parameters
     ----------
@@ -201,23 +208,25 @@ class Posterior:
     Attributes
     ----------
     white_precision : (N, 6, 6) array
-        Precisions of the white errors for weight 1.
+        Precisions of the white errors, without the weights of poses.
     walk_covariance, walk_precision : (6, 6) arrays
-        Of the walk over a typical increment.
-    evidence : (n,) array
-        Factors of ``walk_precision``; zero for increments that are no evidence.
+        Covariance of the walk over a typical increment, and its inverse.
+    walk_weights : (n,) array
+        W of increment i is ``walk_weights[i] walk_precision``; zero for increments without
+        information.
     groups : list of Markov
     factor : Factor
-        Of P. Its ``selected_inverse`` holds the covariances of the states for known parameters: of
-        each pose (N, d, d), and between each pose and the pose before (n, d, d).
+        Cholesky factor L of Lambda. Its ``selected_inverse`` contains the covariances of the states
+        for known parameters: of each pose (N, d, d), and between each pose and the pose before
+        (n, d, d).
     log_determinant : float
-        log|V| without the increments that are no evidence.
+        log|V|, with V restricted to the increments that have information.
     whitened : (N, d, p + 1) array
-        Y of the space's columns.
+        Y of Z = [J e].
     products : (p + 1, p + 1) array
-        ``[J e]' V^-1 [J e]`` and the prior.
+        ``[J e]' V^-1 [J e]``, plus the prior of the parameters.
     normal : NormalEquations
-        Solution for all parameters.
+        Generalised least squares solution for the parameters beta.
     loss : float
         Negative restricted log likelihood without constants (Patterson, Thompson, Biometrika 58,
         1971).
@@ -235,12 +244,12 @@ class Posterior:
         is_free = space.weights == 0.0
         self.white_precision, white_log_determinants = space.white_precision(levels)
         self._white_precisions = space.weights[:, None, None] * self.white_precision
-        # The logarithm of this determinant is zero.
+        # An identity in place of zeros keeps Pi invertible; its log determinant is zero.
         self._white_precisions[is_free] = np.eye(WHITE)
         self.walk_covariance = total_covariance(levels[n_white:], space.walk_bases)
         self.walk_precision = np.linalg.inv(self.walk_covariance)
-        self.evidence = np.where(space.cut, 0.0, 1.0 / space.walk_factors)
-        self._walk_precisions = self.evidence[:, None, None] * self.walk_precision
+        self.walk_weights = np.where(space.cut, 0.0, 1.0 / space.walk_factors)
+        self._walk_precisions = self.walk_weights[:, None, None] * self.walk_precision
         self.groups = self._groups(n_white + len(space.walk_bases))
         self.factor = self._factorised()
         self.log_determinant = self._log_determinant(white_log_determinants[~is_free])
@@ -252,7 +261,7 @@ class Posterior:
         self.loss = 0.5 * float(determinants + self.normal.cost)
 
     def _groups(self, first_level: int) -> list[Markov]:
-        """Return the processes of each group, whose two levels begin at ``first_level``."""
+        """Return all groups of processes; ``first_level`` is the index of their first level."""
         groups = []
         state = WHITE
         level = first_level
@@ -264,48 +273,51 @@ class Posterior:
         return groups
 
     def _factorised(self) -> Factor:
-        """Return the factor of P. The blocks of P, as large as the factor, are not stored."""
+        """Return the Cholesky factor of Lambda.
+
+        The blocks of Lambda are as large as the factor. They are local, so that they are released.
+        """
         diagonal, below = self._precision_blocks(0, len(self.space.cut))
-        np.einsum("nii->ni", diagonal)[:] *= 1.0 + _RAISED
+        np.einsum("nii->ni", diagonal)[:] *= 1.0 + _DIAGONAL_INCREASE
         return Factor(diagonal, below)
 
     def _log_determinant(self, white_log_determinants: FloatArray) -> float:
-        """Return log|V| from the log determinants of P, Pi and W."""
+        """Return log|V| from the log determinants of Lambda, Pi and W."""
         space = self.space
         weights = space.weights[space.weights != 0.0]
         of_pi = float((WHITE * np.log(weights) - white_log_determinants).sum())
         for group, size in zip(self.groups, space.group_sizes, strict=True):
             of_pi -= size * group.log_determinant
-        evidence = space.walk_factors[~space.cut]
-        of_walk = WHITE * np.log(evidence).sum()
-        of_walk += len(evidence) * np.linalg.slogdet(self.walk_covariance)[1]
+        walk_factors = space.walk_factors[~space.cut]
+        of_walk = WHITE * np.log(walk_factors).sum()
+        of_walk += len(walk_factors) * np.linalg.slogdet(self.walk_covariance)[1]
         return float(of_walk + self.factor.log_determinant - of_pi)
 
     def _precision_blocks(self, start: int, end: int) -> tuple[FloatArray, FloatArray]:
-        """Blocks of P on the diagonal (m + 1, d, d) and below it (m, d, d).
+        """Return the contribution of m increments, from pose ``start`` to pose ``end``, to Lambda.
 
-        They belong to the m increments from pose ``start`` to pose ``end``. The precision of each
-        pose's white error belongs to the increment before the pose, except that of the first pose,
-        which belongs to the first increment.
+        The blocks on the diagonal are (m + 1, d, d), those below it (m, d, d). The prior precision
+        of a pose counts with the increment before the pose; that of the very first pose, with the
+        first increment.
         """
         space = self.space
         increments = slice(start, end)
         later = slice(1, None)
-        ahead = space.ahead[increments]
-        behind = space.behind[increments]
+        h1_processes = space.h1_processes[increments]
+        h0 = space.h0[increments]
         W = self._walk_precisions[increments]
-        n, _, size = behind.shape
+        n, _, size = h0.shape
         diagonal = np.zeros((n + 1, size, size))
         below = np.zeros((n, size, size))
         diagonal[later, :WHITE, :WHITE] = W
-        W_H0 = np.matmul(W, behind, out=below[:, :WHITE])
+        W_H0 = np.matmul(W, h0, out=below[:, :WHITE])
         if self.groups:
-            W_H1 = W @ ahead
+            W_H1 = W @ h1_processes
             diagonal[later, :WHITE, WHITE:] = W_H1
             diagonal[later, WHITE:, :WHITE] = transposed(W_H1)
-            diagonal[later, WHITE:, WHITE:] = transposed(ahead) @ W_H1
-            below[:, WHITE:] = -(transposed(ahead) @ W_H0)
-        diagonal[:-1] += transposed(behind) @ W_H0
+            diagonal[later, WHITE:, WHITE:] = transposed(h1_processes) @ W_H1
+            below[:, WHITE:] = -(transposed(h1_processes) @ W_H0)
+        diagonal[:-1] += transposed(h0) @ W_H0
         np.negative(W_H0, out=W_H0)
         diagonal[later, :WHITE, :WHITE] += self._white_precisions[start + 1 : end + 1]
         if start == 0:
@@ -320,20 +332,20 @@ class Posterior:
         return diagonal, below
 
     def forward_half(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return W Z (n, 6, k) and Y (N, d, k) of columns Z (n, 6, k)."""
+        """Return W Z (n, 6, k) and Y = L^-1 U' W Z (N, d, k) of columns Z (n, 6, k)."""
         weighted = self._walk_precisions @ columns
         return weighted, self.factor.whiten(self.space.apply_u_transposed(weighted))
 
     def states_after(self, step: FloatArray) -> FloatArray:
-        """Return the expected states (N, d) after a step (p,) of the parameters."""
+        """Return the posterior mean (N, d) of the states after a step (p,) of the parameters."""
         mixing = np.r_[step, 1.0][:, None]
-        return self.factor.restore(_mixed(self.whitened, mixing))[:, :, 0]
+        return self.factor.restore(_combine(self.whitened, mixing))[:, :, 0]
 
     def smoothed(self) -> tuple[FloatArray, FloatArray]:
-        """Return states (N, d, 1 + p) and walk (n, 6, 1 + p), smoothed, for unknown parameters.
+        """Return the smoothed states (N, d, 1 + p) and walk (n, 6, 1 + p).
 
-        The first column is the expected value. The squares of the other columns sum to the variance
-        that the uncertainty of the parameters adds.
+        The first column is the posterior mean. The other columns are a root of the covariance that
+        the uncertainty of the parameters adds: the sum of their outer products.
         """
         normal = self.normal
         size = len(normal.step)
@@ -341,72 +353,74 @@ class Posterior:
         mixing[:-1, 0] = normal.step
         mixing[-1, 0] = 1.0
         mixing[:-1, 1:] = normal.root
-        states = self.factor.restore(_mixed(self.whitened, mixing))
-        walk = _mixed(self.space.columns, mixing) - self.space.apply_u(states)
+        states = self.factor.restore(_combine(self.whitened, mixing))
+        walk = _combine(self.space.columns, mixing) - self.space.apply_u(states)
         return states, walk
 
     def walk_covariances(self) -> FloatArray:
         """Return the covariances (n, 6, 6) of the smoothed walk for known parameters."""
         space = self.space
         covariances, below = self.factor.selected_inverse
-        behind = space.behind
+        h0 = space.h0
         half = space.apply_h1(covariances[1:])
-        total = space.apply_h1(transposed(half)) + behind @ covariances[:-1] @ transposed(behind)
-        mixed = space.apply_h1(below) @ transposed(behind)
+        total = space.apply_h1(transposed(half)) + h0 @ covariances[:-1] @ transposed(h0)
+        mixed = space.apply_h1(below) @ transposed(h0)
         total -= mixed
         total -= transposed(mixed)
         return total
 
     def part_products(self) -> FloatArray:
-        """Return the contribution of each part of the recording to the products.
+        """Return the contribution of each block of time to ``products``, for a jackknife.
 
-        Solutions without a part would scatter more than the error does: without its increments the
-        trajectory would be cut, although white noise keeps most knowledge across the gap. So
-        each contribution is that of the innovations of a part after all parts before. Contributions
-        are independent of each other if the model is right.
+        A contribution is that of the innovations of a block, predicted from all earlier blocks. If
+        the model is right, the contributions are independent of each other. A jackknife that only
+        drops the increments of a block would overestimate the error: it would cut the trajectory,
+        although the white noise of the poses carries most information across the gap.
 
-        Each part is a quadratic form of the states at its two ends and of the columns; all states
-        between are eliminated. The forms are added in order of time. The prior of the parameters
-        counts in equal shares.
+        Each block becomes a quadratic form of the states at its two ends and of the columns; the
+        states between are eliminated. The forms are added in order of time. Each contribution
+        contains an equal share of the prior of the parameters.
 
         Returns
         -------
         (K, p + 1, p + 1) array
-            K is at most 20.
+            K is at most 20. The sum over K equals ``products``.
         """
         n, _, n_columns = self.space.columns.shape
-        size = self.space.behind.shape[2]
-        ends = np.linspace(0, n, min(_N_PARTS, n) + 1).astype(int).tolist()
-        history = np.zeros((size + n_columns, size + n_columns))
+        n_states = self.space.h0.shape[2]
+        ends = np.linspace(0, n, min(_MAX_BLOCKS, n) + 1).astype(int).tolist()
+        # Form of the state at the end of the last block, and of the columns.
+        history = np.zeros((n_states + n_columns, n_states + n_columns))
         totals = [np.zeros((n_columns, n_columns))]
         for start, end in pairwise(ends):
             form = self._form_between(start, end)
-            start_and_columns = np.r_[np.arange(size), np.arange(2 * size, len(form))]
+            start_and_columns = np.r_[np.arange(n_states), np.arange(2 * n_states, len(form))]
             form[np.ix_(start_and_columns, start_and_columns)] += history
-            history = _eliminated(form, size)
-            totals.append(_eliminated(history, size))
+            history = _eliminate(form, n_states)
+            totals.append(_eliminate(history, n_states))
         return np.diff(np.array(totals), axis=0) + self.space.prior / (len(ends) - 1)
 
     def _form_between(self, start: int, end: int) -> FloatArray:
-        """Quadratic form (2 d + k, 2 d + k) of the increments from pose ``start`` to pose ``end``.
+        """Return the quadratic form of the increments from pose ``start`` to pose ``end``.
 
-        Its variables are the states at ``start``, the states at ``end`` and k columns. The states
-        at ``start`` have no other evidence.
+        It is a symmetric matrix (2 d + p + 1, 2 d + p + 1). Its rows belong to the state at
+        ``start``, the state at ``end``, and the columns [J e]. The states between are eliminated.
+        Earlier increments are not included.
         """
         space = self.space
         increments = slice(start, end)
-        columns_of_part = space.columns[increments]
-        size = space.behind.shape[2]
+        columns = space.columns[increments]
+        size = space.h0.shape[2]
         diagonal, below = self._precision_blocks(start, end)
-        weighted = self._walk_precisions[increments] @ columns_of_part
-        part_space = replace(space, ahead=space.ahead[increments], behind=space.behind[increments])
-        forces = part_space.apply_u_transposed(weighted)
-        corner = below[0] if len(diagonal) == 2 else np.zeros((size, size))
-        products = multiplied(columns_of_part, weighted)
+        weighted = self._walk_precisions[increments] @ columns
+        block = replace(space, h1_processes=space.h1_processes[increments], h0=space.h0[increments])
+        forces = block.apply_u_transposed(weighted)
+        coupling = below[0] if len(diagonal) == 2 else np.zeros((size, size))
+        products = multiplied(columns, weighted)
         form = np.block(
             [
-                [diagonal[0], corner.T, forces[0]],
-                [corner, diagonal[-1], forces[-1]],
+                [diagonal[0], coupling.T, forces[0]],
+                [coupling, diagonal[-1], forces[-1]],
                 [forces[0].T, forces[-1].T, products],
             ]
         )
@@ -420,21 +434,21 @@ class Posterior:
         return np.asarray(form - multiplied(whitened, whitened))
 
 
-def _mixed(columns: FloatArray, mixing: FloatArray) -> FloatArray:
-    """Combinations (n, d, l) of columns (n, d, k) by factors (k, l)."""
+def _combine(columns: FloatArray, mixing: FloatArray) -> FloatArray:
+    """Return the linear combinations (n, d, l) of columns (n, d, k) with factors (k, l)."""
     n, size, _ = columns.shape
     return (columns.reshape(n * size, -1) @ mixing).reshape(n, size, -1)
 
 
 def total_covariance(levels: FloatArray, bases: tuple[FloatArray, ...]) -> FloatArray:
-    """Sum of ``exp(level) basis``; levels beyond the bases are ignored."""
+    """Return the sum of ``exp(level) basis`` over all bases. Further levels are ignored."""
     total = np.exp(levels[0]) * bases[0]
     for level, basis in zip(levels[1:], bases[1:], strict=False):
         total = total + np.exp(level) * basis
     return total
 
 
-def _eliminated(form: FloatArray, size: int) -> FloatArray:
-    """Quadratic form without its first variables, which take their best values."""
+def _eliminate(form: FloatArray, size: int) -> FloatArray:
+    """Minimise a quadratic form over its first ``size`` variables; return the rest of the form."""
     root = np.linalg.solve(np.linalg.cholesky(form[:size, :size]), form[:size, size:])
     return np.asarray(form[size:, size:] - root.T @ root)

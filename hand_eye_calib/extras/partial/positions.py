@@ -30,10 +30,10 @@ from hand_eye_calib.core.base.stats import robust_weights
 from hand_eye_calib.core.base.text import angle, length
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.noise import increments, reml
-from hand_eye_calib.core.noise.estimator import PLAIN_SIGMAS, ModelSolution
+from hand_eye_calib.core.noise.estimator import MIN_REPORTED_SIGMAS, ModelSolution
 from hand_eye_calib.core.noise.noise_model import (
     JITTER,
-    LOWEST_VARIANCE,
+    MIN_VARIANCE,
     N_FAST,
     ROTATION,
     ROTATIONS,
@@ -42,10 +42,16 @@ from hand_eye_calib.core.noise.noise_model import (
     WALK_TRANSLATION,
     NoiseModel,
     fast_sigmas,
+    rough_levels,
 )
 from hand_eye_calib.core.noise.normal import NormalEquations
-from hand_eye_calib.core.noise.outliers import Outliers, bridged, innovations, judged
-from hand_eye_calib.core.noise.stages import prior_products, rough_levels, sample
+from hand_eye_calib.core.noise.outliers import (
+    Outliers,
+    bridge_outliers,
+    detect_outliers,
+    innovation_chi_squares,
+)
+from hand_eye_calib.core.noise.stages import prior_products, sample
 from hand_eye_calib.core.noise.state_space import Posterior, StateSpace
 from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 from hand_eye_calib.core.results.records import Noise
@@ -104,7 +110,7 @@ class LeverArmSolution(ModelSolution):
             sentences.append(f"{share} are far less precise, and are left out")
         response_mm = -1e3 * self.parameters[RESPONSE]
         sigma_mm = 1e3 * self.parameter_sigmas[RESPONSE]
-        if abs(response_mm) > PLAIN_SIGMAS * sigma_mm:
+        if abs(response_mm) > MIN_REPORTED_SIGMAS * sigma_mm:
             sentences.append(
                 f"the positions answer to acceleration by {response_mm:.1f} +/- {sigma_mm:.1g} mm "
                 "per m/s^2 (one of the sensors smooths); what that may do is in the +/- values"
@@ -232,11 +238,11 @@ class _State:
         residuals = state.linearised().residuals
         squares = (residuals[:, :3] ** 2).sum(axis=1)
         square_of_position = [squares[:1], 0.5 * (squares[1:] + squares[:-1]), squares[-1:]]
-        imprecise = _imprecise(np.concatenate(square_of_position), tuning, LOWEST_VARIANCE)
+        imprecise = _imprecise(np.concatenate(square_of_position), tuning, MIN_VARIANCE)
         levels = rough_levels(residuals, imprecise[1:] | imprecise[:-1], tuning.jitter)
         levels[ROTATION] = _ANY_ROTATION
         levels[WALK_ROTATION] = tuning.rotation_walk[1]
-        streams = bridged(streams, state.X, imprecise)
+        streams = bridge_outliers(streams, state.X, imprecise)
         return replace(state, streams=streams, levels=levels, imprecise=imprecise)
 
     @property
@@ -256,8 +262,8 @@ class _State:
         worlds = streams.Ts_cw_c[:-1, :3, :3] @ back_p
         return replace(
             course,
-            path=increments.summed(se3.times(worlds, np.diff(course.path, axis=0))),
-            along=increments.summed(worlds @ np.diff(course.along, axis=0)),
+            path=increments.cumulative_sum(se3.times(worlds, np.diff(course.path, axis=0))),
+            along=increments.cumulative_sum(worlds @ np.diff(course.along, axis=0)),
         )
 
     def linearised(self) -> increments.Linearisation:
@@ -320,7 +326,7 @@ class _State:
         best = replace(self, levels=fit.levels)
         loss = fit.loss - tuning.least_gain
         for kind in kinds:
-            model, levels = self.model.with_lasting(((kind, "translation"),), fit.levels)
+            model, levels = self.model.with_processes(((kind, "translation"),), fit.levels)
             prior = _level_prior(model, levels)
             rival, _ = reml.fit(self.sampled_space(model), levels, prior, tuning.settled_loss)
             if rival.loss < loss:
@@ -333,9 +339,9 @@ class _State:
 
         Jumps are large steps of the walk; outliers are single wrong positions.
         """
-        of_walk, of_white = innovations(posterior, self.left_out)
+        of_walk, of_white = innovation_chi_squares(posterior, self.left_out)
         tuning = self.tuning
-        outliers = judged(self.outliers, of_walk, of_white, tuning)
+        outliers = detect_outliers(self.outliers, of_walk, of_white, tuning)
         jump_factors = np.maximum(tuning.jump_factor * of_walk, self.walk_factors)
         errors = posterior.states_after(posterior.normal.step)[:, :3]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
@@ -413,7 +419,7 @@ def _solution(
     parameters[[*_SHARED, RESPONSE]] += np.r_[normal.step[3:], with_response.step[-1]]
     # An error that is correlated over part of the recording may also have a part that is constant
     # over all of it. X absorbs this part, so the variance of the error is added.
-    lasting = float(np.exp(state.levels[N_FAST])) if state.model.slow else 0.0
+    lasting = float(np.exp(state.levels[N_FAST])) if state.model.processes else 0.0
     return LeverArmSolution(
         lever_arm=se3.translation_of(state.X) + normal.step[:3],
         covariance=covariance[:3, :3] + np.outer(shift, shift) + lasting * np.eye(3),
