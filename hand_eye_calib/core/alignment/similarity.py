@@ -1,17 +1,18 @@
 """Robust fit of extrinsic, scale and time offset.
 
-Model: X = (R, t), the factor s of the child's lengths and a correction d of the clock offset
-satisfy for all motion pairs A, B
+Model: X = (R, t), the scale s of the child's lengths and a correction d (s) of the child's stamps
+satisfy for all motion pairs A = (R_A, t_A) and B = (R_B, t_B)
 
     (R_A - I) t + t_A = s R t_B,      R_A R = R R_B,      B = B(d).
 
-The methods of this package assume one clock and one unit of length; this fit comes first if these
-are not known. The fit needs no start value and tolerates a minority of outliers. Its residuals
+The methods of this package assume one clock and one unit of length. If these are not certain, this
+fit is made first. It needs no initial value and tolerates a minority of outliers. Its residuals
 decide whether both streams can be on one rigid body.
 
-Starts come from random small subsets of the pairs: the quadratic form of
-:mod:`~hand_eye_calib.core.solvers.quadratic_form` over (vec M, t, 1) is minimised with any 3 x 3
-matrix M for s R. Gauss-Newton steps with Geman-McClure weights follow.
+Starts come from small random subsets of the motion pairs. In a start, any 3 x 3 matrix M takes the
+place of s R, so that the quadratic form of :mod:`~hand_eye_calib.core.solvers.quadratic_form` in
+(vec M, t, 1) has a minimum in closed form. Gauss-Newton steps with Geman-McClure weights refine the
+best starts.
 """
 
 from collections.abc import Sequence
@@ -27,65 +28,67 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
 from hand_eye_calib.core.solvers import all_pairs, quadratic_form
 
-# Number of random subsets for starts.
-_SUBSETS = 32
+# Number of random subsets of motion pairs, each of which yields a start.
+_N_SUBSETS = 32
 
-# Sizes of the subsets, in motion pairs.
+# Sizes of the subsets in motion pairs, used in turn.
 _SUBSET_SIZES = (12, 24, 48)
 
 # Largest number of motion pairs that the subsets are drawn from.
 _MAX_RANKED_PAIRS = 300
 
-# Number of starts that are refined.
-_REFINED_STARTS = 3
+# Number of the best starts that are refined.
+_N_REFINED_STARTS = 3
 
 # Largest number of Gauss-Newton steps.
 _MAX_STEPS = 30
 
-# Gauss-Newton ends with a step below this many standard deviations.
+# Gauss-Newton ends if a step is shorter than this, in standard deviations of the unknowns.
 _STEP_TOLERANCE = 1e-2
 
-# Residual, in standard deviations, whose weight is a quarter.
-_TUNING = 3.0
+# Residual, in standard deviations, at which the robust weight is a quarter.
+_QUARTER_WEIGHT_SIGMAS = 3.0
 
-# Number of blocks of time, for the jackknife and for a clock rate.
+# Number of blocks of time for the jackknife and for the clock rate.
 _N_BLOCKS = 10
 
-# Unexplained share of the motion that ends the search for other fits.
+# A fit is good if it leaves a smaller share of the motion unexplained. No further fits are tried.
 EXPLAINED = 0.03
 
-# Largest unexplained share of the translations with which the scale and the offset of a fit count.
+# Scale and offset of a fit are used only if it leaves a smaller share of the translations
+# unexplained.
 _MAX_UNEXPLAINED_TRANSLATION = 0.3
 
-# Smallest standard deviation of rotations (rad): smaller ones are rounding.
+# Lower bound of the standard deviation of rotations (rad). Smaller ones are rounding.
 _MIN_SIGMA_ROTATION = 1e-7
 
-# Smallest standard deviation of translations, as a share of the motion.
+# Lower bound of the standard deviation of translations, as a share of the translation of motions.
 _MIN_SIGMA_TRANSLATION = 1e-9
 
 # Smallest number of motion pairs of a fit.
 MIN_PAIRS = 20
 
-# Durations (s) of the motions that are compared for the scale; long motions determine it best.
+# Durations (s) of the motions from which the scale is estimated; the best estimate is used. Long
+# motions usually determine the scale best.
 _SCALE_LAGS_S = (3.0, 1.0, 8.0)
 
-# Smallest difference of a scale from 1 that counts.
+# The units of length differ if the scale differs from 1 by more than this ...
 _MIN_DIFFERENCE = 0.01
 
-# Smallest such difference in standard deviations.
+# ... and by more than this number of standard deviations ...
 _MIN_SIGMAS = 5.0
 
-# Largest unexplained share of the translations with which a scale may differ from 1: many jumps
-# imitate a scale.
-_MAX_UNEXPLAINED_TO_DIFFER = 0.1
+# ... and if a smaller share of the translations is unexplained, because many jumps may look like a
+# scale.
+_MAX_UNEXPLAINED_OF_OTHER_UNIT = 0.1
 
 # Number of unknowns: rho (3), phi (3), log s, d.
 _N_UNKNOWNS = 8
 
-# Index of log s.
+# Index of log s in the unknowns.
 _SCALE = 6
 
-# Index of d.
+# Index of d in the unknowns.
 _OFFSET = 7
 
 
@@ -100,27 +103,28 @@ class SimilarityFit:
     scale : float
         s: factor from the child's unit of length to the parent's.
     offset_s : float
-        d: seconds to add to the child's stamps, besides the offset that they have. 0 without
-        twists.
+        d: seconds to be added to the child's stamps, on top of the offset that was applied before.
+        0 if no velocities (``twists``) were given.
     sigmas : (8,) array
         Standard deviations of (rho, phi, log s, d), by the delete-a-block jackknife over time. Zero
-        for d without twists.
+        for unknowns that were not estimated.
     scale_sigma, offset_sigma_s : float
         Standard deviations of s and d.
     sensitivity : (6, 2) array
         Derivatives of (rho, phi) with respect to log s and to d.
     offsets_of_blocks : (2, B) array
-        Differences of d in each block of time at this X and s, and the weights of the differences.
-        Zero without twists.
+        Change of d (s) that each of B blocks of time asks for at this X and s, and the weight of
+        this change. Zero if no velocities were given.
     held : float
-        Ratio of these differences to the right ones: steps with fixed robust weights are too short.
+        Ratio of these changes to the changes that a block really asks for, at most 1. They are too
+        small, because they are computed with constant robust weights.
     sigma_translation, sigma_rotation : float
         Robust standard deviations per axis of the residuals, m and rad.
     unexplained_translation, unexplained : float
-        Unexplained share of the translations, and of the whole motion. The former is relative to
-        the root mean square of the parent's translations or of the child's times s, the smaller of
-        both: a scale near zero explains nothing, however small the residuals. If the scale is kept
-        at 1, the larger of both.
+        Residuals as a share of the translations, and of the whole motion. Translations count as
+        those of the stream that moves less in the parent's unit: a scale near zero explains
+        nothing, even if it makes the residuals small. If the scale is fixed at 1, they count as
+        those of the stream that moves more.
     explains_translation : bool
         Whether the fit explains enough of the translations to trust its scale and offset.
     is_in_one_unit : bool
@@ -128,8 +132,8 @@ class SimilarityFit:
     has_own_unit : bool
         Whether s certainly differs from 1 by more than 1 %.
     scale_bias : float
-        Difference of s from the scale with the streams exchanged, which noise of the child causes.
-        Zero unless the lengths differ significantly.
+        Difference between s and the scale of a fit with exchanged streams. Noise of the child
+        causes it. Zero unless the units of length differ.
     """
 
     T_parent_child: FloatArray
@@ -158,7 +162,7 @@ def fit_similarity(
     same_unit: bool = False,
     most: float | None = None,
 ) -> SimilarityFit:
-    """Fit X, the scale and, with twists, the time offset.
+    """Fit X, the scale and, if velocities are given, the time offset.
 
     Parameters
     ----------
@@ -166,18 +170,19 @@ def fit_similarity(
         K pairs in order of time, K >= 4.
     twists : ((K, 6) array, (K, 6) array), optional
         Velocities of the child sensor in its own frame, (v in m/s, w in rad/s), at the start and
-        the end of every pair.
+        the end of every motion.
     start : SimilarityFit or (4, 4) array, optional
-        Fit or X to start at; without one, starts are searched for.
+        Fit or X as initial value. By default, starts are searched for.
     same_unit : bool
-        Keep the scale at 1. If the body only rotates about a sensor, that sensor hardly moves, and
-        any small scale would fit.
+        Fix the scale at 1. If the body only rotates about one of the sensors, this sensor hardly
+        moves, and any small scale would fit.
     most : float, optional
         Starts that leave more than this share of the motion unexplained are not refined.
 
     Returns
     -------
     SimilarityFit
+        The best fit. If no start is good enough for ``most``, the last start, not refined.
     """
     problem = _Problem(pairs, twists, same_unit)
     if isinstance(start, SimilarityFit):
@@ -187,28 +192,37 @@ def fit_similarity(
     fits: list[SimilarityFit] = []
     for T, scale in starts:
         scale = 1.0 if same_unit else scale
-        if most is None or problem.shares(problem.rows(T, scale)[1], scale)[1] < most:
-            fits.append(problem.describe(*problem.refine(T, scale)))
-            if fits[-1].unexplained < EXPLAINED:
-                break
+        if most is not None:
+            _, sigmas, _ = problem.rows(T, scale)
+            _, unexplained = problem.shares(sigmas, scale)
+            if unexplained >= most:
+                continue
+        fits.append(problem.describe(*problem.refine(T, scale)))
+        if fits[-1].unexplained < EXPLAINED:
+            break
     fits = fits or [problem.describe(T, scale, 0.0)]
-    # The smallest volume of the residuals, in the smaller unit of length.
+    # The best fit has the smallest volume of residuals, measured in the smaller unit of length.
     return min(fits, key=lambda fit: fit.sigma_translation * fit.sigma_rotation / min(fit.scale, 1))
 
 
 def estimate_scale(pose_pairs: PosePairs, known: Sequence[SimilarityFit] = ()) -> SimilarityFit:
     """Estimate the factor from the child's unit of length to the parent's.
 
-    Noise of the child makes the factor too small, as noise of any regressor does; the standard
-    deviation does not contain this bias. With the streams exchanged the factor is too large. The
-    child has a unit of its own only if both fits find one.
+    Noise of the child makes the factor too small, because the child's lengths are the regressor.
+    The standard deviation does not contain this bias. If the streams are exchanged, the factor is
+    too large. The units of length differ (``has_own_unit``) only if they differ in both fits.
 
     Parameters
     ----------
     pose_pairs : PosePairs
     known : sequence of SimilarityFit, optional
-        Fits of the same streams over the first of the durations that are compared; without them, a
-        start is searched for.
+        Fits of the same streams that exist already, over the first durations in _SCALE_LAGS_S. By
+        default, all fits are computed.
+
+    Returns
+    -------
+    SimilarityFit
+        Fit with the smallest relative standard deviation of the scale.
 
     Raises
     ------
@@ -233,7 +247,11 @@ def estimate_scale(pose_pairs: PosePairs, known: Sequence[SimilarityFit] = ()) -
 def _best_scale(
     pose_pairs: PosePairs, known: Sequence[SimilarityFit], start: SimilarityFit | None = None
 ) -> SimilarityFit:
-    """Return the fit whose scale has the smallest relative standard deviation."""
+    """Return the fit whose scale has the smallest relative standard deviation.
+
+    The unexplained share of the translations is added to the standard deviation of fits that do not
+    explain them. ``start`` is the initial value of the first fit.
+    """
     fits = [*known]
     for lag_s in _SCALE_LAGS_S[len(fits) :]:
         pairs = pairs_over(pose_pairs, lag_s)
@@ -253,12 +271,20 @@ def _best_scale(
 
 
 def settle_scale(pose_pairs: PosePairs, option: str | float) -> tuple[float, SimilarityFit | None]:
-    """Return the scale that the option ``scale`` asks for, and its fit if the scale is estimated.
+    """Return the scale for the value of the option ``scale``, and its fit if it is estimated.
+
+    Parameters
+    ----------
+    pose_pairs : PosePairs
+    option : str or float
+        A scale, "none" for 1, "estimate" for an estimate, or "auto" for an estimate if the units of
+        length certainly differ, else 1.
 
     Raises
     ------
     NotEnoughDataError
-        If the option asks for an estimate and the scale cannot be estimated.
+        If the option is "estimate" and the scale cannot be estimated, or if it is "auto", the units
+        differ, and the fit does not explain the translations.
     """
     if not isinstance(option, str):
         return option, None
@@ -283,52 +309,83 @@ def settle_scale(pose_pairs: PosePairs, option: str | float) -> tuple[float, Sim
 
 
 def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
-    """Return the best starts (X, scale).
+    """Return the best starts (X, scale), the best first.
 
-    Candidates are the solutions of random subsets of the pairs, of which one without outliers
-    suffices, and those of all pairs at the start rotations of dnl.
+    Candidates are the solutions for random subsets of the pairs, and those for all pairs at the
+    start rotations of dnl. One subset without outliers suffices.
     """
-    ranked = pairs[np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_RANKED_PAIRS)).astype(int)]
-    parent = ranked.Ts_parenti_parentj.copy()
-    child = ranked.Ts_childi_childj.copy()
-    rms = [np.linalg.norm(se3.translation_of(Ts)) / len(Ts) ** 0.5 for Ts in (parent, child)]
-    units = np.maximum(rms, 1e-12)
-    parent[:, :3, 3] /= units[0]
-    child[:, :3, 3] /= units[1]
-    ranked = replace(ranked, Ts_parenti_parentj=parent, Ts_childi_childj=child)
-    random = np.random.default_rng(0)
-    subsets = np.zeros((1 + _SUBSETS, len(ranked)))
-    subsets[0] = 1.0
-    for row in range(_SUBSETS):
-        size = _SUBSET_SIZES[row % len(_SUBSET_SIZES)]
-        subsets[1 + row, random.permutation(len(ranked))[:size]] = 1.0
-    forms = quadratic_form.expand(subsets @ quadratic_form.condense(ranked))
-    # Rotations nearest to the matrices M that minimise the forms over (vec M, t, 1). In flat motion
-    # the smallest singular value is arbitrary; its sign is chosen so that they are rotations.
-    left = forms[:, :12, :12]
-    left = left + 1e-9 * np.trace(left, axis1=1, axis2=2)[:, None, None] * np.eye(12)
-    # Streams that never move have no form at all.
-    left = left + np.finfo(float).tiny * np.eye(12)
-    matrices = -np.linalg.solve(left, forms[:, :12, 12:])[:, :9, 0].reshape(-1, 3, 3)
-    rotations = [*se3.nearest_rotation(matrices), *all_pairs.start_rotations(ranked)]
+    few = pairs[np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_RANKED_PAIRS)).astype(int)]
+    # Lengths in units of the root mean square translation of each stream.
+    parent = few.Ts_parenti_parentj.copy()
+    child = few.Ts_childi_childj.copy()
+    unit_of_parent = max(_rms_translation(parent), 1e-12)
+    unit_of_child = max(_rms_translation(child), 1e-12)
+    parent[:, :3, 3] /= unit_of_parent
+    child[:, :3, 3] /= unit_of_child
+    few = replace(few, Ts_parenti_parentj=parent, Ts_childi_childj=child)
+    forms = quadratic_form.expand(_random_subsets(len(few)) @ quadratic_form.condense(few))
+    rotations = [*_closed_form_rotations(forms), *all_pairs.start_rotations(few)]
+    # The further rotations belong to the form of all pairs.
     forms = np.concatenate([forms, *[forms[:1]] * (len(rotations) - len(forms))])
-    # The best scale and translation of each.
+    # Scale and translation that minimise the form of each rotation.
     reduced, to_translation = quadratic_form.without_translation(forms)
     vectors = np.append(np.reshape(rotations, (-1, 9)), np.zeros((len(forms), 1)), axis=1)
     products = se3.times(reduced, vectors)
     scales = -products[:, 9] / np.maximum((vectors * products).sum(axis=1), 1e-300)
-    # Bad candidates, of opposite or no motion, stay with scale 1: rows still match the forms.
+    # Candidates without a sensible scale, of opposite or no motion, have large costs at scale 1.
     scales[(scales <= 1e-3) | (scales >= 1e9)] = 1.0
     translations = -se3.times(to_translation, scales[:, None] * vectors + np.eye(10)[9])
     Ts = se3.from_rotation_translation(np.array(rotations), translations)
-    costs = quadratic_form.median_costs(quadratic_form.coefficients(ranked), Ts, scales)
-    Ts[:, :3, 3] *= units[0]
-    scales *= units[0] / units[1]
-    return [(Ts[k], float(scales[k])) for k in np.argsort(costs)[:_REFINED_STARTS]]
+    costs = quadratic_form.median_costs(quadratic_form.coefficients(few), Ts, scales)
+    Ts[:, :3, 3] *= unit_of_parent
+    scales *= unit_of_parent / unit_of_child
+    return [(Ts[k], float(scales[k])) for k in np.argsort(costs)[:_N_REFINED_STARTS]]
+
+
+def _rms_translation(motions: FloatArray) -> float:
+    """Return the root mean square length of the translations of motions (K, 4, 4)."""
+    return float(np.linalg.norm(se3.translation_of(motions)) / len(motions) ** 0.5)
+
+
+def _random_subsets(n_pairs: int) -> FloatArray:
+    """Return subsets of motion pairs as rows of weights 0 or 1. The first row is all pairs."""
+    random = np.random.default_rng(0)
+    subsets = np.zeros((1 + _N_SUBSETS, n_pairs))
+    subsets[0] = 1.0
+    for row in range(_N_SUBSETS):
+        size = _SUBSET_SIZES[row % len(_SUBSET_SIZES)]
+        subsets[1 + row, random.permutation(n_pairs)[:size]] = 1.0
+    return subsets
+
+
+def _closed_form_rotations(forms: FloatArray) -> FloatArray:
+    """Return the rotations nearest to the matrices M that minimise quadratic forms.
+
+    In flat motion the smallest singular value of M is arbitrary. Its sign is chosen so that the
+    result is a rotation.
+
+    Parameters
+    ----------
+    forms : (S, 13, 13) array
+        Quadratic forms in (vec M, t, 1).
+
+    Returns
+    -------
+    (S, 3, 3) array
+    """
+    left = forms[:, :12, :12]
+    left = left + 1e-9 * np.trace(left, axis1=1, axis2=2)[:, None, None] * np.eye(12)
+    # The forms of streams that never move are zero.
+    left = left + np.finfo(float).tiny * np.eye(12)
+    matrices = -np.linalg.solve(left, forms[:, :12, 12:])[:, :9, 0].reshape(-1, 3, 3)
+    return se3.nearest_rotation(matrices)
 
 
 class _Problem:
-    """Residuals of all motion pairs, their derivatives, and the Gauss-Newton iteration."""
+    """Residuals of all motion pairs, their derivatives, and the Gauss-Newton iteration.
+
+    ``pairs``, ``twists`` and ``same_unit`` are those of :func:`fit_similarity`.
+    """
 
     def __init__(
         self, pairs: MotionPairs, twists: tuple[FloatArray, FloatArray] | None, same_unit: bool
@@ -344,17 +401,18 @@ class _Problem:
         self.quats_a = se3.to_quat_xyzw(rotation_a)
         self.quats_b = se3.to_quat_xyzw(rotation_b)
         self.skew_b = se3.skew(self.translation_b)
-        self.rms_a = float(np.linalg.norm(se3.translation_of(A)) / len(pairs) ** 0.5)
-        self.rms_b = float(np.linalg.norm(se3.translation_of(B)) / len(pairs) ** 0.5)
+        self.rms_a = _rms_translation(A)
+        self.rms_b = _rms_translation(B)
         self.rms_rotation = float(np.sqrt(np.mean(se3.rotation_angle(rotation_a) ** 2)))
+        # Indices of the unknowns that are estimated.
         self.free = list(range(_SCALE))
         if not same_unit:
             self.free.append(_SCALE)
         if twists is not None:
             self.free.append(_OFFSET)
         twists_i, twists_j = twists or (np.zeros((len(pairs), 6)),) * 2
-        # Derivatives of B with respect to d: with d added to its stamps, the child is at every
-        # instant where it was d before.
+        # Derivatives of B with respect to d. If d is added to the stamps of the child, its pose at
+        # an instant is the pose that it had d earlier.
         rotated_i = np.einsum("kji,kj->ki", rotation_b, twists_i[:, 3:])
         self.rotation_by_offset = rotated_i - twists_j[:, 3:]
         moved_i = twists_i[:, :3] + se3.cross(twists_i[:, 3:], self.translation_b)
@@ -369,13 +427,14 @@ class _Problem:
         Returns
         -------
         parts : list of two (K, 3, 9) arrays
-            Derivatives of the residuals of translation and of rotation, in the parent's axes, by
-            (rho, phi, log s, d), with ``R Exp(phi)`` and ``t + R rho``; in the last column the
-            residuals. All are in standard deviations, times the roots of the robust weights.
+            One array for translations, one for rotations. Columns: derivatives of the residuals
+            with respect to (rho, phi, log s, d), then the residuals. X changes to
+            ``(R Exp(phi), t + R rho)``; residuals are in the parent's axes. All values are divided
+            by the standard deviations of the residuals and multiplied by ``root``.
         sigmas : (float, float)
             Standard deviations per axis of the residuals, m and rad.
         root : (K,) array
-            Roots of the robust weights.
+            Square roots of the robust weights.
         """
         rotation = se3.rotation_of(T)
         back = se3.rotation_of(T).T
@@ -386,7 +445,7 @@ class _Problem:
         of_translation[:, :, _OFFSET] = -scale * self.translation_by_offset @ back
         of_rotation[:, :, 3:6] = np.swapaxes(_times(self.chord_b, back), 1, 2)
         of_rotation[:, :, _OFFSET] = self.rotation_by_offset @ back
-        # R_A^T R R_B R^T, by quaternions.
+        # Vector and scalar part of the quaternion of R_A^T R R_B R^T.
         va = self.quats_a[:, :3]
         wa = self.quats_a[:, 3:]
         vb = self.quats_b[:, :3] @ back
@@ -405,7 +464,7 @@ class _Problem:
             max(median(lengths[1]) / MEDIAN_LENGTH, _MIN_SIGMA_ROTATION),
         )
         squared = sum((length / sigma) ** 2 for length, sigma in zip(lengths, sigmas, strict=True))
-        root = np.sqrt(robust_weights("geman_mcclure", squared / (6 * _TUNING**2)))
+        root = np.sqrt(robust_weights("geman_mcclure", squared / (6 * _QUARTER_WEIGHT_SIGMAS**2)))
         for part, sigma in zip(parts, sigmas, strict=True):
             part *= (root / sigma)[:, None, None]
         return parts, sigmas, root
@@ -420,6 +479,7 @@ class _Problem:
                 moments += flat.T @ flat
             step = np.zeros(_N_UNKNOWNS)
             step[self.free] = -solve(moments, self.free)
+            # At most 1 rad of rotation, and a factor e of the scale.
             step *= min(1.0, 1.0 / max(np.linalg.norm(step[3:6]), abs(step[_SCALE]), 1e-300))
             T = se3.retracted(T, step[:6])
             scale = scale * float(np.exp(step[_SCALE]))
@@ -433,7 +493,7 @@ class _Problem:
 
         ``sigmas`` are the standard deviations of the residuals, m and rad.
         """
-        # Relative to the stream that moves less; to the one that moves more if the scale is fixed.
+        # Of the stream that moves less; if the scale is fixed, of the stream that moves more.
         lengths = (self.rms_a, scale * self.rms_b)
         rms_translation = min(lengths) if _SCALE in self.free else max(lengths)
         of_translation = sigmas[0] / max(rms_translation, 1e-12)
@@ -441,7 +501,7 @@ class _Problem:
         return of_translation, float(np.hypot(of_translation, of_rotation))
 
     def describe(self, T: FloatArray, scale: float, offset_s: float) -> SimilarityFit:
-        """Return the fit at X, s and d with its uncertainty."""
+        """Return the fit at X, s and d, with its uncertainty and its quality."""
         parts, sigmas_of_residuals, root = self.rows(T, scale, offset_s)
         rows = np.concatenate(parts, axis=1)
         blocks = Blocks.of_rows(rows, min(_N_BLOCKS, len(rows)))
@@ -450,15 +510,16 @@ class _Problem:
         by_scale = -solve(blocks.total, range(_SCALE), _SCALE)
         by_offset = -solve(blocks.total, range(_SCALE), _OFFSET)
         weights = blocks.sums[:, _OFFSET, _OFFSET]
-        # A step with fixed robust weights is too short: the weights fall as the offset moves.
+        # A step of d with constant robust weights is too short, because the weights of a block
+        # change as d changes. Geman-McClure weights reduce the curvature of the cost by this share.
         pulls = (rows[:, :, _OFFSET] * rows[:, :, -1]).sum(axis=1) ** 2 / root
-        fall = pulls.sum() / (1.5 * _TUNING**2) / max(weights.sum(), 1e-300)
+        fall = pulls.sum() / (1.5 * _QUARTER_WEIGHT_SIGMAS**2) / max(weights.sum(), 1e-300)
         held = float(np.clip(1.0 - fall, 0.5, 1.0))
         offsets = -blocks.sums[:, _OFFSET, -1] / np.where(weights > 0.0, weights, 1.0)
         of_translation, unexplained = self.shares(sigmas_of_residuals, scale)
         scale_sigma = scale * float(sigmas[_SCALE])
-        off = abs(scale - 1.0)
-        is_off = off > max(_MIN_DIFFERENCE, _MIN_SIGMAS * scale_sigma)
+        difference = abs(scale - 1.0)
+        differs = difference > max(_MIN_DIFFERENCE, _MIN_SIGMAS * scale_sigma)
         return SimilarityFit(
             T_parent_child=T,
             scale=scale,
@@ -473,12 +534,12 @@ class _Problem:
             sigma_rotation=sigmas_of_residuals[1],
             unexplained_translation=of_translation,
             explains_translation=of_translation < _MAX_UNEXPLAINED_TRANSLATION,
-            is_in_one_unit=off + _MIN_SIGMAS * scale_sigma < _MIN_DIFFERENCE,
-            has_own_unit=is_off and of_translation < _MAX_UNEXPLAINED_TO_DIFFER,
+            is_in_one_unit=difference + _MIN_SIGMAS * scale_sigma < _MIN_DIFFERENCE,
+            has_own_unit=differs and of_translation < _MAX_UNEXPLAINED_OF_OTHER_UNIT,
             unexplained=unexplained,
         )
 
 
 def _times(matrices: FloatArray, right: FloatArray) -> FloatArray:
-    """Return ``matrices @ right`` for (K, 3, 3) and (3, 3), by one product."""
+    """Return ``matrices @ right`` for arrays (K, 3, 3) and (3, 3), as a single matrix product."""
     return (matrices.reshape(-1, 3) @ right).reshape(-1, 3, 3)

@@ -1,8 +1,8 @@
 """Pose pairs and motion pairs of two streams.
 
-Pose pairs are poses of both sensors at common instants, by interpolation. Motion pairs are relative
-motions A and B of both sensors between two of these instants: the input of every AX = XB solver
-(Välimäki et al. 2023, eqs 1-2).
+A pose pair consists of the poses of both sensors at one instant; one of the poses is interpolated.
+A motion pair consists of the relative motions A and B of both sensors between two of these
+instants. Motion pairs are the input of every AX = XB solver (Välimäki et al. 2023, eqs 1-2).
 """
 
 from dataclasses import dataclass, replace
@@ -16,16 +16,17 @@ from hand_eye_calib.core.base.text import parse_reference
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Columns, Trajectory
 
-# Streams whose median intervals differ by less than this factor are paired at the child's stamps.
-_EQUALLY_FAST = 1.2
+# Ratio of the median intervals of both streams up to which they are equally fast. Pose pairs have
+# the child's stamps then.
+_MAX_EQUAL_RATIO = 1.2
 
-# Number of poses that are checked at once for the next keyframe.
+# Number of poses that are searched at once for the next keyframe.
 _WINDOW = 64
 
-# Longest pause of a recording, s: after a longer one, the stamps are wrong.
-_LEAP_S = 86_400.0
+# Longest plausible pause of a recording (s): one day. A longer pause means wrong stamps.
+_MAX_PAUSE_S = 86_400.0
 
-# Largest number of motion pairs of a fit, unless the fit needs more.
+# Largest number of motion pairs of a fit, unless its caller asks for more.
 MAX_PAIRS = 800
 
 
@@ -36,9 +37,9 @@ class PosePairs(Columns):
     Attributes
     ----------
     stamps_ns : (N,) int64 array
-        Parent clock, strictly increasing.
+        Stamps on the parent's clock, strictly increasing.
     Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
-        Pose of each sensor in its own world.
+        Poses of each sensor in its own world.
     """
 
     stamps_ns: IntArray
@@ -46,45 +47,51 @@ class PosePairs(Columns):
     Ts_cw_c: FloatArray
 
     def child_scaled(self, factor: float) -> Self:
-        """Return the poses with the child's translations multiplied by ``factor``."""
+        """Return the pose pairs with the child's translations multiplied by ``factor``."""
         Ts_cw_c = self.Ts_cw_c.copy()
         Ts_cw_c[:, :3, 3] *= factor
         return replace(self, Ts_cw_c=Ts_cw_c)
 
     @classmethod
     def empty(cls) -> Self:
-        """Return pairs of length 0."""
+        """Return zero pose pairs."""
         return cls(np.empty(0, dtype=np.int64), np.empty((0, 4, 4)), np.empty((0, 4, 4)))
 
 
 def slower_stream(parent_stamps_ns: IntArray, child_stamps_ns: IntArray) -> str:
-    """Return the stream with the longer median interval, "parent" or "child".
+    """Return the name of the stream with the longer median interval, "parent" or "child".
 
-    It is the child if both intervals are about equal, or if a stream has fewer than two stamps.
+    The result is "child" if the intervals are about equal, or if a stream has fewer than two
+    stamps.
     """
     if len(parent_stamps_ns) < 2 or len(child_stamps_ns) < 2:
         return "child"
     interval_parent = median(np.diff(parent_stamps_ns))
     interval_child = median(np.diff(child_stamps_ns))
-    return "parent" if interval_parent > _EQUALLY_FAST * interval_child else "child"
+    return "parent" if interval_parent > _MAX_EQUAL_RATIO * interval_child else "child"
 
 
 def synchronise(
     parent: Trajectory, child: Trajectory, max_gap_s: float, at: str | None = None
 ) -> PosePairs:
-    """Interpolate the faster stream at the slower stream's stamps.
+    """Interpolate the faster stream at the stamps of the slower stream.
 
-    Instants outside the faster stream are skipped, and instants between two of its poses that are
-    more than ``max_gap_s`` apart. An instant at which the faster stream has a pose is always used.
+    A stamp is skipped if it is outside the faster stream, or in a gap of the faster stream longer
+    than ``max_gap_s``. A stamp at which the faster stream has a pose is always used.
 
     Parameters
     ----------
     parent, child : Trajectory
-        On one clock.
+        Streams with stamps on one clock.
     max_gap_s : float
-        Seconds.
+        Longest interval (s) between two poses in which poses are interpolated.
     at : {"parent", "child"}, optional
-        Stream whose stamps the pairs have; the slower one by default.
+        Stream whose stamps the pose pairs have; by default the slower stream.
+
+    Returns
+    -------
+    PosePairs
+        The pose pairs; none if the streams do not overlap.
     """
     if len(parent) == 0 or len(child) == 0:
         return PosePairs.empty()
@@ -115,11 +122,12 @@ def select_keyframes(
     min_interval_s: float,
     previous: PosePairs | None = None,
 ) -> IntArray:
-    """Return the indices of the keyframes among pose pairs, in order.
+    """Return the indices of keyframes among pose pairs, ascending.
 
-    A pose pair is a keyframe if ``min_interval_s`` has passed since the last keyframe and the
-    parent sensor has moved ``min_translation`` or rotated by ``min_rotation`` since. A threshold of
-    zero switches its criterion off.
+    A pose pair is a keyframe if ``min_interval_s`` has passed since the last keyframe, and if the
+    parent sensor has moved by ``min_translation`` or rotated by ``min_rotation`` since then. A
+    threshold of zero disables its criterion. The first pose pair is a keyframe unless there is a
+    previous one.
 
     Parameters
     ----------
@@ -127,7 +135,7 @@ def select_keyframes(
     min_translation, min_rotation, min_interval_s : float
         Thresholds in m, rad and s.
     previous : PosePairs, optional
-        The last keyframe before these pose pairs, of length 1; of length 0 for none.
+        Last keyframe before these pose pairs, as zero or one pose pair.
     """
     n_poses = len(pose_pairs)
     if n_poses == 0 or max(min_translation, min_rotation, min_interval_s) == 0.0:
@@ -145,15 +153,15 @@ def select_keyframes(
     index = len(keyframes)
     while index < n_poses:
         window = slice(index, index + _WINDOW)
-        is_late = stamps_ns[window] - last_ns >= min_interval_s * 1e9
-        has_moved = np.full(len(is_late), max(min_translation, min_rotation) == 0.0)
+        has_passed = stamps_ns[window] - last_ns >= min_interval_s * 1e9
+        has_moved = np.full(len(has_passed), max(min_translation, min_rotation) == 0.0)
         if min_translation > 0.0:
             distances_m = np.linalg.norm(poses[window, :3, 3] - se3.translation_of(T_last), axis=1)
             has_moved |= distances_m >= min_translation
         if min_rotation > 0.0:
             angles = se3.rotation_angle(se3.rotation_of(T_last).T @ poses[window, :3, :3])
             has_moved |= angles >= min_rotation
-        candidates = np.flatnonzero(is_late & has_moved)
+        candidates = np.flatnonzero(has_passed & has_moved)
         if not candidates.size:
             index += _WINDOW
             continue
@@ -166,12 +174,12 @@ def select_keyframes(
 
 
 def find_leap(stamps_ns: IntArray) -> tuple[str, str] | None:
-    """Find a leap of more than a day in the rising stamps (N,) of a stream.
+    """Detect a leap of more than a day in the ascending stamps (N,) of a stream.
 
     Returns
     -------
     (str, str) or None
-        What is wrong, as a text to follow "the parent stream's", and what to do; None without a
+        The problem, as text that follows "the parent stream's", and the remedy. None without a
         leap.
     """
     if len(stamps_ns) < 2:
@@ -179,26 +187,26 @@ def find_leap(stamps_ns: IntArray) -> tuple[str, str] | None:
     intervals_s = np.diff(stamps_ns) * 1e-9
     count = len(stamps_ns)
     before = int(np.argmax(intervals_s)) + 1
-    days = float(intervals_s[before - 1]) / _LEAP_S
+    days = float(intervals_s[before - 1]) / _MAX_PAUSE_S
     if days <= 1.0:
         return None
-    few = f"the first {before}" if before < count - before else f"the last {count - before}"
-    what = f"stamps leap by {days:,.0f} days after pose {before} of {count}"
-    return what, f"repair the stamps, or remove {few} of its poses"
+    shorter_end = f"the first {before}" if before < count - before else f"the last {count - before}"
+    problem = f"stamps leap by {days:,.0f} days after pose {before} of {count}"
+    return problem, f"repair the stamps, or remove {shorter_end} of its poses"
 
 
 @dataclass(frozen=True, eq=False)
 class MotionPairs(Columns):
-    """Relative motions of both sensors between the same instants i and j, K of them.
+    """K pairs of relative motions, of both sensors between the same instants i and j.
 
     Attributes
     ----------
     Ts_parenti_parentj : (K, 4, 4) array
-        Motion of the parent sensor, ``inv(T_pw_p(i)) @ T_pw_p(j)``: A of AX = XB.
+        Motions of the parent sensor, ``inv(T_pw_p(i)) @ T_pw_p(j)``: A of AX = XB.
     Ts_childi_childj : (K, 4, 4) array
-        Motion of the child sensor: B.
+        Motions of the child sensor: B of AX = XB.
     i, j : (K,) int arrays
-        Indices of the poses the motions run between.
+        Indices of the pose pairs at the start and at the end of each motion.
     """
 
     Ts_parenti_parentj: FloatArray
@@ -207,47 +215,52 @@ class MotionPairs(Columns):
     j: IntArray
 
     def residuals(self, T_parent_child: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the residuals (K, 3) of translation and (K, 3) of rotation at X (4, 4).
+        """Return the residuals of AX = XB at X = (R, t), a (4, 4) array.
 
-        Translation: ``R_A t + t_A - R t_B - t`` in m, in the axes of the parent sensor at instant
-        i: Välimäki et al. 2023, eq. (6). The article prints the last term with the opposite sign;
-        its published results have this sign. Rotation: rotation vectors in rad, in the axes of the
-        child sensor at instant j, from ``R_A R`` to ``R R_B``. Their lengths are the angles of
-        eq. (7).
+        Returns
+        -------
+        (K, 3) array
+            Translations ``R_A t + t_A - R t_B - t`` in m, in the axes of the parent sensor at
+            instant i: Välimäki et al. 2023, eq. (6). The article prints the last term with the
+            opposite sign, but its published results have this sign.
+        (K, 3) array
+            Rotation vectors from ``R_A R`` to ``R R_B`` in rad, in the axes of the child sensor at
+            instant j. Their lengths are the angles of eq. (7).
         """
-        rotation = se3.rotation_of(T_parent_child)
-        translation = se3.translation_of(T_parent_child)
-        chord = se3.rotation_of(self.Ts_parenti_parentj) - np.eye(3)
-        moved_child = se3.translation_of(self.Ts_childi_childj) @ rotation.T
-        of_translation = (
-            chord @ translation + se3.translation_of(self.Ts_parenti_parentj) - moved_child
-        )
-        via_parent = se3.rotation_of(self.Ts_parenti_parentj) @ rotation
-        via_child = rotation @ se3.rotation_of(self.Ts_childi_childj)
-        return of_translation, se3.rotations_between(via_parent, via_child)
+        R = se3.rotation_of(T_parent_child)
+        t = se3.translation_of(T_parent_child)
+        R_A = se3.rotation_of(self.Ts_parenti_parentj)
+        t_A = se3.translation_of(self.Ts_parenti_parentj)
+        R_B = se3.rotation_of(self.Ts_childi_childj)
+        t_B = se3.translation_of(self.Ts_childi_childj)
+        translations = (R_A - np.eye(3)) @ t + t_A - t_B @ R.T
+        return translations, se3.rotations_between(R_A @ R, R @ R_B)
 
 
 def motion_pairs(Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, reference: str) -> MotionPairs:
-    """Return the relative motions of two synchronised trajectories between referenced poses.
+    """Return the relative motions of two synchronised trajectories for a reference.
+
+    The reference defines between which poses the motions are.
 
     Parameters
     ----------
     Ts_pw_p, Ts_cw_c : (N, 4, 4) arrays
         Poses of parent and child sensor in their own worlds at the same N instants.
     reference : str
-        ``"A"``: every pose with the first. ``"B<n>"``: every pose with the n-th before it.
-        ``"C<n>"``: every pose with the keyframe that starts its segment of n poses; a last segment
-        whose keyframe is N - n or later is skipped, as in the published results.
+        ``"A"``: from the first pose to every other pose. ``"B<n>"``: to every pose from the n-th
+        pose before it. ``"C<n>"``: in segments of n poses, from the first pose of the segment to
+        every other pose of it. As in the published results, segments that start at pose N - n or
+        later are skipped.
 
     Returns
     -------
     MotionPairs
-        The pairs; of length 0 if there are too few poses.
+        The motion pairs; none if there are too few poses.
 
     Raises
     ------
     ConfigError
-        If the reference has another form. n is at least 1, and at least 2 after C.
+        If the reference has another form, or if n is below 1, or below 2 after C.
     """
     kind, step = parse_reference("reference", reference)
     n_poses = len(Ts_pw_p)
@@ -264,17 +277,17 @@ def motion_pairs(Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, reference: str) -> Mo
 def pairs_between(
     Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, i: IntArray, j: IntArray
 ) -> MotionPairs:
-    """Return the MotionPairs from the instants i to the instants j, (K,) int arrays."""
+    """Return the motion pairs from the poses i to the poses j, (K,) arrays of indices."""
     parent = motions(Ts_pw_p.take(i, axis=0), Ts_pw_p.take(j, axis=0))
     child = motions(Ts_cw_c.take(i, axis=0), Ts_cw_c.take(j, axis=0))
     return MotionPairs(parent, child, i, j)
 
 
 def motions(start: FloatArray, end: FloatArray) -> FloatArray:
-    """Return the motions (..., 4, 4) of a sensor between two stacks of poses (..., 4, 4).
+    """Return the motions ``inv(start) @ end`` of a sensor between poses (..., 4, 4).
 
-    The translation difference is taken before rotating: with map coordinates of 1e6 m, inverting
-    first costs ten digits.
+    The positions are subtracted before the rotation. For map coordinates of 1e6 m, an inversion of
+    the start would lose ten digits.
     """
     motion = end.copy()
     motion[..., :3, 3] -= se3.translation_of(start)
@@ -283,15 +296,17 @@ def motions(start: FloatArray, end: FloatArray) -> FloatArray:
 
 
 def pairs_over(pose_pairs: PosePairs, lag_s: float, max_pairs: int = MAX_PAIRS) -> MotionPairs:
-    """Return motion pairs between poses about ``lag_s`` seconds apart, evenly over the recording.
+    """Return motion pairs that last about ``lag_s`` seconds, spread evenly over the recording.
+
+    Motions that last more than half longer, because of a gap, are skipped.
 
     Parameters
     ----------
     pose_pairs : PosePairs
     lag_s : float
-        Seconds between the poses of a pair; the median interval if that is longer.
+        Duration (s) of the motions; the median interval of the pose pairs if that is longer.
     max_pairs : int
-        Largest number of pairs.
+        Largest number of motion pairs.
     """
     stamps_ns = pose_pairs.stamps_ns
     if len(stamps_ns) > 1:
@@ -301,7 +316,8 @@ def pairs_over(pose_pairs: PosePairs, lag_s: float, max_pairs: int = MAX_PAIRS) 
     has_end = after < len(stamps_ns)
     i = i[has_end]
     after = after[has_end]
-    # The pose nearest to the end: the first pose after the end would more often have a late stamp.
+    # Use the pose nearest to the end. The first pose after the end would more often have a late
+    # stamp.
     ends_ns = stamps_ns[i] + round(lag_s * 1e9)
     is_before = ends_ns - stamps_ns[after - 1] < stamps_ns[after] - ends_ns
     j = np.maximum(after - is_before, i + 1)
