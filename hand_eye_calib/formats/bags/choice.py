@@ -1,10 +1,10 @@
 """Choose topics of a bag for the streams that the user has not named.
 
-An obvious pair is taken. Otherwise the error states what the bag has, and the options of the
-likeliest pair.
+If only one choice is obvious, it is used. Otherwise an error lists the topics of the bag and the
+options that choose the likeliest pair.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple
 
 from hand_eye_calib.core.base.errors import UnclearStreamsError
@@ -13,17 +13,19 @@ from hand_eye_calib.core.geometry.frames import words_of
 from hand_eye_calib.formats.bags import messages, roles
 from hand_eye_calib.formats.exports import role_of
 
-# A topic with fewer poses is no sensor: goals and initial poses are published once.
-_FEWEST_POSES = 3
+# Smallest number of poses on the topic of a sensor. Goals and initial poses are published once.
+_MIN_POSES = 3
 
-# Words of topics whose poses are not those of a sensor, or are computed from those of sensors.
+# Words in the names of topics whose poses are not measured by one sensor: they are commands, ground
+# truth, or estimates from several sensors.
 _NO_SENSOR = {"goal", "target", "plan", "setpoint", "cmd", "truth", "gt", "filtered", "fused"}
-# Words that name a kind of message, and no sensor.
-_OF_MESSAGES = {"odometry", "odom", "pose", "poses", "path", "trajectory", "stamped", "local"}
-# Kinds of sensors of role_of, the likeliest first; "base" is a vehicle.
+# Words in the names of topics that describe the kind of message, not the sensor.
+_KINDS_OF_MESSAGES = {"odometry", "odom", "pose", "poses", "path", "trajectory", "stamped", "local"}
+# Kinds of sensors that role_of distinguishes, the likeliest first. Its kind "base" is missing here,
+# because a vehicle is no sensor.
 _SENSORS = ("lidar", "camera", "imu", "gnss")
 
-# Characters of the longest list of topics in an error.
+# Largest number of characters of a list of topics in an error.
 _LONGEST_LIST = 600
 
 _FIX = "sensor_msgs/msg/NavSatFix"
@@ -31,7 +33,10 @@ _IMU = "sensor_msgs/msg/Imu"
 
 
 class TopicInfo(NamedTuple):
-    """A topic of a bag: name, message type (empty if publishers disagree), number of messages."""
+    """Topic of a bag: its name, its message type and its number of messages.
+
+    The type is empty if several types of messages were published on the topic.
+    """
 
     name: str
     type: str
@@ -42,7 +47,7 @@ class TopicInfo(NamedTuple):
 
 
 class _Candidate(NamedTuple):
-    """A topic with poses, and the sensor's frame in its first message; empty without a frame."""
+    """Topic with poses, and the sensor's frame in its first message, which may be empty."""
 
     topic: TopicInfo
     frame: str
@@ -53,21 +58,28 @@ class _Candidate(NamedTuple):
 
     @property
     def is_of_sensor(self) -> bool:
-        """Whether the name does not exclude that the poses are those of a sensor."""
+        """Whether the poses may be measured by a sensor, judged by the topic's name."""
         return not words_of(self.name) & _NO_SENSOR
 
     @property
     def rank(self) -> int:
-        """Place of the sensor's kind in ``_SENSORS``, or the place behind the last."""
+        """Index of the sensor's kind in ``_SENSORS``; for other kinds, the number of kinds."""
         role = role_of(self.name) or role_of(self.frame)
         return _SENSORS.index(role) if role in _SENSORS else len(_SENSORS)
 
     def has_sensor_of(self, other: "_Candidate") -> bool:
-        """Whether both topics have poses of one sensor, by their frames or names."""
+        """Whether the poses of both topics are those of one sensor, judged by frames and names."""
         if self.frame and self.frame == other.frame:
             return True
-        words = words_of(self.name) - _OF_MESSAGES
-        return bool(words) and words == words_of(other.name) - _OF_MESSAGES
+        words = words_of(self.name) - _KINDS_OF_MESSAGES
+        return bool(words) and words == words_of(other.name) - _KINDS_OF_MESSAGES
+
+
+def _of_types(
+    topics: Sequence[TopicInfo], types: Collection[str], min_count: int = 0
+) -> list[TopicInfo]:
+    """Return the topics with messages of some types, and with at least ``min_count`` messages."""
+    return [topic for topic in topics if topic.type in types and topic.count >= min_count]
 
 
 def choose(
@@ -81,49 +93,48 @@ def choose(
     Parameters
     ----------
     topics : sequence of TopicInfo
-        Topics that no stream uses.
+        Topics that are not yet used by a stream.
     missing : sequence of str
         Streams without a topic: "parent", "child" or both.
     frame_of : callable
-        Return the sensor's frame in the first message of a topic.
+        Returns the sensor's frame in the first message of a topic.
     edges : collection of str
-        Frames of transforms as WORLD:SENSOR.
+        Frames of the moving transforms in the bag, as WORLD:SENSOR.
 
     Raises
     ------
     UnclearStreamsError
-        If there is no obvious choice.
+        If there is no obvious choice. The error contains the options of the likeliest choice.
     """
     n_missing = len(missing)
-    poses = [topic for topic in topics if topic.type in messages.POSE_TYPES]
-    moving = [topic for topic in poses if topic.count >= _FEWEST_POSES]
-    paths = [topic for topic in topics if topic.type == messages.PATH_TYPE]
-    others = [
-        topic
-        for topic in topics
-        if topic.type in messages.FIELD_POSE_TYPES and topic.count >= _FEWEST_POSES
-    ]
-    for some in (poses, moving, moving + paths, moving + others):
-        if len(some) == n_missing:
-            return [topic.name for topic in some]
+    poses = _of_types(topics, messages.POSE_TYPES)
+    moving = _of_types(topics, messages.POSE_TYPES, _MIN_POSES)
+    paths = _of_types(topics, {messages.PATH_TYPE})
+    others = _of_types(topics, messages.FIELD_POSE_TYPES, _MIN_POSES)
+    # The choice is obvious if the number of topics fits.
+    for group in (poses, moving, moving + paths, moving + others):
+        if len(group) == n_missing:
+            return [topic.name for topic in group]
+    # The choice is also obvious if one topic of each sensor, or of each sensor of a known kind, is
+    # enough.
     candidates = [_Candidate(topic, frame_of(topic.name)) for topic in moving + paths + others]
-    sensors = _one_of_each_sensor(candidates)
-    named = [sensor for sensor in sensors if sensor.rank < len(_SENSORS)]
-    for likely in (sensors, named):
-        if len(likely) == n_missing:
-            return [sensor.name for sensor in likely]
+    sensors = _topic_of_each_sensor(candidates)
+    of_known_kinds = [sensor for sensor in sensors if sensor.rank < len(_SENSORS)]
+    for chosen in (sensors, of_known_kinds):
+        if len(chosen) == n_missing:
+            return [sensor.name for sensor in chosen]
     if len(sensors) < n_missing <= len(candidates):
         sensors = candidates
     raise _unclear(topics, [sensor.topic for sensor in sensors], missing, edges)
 
 
-def _one_of_each_sensor(candidates: Sequence[_Candidate]) -> list[_Candidate]:
+def _topic_of_each_sensor(candidates: Sequence[_Candidate]) -> list[_Candidate]:
     """Return the likeliest topic of each sensor, the likeliest sensor first."""
     sensors: list[_Candidate] = []
     ranked = sorted(candidates, key=lambda candidate: (candidate.rank, -candidate.topic.count))
     for candidate in ranked:
-        is_other = not any(candidate.has_sensor_of(sensor) for sensor in sensors)
-        if candidate.is_of_sensor and is_other:
+        is_same_sensor = any(candidate.has_sensor_of(sensor) for sensor in sensors)
+        if candidate.is_of_sensor and not is_same_sensor:
             sensors.append(candidate)
     return sensors
 
@@ -134,53 +145,67 @@ def _unclear(
     missing: Sequence[str],
     edges: Collection[str],
 ) -> UnclearStreamsError:
-    """Return the error about a bag without an obvious choice."""
-    by_type: dict[str, list[TopicInfo]] = {}
-    for topic in topics:
-        by_type.setdefault(topic.type, []).append(topic)
+    """Return the error for a bag without an obvious choice.
+
+    The error contains the problem, and the options of the likeliest choice. If no choice is
+    possible, it contains what to record instead, and the topics of the bag.
+    """
     if not any(topic.count for topic in topics) and len(missing) > 1:
         return UnclearStreamsError("the bag has no messages: record again", {})
-    if len(sensors) >= len(missing):
-        what = f"{len(sensors)} topics have poses: {_listed(sensors)}"
-        return UnclearStreamsError(what, _options(missing, [topic.name for topic in sensors]))
-    clouds = by_type.get(messages.POINTS_TYPE, [])
-    partners = [*by_type.get(_FIX, []), *clouds, *by_type.get(_IMU, [])]
-    pairs = _separate_edges(edges)
-    if sensors:
-        what = f"only one topic has poses, {sensors[0]}"
-        likeliest = [sensors[0].name, *[topic.name for topic in partners], *pairs]
-        advice = "record the odometry of the other sensor"
-    elif len(pairs) >= len(missing):
-        what = (
-            f"no topic has poses, but transforms have: {shortened(listing(pairs), _LONGEST_LIST)}"
-        )
-        likeliest = pairs
-    elif len(clouds) >= len(missing):
-        what = f"no topic has poses; the odometry of lidars can be computed from {_listed(clouds)}"
-        likeliest = [topic.name for topic in clouds]
-    else:
-        what = "no topic has poses"
-        likeliest = []
-        advice = _advice(by_type)
-    if len(likeliest) >= len(missing):
-        return UnclearStreamsError(what, _options(missing, likeliest))
+    problem, sources = _problem_and_sources(topics, sensors, edges, len(missing))
+    if len(sources) >= len(missing):
+        return UnclearStreamsError(problem, _options(missing, sources))
+    advice = "record the odometry of the other sensor"
+    if not sensors:
+        advice = _advice({topic.type for topic in topics})
     listed = f"The bag has {_listed(topics)}" if topics else "The bag has no other topics"
-    return UnclearStreamsError(f"{what}: {advice}. {listed}", {})
+    return UnclearStreamsError(f"{problem}: {advice}. {listed}", {})
 
 
-def _advice(by_type: Mapping[str, Sequence[TopicInfo]]) -> str:
-    """Return what to do with a bag that has no poses."""
-    if messages.POINTS_TYPE in by_type:
+def _problem_and_sources(
+    topics: Sequence[TopicInfo],
+    sensors: Sequence[TopicInfo],
+    edges: Collection[str],
+    n_missing: int,
+) -> tuple[str, list[str]]:
+    """Return why the choice is unclear, and the possible sources of poses, the likeliest first.
+
+    Sources are topics of poses, pairs of frames in transforms, and clouds of points. ``sensors``
+    are the topics of poses.
+    """
+    pairs = _separate_edges(edges)
+    clouds = _of_types(topics, {messages.POINTS_TYPE})
+    if len(sensors) >= n_missing:
+        problem = f"{len(sensors)} topics have poses: {_listed(sensors)}"
+        return problem, [topic.name for topic in sensors]
+    if sensors:
+        partners = [*_of_types(topics, {_FIX}), *clouds, *_of_types(topics, {_IMU})]
+        names = [topic.name for topic in (sensors[0], *partners)]
+        return f"only one topic has poses, {sensors[0]}", names + pairs
+    if len(pairs) >= n_missing:
+        listed = shortened(listing(pairs), _LONGEST_LIST)
+        return f"no topic has poses, but transforms have: {listed}", pairs
+    if len(clouds) >= n_missing:
+        problem = (
+            f"no topic has poses; the odometry of lidars can be computed from {_listed(clouds)}"
+        )
+        return problem, [topic.name for topic in clouds]
+    return "no topic has poses", []
+
+
+def _advice(types: set[str]) -> str:
+    """Return what to do with a bag whose topics have messages of these types, but no poses."""
+    if messages.POINTS_TYPE in types:
         return "run the odometry of both sensors and record it; clouds of one lidar are one stream"
-    if {*messages.IMAGE_TYPES} & {*by_type}:
+    if not types.isdisjoint(messages.IMAGE_TYPES):
         return "run visual odometry or SLAM on the images, and record its poses"
-    if _FIX in by_type and _IMU in by_type:
+    if _FIX in types and _IMU in types:
         return "GNSS and IMU need the poses of another sensor: record its odometry or SLAM"
     return "run the odometry or SLAM of both sensors, and record it"
 
 
 def _separate_edges(edges: Collection[str]) -> list[str]:
-    """Return edges WORLD:SENSOR that share no frame, because each sensor has its own world."""
+    """Return pairs WORLD:SENSOR that share no frame: each sensor has a world of its own."""
     separate: list[str] = []
     used: set[str] = set()
     for edge in sorted(edges):
@@ -192,12 +217,13 @@ def _separate_edges(edges: Collection[str]) -> list[str]:
 
 
 def _options(missing: Sequence[str], names: Sequence[str]) -> dict[str, str]:
-    """Return the options that name the likeliest topics for the missing streams."""
-    likeliest = [*names[: len(missing)]]
-    if len(likeliest) > 1:
-        likeliest = roles.parent_and_child(likeliest, {}, {})
-    return {f"{stream}_topic": name for stream, name in zip(missing, likeliest, strict=True)}
+    """Return the options that choose the first names, the likeliest, for the missing streams."""
+    chosen = [*names[: len(missing)]]
+    if len(chosen) > 1:
+        chosen = roles.parent_and_child(chosen, {}, {})
+    return {f"{stream}_topic": name for stream, name in zip(missing, chosen, strict=True)}
 
 
 def _listed(topics: Sequence[TopicInfo]) -> str:
+    """Return topics as text for an error, shortened if they are many."""
     return shortened(listing([str(topic) for topic in topics]), _LONGEST_LIST)

@@ -23,18 +23,21 @@ from hand_eye_calib.formats.bags.storage import (
 )
 from hand_eye_calib.formats.yaml_files import read_yaml
 
+# What a path of a bag may be, for messages.
 _EXPECTED = "a rosbag2 directory, a .mcap or .db3 file of one, or a rosbag1 .bag file"
-# Endings of files next to a .db3 in which SQLite leaves the newest messages of a killed recorder.
+# Endings of files that SQLite keeps next to a .db3 while writing. If the recorder was killed, these
+# files contain its newest messages.
 _UNFINISHED = ("-wal", "-journal")
 _METADATA = "metadata.yaml"
-# Largest number of missing files that a message names.
+# Largest number of missing files that a message lists by name.
 _MOST_NAMED = 5
 
 
 def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
-    """Open the storage files of bags; return them in the order of their start.
+    """Open the storage files of bags; return them in the order of their first message.
 
-    Files that are compressed as a whole are unpacked first.
+    Files that are compressed as a whole are unpacked into a temporary folder. ``opened`` closes the
+    files and removes these folders.
 
     Raises
     ------
@@ -66,7 +69,7 @@ def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
 
 
 def _unfinished(file: Path) -> list[Path]:
-    """Return the files of SQLite next to a .db3 that contain its newest messages."""
+    """Return the files next to a .db3 with its newest messages, which SQLite has not merged yet."""
     if file.suffix != ".db3":
         return []
     paths = [file.with_name(f"{file.name}{suffix}") for suffix in _UNFINISHED]
@@ -76,8 +79,8 @@ def _unfinished(file: Path) -> list[Path]:
 def _complete(file: Path, unfinished: Iterable[Path], copy: Path) -> None:
     """Copy a database with its unfinished files, and let SQLite merge them in the copy.
 
-    SQLite writes into the folder of a database even if it only reads, but the folder of the user
-    must not change.
+    A copy is needed because SQLite writes into the folder of a database even to read it, but the
+    user's folder must not change.
     """
     try:
         shutil.copyfile(file, copy)
@@ -98,18 +101,19 @@ def _complete(file: Path, unfinished: Iterable[Path], copy: Path) -> None:
 
 
 def _unpack(file: Path, target: Path) -> str:
-    """Unpack a file that is compressed as a whole; return a line about damage, or an empty text.
+    """Unpack a file that is compressed as a whole.
 
-    Everything before the damage is unpacked.
+    A damaged file is unpacked up to the damage. The returned line describes the damage; it is empty
+    for an intact file.
     """
     zstd = zstd_module()
-    most_bytes = files.LARGEST_RATIO * file.stat().st_size
+    max_bytes = files.LARGEST_RATIO * file.stat().st_size
     n_bytes = 0
     with zstd.open(file, "rb") as packed, target.open("wb") as unpacked:
         try:
             while piece := packed.read(files.BLOCK_BYTES):
                 n_bytes += unpacked.write(piece)
-                if n_bytes > most_bytes:
+                if n_bytes > max_bytes:
                     raise InputError(
                         f"cannot read bag {file}: it unpacks to more than "
                         f"{files.LARGEST_RATIO} times its size; the file is damaged"
@@ -120,12 +124,14 @@ def _unpack(file: Path, target: Path) -> str:
 
 
 def _files_of(path: Path) -> list[Path]:
-    """Return the files of a bag with messages, without packed copies of unpacked files.
+    """Return the storage files of a bag.
+
+    A compressed file is skipped if the same file is there uncompressed.
 
     Raises
     ------
     InputError
-        If there are no such files.
+        If the path is not a bag, or its folder contains no storage files.
     """
     if not path.is_dir():
         if _suffix(path) and path.is_file():
@@ -142,7 +148,7 @@ def _files_of(path: Path) -> list[Path]:
 
 
 def _no_files(folder: Path) -> str:
-    """Return a message about a folder without storage files."""
+    """Return the message for a folder without storage files: what is missing, or where bags are."""
     missing = missing_files(folder).n_messages
     if missing:
         return (
@@ -159,15 +165,15 @@ def _no_files(folder: Path) -> str:
 
 
 class MissingFiles(NamedTuple):
-    """Files that the metadata of a bag lists and that its folder lacks.
+    """Files that the metadata of a bag list, but that are not in its folder.
 
     Attributes
     ----------
     n_messages : dict of str to int
-        Number of messages of each missing file by its name. It is None if the metadata lack it, and
-        may have any type in damaged metadata.
+        Number of messages of each missing file, by file name. None if the metadata do not contain
+        the number; any type if the metadata are damaged.
     n_in_bag : int
-        Number of messages of the whole bag; with the same exceptions.
+        Number of messages of the whole bag. None or any type, too, for the same reasons.
     """
 
     n_messages: dict[str, Any]
@@ -192,7 +198,7 @@ def missing_files(folder: Path) -> MissingFiles:
 
 
 def _listing(names: Iterable[str]) -> str:
-    """List names in words; only the first names of a long list."""
+    """Return names as text; of a long list, the first names and the number of the rest."""
     listed = [*names]
     if len(listed) > _MOST_NAMED:
         listed[_MOST_NAMED:] = [f"{len(listed) - _MOST_NAMED} more"]
@@ -200,10 +206,10 @@ def _listing(names: Iterable[str]) -> str:
 
 
 def losses_of(path: Path, n_present: int) -> list[str]:
-    """Return a line about files that the metadata list and the folder lacks; empty without such.
+    """Return a line about missing files of a bag, and the share of the messages in these files.
 
-    The line states the share of all messages in these files. ``n_present`` is the number of
-    messages in the present files.
+    The list is empty if no file of the metadata is missing. ``n_present`` is the number of messages
+    in the files that are there.
     """
     if not path.is_dir():
         return []
@@ -212,6 +218,7 @@ def losses_of(path: Path, n_present: int) -> list[str]:
         return []
     counts = [count for count in missing.values() if isinstance(count, int)]
     n_missing = sum(counts)
+    # If the number is not known for all files, use the number of messages of the whole bag.
     if len(counts) < len(missing):
         n_missing = max(n_in_bag - n_present, 0) if isinstance(n_in_bag, int) else 0
     verb = "is" if len(missing) == 1 else "are"

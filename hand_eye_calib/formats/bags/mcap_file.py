@@ -16,24 +16,25 @@ from mcap.stream_reader import StreamReader
 from hand_eye_calib.formats import files
 from hand_eye_calib.formats.bags.storage import Message, MessageKind, Storage, kind_of, reason_of
 
-# Head of a record in an mcap chunk: opcode (uint8) and length (uint64).
+# Header of a record in an mcap file: opcode (uint8) and length of the content in bytes (uint64).
 _RECORD = struct.Struct("<BQ")
-# Head of a message: channel (uint16), sequence number, log time (uint64), publish time.
+# Header of a message: channel (uint16) and log time in ns (uint64). The sequence number (4 bytes)
+# and the publish time (8 bytes) are skipped.
 _MESSAGE = struct.Struct("<H4xQ8x")
-# Schema of a channel without schema, such as some channels with JSON.
+# Schema for a channel that has no schema, as some channels with JSON.
 _NO_SCHEMA = records.Schema(id=0, name="", encoding="", data=b"")
 
 
 class McapFile(Storage):
     """An .mcap file, read by the library mcap.
 
-    An intact file is read by its index. In a damaged file, all records before the damage are read,
-    also those of a chunk that is cut off.
+    An intact file is read with the help of its index. In a damaged file, all records before the
+    damage are read. They include the first records of a chunk whose end is missing.
     """
 
     def _open(self, opened: ExitStack) -> None:
         self._stream = _WholeReads(opened.enter_context(self._file.open("rb", buffering=0)))
-        # Indexes of the chunks; empty if the file has no usable index.
+        # Indexes of the chunks, sorted by time; empty if the file has no usable index.
         self._chunks: list[Any] = []
         try:
             summary = self._checked_summary()
@@ -51,7 +52,10 @@ class McapFile(Storage):
             self.span_ns = statistics.message_start_time, statistics.message_end_time
 
     def _checked_summary(self) -> Any:
-        """Return the summary of the file; raise an error of any kind if it is incomplete."""
+        """Return the summary of the file; raise an error of any type if the summary is incomplete.
+
+        A summary without the index of all chunks is incomplete.
+        """
         summary: Any = make_reader(self._stream).get_summary()
         statistics = summary.statistics
         is_complete = (
@@ -64,14 +68,20 @@ class McapFile(Storage):
         return summary
 
     def _add_kind(self, channel: Any, schemas: Mapping[int, Any]) -> None:
+        """Store the kind of the messages of a channel; ``schemas`` are those of the file by id."""
         schema = schemas.get(channel.schema_id, _NO_SCHEMA)
         description = (schema.name, channel.message_encoding, schema.encoding, schema.data)
         self._kinds[channel.id] = kind_of(channel.topic, *description)
 
     def _scan(self, reason: Exception) -> None:
-        """Count the messages of a file without a usable index.
+        """Read a file without a usable index once, to count its messages and to find its damage.
 
         ``reason`` is the error that reading the index raised.
+
+        Raises
+        ------
+        ValueError
+            If the file is damaged and contains no readable message.
         """
         schemas = {}
         times_ns = []
@@ -93,25 +103,29 @@ class McapFile(Storage):
 
     def _messages(self, kinds: Mapping[int, MessageKind]) -> Iterable[Message]:
         if not self._chunks:
-            # `losses` has a line about the damage since the file was opened.
+            # Opening the file has added the damage to `losses` already, so pass another list.
             for record in self._records([]):
                 if isinstance(record, records.Message) and record.channel_id in kinds:
                     yield kinds[record.channel_id], record.log_time, record.data
         for index in self._chunks:
             channels = index.message_index_offsets
+            # Skip chunks without messages of these kinds. A chunk may have no index of channels.
             if not channels or kinds.keys() & channels.keys():
                 messages = _messages_of_chunk(self._content(index.chunk_start_offset), kinds)
                 yield from sorted(messages, key=itemgetter(1))
 
     def _content(self, start: int) -> bytes:
-        """Return the unpacked records of the chunk at a position in the file."""
+        """Return the unpacked records of the chunk that begins at byte ``start`` of the file."""
         self._stream.seek(start + _RECORD.size)
         chunk = records.Chunk.read(ReadDataStream(self._stream))
         stream, size = stream_reader.get_chunk_data_stream(chunk, validate_crc=True)
         return bytes(stream.read(size))
 
     def _records(self, losses: list[str]) -> Iterator[Any]:
-        """Iterate over all records up to damage; append a line about the damage to ``losses``."""
+        """Iterate over all records of the file, or over those before the damage.
+
+        A line about the damage is appended to ``losses``.
+        """
         position = self._stream.seek(0)
         try:
             for record in StreamReader(self._stream, validate_crcs=True).records:
@@ -122,12 +136,15 @@ class McapFile(Storage):
         except Exception as error:
             losses.append(f"it is truncated or damaged ({reason_of(error)}); the rest is lost")
             if isinstance(error, EOFError):
-                # The records of the last chunk end in an error, too, where the file is cut off.
+                # The file is cut off. Reading the records of its last chunk ends in an error, too.
                 with suppress(Exception):
                     yield from self._records_of_cut_chunk(position)
 
     def _records_of_cut_chunk(self, position: int) -> Iterator[Any]:
-        """Iterate over the records of a chunk that is cut off; none if it is another record."""
+        """Iterate over the records of a chunk at byte ``position``, whose end is missing.
+
+        There are none if the record at this position is not a chunk.
+        """
         with self._file.open("rb") as file:
             file.seek(position)
             if file.read(_RECORD.size)[0] != Opcode.CHUNK:
@@ -147,7 +164,7 @@ class McapFile(Storage):
 def _messages_of_chunk(content: bytes, kinds: Mapping[int, MessageKind]) -> Iterator[Message]:
     """Iterate over the messages of some channels in the unpacked records of an mcap chunk.
 
-    The library's own iteration takes several times as long.
+    This takes a fraction of the time of the iteration in the library mcap.
     """
     message_opcode = int(Opcode.MESSAGE)
     end = 0
@@ -164,15 +181,16 @@ def _messages_of_chunk(content: bytes, kinds: Mapping[int, MessageKind]) -> Iter
 
 
 class _WholeReads(BufferedReader):
-    """A file whose ``read`` raises EOFError instead of returning fewer bytes than requested.
+    """File whose ``read`` raises EOFError if fewer bytes than requested are left.
 
-    The library mcap would accept fewer bytes as a whole record.
+    The library mcap would take fewer bytes for a whole record.
     """
 
     def read(self, size: int | None = -1) -> bytes:
-        wanted = size or 0
-        # Before 1.6, the library mcap allocates any length that a damaged file states.
-        data = super().read(size) if wanted < files.LARGEST else b""
-        if len(data) < wanted:
+        n_bytes = size or 0
+        # Before version 1.6, the library mcap requests any length that a damaged file states. Too
+        # large a length would fill the memory.
+        data = super().read(size) if n_bytes < files.LARGEST else b""
+        if len(data) < n_bytes:
             raise EOFError("it ends in the middle of a record")
         return data

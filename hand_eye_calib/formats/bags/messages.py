@@ -1,17 +1,14 @@
-"""Types of messages, and the poses or parts of poses that they measure.
+"""Types of messages that can be read, and the quantities (poses, rates, ...) that they contain.
 
-Frequent types are unpacked from their bytes: a ``std_msgs/Header``, the sensor's frame in some
-types, and the measured values. This takes little time and needs no type definitions. Libraries
-decode messages of all other types. A new type is a row in the table.
+Messages of frequent types are unpacked from their bytes: a ``std_msgs/Header``, the sensor's frame
+in some types, and the values. This takes little time and needs no type definitions. Libraries
+decode messages of all other types. To support a new type, add a row to ``_ROWS`` or ``_FIELDS``.
 """
 
-import json
 import math
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import lru_cache, partial
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,30 +17,29 @@ from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.config import STAMP_UNITS
 from hand_eye_calib.core.base.errors import (
     ConfigError,
-    HandEyeCalibError,
     InputError,
     NoPoseError,
     printable,
-    required,
 )
 from hand_eye_calib.core.base.registry import MEASURES
 from hand_eye_calib.core.base.text import frame_name
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import are_null
 from hand_eye_calib.core.geometry.rates import RateIntegrator
+from hand_eye_calib.formats.bags.decoding import decoder_of
 from hand_eye_calib.formats.bags.pose_table import PoseTable
 from hand_eye_calib.formats.bags.storage import MessageKind
 from hand_eye_calib.formats.files import LONGEST_NAME
 from hand_eye_calib.formats.geodetic import LocalOrigin
 from hand_eye_calib.formats.transforms import PoseFields
 
-# Errors of unpacking if the bytes are not a message of the type.
+# Types of errors that unpacking raises if the bytes are not a message of the expected type.
 MALFORMED = (struct.error, ValueError)
 
 NS_PER_S = STAMP_UNITS["s"]
-# Bytes of a stamp: seconds and nanoseconds.
+# Number of bytes of a stamp: seconds and nanoseconds.
 _STAMP_SIZE = 8
-# Bytes of a pose: position and quaternion.
+# Number of bytes of a pose: position and quaternion.
 _POSE_SIZE = struct.calcsize("=7d")
 _NO_ROTATION = (math.nan,) * 4
 _NO_VECTOR = (math.nan,) * 3
@@ -51,14 +47,15 @@ _NO_VECTOR = (math.nan,) * 3
 
 # ---- bytes
 
-# Number of bytes before the stamp: in CDR the encoding, and values are aligned relative to the end
-# of these bytes; in ROS 1 a sequence number, and values are not aligned.
+# Number of bytes before the stamp. In CDR they are the encoding, and values are aligned relative to
+# their end. In ROS 1 they are a sequence number, and values are not aligned.
 _START = struct.calcsize("=I")
+# First bytes of a message in plain CDR, little endian.
 _CDR = b"\x00\x01"
 
 
 class Cursor:
-    """Read the values of a message in their order.
+    """Reader of the values in the bytes of a message, one after the other.
 
     Raises
     ------
@@ -74,7 +71,7 @@ class Cursor:
         self.position = _START
 
     def read(self, format_: str) -> tuple[Any, ...]:
-        """Read numbers of the same size; ``format_`` is a format of ``struct``."""
+        """Read numbers; ``format_`` is a format of ``struct`` with numbers of the same size."""
         if not self._is_ros1:
             self.position += (_START - self.position) % struct.calcsize(format_[-1])
         values = struct.unpack_from(f"<{format_}", self._data, self.position)
@@ -82,7 +79,7 @@ class Cursor:
         return values
 
     def stamp_ns(self) -> int:
-        """Read a stamp."""
+        """Read a stamp; return it in ns."""
         seconds, nanoseconds = self.read("II" if self._is_ros1 else "iI")
         if nanoseconds >= NS_PER_S:
             raise ValueError(f"a stamp has {nanoseconds} nanoseconds, more than a second")
@@ -105,19 +102,23 @@ class Cursor:
 
 
 def _pose(cursor: Cursor) -> Sequence[float]:
-    """Read position (m) and quaternion."""
+    """Read a position x y z (m) and a quaternion xyzw."""
     return cursor.read("7d")
 
 
 def _point(cursor: Cursor) -> Sequence[float]:
-    """Read a position (m)."""
+    """Read a position x y z (m)."""
     return cursor.read("3d")
 
 
 def _imu(cursor: Cursor) -> Sequence[float]:
-    """Read angular rates (rad/s) and orientation xyzw of an Imu message; NaN if absent."""
+    """Read angular rates (rad/s) and orientation xyzw of an Imu message.
+
+    A quantity is NaN if the message does not contain it.
+    """
+    # Orientation (4 numbers) and its covariance (9), rates (3) and their covariance (9). The first
+    # element of a covariance is -1 if the message does not contain the quantity.
     values = cursor.read("25d")
-    # The first element of the covariance of an absent quantity is -1.
     orientation = _NO_ROTATION if values[4] == -1.0 else values[:4]
     rates = _NO_VECTOR if values[16] == -1.0 else values[13:16]
     return rates + orientation
@@ -135,17 +136,17 @@ def _fix(cursor: Cursor) -> Sequence[float]:
 
 
 class MessageType(NamedTuple):
-    """A type of messages that can be read.
+    """Type of messages that can be read.
 
     Attributes
     ----------
     name : str
     measures : sequence of str
-        Quantities that the messages can be read as, the usual one first.
+        Quantities that can be read from the messages; the first is read by default.
     unpack : callable, optional
-        Reads the values after the frames. None for types that are not unpacked from their bytes.
+        Reads the values after the names of the frames. None for types that a library decodes.
     has_child_frame : bool
-        Whether the sensor's frame follows the header.
+        Whether the name of the sensor's frame follows the header.
     fields : str
         Fields to read from decoded messages, in the notation of :mod:`.sources`.
     """
@@ -157,16 +158,17 @@ class MessageType(NamedTuple):
     fields: str = ""
 
 
-# Columns of each quantity in the unpacked values. Latitude, longitude and height are positions.
+# Columns of each quantity in the values of :func:`_pose`, :func:`_point`, :func:`_imu` and
+# :func:`_fix`. Latitude, longitude and height are read as positions.
 _COLUMNS = {"poses": slice(7), "positions": slice(3), "rotations": slice(3, 7), "rates": slice(3)}
 _OF_POSES = ("poses", "positions", "rotations")
 _OF_POINTS = ("positions",)
 
 PATH_TYPE = "nav_msgs/msg/Path"
 POINTS_TYPE = "sensor_msgs/msg/PointCloud2"
-#: Images, which are read with a target.
+#: Types of images. Poses are computed from images of a target.
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-#: Lists of transforms, and single transforms.
+#: Types of lists of transforms, and of single transforms.
 TF_TYPES = (
     "tf2_msgs/msg/TFMessage",
     "tf/msg/tfMessage",
@@ -176,16 +178,21 @@ TF_TYPES = (
 
 
 def _pose_fields(position: str, orientation: str, stamp: str = "header.stamp") -> str:
-    """Return the fields of a pose from the paths of its parts."""
+    """Return the fields of a pose, in the notation of :mod:`.sources`.
+
+    The parameters are the paths of its position, orientation and stamp in a message.
+    """
     place = f"x={position}.x,y={position}.y,z={position}.z"
     return f"t={stamp},{place},{_rotation_fields(orientation)}"
 
 
 def _rotation_fields(path: str) -> str:
+    """Return the fields of the quaternion at a path in a message."""
     return f"qx={path}.x,qy={path}.y,qz={path}.z,qw={path}.w"
 
 
 def _twist_fields(path: str) -> str:
+    """Return the fields of a stamped twist (velocity and angular rates) at a path in a message."""
     linear = f"vx={path}.linear.x,vy={path}.linear.y,vz={path}.linear.z"
     angular = f"wx={path}.angular.x,wy={path}.angular.y,wz={path}.angular.z"
     return f"t=header.stamp,{linear},{angular}"
@@ -195,7 +202,7 @@ _NOVATEL = (
     "t=header.stamp,lat_deg=latitude,lon_deg=longitude,height=height,"
     "roll_deg=roll,pitch_deg=pitch,heading_deg=azimuth"
 )
-# Types that are read by their fields. If a message has an array of poses, the first pose is read.
+# Fields of types that a library decodes. If a message has an array of poses, the first is read.
 _FIELDS = {
     "novatel_oem7_msgs/msg/INSPVA": _NOVATEL,
     "novatel_oem7_msgs/msg/INSPVAX": _NOVATEL,
@@ -222,7 +229,7 @@ _FIELDS = {
     "gps_msgs/msg/GPSFix": "t=header.stamp,lat_deg=latitude,lon_deg=longitude,height=altitude",
     "foxglove.LocationFix": "t=timestamp,lat_deg=latitude,lon_deg=longitude,height=altitude",
 }
-# The most frequent types first.
+# All types, the most frequent first.
 _ROWS = [
     MessageType("nav_msgs/msg/Odometry", _OF_POSES, _pose, has_child_frame=True),
     MessageType("geometry_msgs/msg/PoseStamped", _OF_POSES, _pose),
@@ -239,9 +246,9 @@ for _name, _fields in _FIELDS.items():
 _ROWS.append(MessageType(POINTS_TYPE, _OF_POSES))
 
 MESSAGE_TYPES = {row.name: row for row in _ROWS}
-#: Types with a whole pose in each message.
+#: Types with a complete pose in each message, which is unpacked from the bytes.
 POSE_TYPES = tuple(row.name for row in _ROWS if row.unpack is _pose)
-#: Types whose fields are a whole pose.
+#: Types with a complete pose in each message, whose fields a library decodes.
 FIELD_POSE_TYPES = tuple(
     name for name, fields in _FIELDS.items() if "qw=" in fields or "roll" in fields
 )
@@ -255,14 +262,14 @@ def measured_as(message_type: str, wanted: str, source: object) -> str:
     message_type : str
         Empty for transforms.
     wanted : str
-        A quantity, or "auto" for the usual one.
+        Quantity that the user asks for, or "auto" for the usual quantity of the type.
     source : object
         Name of the topic in the error.
 
     Raises
     ------
     ConfigError
-        If the messages do not measure the wanted quantity.
+        If the messages do not contain the wanted quantity.
     """
     row = MESSAGE_TYPES.get(message_type)
     possible = row.measures if row else _OF_POSES
@@ -276,64 +283,14 @@ def measured_as(message_type: str, wanted: str, source: object) -> str:
     return wanted
 
 
-# ---- messages that a library decodes
-
-
-@lru_cache
-def _decoder(kind: MessageKind) -> Callable[[bytes], Any]:
-    """Return the function that decodes the bytes of a message into an object.
-
-    Raises
-    ------
-    InputError
-        If the encoding or the definition of the messages is unknown.
-    """
-    if kind.encoding == "json":
-        return partial(json.loads, object_hook=lambda fields: SimpleNamespace(**fields))
-    if kind.encoding not in ("cdr", "ros1", "protobuf"):
-        raise InputError(
-            f"messages of type {kind.type} have the encoding "
-            f"{kind.encoding[:40]!r}; expected cdr, ros1, json or protobuf"
-        )
-    make_decoder = _protobuf_decoder if kind.encoding == "protobuf" else _rosbags_decoder
-    try:
-        return make_decoder(kind)
-    except HandEyeCalibError:
-        raise
-    except Exception as error:  # damaged definitions raise errors of many kinds
-        raise InputError(
-            f"the bag contains no readable definition of {kind.type}; record "
-            "it as mcap, which stores definitions"
-        ) from error
-
-
-def _protobuf_decoder(kind: MessageKind) -> Any:
-    language, content = kind.definition
-    mcap_protobuf = required("mcap_protobuf.decoder", kind.type, "foxglove")
-    schema = SimpleNamespace(id=0, name=kind.type, encoding=language, data=content)
-    return mcap_protobuf.DecoderFactory().decoder_for(kind.encoding, schema)
-
-
-def _rosbags_decoder(kind: MessageKind) -> Callable[[bytes], Any]:
-    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-
-    typestore = get_typestore(Stores.ROS1_NOETIC if kind.is_ros1 else Stores.ROS2_JAZZY)
-    language, content = kind.definition
-    if content and kind.type not in typestore.types:
-        text = content.decode()
-        if "idl" in language.lower():
-            defined = get_types_from_idl(text)
-        else:
-            defined = get_types_from_msg(text, kind.type)
-        new_names = defined.keys() - typestore.types.keys()
-        typestore.register({name: defined[name] for name in new_names})
-    typestore.types[kind.type]  # raises KeyError if the type is not defined
-    decode = typestore.deserialize_ros1 if kind.is_ros1 else typestore.deserialize_cdr
-    return lambda data: decode(data, kind.type)
+# ---- fields of decoded messages
 
 
 def ns_of(stamp: Any) -> int | None:
-    """Return a stamp of ROS, of Foxglove's JSON or of protobuf in ns; None for other objects."""
+    """Return a stamp in ns; None if the object is not a stamp.
+
+    Stamps of ROS, of Foxglove's JSON and of protobuf name their fields differently.
+    """
     for seconds, nanoseconds in (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos")):
         if hasattr(stamp, nanoseconds):
             return int(getattr(stamp, seconds) * NS_PER_S + getattr(stamp, nanoseconds))
@@ -341,13 +298,13 @@ def ns_of(stamp: Any) -> int | None:
 
 
 def pose_row(position: Any, orientation: Any) -> tuple[float, ...]:
-    """Return x y z qx qy qz qw of a position, or translation, and an orientation of a message."""
+    """Return x y z qx qy qz qw of the position (or translation) and orientation of a message."""
     xyz = (position.x, position.y, position.z)
     return (*xyz, orientation.x, orientation.y, orientation.z, orientation.w)
 
 
 def transform_of(message: Any) -> PoseFields:
-    """Return a transform of ROS or of Foxglove; its frames have no leading slash."""
+    """Return a transform of ROS or of Foxglove; names of frames lose their leading slash."""
     if hasattr(message, "header"):
         stamp = message.header.stamp
         parent = message.header.frame_id
@@ -363,7 +320,7 @@ def transform_of(message: Any) -> PoseFields:
 
 
 class Run(NamedTuple):
-    """Consecutive messages of one kind, and their bag times (N,)."""
+    """Messages of one kind in the order of bag time, and their bag times (N,), ns."""
 
     kind: MessageKind
     messages: list[bytes]
@@ -377,7 +334,7 @@ class Run(NamedTuple):
         InputError
             If a message cannot be decoded.
         """
-        decode = _decoder(self.kind)
+        decode = decoder_of(self.kind)
         for data in self.messages:
             try:
                 message = decode(data)
@@ -386,7 +343,7 @@ class Run(NamedTuple):
             yield message
 
     def transforms(self) -> Iterator[tuple[int, PoseFields]]:
-        """Iterate over bag times and transforms of messages of one of TF_TYPES.
+        """Iterate over the transforms in messages of one of TF_TYPES, each with its bag time (ns).
 
         Raises
         ------
@@ -401,7 +358,7 @@ class Run(NamedTuple):
                 raise self.unreadable(error) from error
 
     def unreadable(self, error: Exception) -> InputError:
-        """Return the error to raise for a message that is not of its type."""
+        """Return the error for a message that cannot be read; ``error`` is the reason."""
         return InputError(
             f"{self.kind.topic}: a message of type {self.kind.type} cannot be "
             f"read ({error}); the bag is damaged: record it again"
@@ -412,7 +369,7 @@ class Run(NamedTuple):
 
 
 class _Unpacked(NamedTuple):
-    """Unpacked fields of a message; ``end`` is the position after the values."""
+    """Fields of a message. ``end`` is the number of bytes up to the end of the values."""
 
     stamp_ns: int
     world_frame: str
@@ -422,7 +379,16 @@ class _Unpacked(NamedTuple):
 
 
 class _Frames(NamedTuple):
-    """Frames of a pose in CDR: their bytes after the stamp, and the position after these bytes."""
+    """Frames of a pose in CDR.
+
+    Attributes
+    ----------
+    data : bytes
+        Bytes of the message between its stamp and its pose, which contain the names of the frames.
+    end : int
+        Number of bytes of the message before the pose.
+    world_frame, sensor_frame : str
+    """
 
     data: bytes
     end: int
@@ -431,7 +397,7 @@ class _Frames(NamedTuple):
 
 
 def _unpack(row: MessageType, is_ros1: bool, data: bytes) -> _Unpacked:
-    """Unpack one message; raise MALFORMED if it is not of its type."""
+    """Unpack one message; raise an error of ``MALFORMED`` if it is not of the type of the row."""
     cursor = Cursor(data, is_ros1)
     stamp_ns = cursor.stamp_ns()
     world_frame = cursor.name()
@@ -441,9 +407,10 @@ def _unpack(row: MessageType, is_ros1: bool, data: bytes) -> _Unpacked:
 
 
 def unpack_poses(messages: Sequence[bytes], message_type: str, is_ros1: bool) -> PoseTable:
-    """Unpack messages of one of MESSAGE_TYPES; raise MALFORMED if one is not of its type.
+    """Unpack messages of a type in MESSAGE_TYPES.
 
-    Poses with equal frames are unpacked together, which takes less time.
+    Raises an error of ``MALFORMED`` if a message is not of this type. Poses with equal frames are
+    unpacked together, which takes less time.
     """
     row = MESSAGE_TYPES[message_type]
     if row.unpack is _pose and len(messages) > 1:
@@ -456,47 +423,54 @@ def unpack_poses(messages: Sequence[bytes], message_type: str, is_ros1: bool) ->
 
 
 def _unpack_alike(messages: Sequence[bytes], row: MessageType, is_ros1: bool) -> PoseTable | None:
-    """Unpack poses together; None if their lengths or frames differ, or a stamp is invalid."""
+    """Unpack poses together, as columns of the bytes of all messages.
+
+    Return None if the messages differ in length or in frames, or if a stamp is invalid. They must
+    then be unpacked one by one.
+    """
     size = len(messages[0])
     if any(len(data) != size for data in messages):
         return None
     first = _unpack(row, is_ros1, messages[0])
     rows = np.frombuffer(b"".join(messages), dtype=np.uint8).reshape(-1, size)
     encodings = rows[:, :2]
-    # These bytes are the encoding of CDR, which must not differ, or the sequence number of ROS 1.
-    is_alike = is_ros1 or (encodings == encodings[0]).all()
+    # In CDR these bytes are the encoding, which must be the same. In ROS 1 they belong to the
+    # sequence number.
+    has_same_encoding = is_ros1 or (encodings == encodings[0]).all()
     frames = rows[:, _START + _STAMP_SIZE : first.end - _POSE_SIZE]
     stamps = np.ascontiguousarray(rows[:, _START : _START + _STAMP_SIZE])
     seconds, nanoseconds = stamps.view("<u4" if is_ros1 else "<i4").T.astype(np.int64)
     are_stamps = (nanoseconds // NS_PER_S == 0).all()
-    if not (is_alike and are_stamps and (frames == frames[0]).all()):
+    has_same_frames = (frames == frames[0]).all()
+    if not (has_same_encoding and are_stamps and has_same_frames):
         return None
     poses = np.ascontiguousarray(rows[:, first.end - _POSE_SIZE : first.end]).view("<f8")
     stamps_ns = seconds * NS_PER_S + nanoseconds
     return PoseTable.of(stamps_ns, poses, first.world_frame, first.sensor_frame)
 
 
-# ---- what the messages of a topic measure
+# ---- quantities in the messages of a topic
 
 
 class MessageReader:
-    """Unpack the messages of one topic in their order as poses.
+    """Reader of the messages of one topic, in their order, as poses.
 
-    Poses without orientations have the identity as orientation, and poses without positions are at
-    the origin. These values are placeholders.
+    Angular rates are integrated to orientations. If the messages contain no orientation, the poses
+    have the identity as a placeholder; if they contain no position, the poses are at the origin.
 
     Parameters
     ----------
     message_type : str
     measures : str
-        A quantity, see :func:`measured_as`.
+        Quantity to read, see :func:`measured_as`.
     origin : LocalOrigin, optional
-        Origin of latitudes and longitudes; by default, the first position.
+        Point from which latitudes and longitudes are converted to metres; by default, the first
+        position.
 
     Attributes
     ----------
     n_left_out : int
-        Messages without the measured quantity: null poses, no fix, no orientation.
+        Number of messages without the quantity: null poses, no fix, no orientation.
     """
 
     def __init__(self, message_type: str, measures: str, origin: LocalOrigin | None = None) -> None:
@@ -516,7 +490,8 @@ class MessageReader:
         -------
         PoseTable
         (N,) bool array
-            Messages that have the measured quantity; the poses of the others are not finite.
+            True for messages that contain the quantity. The poses of other messages are NaN, or as
+            the message contains them.
 
         Raises
         ------
@@ -543,26 +518,35 @@ class MessageReader:
         poses[~is_usable] = np.nan
         if self._row.unpack not in (_imu, _fix):
             return replace(columns, poses=poses), is_usable
-        # The header of these types names the sensor's frame, not a world.
+        # The header of these types contains the sensor's frame, not a world frame.
         return PoseTable.of(columns.stamps_ns, poses, "", columns.world_frames), is_usable
 
     def _measured(self, stamps_ns: IntArray, values: FloatArray) -> FloatArray:
-        """Return positions (N, 3) or quaternions (N, 4) from the unpacked values."""
+        """Return positions (N, 3), m, or quaternions (N, 4) from the values of N messages.
+
+        Rates are integrated; latitude, longitude (deg) and height become metres.
+        """
         if self._measures == "rates":
             return se3.to_quat_xyzw(self._rates.rotations(stamps_ns, values))
         if self._row.unpack is not _fix:
             return values
-        beyond = values[(np.abs(values[:, :2]) > (90, 360)).any(axis=1)]
-        if len(beyond):
+        out_of_range = values[(np.abs(values[:, :2]) > (90, 360)).any(axis=1)]
+        if len(out_of_range):
             raise InputError(
                 "found latitude {:.7g} and longitude {:.7g}; the limits are "
-                "90 deg and 360 deg. If both are swapped, repair their source".format(*beyond[0])
+                "90 deg and 360 deg. If both are swapped, repair their source".format(
+                    *out_of_range[0]
+                )
             )
         lat, lon = np.radians(values[:, :2]).T
         return self._origin.local(lat, lon, values[:, 2])
 
     def _pose_fields(self, data: bytes) -> PoseFields:
-        """Unpack a pose in CDR. Frames are decoded only if they differ from the previous frames."""
+        """Unpack a pose in CDR.
+
+        To save time, names of frames are decoded only if their bytes differ from those of the
+        previous pose.
+        """
         start = _START + _STAMP_SIZE
         if data[start : self._frames.end] != self._frames.data:
             unpacked = _unpack(self._row, False, data)
@@ -581,7 +565,7 @@ class MessageReader:
         Raises
         ------
         NoPoseError
-            If the message lacks the measured quantity.
+            If the message does not contain the quantity.
         InputError
             If the message cannot be unpacked.
         """

@@ -6,14 +6,15 @@ from pathlib import Path
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.formats import remote
 
+# Endings of the storage files of bags.
 _SUFFIXES = (".bag", ".mcap", ".db3")
 
 
 def matching(pattern: str) -> list[str]:
     """Return the bags that match a pattern.
 
-    A bag matches itself; any other folder matches all bags below it. ``**`` skips files that are
-    not bags, and files inside bags.
+    The pattern may be the path of a bag; a folder that is not a bag matches all bags below it. A
+    pattern with ``**`` matches bags only: other files, and files inside bags, are skipped.
 
     Raises
     ------
@@ -33,6 +34,7 @@ def matching(pattern: str) -> list[str]:
 
 
 def _local_bags(pattern: str) -> list[str]:
+    """Return the paths on this computer that match a pattern; a plain path is not checked."""
     if not has_magic(pattern) or Path(pattern).exists():
         return [pattern]
     paths = sorted(glob(pattern, recursive=True))
@@ -42,14 +44,14 @@ def _local_bags(pattern: str) -> list[str]:
 
 
 def _is_folder_of_bags(path: Path) -> bool:
-    """Return whether a path is a folder, but not a bag."""
+    """Whether a path is a folder, but not a bag."""
     return path.is_dir() and not any(
         file.name == "metadata.yaml" or file.suffix in _SUFFIXES for file in path.iterdir()
     )
 
 
 def _is_recording(path: Path) -> bool:
-    """Return whether a path is a bag, and not a file inside a bag."""
+    """Whether a path is a bag, and not a file inside a bag."""
     if path.is_dir():
         return (path / "metadata.yaml").exists()
     return path.suffix in _SUFFIXES and not (path.parent / "metadata.yaml").exists()

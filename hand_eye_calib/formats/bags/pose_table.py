@@ -1,4 +1,7 @@
-"""Poses of one or two streams as columns, in the order of bag time."""
+"""Table of the poses of one or two streams, in the order of bag time.
+
+Bag time is the time at which the recorder received a message.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -13,7 +16,7 @@ from hand_eye_calib.core.geometry.trajectory import Columns, Trajectory
 
 @dataclass(frozen=True, eq=False)
 class PoseTable(Columns):
-    """N poses of streams in the order of bag time.
+    """Table of N poses of one or two streams, in the order of bag time.
 
     Attributes
     ----------
@@ -24,9 +27,10 @@ class PoseTable(Columns):
     world_frames, sensor_frames : (N,) object array
         Names of frames; None if the message type has no such field.
     poses : (N, 7) array
-        x y z qx qy qz qw, m. Messages without poses have their unpacked values instead.
+        Position x y z, m, and quaternion qx qy qz qw of the sensor in its world. For messages
+        without poses, such as angular rates, the values of the messages in any number of columns.
     bag_ns : (N,) int64 array
-        Times at which the messages were recorded.
+        Times at which the recorder received the messages.
     """
 
     streams: NDArray[np.object_]
@@ -38,9 +42,9 @@ class PoseTable(Columns):
 
     @classmethod
     def of(cls, stamps_ns: Any, poses: Any, world: Any = "", sensor: Any = None) -> Self:
-        """Make a table without stream names; the stamps (N,) are also the bag times.
+        """Return a table without stream names. Its stamps (N,), ns, are also its bag times.
 
-        ``world`` and ``sensor`` are the frame of all poses, or the frames (N,).
+        ``world`` and ``sensor`` are either the frame of all poses, or the frame of each pose (N,).
         """
         stamps_ns = np.array(stamps_ns, dtype=np.int64)
 
@@ -65,12 +69,15 @@ class PoseTable(Columns):
     def joined(cls, tables: Iterable[Self]) -> Self:
         """Return the rows of one or more tables in the order of bag time."""
         table = cls.concatenate(*tables)
-        # Most bags are in order, and need no copy of the columns.
+        # Most bags are in order: do not copy their columns.
         is_sorted = (np.diff(table.bag_ns) >= 0).all()
         return table if is_sorted else table[np.argsort(table.bag_ns, kind="stable")]
 
     def trajectory(self) -> Trajectory:
-        """Return the poses of one stream sorted by stamps; of equal stamps, the first pose."""
+        """Return the trajectory of a table with one stream, sorted by stamps.
+
+        Among poses with equal stamps, only the first is used.
+        """
         stamps_ns, first = np.unique(self.stamps_ns, return_index=True)
         poses = self.poses[first]
         sensor_frame = self.sensor_frames[first[0]] or ""

@@ -1,4 +1,4 @@
-"""Read the poses of two streams from bags."""
+"""Read the poses of two streams, parent and child, from bags."""
 
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -46,8 +46,8 @@ class PoseBag:
     start_ns, end_ns : int or None
         Bag times of the first and the last message; None without messages.
     shown : callable
-        ``shown(runs, n_messages, step, size_of)`` yields the runs of messages, and may report the
-        progress. ``step`` is the text of the step; ``size_of`` returns the size of a run.
+        Hook to report progress. ``shown(runs, n_messages, step, size_of)`` yields the runs of
+        messages. ``step`` is a text for the user; ``size_of(run)`` is the number of its messages.
 
     Raises
     ------
@@ -75,12 +75,13 @@ class PoseBag:
         self.end_ns = max(times_ns, default=None)
 
     def _all_topics(self) -> dict[str, TopicInfo]:
+        """Return the topics of all files, sorted by name."""
         topics: dict[str, TopicInfo] = {}
         for storage in self._storages:
             for kind, count in storage.counts.items():
-                before = topics.get(kind.topic, TopicInfo(kind.topic, kind.type, 0))
-                type_ = kind.type if kind.type == before.type else ""
-                topics[kind.topic] = TopicInfo(kind.topic, type_, before.count + count)
+                previous = topics.get(kind.topic, TopicInfo(kind.topic, kind.type, 0))
+                type_ = kind.type if kind.type == previous.type else ""
+                topics[kind.topic] = TopicInfo(kind.topic, type_, previous.count + count)
         return dict(sorted(topics.items()))
 
     def __enter__(self) -> Self:
@@ -94,7 +95,10 @@ class PoseBag:
 
     @property
     def warnings(self) -> list[str]:
-        """Lines about unread parts and wrong poses, complete after all poses are read."""
+        """Lines about parts that cannot be read, and about skipped poses.
+
+        The list is complete after all poses are read.
+        """
         warnings = [*self._notes]
         for storage in self._storages:
             warnings += [f"{storage.paths[0]}: {loss}" for loss in storage.losses]
@@ -108,6 +112,7 @@ class PoseBag:
     # ---- topics
 
     def _listing(self) -> str:
+        """Return a sentence with all topics of the bag, for messages."""
         return f"The bag has {', '.join(map(str, self.topics.values())) or 'no topics'}"
 
     def type_of(self, source: Source) -> str:
@@ -115,13 +120,13 @@ class PoseBag:
         return self.topics[source].type if source in self.topics else ""
 
     def _tf_topics(self) -> list[str]:
+        """Return the names of the topics of transforms."""
         return [topic.name for topic in self.topics.values() if topic.type in messages.TF_TYPES]
 
     def edges_on(self, topic: str) -> list[str]:
-        """Return pairs of frames, ``parent:child``, in the first messages of a topic.
+        """Return the pairs of frames, ``parent:child``, in the first transforms on a topic.
 
-        The list is empty if the messages are not transforms. Raises InputError if the messages
-        cannot be read.
+        The list is empty for other topics. Raises InputError if the messages cannot be read.
         """
         if self.type_of(topic) not in messages.TF_TYPES:
             return []
@@ -132,22 +137,23 @@ class PoseBag:
         return sorted(edges)
 
     def measured(self, source: Source, wanted: str = "auto") -> str:
-        """Return the quantity that a source measures: a key of registry.MEASURES.
+        """Return the quantity to read from a source: a key of registry.MEASURES.
 
         Parameters
         ----------
         source : Source
         wanted : str
-            A quantity, or "auto" for the usual one of the message type.
+            Quantity that the user asks for, or "auto" for the usual quantity of the messages.
 
         Raises
         ------
         ConfigError
-            If the messages do not measure the wanted quantity.
+            If the messages do not contain the wanted quantity.
         """
         topic, _, fields = str(source).partition("?")
         if "=" not in fields:
             return messages.measured_as(self.type_of(source), wanted, source)
+        # The source names fields of the messages, which determine the quantity.
         usual = sources.FieldReading("", topic, fields).measures
         if wanted == "auto":
             return usual
@@ -158,7 +164,8 @@ class PoseBag:
     def check(self, source: Source) -> None:
         """Raise InputError if a source cannot be read; the message lists the topics of the bag.
 
-        Topics without poses cannot be read, nor frames in a bag without transforms.
+        These are topics that are not in the bag or have no poses, and frames in a bag without
+        transforms.
         """
         if isinstance(source, TfSource):
             if not self._tf_topics():
@@ -177,7 +184,10 @@ class PoseBag:
             self._check_type(topic)
 
     def _check_type(self, topic: str) -> None:
-        """Raise InputError if messages of a topic cannot be read by the topic's name alone."""
+        """Raise InputError if the messages of a topic cannot be read, unless fields are named.
+
+        The message states what the user can write instead of the topic alone.
+        """
         type_ = self.type_of(topic)
         if type_ in messages.MESSAGE_TYPES:
             return
@@ -199,20 +209,23 @@ class PoseBag:
     ) -> tuple[Source, Source]:
         """Choose the sources of the parent's and the child's poses.
 
-        Without names, the bag must have two obvious topics of poses, see :mod:`.choice`. The parent
-        is the topic whose name has the word parent, base or lidar, or the first by name.
+        Sources that the user does not name must be obvious, see :mod:`.choice`. If no source is
+        named, the parent is the topic whose name contains parent, base or lidar. Without such a
+        name, the parent is the first topic by name.
 
         Parameters
         ----------
         parent, child : Source, optional
             Sources as the user names them.
         frames : mapping of str to str, optional
-            Frames of the sensors of "parent" or "child". The names of frames choose the topics.
+            Frames of the sensors that the user sets for "parent" or "child". The parent's topic is
+            chosen by these frames.
 
         Raises
         ------
         InputError
-            If a named source cannot be used, both are the same, or there is no obvious choice.
+            If a named source cannot be used, if both sources are the same, or if there is no
+            obvious choice.
         """
         named = [source for source in (parent, child) if source]
         for source in named:
@@ -232,7 +245,7 @@ class PoseBag:
         return self._by_role(topics, frames or {})
 
     def _by_role(self, topics: Sequence[str], frames: Mapping[str, str]) -> tuple[str, str]:
-        """Return the topics of the parent and of the child."""
+        """Sort two topics: first that of the parent, then that of the child."""
         sensors = {}
         if any(frames.values()):
             sensors = {topic: self.sensor_frame(topic) for topic in topics}
@@ -240,7 +253,11 @@ class PoseBag:
         return parent, child
 
     def _choice(self, missing: Sequence[str], used: Collection[Source]) -> list[str]:
-        """Return topics for the missing streams; an UnclearStreamsError without obvious ones."""
+        """Return the topics for the missing streams, "parent" or "child" or both.
+
+        Raises UnclearStreamsError if no choice is obvious. ``used`` are sources that the user
+        names.
+        """
         free = [topic for topic in self.topics.values() if topic.name not in used]
         moving_edges = set()
         for topic in self._tf_topics():
@@ -263,9 +280,9 @@ class PoseBag:
         return table.sensor_frames[0] or ""
 
     def _parts_of(self, topic: str) -> list[str]:
-        """Split ``/fix+/imu`` into the topics of positions and of orientations.
+        """Split ``/fix+/imu`` into the topic of positions and the topic of orientations.
 
-        Return the name of any other topic alone.
+        Any other name is returned as the only element.
         """
         parts = topic.split("+")
         is_joined = topic not in self.topics and len(parts) == 2 and all(parts)
@@ -287,11 +304,12 @@ class PoseBag:
         ----------
         parent, child : Source
         max_gap_s : float
-            Longest time between two transforms across which is interpolated.
+            Largest time between two transforms (s), between which poses are interpolated.
         measures : mapping of str to str, optional
             Quantities to read from the topics of "parent" and "child", see :meth:`measured`.
         stamps : mapping of str to str, optional
-            Origin of the stamps of "parent" and "child": "header" or "receive".
+            Stamps of "parent" and "child": "header", or "receive" for the times at which the
+            recorder received the messages.
 
         Raises
         ------
@@ -319,7 +337,7 @@ class PoseBag:
     def _reading(
         self, stream: str, source: Source, measures: Mapping[str, str], max_gap_s: float
     ) -> Reading:
-        """Return the reader of a source."""
+        """Return the reader for a source. ``stream`` is "parent" or "child"."""
         if isinstance(source, TfSource):
             # Raise an InputError if the frames are not connected.
             self.static_frames.route(*source)
@@ -350,7 +368,9 @@ class PoseBag:
     def trajectory(
         self, source: Source, measures: str = "auto", stamps: str = "header"
     ) -> tuple[Trajectory, list[str]]:
-        """Read the trajectory of one source, sorted by stamps; of equal stamps, the first pose.
+        """Read the trajectory of one source, sorted by stamps.
+
+        Among poses with equal stamps, only the first is used.
 
         Parameters
         ----------
@@ -358,6 +378,7 @@ class PoseBag:
         measures : str
             Quantity to read, see :meth:`measured`.
         stamps : {"header", "receive"}
+            See :meth:`poses`.
 
         Returns
         -------
@@ -387,10 +408,10 @@ class PoseBag:
 
     @cached_property
     def static_frames(self) -> FrameTree:
-        """Frames of the bag and their static transforms; of repeated transforms, the last.
+        """Tree of all frames in the bag, with the poses of the static transforms.
 
-        Invalid transforms are skipped, as in tf2. Raises InputError if the frames do not form a
-        tree, or if a message is damaged.
+        The last of repeated static transforms counts. Invalid transforms are skipped with a note,
+        as in tf2. Raises InputError if the frames do not form a tree, or if a message is damaged.
         """
         tree = FrameTree("the bag's transforms")
         notes = {}
@@ -409,9 +430,10 @@ class PoseBag:
     # ---- messages
 
     def runs(self, topics: Collection[str]) -> Iterator[Run]:
-        """Iterate over messages of some topics in the order of bag time, in runs of one kind.
+        """Iterate over the messages of some topics in the order of bag time, in runs of one kind.
 
-        Files that were recorded at the same time are read one after the other.
+        A run has the messages of one kind in a block of a file. Files that were recorded at the
+        same time are read one after the other.
         """
         for storage in self._storages:
             for block in storage.blocks(topics):
@@ -424,7 +446,7 @@ class PoseBag:
 
 
 def _bag_times(bag_ns: Sequence[int]) -> IntArray:
-    """Return times as int64 (N,); times out of range, as in damaged bags, are limited."""
+    """Return bag times (N,), ns, as int64. Times out of range, as in damaged bags, are clipped."""
     try:
         return np.array(bag_ns, dtype=np.int64)
     except OverflowError:

@@ -7,26 +7,28 @@ from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.geometry.frames import words_of
 from hand_eye_calib.formats.exports import role_of
 
-# Words in the names of topics, the likeliest parent first. The empty word is that of other topics.
+# Words in the names of topics, from the likeliest parent to the likeliest child. The empty word is
+# for topics without any of the other words.
 _WORDS = ("parent", "base", "lidar", "", "child")
 
-# Words that many names of frames contain.
+# Words that many names of frames contain, so that a common word does not mean the same sensor.
 _COMMON_WORDS = {"link", "frame", "sensor", "optical", "base"}
 
-# Score of a topic for a frame that the user names, if its messages name the same frame.
+# Scores, added up, of a topic for a sensor's frame that the user sets. Only their order matters.
+# The messages name the same frame.
 _SAME_NAME = 8.0
-# Score of each word that the frame shares with the topic or with the frame of its messages.
+# For each word that the frame has in common with the topic or with the frame in its messages.
 _SAME_WORD = 2.0
-# Score if the frame and the topic name sensors of the same kind.
+# The names of the frame and of the topic indicate the same kind of sensor.
 _SAME_KIND = 1.0
-# Score if the messages name no frame, which is better than another frame.
+# The messages name no frame. If they name a different frame, the score is 0.
 _NO_NAME = 0.5
 
 
 def parent_and_child(
     topics: Sequence[str], frames: Mapping[str, str], sensors: Mapping[str, str]
 ) -> list[str]:
-    """Sort two topics of poses: parent, child.
+    """Return two topics of poses in the order parent, child.
 
     Parameters
     ----------
@@ -34,12 +36,12 @@ def parent_and_child(
     frames : mapping of str to str
         Frames of the sensors of "parent" and "child" that the user set; empty if not set.
     sensors : mapping of str to str
-        Frame of the sensor in the messages of each topic; empty if the messages name none.
+        Frame of the sensor in the messages of each topic; empty if the messages name no frame.
 
     Raises
     ------
     InputError
-        If the user names a frame that fits both topics equally well.
+        If the user sets a frame, and both orders of the topics fit it equally well.
     """
     by_words = sorted(topics, key=_parent_first)
     named = {stream: frame for stream, frame in frames.items() if frame}
@@ -66,7 +68,10 @@ def parent_and_child(
 
 
 def _match(frame: str, topic: str, sensor: str) -> float:
-    """Return a score that is higher the more likely a frame is that of a topic's sensor."""
+    """Return a score: the higher it is, the more likely ``frame`` is the frame of a topic's sensor.
+
+    ``sensor`` is the frame of the sensor in the topic's messages.
+    """
     score = 0.0
     if sensor == frame:
         score += _SAME_NAME
@@ -81,7 +86,7 @@ def _match(frame: str, topic: str, sensor: str) -> float:
 
 
 def _parent_first(topic: str) -> tuple[int, str]:
-    """Return a sort key: by the likeliest word of a topic's name, then by the name."""
+    """Return a sort key that puts the likeliest parent first; equal topics are sorted by name."""
     words = {*re.split(r"[/_:]+", topic.lower()), ""}
     if "child" in words:
         return _WORDS.index("child"), topic

@@ -1,12 +1,14 @@
 """Sources of a stream in a bag.
 
-A source is a topic of poses, two topics that are joined, a path, the points of a lidar, images of a
-target, fields of any message, or transforms.
+A source is what the poses of the parent or of the child are read from: a topic of poses, a topic of
+positions joined with a topic of orientations, a path, the points of a lidar, images of a target,
+fields of any message, or transforms between two frames.
 
 Fields are written ``/topic?t=header.stamp,x=pose.position.x,...``. The names before the equals
-signs are those of csv columns, with their units; vx, vy, vz, wx, wy, wz are integrated. A target is
-written ``/camera/image_raw?charuco:5x7:0.04:0.03:4X4_50``. ``@FILE`` at its end names the file of
-the camera's intrinsics.
+signs are those of csv columns, with their units. Velocities and angular rates vx, vy, vz, wx, wy,
+wz are integrated to poses. A target is written
+``/camera/image_raw?charuco:5x7:0.04:0.03:4X4_50``. ``@FILE`` at the end names the file of the
+camera's intrinsics.
 """
 
 from abc import ABC, abstractmethod
@@ -32,31 +34,33 @@ from hand_eye_calib.formats.transforms import TfSource, TfStream
 
 Source = str | TfSource
 
-# Smallest jump (s) of a wrong stamp, see `are_believable`. On a busy computer, delays of messages
-# differ by less.
+# A stamp is wrong only if the delay of its message jumps by more than this (s), see
+# `are_believable`. On a busy computer, the delays of correct messages jump by less.
 _JUMP_S = 0.5
-# Stamps are unusable if at least this share of them is 0 or repeats another stamp.
+# All stamps of a topic are unusable if this share of them is 0, or repeats another stamp.
 _MOSTLY = 0.5
 
 _NO_POSES = PoseTable.of([], np.empty((0, 7)))
 
 
 def source_of(text: str) -> Source:
-    """Parse the name of a source: a topic or a pair of frames."""
+    """Return the source that a user names: a topic as text, or ``WORLD:SENSOR`` as two frames."""
     return TfSource.parse(text) if ":" in text.partition("?")[0] else text
 
 
 class Reading(ABC):
-    """Base of the readers of one stream; each kind of source has a subclass.
+    """Base class of the readers of one stream. Each kind of source has a subclass.
+
+    The caller passes all messages of the topics to :meth:`take`, and then calls :meth:`table`.
 
     Attributes
     ----------
     stream : str
         "parent" or "child".
     topics : tuple of str
-        Topics whose messages are taken.
+        Topics whose messages are needed.
     notes : list of str
-        Lines for the user; complete after :meth:`table`.
+        Notes for the user; complete after :meth:`table`.
     """
 
     def __init__(self, stream: str, *topics: str) -> None:
@@ -71,25 +75,28 @@ class Reading(ABC):
         return "+".join(self.topics)
 
     def use_stamps(self, stamps: str) -> None:
-        """Choose the stamps of the poses: "header", or "receive" for the times of the recorder.
+        """Set the stamps of the poses: "header", or "receive" for the times of the recorder.
 
         Raises
         ------
         ConfigError
-            If the recorder did not receive the poses one by one.
+            For "receive", if several poses were received in one message.
         """
         self.stamps = stamps
 
     @abstractmethod
     def take(self, run: messages.Run) -> None:
-        """Take the next messages of one of the topics; raise InputError if they are unusable."""
+        """Read the next messages of one of the topics; raise InputError if they are unusable."""
 
     @abstractmethod
     def table(self) -> PoseTable:
-        """Return the poses of all messages; raise InputError if there can be none."""
+        """Return the poses of all messages; raise InputError if they cannot contain any pose."""
 
     def _stamped(self, table: PoseTable) -> PoseTable:
-        """Return the table with the chosen stamps; poses with stamp 0 are left out."""
+        """Return the table with the stamps that were set, without poses whose header stamp is 0.
+
+        Raises InputError if the header stamps are unusable.
+        """
         if self.stamps == "receive":
             self.notes.append(
                 f"{self.name}: the stamps are the times at which the recorder "
@@ -100,7 +107,7 @@ class Reading(ABC):
         is_zero = table.stamps_ns == 0
         n_zero = int(is_zero.sum())
         self._refuse_zeros(n_zero, len(table))
-        # A single stamp may be 0, because a simulation may begin at 0.
+        # Keep a single stamp 0, because a simulation may begin at 0.
         if n_zero > 1:
             self.notes.append(
                 f"{self.name}: {n_zero:,} poses were left out: their header stamps are 0"
@@ -132,13 +139,13 @@ class Reading(ABC):
             )
 
     def _note_null(self, n_null: int, n_all: int) -> None:
-        """Add a note about null poses that were left out."""
+        """Add a note about skipped poses whose quaternion is 0 or whose values are not finite."""
         if n_null:
             self.notes.append(f"{self.name}: {without_poses(n_null, n_all)}")
 
 
 class TopicReading(Reading):
-    """Read a topic with a pose, or a measured part of one, in each message."""
+    """Reader of a topic with a pose, a position, an orientation or angular rates per message."""
 
     def __init__(self, stream: str, topic: str, message_type: str, measures: str) -> None:
         super().__init__(stream, topic)
@@ -179,11 +186,11 @@ class TopicReading(Reading):
 
 
 def are_believable(stamps_ns: IntArray, bag_ns: IntArray) -> BoolArray:
-    """Detect stamps that jump away from bag time and back.
+    """Detect single stamps that jump away from bag time.
 
-    A single wrong stamp may extend a recording of minutes to years. The delay of a message is bag
-    time minus stamp. A stamp is wrong if its delay differs from the delays of both neighbours by
-    more than ``_JUMP_S``, the difference of these two delays and the usual step together.
+    A single wrong stamp may extend a recording of minutes to years. The delay of a message is its
+    bag time minus its stamp, d_i. A stamp is wrong if both abs(d_i - d_(i-1)) and
+    abs(d_i - d_(i+1)) exceed ``_JUMP_S`` + abs(d_(i+1) - d_(i-1)) + the median step of delays.
 
     Parameters
     ----------
@@ -198,7 +205,7 @@ def are_believable(stamps_ns: IntArray, bag_ns: IntArray) -> BoolArray:
     if len(stamps_ns) < 3:
         return np.ones(len(stamps_ns), dtype=bool)
     delays_s = np.asarray(bag_ns - stamps_ns, dtype=float) * 1e-9
-    # The neighbours of the first and the last message are both on the same side.
+    # The first message is compared with the two messages after it, the last with the two before.
     padded_s = np.r_[delays_s[2], delays_s, delays_s[-3]]
     steps_s = np.abs(np.diff(padded_s))
     smaller_steps_s = np.minimum(steps_s[:-1], steps_s[1:])
@@ -208,7 +215,10 @@ def are_believable(stamps_ns: IntArray, bag_ns: IntArray) -> BoolArray:
 
 
 class JoinedReading(Reading):
-    """Read positions of a topic, and interpolate orientations of another topic at their stamps."""
+    """Reader of positions on one topic and orientations on another topic.
+
+    The orientations are interpolated at the stamps of the positions.
+    """
 
     def __init__(self, fixes: TopicReading, rotations: TopicReading) -> None:
         super().__init__(fixes.stream, *fixes.topics, *rotations.topics)
@@ -240,10 +250,10 @@ class JoinedReading(Reading):
 
 
 class PathReading(Reading):
-    """Read the poses of the newest message of a path.
+    """Reader of the poses in the newest message of a path.
 
-    A path is published repeatedly as it grows, and all of its poses may be corrected. The stamps of
-    its poses are also their bag times.
+    A path is published again each time it grows, and earlier poses may then be corrected. The
+    stamps of the poses are also used as their bag times.
     """
 
     _newest: messages.Run | None = None
@@ -278,7 +288,7 @@ class PathReading(Reading):
 
 
 class FieldReading(Reading):
-    """Read fields of messages of any type.
+    """Reader of fields that the user names, in messages of any type.
 
     Attributes
     ----------
@@ -288,7 +298,7 @@ class FieldReading(Reading):
     Raises
     ------
     ConfigError
-        If the text of the fields has another form.
+        If the fields are not written NAME=PATH,...
     InputError
         If the fields are angular rates without velocities.
     """
@@ -319,7 +329,7 @@ class FieldReading(Reading):
         self._bag_ns += run.bag_ns.tolist()
 
     def _cell(self, message: Any, path: list[str]) -> str:
-        """Return the field of a message as text; a stamp in seconds with all its digits."""
+        """Return a field of a message as text; a stamp is in seconds with all its digits."""
         value = message
         try:
             for name in path:
@@ -347,22 +357,25 @@ class FieldReading(Reading):
 
 
 def _integrated(stamps_ns: IntArray, twists: FloatArray) -> FloatArray:
-    """Integrate twists (N, 6), m/s and rad/s in the sensor's own frame, to poses (N, 7)."""
+    """Integrate twists (N, 6), m/s and rad/s in the sensor's frame, to poses (N, 7).
+
+    The first pose is the identity. Between two stamps, the twist is the mean of both.
+    """
     intervals_s = np.diff(stamps_ns) * 1e-9
     steps = (twists[1:] + twists[:-1]) / 2 * intervals_s[:, None]
     return se3.to_rows(se3.chained(se3.exp(steps)))
 
 
 class TransformReading(Reading):
-    """Compose transforms between two frames.
+    """Reader of the transform between two frames, composed of a chain of transforms.
 
-    There is one pose at each stamp of the moving transform with the lowest rate in the chain.
+    The poses have the stamps of the moving transform in the chain that has the lowest rate.
     """
 
     def __init__(self, stream: str, source: TfStream, topics: Collection[str]) -> None:
         super().__init__(stream, *(topic for topic in topics if not topic.endswith("tf_static")))
         self._source = source
-        # Bag time, stamp, and rows x y z qx qy qz qw of the moving edges by frame, for each pose.
+        # For each pose: bag time, stamp, and x y z qx qy qz qw of each moving transform by frame.
         self._poses: list[tuple[int, int, Any]] = []
         self._n_null = 0
         self._n_zero = 0

@@ -1,4 +1,7 @@
-"""Read one storage file of a bag through the library rosbags: sqlite3 and rosbag1."""
+"""Read one storage file of a bag: base class, and files that the library rosbags reads.
+
+rosbags reads the formats sqlite3 (.db3) and rosbag1 (.bag).
+"""
 
 import struct
 import sys
@@ -15,27 +18,27 @@ from urllib.parse import quote
 from hand_eye_calib.core.base.errors import InputError, MissingDependencyError, printable, required
 from hand_eye_calib.formats import files
 
-# Tool that repairs a damaged file, by the suffix of the storage file.
+# Tool that repairs a damaged storage file with this suffix.
 REPAIRS = {".mcap": "'mcap recover'", ".db3": "sqlite3's '.recover'", ".bag": "'rosbag reindex'"}
-# First bytes of a message that zstd has compressed. Plain CDR never begins with these bytes.
+# First bytes of a message that is compressed with zstd. Plain CDR never begins with these bytes.
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-# Length (uint32) of the header or of the data of a rosbag1 record.
+# Length in bytes (uint32) before the header and before the data of a rosbag1 record.
 _LENGTH = struct.Struct("<I")
-# Field of a rosbag1 record header that marks a message.
+# Field in the header of a rosbag1 record that is a message.
 _MESSAGE_OP = b"op=\x02"
 
 
 class MessageKind(NamedTuple):
-    """Topic, type, encoding and definition of messages.
+    """What messages of one connection or channel have in common.
 
     Attributes
     ----------
     topic, type : str
         Printable names.
     encoding : str
-        Only "cdr", "ros1", "json" and "protobuf" can be read.
+        Serialisation of the messages. Only "cdr", "ros1", "json" and "protobuf" can be read.
     definition : (str, bytes)
-        Language and content of the type definition; empty if the bag stores none.
+        Language and text of the type definition; empty if the bag does not contain the definition.
     """
 
     topic: str
@@ -45,7 +48,7 @@ class MessageKind(NamedTuple):
 
     @property
     def is_ros1(self) -> bool:
-        """Return whether ROS 1 serialised the messages."""
+        """Whether the messages are serialised as in ROS 1."""
         return self.encoding == "ros1"
 
 
@@ -55,15 +58,15 @@ Message: TypeAlias = tuple[MessageKind, int, bytes]
 
 @lru_cache
 def kind_of(topic: str, name: str, encoding: str, language: str, content: bytes) -> MessageKind:
-    """Return the kind of a connection; the cache returns one object for equal connections."""
-    # ROS 1 writes package/Type.
+    """Return the kind of a connection's messages; equal connections get the same object."""
+    # ROS 1 names types package/Type, ROS 2 package/msg/Type.
     if encoding == "ros1" and name.count("/") == 1:
         name = name.replace("/", "/msg/")
     return MessageKind(printable_name(topic), printable_name(name), encoding, (language, content))
 
 
 def printable_name(name: str) -> str:
-    """Return a name in printable characters, cut to the largest length of names."""
+    """Return a name with its control characters escaped, cut to ``LONGEST_NAME`` characters."""
     return printable(name[: files.LONGEST_NAME])
 
 
@@ -73,11 +76,11 @@ class Storage(ABC):
     Parameters
     ----------
     paths : list of Path
-        The file of the user, and its unfinished files.
+        File of the user, and the files of SQLite next to it.
     file : Path
-        The unpacked file, which is read.
+        File that is read: the file of the user, or an unpacked copy.
     opened : ExitStack
-        Closes the file at its end.
+        Closes the storage file when it is closed itself.
 
     Attributes
     ----------
@@ -86,7 +89,7 @@ class Storage(ABC):
     span_ns : (first, last) or ()
         Bag times of the first and the last message; empty without messages.
     losses : list of str
-        One line for each part that could not be read.
+        One line for each part of the file that cannot be read.
 
     Raises
     ------
@@ -102,7 +105,7 @@ class Storage(ABC):
         self._file = file
         # Tool that repairs the file.
         self._repair = REPAIRS[file.suffix]
-        # The keys are the numbers of connections or channels in the file.
+        # Kind of the messages of each connection or channel, by its number in the file.
         self._kinds: dict[int, MessageKind] = {}
         with self._guarded():
             self._open(opened)
@@ -116,8 +119,8 @@ class Storage(ABC):
     def blocks(self, topics: Collection[str]) -> Iterator[list[Message]]:
         """Iterate over blocks of messages of some topics in the order of bag time.
 
-        Chunks of an mcap file that overlap in time are read one after the other. Their messages are
-        in order only within each chunk.
+        If chunks of an mcap file overlap in time, their messages are in order only within each
+        chunk.
         """
         kinds = {key: kind for key, kind in self._kinds.items() if kind.topic in topics}
         if not kinds:
@@ -132,10 +135,10 @@ class Storage(ABC):
 
     @contextmanager
     def _guarded(self) -> Iterator[None]:
-        """Limit the memory, and turn any error of the block into an InputError of one line.
+        """Context in which a library reads the file: limit its memory and convert its errors.
 
-        The libraries raise errors of many kinds for damaged files. Only the libraries and the
-        recovery of damaged files run in the block, so no other defect is hidden.
+        The libraries raise errors of many types for damaged files. Each becomes an InputError of
+        one line. Little other code runs in this context, so its defects are not hidden.
         """
         try:
             with files.reading_memory():
@@ -143,7 +146,7 @@ class Storage(ABC):
         except MissingDependencyError:
             raise
         except Exception as error:
-            # rosbags reads SQLite with apsw, whose NoMemError is no MemoryError.
+            # rosbags reads SQLite with apsw, whose NoMemError is not a subclass of MemoryError.
             if isinstance(error, MemoryError) or type(error).__name__ == "NoMemError":
                 why = "reading it needs too much memory; the file is damaged or malicious"
             else:
@@ -158,15 +161,15 @@ class Storage(ABC):
 class RosbagsFile(Storage):
     """A .db3 or .bag file, read by the library rosbags.
 
-    If the library mcap is missing, this class also reads intact .mcap files of ROS 2. rosdep cannot
-    install that library.
+    This class also reads intact .mcap files of ROS 2 if the library mcap is missing, because rosdep
+    cannot install the library mcap.
     """
 
     def _open(self, opened: ExitStack) -> None:
         suffix = self._file.suffix
         reader = rosbags(1 if suffix == ".bag" else 2).Reader(self._file)
         self._reader = reader
-        # SQLite reads the path as a URI.
+        # rosbags passes the path to SQLite as a URI, so characters such as % must be escaped.
         if suffix == ".db3":
             reader.storage.path = Path(quote(str(self._file)))
         if suffix == ".mcap":
@@ -198,12 +201,13 @@ class RosbagsFile(Storage):
     def _rosbag1_messages(self, kinds: Mapping[int, MessageKind]) -> Iterator[Message]:
         """Iterate over messages of rosbag1 in the order of bag time.
 
-        The index of the library states the position of each message. The library's own iteration
+        The messages are read at the positions in the library's index. The library's own iteration
         takes 1.7 times as long.
         """
         reader = self._reader
         entries = [(entry, kind) for key, kind in kinds.items() for entry in reader.indexes[key]]
         entries.sort(key=lambda item: item[0].time)
+        # Position and unpacked content of the chunk of the previous message.
         chunk_pos = -1
         chunk = b""
         for entry, kind in entries:
@@ -216,7 +220,10 @@ class RosbagsFile(Storage):
 
 
 def _rosbag1_message(chunk: bytes, start: int) -> bytes:
-    """Return the message at a position in a chunk, or after the connection record there."""
+    """Return the message at byte ``start`` of a chunk.
+
+    A record of the connection may precede the message; it is skipped.
+    """
     end = start
     is_message = False
     while not is_message:
@@ -229,18 +236,18 @@ def _rosbag1_message(chunk: bytes, start: int) -> bytes:
 
 
 def reason_of(error: BaseException) -> str:
-    """Return the kind and the text of an error in one line."""
+    """Return the type and the text of an error in one line."""
     words = " ".join(str(error).split())
     return f"{type(error).__name__}: {words}".rstrip(".: ")
 
 
 def rosbags(version: int) -> Any:
-    """Import the module of rosbags for bags of ROS 1 or ROS 2."""
+    """Return the module of rosbags that reads bags of ROS 1 or of ROS 2."""
     return required(f"rosbags.rosbag{version}", "this bag", "rosbags")
 
 
 def message_blocks(messages: Iterable[Message]) -> Iterator[list[Message]]:
-    """Group messages into blocks; unpack messages that zstd has compressed."""
+    """Group messages into blocks of about ``BLOCK_BYTES``; decompress messages packed with zstd."""
     block = list[Message]()
     size = 0
     for kind, bag_ns, data in messages:
@@ -257,5 +264,5 @@ def message_blocks(messages: Iterable[Message]) -> Iterator[list[Message]]:
 
 
 def zstd_module() -> Any:
-    """Import the zstd module of Python 3.14 and later, or its backport."""
+    """Return the zstd module of Python 3.14 and later, or its backport."""
     return import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")

@@ -12,19 +12,20 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.formats.bags.storage import rosbags
 from hand_eye_calib.formats.files import writing
 
+# Trajectory and message type of each topic.
 Streams = Mapping[str, tuple[Trajectory, str]]
 
 
 def write_bag(path: str | Path, streams: Streams, storage: str = "mcap") -> None:
-    """Write trajectories into a new bag, the poses of all topics in the order of their stamps.
+    """Write trajectories into a new bag; the poses of all topics are sorted by their stamps.
 
     Parameters
     ----------
     path : str or Path
-        Directory to make, or for rosbag1 the ``.bag`` file; it must not exist.
+        Directory of the bag, or for rosbag1 the ``.bag`` file. It must not exist.
     streams : mapping of str to (Trajectory, str)
-        Trajectory and message type of each topic. The type is Odometry, which has the sensor's
-        frame, or PoseStamped. The header stamps are also the bag times.
+        Trajectory and message type of each topic. The type is Odometry, which contains the sensor's
+        frame, or PoseStamped. The stamps of the trajectory are the header stamps and the bag times.
     storage : {"mcap", "sqlite3", "rosbag1"}
 
     Raises
@@ -67,7 +68,10 @@ def write_streams(writer: Any, streams: Streams, storage: str) -> None:
 def stamped_messages(
     types: Mapping[str, Any], trajectory: Trajectory, message_type: str, is_ros1: bool
 ) -> Iterator[tuple[int, Any]]:
-    """Iterate over stamps in ns and messages of a trajectory; ``types`` are rosbags' classes."""
+    """Iterate over the stamps (ns) and messages of a trajectory.
+
+    ``types`` are the classes of messages in rosbags, by message type.
+    """
 
     def make(name: str, *values: Any) -> Any:
         return types[f"geometry_msgs/msg/{name}"](*values)
