@@ -68,13 +68,37 @@ _LONG_PATH_M = 400.0
 _STEP_S = 1.0
 # Share of the path. Recordings of two sensors have 5e-5 to 6e-3; two poses of one INS have 2e-8.
 _LEAST_DRIFT = 2.5e-5
-# Streams do not drift if positions differ over the whole recording by less than this factor times
-# their distance within windows of _LONG_S: 1.58 at least in simulated and real recordings of two
-# odometries on paths above 200 m.
-_STEADY = 1.25
-# Shortest path (m) on which this is judged. Hand-held sensors in a motion capture room, which do
-# not drift either, have shorter paths (100 m).
+# The errors of two odometries add up, so that the difference of their poses grows with time. The
+# growth is that of the largest of six axes: three of positions, three of orientations.
+# Quantile of the differences: most of a recording may be without motion.
+_DIFFERENCE_SHARE = 0.9
+# Shortest recording (s), and fewest poses, whose growth is judged.
+_GROWTH_S = 45.0
+_GROWTH_POSES = 200
+# Times (s) over which errors have grown, up to a third of the recording.
+_GROWN_S = (3.0, 8.0, 15.0, 30.0, 60.0)
+# The difference is white noise if it grows by less than this factor from pose to pose on. It grows
+# by 1.4 at least in recordings of two sensors (an arm and a camera), and by 1.19 at most in copies
+# with white noise.
+_WHITE_GROWTH = 1.25
+# A filter corrects one stream by the other if their difference grows only for a short time, by at
+# least the first factor for orientations, and afterwards by less than the second factor.
+# Recordings of two sensors grow by 1.5 at least, streams that are corrected within 0.3 s by 1.27.
+_EARLY_GROWTH = 2.0
+_LATE_GROWTH = 1.3
+# Index in _GROWN_S of the time that ends the short time, and of the first long time.
+_EARLY = 0
+_LATE = 2
+# Shortest path (m) on which a filter is found so: errors of a sensor may also be correlated for a
+# second and no longer.
 _STEADY_PATH_M = 190.0
+# Largest noise of the difference of both streams, as a multiple of the noise of the noisier stream,
+# if one stream was computed from the other: the noise of a copy contains that of its source. The
+# noise of two sensors adds up.
+_NOISE_OF_COPY = 1.1
+# Smallest such multiple. Below it, the noisier stream consists of motion, or the copy has so little
+# noise of its own that other checks detect it (_SHARED).
+_LEAST_NOISE = 0.33
 # Largest number of poses that are compared.
 _MOST_POSES = 2000
 
@@ -283,65 +307,111 @@ def _rotations_of_blocks(motions: MotionPairs, n_poses: int) -> FloatArray | Non
 
 
 def _no_drift(pose_pairs: PosePairs, X: FloatArray) -> Finding | None:
-    """Return the doubt about streams that hardly drift against each other on a long path."""
+    """Return the doubt about streams that hardly drift against each other."""
     path = coarse(Trajectory(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p), _STEP_S)
     path_m = float(np.linalg.norm(np.diff(se3.translation_of(path.poses), axis=0), axis=1).sum())
-    if path_m < _STEADY_PATH_M:
-        return None
     few = pose_pairs[:: 1 + len(pose_pairs) // _MOST_POSES]
     points = se3.translation_of(few.Ts_pw_p @ X)
     others = se3.translation_of(few.Ts_cw_c)
-    apart_m = _after_alignment(points, others)
+    apart_m = median(_alignment(points, others)[1])
     is_close = path_m >= _LONG_PATH_M and apart_m <= _LEAST_DRIFT * path_m
-    if not (is_close or _is_steady(few, X)):
+    may_be_filtered = path_m >= _STEADY_PATH_M
+    if not (is_close or _is_steady(pose_pairs, X, may_be_filtered)):
         return None
     text = f"the streams drift apart by only {length(apart_m)} over {length(path_m)}"
     return _doubt(text, drift_m=apart_m, path_m=path_m)
 
 
-def _is_steady(pose_pairs: PosePairs, X: FloatArray) -> bool:
-    """Return whether positions differ over the whole recording as little as within seconds.
+def _is_steady(pose_pairs: PosePairs, X: FloatArray, may_be_filtered: bool) -> bool:
+    """Return whether the poses of both streams differ after a long time as after a short time.
+
+    ``may_be_filtered`` is whether a difference that grows only for a short time suffices.
+    """
+    few = pose_pairs[:: 1 + len(pose_pairs) // _MOST_POSES]
+    seconds = (few.stamps_ns - few.stamps_ns[0]) * 1e-9
+    if len(seconds) < _GROWTH_POSES or seconds[-1] < _GROWTH_S:
+        return False
+    interval_s = median(np.diff(seconds))
+    times_s = [time_s for time_s in _GROWN_S if time_s <= seconds[-1] / 3.0]
+    differences = _differences(seconds, few, X)
+    first = _size_of_changes(differences, 1)
+    sizes = [_size_of_changes(differences, round(time_s / interval_s)) for time_s in times_s]
+    grown = np.array(sizes) / first
+    if grown.max() < _WHITE_GROWTH:
+        return _is_noise_shared(pose_pairs, X)
+    late = grown[_LATE:] / grown[_EARLY]
+    is_late_steady = late.max() < _LATE_GROWTH and grown[_EARLY, 3:].max() > _EARLY_GROWTH
+    return bool(may_be_filtered and is_late_steady)
+
+
+def _is_noise_shared(pose_pairs: PosePairs, X: FloatArray) -> bool:
+    """Return whether the noise of one stream contains the noise of the other.
+
+    Noise is white in the upper half of the spectrum. Positions or orientations without white noise
+    are not compared.
+    """
+    of_parent = _second_differences(pose_pairs.Ts_pw_p @ X)
+    of_child = _second_differences(pose_pairs.Ts_cw_c)
+    is_calm = _is_calm(of_parent, of_child)[:, None, None]
+    quarters = _upper_quarters(np.stack([of_parent, of_child, of_child - of_parent]) * is_calm)
+    # Positions and orientations of two quarters, (2, 2).
+    of_noisier = quarters[:, :2].max(axis=1)
+    of_difference = quarters[:, 2]
+    is_white = of_noisier.max(axis=0) < _FLAT * of_noisier.min(axis=0)
+    shares = of_difference.sum(axis=0) / of_noisier.sum(axis=0)
+    is_noise = is_white & (shares > _LEAST_NOISE**2)
+    return bool(is_noise.any() and (shares[is_noise] < _NOISE_OF_COPY**2).all())
+
+
+def _size_of_changes(values: FloatArray, n_poses: int) -> FloatArray:
+    """Return the usual change (d,) of values (N, d) over a number of poses, at least one."""
+    n_poses = max(n_poses, 1)
+    changes = np.sort(np.abs(values[n_poses:] - values[:-n_poses]), axis=0)
+    return np.maximum(changes[int(_DIFFERENCE_SHARE * len(changes))], 1e-12)
+
+
+def _differences(seconds: FloatArray, pose_pairs: PosePairs, X: FloatArray) -> FloatArray:
+    """Return the differences (N, 6) of child and parent poses: positions (m), orientations (rad).
 
     Errors of X, scale and clock offset cause differences as well. Their columns are fitted first.
     """
-    points = se3.translation_of(pose_pairs.Ts_pw_p @ X)
+    Ts = pose_pairs.Ts_pw_p @ X
+    points = se3.translation_of(Ts)
     others = se3.translation_of(pose_pairs.Ts_cw_c)
+    rotations = se3.rotation_of(Ts)
+    constant = np.broadcast_to(np.eye(3), rotations.shape)
     R = _alignment(points, others)[0]
-    residuals = (others - others.mean(axis=0)) @ R.T - (points - points.mean(axis=0))
-    seconds = (pose_pairs.stamps_ns - pose_pairs.stamps_ns[0]) * 1e-9
     from_mean = points - points.mean(axis=0)
-    columns = [
-        np.broadcast_to(np.eye(3), (len(points), 3, 3)),
+    velocities = np.gradient(points, seconds, axis=0)
+    of_positions = [
+        constant,
         se3.skew(from_mean),
-        se3.rotation_of(pose_pairs.Ts_pw_p),
+        rotations,
         from_mean[:, :, None],
-        np.gradient(points, seconds, axis=0)[:, :, None],
+        velocities[:, :, None],
     ]
+    distances = (others - others.mean(axis=0)) @ R.T - from_mean
+    # Rotations from the parent's world to the child's world are constant but for errors.
+    between = se3.rotation_of(pose_pairs.Ts_cw_c) @ np.swapaxes(rotations, 1, 2)
+    world = se3.nearest_rotation(between.sum(axis=0))
+    turns = se3.rotation_log(world.T @ between)
+    steps = se3.rotation_log(rotations[1:] @ np.swapaxes(rotations[:-1], 1, 2))
+    rates = np.gradient(np.cumsum(np.pad(steps, ((1, 0), (0, 0))), axis=0), seconds, axis=0)
+    of_orientations = [constant, rotations, rates[:, :, None]]
+    residuals = [
+        _without_columns(of_positions, distances),
+        _without_columns(of_orientations, turns),
+    ]
+    return np.concatenate(residuals, axis=1)
+
+
+def _without_columns(columns: list[FloatArray], targets: FloatArray) -> FloatArray:
+    """Return targets (N, 3) less their robust fit by columns (N, 3, m)."""
     rows = np.concatenate(columns, axis=2)
-    values, distances_m = robust_regression(
-        "cauchy", rows, residuals, _ROUNDS, lambda lengths_m: 2.0 * median(lengths_m)
+    values, _ = robust_regression(
+        "cauchy", rows, targets, _ROUNDS, lambda lengths: 2.0 * median(lengths)
     )
-    corrected = points + rows @ values
-    windows_m = _apart_in_windows(pose_pairs.stamps_ns, corrected, others)
-    return median(distances_m) < _STEADY * windows_m
-
-
-def _apart_in_windows(stamps_ns: IntArray, points: FloatArray, others: FloatArray) -> float:
-    """Return the median distance (m) of points (N, 3) that were aligned in windows of time."""
-    # A window needs enough points, also of a long recording with few of its poses.
-    window_ns = max(round(_LONG_S * 1e9), round(2 * MIN_PAIRS * median(np.diff(stamps_ns))))
-    windows = (stamps_ns - stamps_ns[0]) // window_ns
-    distances_m = [
-        _after_alignment(points[windows == window], others[windows == window])
-        for window in np.unique(windows)
-        if (windows == window).sum() >= MIN_PAIRS
-    ]
-    return median(distances_m) if distances_m else 0.0
-
-
-def _after_alignment(points: FloatArray, others: FloatArray) -> float:
-    """Return the median distance (m) of points (N, 3) after a robust alignment."""
-    return median(_alignment(points, others)[1])
+    return np.asarray(targets - rows @ values)
 
 
 def _alignment(points: FloatArray, others: FloatArray) -> tuple[FloatArray, FloatArray]:
