@@ -267,6 +267,20 @@ class TestParentFusedFromTheChild:
         assert check_streams(parent, truth.child, are_exact=True).findings == ()
         assert check_streams(truth.parent, truth.child).findings == ()
 
+    @pytest.mark.parametrize("kind", ["hand_vio_walk", "drone_two_vios"])
+    def test_a_copy_with_noise_of_its_own_is_questioned_on_a_short_path(self, kind):
+        truth = make(kind, 901)
+        copies = truth.child.poses @ se3.inverse(truth.T_parent_child @ self.WRONG)
+        parent = Trajectory(truth.child.stamps_ns, disturbed(copies, 3, 0.003, 0.0015))
+        (finding,) = check_streams(parent, truth.child).findings
+        assert (finding.code, finding.severity) == ("not_independent", Severity.WARNING)
+        assert finding.what.endswith(TestOneStreamComputedFromTheOther.QUESTION)
+        assert check_streams(parent, truth.child, are_exact=True).findings == ()
+
+    def test_two_sensors_with_white_noise_are_not_questioned(self):
+        truth = make("hand_white", 901)
+        assert check_streams(truth.parent, truth.child).findings == ()
+
 
 SHIFT = np.r_[0.03, -0.02, 0.01, np.radians([1.0, -0.5, 1.5])]
 
