@@ -1,4 +1,4 @@
-"""Files and messages: bags, trajectory files, results, transforms."""
+"""Read and write files and messages: bags, trajectory files, results, transforms."""
 
 from typing import Any
 
@@ -12,12 +12,14 @@ def register() -> None:
 
 
 def _save(result: Any, directory: Any) -> Any:
+    """Call :func:`.results.save_result`, which is imported only when it is needed."""
     from hand_eye_calib.formats.results import save_result
 
     return save_result(result, directory)
 
 
 def _export(result: Any, format: str) -> str:
+    """Call :func:`.exports.export_text`, which is imported only when it is needed."""
     from hand_eye_calib.formats.exports import export_text
 
     return export_text(result, format)

@@ -1,8 +1,8 @@
-"""Extrinsics in the files of other programs. Their layouts are in ``layouts.yaml``.
+"""Write extrinsics into the files of other programs, whose layouts are in ``layouts.yaml``.
 
-The direction of a transform is the most frequent mistake. Therefore each file names source and
-target frame of its numbers, and states whether the calibration was inverted. docs/exports.md names
-the sources for the directions.
+A wrong direction of the transform is the most frequent mistake. Therefore each file names the
+source frame and the target frame of its numbers, and states whether the calibration was inverted.
+docs/exports.md lists the sources for the directions.
 """
 
 import json
@@ -25,8 +25,8 @@ from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.core.results.verdict import Judged, Verdict
 from hand_eye_calib.formats.results import launch_text, xacro_text
 
-# Beginnings of words in a frame's name, by the kind of sensor. The kinds are sorted by their usual
-# distance from the body.
+# Beginnings of words in the names of frames, by the kind of sensor. The kinds are sorted by their
+# usual place on a vehicle: the base first, then sensors that other sensors are calibrated to.
 _ROLES = {
     "base": ("base", "ego", "vehicle", "chassis", "rig", "hand", "tool", "flange"),
     "imu": ("imu", "body", "gyro", "ins", "novatel", "xsens"),
@@ -34,32 +34,37 @@ _ROLES = {
     "camera": ("cam", "image", "optical", "rgb", "stereo", "realsense", "zed", "vio", "vision"),
     "gnss": ("gnss", "gps", "antenna", "rtk"),
 }
+# Place of each kind in this order.
 _RANKS = {role: rank for rank, role in enumerate(_ROLES)}
-# Decimals of the numbers in a file. For metres, the last digit is 1 pm.
+# Number of decimals in a file. The last digit of a length in metres is 1 pm.
 _DECIMALS = 12
-# Longest delay (ms) that PX4 accepts (EKF2_EV_DELAY).
-_LONGEST_DELAY_MS = 300.0
+# Largest delay (ms) that PX4 accepts for its parameter EKF2_EV_DELAY.
+_MAX_DELAY_MS = 300.0
 
 
 class Layout(NamedTuple):
-    """Layout of a format for two kinds of sensors. Its numbers are ``T_target_source``.
+    """Layout of a file format for two kinds of sensors.
+
+    The file contains the transform ``T_target_source``, the pose of the source in the target.
 
     Attributes
     ----------
     target, source : str
-        Kinds of the sensors; empty for any kind.
+        Kind of each sensor, such as "lidar"; empty for any kind.
     is_inverted : bool or None
-        True if the target is the child, False if it is the parent, None if either is possible.
+        True if the target is the child, False if the target is the parent, None if both are
+        possible.
     keys : sequence of str
-        Keys of the pose in the file, or of translation and rotation.
+        Keys in the file under which the pose is, or its translation and its rotation.
     text : str
         Text of the file, with ``%(name)s`` for numbers and names.
     clock : int
-        Sign of the shift in ``t_target = t_source + clock * shift``; 0 if the file has no shift.
+        Sign of the shift of clocks in ``t_target = t_source + clock * shift``; 0 if the file does
+        not contain the shift.
     axes : sequence of str
-        Axes that the recording must determine.
+        Axes that the file needs, so the recording must determine them.
     axes_note : str
-        Note about the axes, for the user of the file.
+        Note about these axes, which is written into the file.
     """
 
     target: str = ""
@@ -73,15 +78,15 @@ class Layout(NamedTuple):
 
 
 class Arrangement(NamedTuple):
-    """Layout for two sensors, and its direction.
+    """Layout for a pair of sensors, and the direction of its transform.
 
     Attributes
     ----------
     layout : Layout
     is_inverted : bool
-        Whether its numbers are ``T_child_parent``.
+        True if the file contains ``T_child_parent`` instead of ``T_parent_child``.
     is_certain : bool
-        Whether the names of the frames state the kinds of the sensors.
+        Whether the kinds of the sensors are those of the layout, judged by the names of the frames.
     """
 
     layout: Layout
@@ -98,14 +103,14 @@ def formats() -> dict[str, list[Layout]]:
 
 
 def role_of(frame: str) -> str:
-    """Return the kind of a sensor, from the name of its frame; empty if the name states none."""
+    """Return the kind of a sensor, judged by the name of its frame; empty for other names."""
     words = re.findall("[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", frame).lower())
     roles = [
         role
         for role, beginnings in _ROLES.items()
         if any(word.startswith(beginnings) for word in words)
     ]
-    # A second role is preferred to "base": base_imu_link belongs to an IMU.
+    # Another kind is preferred to "base": base_imu_link is the frame of an IMU.
     if len(roles) > 1 and roles[0] == "base":
         return roles[1]
     return roles[0] if roles else ""
@@ -114,30 +119,31 @@ def role_of(frame: str) -> str:
 def arranged(layouts: Sequence[Layout], parent_frame: str, child_frame: str) -> Arrangement:
     """Return the layout and the direction that fit the sensors best.
 
-    The criteria are, in this order: most matching kinds of sensors, fewest differing kinds, the
-    first layout, and a parent that is nearer to the body than the child.
+    The criteria are, in this order: most kinds of sensors that match the layout, fewest kinds that
+    contradict it, the first layout, and a parent that comes before the child in ``_ROLES``.
     """
     roles = (role_of(parent_frame), role_of(child_frame))
     best_score: tuple[Any, ...] = ()
-    for order, layout in enumerate(layouts):
+    for index, layout in enumerate(layouts):
         directions = (False, True) if layout.is_inverted is None else (layout.is_inverted,)
         for is_inverted in directions:
-            wanted = (layout.target, layout.source)
+            # Kinds of the parent and of the child in this direction; empty for any kind.
+            kinds = (layout.target, layout.source)
             if is_inverted:
-                wanted = (layout.source, layout.target)
-            pairs = list(zip(wanted, roles, strict=True))
+                kinds = (layout.source, layout.target)
+            pairs = list(zip(kinds, roles, strict=True))
             n_matches = sum(kind == role != "" for kind, role in pairs)
-            n_misses = sum(kind not in ("", role) for kind, role in pairs)
-            is_natural = _RANKS.get(wanted[0], 0) <= _RANKS.get(wanted[1], 0)
-            score = (n_matches, -n_misses, -order, is_natural)
+            n_contradictions = sum(kind not in ("", role) for kind, role in pairs)
+            is_usual_order = _RANKS.get(kinds[0], 0) <= _RANKS.get(kinds[1], 0)
+            score = (n_matches, -n_contradictions, -index, is_usual_order)
             if score > best_score:
                 best_score = score
-                best = Arrangement(layout, is_inverted, is_certain=n_misses == 0)
+                best = Arrangement(layout, is_inverted, is_certain=n_contradictions == 0)
     return best
 
 
 def export_text(result: Judged, name: str) -> str:
-    """Return a calibration in the format of another program.
+    """Return the text of a calibration file for another program.
 
     See :meth:`~hand_eye_calib.core.results.calibration.Calibration.export`.
 
@@ -161,12 +167,12 @@ def export_text(result: Judged, name: str) -> str:
 
 
 def _filled_layout(result: Judged, name: str) -> str:
-    """Return a calibration in a format of layouts.yaml, see :func:`export_text`."""
+    """Return a calibration in a format of ``layouts.yaml``, see :func:`export_text`."""
     frames = (result.parent_frame, result.child_frame)
     T = result.T_parent_child
     arrangement = arranged(formats()[name], *frames)
     layout = arrangement.layout
-    # The target of such a format is a vehicle or robot: prefer the frame of its description.
+    # The target of such a layout is a vehicle or robot. Prefer the frame in its description.
     if layout.is_inverted is False and not layout.target:
         frames = (result.mounting[0], result.child_frame)
         T = result.mounting[1]
@@ -183,7 +189,7 @@ def _filled_layout(result: Judged, name: str) -> str:
         T = se3.inverse(T)
         offset_s = -offset_s
     texts = _numbers(T) | _robot_frames(target)
-    # The delay of PX4 is that of the child, whatever the direction of the transform.
+    # The delay in PX4 is the delay of the child in both directions of the transform.
     texts |= {
         "target": json.dumps(target),
         "source": json.dumps(source),
@@ -192,7 +198,7 @@ def _filled_layout(result: Judged, name: str) -> str:
     }
     lines = _remarks(result, name, arrangement, target, source)
     lines = [printable(" ".join(line.split())) for line in lines]
-    # Files of kitti and JSON have no comments, so the remarks are a value.
+    # Files of KITTI and JSON cannot contain comments, so the remarks are a value.
     if name == "kitti":
         texts["about"] = json.dumps(" ".join(lines))
     elif layout.text.startswith(("{", "[")):
@@ -203,16 +209,19 @@ def _filled_layout(result: Judged, name: str) -> str:
 
 
 def _robot_frames(target: str) -> dict[str, str]:
-    """Return the texts of a robot's base and hand. The target is one of these frames."""
-    # The camera is beside the robot, not on its hand.
+    """Return the values of a layout for a robot arm: base, hand, and where the camera is.
+
+    The target is the base or the hand.
+    """
     if "base" in target.lower():
+        # The camera does not move with the hand.
         return {"eye": "eye_on_base", "robot": json.dumps(target), "effector": '"hand"'}
     return {"eye": "eye_in_hand", "robot": '"base"', "effector": json.dumps(target)}
 
 
 def _delay_of_px4(delay_ms: float) -> str:
-    """Return the command that sets a delay in PX4; a comment if PX4 does not accept the delay."""
-    if 0 <= delay_ms <= _LONGEST_DELAY_MS:
+    """Return the command that sets a delay in PX4; a comment if the delay is out of range."""
+    if 0 <= delay_ms <= _MAX_DELAY_MS:
         return f"param set EKF2_EV_DELAY {_number(round(delay_ms, 3))}"
     return f"# EKF2_EV_DELAY would be {delay_ms:.1f} ms; PX4 accepts 0 to 300 ms"
 
@@ -220,7 +229,7 @@ def _delay_of_px4(delay_ms: float) -> str:
 def _remarks(
     result: Judged, name: str, arrangement: Arrangement, target: str, source: str
 ) -> list[str]:
-    """Return remarks for the user in a file: direction, clocks, assumptions and axes."""
+    """Return remarks for the user of a file: direction, clocks, assumptions and axes."""
     layout = arrangement.layout
     sign = "-" if result.time_offset_s < 0 else "+"
     origin = "estimated" if result.time_offset_sigma_s else "given, not estimated"
@@ -242,13 +251,14 @@ def _remarks(
 
 
 def _numbers(T: FloatArray) -> dict[str, str]:
-    """Return the texts of a pose (4, 4) for layouts."""
+    """Return the values of a layout for a pose (4, 4): m, rad, quaternions and matrices."""
     t = se3.translation_of(T)
     R = se3.rotation_of(T)
     rpy_rad = se3.rotation_to_rpy(R)
     quat_xyzw = se3.to_quat_xyzw(T)
     numbers = dict(zip(AXES, [*t, *rpy_rad], strict=True))
     numbers |= zip(("qx", "qy", "qz", "qw"), quat_xyzw, strict=True)
+    # Axes forward, right and down, as in PX4.
     numbers |= {"y_frd": -t[1], "z_frd": -t[2]}
     rows = [_listed(row) for row in T]
     return {name: _number(value) for name, value in numbers.items()} | {
@@ -266,11 +276,12 @@ def _numbers(T: FloatArray) -> dict[str, str]:
 
 
 def _listed(values: FloatArray, separator: str = ", ") -> str:
+    """Return numbers as text."""
     return separator.join(map(_number, values))
 
 
 def _number(value: float) -> str:
-    """Format a number with a decimal point and without an exponent, for every parser."""
+    """Return a number as text that every parser reads: a decimal point and no exponent."""
     # Adding 0.0 turns -0.0 into 0.0.
     text = f"{round(float(value), _DECIMALS) + 0.0:.{_DECIMALS}f}".rstrip("0")
     return f"{text}0" if text.endswith(".") else text

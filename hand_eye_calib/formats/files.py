@@ -1,8 +1,8 @@
-"""Files: limits of their size, and writing in one step.
+"""Open, read and write files of unknown origin, with limits of their size.
 
-A size that a file states may be wrong. So text and YAML that are too large are refused before
-memory is allocated. Bags are read by libraries: during this time, a command limits the growth of
-its process to :data:`LARGEST`. The poses that are kept take memory of their own.
+Text and YAML that are too large are refused before memory is allocated. Bags are read by libraries,
+which may trust a wrong size in a damaged bag. During this time, a command limits the growth of the
+memory of its process to :data:`LARGEST`. This limit does not include the poses that are kept.
 """
 
 import os
@@ -18,48 +18,51 @@ from typing import Any
 from hand_eye_calib.core.base.errors import InputError, printable, require_type
 from hand_eye_calib.core.base.option import did_you_mean
 
-# Folder of the recordings in the package, for ``sample:NAME``.
+# Folder of the sample recordings in the package, which users name ``sample:NAME``.
 _SAMPLES = Path(__file__).parents[1] / "sample"
 
 # ---- all files
 
-#: Bytes of the largest trajectory file, and of the memory for reading a bag in a command.
+#: Largest size of a trajectory file, and largest growth of memory while a command reads a bag
+#: (bytes).
 LARGEST = 512 << 20
 
 # ---- bags
 
-#: Largest ratio of a file to its compressed size.
+#: Largest ratio of the size of a file to its compressed size.
 LARGEST_RATIO = 256
-#: Bytes of the longest name of a topic, a type or a frame.
+#: Largest size of the name of a topic, a type or a frame (bytes).
 LONGEST_NAME = 1_024
-#: Bytes at which a block of messages is complete.
+#: A block of messages is complete if it has more than this size (bytes).
 BLOCK_BYTES = 4 << 20
 
 # ---- YAML
 
-#: Bytes of the largest YAML file.
+#: Largest size of a YAML file (bytes).
 LARGEST_YAML = 1 << 20
-#: Whole numbers must be smaller than this, so that they fit into a signed integer of 64 bits.
+#: Whole numbers must be smaller than this limit, so that they fit into signed integers of 64 bits.
 LARGEST_INT = 1 << 63
-#: Largest number of levels of nesting.
+#: Largest number of nested levels in a YAML file.
 DEEPEST_YAML = 32
 
 # ---- .npz
 
-#: Bytes of all arrays of the largest file. The poses of 100,000 stops have 26 million.
+#: Largest size of all arrays of a file (bytes). The poses of 100,000 stops take 26 million bytes.
 LARGEST_ARRAYS = 64 << 20
 
 # ---- trajectory files
 
-#: Characters of the longest line.
+#: Largest number of characters of a line.
 LONGEST_LINE = 65_536
 
 
+# File of Linux with the memory of this process.
 _STATM = Path("/proc/self/statm")
+# Whether `reading_memory` limits the memory.
 _is_limited = False
 
-# Limits of the process before each reading in progress. Readings may run in several threads; the
-# last one to end restores the limits before the first one.
+# For each reading in progress, the limits of the process before it. Several threads may read; the
+# last reading to end restores the limits that were valid before the first reading.
 _before: list[tuple[int, int]] = []
 _lock = threading.Lock()
 
@@ -75,10 +78,10 @@ def limit_memory() -> None:
 
 @contextmanager
 def reading_memory() -> Iterator[None]:
-    """Limit the growth of the process to :data:`LARGEST` while the block runs.
+    """Context in which the memory of the process grows by at most :data:`LARGEST`.
 
-    The limit is set only after a call of :func:`limit_memory`. A growth beyond it raises a
-    MemoryError.
+    Larger growth raises a MemoryError. Without an earlier call of :func:`limit_memory`, there is no
+    limit.
     """
     if not _is_limited:
         yield
@@ -88,7 +91,7 @@ def reading_memory() -> Iterator[None]:
     with _lock:
         limits = resource.getrlimit(resource.RLIMIT_AS)
         _before.append(limits)
-        # The limit is for virtual memory.
+        # The limit of the system is for virtual memory: the first number of statm, in pages.
         largest = int(_STATM.read_text().split()[0]) * resource.getpagesize() + LARGEST
         allowed = [limit for limit in limits if limit != resource.RLIM_INFINITY]
         resource.setrlimit(resource.RLIMIT_AS, (min([largest, *allowed]), limits[1]))
@@ -102,7 +105,7 @@ def reading_memory() -> Iterator[None]:
 
 
 def local_path(source: str | Path) -> Path:
-    """Return a source as path; ``sample:NAME`` is a recording in the package.
+    """Return the path of a source; ``sample:NAME`` is a sample recording in the package.
 
     Raises
     ------
@@ -120,19 +123,19 @@ def local_path(source: str | Path) -> Path:
 
 
 def path_of(name: str, value: Any) -> Path:
-    """Return the path that an argument of the Python interface names, as :func:`local_path`.
+    """Return an argument of the Python interface as a path, see :func:`local_path`.
 
     Raises
     ------
     InputError
-        If the argument is no path.
+        If the value is neither text nor path-like. ``name`` is the argument in the message.
     """
     require_type(name, value, str, PathLike)
     return local_path(os.fspath(value))
 
 
 def similar(path: str | Path) -> str:
-    """Return ``; did you mean NAME?`` for a missing file if its folder has a similar name."""
+    """Return ``; did you mean NAME?`` for a missing file; empty without a similar name there."""
     # The folder may not exist, or the path may contain a zero byte.
     with suppress(OSError, ValueError):
         if not Path(path).exists():
@@ -146,7 +149,7 @@ def open_regular(path: str | Path) -> BufferedReader:
     Raises
     ------
     InputError
-        If the file cannot be opened, or is a pipe or a device, which may block for ever.
+        If the file cannot be opened, or is a pipe or a device, whose reading may never end.
     """
     try:
         file = open(  # noqa: SIM115
@@ -179,7 +182,7 @@ def read_bytes(path: str | Path, largest: int = LARGEST) -> bytes:
 
 
 def read_text(path: str | Path, expected: str, largest: int = LARGEST) -> str:
-    """Read a whole text file; see :func:`decoded`. Raises as :func:`read_bytes`."""
+    """Read a whole text file. Raises the errors of :func:`read_bytes` and :func:`decoded`."""
     return decoded(path, read_bytes(path, largest), expected)
 
 
@@ -189,7 +192,7 @@ def decoded(path: str | Path, data: bytes, expected: str) -> str:
     Raises
     ------
     InputError
-        If the data is not text. The message contains ``expected``, a description of the file.
+        If the data is not text. ``expected`` describes the expected file in the message.
     """
     try:
         return data.decode("utf-8-sig")
@@ -199,7 +202,7 @@ def decoded(path: str | Path, data: bytes, expected: str) -> str:
 
 @contextmanager
 def writing(path: str | Path) -> Iterator[None]:
-    """Turn an OSError in the block into an InputError that names the file or the path."""
+    """Context that turns an OSError into an InputError with the name of the file, or ``path``."""
     try:
         yield
     except OSError as error:
@@ -212,8 +215,8 @@ def writing(path: str | Path) -> Iterator[None]:
 def write_atomically(contents: Mapping[Path, str | bytes]) -> None:
     """Write files under temporary names, and then rename them.
 
-    So a reader gets the whole old file or the whole new file. Text is written in UTF-8. A symbolic
-    link is replaced by the file; the target of the link is not changed.
+    So other programs always read a complete file, the old or the new one. Text is written in UTF-8.
+    A symbolic link is replaced by the file; the target of the link does not change.
 
     Raises
     ------

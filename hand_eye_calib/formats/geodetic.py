@@ -1,6 +1,7 @@
-"""Positions east, north and up of a first position, from latitude, longitude and height.
+"""Positions in axes east, north and up at a first position, from latitude, longitude and height.
 
-Coordinates from the centre of the earth, with latitude phi, longitude lambda and height h:
+Coordinates X, Y, Z relative to the centre of the earth (ECEF), from latitude phi, longitude lambda
+and height h above the ellipsoid with equatorial radius a and flattening f:
     X = (nu + h) cos phi cos lambda, Y = (nu + h) cos phi sin lambda, Z = ((1 - e^2) nu + h) sin phi
     nu = a / sqrt(1 - e^2 sin^2 phi), e^2 = f (2 - f)
 Reference: coordinate operations 9602 and 9837 of the EPSG (IOGP publication 373-7-2), on the
@@ -17,14 +18,15 @@ _RADIUS_M = 6_378_137.0
 _FLATTENING = 1.0 / 298.257223563
 # Square of the first eccentricity, e^2.
 _ECCENTRICITY_2 = _FLATTENING * (2.0 - _FLATTENING)
-# Smallest distance (m) of a position on the ground from the centre of the earth.
-_SMALLEST_M = 6.3e6
-# Largest distance (m) of a position in an aircraft from the centre of the earth.
-_LARGEST_M = 6.45e6
+# Positions are in ECEF if their distance from the centre of the earth is between both limits (m).
+# Every position on the ground is beyond the first limit.
+_MIN_ECEF_M = 6.3e6
+# Every position of an aircraft is within this limit.
+_MAX_ECEF_M = 6.45e6
 
 
 class LocalOrigin:
-    """First position of a stream; the other positions are relative to it.
+    """Origin of a stream's local coordinates: its first position.
 
     Attributes
     ----------
@@ -36,33 +38,38 @@ class LocalOrigin:
         self.geodetic: tuple[float, float, float] | None = None
 
     def local(self, lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArray) -> FloatArray:
-        """Return positions (N, 3), m, east, north and up of the first position of all calls."""
+        """Return positions (N, 3), m, in the axes east, north and up at the origin.
+
+        The first call sets the origin to its first position.
+        """
         if self.geodetic is None:
             self.geodetic = float(lat_rad[0]), float(lon_rad[0]), float(height_m[0])
         origin = np.array(self.geodetic)[:, None]
         from_origin = _earth_centred(lat_rad, lon_rad, height_m) - _earth_centred(*origin)
-        # These sums round a single position, as in live use, like many positions; a matrix product
-        # would not.
+        # These sums give the same bits for one position, as in live use, and for many positions. A
+        # matrix product does not.
         terms = from_origin[:, :, None] * _axes(*origin[:2])
         return np.asarray(terms[:, 0] + terms[:, 1] + terms[:, 2])
 
 
 def are_earth_centred(positions: FloatArray) -> bool:
-    """Whether all positions (N, 3), m, may be relative to the centre of the earth."""
+    """Whether all positions (N, 3), m, may be in ECEF, judged by their distance from its origin."""
     distances = np.linalg.norm(positions, axis=1)
-    return bool(((distances > _SMALLEST_M) & (distances < _LARGEST_M)).all())
+    return bool(((distances > _MIN_ECEF_M) & (distances < _MAX_ECEF_M)).all())
 
 
 def axes_of_places(positions: FloatArray) -> FloatArray:
     """Return the axes east, north and up (N, 3, 3), as columns, at positions (N, 3), m.
 
-    The positions are relative to the centre of the earth. The latitude is that of Bowring 1976,
-    with errors of at most 1e-9 rad on the ground.
+    Positions and axes are in ECEF. Latitudes are computed by the method of Bowring 1976. Its errors
+    on the ground are at most 1e-9 rad.
     """
     x, y, z = positions.T
+    # Distance from the axis of the earth.
     from_axis = np.hypot(x, y)
     polar_radius = _RADIUS_M * (1.0 - _FLATTENING)
     second_eccentricity_2 = _ECCENTRICITY_2 / (1.0 - _ECCENTRICITY_2)
+    # Reduced latitude.
     reduced = np.arctan2(z * _RADIUS_M, from_axis * polar_radius)
     up = z + second_eccentricity_2 * polar_radius * np.sin(reduced) ** 3
     out = from_axis - _ECCENTRICITY_2 * _RADIUS_M * np.cos(reduced) ** 3
@@ -70,7 +77,7 @@ def axes_of_places(positions: FloatArray) -> FloatArray:
 
 
 def rotations_to_first(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:
-    """Return the rotations (N, 3, 3) from the axes of each position to those of the first one.
+    """Return the rotations (N, 3, 3) from the axes at each position to those at the first position.
 
     The axes are east, north and up.
     """
@@ -79,9 +86,10 @@ def rotations_to_first(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:
 
 
 def _earth_centred(lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArray) -> FloatArray:
-    """Return positions (N, 3), m, from the centre of the earth along its axes."""
+    """Return positions (N, 3), m, in ECEF: the formulas of this module."""
     sin_lat = np.sin(lat_rad)
     cos_lat = np.cos(lat_rad)
+    # Radius of curvature nu in the prime vertical.
     normal = _RADIUS_M / np.sqrt(1.0 - _ECCENTRICITY_2 * sin_lat**2)
     from_axis = (normal + height_m) * cos_lat
     along_axis = ((1.0 - _ECCENTRICITY_2) * normal + height_m) * sin_lat
@@ -89,7 +97,7 @@ def _earth_centred(lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArra
 
 
 def _axes(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:
-    """Return the axes east, north and up (N, 3, 3), as columns, in the axes of the earth."""
+    """Return the axes east, north and up (N, 3, 3), as columns, in ECEF."""
     sin_lat = np.sin(lat_rad)
     cos_lat = np.cos(lat_rad)
     sin_lon = np.sin(lon_rad)

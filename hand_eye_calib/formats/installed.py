@@ -1,4 +1,4 @@
-"""Read the installed extrinsic: the one that a robot uses now.
+"""Read the installed extrinsic, which the robot uses now.
 
 Its source is a robot description, an earlier result, a file of another program, a bag, or numbers.
 """
@@ -27,8 +27,11 @@ from hand_eye_calib.formats.yaml_files import read_yaml
 
 # Value of the key "format" in a result of this package.
 _FORMAT = "hand_eye_calib/extrinsic"
+# Endings of robot descriptions.
 _DESCRIPTIONS = (".urdf", ".xml", ".xacro")
+# Endings of results, and of files of other programs.
 _DOCUMENTS = (".yaml", ".yml", ".json", ".txt", ".calib")
+# Description of a file with an extrinsic, for messages.
 _EXPECTED = (
     f"a calibration: extrinsic.yaml of this package, or a file of {', '.join(EXPORT_FORMATS)}; "
     "parameters of PX4 have a position but no rotation; set six numbers instead"
@@ -36,7 +39,7 @@ _EXPECTED = (
 
 
 def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
-    """Read the installed extrinsic before the frames of the sensors are known.
+    """Read the source of an installed extrinsic, before the frames of the sensors are known.
 
     Parameters
     ----------
@@ -88,19 +91,27 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
 def stated(
     find: Callable[[str, str], FloatArray], origin: str, parent_frame: str, child_frame: str
 ) -> Extrinsic:
-    """Return the installed pose from a source, by the names of both frames.
+    """Return the installed pose of the child sensor in the parent sensor's frame.
+
+    Parameters
+    ----------
+    find : callable
+        ``find(parent_frame, child_frame)`` returns the pose (4, 4).
+    origin : str
+        Name of the source, for the result and for messages.
+    parent_frame, child_frame : str
 
     Raises
     ------
     InputError
-        If the source does not have this pose. The message begins with the origin.
+        If the source does not contain this pose.
     """
     with located(origin):
         return Extrinsic(find(parent_frame, child_frame), origin)
 
 
 def frames_of_bag(path: str | Path) -> FrameTree:
-    """Return the frames of a bag's ``/tf_static``."""
+    """Return the tree of the frames in a bag, with the static transforms."""
     from hand_eye_calib.formats.bags.reader import PoseBag
 
     with PoseBag(path) as bag:
@@ -108,6 +119,13 @@ def frames_of_bag(path: str | Path) -> FrameTree:
 
 
 def _of_result(result: Calibration, path: Path, parent_frame: str, child_frame: str) -> Extrinsic:
+    """Return the pose in an earlier result of this package, inverted if the sensors are exchanged.
+
+    Raises
+    ------
+    InputError
+        If the result is that of other sensors.
+    """
     result_parent = frame_name(result.parent_frame)
     result_child = frame_name(result.child_frame)
     wanted = (frame_name(parent_frame), frame_name(child_frame))
@@ -127,17 +145,20 @@ def _of_result(result: Calibration, path: Path, parent_frame: str, child_frame: 
 
 
 def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
-    """Return the pose of the child sensor in the parent sensor's frame, from any document.
+    """Return the pose (4, 4) of the child sensor in the parent sensor's frame, from any document.
+
+    Transforms with the names of both frames are preferred. Otherwise the pose is searched by the
+    keys of the export formats. At last, a document with one matrix is that matrix.
 
     Raises
     ------
     InputError
-        If the document has no such pose.
+        If the document does not contain this pose.
     """
     nodes = [*_nodes(document, ())]
     frames = FrameTree("the file")
     for path, node in nodes:
-        if edge := _named(path, node):
+        if edge := _named_transform(path, node):
             parent, child, *pose = edge
             frames.add(str(parent), str(child), pose_of(*pose))
     if frames.edges:
@@ -149,7 +170,7 @@ def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
             names, values = _of_sensors(nodes, layout.keys, {parent_frame, child_frame})
             is_fixed = layout.is_inverted is not None
             if is_fixed and child_frame not in names and parent_frame in names:
-                # The file names the frame of its child. Here, this sensor is the parent.
+                # The file names the frame of its child, and here this sensor is the parent.
                 is_inverted = not is_inverted
             T = pose_of(*values)
             return se3.inverse(T) if is_inverted else T
@@ -159,15 +180,19 @@ def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
 
 
 def _fits(layout: Layout, nodes: "Sequence[_Node]") -> bool:
+    """Whether a mapping of the document has all keys of the layout."""
     return bool(layout.keys) and any(_values_at(node, layout.keys) for _, node in nodes)
 
 
-# A mapping, and the keys that lead to it.
+# The keys that lead to a mapping in a document, and this mapping.
 _Node = tuple[tuple[str, ...], Mapping[str, Any]]
 
 
 def _nodes(document: Any, path: tuple[str, ...]) -> Iterator[_Node]:
-    """Yield all mappings of a document."""
+    """Iterate over all mappings in a document, at any depth.
+
+    ``path`` are the keys that lead to the document.
+    """
     if isinstance(document, Mapping):
         yield path, document
         for name, value in document.items():
@@ -177,23 +202,25 @@ def _nodes(document: Any, path: tuple[str, ...]) -> Iterator[_Node]:
             yield from _nodes(item, path)
 
 
-def _named(path: tuple[str, ...], node: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Return parent and child of a node that names both frames, and its pose.
+def _named_transform(path: tuple[str, ...], node: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Return the parent frame, the child frame and the pose of a mapping that is a named transform.
 
-    The pose is one value, or two values: translation and angles (deg). The tuple is empty for other
-    nodes.
+    The pose is one value (any form of :func:`.frames.pose_of`), or two values: translation (m) and
+    roll, pitch, yaw (deg). The tuple is empty for other mappings.
     """
     header = node.get("header")
     parameters = node.get("parameters")
     # TransformStamped of ROS.
     if isinstance(header, Mapping) and "child_frame_id" in node:
         return header.get("frame_id"), node["child_frame_id"], node.get("transform")
+    # One transform of a list.
     if {"parent", "child", "value"} <= node.keys():
         return node["parent"], node["child"], node["value"]
+    # A mapping {parent: {child: {x: ..., yaw: ...}}}.
     if {*AXES} <= node.keys() and len(path) > 1:
         rpy_deg = np.degrees(numbers_of([node[name] for name in ROTATIONS]))
         return *path[-2:], [node[name] for name in TRANSLATIONS], rpy_deg
-    # easy_handeye2.
+    # easy_handeye2: the robot's frame is its base or its hand.
     if isinstance(parameters, Mapping) and "transform" in node:
         is_fixed = parameters.get("calibration_type") == "eye_on_base"
         robot = parameters.get("robot_base_frame" if is_fixed else "robot_effector_frame")
@@ -204,15 +231,15 @@ def _named(path: tuple[str, ...], node: Mapping[str, Any]) -> tuple[Any, ...]:
 def _of_sensors(
     nodes: list[_Node], keys: Sequence[str], frames: set[str]
 ) -> tuple[set[str], list[Any]]:
-    """Return the frames that an extrinsic names, and the values under its keys.
+    """Return the values under ``keys`` in the mapping of two sensors, and the frames it names.
 
-    The names are in the same mapping as the values, or in the path to this mapping. If there are
-    several extrinsics, those that name none of the frames are ignored.
+    ``frames`` are the frames of the sensors. A mapping names a frame by one of its values, or by a
+    key that leads to it. If several mappings have the keys, those that name no frame are ignored.
 
     Raises
     ------
     InputError
-        If several extrinsics remain, or none.
+        If not exactly one mapping remains.
     """
     extrinsics = []
     for path, node in nodes:
@@ -259,6 +286,7 @@ def read_urdf(path: str | Path) -> FrameTree:
 
 
 def _frames(data: bytes) -> FrameTree:
+    """Return the frames of the text of a URDF file; raises as :func:`read_urdf`."""
     if b"<xacro:" in data:
         raise InputError("has xacro macros; pass the URDF that xacro makes from it")
     try:
@@ -281,7 +309,7 @@ def _frames(data: bytes) -> FrameTree:
 
 
 def _origin(joint: ElementTree.Element) -> list[float]:
-    """Return x, y, z, roll, pitch and yaw of a joint's origin."""
+    """Return x, y, z (m), roll, pitch and yaw (rad) of a joint's origin; 0 without an origin."""
     attributes = {"xyz": "0 0 0", "rpy": "0 0 0"}
     for origin in joint.findall("origin")[:1]:
         attributes |= origin.attrib

@@ -1,14 +1,14 @@
-"""Session journal: the poses of the node, written to disk as they arrive.
+"""Session journal: the poses that the node receives, written to disk as they arrive.
 
 After a crash, only the last poses are lost.
 
 A journal is a directory with a text file for each stream: ``parent.tum``, ``child.tum`` and so on.
 Other programs can read these files, too. Each pose is a line ``t x y z qx qy qz qw``, with the
-stamp in seconds and all digits of every number. A line that begins with ``# {`` is JSON: the first
-such line describes the stream and its options, later lines their changes. ``parent_poses`` in such
-a line is the number of poses in the parent's file when the next poses of this file were written.
-This number determines the order of arrival. A process that is killed may leave an incomplete line.
-So the reader stops before the first line that it cannot read.
+stamp in seconds and all digits of every number. A line that begins with ``# {`` is JSON. The first
+such line describes the stream and its options; later lines contain changes. ``parent_poses`` in
+such a line is the number of poses in the parent's file when the next poses of this file were
+written. The order in which poses of several streams arrived is computed from this number. A process
+that is killed may leave an incomplete line, so the reader stops before the first unreadable line.
 """
 
 import json
@@ -33,13 +33,16 @@ from hand_eye_calib.formats.files import LONGEST_LINE, open_regular
 from hand_eye_calib.formats.trajectory_files.table import tum_line
 
 _FORMAT = "hand_eye_calib/journal"
+# Version of the format; journals of other versions are rejected.
 _VERSION = 2
 _STREAMS = ("parent", "child", *other_names())
+# Key of the number of the parent's poses.
 _BATCH = "parent_poses"
-# Largest number in the name of a journal that was set aside.
-_MOST_ASIDE = 100
+# End (exclusive) of the numbers in the names of journals that were renamed, see `keep_aside`.
+_END_OF_NUMBERS = 100
+# Remedy in messages about a journal that cannot be read.
 _ADVICE = "move it away to start anew"
-# Errors while parsing a line that does not belong to a journal.
+# Types of errors that parsing raises for a line that is not of a journal.
 _UNREADABLE = (ValueError, TypeError, OverflowError, RecursionError)
 
 #: Description of each stream in plain values: topic, frame, origin, options and others.
@@ -47,7 +50,7 @@ About = Mapping[str, Document]
 
 
 class JournalWriter:
-    """Writer of one session into a directory.
+    """Writer of the journal of one session into a directory.
 
     All methods raise an OSError if the directory cannot be written.
 
@@ -58,12 +61,12 @@ class JournalWriter:
     about : About
         Description of each stream.
     resumed : Journal, optional
-        Session in the directory to be continued. The unreadable end of its files is cut off.
+        Session in the directory that is continued. The unreadable end of its files is cut off.
 
     Raises
     ------
     OSError
-        Also if a file with a stream's name is a link, or does not belong to a journal.
+        Also if a file with a stream's name is a link, or is not a journal.
     """
 
     def __init__(
@@ -81,7 +84,7 @@ class JournalWriter:
         self._pending: dict[str, list[str]] = {stream: [] for stream in {**about, **self._about}}
         self._files: dict[str, FileIO] = {}
         for stream in self._pending:
-            # Without a buffer, data survives this process as soon as it is written.
+            # Without a buffer, data that was written survives a crash of this process.
             path = Path(directory, f"{stream}.tum")
             self._files[stream] = open(path, "ab", buffering=0, opener=_open_no_link)  # noqa: SIM115
             self._files[stream].truncate(whole_bytes.get(stream, 0))
@@ -95,18 +98,20 @@ class JournalWriter:
         self._pending[stream].append(tum_line(stamp_ns, (*position, *quat_xyzw)))
 
     def describe(self, about: About) -> None:
-        """Write the changes in the descriptions of streams at once."""
+        """Write changes in the descriptions of streams immediately, after the pending poses."""
         self.flush()
         for stream, description in about.items():
-            before = self._about.get(stream, {})
-            changes = {key: value for key, value in description.items() if before.get(key) != value}
+            written = self._about.get(stream, {})
+            changes = {
+                key: value for key, value in description.items() if written.get(key) != value
+            }
             if changes:
                 self._write(stream, [f"# {json.dumps(changes)}"])
-            self._about[stream] = {**before, **description}
+            self._about[stream] = {**written, **description}
 
     def flush(self) -> None:
-        """Write all poses to the operating system, so that they survive this process."""
-        # The parent's stream is the first.
+        """Pass all pending poses to the operating system, so that they survive a crash."""
+        # The parent is the first stream, so its number of poses is up to date for the others.
         for stream, lines in self._pending.items():
             if not lines:
                 continue
@@ -118,14 +123,15 @@ class JournalWriter:
             lines.clear()
 
     def _write(self, stream: str, lines: Sequence[str]) -> None:
+        """Write lines to the file of a stream; raise an OSError if the file was replaced."""
         file = self._files[stream]
-        # If the file was replaced or deleted, data written to it would be lost.
+        # Data written to a file that was replaced or deleted would be lost.
         if not os.path.samestat(os.stat(file.name), os.fstat(file.fileno())):
             raise OSError("another program has replaced its file")
         file.write("\n".join([*lines, ""]).encode())
 
     def close(self) -> None:
-        """Flush and close."""
+        """Write all pending poses and close the files."""
         try:
             self.flush()
         finally:
@@ -135,19 +141,19 @@ class JournalWriter:
 
 @dataclass(frozen=True)
 class Journal:
-    """Session of a directory, with its poses in the order of their arrival.
+    """Session that was read from a directory; its poses are in the order of their arrival.
 
     Attributes
     ----------
     about : dict of str to dict
-        "options", "topic", "frame", "origin" and other values of each stream.
+        Description of each stream: "options", "topic", "frame", "origin" and others.
     streams : (N,) array of str
         Stream of each pose.
     stamps_ns : (N,) array of int64
     poses : (N, 7) array
-        x y z (m), qx qy qz qw.
+        Position x y z (m) and quaternion qx qy qz qw.
     whole_bytes : dict of str to int
-        Number of readable bytes of each stream's file.
+        Number of bytes of the complete lines in each stream's file.
     """
 
     about: dict[str, Document]
@@ -167,8 +173,7 @@ def read_journal(directory: str | Path) -> Journal:
     """
     paths = {stream: Path(directory, f"{stream}.tum") for stream in _STREAMS}
     files = {stream: _read(path) for stream, path in paths.items() if os.path.lexists(path)}
-    # Checked after reading: a node may have renamed the directory meanwhile, so that its files are
-    # gone.
+    # Check this after reading, because a node may have renamed the directory in the meantime.
     if "parent" not in files:
         raise InputError(f"no session journal in {directory}")
     rows = np.concatenate([np.reshape(file.values, (-1, 8)) for file in files.values()])
@@ -185,10 +190,11 @@ def read_journal(directory: str | Path) -> Journal:
 
 
 class _StreamFile(NamedTuple):
-    """File of one stream.
+    """Content of the file of one stream.
 
-    A row of ``values`` is the order of arrival and x y z qx qy qz qw. The order of arrival is
-    counted in poses of the parent. ``whole_bytes`` is the number of readable bytes.
+    ``values`` are rows of 8 numbers: the order of arrival and x y z qx qy qz qw. The order of
+    arrival of a parent's pose is its index; that of another pose is between two such indices.
+    ``whole_bytes`` is the number of bytes of the complete lines.
     """
 
     about: Document
@@ -200,7 +206,7 @@ class _StreamFile(NamedTuple):
 def _read(path: Path) -> _StreamFile:
     """Read the file of one stream up to the first unreadable line."""
     about: Document = {}
-    # A session may last all day: a pose takes 72 bytes in these arrays, and 500 in lists.
+    # A session may last all day. A pose takes 72 bytes in these arrays, but 500 bytes in lists.
     stamps_ns = array("q")
     values = array("d")
     whole_bytes = 0
@@ -213,9 +219,10 @@ def _read(path: Path) -> _StreamFile:
                 seconds, _, decimals = stamp.partition(b".")
                 if len(cells) != 7 or len(decimals) != 9:
                     break
-                # The parent's poses are 0, 1, 2, ... Other poses arrived between two of them.
-                arrived = about.get(_BATCH, len(stamps_ns) + 0.5) - 0.5
-                row = [float(cell) for cell in (arrived, *cells)]
+                # Order of arrival: 0, 1, 2, ... for the parent's poses. A pose of another stream
+                # that arrived after n poses of the parent has n - 0.5.
+                arrival = about.get(_BATCH, len(stamps_ns) + 0.5) - 0.5
+                row = [float(cell) for cell in (arrival, *cells)]
                 stamps_ns.append(int(seconds + decimals))
                 values.extend(row)
             whole_bytes += len(line)
@@ -230,7 +237,7 @@ def _read(path: Path) -> _StreamFile:
 
 
 def _refuse_foreign(directory: Path) -> None:
-    """Raise an OSError if a file with a stream's name is not a journal, to protect its content."""
+    """Raise an OSError if a file with a stream's name is not a journal, to protect it."""
     for stream in _STREAMS:
         path = directory / f"{stream}.tum"
         if os.path.lexists(path) and not _is_own(path):
@@ -238,7 +245,7 @@ def _refuse_foreign(directory: Path) -> None:
 
 
 def _is_own(path: Path) -> bool:
-    """Whether a file is empty or begins like a journal, and is not a link."""
+    """Whether a file belongs to a journal: no link, and either empty or with its first line."""
     if path.is_symlink() or not path.is_file():
         return False
     with open_regular(path) as file:
@@ -247,24 +254,25 @@ def _is_own(path: Path) -> bool:
 
 
 def _open_no_link(path: str, flags: int) -> int:
+    """Open a file for the builtin open; raise an OSError if the path is a link."""
     return os.open(path, flags | os.O_NOFOLLOW, 0o666)
 
 
 def is_used(directory: str | Path) -> bool:
-    """Whether a directory has a file with a stream's name and any content."""
+    """Whether a directory has a file with a stream's name, a journal or not."""
     return any(os.path.lexists(Path(directory, f"{stream}.tum")) for stream in _STREAMS)
 
 
 def has_session(directory: str | Path) -> bool:
-    """Whether a directory has a journal."""
+    """Whether a directory has the parent's file of a journal."""
     return os.path.isfile(Path(directory) / "parent.tum")
 
 
 def keep_aside(directory: str | Path) -> Path:
     """Rename the directory of a journal, so that a new session can use its name.
 
-    The new name is ``journal.previous``. An older journal with this name is removed. If the name
-    belongs to other files, the next free name is used, such as ``journal.previous2``.
+    The new name of ``journal`` is ``journal.previous``. An older journal with this name is removed.
+    If the name belongs to other files, the next free name is used, such as ``journal.previous2``.
 
     Returns
     -------
@@ -277,7 +285,7 @@ def keep_aside(directory: str | Path) -> Path:
         If the directory cannot be renamed, or no name is free.
     """
     directory = Path(directory)
-    for number in ("", *range(2, _MOST_ASIDE)):
+    for number in ("", *range(2, _END_OF_NUMBERS)):
         aside = directory.with_name(f"{directory.name}.previous{number}")
         if _is_journal(aside):
             shutil.rmtree(aside)
@@ -287,7 +295,7 @@ def keep_aside(directory: str | Path) -> Path:
 
 
 def _is_journal(directory: Path) -> bool:
-    """Whether a directory has files of a journal and no other files."""
+    """Whether a directory is not a link and contains only files of a journal."""
     if directory.is_symlink() or not directory.is_dir():
         return False
     names = {f"{stream}.tum" for stream in _STREAMS}
@@ -295,7 +303,7 @@ def _is_journal(directory: Path) -> bool:
 
 
 def count_poses(directory: str | Path) -> int | None:
-    """Return the number of poses in the session of a directory; None for unreadable sessions."""
+    """Return the number of poses in the session of a directory; None if it cannot be read."""
     try:
         return len(read_journal(directory).stamps_ns)
     except InputError:
@@ -308,7 +316,7 @@ def replay_journal(journal: Journal, directory: Path, engines: Calibrators) -> N
     Raises
     ------
     InputError
-        If a calibrator refuses a pose. The message names the directory.
+        If a calibrator rejects a pose. ``directory`` is the name of the session in the message.
     """
     with located(f"cannot use the session journal {directory}"):
         for stream, about in journal.about.items():

@@ -1,4 +1,7 @@
-"""Arrays in ``.npz`` files. Their size is checked before memory is allocated."""
+"""Read arrays from ``.npz`` files of unknown origin.
+
+The size of the arrays is checked before memory is allocated.
+"""
 
 import math
 import zipfile
@@ -12,7 +15,7 @@ from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.text import shortened
 from hand_eye_calib.formats.files import LARGEST_ARRAYS, open_regular
 
-# Errors of numpy and zipfile for damaged archives and arrays.
+# Types of errors that numpy and zipfile raise for damaged archives and arrays.
 _NO_ARRAYS = (
     OSError,
     ValueError,
@@ -33,8 +36,8 @@ def read_arrays(path: str | Path, largest: int = LARGEST_ARRAYS) -> dict[str, np
     Raises
     ------
     InputError
-        If the file cannot be read, or if the arrays take more than ``largest`` bytes. The size of
-        the file itself is not limited, because zeros are compressed to a thousandth.
+        If the file cannot be read, or if the arrays take more than ``largest`` bytes. This limit
+        is for the unpacked arrays, because zeros are compressed to a thousandth of their size.
     """
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:

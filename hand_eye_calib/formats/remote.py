@@ -1,7 +1,7 @@
-"""Bags in object storage and on web servers.
+"""Copy bags from object storage and web servers.
 
-The package fsspec copies such a bag to a temporary folder. The copy is read and then removed.
-Examples of URLs are ``s3://bucket/run_1``, ``gs://...`` and ``https://host/run_1.mcap``.
+The package fsspec copies a bag to a temporary folder. The copy is read and then removed. Examples
+of URLs are ``s3://bucket/run_1``, ``gs://...`` and ``https://host/run_1.mcap``.
 """
 
 import json
@@ -19,22 +19,23 @@ from hand_eye_calib.core.base.errors import (
     installing,
 )
 
-#: Function that replaces paths of copies by URLs in plain values.
+#: Function that replaces the paths of copies by the URLs of the bags, in plain values.
 RestoreUrls = Callable[[Any], Any]
 
-# Endings of the files of a bag.
+# Endings of the files of a bag that are copied.
 _SUFFIXES = (".yaml", ".mcap", ".db3", ".bag", ".zstd")
-# Endings of files with the newest messages of a .db3 whose recorder was killed.
+# Endings of files that SQLite keeps next to a .db3 while writing. If the recorder was killed, these
+# files contain its newest messages.
 _JOURNALS = (".db3-wal", ".db3-journal")
 
 
 def is_url(path: object) -> bool:
-    """Whether a bag's name is a URL rather than a path."""
+    """Whether the name of a bag is a URL, not a path."""
     return "://" in str(path)
 
 
 def public(url: str) -> str:
-    """Remove user, password and query from a URL, because they are secret; a path is unchanged."""
+    """Return a URL without user, password and query, which are secret; return a path unchanged."""
     if not is_url(url):
         return url
     protocol, mark, rest = url.partition("?")[0].partition("://")
@@ -53,14 +54,14 @@ def expanded(pattern: str) -> list[str]:
 
 @contextmanager
 def local_copies(paths: Sequence[Any]) -> Iterator[tuple[list[Any], RestoreUrls]]:
-    """Copy remote bags to this machine while the block runs.
+    """Copy remote bags to this machine; the copies are removed at the end of the context.
 
-    Errors that the block raises name the URLs instead of the copies.
+    Errors that are raised in the context name the URLs instead of the copies.
 
     Yields
     ------
     paths : list of path-like
-        Paths on this machine.
+        Paths of all bags on this machine.
     restore_urls : callable
         Replaces the paths of the copies by the URLs in plain values.
 
@@ -68,7 +69,7 @@ def local_copies(paths: Sequence[Any]) -> Iterator[tuple[list[Any], RestoreUrls]
     ------
     InputError
         If a store cannot be reached or has no bag, or if the bag is larger than half of the free
-        space.
+        disk space.
     MissingDependencyError
         If a package that the store needs is not installed.
     """
@@ -105,7 +106,7 @@ def _copied(url: str, folder: Path) -> Path:
         files = [entry for entry in entries if _name(entry["name"]).endswith(suffixes)]
         if not files:
             raise InputError(f"no bag there: expected files that end in {', '.join(_SUFFIXES)}")
-        # Leave the other half of the free space for the copies of other processes.
+        # Use at most half of the free space, because other processes may copy bags, too.
         largest = shutil.disk_usage(folder).free // 2
         if sum(entry.get("size") or 0 for entry in files) > largest:
             raise InputError(
@@ -113,13 +114,13 @@ def _copied(url: str, folder: Path) -> Path:
                 f"{tempfile.gettempdir()}; set TMPDIR to a folder with more space"
             )
         for entry in files:
-            # Use only the last part of the name, because a store must not choose the folder.
+            # Use only the last part of the name. A store could otherwise choose another folder.
             system.get_file(entry["name"], str(folder / _name(entry["name"])))
         return folder / _name(path) if is_file else folder
 
 
 def _entries_of_file(system: Any, path: str) -> list[dict[str, Any]]:
-    """Return the entries of a file in a store, and of the SQLite journals that belong to it."""
+    """Return the entries (name, size, ...) of a file in a store, and of its SQLite journals."""
     paths = [path]
     if path.endswith(".db3"):
         journals = [path.removesuffix(".db3") + suffix for suffix in _JOURNALS]
@@ -136,8 +137,9 @@ def _name(path: str) -> str:
 def _reached(url: str) -> Iterator[tuple[Any, str]]:
     """Yield the file system of a URL, and the path in this file system.
 
-    Any error in the block becomes an InputError of one line, because every kind of store raises
-    other errors. Only code of fsspec runs in the block, so no other defect is hidden.
+    Any error that is raised in the context becomes an InputError of one line, because each kind of
+    store raises errors of other types. Little other code than that of fsspec runs in the context,
+    so its defects are not hidden.
     """
     try:
         from fsspec.core import url_to_fs

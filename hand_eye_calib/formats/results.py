@@ -1,6 +1,6 @@
 """Write and read the files of calibrations and rigs.
 
-``extrinsic.yaml`` and ``rig.yaml`` contain the whole result. An xacro file and a launch file
+``extrinsic.yaml`` and ``rig.yaml`` contain the complete result. The xacro file and the launch file
 contain only the transforms.
 """
 
@@ -34,7 +34,8 @@ RIG_NAME = "rig.yaml"
 XACRO_NAME = "extrinsic.urdf.xacro"
 LAUNCH_NAME = "static_transform.launch.py"
 _NAMES = (XACRO_NAME, LAUNCH_NAME, FILE_NAME)
-# Texts in every file that this program wrote: its name, or the column of headlines of a table.
+# A file was written by this program if it contains one of these texts: the name of the program, or
+# the column of headlines in a table of many calibrations.
 _MARKS = (b"hand_eye_calib", b'"headline"')
 
 
@@ -52,8 +53,8 @@ def save_result(
     directory : str or path-like
         A missing directory is made.
     inputs : mapping, optional
-        Origin of the data in plain values, for the provenance in the file. Its ``options`` become
-        the parameters of the provenance.
+        Origin of the data in plain values, for the provenance in ``extrinsic.yaml``. Its entry
+        ``options`` becomes the entry ``parameters`` of the provenance.
 
     Returns
     -------
@@ -121,9 +122,10 @@ def save_text(path: Path, text: str) -> Path:
 
 
 def _written(directory: Path, texts: Mapping[str, str | None]) -> Path:
-    """Write texts into files of a directory, all or none, and return the path of the last file.
+    """Write texts into files of a directory, and return the path of the last file.
 
-    A file whose text is None is removed.
+    ``texts`` are the contents by file name; a file with None is removed. If a file cannot be
+    written, no file changes.
     """
     contents = {directory / name: text for name, text in texts.items() if text is not None}
     paths = [directory / name for name in texts]
@@ -139,7 +141,7 @@ def _written(directory: Path, texts: Mapping[str, str | None]) -> Path:
 
 
 def _yaml_text(document: Mapping[str, Any], inputs: Mapping[str, Any] | None) -> str:
-    """Return a document with its provenance as YAML."""
+    """Return a document as YAML, with the versions, options and inputs that it was made from."""
     inputs = {**(inputs or {})}
     provenance = {
         "package": "hand_eye_calib",
@@ -154,11 +156,10 @@ def _yaml_text(document: Mapping[str, Any], inputs: Mapping[str, Any] | None) ->
 
 
 def _keep_foreign(path: Path) -> None:
-    """Preserve a file that this program has not written, before it is replaced.
+    """Preserve a file that is about to be replaced, unless this program has written it.
 
-    The file gets a second name: its own with ``.kept``, ``.kept2`` and so on. Links are not
-    preserved, because their targets do not change. Files with a copy in ``previous`` are not
-    preserved either.
+    The file gets a second name: its own with ``.kept``, ``.kept2`` and so on. Links need no second
+    name, because their targets do not change, nor do files with a copy in ``previous``.
     """
     if path.is_symlink() or not path.is_file():
         return
@@ -171,7 +172,7 @@ def _keep_foreign(path: Path) -> None:
 
 
 def _free_name(path: Path) -> Path:
-    """Return the first name that no file has: ``path.kept``, ``path.kept2`` and so on."""
+    """Return the first unused path among ``path.kept``, ``path.kept2`` and so on."""
     names = (path.with_name(f"{path.name}.kept{number}") for number in ("", *range(2, 10_000)))
     return next(name for name in names if not os.path.lexists(name))
 
@@ -203,7 +204,7 @@ def keep_earlier_results(directory: str | Path) -> str:
 
 
 def fingerprint(path: str | Path) -> dict[str, str | int]:
-    """Return name, size and SHA-256 of an input file, for the provenance."""
+    """Return path, size and SHA-256 of an input file, for the provenance."""
     with open_regular(path) as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
         return {"file": str(path), "bytes": file.tell(), "sha256": digest}
@@ -235,12 +236,12 @@ def load_result(path: str | Path) -> Calibration:
 
 
 def xacro_text(calibration: Judged) -> str:
-    """Return a fixed joint from the parent's to the child's link, for a robot description."""
+    """Return a xacro file with a fixed joint between the parent's link and the child's link."""
     parent = calibration.mounting[0]
     child = calibration.child_frame
     numbers = usable_numbers(calibration) | usable_angles(calibration)
     comment = "\n".join(f"     {line}" for line in _remarks(calibration))
-    # XML forbids two hyphens in a comment.
+    # XML forbids two hyphens in a comment: separate them by a space.
     return _template(XACRO_NAME).format(
         comment=re.sub("-(?=-)", "- ", comment),
         joint=_quoted(f"{parent}_to_{child}"),
@@ -270,6 +271,7 @@ def launch_text(calibrations: Sequence[Judged]) -> str:
 
 
 def _template(name: str) -> str:
+    """Return the template of a file, with fields in braces."""
     return Path(__file__).with_name("templates").joinpath(f"{name}.in").read_text("utf-8")
 
 

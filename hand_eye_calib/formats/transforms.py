@@ -1,4 +1,8 @@
-"""Poses of a frame in another frame, from transforms that arrive live or are read from a bag."""
+"""Poses of a sensor's frame in a world frame, composed from the transforms of ``/tf``.
+
+An edge is the transform between a frame and its parent in the tree. The transforms arrive live or
+are read from a bag.
+"""
 
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,12 +19,13 @@ from hand_eye_calib.core.base.text import split_frames
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import FrameTree, check_pose
 
-# If the stamps of an edge jump back by more than this (ns), a new session begins.
+# A new recording begins if the stamps of an edge jump back by more than this (ns).
 _JUMP_BACK_NS = STAMP_UNITS["s"]
 
-# Smallest number of transforms for an estimate of an edge's rate.
+# Number of transforms of an edge from which its rate is estimated.
 _RATE_FROM = 5
-# Largest number of transforms of a moving edge that are stored.
+# Largest number of transforms that are stored for each moving edge, until the other edges reach
+# their stamps.
 _MOST_KEPT = 2000
 
 # Pose x y z qx qy qz qw of a frame in its parent.
@@ -30,7 +35,7 @@ _MovingEdge = deque[tuple[int, _Row]]
 
 
 class TfSource(NamedTuple):
-    """Pair of frames: the fixed frame of the poses, and the frame of the sensor."""
+    """Pair of frames: the world frame of the poses, and the frame of the sensor."""
 
     world_frame: str
     sensor_frame: str
@@ -40,15 +45,15 @@ class TfSource(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> "TfSource":
-        """Return the source of ``world:sensor``; a ConfigError if the frames are not different."""
+        """Parse ``world:sensor``; raise a ConfigError if these are not two different frames."""
         return cls(*split_frames("a transform", text))
 
 
 class PoseFields(NamedTuple):
-    """Stamped pose or transform of a message; positions in m.
+    """Stamped pose or transform from a message; the position is in m.
 
-    For a transform, the frames are its parent and its child. ``sensor_frame`` is None if the type
-    of the message has no such field.
+    ``world_frame`` and ``sensor_frame`` of a transform are its parent frame and its child frame.
+    ``sensor_frame`` is None if the type of the message has no such field.
     """
 
     stamp_ns: int
@@ -61,17 +66,19 @@ class PoseFields(NamedTuple):
 class TfStream:
     """Stream of a sensor's poses, composed from the edges of a transform tree as they arrive.
 
-    Each transform of the moving edge with the lowest rate makes one pose. The other moving edges
-    are interpolated at its stamp, never extrapolated, and never across a gap of more than
-    ``max_gap_s``. Repeated and late transforms of an edge are skipped.
+    Each transform of the moving edge with the lowest rate becomes one pose. The other moving edges
+    are interpolated at its stamp. They are not extrapolated, and not interpolated between
+    transforms that are more than ``max_gap_s`` apart. Transforms with a stamp that is not later
+    than the last stamp of their edge are skipped.
 
     Parameters
     ----------
     source : TfSource
     max_gap_s : float
-        The attribute of this name may be changed later.
+        Largest time between two transforms (s) for interpolation. The attribute of this name may
+        be changed later.
     tree : FrameTree, optional
-        Edges that are known before the first transform.
+        Edges that are known before the first transform arrives.
     """
 
     def __init__(self, source: TfSource, max_gap_s: float, tree: FrameTree | None = None) -> None:
@@ -83,7 +90,7 @@ class TfStream:
         self._find_chain()
 
     def add(self, transform: PoseFields, is_static: bool) -> Iterator[PoseFields]:
-        """Add a transform, and yield the poses that it completes.
+        """Add a transform, and yield the sensor's poses for which all edges are now known.
 
         Raises the errors of :meth:`edges_at`.
         """
@@ -95,7 +102,7 @@ class TfStream:
     def edges_at(
         self, transform: PoseFields, is_static: bool
     ) -> Iterator[tuple[int, dict[str, _Row]]]:
-        """Add a transform, and yield the stamps at which it completes the pose.
+        """Add a transform, and yield the stamps at which all edges are now known.
 
         Yields
         ------
@@ -111,14 +118,14 @@ class TfStream:
         parent = transform.world_frame
         frame = transform.sensor_frame or ""
         edges = self._tree.edges
-        before = edges[frame].is_static if frame in edges else None
+        was_static = edges[frame].is_static if frame in edges else None
         row = (*transform.position, *transform.quat_xyzw)
         if is_static or frame in self._moving:
             with located(f"transform {parent}:{frame}"):
                 check_pose(*row)
         pose = _matrices(row) if is_static else None
-        is_fixed = self._tree.add(parent, frame, pose, is_static).is_static
-        if before != is_fixed:
+        # The chain of edges changes if the edge is new, or if a static edge begins to move.
+        if was_static != self._tree.add(parent, frame, pose, is_static).is_static:
             self._find_chain()
         if frame in self._moving and not is_static:
             yield from self._move(frame, transform.stamp_ns, row)
@@ -129,7 +136,7 @@ class TfStream:
         return self._tree.pose(*self.source, matrices)
 
     def describe_missing(self) -> str:
-        """Return the reason why there is no pose yet."""
+        """Return why there is no pose yet, as text for the user."""
         try:
             up, down = self._tree.route(*self.source)
         except InputError as error:
@@ -142,7 +149,7 @@ class TfStream:
         return "its transforms have no common time"
 
     def _find_chain(self) -> None:
-        """Find the moving edges between both frames; none if the frames are not connected."""
+        """Update the moving edges between both frames; none if the frames are not connected."""
         self._slowest = ""
         frames = []
         with suppress(InputError):
@@ -153,7 +160,7 @@ class TfStream:
         }
 
     def _move(self, frame: str, stamp_ns: int, row: _Row) -> Iterator[tuple[int, dict[str, _Row]]]:
-        """Add a pose of a moving edge, and yield the stamps and poses that it completes."""
+        """Add a pose of a moving edge; yield as :meth:`edges_at`."""
         last_ns = self._last_ns.get(frame, stamp_ns - 1)
         if last_ns - _JUMP_BACK_NS <= stamp_ns <= last_ns:
             return
@@ -170,7 +177,11 @@ class TfStream:
             yield from self._completed()
 
     def _completed(self) -> Iterator[tuple[int, dict[str, _Row]]]:
-        """Yield the stamps of the slowest edge that all edges have reached, and their poses."""
+        """Yield the stamps of the slowest edge that all other edges have reached.
+
+        Each stamp comes with the poses of the moving edges at this stamp, see :meth:`edges_at`.
+        Stamps at which an edge cannot be interpolated are skipped.
+        """
         slowest = self._moving[self._slowest]
         others = {name: edge for name, edge in self._moving.items() if edge is not slowest}
         while slowest and all(edge and edge[-1][0] >= slowest[0][0] for edge in others.values()):
@@ -184,8 +195,8 @@ class TfStream:
                 yield at_ns, rows
 
     def _find_slowest(self) -> str:
-        """Return the moving edge with the lowest rate; empty until the rates of all are known."""
-        # In this usual case, no pose has to wait.
+        """Return the moving edge with the lowest rate; empty until all rates can be estimated."""
+        # A single moving edge is the usual case. Its poses need not wait for an estimate of rates.
         if len(self._moving) == 1:
             return next(iter(self._moving))
         if any(len(edge) < _RATE_FROM for edge in self._moving.values()):
@@ -198,10 +209,11 @@ class TfStream:
 
 
 def _interpolated(edge: _MovingEdge, stamp_ns: int, max_gap_s: float) -> _Row | None:
-    """Return the pose of an edge at a stamp; None before the first pose and in long gaps.
+    """Return the interpolated pose of an edge at a stamp (ns).
 
-    The stamp must not be after the last pose. Earlier poses are removed, so the stamps of calls
-    must not decrease.
+    The result is None before the first pose, and between poses more than ``max_gap_s`` apart. The
+    stamp must not be later than the last pose. Poses before the stamp are removed from ``edge``, so
+    stamps must not decrease from call to call.
     """
     while len(edge) > 1 and edge[1][0] <= stamp_ns:
         edge.popleft()
@@ -217,11 +229,11 @@ def _interpolated(edge: _MovingEdge, stamp_ns: int, max_gap_s: float) -> _Row | 
 
 
 def _row(T: FloatArray) -> _Row:
-    """Return x y z qx qy qz qw of a pose (4, 4)."""
+    """Convert a pose (4, 4) to x y z qx qy qz qw."""
     return tuple(se3.to_rows(T).tolist())
 
 
 def _matrices(rows: ArrayLike) -> FloatArray:
-    """Return poses (..., 4, 4) from x y z qx qy qz qw (..., 7)."""
+    """Convert x y z qx qy qz qw (..., 7) to poses (..., 4, 4)."""
     rows = np.asarray(rows)
     return se3.from_quat_xyzw(rows[..., :3], rows[..., 3:])

@@ -1,8 +1,8 @@
 """Read YAML files of unknown origin within limits.
 
-Every YAML file of the package is read here, also JSON with comments and YAML of OpenCV. Values are
-those of JSON; a date is read as text. Other tags of YAML, repeated keys, aliases, and documents
-that are too large or too deep raise an error of one line.
+Every YAML file of the package is read here, also JSON with comments and YAML of OpenCV. The values
+are those of JSON; a date is read as text. An error of one line is raised for other tags of YAML,
+repeated keys, aliases, and documents that are too large or too deeply nested.
 """
 
 import re
@@ -23,11 +23,12 @@ from hand_eye_calib.formats.files import (
     read_text,
 )
 
-# Largest number of characters of a whole number: 64 binary digits with underscores.
+# Largest number of characters of a whole number: 64 binary digits, with room for underscores.
 _LONGEST_INT = 100
+# Tags of YAML for the values of JSON.
 _TAGS = ("null", "bool", "int", "float", "str", "seq", "map")
 
-# The loader of libyaml takes a fraction of the time. Most builds contain it.
+# The loader of libyaml is several times faster. Most builds of the package yaml contain it.
 _Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _dump = partial(yaml.dump, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False)
 
@@ -35,7 +36,7 @@ _dump = partial(yaml.dump, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper),
 class _Loader(_Base):
     """Safe loader of YAML, restricted to the values of JSON."""
 
-    # Dates are not recognised, because an impossible date such as 2024-13-45 would be an error.
+    # Read dates as text: an impossible date such as 2024-13-45 would otherwise be an error.
     yaml_implicit_resolvers: ClassVar = {
         first: [(tag, pattern) for tag, pattern in resolvers if not tag.endswith(":timestamp")]
         for first, resolvers in _Base.yaml_implicit_resolvers.items()
@@ -47,6 +48,7 @@ class _Loader(_Base):
     }
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        """Return a mapping; raise a ValueError for a repeated key."""
         names = set()
         for key, _ in node.value:
             if (name := str(key.value)) in names:
@@ -57,9 +59,9 @@ class _Loader(_Base):
 
 
 def _whole_number(loader: Any, node: Any) -> int:
-    """Return a whole number in any base.
+    """Return a whole number in any base; raise a ValueError if it does not fit into 64 bits.
 
-    The length of the text is checked first, because ``0xff...`` may have any length.
+    The length of the text is checked first, because the conversion of long texts takes long.
     """
     is_short = len(node.value) <= _LONGEST_INT
     number = int(loader.construct_yaml_int(node)) if is_short else LARGEST_INT
@@ -78,7 +80,7 @@ def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
     ----------
     path : str or path-like
     expected : str
-        Description of the file for errors.
+        Description of the file that is expected, for errors.
 
     Raises
     ------
@@ -91,7 +93,7 @@ def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
     try:
         _check_events(text)
         return yaml.load(text, Loader=_Loader)
-    # The loader raises errors of many kinds for values that do not fit their tags.
+    # The loader raises errors of many types for values that do not fit their tags.
     except Exception as error:
         reason = shortened(" ".join(str(error).split()), LONGEST_NAME // 2) or type(error).__name__
         raise InputError(f"{path} is not readable YAML: {reason}") from None
