@@ -109,19 +109,18 @@ def limits_table():
         elif line.startswith("#:"):
             text.append(line.removeprefix("#:").strip())
         elif match := re.match(r"([A-Z][A-Z_]*) = ", line):
-            meaning = " ".join(text).rstrip(".")
-            lines.append(
-                f"| {section} | {meaning} | {readable(meaning, getattr(files, match[1]))} |"
-            )
+            meaning, in_bytes, more = " ".join(text).rstrip(".").partition(" (bytes)")
+            limit = readable(getattr(files, match[1]), bool(in_bytes))
+            lines.append(f"| {section} | {meaning}{more} | {limit} |")
             text = []
     return "\n".join(lines)
 
 
-def readable(meaning, value):
-    """A limit with its unit: bytes in MiB."""
-    if meaning.startswith("Bytes") and value % (1 << 20) == 0:
+def readable(value, is_in_bytes):
+    """Return a limit as text; many bytes are in MiB."""
+    if is_in_bytes and value % (1 << 20) == 0:
         return f"{value >> 20:,} MiB"
-    return f"{value:,}" if isinstance(value, int) else f"{value:g}"
+    return f"{value:,} bytes" if is_in_bytes else f"{value:,}"
 
 
 def test_limits_are_those_of_the_code():
