@@ -27,7 +27,7 @@ _MODULES = {
     "save": "hand_eye_calib.formats.results",
     "read_trajectory": "hand_eye_calib.formats.trajectory_files.reading",
     "write_trajectory": "hand_eye_calib.formats.trajectory_files.table",
-    "plot": "hand_eye_calib.offline.report.figures",
+    "plot": "hand_eye_calib.offline.report.views",
     "Calibration": "hand_eye_calib.core.results.calibration",
     "Residuals": "hand_eye_calib.core.results.records",
     "SolveStatus": "hand_eye_calib.core.results.records",

@@ -27,6 +27,6 @@ from hand_eye_calib.formats.trajectory_files.reading import read_trajectory as r
 from hand_eye_calib.formats.trajectory_files.table import write_trajectory as write_trajectory
 from hand_eye_calib.offline.calibrate import calibrate as calibrate
 from hand_eye_calib.offline.calibrate import cross_check as cross_check
-from hand_eye_calib.offline.report.figures import plot as plot
+from hand_eye_calib.offline.report.views import plot as plot
 
 __version__: str

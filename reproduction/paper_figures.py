@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator
 
-from hand_eye_calib.offline.report.figures import page_style
+from hand_eye_calib.offline.report.style import page_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -46,7 +46,7 @@ def _export() -> Any:
 
 
 def _plot(result: Any, ax: Any) -> Any:
-    from hand_eye_calib.offline.report.figures import plot
+    from hand_eye_calib.offline.report.views import plot
 
     return plot(result, ax)
 

@@ -34,8 +34,8 @@ from hand_eye_calib.extras.simulation.options import REALISTIC
 from hand_eye_calib.offline.cli import main as cli
 from hand_eye_calib.offline.cli.reporting import write_report
 from hand_eye_calib.offline.report import evidence
-from hand_eye_calib.offline.report.figures import _VIEWS
 from hand_eye_calib.offline.report.report import render
+from hand_eye_calib.offline.report.views import VIEWS
 
 FIGURES = ("views", "trajectories", "coordinates", "residuals", "streams")
 VOID = {"meta", "br", "hr", "img", "link", "input"}
@@ -408,7 +408,7 @@ def test_no_sentence_speaks_against_a_green_verdict():
 
 def test_views_are_named_by_where_one_looks_from():
     from_where = {"from above": [0, 0, 1], "from the side": [0, -1, 0], "from the front": [1, 0, 0]}
-    for (across, up), name in _VIEWS.items():
+    for (across, up), name in VIEWS.items():
         axes = np.eye(3)[["xyz".index(across), "xyz".index(up)]]
         assert np.cross(*axes).tolist() == from_where[name]
 
@@ -424,7 +424,7 @@ def test_an_unknown_axis_is_a_line_along_that_axis(unknown):
         observability_measured=dofs(sigmas, unknown),
     )
     place = dict(zip("xyz", result.translation, strict=True))
-    for panel, axes in zip(hec.plot(result).axes, _VIEWS, strict=True):
+    for panel, axes in zip(hec.plot(result).axes, VIEWS, strict=True):
         lines = ends_of_dashed_lines(panel)
         assert len(lines) == (unknown in axes)
         for ends in lines:
@@ -461,7 +461,7 @@ def test_an_unknown_direction_between_axes_is_drawn_as_it_is():
         covariance_measured=covariance,
         observability_measured=dofs([np.inf, 1e-3, np.inf, 1e-3, 1e-3, 1e-3]),
     )
-    for panel, axes in zip(hec.plot(result).axes, _VIEWS, strict=True):
+    for panel, axes in zip(hec.plot(result).axes, VIEWS, strict=True):
         (ends,) = ends_of_dashed_lines(panel)
         along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
         expected = direction[["xyz".index(axis) for axis in axes]]

@@ -17,7 +17,7 @@ _LENGTH = 30_000
 # several seconds, an exponential one years.
 _MOST_S = 2.0
 # Patterns that meet only what the package has drawn itself.
-_OF_OWN_TEXT = {"offline/report/figures.py"}
+_OF_OWN_TEXT = {"offline/report/style.py"}
 # Most characters of a pattern from which hostile texts are made.
 _ALPHABET = 5
 

@@ -19,7 +19,8 @@ from hand_eye_calib.core.base.text import ABOUT, counted, listing, with_sigma
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.extras.fleet.records import Recorded
 from hand_eye_calib.extras.fleet.together import row_of_result
-from hand_eye_calib.offline.report.figures import (
+from hand_eye_calib.offline.report.report import TONES, page
+from hand_eye_calib.offline.report.style import (
     BAD,
     GRID,
     INK,
@@ -29,7 +30,6 @@ from hand_eye_calib.offline.report.figures import (
     as_drawn,
     page_style,
 )
-from hand_eye_calib.offline.report.report import TONES, page
 
 _AXES = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}
 _GRAVITY = ("bad", "warn", "good")
@@ -67,7 +67,7 @@ def render_batch(
     counts = Counter(cell[2] for cell in cells)
     ordered = sorted(vehicles.items(), key=lambda item: _gravity(item[1].verdict.value))
     shown_vehicles = []
-    for number, (name, result) in enumerate(ordered[: LOOK.vehicles], start=1):
+    for number, (name, result) in enumerate(ordered[: LOOK.max_vehicles], start=1):
         values = _values(row_of_result(result.to_dict()))
         shown_vehicles.append((name, result, values, _trend(result, number)))
     return page(
@@ -76,7 +76,7 @@ def render_batch(
         counted(len(rows), "recording"),
         listing([f"{count:,} {verdict}" for verdict, count in counts.most_common()]),
         batch=Path(title.rstrip("/*")).name or title,
-        vehicles_left_out=max(0, len(ordered) - LOOK.vehicles),
+        vehicles_left_out=max(0, len(ordered) - LOOK.max_vehicles),
         vehicles=shown_vehicles,
         rows=cells,
         tones=TONES,

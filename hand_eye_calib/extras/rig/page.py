@@ -8,8 +8,8 @@ from hand_eye_calib.core.results.document import printed_numbers, transforms_of
 from hand_eye_calib.extras.rig.rig import RigCalibration, calibrate_rig
 from hand_eye_calib.formats.results import save_rig
 from hand_eye_calib.offline.cli.reporting import write_page
-from hand_eye_calib.offline.report.figures import figure_of_views
 from hand_eye_calib.offline.report.report import TONES, page
+from hand_eye_calib.offline.report.views import figure_of_views
 
 # Frame of a child sensor without a name. A rig uses the name of the input for such a sensor.
 _NAMELESS = "child_sensor"

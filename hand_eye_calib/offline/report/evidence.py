@@ -1,4 +1,4 @@
-"""Evidence of a report beside the result: paths, excitation, both streams before any solve."""
+"""Evidence for a result in its report: both paths, motion, and both streams before any solve."""
 
 from dataclasses import dataclass, replace
 
@@ -16,12 +16,12 @@ from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.document import UNKNOWN_M
 
-# Shortest step (s) of a path length. Shorter steps would add up the noise.
-_PATH_STEP_S = 0.2
+# Shortest step (s) of which the length of a path is summed. Shorter steps would sum the noise.
+_MIN_PATH_STEP_S = 0.2
 
-# Most samples of the angular rates of a stream.
+# Largest number of samples of the rates of a stream.
 _MAX_RATES = 1500
-# Shortest window of an angular rate (s).
+# Shortest window (s) over which a rate is computed.
 _MIN_WINDOW_S = 0.2
 
 
@@ -32,14 +32,17 @@ class StreamSummary:
     Attributes
     ----------
     poses : int
+        Number of poses.
     duration_s : float
+        Time between the first and the last pose (s).
     rate_hz : float
-        Of the median interval.
+        Inverse of the median interval (Hz).
     longest_interval_s : float
+        Longest interval between two poses (s).
     path_m : float or None
-        Length of the path; None without positions.
+        Length of the path (m); None without positions.
     rotation_rad : float or None
-        Sum of all rotation angles; None without orientations.
+        Sum of all rotation angles (rad); None without orientations.
     """
 
     poses: int
@@ -53,7 +56,7 @@ class StreamSummary:
 def summarise(trajectory: Trajectory) -> StreamSummary:
     """Summarise a trajectory of at least two poses."""
     intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
-    poses = coarse(trajectory, max(_PATH_STEP_S, median(intervals_s))).poses
+    poses = coarse(trajectory, max(_MIN_PATH_STEP_S, median(intervals_s))).poses
     steps = np.linalg.norm(np.diff(se3.translation_of(poses), axis=0), axis=1)
     angles = se3.rotation_angle(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
     return StreamSummary(
@@ -68,18 +71,18 @@ def summarise(trajectory: Trajectory) -> StreamSummary:
 
 @dataclass(frozen=True, kw_only=True)
 class StreamView:
-    """Rates of the parent and of the child, in this order, before any solve.
+    """Angular rates or speeds of the parent and of the child, in this order, before any solve.
 
     Times are on the parent's clock, lengths in the parent's unit.
 
     Attributes
     ----------
     quantity : {"angular rate", "speed"}
-        The speed if one sensor has positions without orientations.
+        Speed if one sensor has positions without orientations.
     rates : 2 x (times_s, rates)
-        rad/s or m/s; NaN in gaps.
+        Times (s) and rates (rad/s or m/s) of each stream; NaN in gaps.
     spans_s : 2 x (M, 2) arrays
-        Start and end of the times in which each stream has poses, without long gaps.
+        Start and end (s) of each time for which a stream has poses without a long gap.
     """
 
     quantity: str
@@ -87,8 +90,8 @@ class StreamView:
     spans_s: tuple[FloatArray, ...]
 
     @property
-    def apart(self) -> float:
-        """Median difference of both rates (rad/s) or speeds (m/s); NaN if they never overlap."""
+    def difference(self) -> float:
+        """Median difference of both rates (rad/s or m/s); NaN if the streams never overlap."""
         (times_s, parent_rates), (child_times_s, child_rates) = self.rates
         if not len(child_times_s):
             return float("nan")
@@ -100,23 +103,26 @@ class StreamView:
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """Evidence in the figures beside the Calibration itself.
+    """What the figures of a report draw, besides the Calibration.
 
     Attributes
     ----------
     times_s : (N,) array
-        Of both paths, s.
+        Times of both paths (s).
     parent, child : (N, 3) arrays
-        Paths of one sensor, m: from its own stream, and from the other stream through the result.
-        The sensor is the parent, in its world, or the sensor without orientations, in its frame.
+        Two paths of one sensor (m), from the parent's stream and from the child's stream. One path
+        is measured by this sensor, the other is computed from the other stream and the result. The
+        sensor is the parent, or the sensor that has positions without orientations. The paths are
+        in this sensor's world and begin at its first position.
     angles : 2 x (N, 3) arrays, or None
-        Roll, pitch and yaw (rad) of the parent against its first pose, from both streams in this
-        order; None if a stream does not measure poses.
+        Roll, pitch and yaw (rad) of the parent relative to its first pose: as measured, and as
+        computed from the child's stream. None if a stream does not measure poses.
     excitation : Excitation
         Motion of the sensors.
     streams : StreamView
+        Rates of both streams.
     has_positions_of_parent : bool
-        The parent has positions without orientations.
+        Whether the parent has positions without orientations.
     """
 
     times_s: FloatArray
@@ -129,9 +135,9 @@ class Evidence:
 
 
 def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
-    """Collect the evidence of a result from the poses and options that gave it."""
+    """Compute the evidence for a result from its poses and options."""
     config = snapshot.config
-    # Estimating the time offset again would cost time.
+    # The clock offset is known from the result: a second estimate would take time.
     settled = replace(config, time_offset=calibration.time_offset_s)
     pose_pairs = replace(snapshot, config=settled).pose_pairs.child_scaled(calibration.scale)
     parent_is_positions = config.parent_measures == "positions"
@@ -156,7 +162,7 @@ def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
 
 
 def view_streams(parent: Trajectory, child: Trajectory, max_gap_s: float) -> StreamView:
-    """Return the rates of two trajectories on one clock, in one unit of length."""
+    """Return the rates of two trajectories that are on one clock and in one unit of length."""
     start_ns = min(parent.stamps_ns[0], child.stamps_ns[0])
     longest_s = max(parent.duration_s, child.duration_s)
     step_s = max(parent.interval_s, child.interval_s, longest_s / _MAX_RATES)
@@ -168,6 +174,8 @@ def view_streams(parent: Trajectory, child: Trajectory, max_gap_s: float) -> Str
         values = angular_rates(stream, window_s, step_s, max_gap_s, of_speed=not has_rates)
         first_s = (stream.stamps_ns[0] - start_ns) * 1e-9
         rates.append((first_s + np.arange(len(values)) * step_s, values))
+        # Each gap ends a span and begins the next one. So the sorted edges are pairs of start and
+        # end.
         gaps = np.flatnonzero(are_gaps(np.diff(stream.stamps_ns) * 1e-9, max_gap_s))
         edges_ns = stream.stamps_ns[np.sort(np.r_[0, gaps, gaps + 1, len(stream) - 1])]
         spans_s.append((edges_ns.reshape(-1, 2) - start_ns) * 1e-9)
@@ -178,7 +186,10 @@ def view_streams(parent: Trajectory, child: Trajectory, max_gap_s: float) -> Str
 def _paths_of_positions(
     calibration: Calibration, pose_pairs: PosePairs, parent_is_positions: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the paths of parent and child; rotation and mean of the path align their worlds."""
+    """Return the paths (N, 3) of the sensor with positions, from the parent's and child's stream.
+
+    The computed path is moved onto the measured one by the best rotation and by the mean.
+    """
     if parent_is_positions:
         poses = pose_pairs.Ts_cw_c @ calibration.T_child_parent
         positions = se3.translation_of(pose_pairs.Ts_pw_p)
@@ -190,6 +201,7 @@ def _paths_of_positions(
     center = positions.mean(axis=0)
     rotation = se3.nearest_rotation((positions - center).T @ path)
     path = path @ rotation.T + center
+    # Both paths begin at the first measured position.
     measured = positions - positions[0]
     computed = path - positions[0]
     return (measured, computed) if parent_is_positions else (computed, measured)
@@ -198,9 +210,10 @@ def _paths_of_positions(
 def _paths_of_poses(
     calibration: Calibration, pose_pairs: PosePairs
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the path of the parent as measured, and as computed from the child.
+    """Return the path (N, 3) of the parent as measured, and as computed from the child's stream.
 
-    The mean rotation and the median shift of all poses align the worlds.
+    The computed path is moved onto the measured one by the mean rotation between the worlds and by
+    the median difference.
     """
     Ts_cw_p = pose_pairs.Ts_cw_c @ calibration.T_child_parent
     parent = se3.translation_of(pose_pairs.Ts_pw_p)
@@ -210,20 +223,27 @@ def _paths_of_poses(
 
 
 def _between_worlds(pose_pairs: PosePairs, Ts_cw_p: FloatArray) -> FloatArray:
-    """Return the mean rotation (3, 3) from the child's world to the parent's world."""
+    """Return the mean rotation (3, 3) from the child's world to the parent's world.
+
+    ``Ts_cw_p`` (N, 4, 4) are the parent's poses in the child's world.
+    """
     rotations = se3.rotation_of(pose_pairs.Ts_pw_p) @ np.swapaxes(se3.rotation_of(Ts_cw_p), 1, 2)
     return se3.nearest_rotation(rotations.mean(axis=0))
 
 
 def _angles(calibration: Calibration, pose_pairs: PosePairs) -> tuple[FloatArray, FloatArray]:
-    """Return roll, pitch and yaw of the parent as measured, and as computed from the child."""
+    """Return roll, pitch and yaw (N, 3) of the parent as measured, and as computed.
+
+    The computed angles (rad) are from the child's stream and the result. All angles are relative to
+    the first measured pose.
+    """
     Ts_cw_p = pose_pairs.Ts_cw_c @ calibration.T_child_parent
     measured = se3.rotation_of(pose_pairs.Ts_pw_p)
     computed = _between_worlds(pose_pairs, Ts_cw_p) @ se3.rotation_of(Ts_cw_p)
     first = measured[0].T
     measured_rad = np.unwrap(se3.rotation_to_rpy(first @ measured), axis=0)
     computed_rad = np.unwrap(se3.rotation_to_rpy(first @ computed), axis=0)
-    # Both begin on the same turn.
+    # Unwrapped angles may differ by whole turns: remove them.
     computed_rad -= 2 * np.pi * np.round((computed_rad[0] - measured_rad[0]) / (2 * np.pi))
     return measured_rad, computed_rad
 
@@ -231,16 +251,22 @@ def _angles(calibration: Calibration, pose_pairs: PosePairs) -> tuple[FloatArray
 def spread_of_position(calibration: Calibration) -> tuple[FloatArray, FloatArray]:
     """Return covariance and unknown directions of the child's position, in the parent's axes.
 
-    The covariance (3, 3), m^2, is without the unknown directions, which are unit vectors (K, 3).
+    Returns
+    -------
+    covariance : (3, 3) array
+        Covariance (m^2) without its part along unknown directions.
+    unknown : (K, 3) array
+        Unit vectors of the unknown directions.
     """
     sigmas_m = calibration.sigmas[:3]
     is_unknown = ~np.isfinite(sigmas_m)
     covariance = calibration.covariance[:3, :3]
     if np.isfinite(covariance).all():
+        # An unknown direction need not be along an axis: it is an eigenvector with a huge variance.
         R = se3.rotation_of(calibration.T_parent_child)
         variances, directions = np.linalg.eigh(R @ covariance @ R.T)
-        is_vague = (variances > UNKNOWN_M**2) & is_unknown.any()
-        if is_vague.any() or not is_unknown.any():
-            known = directions[:, ~is_vague]
-            return (known * variances[~is_vague]) @ known.T, directions[:, is_vague].T
+        is_huge = (variances > UNKNOWN_M**2) & is_unknown.any()
+        if is_huge.any() or not is_unknown.any():
+            finite = directions[:, ~is_huge]
+            return (finite * variances[~is_huge]) @ finite.T, directions[:, is_huge].T
     return np.diag(np.where(is_unknown, 0.0, sigmas_m) ** 2), np.eye(3)[is_unknown]

@@ -34,8 +34,11 @@ from hand_eye_calib.core.results.parts import advice_of
 from hand_eye_calib.core.results.records import ROTATIONS
 from hand_eye_calib.core.results.verdict import shown, target_of
 from hand_eye_calib.offline.report.evidence import Evidence, gather, summarise
-from hand_eye_calib.offline.report.figures import LOOK, figure_of_views, figures_of
+from hand_eye_calib.offline.report.figures import figures_of
+from hand_eye_calib.offline.report.style import LOOK
+from hand_eye_calib.offline.report.views import figure_of_views
 
+# Sign of each tone. A tone is also a class in page.css.
 MARKS = {"good": "✓", "warn": "!", "bad": "✗"}
 TONES = {
     Verdict.USE.value: "good",
@@ -43,7 +46,7 @@ TONES = {
     Verdict.DO_NOT_USE.value: "bad",
 }
 
-# Text of each verdict on an axis.
+# Explanation of each verdict on an axis.
 _WORDS = {
     "observed": "determined by the motion",
     "weak": "determined, but not well",
@@ -59,10 +62,10 @@ _AXIS_NAMES = {
     "yaw": "about z (yaw)",
 }
 
-# Frames of sensors without a name.
-_NAMELESS = ("parent_sensor", "child_sensor")
-# Figures above the details; the other figures are evidence for the result.
-_SHOWN_FIRST = ("views", "trajectories")
+# Frames of sensors that have no name of their own.
+_DEFAULT_FRAMES = ("parent_sensor", "child_sensor")
+# Names of the figures at the top of the page. All other figures are in the section Evidence.
+_TOP_FIGURES = ("views", "trajectories")
 
 _FOLDER = Path(__file__).parent / "templates"
 _TEMPLATES = jinja2.Environment(
@@ -82,17 +85,18 @@ _TEMPLATES.globals["axis_names"] = _AXIS_NAMES
 
 @cache
 def _template(path: Path) -> jinja2.Template:
-    """Compile a template once; it may extend or import the templates of this package."""
+    """Return a compiled template, which may extend or import the templates of this package."""
     return _TEMPLATES.from_string(path.read_text(encoding="utf-8"))
 
 
 def page(template: Path, tone: str, verdict: str, sentence: str, **values: Any) -> str:
-    """Return a page from its template; every page begins with a verdict.
+    """Return a page as HTML. Every page begins with a verdict.
 
     Parameters
     ----------
     template : Path
     tone : {"good", "warn", "bad"}
+        Colour and sign of the verdict.
     verdict : str
         One or two words.
     sentence : str
@@ -101,7 +105,7 @@ def page(template: Path, tone: str, verdict: str, sentence: str, **values: Any) 
         Other variables of the template.
     """
     values |= {"tone": tone, "mark": MARKS[tone], "marks": MARKS, "verdict": verdict}
-    return _template(template).render(**values, said=text.capital(sentence))
+    return _template(template).render(**values, sentence=text.capital(sentence))
 
 
 def render(
@@ -113,16 +117,16 @@ def render(
     ----------
     calibration : Calibration
     snapshot : Snapshot or None
-        Poses and options of the result; None for stops.
+        Poses and options of the result; None for the stops of an arm.
     inputs : dict, optional
-        Origin of the data in plain values.
+        Origin of the data, such as paths and topics, in plain values.
     """
     inputs = inputs or {}
     command = calibration.static_transform_command()
     calibration = replace(
         calibration,
-        parent_frame=_named(calibration.parent_frame, inputs.get("parent", {})),
-        child_frame=_named(calibration.child_frame, inputs.get("child", {})),
+        parent_frame=_sensor_name(calibration.parent_frame, inputs.get("parent", {})),
+        child_frame=_sensor_name(calibration.child_frame, inputs.get("child", {})),
     )
     parent = printable(calibration.parent_frame)
     child = printable(calibration.child_frame)
@@ -159,13 +163,13 @@ def render(
         target=_targets(calibration),
         reasons=shown(calibration.reasons),
         figures=figures_of(calibration, evidence),
-        shown_first=_SHOWN_FIRST,
+        top_figures=_TOP_FIGURES,
         **_data(calibration, snapshot, evidence, inputs),
     )
 
 
 def render_brief(calibration: Calibration) -> str:
-    """Return verdict, numbers and the three views of a result as HTML for a notebook."""
+    """Return headline, pose and the three views of a result as HTML for a notebook."""
     transform = transforms_of(calibration)["T_parent_child"]
     return _template(_FOLDER / "brief.html").render(
         calibration=calibration,
@@ -177,7 +181,10 @@ def render_brief(calibration: Calibration) -> str:
 
 
 def _other_transforms(calibration: Calibration) -> list[tuple[Notation, tuple[str, str]]]:
-    """Return the transforms of parts, such as the target in the base, with source and target."""
+    """Return further transforms of the result with the names of their source and target frames.
+
+    The stops of an arm have one, for example: the pose of the target in the base.
+    """
     transforms = transforms_of(calibration)
     return [
         (transforms[name], (printable(extra.source), printable(extra.target)))
@@ -186,31 +193,36 @@ def _other_transforms(calibration: Calibration) -> list[tuple[Notation, tuple[st
 
 
 def _kind_of_result(calibration: Calibration) -> str:
-    """Return "Pose", or the part of a pose that the result has."""
+    """Return "Pose", or "Position" or "Orientation" if the streams determine only this part."""
     unknown = {*calibration.out_of_reach}
     if unknown & {*ROTATIONS}:
         return "Position"
     return "Orientation" if unknown else "Pose"
 
 
-def _named(frame: str, origin: Document) -> str:
-    """Return the name of a sensor: its frame, or its topic or file if the frame has no name."""
+def _sensor_name(frame: str, origin: Document) -> str:
+    """Return the frame of a sensor; its topic or file if the frame is a default name."""
     source = str(origin.get("topic") or Path(str(origin.get("file", ""))).stem)
-    return source if frame in _NAMELESS and source else frame
+    return source if frame in _DEFAULT_FRAMES and source else frame
 
 
 def _at_distance(calibration: Calibration) -> str:
-    """State the error of an object at a distance; empty if a standard deviation is unknown."""
+    """Return a sentence about the position error of an object that the child sensor measures.
+
+    The sentence is empty if a standard deviation is unknown.
+    """
     if not np.isfinite(calibration.sigmas).all():
         return ""
-    # Stops are those of an arm: its objects are near, and no odometry has errors.
+    # The objects of an arm are near, and its stops have no errors of an odometry.
     are_stops = calibration.reference == "stops"
-    distance_m = LOOK.near_m if are_stops else LOOK.distance_m
+    distance_m = LOOK.near_object_m if are_stops else LOOK.object_m
     errors = "one standard deviation"
     if not are_stops:
         errors += ", constant odometry errors included"
+    # The object is on an axis of the child sensor. The direction with the largest error counts.
     variances = []
     for point in distance_m * np.eye(3):
+        # Derivative of the object's position with respect to the error of the pose.
         J = np.hstack([np.eye(3), -se3.skew(point)])
         variances.append(np.linalg.eigvalsh(J @ calibration.covariance @ J.T)[-1])
     child = printable(calibration.child_frame)
@@ -221,7 +233,7 @@ def _at_distance(calibration: Calibration) -> str:
 
 
 def _targets(calibration: Calibration) -> str:
-    """Return the targets of x, y and z, of the rotations, and of the axes with their own target."""
+    """Return the targets of translation and rotation, and those of axes with their own target."""
     targets = [
         text.length(calibration.target_translation),
         text.angle(calibration.target_rotation),
@@ -232,10 +244,20 @@ def _targets(calibration: Calibration) -> str:
 
 
 class AxisRow(NamedTuple):
-    """Row of the table of uncertainties.
+    """Row of the table of uncertainties, for one axis.
 
-    ``bar`` is the length of the bar of the standard deviation in per cent, ``measured`` that of its
-    measured part.
+    Attributes
+    ----------
+    name, title : str
+        Name of the axis, such as "roll", and its title, such as "about x (roll)".
+    sigma : str
+        Standard deviation with its unit.
+    verdict, words : str
+        Verdict on the axis, and its explanation.
+    bar : float
+        Length of the bar of the standard deviation (per cent).
+    measured : float
+        Length of the bar without the allowance (per cent).
     """
 
     name: str
@@ -266,9 +288,9 @@ def _axes(calibration: Calibration) -> Iterable[AxisRow]:
 
 
 def _bar(ratio: float) -> float:
-    """Return the length of a bar in per cent from the ratio of sigma to its target."""
+    """Return the length of a logarithmic bar (per cent) from the ratio of sigma to its target."""
     with np.errstate(divide="ignore"):
-        decades = LOOK.bar_above - np.log10(ratio)
+        decades = LOOK.decades_above - np.log10(ratio)
     return float(np.clip(100 * (1 - decades / LOOK.bar_decades), 1, 100))
 
 
@@ -278,7 +300,7 @@ def _bar(ratio: float) -> float:
 def _data(
     calibration: Calibration, snapshot: Snapshot | None, evidence: Evidence | None, inputs: Document
 ) -> Document:
-    """Return the origin of the result for the template."""
+    """Return the variables of the section "Data and solution" of the template."""
     defaults = CalibratorConfig().to_options()
     options = snapshot.config.to_options() if snapshot else defaults
     changed = [f"{name} {value}" for name, value in options.items() if value != defaults[name]]
@@ -304,7 +326,10 @@ def _data(
 
 
 def _stream(name: str, origin: Document, stream: Trajectory | None) -> dict[str, str]:
-    """Return origin, number of poses, duration, rate, longest gap and path length of a stream."""
+    """Return the row of a stream: source, poses, duration, rate, longest gap and path length.
+
+    A value that is not known is "-".
+    """
     count = origin.get("messages", origin.get("poses"))
     row = {"name": name, "source": origin.get("topic") or Path(origin.get("file", "-")).name}
     row |= dict.fromkeys(("poses", "rate", "duration", "gap", "path"), "-")
@@ -314,8 +339,8 @@ def _stream(name: str, origin: Document, stream: Trajectory | None) -> dict[str,
         if duration_s:
             row["duration"] = text.duration(duration_s)
             row["rate"] = f"{(count - 1) / duration_s:.1f} Hz"
-    # The stream of a bag has only the poses of pairs, and only the newest of a long bag. Its gaps
-    # are not those of the topic.
+    # The stream of a bag contains only the poses of pairs, and only the newest of a long bag. Then
+    # its gaps are not the gaps of the topic, and the values of ``origin`` stay.
     if stream is not None and len(stream) >= max(2, count or 0):
         whole = summarise(stream)
         count = len(stream)

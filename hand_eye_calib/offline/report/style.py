@@ -1,0 +1,217 @@
+"""The look of all figures: colours, sizes and fonts, and their conversion to elements of a page.
+
+All figures are light, in colours that colour-blind people can distinguish. They are made without
+pyplot, so they need no display and no global state.
+"""
+
+import io
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from hand_eye_calib.core.base.errors import printable
+from hand_eye_calib.core.base.plain import Document
+
+# Colours as they are drawn. In a page, variables of the style sheet replace them, so that a dark
+# page has lighter colours.
+INK = "#1b1f24"
+MUTED = "#5c6670"
+GRID = "#d9dee3"
+PARENT = "#0072b2"
+CHILD = "#d98300"
+BAD = "#c8452f"
+GREEN = "#009e73"
+_VARIABLES = {
+    INK: "ink",
+    MUTED: "muted",
+    GRID: "grid",
+    PARENT: "parent",
+    CHILD: "child",
+    BAD: "bad",
+    GREEN: "good",
+}
+
+
+class Look(NamedTuple):
+    """Sizes and limits of pages and figures.
+
+    Attributes
+    ----------
+    width : float
+        Width of a figure (inches). A page has about 96 pixels an inch.
+    sigmas : float
+        Half width of an ellipse or a band, in standard deviations.
+    axis_share : float
+        Length of a sensor's axes as a share of the distance between the sensors.
+    min_distance_m : float
+        Distance between the sensors (m) that is used for a smaller one in the length of the axes.
+    object_m : float
+        Distance of the object for which the error of its position is stated (m).
+    near_object_m : float
+        The same distance for the camera of an arm (m).
+    bar_decades : float
+        Length of the logarithmic scale of a bar, in powers of ten.
+    decades_above : float
+        Part of this scale above the target, in powers of ten.
+    min_in_view : float
+        Length, in a view, of a unit vector along an unknown direction. If it is shorter, the
+        direction is nearly perpendicular to the view, and its line is not drawn.
+    max_points : int
+        Largest number of points of a line, and of single dots.
+    max_coordinate_points : int
+        Largest number of points of a line of one coordinate over time.
+    max_vehicles : int
+        Largest number of vehicles on the page of a batch.
+    """
+
+    width: float = 8.6
+    sigmas: float = 3.0
+    axis_share: float = 0.22
+    min_distance_m: float = 0.05
+    object_m: float = 10.0
+    near_object_m: float = 0.5
+    bar_decades: float = 4.0
+    decades_above: float = 1.0
+    min_in_view: float = 0.1
+    max_points: int = 1000
+    max_coordinate_points: int = 400
+    max_vehicles: int = 4
+
+
+LOOK = Look()
+
+# Settings of Matplotlib that differ from its defaults.
+_STYLE: Document = {
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.titlecolor": INK,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "axes.edgecolor": MUTED,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    "savefig.facecolor": "none",
+    "font.size": 9.0,
+    "axes.labelsize": 9.0,
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
+    "legend.fontsize": 8.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.6,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.major.size": 2.5,
+    "ytick.major.size": 2.5,
+    "axes.titlesize": 9.5,
+    "axes.titleweight": "bold",
+    "axes.grid": True,
+    "grid.color": GRID,
+    "grid.linewidth": 0.5,
+    "legend.frameon": False,
+    "lines.linewidth": 1.5,
+    "path.simplify_threshold": 0.3,
+    # A fixed salt instead of a random one, so that equal figures have equal files.
+    "svg.hashsalt": "hand_eye_calib",
+    "svg.fonttype": "none",
+}
+
+
+@contextmanager
+def page_style(**more: Any) -> Iterator[None]:
+    """Draw in the style of HTML pages inside the block.
+
+    The user's own settings of Matplotlib have no effect. ``more`` are further settings, with an
+    underscore for each dot in their names.
+    """
+    changed = {name.replace("_", "."): value for name, value in more.items()}
+    defaults: Any = matplotlib.rcParamsDefault
+    context: Any = matplotlib.rc_context
+    with context({**defaults, **_STYLE, **changed}), warnings.catch_warnings():
+        # A character may be missing in Matplotlib's font: the browser draws the text with its own
+        # fonts.
+        warnings.filterwarnings("ignore", message="Glyph .* missing")
+        yield
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Figure of a page: name of the HTML element, title, caption and SVG."""
+
+    name: str
+    title: str
+    caption: str
+    svg: str
+
+
+def as_drawn(figure: Figure, name: str, title: str, caption: str) -> Drawn:
+    """Return a figure as SVG that fits into a page.
+
+    The SVG is scaled by the page, has the colours of the page, and has ids that begin with the name
+    of the figure, so that two figures never share an id.
+    """
+    buffer = io.StringIO()
+    no_metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    figure.savefig(buffer, format="svg", metadata=no_metadata)
+    # Remove the XML prologue and the fixed size.
+    _, _, svg = buffer.getvalue().partition("<svg")
+    svg = re.sub(r' (width|height)="[^"]*"', "", svg, count=2)
+    svg = f'<svg aria-hidden="true" focusable="false"{svg}'
+    # Remove comments, indentation and name spaces.
+    svg = re.sub(r'<!--.*?-->|(?<=\n) +| xmlns(:\w+)?="[^"]*"', "", svg, flags=re.DOTALL)
+    # Remove the ids of groups, which nothing refers to. All other ids get the name of the figure.
+    svg = re.sub(r'<g id="[^"]*"', "<g", svg)
+    svg = re.sub(r'\bid="', f'id="{name}-', svg)
+    svg = svg.replace('xlink:href="#', f'href="#{name}-')
+    svg = svg.replace("url(#", f"url(#{name}-")
+    svg = re.sub(r"(font: [\d.]+px|font-family:) [^;\"]*", r"\1 var(--sans)", svg)
+    # Coordinates of the elements path and use have two decimals: that is enough.
+    svg = re.sub(r"<[pu][^>]*>", lambda shape: re.sub(r"(\.\d\d)\d+", r"\1", shape[0]), svg)
+    for colour, variable in _VARIABLES.items():
+        svg = svg.replace(colour.lower(), f"var(--{variable})")
+    return Drawn(name, title, caption, svg)
+
+
+def plain_label(label: str) -> str:
+    """Return a name that Matplotlib draws as it is.
+
+    A dollar sign would begin a formula. A leading underscore would hide the name from the legend,
+    so a zero-width space precedes it.
+    """
+    text = printable(label).replace("$", r"\$")
+    return f"\u200b{text}" if text.startswith("_") else text
+
+
+def make_panels(
+    height: float, rows: int, columns: int, bottom: float = 0.5, gap: float = 0.2, **options: Any
+) -> tuple[Figure, Sequence[Axes]]:
+    """Make a figure with rows and columns of panels, and return the figure and its panels.
+
+    Margins are fixed, because measuring the text takes more time than all other steps.
+
+    Parameters
+    ----------
+    height : float
+        Height of the figure (inches).
+    rows, columns : int
+    bottom : float
+        Space below the panels (inches), for labels and a legend.
+    gap : float
+        Space between columns, as a share of the width of a panel.
+    **options
+        Arguments of ``Figure.subplots``.
+    """
+    figure = Figure(figsize=(LOOK.width, height))
+    spacing = {"left": 0.085, "right": 0.985, "wspace": gap, "hspace": 0.12}
+    spacing |= {"bottom": bottom / height, "top": 1 - 0.3 / height}
+    panels = figure.subplots(rows, columns, gridspec_kw=spacing, squeeze=False, **options)
+    return figure, panels.ravel()

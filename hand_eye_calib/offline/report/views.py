@@ -1,0 +1,177 @@
+"""Draw the sensors of a result in space, from three sides, with the uncertainty of their positions.
+
+:func:`plot` is the public function; the report has the same three views as a figure.
+"""
+
+import io
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.errors import InputError, require_type
+from hand_eye_calib.core.base.text import listing
+from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.offline.report.evidence import spread_of_position
+from hand_eye_calib.offline.report.style import (
+    BAD,
+    CHILD,
+    GREEN,
+    INK,
+    LOOK,
+    MUTED,
+    PARENT,
+    Drawn,
+    as_drawn,
+    make_panels,
+    page_style,
+    plain_label,
+)
+
+# The three views. The key has the parent's axes that are drawn to the right and upwards. The title
+# fits a vehicle, with x forward and z up.
+VIEWS = {"xy": "from above", "xz": "from the side", "yz": "from the front"}
+
+
+class NotebookFigure(Figure):
+    """A figure that notebooks display without pyplot."""
+
+    def _repr_png_(self) -> bytes:
+        """Return the figure as PNG; notebooks call this method."""
+        buffer = io.BytesIO()
+        self.savefig(buffer, format="png", dpi=130)
+        return buffer.getvalue()
+
+
+def plot(calibration: Calibration, ax: Any = None) -> Figure:
+    """Draw the poses of both sensors in three views of the parent sensor's frame.
+
+    An ellipse covers three standard deviations of the child's position.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    ax : sequence of three matplotlib.axes.Axes, optional
+        Axes to draw into. By default a new figure is made.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        The figure of ``ax``, or a new one. Notebooks display it; its method ``savefig`` writes a
+        file.
+
+    Raises
+    ------
+    InputError
+        If ``calibration`` is no Calibration, or ``ax`` has not three axes.
+
+    Examples
+    --------
+    >>> hec.plot(result).savefig("result.png")
+    """
+    require_type("the result", calibration, Calibration)
+    if ax is not None:
+        if np.size(ax) != len(VIEWS):
+            raise InputError(f"ax must be three axes of Matplotlib; got {type(ax).__name__}")
+        draw_views(ax, calibration)
+        return ax[0].figure
+    with page_style(figure_facecolor="white", savefig_facecolor="white"):
+        figure = NotebookFigure(figsize=(LOOK.width, 3.3), layout="constrained")
+        FigureCanvasAgg(figure)
+        draw_views(figure.subplots(1, 3), calibration)
+        figure.suptitle(calibration.headline, fontsize=8, fontweight="bold", wrap=True)
+        figure.supxlabel(caption_of_views(calibration), fontsize=7.5, wrap=True)
+    return figure
+
+
+def caption_of_views(*calibrations: Calibration) -> str:
+    """Return the caption of the three views: colours of axes, ellipses and dashed lines."""
+    sigmas = np.array([calibration.sigmas[:3] for calibration in calibrations])
+    is_finite = np.isfinite(sigmas)
+    text = "Axes of all sensors: x red, y green, z blue."
+    if is_finite.any():
+        text += f" Ellipse: {LOOK.sigmas:g} standard deviations of the position."
+    unknown = np.array([*"xyz"])[~is_finite.all(axis=0)].tolist()
+    if unknown:
+        text += f" Unknown along {listing(unknown)}: the dashed line."
+    return text
+
+
+def draw_views(panels: Sequence[Axes], *calibrations: Calibration) -> None:
+    """Draw the parent sensor and all child sensors in its frame, one view in each of three panels.
+
+    Several calibrations have the same parent sensor.
+    """
+    distances = [float(np.linalg.norm(calibration.translation)) for calibration in calibrations]
+    axis_m = LOOK.axis_share * max(*distances, LOOK.min_distance_m)
+    for panel, (axes, title) in zip(panels, VIEWS.items(), strict=True):
+        rows = ["xyz".index(axis) for axis in axes]
+        _draw_sensor(panel, np.eye(4)[rows], calibrations[0].parent_frame, PARENT, axis_m, 6)
+        for calibration in calibrations:
+            T = calibration.T_parent_child[rows]
+            # A dotted line from the parent's origin to the child's.
+            panel.plot(*T[:, 3:] * [[0.0, 1.0]], color=MUTED, lw=0.8, ls=":", zorder=1)
+            _draw_sensor(panel, T, calibration.child_frame, CHILD, axis_m, -14)
+            _draw_uncertainty(panel, T, calibration, rows)
+        panel.set(xlabel=f"{axes[0]} (m)", ylabel=f"{axes[1]} (m)", title=title)
+        panel.set_aspect("equal", adjustable="datalim")
+        panel.margins(0.3)
+
+
+def _draw_uncertainty(
+    panel: Axes, T: FloatArray, calibration: Calibration, rows: Sequence[int]
+) -> None:
+    """Draw the ellipse of the child's position, or a line along each unknown direction.
+
+    Parameters
+    ----------
+    panel : Axes
+    T : (2, 4) array
+        Rows of the child's pose for the two axes of the view.
+    calibration : Calibration
+    rows : sequence of int
+        Indices of the two axes of the view: to the right and upwards.
+    """
+    x, y = T[:, 3]
+    covariance, unknown = spread_of_position(calibration)
+    has_line = False
+    for right, up in unknown[:, rows]:
+        if math.hypot(right, up) > LOOK.min_in_view:
+            has_line = True
+            slope = up / right if abs(right) > 1e-9 else math.inf
+            panel.axline((x, y), slope=slope, color=CHILD, ls="--", lw=1.0)
+    if has_line:
+        return
+    variances, axes = np.linalg.eigh(covariance[np.ix_(rows, rows)])
+    width, height = 2 * LOOK.sigmas * np.sqrt(np.maximum(variances, 0.0))
+    angle_deg = float(np.degrees(np.arctan2(axes[1, 0], axes[0, 0])))
+    panel.add_patch(Ellipse((x, y), width, height, angle=angle_deg, color=CHILD, alpha=0.3))
+
+
+def _draw_sensor(
+    panel: Axes, T: FloatArray, name: str, colour: str, axis_m: float, below: float
+) -> None:
+    """Draw a sensor's axes and its name.
+
+    ``T`` (2, 4) are the rows of its pose for the two axes of the view, ``axis_m`` is the length of
+    its axes, and ``below`` the vertical offset of the name (points).
+    """
+    origin = T[:, 3]
+    for axis, axis_colour in zip(T[:, :3].T, (BAD, GREEN, PARENT), strict=True):
+        panel.plot(*np.stack([origin, origin + axis_m * axis], axis=1), color=axis_colour)
+    panel.plot(*origin, "o", color=colour, ms=5)
+    panel.annotate(plain_label(name), (*origin,), (5, below), textcoords="offset points", color=INK)
+
+
+@page_style()
+def figure_of_views(calibrations: Sequence[Calibration]) -> Drawn:
+    """Draw the child sensors of one or several results in their parent's frame."""
+    figure, panels = make_panels(3.1, 1, 3, gap=0.36)
+    draw_views(panels, *calibrations)
+    return as_drawn(figure, "views", "The sensors in space", caption_of_views(*calibrations))
