@@ -450,6 +450,18 @@ def ends_of_dashed_lines(panel):
     return ends
 
 
+@pytest.mark.parametrize("unknown", ["x", "yaw"])
+def test_a_notebook_gets_the_numbers_of_a_result_with_an_unknown_axis(unknown):
+    sigmas = np.where([name == unknown for name in NAMES], np.inf, 1e-3)
+    covariance = np.diag(sigmas**2)
+    result = calibration(
+        covariance_measured=covariance, observability_measured=dofs(sigmas, unknown)
+    )
+    html = result._repr_html_()
+    assert result.headline in html
+    assert f">{unknown}</th>" in html
+
+
 def test_an_unknown_direction_between_axes_is_drawn_as_it_is():
     direction = np.array([0.6, 0.0, 0.8])
     in_parent = np.diag(np.full(3, 1e-6)) + 9.0 * np.outer(direction, direction)
