@@ -240,7 +240,7 @@ def test_bars_show_the_share_of_the_information_and_the_time_left():
     assert ["sketch" in fragment(view) for view in (on_wheels, view_of(state()))] == [True, False]
     assert bars["z"].share == pytest.approx(0.25)  # twice the target: a quarter of the information
     assert (bars["z"].tone, bars["z"].word) == (Tone.ACT, "25 s left")
-    assert (bars["z"].against, bars["yaw"].against) == ("± 4 cm of 2 cm", "± 0.057 deg of 0.3 deg")
+    assert (bars["z"].sigma, bars["yaw"].sigma) == ("± 4 cm of 2 cm", "± 0.057 deg of 0.3 deg")
 
 
 @pytest.mark.parametrize(

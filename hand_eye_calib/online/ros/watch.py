@@ -1,4 +1,4 @@
-"""``watch``: the live node as a person reads it, on a terminal and in a browser."""
+"""The command ``watch``: display the live node on a terminal and in a browser."""
 
 import argparse
 import contextlib
@@ -23,20 +23,20 @@ examples:
   hand_eye_calib watch                     on this terminal
   hand_eye_calib watch --web               also in a browser, on a phone for example
   hand_eye_calib watch --node /robot1/calibrator
-  hand_eye_calib watch > seen.txt          a line whenever something else is said"""
+  hand_eye_calib watch > log.txt           a line for every new headline"""
 
-# Default port of the page; 8765 is that of foxglove_bridge.
+# Default port of the page: not 8765, which foxglove_bridge uses.
 _PORT = 8775
 
-# Longest wait (s) for a message between two looks at keyboard and browser.
-_LISTEN_S = 0.1
+# Longest wait (s) for a message. Keys and requests of a browser are processed after the wait.
+_MAX_WAIT_S = 0.1
 
-# Time (s) within which the second press of a key confirms a request.
-_CONFIRM_S = 5.0
+# Time (s) within which a second press of a key confirms its request.
+_CONFIRM_WITHIN_S = 5.0
 
 _REQUESTS = {key: request for request, key in KEYS.items()}
 
-# Requests that need a second press of their key, with their consequence.
+# Requests that need a second press of their key, and the consequence of each request.
 _CONSEQUENCES = {
     "reset": "forgets all poses",
     "recalibrate": "stops watching and calibrates anew",
@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
         session = Session(board, requests, stack.enter_context(_keyboard()))
         display = stack.enter_context(_display(addresses[0]))
         while not received and not session.is_over:
-            watcher.spin(_LISTEN_S)
+            watcher.spin(_MAX_WAIT_S)
             while not requests.empty():
                 watcher.ask(requests.get())
             display(session.view(), session.shows_code)
@@ -90,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class Session:
-    """The keys that a person presses on the terminal.
+    """Processes the keys that a person presses on the terminal.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class Session:
     requests : queue of str
         Receives the requests of the keys.
     keys : callable
-        Returns the keys that were pressed since its last call.
+        Returns the keys that were pressed since the last call.
 
     Attributes
     ----------
@@ -141,7 +141,7 @@ class Session:
         is_confirmed = request == self._unconfirmed and now_s <= self._confirm_until_s
         if request in _CONSEQUENCES and not is_confirmed:
             self._unconfirmed = request
-            self._confirm_until_s = now_s + _CONFIRM_S
+            self._confirm_until_s = now_s + _CONFIRM_WITHIN_S
             text = f"{_CONSEQUENCES[request]}: press {key} again"
             self._board.answer(request, False, text, now_s)
         else:
@@ -150,10 +150,11 @@ class Session:
 
 @contextlib.contextmanager
 def _display(address: str) -> Iterator[Callable[[View, bool], None]]:
-    """Function that displays a view, or the QR code of the page's address.
+    """Yield a function that displays a view.
 
-    A terminal displays the view on its whole screen. A file or a pipe receives lines. A line that
-    differs from the last lines only in its numbers is not repeated.
+    The arguments of the function are a View, and whether to display the QR code of the page's
+    address in its place. On a terminal, the view is on the whole screen. A file or a pipe receives
+    lines; a line that differs from one of the last view only in numbers is not repeated.
     """
     from rich.live import Live
     from rich.text import Text
@@ -167,7 +168,7 @@ def _display(address: str) -> Iterator[Callable[[View, bool], None]]:
             before = printed.copy()
             printed.clear()
             for line in lines(view):
-                # A line is printed again only if more than its numbers has changed.
+                # The line without its numbers.
                 key = re.sub(r"[\d.]+", "", line)
                 printed.add(key)
                 if key not in before:
@@ -212,9 +213,10 @@ def qr_code(address: str) -> str:
 
 @contextlib.contextmanager
 def _keyboard() -> Iterator[Callable[[], str]]:
-    """Function that returns the keys pressed since its last call, without echo and without Enter.
+    """Yield a function that returns the keys that were pressed since its last call.
 
-    It always returns an empty text if standard input or output is no terminal.
+    Keys are read at once, without Enter, and are not displayed. If standard input or output is no
+    terminal, the function returns an empty text.
     """
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         yield str

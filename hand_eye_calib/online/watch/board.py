@@ -1,7 +1,7 @@
-"""The state of a node in words, signs and bars, for a person.
+"""Convert the state of a node into what ``watch`` displays: words, signs and bars.
 
-A :class:`Board` receives states and makes a :class:`View`. Nothing here depends on ROS, a terminal
-or a browser.
+A :class:`Board` stores the newest state of a node and makes a :class:`View`. This module does not
+depend on ROS, a terminal or a browser.
 """
 
 import json
@@ -41,19 +41,19 @@ from hand_eye_calib.online.live.state import (
 )
 from hand_eye_calib.online.watch.view import AxisTexts, Bar, Line, Texts, Tone, View
 
-# Age (s) of the newest state at which a node counts as silent: three reports are missing.
+# Age (s) of the newest state from which on a node is silent: three reports are missing.
 SILENT_AFTER_S = 3.5 * REPORT_PERIOD_S
 
 # Time (s) for which the answer to a button is displayed.
 ANSWER_FOR_S = 20.0
 
-# Words of headlines that decide about buttons.
+# Words of headlines with which certain buttons are displayed.
 MOVED = "MOUNT MOVED"
 CHANGE_MOTION = "CHANGE THE MOTION"
 CHANGE_TARGET = "CHANGE THE TARGET"
 DONE = "DONE"
 
-# Names of the axes.
+# Names of the axes of the parent sensor's frame.
 _NAMES = {axis: f"along {axis}" for axis in "xyz"}
 _NAMES |= {axis: f"about {direction}" for axis, direction in ABOUT.items()}
 # Meaning of the axes on a vehicle (REP 103).
@@ -67,7 +67,7 @@ _ON_A_VEHICLE = {
 }
 
 
-# Tones of levels, verdicts, comparisons and broadcasts.
+# Tone of each level, verdict, verdict of a comparison, and state of a broadcast.
 _TONES: dict[object, Tone] = {
     **dict.fromkeys((Level.OK, "USE", "same", Broadcast.ON), Tone.GOOD),
     **dict.fromkeys((Level.WARN, "USE WITH CARE", "moved", Broadcast.REFUSED), Tone.ACT),
@@ -77,8 +77,16 @@ _TONES: dict[object, Tone] = {
 
 
 class Headline(NamedTuple):
-    """The most important fact about a node: sign, a word or two in capitals, a sentence, and what
-    to do.
+    """The most important fact about a node.
+
+    Attributes
+    ----------
+    tone : Tone
+    word : str
+        One or two words in capitals.
+    sentence : str
+    advice : str
+        What to do; empty if the sentence contains it.
     """
 
     tone: Tone
@@ -88,32 +96,33 @@ class Headline(NamedTuple):
 
 
 class Board:
-    """The newest state of one node, from which views are made. Several threads may use it.
+    """Stores the newest state of one node, and makes views from it. Several threads may use it.
 
     Parameters
     ----------
     wanted : str
-        Fully qualified name of the node. If empty, the first node that sends a state is displayed;
-        another node replaces it when it is silent.
+        Fully qualified name of the node. If empty, the first node that sends a state is displayed,
+        until it is silent and another node sends a state.
 
     Attributes
     ----------
     topics : tuple of str
-        One line for every topic with poses.
+        A line for each topic with poses.
     """
 
     def __init__(self, wanted: str = "") -> None:
         self.topics: Texts = ()
         self._wanted = wanted
-        # State and answer with their times (s). A tuple is assigned at once, so that no thread
-        # reads half of it.
+        # State and answer, each with its time (s). Both are in one tuple, which is replaced as a
+        # whole, so that no thread reads a state with the time of another state.
         self._newest: tuple[NodeState, float] | None = None
         self._answer: tuple[Line, float] | None = None
+        # Node and start (ns) of the alarm that a person has acknowledged.
         self._acknowledged: tuple[str, int | None] | None = None
 
     @property
     def priors(self) -> Texts:
-        """Axes whose prior is set on the displayed node."""
+        """Axes of the displayed node that have a prior."""
         return tuple(dict(_priors_of(self._newest[0]))) if self._newest else ()
 
     @property
@@ -122,22 +131,25 @@ class Board:
         return self._newest[0].node if self._newest else ""
 
     def take(self, state: NodeState, now_s: float) -> None:
-        """Store a state of a node; ignored if another node is displayed."""
+        """Store a state; ignore it if another node is displayed.
+
+        ``now_s`` is the time (s) at which the state was received, on a steady clock.
+        """
         is_silent = not self._newest or now_s - self._newest[1] > SILENT_AFTER_S
         if state.node == (self._wanted or self.node) or (is_silent and not self._wanted):
             self._newest = state, now_s
 
     def answer(self, request: str, good: bool | None, text: str, now_s: float) -> None:
-        """Store the answer to a button; ``good`` is None while the answer is awaited."""
+        """Store the answer to a request; ``good`` is None until the answer arrives."""
         tones = {None: Tone.BUSY, True: Tone.GOOD, False: Tone.ACT}
         self._answer = Line(tones[good], request, text), now_s
 
     def acknowledge(self) -> None:
-        """Display the present alarm of the mount without alarm, until the next alarm."""
+        """Display the present alarm of the mount as acknowledged, until another alarm begins."""
         self._acknowledged = _alarm_of(self._newest[0]) if self._newest else None
 
     def view(self, now_s: float) -> View:
-        """Return the view; ``now_s`` (s) is on the clock of :meth:`take`."""
+        """Return what to display at a time ``now_s`` (s), on the clock of :meth:`take`."""
         if self._newest is None:
             name = self._wanted or "a calibrator"
             text = f"No message from {name} yet. Is the node running, on the same ROS domain and "
@@ -160,11 +172,12 @@ class Board:
 
 
 def _alarm_of(state: NodeState) -> tuple[str, int | None]:
+    """Return node and start (ns) of an alarm of the mount: they identify the alarm."""
     return state.node, state.mount.since_ns if state.mount else None
 
 
 def _priors_of(state: NodeState) -> AxisTexts:
-    """Return axes and priors that are set, as typed by the user."""
+    """Return the axes that have a prior, with the priors as the user has typed them."""
     if state.extrinsic is None:
         return ()
     priors = state.extrinsic.priors
@@ -172,6 +185,7 @@ def _priors_of(state: NodeState) -> AxisTexts:
 
 
 def _view(state: NodeState, silent_s: float) -> View:
+    """Return the view of a state that was received ``silent_s`` seconds ago."""
     is_silent = silent_s > SILENT_AFTER_S
     is_old = state.has_ended or is_silent
     if state.has_ended:
@@ -190,8 +204,8 @@ def _view(state: NodeState, silent_s: float) -> View:
         return _with_mount(view, state.mount)
     view = _with_result(view, state)
     view = replace(view, facts=_facts(state, is_old), by_hand=_axes_by_hand(state, view.word))
-    if at := state.progress:
-        bars = tuple(_bar(axis, at, state.extrinsic) for axis in AXES)
+    if progress := state.progress:
+        bars = tuple(_bar(axis, progress, state.extrinsic) for axis in AXES)
         view = replace(view, bars=bars)
     if is_old:
         return view
@@ -199,7 +213,7 @@ def _view(state: NodeState, silent_s: float) -> View:
 
 
 def _with_result(view: View, state: NodeState) -> View:
-    """Return the view of a node that calibrates, with its result."""
+    """Add the result to the view of a node that calibrates; a refuted result has no pose."""
     view = replace(view, result=tuple(_result(state)))
     if result := state.result:
         view = replace(view, reasons=result.reasons)
@@ -210,7 +224,7 @@ def _with_result(view: View, state: NodeState) -> View:
 
 
 def _with_mount(view: View, mount: MountState) -> View:
-    """Return the view of a node that monitors the mount."""
+    """Add the mount to the view of a node that monitors the mount."""
     facts = f"{duration(mount.seconds_of_motion)} of motion seen"
     if mount.since_ns and mount.newest_ns:
         facts = f"{duration((mount.newest_ns - mount.since_ns) * 1e-9)} ago"
@@ -222,7 +236,7 @@ def _with_mount(view: View, mount: MountState) -> View:
 
 
 def _buttons(state: NodeState, word: str) -> Texts:
-    """Return the requests that are possible, the recommended request first."""
+    """Return the possible requests to a node that calibrates, the recommended one first."""
     buttons: Texts = ("reset",)
     if state.result:
         buttons = ("solve", "save", "reset")
@@ -234,7 +248,11 @@ def _buttons(state: NodeState, word: str) -> Texts:
 
 
 def _axes_by_hand(state: NodeState, word: str) -> Texts:
-    """Return axes that a person may measure, or whose prior may be corrected or removed."""
+    """Return axes whose prior a person may set, correct or remove, the most important first.
+
+    These are the axes whose prior contradicts the motion, the axis that the present motion cannot
+    determine, and all other axes with a prior.
+    """
     extrinsic = state.extrinsic
     if extrinsic is None or state.progress is None:
         return ()
@@ -264,10 +282,14 @@ def _alarm(state: NodeState) -> Headline | None:
 
 
 def _conditions(state: NodeState) -> Iterator[tuple[Tone, str, Level, Part | None]]:
-    """Yield conditions with the level at which the part of the node meets them, gravest first."""
+    """Yield conditions, the gravest first.
+
+    A condition has the tone and the word of its headline, a level, and a part of the node. The node
+    is in this condition if the part has the level.
+    """
     extrinsic = state.extrinsic
     checks = state.checks
-    # Further child sensors have lines of their own, but no headline.
+    # The inputs of further child sensors are displayed, but do not become a headline.
     inputs = [stream for name, stream in state.inputs.items() if name in ("parent", "child")]
     yield Tone.BAD, "BROKEN", Level.ERROR, extrinsic
     yield Tone.BAD, MOVED, Level.ERROR, state.mount
@@ -299,43 +321,44 @@ def _activity(state: NodeState) -> Headline:
         if state.mount.is_learning:
             return Headline(Tone.BUSY, "LEARNING", sentence)
         return Headline(Tone.GOOD, "WATCHING", sentence)
-    at = state.progress
-    if at is None:
+    session = state.progress
+    if session is None:
         text = "The node runs, and has no result yet."
         return Headline(Tone.UNKNOWN, "LISTENING", text)
-    sentence = _sentence(at.text)
-    # The streams are faulty, although an earlier result was good.
-    if at.progress.is_faulty:
+    sentence = _sentence(session.text)
+    # Streams may become faulty after the goal is reached.
+    if session.progress.is_faulty:
         return Headline(Tone.ACT, "CHECK THE STREAMS", sentence)
-    if at.progress.done:
-        return _done(state, at)
-    tone = Tone.BUSY if at.level is Level.OK else Tone.ACT
-    if at.is_paused:
+    if session.progress.done:
+        return _at_goal(state, session)
+    tone = Tone.BUSY if session.level is Level.OK else Tone.ACT
+    if session.is_paused:
         return Headline(tone, "PAUSED", sentence)
     if state.result is None:
         return Headline(Tone.BUSY, "START", sentence)
-    if at.progress.target_is_too_small:
+    if session.progress.target_is_too_small:
         return Headline(tone, CHANGE_TARGET, sentence)
     return Headline(tone, "GO ON" if tone is Tone.BUSY else CHANGE_MOTION, sentence)
 
 
-def _done(state: NodeState, at: ProgressState) -> Headline:
+def _at_goal(state: NodeState, session: ProgressState) -> Headline:
     """Return the headline of a session that has reached its goal.
 
-    The sentence describes what has moved compared with the installed transform, or the precision.
-    The advice contains the gravest reason if the verdict is not ``USE``.
+    If the sensor has moved against the installed transform, the sentence states by how much.
+    Otherwise the sentence states the precision. If the verdict is not ``USE``, the advice contains
+    the gravest reason.
     """
     tone = Tone.GOOD
-    sentence = _sentence(at.progress.precision)
+    sentence = _sentence(session.progress.precision)
     advice = "Stop and save."
     caution = ""
     if state.result and state.result.verdict != "USE":
         tone = Tone.ACT
         gravest = state.result.reasons[:1]
         caution = _sentence(": ".join((state.result.verdict, *gravest)))
-    if state.result and at.comparison and at.comparison.verdict == "moved":
+    if state.result and session.comparison and session.comparison.verdict == "moved":
         tone = Tone.ACT
-        displacement = _typeset(at.comparison.differences[0].change)
+        displacement = _typeset(session.comparison.differences[0].change)
         sentence = f"{state.result.child_frame} HAS MOVED: {displacement}."
         advice = "Save."
     if state.saved:
@@ -345,7 +368,7 @@ def _done(state: NodeState, at: ProgressState) -> Headline:
 
 
 def _silence(state: NodeState, silent_s: float) -> Headline:
-    """Return the headline of a node that sends no states any more."""
+    """Return the headline of a node that no longer sends its state."""
     text = f"No message from the node for {silent_s:.0f} s. If it has died, start it again"
     if state.journal and state.journal.directory:
         text += ", with journal:=resume"
@@ -373,17 +396,18 @@ def _end(state: NodeState) -> Headline:
 
 
 def _typeset(text: str) -> str:
+    """Return a text with the sign ± in place of +/-."""
     return text.replace("+/-", "±")
 
 
 def _sentence(text: str) -> str:
-    """Return the text with a capital letter and a full stop."""
+    """Return a text as a sentence, with a capital letter and a full stop."""
     text = capital(_typeset(text))
     return text if text.endswith((".", "!", "?")) else f"{text}."
 
 
 def _facts(state: NodeState, is_old: bool) -> str:
-    """Return path, duration of motion and age of the result, as far as known."""
+    """Return path length, duration of motion and age of the result; empty without poses."""
     extrinsic = state.extrinsic
     if extrinsic is None or not extrinsic.n_poses:
         return ""
@@ -398,61 +422,64 @@ def _facts(state: NodeState, is_old: bool) -> str:
 # ------------------------------------------------------------------------ axes
 
 
-def _bar(axis: str, at: ProgressState, extrinsic: ExtrinsicState | None) -> Bar:
-    row = at.progress.axes[AXIS_KEYS[axis]]
+def _bar(axis: str, session: ProgressState, extrinsic: ExtrinsicState | None) -> Bar:
+    """Return the bar of an axis."""
+    row = session.progress.axes[AXIS_KEYS[axis]]
     target = amount(axis, row.target)
     if extrinsic and extrinsic.contradicted:
         tone = Tone.UNKNOWN
         word = "no usable result"
-        against = f"wanted: {target}"
+        sigma = f"wanted: {target}"
     elif math.isfinite(row.sigma):
-        tone, word = _progress_in_words(row, at, axis)
-        against = f"± {amount(axis, row.sigma)}"
-        against += ", from the prior" if _is_by_hand(row) else f" of {target}"
+        tone, word = _progress_in_words(row, session, axis)
+        sigma = f"± {amount(axis, row.sigma)}"
+        sigma += ", from the prior" if _has_prior(row) else f" of {target}"
     else:
         tone = Tone.UNKNOWN
-        # A time left without a standard deviation: these streams never observe the axis.
+        # The time left is 0 without a standard deviation: these streams never observe the axis.
         is_out_of_reach = math.isfinite(row.seconds_left)
         word = "out of reach" if is_out_of_reach else "not seen yet"
-        against = "" if is_out_of_reach else f"wanted: {target}"
+        sigma = "" if is_out_of_reach else f"wanted: {target}"
     meaning = _ON_A_VEHICLE[axis] if extrinsic and extrinsic.has_vehicle_axes else ""
-    return Bar(_NAMES[axis], meaning, _share_of(row), tone, word, against, _difference(axis, at))
+    difference = _difference(axis, session)
+    return Bar(_NAMES[axis], meaning, _share_of(row), tone, word, sigma, difference)
 
 
-def _is_by_hand(row: AxisProgress) -> bool:
-    """Whether an axis is good enough although its target is not reached: it has a prior."""
+def _has_prior(row: AxisProgress) -> bool:
+    """Whether an axis has a prior: no time is left, although the target is not reached."""
     return row.seconds_left == 0 and row.target < row.sigma < math.inf
 
 
 def _share_of(row: AxisProgress) -> float:
-    """Return the share of the information that the target needs."""
-    if row.sigma <= row.target or _is_by_hand(row):
+    """Return the information of an axis (1 / variance) as a share of what the target needs."""
+    if row.sigma <= row.target or _has_prior(row):
         return 1.0
     return (row.target / row.sigma) ** 2
 
 
-def _difference(axis: str, at: ProgressState) -> str:
-    """Return the difference from the installed transform; empty if unknown."""
-    if at.comparison is None or not at.comparison.differences:
+def _difference(axis: str, session: ProgressState) -> str:
+    """Return the difference of an axis from the installed transform; empty if unknown."""
+    if session.comparison is None or not session.comparison.differences:
         return ""
-    row = at.comparison.differences[0].axes[AXIS_KEYS[axis]]
+    row = session.comparison.differences[0].axes[AXIS_KEYS[axis]]
     return change(axis, row.difference, row.sigma)
 
 
-def _progress_in_words(row: AxisProgress, at: ProgressState, axis: str) -> tuple[Tone, str]:
-    """Return tone and word of an axis with a standard deviation."""
-    if at.progress.is_faulty:
+def _progress_in_words(row: AxisProgress, session: ProgressState, axis: str) -> tuple[Tone, str]:
+    """Return tone and word of an axis that has a standard deviation."""
+    if session.progress.is_faulty:
         return Tone.UNKNOWN, "of faulty streams"
     if row.seconds_left == 0:
         return Tone.GOOD, "enough"
     word = "not with this motion"
     if math.isfinite(row.seconds_left):
         word = f"{duration(row.seconds_left)} left"
-    return Tone.ACT if at.progress.limiting_axis == AXIS_KEYS[axis] else Tone.BUSY, word
+    is_limiting = session.progress.limiting_axis == AXIS_KEYS[axis]
+    return Tone.ACT if is_limiting else Tone.BUSY, word
 
 
 def _values(result: ResultState) -> Iterator[tuple[str, str]]:
-    """Yield each axis with value and standard deviation; a question mark if unobserved."""
+    """Yield each axis of the printed pose with its value and standard deviation."""
     for axis in AXES:
         value = result.pose.get(axis)
         sigma = result.pose_sigma.get(axis)
@@ -467,7 +494,8 @@ def _values(result: ResultState) -> Iterator[tuple[str, str]]:
 def _watched(axis: str, mount: MountState) -> Line:
     """Return the line of one axis of a monitored mount.
 
-    The line has the shift, or the smallest shift that ten minutes of motion would reveal.
+    The text is the shift of the axis, or the smallest shift that ten minutes of motion would
+    detect.
     """
     key = AXIS_KEYS[axis]
     shift = mount.shift.get(key) or 0.0
@@ -475,6 +503,7 @@ def _watched(axis: str, mount: MountState) -> Line:
     visible = mount.visible_10min.get(key)
     tone = Tone.UNKNOWN
     text = "cannot be watched with this motion"
+    # An axis has moved if noise seldom makes the largest of six shifts as large.
     if abs(shift) > LARGEST_OF_SIX * sigma:
         tone = Tone.BAD
         text = f"moved by {amount(axis, shift)} ± {amount(axis, sigma)}"
@@ -490,13 +519,16 @@ def _watched(axis: str, mount: MountState) -> Line:
 
 
 def _health(state: NodeState, is_old: bool) -> Iterator[Line]:
-    """Yield a line for each input, the stream checks and the journal."""
+    """Yield a line for each input, for the stream checks and for the journal.
+
+    A state that is old has no tones: its conditions may have changed.
+    """
     for name, part in state.parts():
         if name in ("extrinsic", "progress", "mount"):
             continue
         tone = _TONES[part.level]
         text = part.text
-        # No action is needed before the first check.
+        # Before the first check, the level is WARN, but a person need not act.
         if part is state.checks and state.checks.age_s is None:
             tone = Tone.BUSY
         if isinstance(part, InputState) and part.topic not in text:
@@ -505,7 +537,7 @@ def _health(state: NodeState, is_old: bool) -> Iterator[Line]:
 
 
 def _result(state: NodeState) -> Iterator[Line]:
-    """Yield verdict, warnings, priors, comparison, broadcast and files of the result."""
+    """Yield the lines of the result: verdict, warnings, priors, comparison, broadcast and files."""
     result = state.result
     verdict = result.verdict if result else "no result yet"
     yield Line(_TONES.get(verdict, Tone.UNKNOWN), "verdict", verdict)
@@ -535,6 +567,7 @@ def _prior_lines(state: NodeState) -> Iterator[Line]:
 
 
 def _broadcast(extrinsic: ExtrinsicState, has_ended: bool) -> Line:
+    """Return the line about the broadcast of the result on /tf_static."""
     tone = _TONES[extrinsic.tf_static]
     text = extrinsic.tf_static.value
     if extrinsic.tf_static_reason:
@@ -548,12 +581,12 @@ def _broadcast(extrinsic: ExtrinsicState, has_ended: bool) -> Line:
 def state_of(text: str) -> NodeState | None:
     """Return the state of a node from its JSON, without control characters.
 
-    Any program may publish on the topic. None is returned for a text that is no state, for the
+    Any program may publish on the topic. So None is returned for a text that is no state, for the
     state of another version, and for a state whose values cannot be displayed.
     """
     try:
         state = from_plain(NodeState, _printable(json.loads(text)))
-        # A trial that raises an error for values that cannot be displayed.
+        # Make a view as a trial: it raises an error for values that cannot be displayed.
         _view(state, 0.0)
     except (TypeError, ValueError, KeyError, RecursionError, OverflowError, OSError):
         return None
@@ -561,7 +594,7 @@ def state_of(text: str) -> NodeState | None:
 
 
 def _printable(value: Any) -> Any:
-    """Return plain data whose texts have no control characters."""
+    """Return plain data with all control characters of texts and keys escaped."""
     if isinstance(value, dict):
         return {printable(key): _printable(item) for key, item in value.items()}
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""A view on a terminal: redrawn in place, or line by line into a file or a pipe."""
+"""Draw a view on a terminal, or as lines for a file or a pipe."""
 
 from rich.console import Group, RenderableType
 from rich.panel import Panel
@@ -19,13 +19,13 @@ _STYLES = {
 # Length of a progress bar (columns).
 _BAR_LENGTH = 16
 
-# Least width (columns) of a terminal on which bars have their last column.
-_WIDE = 76
+# Smallest width (columns) of a terminal on which the last column of the bars is displayed.
+_MIN_WIDTH = 76
 
-# Reasons that are displayed at most.
+# Largest number of reasons that are displayed.
 _MAX_REASONS = 3
 
-# Labels of requests that differ from their names.
+# Labels of requests, where they differ from the names of the requests.
 _LABELS = {"forget": "forget priors"}
 
 
@@ -41,29 +41,29 @@ def screen(view: View, width: int, footer: str = "") -> RenderableType:
         Text after the keys, such as the address of the page.
     """
     word = f" {view.tone.value} {view.word} "
-    parts: list[RenderableType] = [
+    rows: list[RenderableType] = [
         Text.assemble((word, f"reverse {_STYLES[view.tone]}")),
         Text(view.text, style="bold"),
     ]
     if view.facts:
-        parts.append(_dim(view.facts))
+        rows.append(_dim(view.facts))
     if view.answer:
-        parts.append(_lines(view.answer))
-    parts += [Text(f"    {topic}") for topic in view.topics]
+        rows.append(_lines(view.answer))
+    rows += [Text(f"    {topic}") for topic in view.topics]
     if view.bars:
-        parts += [_bars(view, width), _dim(view.title), _pose(view)]
+        rows += [_bars(view, width), _dim(view.title), _pose(view)]
     if view.watched:
-        parts += [_dim("the mount, after ten minutes of motion"), _lines(view.watched)]
-    parts.append(_lines(view.result + view.health))
-    parts += [_dim(f"    - {reason}") for reason in view.reasons[:_MAX_REASONS]]
+        rows += [_dim("the mount, after ten minutes of motion"), _lines(view.watched)]
+    rows.append(_lines(view.result + view.health))
+    rows += [_dim(f"    - {reason}") for reason in view.reasons[:_MAX_REASONS]]
     keys = [f"{KEYS[name]} {_LABELS.get(name, name)}   " for name in view.buttons]
     title = Text(f"hand_eye_calib watch {view.node}".rstrip())
-    panel = Panel(Group(*parts), title=title, title_align="left")
+    panel = Panel(Group(*rows), title=title, title_align="left")
     return Group(_dim(f" {''.join(keys)}q quit   {footer}".rstrip()), panel)
 
 
 def lines(view: View) -> list[str]:
-    """Return headline and answer to a button, as lines for a file or a pipe."""
+    """Return the headline and the answer to the last button, as lines for a file or a pipe."""
     answers = [f"{line.tone.value} {line.name}: {line.text}" for line in view.answer]
     return [f"{view.tone.value} {view.word}: {view.text}", *answers]
 
@@ -73,7 +73,7 @@ def _dim(text: str) -> Text:
 
 
 def _pose(view: View) -> Table:
-    """Return a table with x, y, z above roll, pitch, yaw."""
+    """Return a table of the pose with two rows: x, y, z and roll, pitch, yaw."""
     table = Table.grid(padding=(0, 3))
     values = [Text.assemble((axis, "bold"), f" {text}") for axis, text in view.values]
     table.add_row(*values[:3])
@@ -82,6 +82,7 @@ def _pose(view: View) -> Table:
 
 
 def _bars(view: View, width: int) -> Table:
+    """Return a table with a row for each axis; the last column needs a wide terminal."""
     table = Table.grid(padding=(0, 1))
     for bar in view.bars:
         style = _STYLES[bar.tone]
@@ -89,9 +90,9 @@ def _bars(view: View, width: int) -> Table:
             Text(bar.name, style="bold"),
             ProgressBar(1.0, bar.share, _BAR_LENGTH, complete_style=style, finished_style=style),
             Text(f"{bar.tone.value} {bar.word}", style=style),
-            Text(bar.against),
+            Text(bar.sigma),
         ]
-        if width >= _WIDE:
+        if width >= _MIN_WIDTH:
             cells.append(Text(bar.difference or bar.meaning))
         table.add_row(*cells)
     return table

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TypeAlias
 
-# Requests that a person can make, with their keys on a terminal.
+# Requests that a person can send to the node, and the key of each request on a terminal.
 KEYS = {
     "solve": "s",
     "save": "w",
@@ -16,7 +16,7 @@ KEYS = {
 
 
 class Tone(Enum):
-    """Severity, with its sign: a colour alone is not readable by everybody."""
+    """Severity, with its sign. The sign is for people who cannot distinguish the colours."""
 
     GOOD = "✓"
     BUSY = "▶"
@@ -27,7 +27,7 @@ class Tone(Enum):
 
 @dataclass(frozen=True)
 class Line:
-    """One line with its sign, such as the health of an input."""
+    """A line with a sign, a name and a text, such as the condition of an input."""
 
     tone: Tone
     name: str
@@ -49,16 +49,18 @@ class Bar:
     name : str
         The axis, such as "about z".
     meaning : str
-        The axis on a vehicle, such as "turn"; empty if the motion is not that of a vehicle.
+        Meaning of the axis on a vehicle, such as "turn"; empty if the parent does not move like a
+        vehicle.
     share : float
-        Share of the information that the target needs, 0 to 1.
+        Length of the bar, 0 to 1: present information as a share of what the target needs. The
+        information is the inverse of the variance.
     tone : Tone
     word : str
         Progress in words, such as "30 s left".
-    against : str
+    sigma : str
         Standard deviation and target, such as "± 0.065 deg of 0.3 deg".
     difference : str
-        Difference from the installed transform; empty if unknown.
+        Difference of the result from the installed transform; empty if unknown.
     """
 
     name: str
@@ -66,44 +68,46 @@ class Bar:
     share: float
     tone: Tone
     word: str
-    against: str
+    sigma: str
     difference: str
 
 
 @dataclass(frozen=True)
 class View:
-    """The whole content of one node.
+    """Everything that is displayed of a node.
 
     Attributes
     ----------
     node : str
         Fully qualified name of the node.
     tone, word, sentence
-        The headline.
+        Severity of the headline, its one or two words in capitals, and its sentence.
     advice : str
-        What to do about the headline; empty if the sentence contains it.
+        What to do; empty if the sentence contains it.
     facts : str
         Amount of motion, and age of the result.
     title : str
         Name of the pose in ``values``.
     values : tuple of (str, str)
-        Axes and values of the pose as printed.
+        Axes and values of the printed pose.
     bars : tuple of Bar
         Progress of each axis; empty if the node monitors the mount.
     watched : tuple of Line
         Axes of a monitored mount; empty if the node calibrates.
-    result, reasons
-        Verdict, priors, comparison and files of the result; reasons of the verdict.
+    result : tuple of Line
+        Verdict, warnings, priors, comparison and files of the result.
+    reasons : tuple of str
+        Reasons for the verdict.
     health : tuple of Line
-        Inputs, stream checks and journal.
+        Conditions of inputs, stream checks and journal.
     topics : tuple of str
         Topics with poses, if an input lacks poses.
     buttons : tuple of str
         Requests that are possible now, the recommended request first.
     by_hand : tuple of str
-        Axes whose value may be measured by hand or corrected, the most important first.
+        Axes whose prior a person may set, correct or remove, the most important first.
     priors : tuple of (str, str)
-        Axes and priors as typed by the user.
+        Axes with a prior, and the priors as the user has typed them.
     saved_in : str
         Directory of the saved files; empty if nothing is saved.
     answer : tuple of Line

@@ -1,8 +1,8 @@
-"""A view in a browser: a server of one page, which loads nothing from the internet.
+"""Serve a view as a page for browsers. The page loads nothing from the internet.
 
-The server sends the view as server-sent events; an event is a fragment of HTML that replaces the
-last fragment. Buttons of the page send requests back. Every request needs the key in the address of
-the page, so that other pages in the same browser cannot use the server.
+The server sends the view as server-sent events. An event is a fragment of HTML that replaces the
+last fragment. The buttons of the page send requests to the server. Every request needs the key in
+the address of the page, so that other pages in the same browser cannot use the server.
 """
 
 import contextlib
@@ -29,16 +29,17 @@ from hand_eye_calib.online.live.state import REPORT_PERIOD_S
 from hand_eye_calib.online.watch.board import Board
 from hand_eye_calib.online.watch.view import KEYS, Bar, Line, Tone, View
 
-# Period (s) at which the server looks for changes of the view.
-_LOOK_S = 0.25
+# Period (s) at which the server compares the view with the last view it has sent.
+_PERIOD_S = 0.25
 
 # Time (s) after which a browser that accepts no data is disconnected.
-_PATIENCE_S = 10.0
+_TIMEOUT_S = 10.0
 
-# Files of the page that contain no secrets.
+# Files of the page that are sent without the key. A page cannot add the key to these addresses.
 _STYLE_AND_SCRIPT = ("page.css", "page.js")
 _FOLDER = files("hand_eye_calib.online.watch").joinpath("page")
-# A vehicle from its left side: its y axis points towards the reader.
+# Sketch of a vehicle with the names of its axes. It is drawn from the left, so its y axis points
+# towards the reader.
 _SKETCH = _FOLDER.joinpath("sketch.svg").read_text(encoding="utf-8")
 # Files of a saved result to which the page links.
 SAVED = ("report.html", "extrinsic.yaml")
@@ -49,6 +50,7 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
+# Content security policies of the page, and of the files of a saved result.
 _POLICY = (
     "default-src 'none'; connect-src 'self'; img-src data:; script-src 'self'; style-src 'self'; "
     "frame-ancestors 'none'; base-uri 'none'"
@@ -57,9 +59,10 @@ _POLICY_OF_SAVED = "default-src 'none'; style-src 'unsafe-inline'; frame-ancesto
 
 
 def _user_key() -> str:
-    """Return the key of this user, the same at every start, so that an open page reconnects.
+    """Return the key of this user.
 
-    The key is new if it cannot be stored in a file that only this user can read.
+    The key is stored in a file, so that it is the same at the next start and an open page can
+    reconnect. If no file can be stored that only this user can read, the key is a new one.
     """
     new_key = secrets.token_urlsafe(6)
     with contextlib.suppress(OSError, RuntimeError, ValueError):
@@ -79,7 +82,7 @@ def _user_key() -> str:
 
 
 class WebServer(ThreadingHTTPServer):
-    """Server of the view in threads of its own, until :meth:`stop`.
+    """Serves the view in threads of its own, until :meth:`stop` is called.
 
     Parameters
     ----------
@@ -116,12 +119,16 @@ class WebServer(ThreadingHTTPServer):
         threading.Thread(target=self.serve_forever, name="web", daemon=True).start()
 
     def addresses(self) -> list[str]:
-        """Return addresses of the page; the first address works on other computers too."""
+        """Return addresses of the page.
+
+        With a network, the first address also works on other computers.
+        """
         hosts = [self._host or "localhost"]
         probe = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        # A computer without a network raises.
+        # connect() raises an error on a computer without a network.
         with probe, contextlib.suppress(OSError):
-            # Sends nothing, but selects the network interface. The address is for documentation.
+            # For UDP, connect() sends nothing: it only selects the network interface. 192.0.2.1 is
+            # an address that is reserved for documentation (RFC 5737).
             probe.connect(("192.0.2.1", 9))
             if not self._host:
                 hosts.insert(0, str(probe.getsockname()[0]))
@@ -138,17 +145,19 @@ class WebServer(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
+    """Answers the requests of one connection."""
+
     server: WebServer
     protocol_version = "HTTP/1.1"
     server_version = "hand_eye_calib"
     sys_version = ""
-    timeout = _PATIENCE_S
+    timeout = _TIMEOUT_S
 
     def do_GET(self) -> None:
         """Send a file of the page, the events, or a file of the saved result."""
         name = self._path() or "page.html"
         if name not in _STYLE_AND_SCRIPT and not self._has_key():
-            text = b"Open the whole address that the terminal with `hand_eye_calib watch` shows."
+            text = b"Open the whole address that `hand_eye_calib watch` shows on its terminal."
             self._send(HTTPStatus.FORBIDDEN, text)
         elif name in ("page.html", *_STYLE_AND_SCRIPT):
             self._send(HTTPStatus.OK, _FOLDER.joinpath(name).read_bytes(), name)
@@ -160,8 +169,8 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.NOT_FOUND, b"there is no such page")
 
     def do_POST(self) -> None:
-        """Pass a request of a button, or a prior, on to the node."""
-        # The body of the request, if any, is not read.
+        """Pass the request of a button, or a prior, on to the node."""
+        # The body of the request is not read, so the connection cannot be used again.
         self.close_connection = True
         if not self._has_key():
             self._send(HTTPStatus.FORBIDDEN, b"the key is missing")
@@ -184,12 +193,16 @@ class _Handler(BaseHTTPRequestHandler):
         """Log nothing: the terminal displays the view."""
 
     def _saved(self, name: str) -> bytes:
-        """Return a file of the saved result; empty if it is absent here, or a symbolic link."""
+        """Return a file of the saved result; empty if there is none, or if it is a symbolic link.
+
+        The node may run on another computer, so the file may be absent here.
+        """
         folder = self.server.board.view(time.monotonic()).saved_in
         file = Path(folder, name)
         return file.read_bytes() if folder and file.is_file() and not file.is_symlink() else b""
 
     def _path(self) -> str:
+        """Return the path of the request without the slash."""
         return urlsplit(self.path).path[1:]
 
     def _argument(self, name: str) -> str:
@@ -197,6 +210,7 @@ class _Handler(BaseHTTPRequestHandler):
         return parse_qs(urlsplit(self.path).query).get(name, [""])[-1]
 
     def _has_key(self) -> bool:
+        """Whether the address has the right key; the comparison takes the same time for any key."""
         key = self._argument("key").encode(errors="replace")
         return hmac.compare_digest(key, self.server.key.encode())
 
@@ -227,30 +241,32 @@ class _Handler(BaseHTTPRequestHandler):
                 self.wfile.write(event)
 
     def _events(self) -> Iterator[bytes]:
-        """Yield the view whenever it has changed, and an empty event every second in between."""
-        html = ""
+        """Yield the view whenever it has changed, and an empty event after a second without one."""
+        last_html = ""
         sent_s = 0.0
-        while not self.server.stopping.wait(_LOOK_S if html else 0.0):
+        while not self.server.stopping.wait(_PERIOD_S if last_html else 0.0):
             now_s = time.monotonic()
             view = self.server.board.view(now_s)
             # Path.is_file would raise an error for a name that is too long.
             files = [name for name in SAVED if os.path.isfile(f"{view.saved_in}/{name}")]
-            newest = " ".join(fragment(view, files if view.saved_in else ()).splitlines())
-            if newest != html:
-                yield f"data: {newest}\n\n".encode()
+            html = fragment(view, files if view.saved_in else ())
+            # The data of an event are one line.
+            html = " ".join(html.splitlines())
+            if html != last_html:
+                yield f"data: {html}\n\n".encode()
             elif now_s - sent_s >= REPORT_PERIOD_S:
                 yield b"data: \n\n"
             else:
                 continue
-            html = newest
+            last_html = html
             sent_s = now_s
 
 
 def fragment(view: View, files: Sequence[str] = ()) -> str:
-    """Return the HTML of a view without buttons and links.
+    """Return the HTML of a view, without buttons and links.
 
-    Buttons and links stay in the page, because a button that is replaced under a finger misses the
-    press. Attributes of the first element list the buttons and links to display.
+    Buttons and links are fixed parts of the page, because a button that is replaced while a finger
+    is on it does not react. Attributes of the first element list the buttons and links to display.
 
     Parameters
     ----------
@@ -270,7 +286,7 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
     if any(bar.meaning for bar in view.bars):
         bars = _SKETCH + bars
     pose = [_element("dt", axis) + _element("dd", text) for axis, text in view.values]
-    # The first line is the verdict; its reasons follow.
+    # The first line of the result is the verdict. The reasons for the verdict follow it.
     health = _lines(view.result[:1]) + _listed(view.reasons)
     health += _lines(view.result[1:] + view.health)
     return (
@@ -304,6 +320,7 @@ def _element(tag: str, text: str, name: str = "") -> str:
 
 
 def _wrapped(tag: str, parts: Iterable[str]) -> str:
+    """Return an element with other elements; empty without them."""
     content = "".join(parts)
     return f"<{tag}>{content}</{tag}>" if content else ""
 
@@ -330,7 +347,7 @@ def _bar(bar: Bar) -> str:
         f"<span><b>{name}</b> {escape(bar.meaning)}</span>"
         f'<span class="state">{_sign(bar.tone)} {escape(bar.word)}</span>'
         f'<progress max="1" value="{bar.share:.3f}" aria-label="{name}"></progress>'
-        f"{_element('span', bar.against)}{_element('span', difference)}</div>"
+        f"{_element('span', bar.sigma)}{_element('span', difference)}</div>"
     )
 
 
