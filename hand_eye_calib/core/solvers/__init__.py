@@ -1,1 +1,1 @@
-"""Solvers of AX = XB: motion pairs in, X = T_parent_child out."""
+"""Solvers of AX = XB, which estimate X = T_parent_child from motion pairs (A, B)."""

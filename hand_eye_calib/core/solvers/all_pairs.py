@@ -1,24 +1,25 @@
-"""Solvers that weigh all motion pairs alike, and what every solver returns.
+"""Solvers that give all motion pairs the same weight, and the solution type of all solvers.
 
-Park and Taylor solve AX = XB of motions A, B in two steps, with rotation vectors a, b of A and B:
+Park and Taylor solve AX = XB in two steps, with the rotation vectors a, b of the motions A and B:
 
     min sum |a - R b|^2,    then    min sum |(R_A - I) t - (R t_B - t_A)|^2
 
-They are the coarse stages of C. Park, P. Moghadam, S. Kim, S. Sridharan, C. Fookes,
+They are the initial stages of the methods of C. Park, P. Moghadam, S. Kim, S. Sridharan, C. Fookes,
 *Spatiotemporal camera-LiDAR calibration: a targetless and structureless approach*, IEEE Robotics
 and Automation Letters 5(2), 2020, and of Z. Taylor, J. Nieto, *Motion-based calibration of
 multimodal sensor arrays*, IEEE International Conference on Robotics and Automation, 2015, with
-equal weights for all readings. Both solve the same two least-squares problems, and their published
-results differ by rounding only. They have names of their own because the comparison of Välimäki et
-al. (2023) lists both.
+equal weights for all motions. Both methods solve the same two least-squares problems, and their
+published results differ only by rounding. Both have a name here, because the comparison of Välimäki
+et al. (2023) lists both.
 
 DNL minimises ``sum |A X - X B|_F^2``: direct non-linear optimisation (Välimäki et al. 2023, eq. 4).
 
-Ali minimises the translation residual alone. This is cost Xc1 of I. Ali, O. Suominen, A. Gotchev,
-E. R. Morales, *Methods for simultaneous robot-world-hand-eye calibration: a comparative study*,
-Sensors 19(12), 2019, as its authors' program computes it: the rotation residual of a motion pair
-enters only as the norm of a unit quaternion, a constant (Välimäki et al. 2023, section 2). The rest
-is the translation of AX - XB, a quadratic form in the same thirteen variables as dnl's cost.
+Ali minimises only the translation residual. This is cost Xc1 of I. Ali, O. Suominen, A. Gotchev, E.
+R. Morales, *Methods for simultaneous robot-world-hand-eye calibration: a comparative study*,
+Sensors 19(12), 2019, as the program of its authors computes it: the rotation residual enters only
+as the norm of a unit quaternion, which is constant (Välimäki et al. 2023, section 2). The
+translation residual of AX - XB is a quadratic form in the same thirteen variables as the cost of
+DNL.
 """
 
 from dataclasses import dataclass
@@ -30,8 +31,8 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.core.solvers import quadratic_form
 
-# Singular values below this share of the largest one are rounding. They belong to directions that
-# the motion does not excite, which stay at zero.
+# Singular values below this share of the largest one are rounding: the motion does not excite their
+# directions.
 RANK_TOLERANCE = 1e-12
 
 
@@ -42,14 +43,14 @@ class Solution:
     Attributes
     ----------
     T_parent_child : (4, 4) array
-        X. Directions that the motion does not excite keep zero translation or the rotation of the
-        start.
+        X. Along directions that the motion does not excite, the translation is zero and the
+        rotation is that of the start.
     objective : float
-        The method's own cost at X.
+        Cost of the method at X.
     converged : bool
-        Whether the iteration settled. If not, X is the best point that was reached.
+        Whether the iteration converged. If not, X is the best transform that was reached.
     weights : (K,) array
-        Weight of each motion pair; 1 for all with methods that do not reject outliers.
+        Weight of each motion pair; 1 if the method does not reject outliers.
     """
 
     T_parent_child: FloatArray
@@ -59,9 +60,9 @@ class Solution:
 
 
 def solve_park(pairs: MotionPairs) -> Solution:
-    """Solve AX = XB of K >= 1 pairs in two closed-form steps.
+    """Solve AX = XB for K >= 1 pairs in two closed-form steps.
 
-    ``objective`` is the sum of squared translation residuals, the cost of the second step, in m^2.
+    ``objective`` is the cost of the second step, the sum of squared translation residuals (m^2).
     """
     R = align_rotation_vectors(pairs)
     rows, targets = translation_equations(pairs, R)
@@ -72,7 +73,7 @@ def solve_park(pairs: MotionPairs) -> Solution:
 
 
 def translation_equations(pairs: MotionPairs, R: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return both sides of the equations ``(R_A - I) t = R t_B - t_A`` of the translation t.
+    """Return both sides of the equations ``(R_A - I) t = R t_B - t_A`` for the translation t.
 
     Parameters
     ----------
@@ -94,12 +95,12 @@ def translation_equations(pairs: MotionPairs, R: FloatArray) -> tuple[FloatArray
 
 
 def align_rotation_vectors(pairs: MotionPairs, weights: FloatArray | None = None) -> FloatArray:
-    """Estimate the rotation (3, 3) from the child's rotation vectors b to the parent's a.
+    """Estimate the rotation R (3, 3) of X from rotation vectors a of the parent and b of the child.
 
-    ``R_A = R R_B R'`` means ``a = R b``. The best R in least squares comes from the singular value
-    decomposition of the 3 x 3 correlation of the vectors (Kabsch 1976), mirrored back if it is a
-    reflection. No centroid is subtracted, because the vectors have a common origin. If a rotation
-    is nearly pi, noise decides the sign of its vector.
+    ``R_A = R R_B R'`` means ``a = R b``. The least squares solution comes from the singular value
+    decomposition of the 3 x 3 correlation of the vectors (Kabsch 1976); a reflection is corrected
+    to a rotation. No centroid is subtracted, because the vectors have a common origin. If a
+    rotation is close to pi, the sign of its vector is random.
 
     Parameters
     ----------
@@ -133,9 +134,9 @@ def solve_ali(pairs: MotionPairs) -> Solution:
 
 
 def residual_rows(pairs: MotionPairs) -> FloatArray:
-    """Return the matrix (3 K, 13) that takes x to the residuals ``R_A t + t_A - R t_B - t``.
+    """Return the matrix (3 K, 13) that maps x to the residuals ``R_A t + t_A - R t_B - t``.
 
-    ``x = (vec R, t, 1)`` with vec row-major.
+    ``x = (vec R, t, 1)`` with row-major vec.
     """
     rows = np.zeros((len(pairs), 3, quadratic_form.DIMENSION))
     for axis in range(3):
@@ -146,26 +147,29 @@ def residual_rows(pairs: MotionPairs) -> FloatArray:
 
 
 def _lowest_minimum(Q: FloatArray, pairs: MotionPairs) -> tuple[FloatArray, bool]:
-    """Return the X (4, 4) of the lowest minimum of a form (13, 13), and whether X converged."""
+    """Return X (4, 4) at the lowest minimum of a form (13, 13), and whether it converged.
+
+    The starts are those of :func:`start_rotations`.
+    """
     Ts, values, converged = quadratic_form.minimise(Q, start_rotations(pairs))
     best = int(np.argmin(values))
     return Ts[best], bool(converged[best])
 
 
 def pair_costs(pairs: MotionPairs, T_parent_child: FloatArray) -> FloatArray:
-    """Return the costs ``|A X - X B|_F^2`` (K,), with more digits than condensed forms have."""
+    """Return the costs ``|A X - X B|_F^2`` (K,), with more digits than from condensed forms."""
     return quadratic_form.costs(quadratic_form.coefficients(pairs), T_parent_child)
 
 
 def start_rotations(pairs: MotionPairs) -> FloatArray:
-    """Return rotations (4, 3, 3) to start from.
+    """Return rotations (4, 3, 3) of X from which iterations start.
 
     The first rotation aligns the child's rotation axes with the parent's. It is close to the
-    solution if the sensors rotate at all. The other three rotate the child by pi about one of its
-    axes as well; they help if the sensors hardly rotate.
+    solution if the sensors rotate. The other three are the first one after a rotation of the child
+    by pi about one of its axes. They help if the sensors hardly rotate.
     """
-    # The skew part of a rotation matrix has the direction of its axis, and takes less time than a
-    # rotation vector.
+    # The antisymmetric part of a rotation matrix has the direction of the rotation axis. It takes
+    # less time than a rotation vector.
     axes_parent = se3.vee(pairs.Ts_parenti_parentj)
     axes_child = se3.vee(pairs.Ts_childi_childj)
     U, _, V_transposed = np.linalg.svd(axes_parent.T @ axes_child)

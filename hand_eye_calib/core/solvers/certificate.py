@@ -1,20 +1,20 @@
 """Proof that a minimum of a quadratic form over SE(3) is the global one.
 
-With the translation eliminated, the cost is ``x' M x`` in ``x = (vec R, 1)``. A rotation satisfies
-20 independent quadratic equations (orthonormal rows and columns, right-handed both ways), and the
-last variable is 1. Each equation is a symmetric matrix A_i with ``x' A_i x`` constant for every
-rotation. So, for any multipliers,
+After the translation is eliminated, the cost is ``x' M x`` in ``x = (vec R, 1)``. A rotation
+satisfies 20 independent quadratic equations: its rows and its columns are orthonormal and
+right-handed. One more equation is that the last variable is 1. Each equation is a symmetric matrix
+A_i: ``x' A_i x`` is the same constant for all rotations. So, for any multipliers lambda_i,
 
-    Z = M + sum lambda_i A_i,    x' Z x = x' M x + constant    for all rotations.
+    Z = M + sum_i lambda_i A_i,    x' Z x = x' M x + constant    for all rotations.
 
-``Z x = 0`` at the minimum leaves 14 multipliers free. If some choice makes Z positive semidefinite,
-no rotation has a smaller cost: Lagrangian duality (Briales and Gonzalez-Jimenez, *Convex global 3D
-registration with Lagrangian duality*, CVPR 2017; Giamou et al., *Certifiably globally optimal
-extrinsic calibration from per-sensor egomotion*, RA-L 2019).
+The condition ``Z x = 0`` at the minimum leaves 14 multipliers free. If Z is positive semidefinite
+for some choice of the multipliers, no rotation has a smaller cost. This is Lagrangian duality
+(Briales and Gonzalez-Jimenez, *Convex global 3D registration with Lagrangian duality*, CVPR 2017;
+Giamou et al., *Certifiably globally optimal extrinsic calibration from per-sensor egomotion*, RA-L
+2019).
 
-The coordinates are rotated so that the minimum is the identity. Everything that depends on the
-equations alone is then constant. The rest is a Newton iteration in 14 variables with matrices of
-9 x 9.
+The coordinates are rotated so that the minimum is the identity. Then the terms that depend only on
+the equations are constants. A Newton iteration in 14 multipliers with matrices of 9 x 9 remains.
 """
 
 from functools import cache
@@ -26,62 +26,64 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.solvers import quadratic_form
 
-# A minimum is proved if the bound is below it by at most this share of the minimum, plus rounding.
-_RELATIVE = 1e-6
-# Rounding of the bound, as a share of the form's mean eigenvalue.
+# A minimum is proved to be global if the lower bound of the cost is below the minimum by at most
+# this share of it ...
+_MAX_RELATIVE_GAP = 1e-6
+# ... plus this rounding, as a share of the mean eigenvalue of the form.
 _ROUNDING = 1e-11
 
-# Factor by which the barrier's weight grows after a short Newton step. The first weight is its
-# square.
-_SHARPENING = 10.0
-# The iteration ends when the bound is this close to the best one, as a share of the form's mean
-# eigenvalue.
+# Factor by which the weight of t in the barrier method grows after a short Newton step. The first
+# weight is the square of the factor.
+_WEIGHT_GROWTH = 10.0
+# The iteration ends if t is this close to its minimum, as a share of the mean eigenvalue of the
+# form.
 _CLOSE = 1e-12
 
 
 def is_global(Q: FloatArray, T_parent_child: FloatArray) -> bool:
-    """Return whether the cost at a transform is proved to be the smallest over all of SE(3).
+    """Return whether the cost at a transform is proved to be the global minimum over SE(3).
 
     Parameters
     ----------
     Q : (13, 13) array
-        The form, see :mod:`~hand_eye_calib.core.solvers.quadratic_form`.
+        Quadratic form of the cost, see :mod:`~hand_eye_calib.core.solvers.quadratic_form`.
     T_parent_child : (4, 4) array
-        Near a local minimum.
+        Transform near a local minimum.
     """
     Ts, values, _ = quadratic_form.minimise(Q, T_parent_child[None, :3, :3])
-    # R = R_minimum S, and M is the form of S. So S is the identity at the minimum.
+    # With R = R_minimum S, M is the form of S, and S is the identity at the minimum.
     turn = np.eye(10)
     turn[:9, :9] = np.kron(Ts[0, :3, :3], np.eye(3))
     forms, _ = quadratic_form.without_translation(Q[None])
     M = turn.T @ forms[0] @ turn
     scale = max(float(np.trace(M)) / len(M), np.finfo(float).tiny)
     minimum = max(float(values[0]), 0.0)
-    tolerance = _RELATIVE * minimum / scale + _ROUNDING
-    eigenvalue = _largest_smallest_eigenvalue(M / scale, enough=-0.25 * tolerance)
-    # |x|^2 is 4 for every rotation, so the bound is below the minimum by at most 4 eigenvalues.
+    tolerance = _MAX_RELATIVE_GAP * minimum / scale + _ROUNDING
+    eigenvalue = _maximise_smallest_eigenvalue(M / scale, enough=-0.25 * tolerance)
+    # |x|^2 is 4 for every rotation. So the lower bound is below the minimum by at most 4 times a
+    # negative eigenvalue.
     gap = 4.0 * max(-eigenvalue, 0.0)
     decrease = float(quadratic_form.decrease(Q, T_parent_child, Ts[0]))
     gap += max(decrease, 0.0) / scale
     return gap <= tolerance
 
 
-def _largest_smallest_eigenvalue(M: FloatArray, enough: float) -> float:
+def _maximise_smallest_eigenvalue(M: FloatArray, enough: float) -> float:
     """Maximise the smallest eigenvalue of Z over the free multipliers; return this eigenvalue.
 
-    The search ends early once the eigenvalue is at least ``enough``. A barrier method minimises t
-    with ``Z + t I`` positive definite on the directions perpendicular to the identity. Along the
-    identity, Z is zero by construction.
+    The search ends early if the eigenvalue is at least ``enough``. A barrier method minimises t
+    such that ``Z + t I`` is positive definite on the directions perpendicular to the identity.
+    Along the identity, Z is zero by construction.
     """
     tables = _tables()
     across = tables.across
     Z = M - np.tensordot(tables.stationary @ (M @ tables.identity), tables.equations, 1)
     Z_across = across.T @ Z @ across
-    # The unknowns are the free multipliers and t. At the start, Z + t I is positive definite.
+    # The unknowns are the free multipliers and t. The first t makes Z + t I positive definite.
     derivatives = np.concatenate([across.T @ tables.free @ across, np.eye(9)[None]])
     t_start = max(-float(np.linalg.eigvalsh(Z_across)[0]), 0.0) + 0.1
     unknowns = np.append(np.zeros(len(tables.free)), t_start)
-    weight = _SHARPENING**2
+    weight = _WEIGHT_GROWTH**2
     best = float(np.linalg.eigvalsh(Z)[0])
     for _ in range(quadratic_form.MAX_NEWTON_STEPS):
         if best >= enough:
@@ -94,7 +96,7 @@ def _largest_smallest_eigenvalue(M: FloatArray, enough: float) -> float:
         if decrement < 0.5:
             if len(Z_across) / weight < _CLOSE:
                 break
-            weight *= _SHARPENING
+            weight *= _WEIGHT_GROWTH
     return best
 
 
@@ -106,9 +108,10 @@ def _newton_step(solved: FloatArray, weight: float) -> tuple[FloatArray, float]:
     Parameters
     ----------
     solved : (15, 9, 9) array
-        The inverse of ``Z + t I`` times its derivatives with respect to the 14
+        Inverse of ``Z + t I`` times the derivatives of ``Z + t I`` with respect to the 14
         multipliers and t.
     weight : float
+        Weight of t.
     """
     gradient = -np.trace(solved, axis1=1, axis2=2)
     gradient[-1] += weight
@@ -125,7 +128,7 @@ def _newton_step(solved: FloatArray, weight: float) -> tuple[FloatArray, float]:
 
 
 class _Tables(NamedTuple):
-    """Constants of the equations at the identity.
+    """Constants of the proof, which depend only on the equations of rotations.
 
     Attributes
     ----------
@@ -134,11 +137,11 @@ class _Tables(NamedTuple):
     across : (10, 9) array
         Directions perpendicular to ``identity``.
     equations : (21, 10, 10) array
-        Independent symmetric matrices A_i; the last one belongs to the last variable.
+        Independent symmetric matrices A_i. The last one states that the last variable is 1.
     stationary : (21, 10) array
-        Factors that map ``M x`` to the multipliers that make ``Z x = 0``, with signs reversed.
+        Factors that map ``M x`` to negative multipliers with ``Z x = 0`` at the identity.
     free : (14, 10, 10) array
-        Combinations of the equations that keep ``Z x = 0``.
+        Combinations of the equations whose multipliers are free: they do not change ``Z x``.
     """
 
     identity: FloatArray
@@ -150,7 +153,7 @@ class _Tables(NamedTuple):
 
 @cache
 def _tables() -> _Tables:
-    """Compute the constants from the equations that 200 random rotations fulfil."""
+    """Compute the constants; the equations are those that 200 random rotations satisfy."""
     rotations = se3.rotation_exp(np.random.default_rng(0).normal(size=(200, 3)))
     x = np.append(rotations.reshape(-1, 9), np.ones((200, 1)), axis=1)
     upper = np.triu_indices(10)
@@ -162,11 +165,11 @@ def _tables() -> _Tables:
     identity = np.append(np.eye(3).ravel(), 1.0)
     across = np.linalg.svd(identity[None])[2][1:].T
     at_identity = (equations @ identity).T
-    kept = np.linalg.svd(at_identity)[2][np.linalg.matrix_rank(at_identity) :]
+    null_space = np.linalg.svd(at_identity)[2][np.linalg.matrix_rank(at_identity) :]
     return _Tables(
         identity=identity,
         across=across,
         equations=equations,
         stationary=np.linalg.pinv(at_identity),
-        free=np.tensordot(kept, equations, 1),
+        free=np.tensordot(null_space, equations, 1),
     )

@@ -1,8 +1,8 @@
 """DNL and DNLO as in the paper: CasADi expressions minimised by Ipopt.
 
-The problems are eqs (4) and (5) of Välimäki et al. 2023, section 3.2. Unknowns are the rotation
-vector, the translation and, for DNLO, one weight per pair. The fast solvers are tested against
-these.
+The problems are eqs (4) and (5) of Välimäki et al. 2023, section 3.2. The unknowns are the rotation
+vector, the translation and, for DNLO, one weight per pair. These solvers are slow; tests compare
+the fast solvers of this package with them.
 """
 
 from typing import Any, TypeAlias
@@ -36,7 +36,7 @@ def solve_dnl(pairs: MotionPairs) -> Solution:
 def solve_dnlo(pairs: MotionPairs, threshold: float, min_inlier_fraction: float) -> Solution:
     """Minimise eq. (5) from the identity with all weights 1.
 
-    Parameters are as for :func:`hand_eye_calib.core.solvers.dnlo.solve`.
+    The parameters are those of :func:`hand_eye_calib.core.solvers.dnlo.solve`.
     """
     n_pairs = len(pairs)
     pose = casadi.MX.sym("pose", 6)
@@ -63,9 +63,12 @@ def solve_dnlo(pairs: MotionPairs, threshold: float, min_inlier_fraction: float)
 def _minimum(
     problem: dict[str, _Expression], n_weights: int, **bounds: Any
 ) -> tuple[FloatArray, bool]:
-    """Return X (4, 4) from a start at the identity with weights 1, and whether Ipopt converged."""
+    """Solve a problem of CasADi; return X (4, 4), and whether Ipopt converged.
+
+    The start is the identity with weights 1. ``bounds`` are those of the unknowns and constraints.
+    """
     solver = casadi.nlpsol("solver", "ipopt", problem, _IPOPT_OPTIONS)
-    # The rotation angle has no derivative at zero.
+    # The start is not exactly the identity, because the rotation angle has no derivative at zero.
     solution = solver(x0=np.r_[np.full(3, 1e-6), np.zeros(3), np.ones(n_weights)], **bounds)
     pose = np.array(solution["x"]).ravel()[:6]
     T_parent_child = se3.from_rotation_translation(se3.rotation_exp(pose[:3]), pose[3:])
@@ -73,9 +76,9 @@ def _minimum(
 
 
 def _cost_expressions(pairs: MotionPairs, pose: _Expression) -> _Expression:
-    """Expression (1, K) of ``|A X - X B|_F^2``.
+    """Return the expression (1, K) of the costs ``|A X - X B|_F^2`` of all pairs.
 
-    One function is mapped over the pairs, which keeps the graph small.
+    One function is mapped over the pairs, so that the expression graph is small.
     """
     motion_a = casadi.SX.sym("A", 3, 4)
     motion_b = casadi.SX.sym("B", 3, 4)
@@ -96,12 +99,12 @@ def _cost_expressions(pairs: MotionPairs, pose: _Expression) -> _Expression:
 
 
 def _columns(transforms: FloatArray) -> FloatArray:
-    """Top three rows (12, K) of each transform, column-major as CasADi stores matrices."""
+    """Return the top three rows of transforms as columns (12, K), column-major as in CasADi."""
     return np.ascontiguousarray(np.swapaxes(transforms[:, :3], 1, 2).reshape(len(transforms), 12).T)
 
 
 def _rodrigues(rotation_vector: _Expression) -> _Expression:
-    """Expression (3, 3) of the rotation matrix of a rotation vector."""
+    """Return the expression (3, 3) of the rotation matrix of a rotation vector."""
     angle = casadi.norm_2(rotation_vector)
     cross = casadi.skew(rotation_vector / angle)
     return casadi.SX.eye(3) + casadi.sin(angle) * cross + (1 - casadi.cos(angle)) * cross @ cross

@@ -5,13 +5,13 @@ cost of pair k is a quadratic form with a constant symmetric 13 x 13 matrix,
 
     e_k(X) = | A X - X B |_F^2  (top three rows)  =  x' Q_k x,
 
-and so is every weighted sum of pairs. Its minimum takes a Newton iteration in three variables, for
-any number of pairs.
+and every weighted sum of costs is such a form. For any number of pairs, the minimum of the sum
+takes a Newton iteration in three variables.
 
-The residual is linear in the pair, too: it is ``(A - I) X - X (B - I)``, where a pair enters with
-the 24 coefficients u of ``A - I`` and ``B - I``. Residuals, forms and sums of forms are thus
-products of u with a constant array. Subtracting the identity first keeps the digits of small
-motions.
+The residual is also linear in the pair: it is ``(A - I) X - X (B - I)``. A pair enters with 24
+coefficients u, the elements of ``A - I`` and ``B - I``. So residuals, forms and sums of forms are
+products of u with a constant array. The identity is subtracted first, because this keeps the digits
+of small motions.
 """
 
 import numpy as np
@@ -24,31 +24,31 @@ from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
 # Number of variables in x.
 DIMENSION = 13
 
-# Pairs that are condensed at once: their arrays fit into the cache of the processor.
+# Number of pairs that are condensed at once. Their arrays fit into the cache of the processor.
 _BLOCK = 128
-# Pairs that are summed at once, whose arrays are smaller.
+# Number of pairs that are summed at once. Their arrays are smaller.
 _SUMMED_BLOCK = 1024
 
-# Eigenvalues of the translation block below this share of the largest one are rounding. They count
-# as zero.
+# Eigenvalues of the translation block of a form count as zero below this share of the largest one:
+# they are rounding.
 _RANK_TOLERANCE = 1e-10
 
-# Largest number of steps of a Newton iteration; a well-posed form needs about ten.
+# Largest number of steps of a Newton iteration. A well-posed form needs about ten.
 MAX_NEWTON_STEPS = 60
-# A Newton step below this length (rad) is the last.
+# A Newton iteration ends if a step is shorter than this (rad).
 _STEP_TOLERANCE = 1e-12
 
-# Smallest divisor.
+# Smallest divisor, which prevents divisions by zero.
 TINY = 1e-300
 
-# Positions of the variables x in the sixteen entries of X.
+# Indices of the variables x in the sixteen entries of X.
 _X_IN_T = np.array([0, 1, 2, 4, 5, 6, 8, 9, 10, 3, 7, 11, 15])
 
 # Rows and columns of the upper triangle of a form.
 _ROWS, _COLUMNS = np.triu_indices(DIMENSION)
-# An element off the diagonal counts twice, because the triangle has it once.
+# How often each element of the triangle is in the form: twice off the diagonal.
 _MULTIPLICITY = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
-# Position in the triangle of every element of a form.
+# Index in the triangle of each element of a form.
 _TRIANGLE = np.empty((DIMENSION, DIMENSION), dtype=int)
 _TRIANGLE[_ROWS, _COLUMNS] = np.arange(len(_ROWS))
 _TRIANGLE[_COLUMNS, _ROWS] = np.arange(len(_ROWS))
@@ -58,9 +58,9 @@ _GENERATORS = se3.skew(np.eye(3))
 
 
 def _residual_table() -> FloatArray:
-    """Return the factors F (24, 12, 13) of the residuals: ``e_r = sum u_c F[c, r, m] x_m``.
+    """Return factors F (24, 12, 13) with residual ``r = sum_c,m u_c F[c, r, m] x_m``.
 
-    Residual r is element (i, j) of ``(A - I) X - X (B - I)``, row-major.
+    The 12 residuals are the top three rows of ``(A - I) X - X (B - I)``, row-major.
     """
     flat = np.zeros((16, DIMENSION))
     flat[_X_IN_T, np.arange(DIMENSION)] = 1.0
@@ -72,7 +72,7 @@ def _residual_table() -> FloatArray:
 
 
 def _twist_table() -> FloatArray:
-    """Matrices D (6, 4, 4) of ``X D``, the derivative of X along each tangent (rho, phi)."""
+    """Return matrices D (6, 4, 4): ``X D`` are the derivatives of ``X Exp(xi)`` at xi = 0."""
     twists = np.zeros((6, 4, 4))
     twists[[0, 1, 2], [0, 1, 2], 3] = 1.0
     twists[3:, :3, :3] = _GENERATORS
@@ -80,9 +80,9 @@ def _twist_table() -> FloatArray:
 
 
 def _tangent_table() -> FloatArray:
-    """Return factors (16, 91) that map ``X.ravel()`` to seven vectors x (13,).
+    """Return factors (16, 7 * 13) that map the entries of X to seven vectors like x (13,).
 
-    The first six are those of ``X D``, the derivatives of X; the last is that of X.
+    The first six vectors are the derivatives of x along the six tangents; the last is x itself.
     """
     maps = np.concatenate([_twist_table(), np.eye(4)[None]])
     tangents = np.einsum("in,dkl->nkdil", np.eye(4), maps).reshape(16, 7, 16)
@@ -95,9 +95,9 @@ _TANGENTS = _tangent_table()
 
 
 def condense(pairs: MotionPairs) -> FloatArray:
-    """Return the upper triangles (K, 91) of the forms Q_k of all pairs.
+    """Return the upper triangles (K, 91) of the forms Q_k of all K pairs.
 
-    Their elements are in the order of ``numpy.triu_indices(13)``. The costs of the pairs are
+    Their elements are in the order of ``numpy.triu_indices(13)``. So the costs of the pairs are
     ``condensed @ monomials(X)``.
     """
     condensed = np.empty((len(pairs), len(_ROWS)))
@@ -127,21 +127,29 @@ def costs(coefficients: FloatArray, T_parent_child: FloatArray) -> FloatArray:
 
 
 def median_costs(coefficients: FloatArray, Ts: FloatArray, scales: FloatArray) -> FloatArray:
-    """Return the medians (S,) of the costs at each X (S, 4, 4), with the child scaled.
+    """Return the medians (S,) of the costs of all pairs, at each X and scale of the child.
 
-    Each scale (S,) multiplies the child's translations. The costs are in the smaller unit of
-    length; otherwise a scale of zero would have the smallest cost.
+    The costs are in the smaller unit of length. Otherwise a scale of zero would have the smallest
+    cost.
+
+    Parameters
+    ----------
+    coefficients : (K, 24) array
+    Ts : (S, 4, 4) array
+    scales : (S,) array
+        Factors of the child's translations.
     """
+    # Factors (S, 24, 12) from coefficients to residuals.
     by_u = np.tensordot(Ts.reshape(-1, 16)[:, _X_IN_T], _RESIDUAL, axes=(1, 2))
-    # The second half of u is B - I (3, 4); its last column is the child's translation.
+    # The second half of u is B - I (3, 4). Its last column is the child's translation.
     by_u.reshape(-1, 2, 3, 4, 12)[:, 1, :, 3] *= scales[:, None, None]
     return medians(((coefficients @ by_u) ** 2).sum(axis=2)) / np.minimum(scales, 1.0) ** 2
 
 
 def weighted_sum(coefficients: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the weighted sum (13, 13) of the forms of pairs with weights (K,).
+    """Return the sum (13, 13) of the forms of K pairs, with weights (K,).
 
-    The sum is made from the coefficients, which takes less time than a sum of forms.
+    The sum is computed from the coefficients (K, 24), in less time than a sum of forms.
     """
     moments = np.zeros((24, 24))
     for start in range(0, len(coefficients), _SUMMED_BLOCK):
@@ -161,9 +169,9 @@ def decrease(
 
 
 def monomials(T_parent_child: FloatArray) -> FloatArray:
-    """Return the products ``x_i x_j`` (..., 91) of the variables of transforms (..., 4, 4).
+    """Return the products ``x_i x_j`` (..., 91), i <= j, of transforms X (..., 4, 4).
 
-    Products of two different variables are doubled, because a triangle has them once.
+    Products of two different variables are doubled, because the triangle contains them once.
     """
     entries = T_parent_child.reshape((*T_parent_child.shape[:-2], 16))
     first = entries.take(_X_IN_T[_ROWS], axis=-1)
@@ -171,29 +179,30 @@ def monomials(T_parent_child: FloatArray) -> FloatArray:
 
 
 def expand(condensed: FloatArray) -> FloatArray:
-    """Return the symmetric matrices (..., 13, 13) of upper triangles (..., 91)."""
+    """Return the symmetric matrices (..., 13, 13) with the upper triangles (..., 91)."""
     return condensed.take(_TRIANGLE, axis=-1)
 
 
 def minimise(Q: FloatArray, rotation_start: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Minimise ``x' Q x`` over SE(3), from several rotations or for several forms at once.
+    """Minimise ``x' Q x`` over SE(3), for one form from several starts or for several forms.
 
-    The translation is eliminated exactly. The rest is a quadratic function of the nine entries of
-    R, minimised by damped Newton steps ``R <- R Exp(phi)``.
+    The translation is eliminated exactly. The remaining quadratic function of the nine entries of R
+    is minimised by damped Newton steps ``R <- R Exp(phi)``.
 
     Parameters
     ----------
     Q : (13, 13) or (B, 13, 13) array
     rotation_start : (B, 3, 3) array
+        Rotation at the start of each of B iterations.
 
     Returns
     -------
     (B, 4, 4) array
-        Transforms.
+        Transforms X.
     (B,) array
-        Values of the forms.
+        Values of the forms at X.
     (B,) bool array
-        Whether the iteration converged.
+        Whether each iteration converged.
     """
     R = np.array(rotation_start, dtype=float)
     whole_forms = np.broadcast_to(Q, (len(R), DIMENSION, DIMENSION))
@@ -209,7 +218,7 @@ def minimise(Q: FloatArray, rotation_start: FloatArray) -> tuple[FloatArray, Flo
         R_new = R @ se3.rotation_exp(step)
         value_new, gradient_new, hessian_new = _derivatives(forms, R_new)
         better = (value_new < value) & ~converged
-        # Near the minimum, a step changes the value by less than rounding. Such a step is the last.
+        # Near the minimum, a step changes the value by less than rounding. It is the last step.
         rounding = 1e-15 * (np.abs(value) + np.abs(constant))
         stalled = ~better & (0.5 * curvature * length**2 <= rounding)
         converged |= (length < _STEP_TOLERANCE) | stalled
@@ -234,9 +243,9 @@ def without_translation(Q: FloatArray) -> tuple[FloatArray, FloatArray]:
     (B, 10, 10) array
         Forms of ``(vec R, 1)`` at the best translation for R.
     (B, 3, 10) array
-        Factors that map ``(vec R, 1)`` to the best translation (m) with its sign reversed.
+        Factors that map ``(vec R, 1)`` to the negative best translation (m).
     """
-    # The variables without the translation: vec R and 1.
+    # Indices of vec R and 1.
     others = np.append(np.arange(9), 12)
     coupling = Q[:, 9:12][:, :, others]
     # The pseudo-inverse of the translation block is zero along unobservable directions.
@@ -264,7 +273,7 @@ def _newton_step(
         Largest absolute curvature of each form.
     """
     values, axes = np.linalg.eigh(hessian)
-    # With absolute values, the step goes downhill along negative curvature, too.
+    # Absolute values make the step a descent direction also along negative curvature.
     curvatures = np.abs(values)
     largest = curvatures.max(axis=1)
     # A curvature below rounding would make an arbitrarily long step.
@@ -279,21 +288,23 @@ def _newton_step(
 def gauss_newton_step(Q: FloatArray, Ts_parent_child: FloatArray) -> FloatArray:
     """Take one Gauss-Newton step for each form from its own transform.
 
-    This step takes less time than one of :func:`minimise`, but loses digits. It serves searches
-    whose result is refined afterwards.
+    It takes less time than a step of :func:`minimise`, but loses digits. It is for searches whose
+    result is refined afterwards.
 
     Parameters
     ----------
     Q : (B, 13, 13) or (13, 13) array
-        Sums of the forms of pairs.
+        Sums of forms of pairs.
     Ts_parent_child : (B, 4, 4) array
+        Transforms before the step.
 
     Returns
     -------
     (B, 4, 4) array
+        Transforms after the step.
     """
     n_forms = len(Ts_parent_child)
-    # The derivatives of x along the six tangents at X, and x itself, are linear in X.
+    # Derivatives of x along the six tangents, then x itself: seven vectors, linear in X.
     tangents = (Ts_parent_child.reshape(n_forms, 16) @ _TANGENTS).reshape(n_forms, 7, DIMENSION)
     normal = tangents @ Q @ tangents.transpose(0, 2, 1)
     # The damping keeps X along directions that the pairs do not determine, and is too small to slow
@@ -301,14 +312,14 @@ def gauss_newton_step(Q: FloatArray, Ts_parent_child: FloatArray) -> FloatArray:
     diagonal = normal.reshape(n_forms, 49)[:, :48:8]
     diagonal += 1e-12 * diagonal.sum(axis=1, keepdims=True) + TINY
     step = np.linalg.solve(normal[:, :6, :6], -normal[:, :6, 6:])
-    # Cayley's map makes a rotation that equals the exponential up to second order, in less time.
+    # Cayley's map equals the exponential up to second order, and takes less time.
     twist = (step[:, :, 0] @ _TWISTS).reshape(n_forms, 4, 4)
     shrink = 1 / (1 + 0.25 * (step[:, 3:] ** 2).sum(axis=1, keepdims=True))
     return Ts_parent_child @ (np.eye(4) + shrink * (twist + 0.5 * twist @ twist))
 
 
 def _derivatives(forms: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the values of forms of (vec R, 1), and their derivatives under ``R Exp(phi)`` at 0.
+    """Return the values of forms of (vec R, 1) at ``R Exp(phi)``, and derivatives at phi = 0.
 
     Returns
     -------

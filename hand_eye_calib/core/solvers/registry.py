@@ -1,4 +1,4 @@
-"""Solvers of AX = XB by the name of their method, with their options."""
+"""Solvers of AX = XB by the names of their methods, and a method with its options."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,11 +30,11 @@ class _Solver(NamedTuple):
     solve : callable
         ``solve(pairs)``; for dnlo ``solve(pairs, threshold, min_inlier_fraction)``.
     solve_near : callable or None
-        ``solve_near(pairs, T_start)`` starts from a transform (4, 4) near the solution, which saves
-        time. None if the method cannot use a start.
+        ``solve_near(pairs, T_start)`` saves time by a start from a transform (4, 4) near the
+        solution. None if the method has no start.
     solve_best_stride : callable or None
-        Solve poses and choose the motions for the reference ``auto``. None if the adaptive
-        estimator chooses them.
+        ``solve_best_stride(Ts_pw_p, Ts_cw_c)`` chooses the motions for the reference ``auto``, and
+        solves them. None if the adaptive estimator chooses the reference.
     """
 
     solve: Callable[..., Solution]
@@ -56,7 +56,7 @@ _SOLVERS = {
 
 @dataclass(frozen=True)
 class Method:
-    """A method with its options.
+    """Method of the paper, or robust least squares, with its options.
 
     Parameters
     ----------
@@ -87,7 +87,10 @@ class Method:
 
     @property
     def solve_best_stride(self) -> Callable[[FloatArray, FloatArray], robust.Stride] | None:
-        """Solver that chooses the motions for the reference ``auto``; None if there is none."""
+        """Function ``(Ts_pw_p, Ts_cw_c)`` that chooses the motions for the reference ``auto``.
+
+        None if the method has no such function.
+        """
         return _SOLVERS[self.name].solve_best_stride
 
     def solve(self, pairs: MotionPairs) -> Solution:
@@ -104,7 +107,7 @@ class Method:
             )
         solve = _SOLVERS[self.name].solve
         if self.backend == "ipopt":
-            # The import takes a second.
+            # The import takes a second, so it is made only here.
             from hand_eye_calib.core.solvers import ipopt
 
             solve = ipopt.solve_dnl if self.name == "dnl" else ipopt.solve_dnlo
@@ -125,23 +128,24 @@ class Method:
     def solve_without(
         self, pairs: MotionPairs, solution: Solution, left_out: BoolArray
     ) -> FloatArray:
-        """Solve again without some of the pairs, for resampling.
+        """Solve B times, each time without some of the pairs, for resampling.
 
         Parameters
         ----------
         pairs : MotionPairs
             K pairs.
         solution : Solution
-            The solution with all pairs.
+            Solution with all pairs.
         left_out : (B, K) bool array
-            Pairs to leave out of each of B solutions.
+            Pairs that are left out of each solution.
 
         Returns
         -------
         (B, 4, 4) array
+            Transforms X.
         """
         if self.name == "dnlo":
-            # The search is quicker from a solution.
+            # Iterations from the solution take less time than a search for it.
             return dnlo.solve_without(
                 pairs, solution, left_out, self.threshold, self.min_inlier_fraction
             )

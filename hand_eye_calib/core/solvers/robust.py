@@ -4,11 +4,11 @@ Model: the residual of motion A_i of the parent and motion B_i of the child is
 
     e_i(X) = (translation, rotation vector) of B_i^-1 X^-1 A_i X.
 
-Residuals have heavy tails, one unknown scale for all translations, and one for all rotations. X
-minimises the sum of Cauchy costs of both components. The scales are estimated from medians of the
-residuals. Pairs that overlap are not independent. So the covariance is computed from sums over
-neighbouring pairs: W. K. Newey, K. D. West, *A simple, positive semi-definite, heteroskedasticity
-and autocorrelation consistent covariance matrix*, Econometrica 55, 1987.
+Residuals have heavy tails. All translations have one unknown standard deviation, and all rotations
+another; both are estimated from medians of the residuals. X minimises the sum of Cauchy costs of
+translations and rotations. Motions that overlap are not independent, so the covariance is computed
+from sums over neighbouring pairs: W. K. Newey, K. D. West, *A simple, positive semi-definite,
+heteroskedasticity and autocorrelation consistent covariance matrix*, Econometrica 55, 1987.
 """
 
 import math
@@ -32,38 +32,38 @@ from hand_eye_calib.core.solvers.all_pairs import (
 # errors (Holland and Welsch 1977, table 1).
 _CAUCHY_UNIT = 2.385
 
-# Largest number of steps.
+# Largest number of Gauss-Newton steps.
 _MAX_STEPS = 100
-# The scales of the residuals are fixed after this number of steps, because the median may alternate
-# between two residuals.
+# The standard deviations of the residuals are fixed after this number of steps, because medians may
+# alternate between two residuals.
 _FREE_SCALE_STEPS = 50
 
-# Default length of the last step, in standard deviations of X.
+# The iteration ends by default if a step is shorter than this, in standard deviations of X.
 _STEP_TOLERANCE = 1e-5
 
 # Number of start angles about the common axis of all motions. On flat ground, rotations do not
 # determine this angle.
 _N_STARTS = 12
 
-# Smallest scale of residuals (m, rad), for exact data.
+# Lower bound of the standard deviation of residuals (m, rad), for exact data.
 _MIN_SCALE = 1e-8
 
-# Longest correlation time of errors, as a share of the recording.
-_LASTING_SHARE = 1.0 / 20.0
-# Shortest correlation time, in motions: motions that overlap share errors.
-_LASTING_MOTIONS = 2
+# Assumed correlation time of errors, as a share of the recording.
+_CORRELATED_SHARE = 1.0 / 20.0
+# Smallest assumed correlation time, in motions: motions that overlap have common errors.
+_CORRELATED_MOTIONS = 2
 
-# Numbers of poses between both ends of a motion that are tried.
+# Strides that are tried. A stride is the number of poses from the start to the end of a motion.
 _STRIDES = (1, 2, 5, 10, 20, 50)
 
-# Motions that begin within a stride. More would overlap by more than four fifths and add little
-# evidence.
+# Number of motions that start within one stride. More motions would overlap by more than four
+# fifths and add little information.
 _MOTIONS_PER_STRIDE = 5
 
-# Largest number of motions of one stride. More take time and hardly change the covariance.
-_MOST_MOTIONS = 2000
+# Largest number of motions of one stride. More motions take time and hardly change the covariance.
+_MAX_MOTIONS = 2000
 
-# Smallest number of motions that do not overlap, for strides above 1.
+# Strides above 1 are skipped if fewer motions than this fit into the recording one after the other.
 _MIN_MOTIONS = 10
 
 
@@ -74,9 +74,10 @@ class RobustSolution(Solution):
     Attributes
     ----------
     cov_parent_child_in_child : (6, 6) array
-        Covariance of xi in ``X Exp(xi)``, m before rad; zero along directions without evidence.
+        Covariance of xi = (rho in m, phi in rad) in ``X Exp(xi)``; zero along directions without
+        information.
     unseen : (6, k) array
-        Directions of xi without evidence.
+        Unit vectors of xi along which the motions have no information.
     """
 
     cov_parent_child_in_child: FloatArray
@@ -88,15 +89,19 @@ def solve(
 ) -> RobustSolution:
     """Solve A X = X B for K >= 1 pairs.
 
-    ``objective`` is the sum of the Cauchy costs of both components, in units of their scales.
-
     Parameters
     ----------
     pairs : MotionPairs
     T_start : (4, 4) array, optional
-        A transform near the solution. By default, the solver finds one.
+        Transform near the solution. By default, it is computed from the pairs.
     tolerance : float
-        A step shorter than this, in standard deviations of X, is the last.
+        The iteration ends if a step is shorter than this, in standard deviations of X.
+
+    Returns
+    -------
+    RobustSolution
+        ``objective`` is the sum of the Cauchy costs of translations and rotations, each in units of
+        its standard deviation. ``weights`` are the smaller of both weights of each pair.
     """
     T_parent_child = _start(pairs) if T_start is None else T_start
     scales = np.full(2, _MIN_SCALE)
@@ -130,9 +135,9 @@ class Stride(NamedTuple):
     Attributes
     ----------
     reference : str
-        "B5" for motions over five poses.
+        Reference of the motions: "B5" for motions over five poses.
     pairs : MotionPairs
-        Pairs of the reference. Only every few of them if neighbours overlap much or if there are
+        Motion pairs of the reference: every k-th pair if neighbours overlap much, or if there are
         many pairs.
     solution : RobustSolution
     """
@@ -156,15 +161,21 @@ def solve_strides(
         Synchronised poses of both sensors, in order of time.
     T_start : (4, 4) array, optional
     tolerance : float
-        As for :func:`solve`.
+        ``T_start`` and ``tolerance`` are those of :func:`solve`.
+
+    Returns
+    -------
+    list of Stride
+        Stride 1, and all longer strides for which the recording is long enough.
     """
     strides = []
     for n_poses in _STRIDES:
         if n_poses == 1 or _MIN_MOTIONS * n_poses < len(Ts_pw_p):
             reference = f"B{n_poses}"
             pairs = motion_pairs(Ts_pw_p, Ts_cw_c, reference)
-            every_for_time = math.ceil(len(pairs) / _MOST_MOTIONS)
-            pairs = pairs[:: max(n_poses // _MOTIONS_PER_STRIDE, every_for_time, 1)]
+            every_by_overlap = n_poses // _MOTIONS_PER_STRIDE
+            every_by_number = math.ceil(len(pairs) / _MAX_MOTIONS)
+            pairs = pairs[:: max(every_by_overlap, every_by_number, 1)]
             strides.append(Stride(reference, pairs, solve(pairs, T_start, tolerance)))
     return strides
 
@@ -177,19 +188,22 @@ def solve_best_stride(Ts_pw_p: FloatArray, Ts_cw_c: FloatArray) -> Stride:
 
 @dataclass(frozen=True)
 class _Component:
-    """Residuals (K, 3) of translation or rotation, and their Jacobians (K, 3, 6)."""
+    """Translations or rotations of K residuals: residuals (K, 3) and Jacobians (K, 3, 6)."""
 
     residuals: FloatArray
     jacobians: FloatArray
 
 
 def _components(pairs: MotionPairs, T_parent_child: FloatArray) -> tuple[_Component, _Component]:
-    """Linearise the residuals at ``X Exp(xi)``."""
-    # The child's motion that the parent's motion predicts: X^-1 A X.
+    """Return residuals and their derivatives with respect to xi in ``X Exp(xi)``.
+
+    The first component are the translations (m), the second the rotation vectors (rad).
+    """
+    # Motion X^-1 A X of the child, predicted from the motion of the parent.
     predicted = se3.inverse(T_parent_child) @ pairs.Ts_parenti_parentj @ T_parent_child
     errors = se3.inverse(pairs.Ts_childi_childj) @ predicted
-    # Exp(-xi) Y Exp(xi) = Y Exp(xi - Ad(Y^-1) xi) to first order. The errors are near the identity,
-    # so that their own rotation is neglected in the Jacobians.
+    # For a predicted motion Y, Exp(-xi) Y Exp(xi) = Y Exp(xi - Ad(Y^-1) xi) to first order. The
+    # errors are near the identity, so that the Jacobians neglect the rotation of the errors.
     jacobians = np.eye(6) - se3.adjoint(se3.inverse(predicted))
     rotation_vectors = se3.rotation_log(se3.rotation_of(errors))
     translation = _Component(se3.translation_of(errors), jacobians[:, :3])
@@ -198,13 +212,13 @@ def _components(pairs: MotionPairs, T_parent_child: FloatArray) -> tuple[_Compon
 
 
 def _scales(components: tuple[_Component, _Component]) -> FloatArray:
-    """Estimate the standard deviation (2,) of the residuals of each component from their median."""
+    """Return the standard deviations (2,) of both components, from medians of residuals."""
     medians = [median(np.abs(component.residuals).ravel()) for component in components]
     return np.maximum(np.array(medians) / MEDIAN_NORMAL, _MIN_SCALE)
 
 
 def _weights(components: tuple[_Component, _Component], scales: FloatArray) -> FloatArray:
-    """Cauchy weights (2, K) of translations and rotations."""
+    """Return the Cauchy weights (2, K) of translations and of rotations."""
     squared = []
     for component, scale in zip(components, scales, strict=True):
         squared.append((component.residuals**2).sum(axis=1) / 3.0 / (_CAUCHY_UNIT * scale) ** 2)
@@ -216,7 +230,7 @@ def _normal_equations(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the weighted Hessian (6, 6), and the scores (2, K, 6).
 
-    A score is the derivative of a pair's cost in translation or in rotation.
+    A score is the derivative, with respect to xi, of the cost of one translation or rotation.
     """
     hessian = np.zeros((6, 6))
     scores = []
@@ -229,25 +243,28 @@ def _normal_equations(
 
 
 def _covariance(hessian: FloatArray, scores: FloatArray, pairs: MotionPairs) -> FloatArray:
-    """Covariance (6, 6) from the weighted Hessian (6, 6) and the scores (2, K, 6) of the pairs."""
-    # The weight of a pair falls if its residual grows. This term of the second derivative is not
-    # in the weighted Hessian.
+    """Return the covariance (6, 6) from the weighted Hessian and the scores (2, K, 6) of pairs.
+
+    It allows for errors that are correlated over a share of the recording.
+    """
+    # The weight of a pair decreases as its residual grows. The weighted Hessian does not contain
+    # this term of the second derivative.
     curvature = 2.0 / 3.0 / _CAUCHY_UNIT**2 * np.einsum("pki,pkj->ij", scores, scores)
     n_poses = int(pairs.j[-1] - pairs.i[0])
     motion = median(pairs.j - pairs.i)
-    # Correlation time in poses, and the window of the sums in pairs.
-    lasting = max(_LASTING_SHARE * n_poses, _LASTING_MOTIONS * motion)
-    window = round(lasting * len(pairs) / n_poses)
+    # Correlation time in poses, then in pairs.
+    n_correlated_poses = max(_CORRELATED_SHARE * n_poses, _CORRELATED_MOTIONS * motion)
+    window = round(n_correlated_poses * len(pairs) / n_poses)
     window = min(max(window, 1), len(pairs) // 2 + 1)
-    # The six unknowns fit some of the errors, so residuals are smaller than errors. The factor
-    # n / (n - 6) corrects this; n is the number of motions that do not overlap.
+    # Residuals are smaller than errors, because the six unknowns fit some of the errors. The factor
+    # n / (n - 6) corrects this, for n motions that do not overlap.
     n_motions = n_poses / motion
     n_free = max(n_motions - 6.0, 1.0)
     return n_motions / n_free * _sandwich(hessian - curvature, scores.sum(axis=0), window)
 
 
 def _sandwich(hessian: FloatArray, scores: FloatArray, window: int) -> FloatArray:
-    """Covariance (6, 6) from the scatter of sums of scores (K, 6) over windows of pairs."""
+    """Return the covariance (6, 6) from sums of scores (K, 6) over windows of consecutive pairs."""
     total = np.cumsum(np.vstack([np.zeros(6), scores]), axis=0)
     sums = total[window:] - total[:-window]
     scatter = len(scores) / window / len(sums) * sums.T @ sums
@@ -256,10 +273,10 @@ def _sandwich(hessian: FloatArray, scores: FloatArray, window: int) -> FloatArra
 
 
 def _inverse(hessian: FloatArray) -> FloatArray:
-    """Pseudo-inverse (6, 6) of a Hessian.
+    """Return the pseudo-inverse (6, 6) of a Hessian.
 
-    Its rank is decided with both components scaled alike, because translation and rotation may
-    differ by many powers of ten.
+    The rank is determined after translation and rotation were scaled to the same size, because they
+    may differ by many powers of ten.
     """
     units = _units(hessian)
     balanced = np.linalg.pinv(hessian / units / units[:, None], RANK_TOLERANCE, hermitian=True)
@@ -267,7 +284,7 @@ def _inverse(hessian: FloatArray) -> FloatArray:
 
 
 def _null_space(hessian: FloatArray) -> FloatArray:
-    """Directions (6, k) without evidence, of length 1."""
+    """Return unit vectors (6, k) of the k directions without information."""
     units = _units(hessian)
     values, vectors = np.linalg.eigh(hessian / units / units[:, None])
     directions = vectors[:, values <= RANK_TOLERANCE * values[-1]] / units[:, None]
@@ -275,13 +292,16 @@ def _null_space(hessian: FloatArray) -> FloatArray:
 
 
 def _units(hessian: FloatArray) -> FloatArray:
-    """Root (6,) of the largest diagonal element of each component; 1 if this element is zero."""
+    """Return the scales (6,) of translation and of rotation in a Hessian (6, 6).
+
+    A scale is the root of the largest diagonal element of its component; 1 if this is zero.
+    """
     roots = np.sqrt(np.diag(hessian).reshape(2, 3).max(axis=1))
     return np.repeat(np.where(roots > 0.0, roots, 1.0), 3)
 
 
 def _log_volume(solution: RobustSolution) -> float:
-    """Logarithm of the determinant of the covariance; infinite if a direction has no evidence."""
+    """Return the log determinant of the covariance; infinite if a direction has no information."""
     if solution.unseen.shape[1]:
         return np.inf
     return float(np.linalg.slogdet(solution.cov_parent_child_in_child)[1])
@@ -294,12 +314,12 @@ def _start(pairs: MotionPairs) -> FloatArray:
     """Return a transform (4, 4) near the solution.
 
     The rotation aligns the rotation vectors of both sensors. If all motions rotate about one axis,
-    the angle about this axis remains unknown. So several angles are tried, each with a translation
-    by least squares.
+    the angle about this axis remains unknown. So several angles are tried, each with its
+    translation by least squares.
     """
     vectors_parent = se3.rotation_log(se3.rotation_of(pairs.Ts_parenti_parentj))
     vectors_child = se3.rotation_log(se3.rotation_of(pairs.Ts_childi_childj))
-    # Both motions of a pair rotate by the same angle, for any X.
+    # Both motions of a pair rotate by the same angle, for any X. Other pairs get small weights.
     differences = np.linalg.norm(vectors_parent, axis=1) - np.linalg.norm(vectors_child, axis=1)
     unit = max(1.5 * median(np.abs(differences)), _MIN_SCALE)
     weights = robust_weights("cauchy", (differences / unit) ** 2)
@@ -315,7 +335,8 @@ def _start(pairs: MotionPairs) -> FloatArray:
         misfit_m = _median_length(slopes @ translation - targets)
         misfit_rad = _median_length(vectors_parent - vectors_child @ rotation.T)
         starts.append(se3.from_rotation_translation(rotation, translation))
-        # The misfit of rotation, as a share of the motion, counts as much as that of translation.
+        # The misfit of rotation, as a share of the rotation, is converted to a share of the
+        # translation in m.
         misfits_m.append(misfit_m + misfit_rad / angle_rad * _median_length(targets))
     return starts[int(np.argmin(misfits_m))]
 
@@ -323,7 +344,15 @@ def _start(pairs: MotionPairs) -> FloatArray:
 def _weighted_translation(
     slopes: FloatArray, targets: FloatArray, weights: FloatArray
 ) -> FloatArray:
-    """Solve ``slopes @ t = targets`` of K pairs with weights (K,) by least squares."""
+    """Solve ``slopes @ t = targets`` by least squares.
+
+    Parameters
+    ----------
+    slopes : (K, 3, 3) array
+    targets : (K, 3) array
+    weights : (K,) array
+        Factors of the equations of each pair.
+    """
     weighted_slopes = (weights[:, None, None] * slopes).reshape(-1, 3)
     weighted_targets = (weights[:, None] * targets).ravel()
     translation = np.linalg.lstsq(weighted_slopes, weighted_targets, rcond=1e-9)[0]
@@ -331,5 +360,5 @@ def _weighted_translation(
 
 
 def _median_length(vectors: FloatArray) -> float:
-    """Median length of vectors (K, 3)."""
+    """Return the median length of vectors (K, 3)."""
     return median(np.linalg.norm(vectors, axis=1))

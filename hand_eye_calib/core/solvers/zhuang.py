@@ -1,24 +1,25 @@
-"""Zhuang: rotation and translation together, by Gauss-Newton on the identification Jacobian.
+"""Zhuang: simultaneous rotation and translation by Gauss-Newton on the identification Jacobian.
 
 H. Zhuang, Z. Qu, *A new identification Jacobian for robotic hand/eye calibration*, IEEE
 Transactions on Systems, Man, and Cybernetics 24(8), 1994, eqs 14-16.
 
 With ``z = tan(w/2) k`` for the rotation by w about k, Cayley's formula ``R = (I - [z])^-1 (I +
-[z])`` makes both halves of AX = XB polynomial once they are multiplied by ``I - [z]``:
+[z])`` makes both parts of AX = XB polynomial after a multiplication by ``I - [z]``:
 
     f = [k_A + k_B] z + k_A - k_B                              (rotation axes: k_A = R k_B)
     g = (I - [z]) ((R_A - I) t + t_A) - (I + [z]) t_B          (translations)
 
-Both are linear in the sixteen products of (1, z) with (1, t). So the pairs are condensed once, by a
-QR decomposition, and an iteration takes the same time for any number of pairs.
+Both residuals f and g are linear in the sixteen products of (1, z) with (1, t). So the pairs are
+condensed once, by a QR decomposition, and an iteration takes the same time for any number of pairs.
 
-The axes have unit length even for the smallest angle, and g grows with the rotation of X. So noisy
-rotations or a large rotation of X bias the solution. A rotation of X by pi has no finite z.
+The axes have unit length even for small angles, so that noisy rotations bias the solution. A large
+rotation of X biases it, too, because g grows with this rotation. A rotation of X by pi has no
+finite z.
 
-The iteration starts from the identity. It may settle in a false minimum if X rotates by more than
-about 1.8 rad. In the published results this happens in 33 rows of one simulated trajectory with an
-X of 3.13 rad; three of these rows are noise-free. Such a solution is returned as published, but
-``converged`` is False if the cost is lower near park's solution.
+The iteration starts from the identity. It may converge to a false minimum if X rotates by more than
+about 1.8 rad. In the published results this happens in 33 rows of one simulated trajectory, whose X
+rotates by 3.13 rad; three of these rows are noise-free. Such a solution is returned as published,
+but ``converged`` is False if the cost is lower near the solution of Park.
 """
 
 import numpy as np
@@ -31,44 +32,46 @@ from hand_eye_calib.core.solvers.all_pairs import Solution
 
 # Largest number of iterations, as in the authors' program.
 _MAX_ITERATIONS = 500
-# A step with every component below this size (m, or of z) is the last, as in the authors' program.
+# The iteration ends if all components of a step, in m or in units of z, are below this limit, as in
+# the authors' program.
 _STEP_TOLERANCE = 1e-8
 
-# A minimum is lower than another if its cost is smaller by more than this share, and by more than
-# rounding.
-_LOWER = 1e-6
-# Rounding of the residuals, as a share of the data.
+# A minimum is lower than another one if its cost is smaller by more than this share ...
+_MIN_DIFFERENCE = 1e-6
+# ... and by more than this rounding of the residuals, as a share of the data.
 _ROUNDING = 1e-12
 
 
 def solve(pairs: MotionPairs) -> Solution:
-    """Solve AX = XB of K >= 1 pairs by Gauss-Newton from the identity.
+    """Solve AX = XB for K >= 1 pairs by Gauss-Newton from the identity.
 
-    ``objective`` is the sum of ``|f|^2 + |g|^2``. ``converged`` is False if the iteration did not
-    settle, or if it settled in a false minimum.
+    ``objective`` is the sum of ``|f|^2 + |g|^2`` over all pairs. ``converged`` is False if the
+    iteration did not converge, or if it converged to a false minimum.
     """
     M = _condense(pairs)
     parameters, objective, settled = _gauss_newton(M, np.zeros(6))
     near_park = _parameters(all_pairs.solve_park(pairs).T_parent_child)
     _, objective_near_park, _ = _gauss_newton(M, near_park)
-    # A solution in a false minimum has a higher cost than the minimum near park's solution.
+    # The cost at a false minimum is higher than that of the minimum near the solution of Park.
     rounding = _ROUNDING**2 * float((M**2).sum())
-    is_lowest = objective <= objective_near_park / (1 - _LOWER) + rounding
+    is_lowest = objective <= objective_near_park / (1 - _MIN_DIFFERENCE) + rounding
     T_parent_child = se3.from_rotation_translation(_rotation(parameters[:3]), parameters[3:])
     return Solution(T_parent_child, objective, settled and is_lowest, np.ones(len(pairs)))
 
 
 def _gauss_newton(M: FloatArray, parameters: FloatArray) -> tuple[FloatArray, float, bool]:
-    """Iterate from parameters (z, t) (6,), with the matrix M of :func:`_condense`.
+    """Minimise ``|M products(z, t)|^2`` from the start ``parameters`` = (z, t) (6,).
+
+    M is the matrix of :func:`_condense`.
 
     Returns
     -------
     (6,) array
         The last (z, t).
     float
-        Its cost.
+        Cost at the last (z, t).
     bool
-        Whether the iteration settled.
+        Whether the iteration converged.
     """
     for _ in range(_MAX_ITERATIONS):
         products, derivatives = _products(parameters)
@@ -84,7 +87,7 @@ def _gauss_newton(M: FloatArray, parameters: FloatArray) -> tuple[FloatArray, fl
 def _condense(pairs: MotionPairs) -> FloatArray:
     """Return the matrix M (at most 20, 16) that maps products of (1, z) with (1, t) to residuals.
 
-    The squared length of these residuals is the sum of ``|f|^2 + |g|^2`` over all pairs.
+    The sum of the squared residuals is that of ``|f|^2 + |g|^2`` over all pairs.
     """
     A = pairs.Ts_parenti_parentj
     B = pairs.Ts_childi_childj
@@ -94,9 +97,9 @@ def _condense(pairs: MotionPairs) -> FloatArray:
     k_B = _axes(se3.rotation_of(B))
     # Factors of (1, z) in f.
     f = np.concatenate([(k_A - k_B)[:, :, None], se3.skew(k_A + k_B)], axis=2)
-    # Coefficients of z_i t_j in g, with z_0 = t_0 = 1. Rearranged, this is
+    # Coefficients (K, 3, i, j) of z_i t_j in g, with z_0 = t_0 = 1:
     # g = (R_A - I) t + t_A - t_B - [z] ((R_A - I) t + t_A + t_B).
-    # The slices of z_1 to z_3 first contain the bracket; the einsum multiplies it by -[z].
+    # The slices i = 1, 2, 3 first contain the bracket; the einsum multiplies it by -[z].
     g = np.zeros((len(pairs), 3, 4, 4))
     g[..., 1:] = (se3.rotation_of(A) - np.eye(3))[:, :, None]
     g[:, :, 0, 0] = t_A - t_B
@@ -110,7 +113,7 @@ def _condense(pairs: MotionPairs) -> FloatArray:
 def _products(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the products (16,) of (1, z) and (1, t), and the derivatives (16, 6).
 
-    The derivatives are with respect to (z, t). The index of t varies fastest.
+    The derivatives are with respect to (z, t). Products are in row-major order of (z, t).
     """
     one_z = np.append(1.0, parameters[:3])
     one_t = np.append(1.0, parameters[3:])
@@ -129,7 +132,7 @@ def _axes(rotations: FloatArray) -> FloatArray:
 
 
 def _rotation(z: FloatArray) -> FloatArray:
-    """Rotation matrix (3, 3) of ``z = tan(w/2) k``."""
+    """Return the rotation matrix (3, 3) of ``z = tan(w/2) k``."""
     length = np.linalg.norm(z)
     factor = 2 * np.arctan(length) / length if length > 0.0 else 2.0
     return se3.rotation_exp(z * factor)
