@@ -1,4 +1,4 @@
-"""Names for the kinds of NumPy arrays, for annotations, and the check of an argument."""
+"""Types of NumPy arrays for annotations, and a check of arguments that are arrays."""
 
 from typing import TypeAlias
 
@@ -13,7 +13,9 @@ BoolArray: TypeAlias = NDArray[np.bool_]
 
 
 def floats(name: str, values: ArrayLike, columns: int = 0) -> FloatArray:
-    """Return an argument of the Python interface as an array of numbers; (N, columns) if not 0.
+    """Return an argument of the Python interface as an array of floats.
+
+    The shape is (N, columns); if ``columns`` is 0, the shape is that of the argument.
 
     Raises
     ------

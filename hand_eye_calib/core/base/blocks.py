@@ -1,9 +1,10 @@
 """Least squares from sums over blocks of time.
 
-The p unknowns x minimise the squares of ``W^(1/2) (J x - y)``. The table of a block is its matrix
-of products ``[J y]' W [J y]`` (p + 1, p + 1). The first p rows of a table are ``[H S]``: the
-information ``J' W J`` and the score ``J' W y``. Tables of blocks add. So the solution for any set
-of blocks (all, all but one, before or since a time) follows from the sum of their tables.
+The p unknowns x minimise the squares of ``W^(1/2) (J x - y)``. The table of a block of time is its
+matrix of products ``[J y]' W [J y]`` (p + 1, p + 1). The first p rows of a table are ``[H S]``: the
+information ``H = J' W J`` and the score ``S = J' W y``. The table of several blocks is the sum of
+their tables. So the solution for any set of blocks (all, all except one, before or since a time)
+needs only sums of tables.
 """
 
 from collections.abc import Sequence
@@ -13,16 +14,17 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 
-# Damping of directions without evidence, if the diagonal is scaled to 1; above rounding.
+# Term added to the diagonal of an information matrix whose diagonal is scaled to 1. It is above
+# rounding, and makes unknowns zero along directions without information.
 _DAMPING = 1e-10
 
-# Smallest root of a diagonal element of an unknown with evidence.
-_SMALLEST_ROOT = 1e-30
+# An unknown has no information if the square root of its diagonal element is not above this.
+_MIN_ROOT = 1e-30
 
 
 @dataclass(frozen=True)
 class Blocks:
-    """Sums (B, ...) of B blocks in order of time: tables, or other arrays that add over blocks.
+    """Sums (B, ...) over B blocks in order of time: tables, or other arrays that can be added.
 
     Examples
     --------
@@ -35,10 +37,10 @@ class Blocks:
 
     @classmethod
     def of_rows(cls, rows: FloatArray, n_blocks: int, probes: FloatArray | None = None) -> "Blocks":
-        """Make tables from weighted rows ``W^(1/2) [J y]`` (K, d, p + 1), in equally long blocks.
+        """Return the tables of weighted rows ``W^(1/2) [J y]`` (K, d, p + 1) in equal blocks.
 
-        ``probes`` (K, d, p + 1), if any, replace the left factor of the products. They are
-        instrumental variables.
+        ``probes`` (K, d, p + 1), if any, are instrumental variables: they replace the left factor
+        of the products.
         """
         n_columns = rows.shape[-1]
         left_factors = np.array_split(rows if probes is None else probes, n_blocks)
@@ -50,13 +52,16 @@ class Blocks:
 
     @classmethod
     def gathered(cls, values: FloatArray, block_of: IntArray, n_blocks: int) -> "Blocks":
-        """Sum values (K, ...) over blocks; ``block_of`` (K,) is the index of a value's block."""
+        """Return the sums of values (K, ...) over blocks.
+
+        ``block_of`` (K,) is the index of the block of each value.
+        """
         sums = np.zeros((n_blocks, *values.shape[1:]))
         np.add.at(sums, block_of, values)
         return cls(sums)
 
     def merged(self, n_blocks: int) -> "Blocks":
-        """Merge neighbouring blocks, so that ``n_blocks`` remain."""
+        """Return ``n_blocks`` larger blocks, each the sum of neighbouring blocks."""
         starts = np.arange(n_blocks) * len(self.sums) // n_blocks
         return Blocks(np.add.reduceat(self.sums, starts))
 
@@ -66,22 +71,22 @@ class Blocks:
         return np.asarray(self.sums.sum(axis=0))
 
     def without(self) -> FloatArray:
-        """Sums (B, ...) of all blocks except one, for each block."""
+        """Return the sums (B, ...) of all blocks except block b, for each b."""
         return self.total - self.sums
 
     def before(self, cuts: IntArray) -> FloatArray:
-        """Sums (C, ...) of the blocks before each cut (C,); a cut is at least 1."""
+        """Return the sums (C, ...) of the blocks before each of the indices ``cuts`` (C,), >= 1."""
         return np.asarray(np.cumsum(self.sums, axis=0)[cuts - 1])
 
     def since(self, cuts: IntArray) -> FloatArray:
-        """Sums (C, ...) of the blocks since each cut (C,); a cut is at most B - 1."""
+        """Return the sums (C, ...) of the blocks from each of the indices ``cuts`` (C,) on."""
         return np.asarray(np.cumsum(self.sums[::-1], axis=0)[::-1][cuts])
 
     def shift_since(self, cuts: IntArray, prior: FloatArray) -> FloatArray:
-        """Evidence ``[H S]`` (C, p, p + 1) of a shift of the unknowns at each cut (C,).
+        """Return information and score ``[H S]`` (C, p, p + 1) of a shift at each of the cuts (C,).
 
-        The unknowns before the cut are estimated from the blocks before it. ``prior`` (p, p) is
-        added to their information.
+        A shift is a change of the unknowns x from the blocks before a cut to those since the cut.
+        ``prior`` (p, p) is added to the information on x before the cut.
         """
         before = self.before(cuts)
         covariances = inverse(information(before) + prior)
@@ -89,49 +94,49 @@ class Blocks:
         return shift_evidence(self.since(cuts), estimates, covariances)
 
     def solve(self, columns: Sequence[int]) -> FloatArray:
-        """Solve all blocks for some unknowns (k,); the other unknowns are zero."""
+        """Solve all blocks for k of the unknowns, by index; the other unknowns are zero."""
         return solve(self.total, columns)
 
     def jackknife(self, columns: Sequence[int]) -> FloatArray:
-        """Jackknife covariance (k, k) of :meth:`solve`, from solutions without one block each."""
+        """Return the jackknife covariance (k, k) of :meth:`solve`, leaving out one block each."""
         return jackknife_covariance(solve(self.without(), columns))
 
 
 def information(tables: FloatArray) -> FloatArray:
-    """Information H (..., p, p) of tables (..., p, p + 1) or (..., p + 1, p + 1)."""
+    """Return the information H (..., p, p) of tables (..., p, p + 1) or (..., p + 1, p + 1)."""
     n_unknowns = tables.shape[-1] - 1
     return tables[..., :n_unknowns, :n_unknowns]
 
 
 def score(tables: FloatArray) -> FloatArray:
-    """Score S (..., p) of tables (..., p, p + 1) or (..., p + 1, p + 1)."""
+    """Return the score S (..., p) of tables (..., p, p + 1) or (..., p + 1, p + 1)."""
     return tables[..., : tables.shape[-1] - 1, -1]
 
 
 def inverse(matrices: FloatArray) -> FloatArray:
-    """Return inverses (..., p, p) of matrices (..., p, p); pseudo-inverses if one is singular."""
+    """Return the inverses of matrices (..., p, p); pseudo-inverses if any of them is singular."""
     try:
         inverses = np.linalg.inv(matrices)
     except np.linalg.LinAlgError:
-        # With exact poses, the information along some directions is so large that the information
-        # along the other directions is rounding.
+        # For exact poses, the information along some directions is so large that along other
+        # directions only rounding remains.
         inverses = np.linalg.pinv(matrices)
     return np.asarray(inverses, dtype=float)
 
 
 def answer_evidence(answers: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Return evidence ``[H S]`` (..., p, p + 1) of estimates (..., p) with their covariances."""
+    """Return ``[H S]`` (..., p, p + 1) of estimates (..., p) with covariances (..., p, p)."""
     H = inverse(covariances)
     return np.concatenate([H, H @ answers[..., None]], axis=-1)
 
 
 def shift_evidence(tables: FloatArray, before: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return evidence ``[H S]`` (..., p, p + 1) of a shift of the unknowns from earlier estimates.
+    """Return information and score ``[H S]`` (..., p, p + 1) of a shift of the unknowns.
 
     Parameters
     ----------
     tables : (..., p, p + 1) or (..., p + 1, p + 1) array
-        Evidence since the shift; H may be singular.
+        Information and score since the shift. The information may be singular.
     before : (..., p) array
         Estimates of the unknowns before the shift.
     covariance : (..., p, p) array
@@ -150,20 +155,20 @@ def solve(tables: FloatArray, columns: Sequence[int], target: int = -1) -> Float
     Parameters
     ----------
     tables : (..., p + 1, p + 1) array
-        Products of the columns.
+        Products of all columns with each other.
     columns : sequence of int
-        The k other columns.
+        Indices of the k columns that are combined.
     target : int
-        The column that is fitted.
+        Index of the column that is fitted.
 
     Returns
     -------
     (..., k) array
-        Coefficients of the columns; zero along directions without evidence.
+        Coefficients of the columns; zero along directions without information.
     """
     normal = tables[..., columns, :][..., columns]
     roots = np.sqrt(np.abs(np.diagonal(normal, axis1=-2, axis2=-1)))
-    units = np.divide(1.0, roots, out=np.zeros_like(roots), where=roots > _SMALLEST_ROOT)
+    units = np.divide(1.0, roots, out=np.zeros_like(roots), where=roots > _MIN_ROOT)
     balanced = normal * units[..., :, None] * units[..., None, :]
     damped = balanced + _DAMPING * np.eye(len(columns))
     scores = units * tables[..., columns, target]
@@ -172,7 +177,7 @@ def solve(tables: FloatArray, columns: Sequence[int], target: int = -1) -> Float
 
 
 def jackknife_covariance(answers: FloatArray) -> FloatArray:
-    """Covariance (p, p) from B estimates (B, p), each made without one of B blocks.
+    """Return the covariance (p, p) from B estimates (B, p), each without one of B blocks.
 
     B. Efron, R. J. Tibshirani, *An introduction to the bootstrap*, 1993, eq. 11.5:
     ``(B - 1) / B * sum (x_b - mean) (x_b - mean)'``.

@@ -1,7 +1,7 @@
-"""Options of the engine and of the node: name, unit, range, default and meaning.
+"""Options of the engine and of the node: name, unit, range, default and help text.
 
-The node's parameters, the options of the command line, ``config/calibrator.yaml`` and the tables of
-the documentation are made from these dataclasses or tested against them.
+Parameters of the node, options of the command line, ``config/calibrator.yaml`` and tables of the
+documentation are generated from these dataclasses or tested against them.
 """
 
 import math
@@ -34,9 +34,9 @@ POSE_TYPES = (
 
 BACKENDS = ("fast", "ipopt")
 
-# Largest time offset (s): the largest difference of two stamps of int64 nanoseconds that are not
-# negative. Clocks may count from 1970, 1904, the start of the computer or of the GPS week.
-_LONGEST_OFFSET_S = 9.2e9
+# Largest time offset (s): about the largest int64 number of nanoseconds. Clocks may count from
+# 1970, from 1904, from the start of the computer or from the start of the GPS week.
+_MAX_OFFSET_S = 9.2e9
 
 
 class MethodRecord(NamedTuple):
@@ -45,7 +45,7 @@ class MethodRecord(NamedTuple):
     Attributes
     ----------
     uses_reference : bool
-        Whether the method solves the motion pairs of a reference; otherwise all poses.
+        Whether the method solves the motion pairs of a reference. Otherwise it uses all poses.
     rejects_outliers : bool
         Whether the method rejects outliers, so that a few jumps hardly change the result.
     backends : tuple of str
@@ -68,7 +68,7 @@ METHODS = {
 
 
 def require_backend(method: str, backend: str) -> None:
-    """Raise ConfigError if a method lacks a backend; the message lists the methods that have it."""
+    """Raise ConfigError if a method does not have a backend. The message lists those that have."""
     if backend not in METHODS[method].backends:
         able = [name for name, record in METHODS.items() if backend in record.backends]
         raise ConfigError(
@@ -77,7 +77,7 @@ def require_backend(method: str, backend: str) -> None:
 
 
 def _both(default: str, doc: str, **settings: Any) -> dict[str, Any]:
-    """Return an option for each stream; {} in ``doc`` is replaced by the name of the stream."""
+    """Return one option for each stream; its name replaces {} in the help text ``doc``."""
     return {
         stream: option(default, doc.format(stream), **settings) for stream in ("parent", "child")
     }
@@ -143,12 +143,12 @@ _PRIOR: dict[str, Any] = {
 
 @dataclass(frozen=True, kw_only=True)
 class CalibratorConfig(OptionSet):
-    """Options of the engine: the same for the node, the replay of bags, files and Python.
+    """Options of the engine, for the node, the replay of bags, files and Python.
 
     Attributes
     ----------
     given : frozenset of str
-        Names of the options that the user set, also to their defaults. ``dataclasses.replace``
+        Names of the options that the user has set, even to their defaults. ``dataclasses.replace``
         keeps these names.
 
     Examples
@@ -239,7 +239,7 @@ class CalibratorConfig(OptionSet):
         "from the angular rates of both streams, of any size.",
         unit="s",
         words=("estimate",),
-        within=(-_LONGEST_OFFSET_S, _LONGEST_OFFSET_S),
+        within=(-_MAX_OFFSET_S, _MAX_OFFSET_S),
     )
     scale: float | str = option(
         "none",
@@ -295,22 +295,22 @@ class CalibratorConfig(OptionSet):
     )
 
     def is_known(self, name: str) -> bool:
-        """Return whether the user set ``time_offset`` or ``scale`` to a fixed value."""
+        """Return whether the user set ``time_offset`` or ``scale`` to a value, not an estimate."""
         return name in self.given and getattr(self, name) not in ("auto", "estimate")
 
     @property
     def given_time_offset_s(self) -> float:
-        """The option ``time_offset`` (s) if it is a number; 0 if it is "estimate"."""
+        """Value (s) of the option ``time_offset`` if it is a number; 0 if it is "estimate"."""
         return 0.0 if isinstance(self.time_offset, str) else self.time_offset
 
     @property
     def given_scale(self) -> float:
-        """The option ``scale`` if it is a number; 1 if it is a word."""
+        """Value of the option ``scale`` if it is a number; 1 if it is a word."""
         return 1.0 if isinstance(self.scale, str) else self.scale
 
     @property
     def measured(self) -> str:
-        """Kind of data of both streams together: "poses", "rotations", "positions" or another.
+        """Kind of data of both streams together, such as "poses", "rotations" or "positions".
 
         Raises
         ------
@@ -333,7 +333,7 @@ class CalibratorConfig(OptionSet):
         )
 
     def _require_order(self) -> None:
-        """Check that the child does not measure what only the parent may measure."""
+        """Raise ConfigError if the child measures a quantity that only the parent may measure."""
         measured = self.child_measures
         if measured != "auto" and MEASURES[measured].is_parent:
             raise ConfigError(
@@ -342,13 +342,9 @@ class CalibratorConfig(OptionSet):
             )
 
     def require_poses(self, request: str) -> None:
-        """Check that both sensors measure whole poses.
+        """Raise ConfigError if a sensor does not measure poses.
 
-        Raises
-        ------
-        ConfigError
-            If a sensor measures anything else. The message begins with ``request``, the name of
-            what needs poses.
+        The message begins with ``request``, the name of the feature that needs poses.
         """
         if self.measured != "poses":
             raise ConfigError(
@@ -358,7 +354,7 @@ class CalibratorConfig(OptionSet):
 
     @property
     def targets(self) -> tuple[float, ...]:
-        """Targets of x, y, z (m), roll, pitch and yaw (rad)."""
+        """Target standard deviations (6,) of x, y, z (m), roll, pitch and yaw (rad)."""
         single = text.parse_targets("target.axes", self.target_axes)
         of_unit = {"m": self.target_translation, "rad": self.target_rotation}
         return tuple(single.get(axis, of_unit[unit]) for axis, unit in text.AXIS_UNITS.items())
@@ -389,7 +385,7 @@ def defaults_of(names: Iterable[str]) -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class NodeConfig(OptionSet):
-    """Options that only the node has."""
+    """Options that only the node has, besides those of the engine."""
 
     solve_period: float = option(2.0, "Time between solves.", unit="s", within=(0.05, 3600.0))
     parent_type: str = _TYPE["parent"]

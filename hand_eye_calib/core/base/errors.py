@@ -1,8 +1,8 @@
-"""The exceptions that this package raises on purpose.
+"""Exceptions that this package raises on purpose.
 
-A message is one line: what was expected, what was found, and what the user should do. The command
-line and the node print the message unchanged. Any other exception is a defect of the package and is
-printed with its traceback.
+A message is one line with the expected value, the value found, and the remedy. The command line and
+the node print it unchanged. Any other exception is a defect of the package; it is printed with its
+traceback.
 """
 
 from collections.abc import Iterator, Mapping
@@ -25,7 +25,7 @@ def printable(text: str) -> str:
 
 
 class HandEyeCalibError(Exception):
-    """Base of all errors that a caller is expected to handle.
+    """Base class of all errors that callers should handle.
 
     Examples
     --------
@@ -54,7 +54,7 @@ class UnclearStreamsError(InputError):
     Attributes
     ----------
     options : dict of str to str
-        Options that name the likeliest streams; empty if the recording has none.
+        Options that select the likeliest streams; empty if the recording has no streams.
     """
 
     def __init__(self, message: str, options: Mapping[str, str]) -> None:
@@ -63,7 +63,7 @@ class UnclearStreamsError(InputError):
 
 
 class NoPoseError(InputError):
-    """A message states that there is no pose: null quaternion, value that is not finite, no fix."""
+    """A message without a pose: zero quaternion, value that is not finite, or no GNSS fix."""
 
 
 class NotEnoughDataError(InputError):
@@ -83,7 +83,7 @@ def require_type(name: str, value: object, *kinds: type) -> None:
 
 @contextmanager
 def located(where: object) -> Iterator[None]:
-    """Prepend a place, such as a path, to the messages of errors that the block raises."""
+    """Put a place, such as a path, before the messages of errors that the block raises."""
     try:
         yield
     except HandEyeCalibError as error:
@@ -91,12 +91,16 @@ def located(where: object) -> Iterator[None]:
 
 
 def installing(extra: str) -> str:
-    """Return the command that installs an extra. The package is not on a package index."""
+    """Return the command that installs an extra, from source because there is no package index."""
     return f"pip install '.[{extra}]' in the source folder of hand_eye_calib"
 
 
 def required(module: str, purpose: str, extra: str) -> Any:
-    """Import a module of an extra; raise MissingDependencyError if it is not installed."""
+    """Return a module of an optional package; raise MissingDependencyError if not installed.
+
+    ``purpose`` is the request that needs the module, ``extra`` the name of the extra; both are for
+    the message.
+    """
     try:
         return import_module(module)
     except ImportError:

@@ -1,4 +1,4 @@
-"""Options: dataclass fields with a name, unit, range, default and meaning."""
+"""Options, which are dataclass fields with a name, unit, range, default and help text."""
 
 import contextlib
 import dataclasses
@@ -14,15 +14,15 @@ OptionValue: TypeAlias = bool | int | float | str
 Options: TypeAlias = Mapping[str, Any]
 OptionField: TypeAlias = dataclasses.Field[Any]
 
-# Whole numbers must be smaller in absolute value, because parameters of ROS have 64 bits.
-_LARGEST_INT = 1 << 63
+# Upper bound of the absolute value of whole numbers: parameters of ROS have 64 bits.
+_MAX_INT = 1 << 63
 
 _GROUPS = ("keyframe", "prior", "target")
 _TYPE_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
 
 
 def options_in_words(options: Options) -> str:
-    """Return options and their values as messages print them: ``scale 0.001, time_offset 0.2``."""
+    """Return options and values as text for messages: ``scale 0.001, time_offset 0.2``."""
     return ", ".join(f"{name} {value}" for name, value in options.items())
 
 
@@ -72,7 +72,7 @@ def option_name(field: OptionField) -> str:
 
 
 def did_you_mean(word: str, candidates: Iterable[str]) -> str:
-    """Return ``; did you mean X?`` for a misspelt word; empty if no candidate is similar."""
+    """Return ``; did you mean X?`` with the most similar candidate; empty if none is similar."""
     import difflib
 
     close = difflib.get_close_matches(word, list(candidates), n=1, cutoff=0.6)
@@ -80,24 +80,24 @@ def did_you_mean(word: str, candidates: Iterable[str]) -> str:
 
 
 def _of_python(value: object) -> object:
-    """Convert a scalar of NumPy, such as ``np.float64(0.1)``, to Python; keep other values."""
+    """Return a scalar of NumPy, such as ``np.float64(0.1)``, as Python's; other values as is."""
     is_scalar = type(value).__module__ == "numpy" and getattr(value, "ndim", None) == 0
     return value.item() if is_scalar else value  # type: ignore[attr-defined]
 
 
 def check_value(field: OptionField, value: object) -> OptionValue:
-    """Check a value of an option and convert it to the option's type.
+    """Return a value of an option, checked and converted to the type of the option.
 
     Raises
     ------
     ConfigError
         If the value has the wrong type, is out of range or is not among the choices. The message
-        is one line and states the allowed values.
+        is one line and contains the allowed values.
     """
     name = option_name(field)
     words = field.metadata["words"]
     value = _of_python(value)
-    if type(value) is int and not -_LARGEST_INT < value < _LARGEST_INT:
+    if type(value) is int and not -_MAX_INT < value < _MAX_INT:
         raise ConfigError(f"{name}: the number is too large")
     kind: type = float if words else type(field.default)
     if isinstance(value, str) and (value in words or kind is str):
@@ -113,9 +113,9 @@ def check_value(field: OptionField, value: object) -> OptionValue:
 
 
 def _as_float(value: object, has_words: bool) -> object:
-    """Convert a whole number to float, and the text of a number if the option allows words.
+    """Return a whole number as float, and the text of a number if the option allows words.
 
-    Other values stay unchanged.
+    Other values are returned unchanged.
     """
     if type(value) is int or (has_words and isinstance(value, str)):
         with contextlib.suppress(ValueError):
@@ -124,7 +124,7 @@ def _as_float(value: object, has_words: bool) -> object:
 
 
 def _checked_text(field: OptionField, text: str) -> str:
-    """Check the text of an option against its choices and its form."""
+    """Return the text of an option; raise ConfigError if it is no choice or has another form."""
     name = option_name(field)
     choices = field.metadata["choices"]
     if choices is not None and text not in choices:
@@ -139,7 +139,7 @@ def _checked_text(field: OptionField, text: str) -> str:
 
 
 def _checked_number(field: OptionField, value: float) -> float:
-    """Check the number of an option against its range."""
+    """Return the number of an option; raise ConfigError if it is out of range."""
     name = option_name(field)
     if not math.isfinite(value):
         raise ConfigError(f"{name} must be a finite number; got {value}")
@@ -152,7 +152,7 @@ def _checked_number(field: OptionField, value: float) -> float:
 
 
 class OptionSet:
-    """Base of dataclasses whose fields are options: checks values, converts to public names."""
+    """Base class of dataclasses whose fields are options. Values are checked when one is made."""
 
     given: frozenset[str]
     __dataclass_fields__: ClassVar[dict[str, OptionField]]
@@ -163,17 +163,17 @@ class OptionSet:
 
     @classmethod
     def by_name(cls) -> dict[str, OptionField]:
-        """The options' fields by their public names."""
+        """Return the fields of the options by their public names."""
         return {option_name(field): field for field in dataclasses.fields(cls)}
 
     @classmethod
     def from_options(cls, options: Mapping[str, object]) -> Self:
-        """Build from a mapping of public names to values.
+        """Make an object from a mapping of public names to values.
 
         Raises
         ------
         ConfigError
-            If a name is unknown (the message lists the known names), or a value is not allowed.
+            If a name is unknown (the message lists all names), or if a value is not allowed.
         """
         by_name = cls.by_name()
         unknown = [name for name in options if name not in by_name]

@@ -12,11 +12,11 @@ from typing import Any, TypeAlias, Union, get_args, get_origin, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-# A mapping of JSON or YAML: names to values that any program reads.
+# Mapping of JSON or YAML: names to plain values.
 Document: TypeAlias = dict[str, Any]
 
-# Numbers of a file must be smaller, so that products of several numbers are finite.
-_LARGEST = 1e50
+# Upper bound of numbers in files, so that products of several numbers are finite.
+_MAX_NUMBER = 1e50
 
 
 def plain(value: Any) -> Any:
@@ -57,8 +57,9 @@ def from_plain(kind: Any, value: Any, **names: type) -> Any:
         A dataclass, an enum, float, int, bool or str; or a tuple, a Mapping or a union of these
         types. For an array type, ``value`` must be an array already.
     value : plain data
+        Value to convert.
     **names
-        Types that the module of a dataclass imports only for type checkers.
+        Types by name, which the module of a dataclass imports only for type checkers.
 
     Raises
     ------
@@ -115,7 +116,7 @@ def _member(kind: type[Enum], value: Any) -> Enum:
     return by_plain[value] if value in by_plain else kind(value)
 
 
-# Cached: resolving type hints takes longer than the rest of a conversion.
+# Cached, because resolving type hints takes longer than the rest of a conversion.
 _hints = cache(get_type_hints)
 
 
@@ -139,7 +140,7 @@ def _number(value: Any) -> float:
         return math.inf
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise TypeError(f"a number is {type(value).__name__}")
-    if not abs(value) < _LARGEST:
+    if not abs(value) < _MAX_NUMBER:
         raise ValueError("a number is not finite, or far too large")
     return float(value)
 

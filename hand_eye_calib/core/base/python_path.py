@@ -1,7 +1,7 @@
-"""The folders in which Python searches modules, without the current folder of a command.
+"""Module search path without the current folder, for processes that the package starts.
 
-``python -m`` and ``python -c`` search the current folder first. A file ``queue.py`` next to a bag
-would then be run in place of the module of the standard library.
+``python -m`` and ``python -c`` search the current folder first. A file ``queue.py`` in this folder
+would be run in place of the module of the standard library.
 """
 
 import os
@@ -28,19 +28,19 @@ def trusted_path() -> list[str]:
 
 
 def trusted_environment() -> dict[str, str]:
-    """Return the environment for a Python process with the modules of this process.
+    """Return the environment for a Python process that finds the same modules as this process.
 
-    ``PYTHONSAFEPATH`` prevents that process from searching its current folder.
+    ``PYTHONSAFEPATH`` prevents the process from searching its current folder.
     """
     return {**os.environ, **_settings()}
 
 
 @contextmanager
 def starting_trusted() -> Iterator[None]:
-    """Start processes in the block with the environment of :func:`trusted_environment`.
+    """Set the environment of :func:`trusted_environment` for processes that the block starts.
 
-    At the end the environment of this process is restored. ``multiprocessing`` needs this, because
-    it accepts no environment.
+    At the end of the block, the environment is restored. This is for ``multiprocessing``, which has
+    no argument for the environment.
     """
     settings = _settings()
     before = {name: os.environ.get(name) for name in settings}

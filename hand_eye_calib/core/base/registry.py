@@ -14,7 +14,7 @@ Entry = TypeVar("Entry")
 
 
 class Registry(dict[str, Entry]):
-    """Entries by name.
+    """Dictionary of registered entries by name.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ class Registry(dict[str, Entry]):
     Raises
     ------
     ConfigError
-        If a name is looked up that no layer has registered.
+        If a name is not registered.
     """
 
     def __init__(self, noun: str) -> None:
@@ -37,12 +37,12 @@ class Registry(dict[str, Entry]):
 
 
 class Command(NamedTuple):
-    """A command of the command line.
+    """Command of the command line.
 
     Attributes
     ----------
     help : str
-        One line for the list of commands.
+        Help text of one line, for the list of commands.
     load : callable
         ``load()`` returns the module of the command. The module has the functions
         ``add_arguments(parser)`` and ``run(arguments) -> int``.
@@ -53,7 +53,7 @@ class Command(NamedTuple):
 
 
 class Route(NamedTuple):
-    """An extension of the command ``calibrate`` for other data than two streams.
+    """Extension of the command ``calibrate`` for other data than two streams.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class Route(NamedTuple):
 
 
 class Measure(NamedTuple):
-    """A quantity that a stream may measure.
+    """Quantity that a stream may measure.
 
     Attributes
     ----------
@@ -81,9 +81,9 @@ class Measure(NamedTuple):
     needs_poses : str
         Reason why the other stream must measure poses; empty if it may measure the same quantity.
     read_as : str
-        Quantity that is read from messages; empty for the measured one.
+        Quantity that is read from messages, if it is not the measured one; otherwise empty.
     is_parent : bool
-        Whether only the parent may measure it.
+        Whether only the parent may measure this quantity.
     """
 
     kind: str
@@ -93,16 +93,16 @@ class Measure(NamedTuple):
 
 
 class ExtraRule(NamedTuple):
-    """A rule of the verdict that an extra adds, see ``core/results/verdict.py``.
+    """Rule of the verdict that an extra adds, see ``core/results/verdict.py``.
 
     Attributes
     ----------
     after : str
-        Name of the rule before this one in the table of rules.
+        Name of the rule that precedes this rule in the table of rules.
     forbids : bool
         Whether the reasons of the rule lead to DO NOT USE; otherwise to USE WITH CARE.
     when : str
-        The condition in words.
+        Condition in words, for the documentation.
     find : callable
         ``find(result)`` yields the grounds (``Ground`` of that module) against a result.
     """

@@ -1,8 +1,8 @@
 """Quantiles and robust weights.
 
-Quantiles of data are computed here because NumPy's functions import ``numpy.ma``, which takes a
-tenth of the time of importing NumPy. Quantiles of distributions are tables, because importing
-SciPy's functions takes longer than a whole comparison of results.
+Quantiles of data are computed here, because the functions of NumPy import ``numpy.ma``, which takes
+a tenth of the import time of NumPy. Quantiles of distributions are tables, because the import of
+SciPy's functions takes longer than a comparison of results.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,34 +23,34 @@ CHI2 = {
     0.01: {1: 6.63, 2: 9.21, 3: 11.34, 4: 13.28, 5: 15.09, 6: 16.81},
     0.001: {6: 22.457744},
 }
-# The largest absolute value of six standard normal variables exceeds this limit once in 200 times.
+# The largest absolute value of six standard normal variables exceeds this in one of 200 cases.
 LARGEST_OF_SIX = 3.341479
 
-# Standard normal quantile of 0.9. If the expected value of an estimate is this many standard
-# deviations above a limit, the estimate exceeds the limit in nine of ten cases.
+# Standard normal quantile of 0.9. An estimate exceeds a limit in nine of ten cases if its expected
+# value is this number of standard deviations above the limit.
 NINE_TIMES_OUT_OF_TEN = 1.281552
 
-# Degrees of freedom of Student's t distribution for heavy tails.
+# Degrees of freedom of Student's t distribution, as a model of heavy tails.
 STUDENT = 4.0
 
-# Singular values of a regression below this share of the largest are rounding errors.
+# Singular values of a regression below this share of the largest one are rounding.
 _RANK_TOLERANCE = 1e-9
 
-# Smallest unit of residuals of a robust regression, for exact data.
+# Smallest unit of residuals in a robust regression, for exact data.
 _SMALLEST_UNIT = 1e-12
 
 
 def median(values: ArrayLike) -> float:
-    """Median of finite values in any shape; NaN without values.
+    """Return the median of finite values of any shape; NaN if there are no values.
 
-    It takes a fraction of the time of ``numpy.median`` for a few hundred values.
+    For a few hundred values, this takes a fraction of the time of ``numpy.median``.
     """
     flat = np.asarray(values, dtype=np.float64).ravel()
     return float(medians(flat)) if flat.size else np.nan
 
 
 def medians(values: FloatArray) -> FloatArray:
-    """Medians (...) of finite values (..., K), K at least 1."""
+    """Return the medians (...) of finite values (..., K), K >= 1."""
     half = values.shape[-1] // 2
     if values.shape[-1] % 2:
         return np.asarray(np.partition(values, half, axis=-1)[..., half])
@@ -59,9 +59,9 @@ def medians(values: FloatArray) -> FloatArray:
 
 
 def quantile(values: ArrayLike, share: float) -> float:
-    """Quantile of one or more finite values in any shape.
+    """Return the quantile of at least one finite value, for a probability from 0 to 1.
 
-    The quantile is interpolated linearly between two neighbouring values, as in
+    Values may have any shape. The quantile is interpolated linearly between two values, as in
     ``numpy.quantile``, but in less time.
     """
     flat = np.asarray(values, dtype=np.float64).ravel()
@@ -73,12 +73,12 @@ def quantile(values: ArrayLike, share: float) -> float:
 
 
 def robust_sigma(vectors: FloatArray) -> FloatArray:
-    """Standard deviations (...) per axis of vectors (..., K, 3), robust against outliers."""
+    """Return robust standard deviations (...) per axis of K vectors each (..., K, 3)."""
     return medians(np.linalg.norm(vectors, axis=-1)) / MEDIAN_LENGTH
 
 
 def student_weights(squared: FloatArray, degrees: float = STUDENT) -> FloatArray:
-    """Weights of vectors of six values from Student's t distribution: 1 on average.
+    """Return weights of vectors of six values for Student's t distribution; their mean is 1.
 
     K. L. Lange, R. J. A. Little, J. M. G. Taylor, *Robust statistical modeling using the t
     distribution*, JASA 84, 1989, eq. 4.
@@ -93,8 +93,7 @@ def student_weights(squared: FloatArray, degrees: float = STUDENT) -> FloatArray
     return (degrees + 6.0) / (degrees + squared)
 
 
-# Weight functions by kind. Their argument is the squared residual in units of the square at which
-# the weight falls.
+# Weight functions by kind. Their argument is the squared residual, see :func:`robust_weights`.
 _WEIGHTS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
     # P. J. Huber, *Robust estimation of a location parameter*, Ann. Math. Statist. 35, 1964.
     "huber": lambda squared: np.asarray(1.0 / np.maximum(np.sqrt(squared), 1.0)),
@@ -109,15 +108,16 @@ _WEIGHTS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
 
 
 def robust_weights(kind: str, squared: FloatArray) -> FloatArray:
-    """Weights of residuals for iteratively reweighted least squares.
+    """Return weights of residuals for iteratively reweighted least squares.
 
     Parameters
     ----------
     kind : {"huber", "cauchy", "geman_mcclure", "student"}
-        The first three are at most 1; ``student`` is 1 on average over vectors of six values.
+        Weight function. Weights are at most 1; those of ``student`` have the mean 1 for vectors of
+        six values.
     squared : (...) array
-        Squared residuals in units of the square at which a weight falls: by half for ``cauchy``, to
-        a quarter for ``geman_mcclure``. ``huber`` begins to fall there.
+        Squared residuals. At 1, the weight is 1/2 for ``cauchy`` and 1/4 for ``geman_mcclure``; the
+        weight of ``huber`` is 1 up to there. For ``student``, squared Mahalanobis distances.
 
     Examples
     --------
@@ -145,8 +145,8 @@ def robust_regression(
     rounds : int
         Number of iterations.
     unit : callable
-        ``unit(lengths)`` returns the length at which weights fall, from the lengths (K,) of all
-        residuals.
+        ``unit(lengths)`` returns the unit of residuals for the weight function, from the lengths
+        (K,) of all residuals.
 
     Returns
     -------
@@ -165,9 +165,9 @@ def robust_regression(
 
 
 def chi_square_quantile(tail: float) -> float:
-    """Return the value that chi-square (6 degrees of freedom) exceeds with probability ``tail``.
+    """Return the value that chi-square with 6 degrees of freedom exceeds with probability ``tail``.
 
-    ``tail`` is from 1e-30 to 0.99. Chi-square exceeds 2 h with probability
+    ``tail`` is from 1e-30 to 0.99. Chi-square exceeds 2 h with the probability
     ``exp(-h) (1 + h + h^2 / 2)``. The negative logarithm of this probability is convex and grows
     with h. So Newton's method converges from above, in at most ten steps.
     """

@@ -12,16 +12,16 @@ from typing import TypeAlias
 
 from hand_eye_calib.core.base.errors import ConfigError
 
-# Units of lengths: largest length (m), unit, factor from metres.
+# Units of lengths: largest length (m) that has this unit, unit, factor from metres.
 _LENGTHS = ((0.00995, "mm", 1000), (0.995, "cm", 100), (math.inf, "m", 1))
 
-# Units of durations: longest duration (s), unit, divisor of seconds.
+# Units of durations: longest duration (s) that has this unit, unit, divisor of seconds.
 _DURATIONS = ((90.0, "s", 1), (5_400.0, "min", 60), (math.inf, "h", 3600))
 
-# Largest number of decimals.
-_MOST_DECIMALS = 6
+# Largest number of decimals in a text.
+_MAX_DECIMALS = 6
 
-#: Axis of each rotation, by the name of its angle.
+#: Axis of rotation, by the name of the angle.
 ABOUT = {"roll": "x", "pitch": "y", "yaw": "z"}
 
 
@@ -35,7 +35,7 @@ def length(metres: float) -> str:
 
 
 def _suitable_unit(size: float, units: Iterable[tuple[float, str, int]]) -> tuple[str, int]:
-    """Return the name and factor of the first unit whose largest size is not exceeded."""
+    """Return the name and factor of the first unit that is suitable for a size."""
     return next((name, factor) for largest, name, factor in units if not size > largest)
 
 
@@ -52,13 +52,13 @@ def amount(axis: str, value: float) -> str:
 
 
 def amount_beside(axis: str, value: float, other: float) -> str:
-    """Format an amount with enough digits to differ from another amount of the same axis."""
+    """Format an amount as :func:`amount`, with more digits if needed to differ from another."""
     text = amount(axis, value)
     if text != amount(axis, other) or value == other or not math.isfinite(value):
         return text
     unit = text.rpartition(" ")[2]
     factors = {name: factor for _, name, factor in _LENGTHS} | {"deg": math.degrees(1.0)}
-    for decimals in range(_MOST_DECIMALS):
+    for decimals in range(_MAX_DECIMALS):
         texts = [f"{factors[unit] * size:.{decimals}f}" for size in (value, other)]
         if float(texts[0]) != float(texts[1]):
             return f"{texts[0]} {unit}"
@@ -90,7 +90,7 @@ def axes_in_words(axes: Sequence[str]) -> str:
 
 
 def two_digits(value: float) -> str:
-    """Format a number with two significant digits, without zeros at the end of its decimals."""
+    """Format a number with two significant digits, without trailing zeros of its decimals."""
     if abs(value) < 1e-3:
         return "less than 0.001" if value else "0"
     decimals = max(1 - math.floor(math.log10(abs(value))), 0)
@@ -99,16 +99,16 @@ def two_digits(value: float) -> str:
 
 
 def with_sigma(value: float | None, sigma: float | None, min_decimals: int = 2) -> str:
-    """Format a number with its standard deviation; "unknown" if one of them is not known.
+    """Format a number with its standard deviation; "unknown" if a number is None or sigma infinite.
 
-    The standard deviation has two digits. Both numbers have the same number of decimals, at least
-    ``min_decimals``.
+    The standard deviation has two significant digits. Value and standard deviation have the same
+    number of decimals, at least ``min_decimals``.
     """
     if value is None or sigma is None or not math.isfinite(sigma):
         return "unknown"
-    decimals = _MOST_DECIMALS
+    decimals = _MAX_DECIMALS
     if sigma > 0:
-        decimals = min(max(1 - math.floor(math.log10(sigma)), 0), _MOST_DECIMALS)
+        decimals = min(max(1 - math.floor(math.log10(sigma)), 0), _MAX_DECIMALS)
     decimals = max(decimals, min_decimals)
     return f"{fixed(value, decimals)} +/- {fixed(sigma, decimals)}"
 
@@ -130,7 +130,7 @@ def in_words(value: object) -> str:
 
 
 def given_or_estimated(value: float, sigma: float, unit: str) -> str:
-    """Format a number that was set by the user (``sigma`` 0) or estimated."""
+    """Format a number: with its standard deviation if estimated; ``sigma`` is 0 if it was set."""
     text = f"{value:.4f} +/- {sigma:.4f} {unit}" if sigma else f"{value:g} {unit}"
     return text.strip() + (", estimated" if sigma else "")
 
@@ -146,7 +146,7 @@ def share(value: float) -> str:
     return f"{value:.1%}" if value < 0.1 else f"{value:.0%}"
 
 
-# Share of messages without a pose above which the user should check the source of the messages.
+# Share of null poses in all messages above which the user is asked to check their source.
 MUCH_NULL = 0.1
 
 
@@ -160,12 +160,12 @@ def without_poses(n_null: int, n_all: int) -> str:
 
 
 def listing(words: Sequence[str]) -> str:
-    """Join words as in "one, two and three"."""
+    """Join words as in "x, y and z"."""
     return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
 
 
 def distinct_names(paths: Sequence[str]) -> list[str]:
-    """Return paths without the folders at the beginning and at the end that all paths share.
+    """Return short names: paths without the leading and trailing parts that all paths share.
 
     For a/monday/bag and a/tuesday/bag, the names are monday and tuesday.
     """
@@ -177,40 +177,40 @@ def distinct_names(paths: Sequence[str]) -> list[str]:
 
 
 def _n_shared(paths: Sequence[Sequence[str]]) -> int:
-    """Return the number of names at the beginning that all paths share."""
+    """Return the number of leading parts that all paths share."""
     levels = zip(*paths, strict=False)
     return sum(1 for _ in takewhile(lambda names: len(set(names)) == 1, levels))
 
 
 def counted(count: int, noun: str) -> str:
-    """Format a count with its noun; the plural of the noun must end in s."""
+    """Format a count with its noun, to which an s is appended for the plural."""
     return f"{count:,} {noun}" if count == 1 else f"{count:,} {noun}s"
 
 
 # --------------------------- quantities that users type: in m and rad, or with a unit
 
 # Largest number of characters of a value in a message.
-_MOST_SHOWN = 80
+_MAX_CHARACTERS = 80
 
 AXIS_UNITS = dict.fromkeys(("x", "y", "z"), "m") | dict.fromkeys(("roll", "pitch", "yaw"), "rad")
 # Factors from the units that a user may type to m or rad.
 _IN_SI = {"m": {"m": 1.0, "cm": 0.01, "mm": 0.001}, "rad": {"rad": 1.0, "deg": math.pi / 180}}
 _QUANTITY = re.compile(r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)(m|cm|mm|rad|deg)?")
 
-# Largest length (m) or angle (rad) of a user, so that squares do not overflow.
-_LARGEST = 1e6
+# Largest length (m) or angle (rad) that a user may type, so that squares do not overflow.
+_MAX_TYPED = 1e6
 
-# Longest length (m) of a prior without a unit. Sensors are rarely farther apart, and a 22 in
-# centimetres must not be read as 22 m.
-_LONGEST_WITHOUT_UNIT_M = 5.0
+# Longest length (m) of a prior without a unit. Sensors are rarely farther apart: 22 without a unit
+# probably means centimetres.
+_MAX_WITHOUT_UNIT_M = 5.0
 
 # Prior on the pose of the child sensor in the parent sensor's frame. For each of x, y, z (m), roll,
 # pitch, yaw (rad): value and standard deviation, or both as the text of the option ``prior.AXIS``.
 Prior: TypeAlias = Mapping[str, tuple[float, float] | str]
 
 
-def shortened(text: str, length: int = _MOST_SHOWN) -> str:
-    """Return the text, cut to ``length`` characters so that a message remains short."""
+def shortened(text: str, length: int = _MAX_CHARACTERS) -> str:
+    """Return the text, cut to ``length`` characters."""
     return text if len(text) <= length else f"{text[:length]}..."
 
 
@@ -227,9 +227,9 @@ def parse_prior(name: str, text: str) -> tuple[float, float]:
     Raises
     ------
     ConfigError
-        If the text has another form, an unknown unit or a standard deviation of 0.
-        If a value of more than 5 m has no unit. The standard deviation may be that large.
-        If the value has a unit other than m or rad, and the standard deviation has none.
+        If the text has another form, an unknown unit or a standard deviation of 0; if a value of
+        more than 5 m has no unit; or if the value has a unit other than m or rad, and the standard
+        deviation has none.
     """
     value, _, sigma = text.replace("±", "+/-").replace("+-", "+/-").partition("+/-")
     unit = AXIS_UNITS[name.removeprefix("prior.")]
@@ -240,7 +240,7 @@ def parse_prior(name: str, text: str) -> tuple[float, float]:
     (prior_sigma,) = quantities(name, [unit], sigma.split(), form, 0.0)
     words = value.strip(), sigma.strip()
     unit_of_value = _unit_of(words[0])
-    if unit == "m" and abs(prior) > _LONGEST_WITHOUT_UNIT_M and not unit_of_value:
+    if unit == "m" and abs(prior) > _MAX_WITHOUT_UNIT_M and not unit_of_value:
         in_cm = "+/-".join(_with_units(words, "cm"))
         in_m = "+/-".join(_with_units(words, "m"))
         raise ConfigError(
@@ -261,20 +261,20 @@ def _unit_of(word: str) -> str:
 
 
 def _with_units(words: Iterable[str], unit: str) -> list[str]:
-    """Append a unit to the quantities that have none."""
+    """Return the quantities with ``unit`` appended to those that have none."""
     return [word if _unit_of(word) else f"{word}{unit}" for word in words]
 
 
 def prior_as_typed(axis: str, value: str, sigma: str) -> str:
-    """Return the text of ``prior.AXIS`` for numbers typed into fields labelled m or deg.
+    """Return the text of the option ``prior.AXIS`` for numbers typed into fields in m or deg.
 
-    A length of more than 5 m gets no unit, so that the option refuses it and asks for a unit.
+    No unit is added to a length of more than 5 m, so that the option asks for a unit.
     """
     words = [word.strip().replace(",", ".") for word in (value, sigma)]
     if AXIS_UNITS[axis] == "rad":
         return "+/-".join(_with_units(words, "deg"))
     value_without_unit = _QUANTITY.fullmatch(words[0]) and not _unit_of(words[0])
-    is_short = not value_without_unit or abs(float(words[0])) <= _LONGEST_WITHOUT_UNIT_M
+    is_short = not value_without_unit or abs(float(words[0])) <= _MAX_WITHOUT_UNIT_M
     return "+/-".join(_with_units(words, "m") if is_short else words)
 
 
@@ -292,14 +292,14 @@ def parse_pose(name: str, text: str) -> tuple[float, ...]:
 
 
 def parse_targets(name: str, text: str) -> dict[str, float]:
-    """Return the targets of single axes: axis name to standard deviation in m or rad.
+    """Return the targets of single axes: name of the axis to standard deviation in m or rad.
 
-    An example of the text is ``z=10cm yaw=0.5deg``. Numbers without a unit are metres and radians.
+    The text is like ``z=10cm yaw=0.5deg``. Numbers without a unit are in metres or radians.
 
     Raises
     ------
     ConfigError
-        If the text has another form, an axis comes twice or a target is not above 0.
+        If the text has another form, if it contains an axis twice, or if a target is not above 0.
     """
     targets: dict[str, float] = {}
     for word in text.replace(",", " ").split():
@@ -320,18 +320,20 @@ def parse_targets(name: str, text: str) -> dict[str, float]:
 def quantities(
     name: str, units: Sequence[str], words: Sequence[str], form: str, above: float = -math.inf
 ) -> list[float]:
-    """Parse words as numbers in ``units`` (m or rad); a word may contain another unit.
+    """Return the numbers of words, each converted to its unit (m or rad).
 
     Parameters
     ----------
     name : str
         Name of the option, for messages.
     units : sequence of {"m", "rad"}
+        Unit of each result, which is also that of a word without unit.
     words : sequence of str
+        Numbers, with or without units such as cm or deg.
     form : str
         Expected form of the text, for messages.
     above : float
-        Numbers must be larger than this.
+        Lower bound that is not allowed itself.
 
     Raises
     ------
@@ -347,8 +349,8 @@ def quantities(
             allowed = " or ".join(_IN_SI[unit])
             raise ConfigError(f"{name} must be numbers in {allowed}; got {shown_value(word)}")
         value = float(match[1]) * _IN_SI[unit][match[2] or unit]
-        if abs(value) > _LARGEST:
-            raise ConfigError(f"{name} must be at most {_LARGEST:g} {unit}; got {word[:20]!r}")
+        if abs(value) > _MAX_TYPED:
+            raise ConfigError(f"{name} must be at most {_MAX_TYPED:g} {unit}; got {word[:20]!r}")
         if not value > above:
             raise ConfigError(f"{name} needs a standard deviation above 0; got {shown_value(word)}")
         if unit == "rad" and not match[2] and abs(value) > 2 * math.pi:
@@ -361,7 +363,7 @@ def quantities(
 
 
 def parse_reference(name: str, text: str) -> tuple[str, int]:
-    """Return kind ("A", "B" or "C") and step (1 for "A") of a reference for motion pairs.
+    """Return the letter (A, B or C) and the number (1 for A) of a reference for motion pairs.
 
     Raises
     ------
@@ -376,12 +378,12 @@ def parse_reference(name: str, text: str) -> tuple[str, int]:
 
 
 def frame_name(name: str) -> str:
-    """Return the name of a frame without the leading slash of ROS 1, which tf2 refuses."""
+    """Return the name of a frame without the leading slash of ROS 1, which tf2 rejects."""
     return name.lstrip("/")
 
 
 def split_frames(name: str, text: str) -> tuple[str, str]:
-    """Return the fixed frame and the sensor's frame of ``WORLD:SENSOR``, the value of an option.
+    """Return the fixed frame and the sensor's frame in ``WORLD:SENSOR``, the value of an option.
 
     Raises
     ------

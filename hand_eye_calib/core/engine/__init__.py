@@ -1,1 +1,1 @@
-"""From poses to a calibration: the engine that the node, the replay and Python share."""
+"""Engine from poses to a calibration, for the node, the replay of bags and Python."""

@@ -1,4 +1,4 @@
-"""Attempts: a snapshot that was solved with some options, checked, and compared with others."""
+"""Attempts: snapshots that were solved with some options, checked, and can be compared."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
@@ -17,27 +17,27 @@ STREAM_REPAIRS = (
     *(f"{stream}_{option}" for stream in STREAMS for option in ("invert", "quaternion")),
 )
 
-# Largest weighted squared residual per degree of freedom of a noise model that fits. The value is 1
-# if the model is right, and less if there is no noise.
+# A noise model fits if its misfit, the weighted squared residual per degree of freedom, is at most
+# this. The misfit is 1 if the model is right, and less if there is no noise.
 _MAX_MISFIT = 2.0
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """A snapshot, solved and checked.
+    """Result of a snapshot that was solved and checked.
 
     Attributes
     ----------
     calibration : Calibration
-        The result, with the findings of the check.
+        Result with the findings of the check.
     snapshot : Snapshot
-        The streams and the options that gave the result.
+        Streams and options of the result.
     check : CheckResult
+        Check of the streams with the result.
     options : mapping
-        Options that were set because a check is certain of them, by name.
+        Options that were set automatically, because a check is certain of them: name to value.
     messages : tuple of str
-        Messages about these options, with the reason. They are the first warnings of the
-        calibration.
+        Messages about these options and the reason. They are the first warnings of the calibration.
     """
 
     calibration: Calibration
@@ -70,8 +70,8 @@ class Attempt:
     def is_better_than(self, other: "Attempt", n_fewer: int) -> bool:
         """Return whether this attempt is better than another one.
 
-        It is better if it alone is usable. It is also better if it has at least ``n_fewer``
-        objections fewer, and its noise model fits no worse.
+        This attempt is better if it is usable and the other is not. It is also better if it has at
+        least ``n_fewer`` objections fewer, unless only the other fits its noise model.
         """
         if self.is_usable and not other.is_usable:
             return True
@@ -79,7 +79,7 @@ class Attempt:
         return is_improved and self.noise_fits >= other.noise_fits
 
     def with_findings(self, findings: Collection[Finding]) -> "Attempt":
-        """Return the attempt with other findings; the choice between two readings is made."""
+        """Return the attempt with other findings, and without an open choice of the reading."""
         sorted_findings = gravest_first(tuple(findings))
         return replace(
             self,
@@ -101,9 +101,9 @@ class Attempt:
 
 
 def with_options(snapshot: Snapshot, options: Options) -> Snapshot:
-    """Return the snapshot with other options.
+    """Return the snapshot with some options changed.
 
-    For another time offset, poses that were paired already are paired again.
+    If the time offset changes, all poses are paired anew.
     """
     if not options:
         return snapshot
@@ -112,7 +112,7 @@ def with_options(snapshot: Snapshot, options: Options) -> Snapshot:
         return replace(snapshot, config=config)
     if not len(snapshot.kept):
         return replace(snapshot, config=config, time_offset=None)
-    # The new snapshot applies the repairs, so its poses must not contain them.
+    # The poses of the new snapshot must not contain the repairs, which it applies itself.
     without_repairs = replace(snapshot.config, **defaults_of(STREAM_REPAIRS))
     parent, child = replace(snapshot, config=without_repairs).streams
     return replace(

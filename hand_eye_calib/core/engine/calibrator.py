@@ -1,6 +1,6 @@
-"""Calibrator: collects the poses of two streams while they arrive, and pairs them.
+"""Calibrator, which collects the poses of two streams while they arrive, and pairs them.
 
-The node, the replay of bags and the Python API use this class.
+The node, the replay of bags and the Python API use it.
 """
 
 import math
@@ -32,15 +32,15 @@ class BufferLimits:
     Attributes
     ----------
     capacity : int
-        Largest number of poses of a stream. A buffer fills up if the other stream lags behind, or
-        if the time offset is not estimated yet. A full buffer is paired in part; if this is not
-        possible, half of its poses are dropped.
+        Largest number of poses in a buffer. A buffer fills up if the other stream is delayed, or if
+        the time offset is not estimated yet. The oldest poses of a full buffer are paired; if this
+        is not possible, half of its poses are dropped.
     pairing_starts : int
-        Number of buffered poses above which the oldest are paired: 20 s at 100 Hz. Buffered
-        messages may arrive in any order.
+        Number of buffered poses above which the oldest ones are paired: 20 s at 100 Hz. Poses in
+        the buffer may arrive in any order.
     batch : int
-        Largest number of poses that are paired at once. Small batches keep the time of a single
-        pose below a few milliseconds.
+        Largest number of poses that are paired at once. Small batches limit the time to add one
+        pose to a few milliseconds.
     batch_every : int
         Number of new poses between two batches.
     late_ns : int
@@ -62,15 +62,15 @@ class StreamStatistics:
     Attributes
     ----------
     received : int
-        Poses that were accepted.
+        Number of accepted poses.
     refused_duplicate : int
-        Poses that were refused because an earlier pose had the same stamp.
+        Number of poses that were refused because another pose has the same stamp.
     refused_late : int
-        Poses that were refused because later poses had already been paired.
+        Number of poses that were refused because later poses were paired already.
     dropped_unpaired : int
-        Accepted poses that were dropped because the other stream had no poses at their times.
+        Number of accepted poses that were dropped because the other stream had no poses then.
     first_stamp_ns, last_stamp_ns : int or None
-        Smallest and largest stamp that was accepted.
+        Smallest and largest accepted stamp; None before the first pose.
     """
 
     received: int = 0
@@ -81,7 +81,7 @@ class StreamStatistics:
     last_stamp_ns: int | None = None
 
 
-# Numbers of a pose: x y z qx qy qz qw.
+# Number of values of a pose: x y z qx qy qz qw.
 _WIDTH = 7
 
 
@@ -104,7 +104,7 @@ class _PoseBuffer:
         return len(self.stamps_ns)
 
     def add(self, stamp_ns: int, pose: tuple[float, ...]) -> bool:
-        """Insert a pose; return False if its stamp is a duplicate or too late."""
+        """Insert a pose (x y z qx qy qz qw); return False if its stamp is a duplicate or late."""
         counts = self.statistics
         index = bisect_left(self.stamps_ns, stamp_ns)
         if stamp_ns <= self._dropped_until_ns:
@@ -123,20 +123,20 @@ class _PoseBuffer:
         return True
 
     def stamp_of(self, index: int) -> int:
-        """Return the stamp of a pose; that of the newest pose if the index is too large."""
+        """Return the stamp (ns) of a pose; that of the newest pose if the index is too large."""
         return self.stamps_ns[min(index, len(self) - 1)]
 
     def trajectory(self, until_ns: int = 2**63) -> Trajectory:
-        """Return the poses up to a stamp, and the few poses after it that interpolation needs."""
+        """Return the poses up to a stamp, and a few more that interpolation needs."""
         end = bisect_right(self.stamps_ns, until_ns) + REACH
         poses = np.array(self._poses[: _WIDTH * end]).reshape(-1, _WIDTH)
         stamps_ns = np.array(self.stamps_ns[:end], dtype=np.int64)
         return Trajectory.from_quat_xyzw(stamps_ns, poses[:, :3], poses[:, 3:])
 
     def drop(self, until_ns: int, unpaired: bool) -> None:
-        """Drop poses up to and including a stamp, except the last few for interpolation.
+        """Drop the poses up to a stamp, except the last few, which interpolation needs.
 
-        If ``unpaired``, the statistics count the poses as dropped.
+        If ``unpaired``, the statistics count these poses as dropped.
         """
         split = max(bisect_right(self.stamps_ns, until_ns) - REACH, 0)
         if unpaired:
@@ -148,10 +148,10 @@ class _PoseBuffer:
 class Calibrator:
     """Collect the poses of both streams and estimate T_parent_child from them.
 
-    Poses may arrive at any rate and in any order. They are paired at the slower stream's stamps.
-    The other stream is interpolated along the geodesic of SE(3), never extrapolated and never
-    across a gap of more than ``max_gap``. Memory is bounded: a buffer per stream and at most
-    ``max_pairs`` pose pairs.
+    Poses may arrive at any rate and in any order. They are paired at the stamps of the slower
+    stream. The poses of the other stream are interpolated along the geodesic of SE(3), neither
+    outside of the stream nor in gaps longer than ``max_gap``. Memory is bounded: one buffer for
+    each stream, and at most ``max_pairs`` pose pairs.
 
     Parameters
     ----------
@@ -185,13 +185,16 @@ class Calibrator:
         self._proposed_offset: TimeOffset | None = None
 
     def reconfigure(self, config: CalibratorConfig) -> None:
-        """Set other options. Poses are kept, except pairs with another time offset."""
+        """Set other options. Poses are kept; pairs are dropped if the time offset changes."""
         if config.time_offset != self.config.time_offset:
             self._drop_pairs()
         self.config = config
 
     def inputs(self, topics: Mapping[str, object]) -> Document:
-        """Return the sources of a result in plain values: options, topics and statistics."""
+        """Return the options, and topic and statistics of each stream, as plain values.
+
+        ``topics`` maps "parent" and "child" to their topics.
+        """
         streams = {}
         for stream, topic in topics.items():
             counts = asdict(self._buffers[stream].statistics)
@@ -203,18 +206,18 @@ class Calibrator:
         return replace(self._buffers[stream].statistics)
 
     def frame(self, stream: str) -> str:
-        """Return the name of a stream's sensor frame in its messages; empty if not received."""
+        """Return the name of a stream's sensor frame in messages; empty before the first one."""
         return self._buffers[stream].frame
 
     def set_frame(self, stream: str, sensor_frame: str) -> None:
-        """Set the name of a stream's sensor frame, as its messages name it.
+        """Set the name of a stream's sensor frame that its messages contain.
 
-        An option that names the frame overrides this name.
+        The option ``parent_frame`` or ``child_frame`` overrides this name.
 
         Raises
         ------
         InputError
-            If the name is empty, or differs from the name before.
+            If no option sets the name, and the name is empty or has changed.
         """
         sensor_frame = frame_name(sensor_frame)
         buffer = self._buffers[stream]
@@ -231,11 +234,11 @@ class Calibrator:
         buffer.frame = buffer.frame or sensor_frame
 
     def world(self, stream: str) -> str:
-        """Return the name of the fixed frame of a stream's poses; empty if not received."""
+        """Return the name of the fixed frame of a stream; empty before the first message."""
         return self._buffers[stream].world
 
     def set_world(self, stream: str, world_frame: str) -> None:
-        """Set the name of the fixed frame of a stream's poses; later calls change nothing."""
+        """Set the name of the fixed frame of a stream. Once set, the name does not change."""
         buffer = self._buffers[stream]
         buffer.world = buffer.world or frame_name(world_frame)
 
@@ -252,11 +255,11 @@ class Calibrator:
         ----------
         stream : {"parent", "child"}
         stamp_ns : int
-            On the stream's own clock.
+            Stamp (ns) on the stream's own clock.
         position : sequence of 3 floats
-            Metres.
+            Position (m).
         quat_xyzw : sequence of 4 floats
-            Scalar last, unit length to 1 %.
+            Quaternion, scalar last, of length 1 to 1 %.
 
         Returns
         -------
@@ -271,7 +274,8 @@ class Calibrator:
         """
         is_unit = abs(math.hypot(*quat_xyzw) - 1.0) <= trajectory.QUATERNION_NORM_TOLERANCE
         if not (is_unit and math.hypot(*position) <= trajectory.FARTHEST_M):
-            check_pose(*position, *quat_xyzw)  # raises InputError with the reason
+            # Raise InputError with the reason.
+            check_pose(*position, *quat_xyzw)
         buffer = self._buffers[stream]
         limits = self._limits
         is_full = len(buffer) >= limits.capacity
@@ -279,12 +283,12 @@ class Calibrator:
         if is_full or (is_due and len(buffer) > limits.pairing_starts):
             self._make_pairs(is_full)
         if len(buffer) >= limits.capacity:
-            # The older half cannot be paired, because the other stream has no poses at its times.
+            # The older half cannot be paired, because the other stream has no poses at these times.
             buffer.drop(buffer.stamp_of(len(buffer) // 2), unpaired=True)
         return buffer.add(int(stamp_ns), (*position, *quat_xyzw))
 
     def snapshot(self) -> Snapshot:
-        """Return the poses and options so far, for an estimate in this or another thread."""
+        """Return the poses and options so far, for an estimate in any thread or process."""
         parent = self._buffers["parent"]
         child = self._buffers["child"]
         config = self.config
@@ -300,9 +304,10 @@ class Calibrator:
         )
 
     def take_pairs(self) -> PosePairs:
-        """Return the pose pairs made so far, and drop all but the last pair.
+        """Return the pose pairs made so far, and drop all of them except the last pair.
 
-        The last pair is kept because new pairs must be later; the next call returns it again.
+        The last pair is kept because new pairs must have later stamps. The next call returns it
+        again.
         """
         pairs = self._kept
         self._kept_parts = [pairs[-1:]]
@@ -316,14 +321,14 @@ class Calibrator:
         return self.snapshot().estimate()
 
     def adopt(self, offset: TimeOffset | None) -> None:
-        """Store the time offset that was estimated for a snapshot, so that it is estimated once."""
+        """Store a time offset that was estimated elsewhere, so that it is not estimated again."""
         self._proposed_offset = offset or self._proposed_offset
 
     def _make_pairs(self, is_full: bool) -> None:
-        """Pair the oldest poses, at most a batch, and drop them from the buffers.
+        """Pair the oldest poses, at most one batch, and drop them from the buffers.
 
-        Poses are paired once earlier poses are not expected any more, see ``late_ns``. If the
-        options ask for a time offset, it is estimated when a buffer is full.
+        Poses are paired only if no earlier poses are expected, see ``BufferLimits.late_ns``. If the
+        time offset is an estimate, it is made when a buffer is full.
         """
         parent = self._buffers["parent"]
         child = self._buffers["child"]
@@ -357,7 +362,7 @@ class Calibrator:
         child.drop(horizon_ns - offset_ns, unpaired=is_alone)
 
     def _estimated_offset(self) -> TimeOffset | None:
-        """Return the time offset of the buffered poses; None if they do not determine it."""
+        """Return the adopted time offset, or that of the buffered poses if they determine it."""
         if self._proposed_offset:
             return self._proposed_offset
         parent = self._buffers["parent"].trajectory()
@@ -368,7 +373,7 @@ class Calibrator:
             return None
 
     def _end_of_batch(self, buffer: _PoseBuffer) -> int:
-        """Return the last stamp of a buffer that the next batch may contain."""
+        """Return the last stamp (ns) of a buffer that the next batch may contain."""
         newest_ns = buffer.stamps_ns[-1] - self._limits.late_ns
         return min(newest_ns, buffer.stamp_of(self._limits.batch))
 
@@ -382,12 +387,16 @@ class Calibrator:
 
 
 class Calibrators(dict[str, Calibrator]):
-    """Calibrators with the same parent sensor. Keys are the child streams: "child" and others."""
+    """Calibrators of several child sensors with one parent sensor.
+
+    Keys are the child streams: "child", "child2" and so on.
+    """
 
     def takers(self, stream: str) -> list[tuple[str, Calibrator]]:
-        """Return the calibrators that use a stream, each with the calibrator's name of the stream.
+        """Return the calibrators that use a stream, each with its own name for this stream.
 
-        All calibrators use the parent's stream. Each child stream is "child" in its own calibrator.
+        All calibrators use the stream "parent". Each child stream is called "child" in its own
+        calibrator.
         """
         if stream == "parent":
             return [(stream, calibrator) for calibrator in self.values()]

@@ -1,10 +1,10 @@
 """Comparison of a result with other estimates of the same transform.
 
-The other estimates come from robust least squares: from motions over several numbers of poses, and
-from each half of the recording. Their scatter about the result is compared with their covariances.
-Motions over other numbers of poses reveal errors that the noise model misses, such as errors with
-longer correlation times than it assumes. The halves reveal changes during the recording. Neither
-reveals a constant error.
+The other estimates come from robust least squares. Some use motions over several strides (numbers
+of poses), the others use each half of the recording. The scatter of the estimates about the result
+is compared with the covariances. Motions over other strides reveal errors that the noise model does
+not contain, such as errors with longer correlation times. The halves reveal changes during the
+recording. Constant errors remain hidden.
 """
 
 import math
@@ -25,47 +25,47 @@ from hand_eye_calib.core.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.core.results.records import AXES, AxisScatter, CrossCheck
 from hand_eye_calib.core.solvers import robust
 
-# Reference of the halves if the result has no reference of its own.
+# Reference of the motions in a half if the result has no reference.
 _REFERENCE_OF_HALVES = "B8"
 
-# Largest number of motion pairs of a half.
-_MOST_PAIRS = 3_000
+# Largest number of motion pairs that are used of a half.
+_MAX_PAIRS = 3_000
 
-# Smallest number of poses of a half.
+# Smallest number of poses of a half for an estimate.
 _MIN_POSES = 20
 
-# Smallest number of other estimates for a robust standard deviation.
+# Smallest number of other estimates for a robust standard deviation of their scatter.
 _MIN_OTHERS = 3
 
-# An estimate is about as certain as the result if its standard deviation is below this multiple of
-# the result's.
+# Another estimate is about as certain as the result if its standard deviation is below this
+# multiple of that of the result.
 _AS_CERTAIN = 3.0
 
-# Smallest number of such estimates for a robust standard deviation.
+# Smallest number of estimates that are about as certain, for a robust standard deviation.
 _MIN_AS_CERTAIN = 2
 
-# Halves are not compared on an axis whose standard deviations differ by more than this factor: the
-# smaller one comes from noise. The factor is 12 to 47 for simulated straight starts of 40 s, and
-# 1.1 to 4.0 with curves in both halves.
-_UNEQUAL_HALVES = 5.0
+# Halves are not compared on an axis if their standard deviations differ by more than this factor:
+# the smaller one is then an effect of noise. The factor is 12 to 47 for simulated straight starts
+# of 40 s, and 1.1 to 4.0 with curves in both halves.
+_MAX_RATIO_OF_HALVES = 5.0
 
-# Smallest standard deviation (m, rad) that is divided by, for noise-free data.
+# Smallest standard deviation (m, rad) used as a divisor, for noise-free data.
 _ROUNDING = 1e-9
 
 
 def cross_checked(solved: Solved, config: CalibratorConfig, pose_pairs: PosePairs) -> Calibration:
     """Return the result of a solve with its cross-check.
 
-    An axis that the result determines and no other estimate does becomes weak. A prior on such an
-    axis replaces the estimate from motion.
+    If only the result determines an axis, and no other estimate does, the verdict of this axis
+    becomes weak. If there is a prior on this axis, it replaces the estimate from motion.
 
     Parameters
     ----------
     solved : Solved
     config : CalibratorConfig
-        The options of the solve.
+        Options of the solve.
     pose_pairs : PosePairs
-        The poses of the solve: on one clock, each stream in its own unit of length.
+        Poses of the solve: on one clock, each stream in its own unit of length.
     """
     result = solved.calibration()
     others = solved.opinions or answers_of_whole(result, pose_pairs)
@@ -79,9 +79,9 @@ def cross_checked(solved: Solved, config: CalibratorConfig, pose_pairs: PosePair
         if dof.name in unconfirmed and dof.verdict is DofVerdict.OBSERVED:
             dof = replace(dof, verdict=DofVerdict.WEAK)
         observability.append(dof)
-    # The standard deviations of the result already contain the scatter of the other estimates. With
-    # them, no other estimate could contradict the result. So the comparison uses the standard
-    # deviations of the noise model alone.
+    # The covariance of the result already contains the excess scatter of the other estimates, so
+    # that no other estimate could contradict the result. The comparison uses the covariance of the
+    # noise model without the excess.
     of_model = replace(solved, excess=np.zeros((6, 6))).calibration(replaced)
     return replace(
         result,
@@ -91,9 +91,9 @@ def cross_checked(solved: Solved, config: CalibratorConfig, pose_pairs: PosePair
 
 
 def _unconfirmed(result: Calibration, others: Sequence[Assessment]) -> BoolArray:
-    """Return which axes (6,) the result determines and no other estimate does."""
-    # A result with a reference uses the most informative motions, so other motions may determine
-    # fewer axes.
+    """Return a mask (6,) of the axes that the result determines and no other estimate does."""
+    # A result with a reference uses the most informative motions. Other motions may determine fewer
+    # axes.
     if len(others) < _MIN_OTHERS or METHODS[result.method].uses_reference:
         return np.zeros(len(AXES), dtype=bool)
     of_others = np.array([other.sigmas for other in others])
@@ -101,18 +101,18 @@ def _unconfirmed(result: Calibration, others: Sequence[Assessment]) -> BoolArray
 
 
 def answers_of_whole(result: Calibration, pose_pairs: PosePairs) -> tuple[Assessment, ...]:
-    """Estimate once for each of several strides, with the scale of the result.
+    """Estimate X from the motions of each of several strides, with the scale of the result.
 
-    A stride is the number of poses that a motion spans.
+    A stride is the number of poses from the start to the end of a motion.
     """
     scaled = pose_pairs.child_scaled(result.scale)
     return second_opinions(scaled.Ts_pw_p, scaled.Ts_cw_c, result.T_parent_child)
 
 
 def answers_of_halves(result: Calibration, pose_pairs: PosePairs) -> list[Assessment]:
-    """Estimate from each half of the recording that has enough poses.
+    """Estimate X from each half of the recording that has enough poses.
 
-    The estimates use the scale of the result, and its reference if there is one.
+    The estimates use the scale of the result, and the reference of the result if it has one.
     """
     scaled = pose_pairs.child_scaled(result.scale)
     middle = len(scaled) // 2
@@ -125,7 +125,7 @@ def answers_of_halves(result: Calibration, pose_pairs: PosePairs) -> list[Assess
             continue
         pairs = motion_pairs(half.Ts_pw_p, half.Ts_cw_c, reference)
         if len(pairs):
-            pairs = pairs[:: math.ceil(len(pairs) / _MOST_PAIRS)]
+            pairs = pairs[:: math.ceil(len(pairs) / _MAX_PAIRS)]
             answers.append(assess_robust(pairs, robust.solve(pairs, result.T_parent_child)))
     return answers
 
@@ -141,14 +141,22 @@ def compare_answers(
     others : sequence of Assessment
         Estimates from the whole recording.
     halves : sequence of Assessment
-        Estimates from the first and the second half of the recording. Ignored unless there are two.
+        Estimates from the first and the second half of the recording. They are ignored unless there
+        are two.
+
+    Returns
+    -------
+    CrossCheck
+        Scatter by the name of the axis.
     """
     sigmas = calibration.sigmas_measured
     allowance = calibration.allowance
     differences = np.empty((len(others), 6))
     joint_sigmas = np.empty((len(others), 6))
     for row, other in enumerate(others):
-        differences[row], joint_sigmas[row] = _apart(calibration.T_parent_child, sigmas, other)
+        differences[row], joint_sigmas[row] = _distance_and_sigma(
+            calibration.T_parent_child, sigmas, other
+        )
     own_sigmas = np.maximum(sigmas, _ROUNDING)
     of_others = np.reshape([other.sigmas for other in others], (-1, 6))
     # Only estimates that are about as certain as the result.
@@ -180,36 +188,37 @@ def compare_answers(
 def _scatter_of_halves(
     calibration: Calibration, halves: Sequence[Assessment]
 ) -> tuple[FloatArray, FloatArray]:
-    """Estimate the standard deviation of a result from the difference of both halves.
+    """Estimate the standard deviation of a result from the difference between both halves.
 
     Returns
     -------
     (6,) array
-        Standard deviation (m, rad); NaN for axes that are not compared.
+        Standard deviations (m, rad); NaN for axes that are not compared.
     (6,) array
-        The same in units of the standard deviation that the covariances predict.
+        Ratios of these standard deviations to those that the covariances predict.
     """
     if len(halves) != 2:
         return np.full(6, np.nan), np.full(6, np.nan)
     first, second = halves
-    between, joint = _apart(first.T_parent_child, first.sigmas, second)
+    between, joint = _distance_and_sigma(first.T_parent_child, first.sigmas, second)
     half_sigmas = np.maximum([first.sigmas, second.sigmas], _ROUNDING)
-    are_alike = half_sigmas.max(axis=0) < _UNEQUAL_HALVES * half_sigmas.min(axis=0)
+    are_alike = half_sigmas.max(axis=0) < _MAX_RATIO_OF_HALVES * half_sigmas.min(axis=0)
     between = np.where(are_alike, between, np.nan)
-    # The result is about the mean of both halves. The standard deviation of a mean is half of that
-    # of a difference. The covariances of the halves contain neither the allowance nor the slow
-    # errors that the noise model estimates.
+    # The result is about the mean of both halves, whose standard deviation is half of that of the
+    # difference. The covariances of the halves lack the allowance. If the result comes from a noise
+    # model, they also lack its slow errors, which the sigma of the result contains.
     has_slow_errors = not METHODS[calibration.method].uses_reference
     missing = calibration.sigmas if has_slow_errors else calibration.allowance
     return between / 2, between / 2 / np.hypot(joint / 2, missing)
 
 
-def _apart(
+def _distance_and_sigma(
     T_parent_child: FloatArray, sigmas: FloatArray, other: Assessment
 ) -> tuple[FloatArray, FloatArray]:
     """Return the distance (6,) of another estimate, and the joint standard deviation (6,).
 
-    Both are NaN on axes that the result or the other estimate does not determine.
+    Distances and standard deviations (m, rad) are NaN on axes that the result or the other estimate
+    does not determine.
     """
     distance = np.abs(deviation(T_parent_child, other.T_parent_child))
     joint = np.hypot(sigmas, other.sigmas)
@@ -221,9 +230,9 @@ def _apart(
 
 
 def _robust_sigma(distances: FloatArray, fewest: int) -> FloatArray:
-    """Estimate the standard deviation (6,) from the median of absolute distances (N, 6).
+    """Return robust standard deviations (6,) of distances (N, 6), from medians.
 
-    The standard deviation is NaN for axes with fewer than ``fewest`` finite distances.
+    A standard deviation is NaN if its axis has fewer than ``fewest`` finite distances.
     """
     medians = np.full(6, np.nan)
     for axis, column in enumerate(distances.T):

@@ -1,6 +1,6 @@
 """From synchronised poses to a calibration.
 
-The steps: settle the scale, choose the motion pairs, solve, assess, add the prior.
+The steps are: determine the scale, choose the motion pairs, solve, assess, add the prior.
 """
 
 from collections.abc import Collection
@@ -35,9 +35,9 @@ from hand_eye_calib.core.solvers.all_pairs import Solution
 from hand_eye_calib.core.solvers.registry import Method
 from hand_eye_calib.core.solvers.robust import Stride
 
-# Largest share of jumps among the increments without a warning. If a tenth of the poses of each
-# trajectory jumps, a fifth of the increments are jumps.
-_MAX_JUMPS = 0.25
+# Share of jumps among the increments above which there is a warning. If a tenth of the poses of
+# each trajectory jumps, a fifth of the increments are jumps.
+_MAX_JUMP_SHARE = 0.25
 
 
 def _zero_covariance() -> FloatArray:
@@ -52,35 +52,37 @@ class Solved:
     ----------
     solution : Solution or AdaptiveSolution
     assessment : Assessment
+        Covariance and observability of the solution.
     method, reference : str
+        Names of the method and of the reference that were used.
     measured : str
         Kind of data.
     pairs : MotionPairs
-        Motion pairs whose residuals become part of the result.
+        Motion pairs whose residuals are part of the result.
     weights : (K,) array
         Weights of the motion pairs.
     stamps_ns : (N,) int64 array
         Stamps of the poses.
     config : CalibratorConfig
     method_reason, reference_reason : str
-        Why ``auto`` chose the method and the reference.
+        Reasons why ``auto`` chose the method and the reference.
     proved_global : str
-        Whether the minimum is proved to be global.
+        Whether the minimum is proved to be global: "yes", "no" or "not tried".
     warnings : tuple of str
     spread : (6, 6) array
-        Covariance due to a possible shift of the mount during the recording; zeros without one.
+        Covariance due to a possible shift of the mount during the recording; zero if there is none.
     scale : float
-        Factor of the child's lengths.
+        Factor by which the child's lengths were multiplied.
     scale_fit : SimilarityFit or None
-        The fit that the scale comes from, if it was estimated.
+        Fit of the scale, if the scale was estimated.
     time_offset : TimeOffset or None
-        The time offset, if it was estimated.
+        Time offset, if it was estimated.
     floor : (6, 6) array
-        Common-mode covariance.
+        Covariance of constant errors that both sensors have in common: the allowance.
     opinions : tuple of Assessment
-        Estimates of other methods, which check the solution of the noise model.
+        Second opinions: estimates by robust least squares, which test the solution.
     excess : (6, 6) array
-        Covariance that the noise model misses, estimated from ``opinions``.
+        Covariance that the noise model lacks, estimated from ``opinions``.
     """
 
     solution: Solution | AdaptiveSolution
@@ -105,7 +107,7 @@ class Solved:
     excess: FloatArray = field(default_factory=_zero_covariance)
 
     def calibration(self, unseen: Collection[str] = ()) -> Calibration:
-        """Return the result without frame names. The axes ``unseen`` become unobservable."""
+        """Return the result, without frame names. The axes in ``unseen`` become unobservable."""
         config = self.config
         solution = self.solution
         assessment = self.assessment
@@ -152,7 +154,7 @@ class Solved:
         )
 
     def _clock(self) -> dict[str, Any]:
-        """Return the fields of the result about the clocks."""
+        """Return the fields of the result about time offset and clock rate."""
         offset_s = float(self.config.time_offset)
         offset_sigma_s = 0.0
         clock_rate = None
@@ -201,9 +203,9 @@ def calibration_of(
         Stamps of the poses.
     config : CalibratorConfig
     warnings : tuple of str
-        A warning about axes that are mostly from the prior is put before these.
+        Warnings. A warning about axes that are mostly from the prior precedes them.
     **fields
-        Further fields of the Calibration.
+        Further fields of the Calibration. They replace the defaults.
     """
     dofs = fused.observability
     out_of_reach = OUT_OF_REACH.get(fields.get("measured", "poses"), ())
@@ -251,9 +253,13 @@ def solve_poses(
     ----------
     pose_pairs : PosePairs
     config : CalibratorConfig
-        Its time offset is in seconds and applied to the poses already.
+        Options. Their time offset is in seconds, and was applied to the poses.
     time_offset : TimeOffset, optional
         The same time offset with its uncertainty, if it was estimated.
+
+    Returns
+    -------
+    Solved
 
     Raises
     ------
@@ -274,7 +280,7 @@ def solve_poses(
         by_log_scale = scale_fit.sensitivity[:, 0]
         relative_sigma = scale_fit.scale_sigma / scale_fit.scale
         spread += np.outer(by_log_scale, by_log_scale) * relative_sigma**2
-    # A noise model that estimates the offset has its uncertainty in the covariance already.
+    # If the noise model estimates the time offset, its covariance contains the uncertainty already.
     has_offset = isinstance(solved.solution, AdaptiveSolution) and solved.solution.time_offset_s
     if time_offset and time_offset.fit and not has_offset:
         by_offset = time_offset.fit.sensitivity[:, 1]
@@ -299,8 +305,8 @@ def solve_poses(
 
 
 def floor_of(solved: Solved, pose_pairs: PosePairs, config: CalibratorConfig) -> FloatArray:
-    """Return the common-mode covariance (6, 6) of the sensors that are odometries."""
-    # The functions of `covariance` return the covariance of two odometries.
+    """Return the covariance (6, 6) of constant errors of the sensors that are odometries."""
+    # The functions in `covariance` return the covariance for two odometries.
     share = [config.parent_kind, config.child_kind].count("odometry") / 2
     speed_m_s = covariance.usual_speed(pose_pairs.stamps_ns, se3.translation_of(pose_pairs.Ts_pw_p))
     if isinstance(solved.solution, AdaptiveSolution):
@@ -312,16 +318,16 @@ def floor_of(solved: Solved, pose_pairs: PosePairs, config: CalibratorConfig) ->
 def _solve_stream(pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free: bool) -> Solved:
     """Solve with the adaptive estimator.
 
-    Method ``auto`` uses DNLO instead if no noise model fits these poses, or if the user set a
-    reference, which only the paper's methods have.
+    Method ``auto`` uses DNLO instead if the noise model does not fit these poses, or if the user
+    set a reference, which the adaptive estimator does not use.
     """
     is_auto = config.method == "auto"
     with_dnlo = replace(config, method="dnlo")
     if is_auto and config.reference != "auto":
         reason = f"auto: dnlo, because the user set reference {config.reference}"
         return replace(_solve_pairs(pose_pairs, with_dnlo), method_reason=reason)
-    # The noise model does not estimate what the user set to a number. It refines a time offset that
-    # the user set to "estimate".
+    # The noise model does not estimate a scale or a time offset that the user set to a number. It
+    # refines a time offset that is "estimate".
     is_fixed = {
         "scale": config.is_known("scale"),
         "time": config.is_known("time_offset") and not is_clock_free,
@@ -359,7 +365,7 @@ def _solve_stream(pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free
 
 
 def _with_opinions(dnlo: Solved, pose_pairs: PosePairs, reason: str) -> Solved:
-    """Return an answer of DNLO that replaces one of the noise model, with second opinions on it."""
+    """Return a solution of DNLO that replaces one of the noise model, with second opinions."""
     T_parent_child = dnlo.solution.T_parent_child
     opinions = second_opinions(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, T_parent_child)
     return replace(dnlo, method_reason=reason, opinions=opinions)
@@ -370,14 +376,15 @@ def _of_model(
 ) -> Solved:
     """Assess a solution of the adaptive estimator.
 
-    The motion pairs of the result have the scale and the time offset of the solution.
+    The motion pairs of the result contain the scale and the time offset of the solution. ``reason``
+    is the reason for the method.
     """
     stamps_ns = pose_pairs.stamps_ns
     child = Trajectory(stamps_ns, pose_pairs.Ts_cw_c).scaled(solution.scale)
     Ts_cw_c = child.shifted(solution.time_offset_s).at(stamps_ns, extrapolate=True)
     spread, warnings = possible_shift(solution.part_products, solution.misfit)
     jumps = float(np.mean(solution.jumps))
-    if jumps > _MAX_JUMPS:
+    if jumps > _MAX_JUMP_SHARE:
         warning = (
             f"{jumps:.0%} of the increments are jumps: the errors do not fit the adaptive noise "
             "model; compare with method dnlo"
@@ -411,8 +418,8 @@ def _solve_pairs(
     pose_pairs : PosePairs
     config : CalibratorConfig
     adaptive : AdaptiveSolution, optional
-        Solution of the adaptive estimator, which chooses the reference ``auto``. By default, the
-        poses are solved for this choice.
+        Solution of the adaptive estimator, which chooses the reference ``auto``. By default, it is
+        computed if the reference is ``auto``.
     """
     method = Method(config.method, config.threshold, config.min_inlier_fraction, config.backend)
     reference = config.reference

@@ -1,4 +1,4 @@
-"""Kinds of data on the road from streams to a result, and what each of them supplies.
+"""Kinds of data: the functions and limits in which they differ on the road to a result.
 
 The road is the same for all kinds (:mod:`hand_eye_calib.core.engine.run`). A kind is registered in
 ``KINDS`` (:mod:`hand_eye_calib.core.base.registry`) under what both sensors measure together
@@ -17,26 +17,29 @@ from hand_eye_calib.core.results.calibration import Calibration
 
 @dataclass(frozen=True)
 class Kind:
-    """What differs between kinds of data.
+    """Kind of data, such as poses or positions: how to solve and how to check it.
 
-    :mod:`hand_eye_calib.core.engine.snapshot` has the snapshots, and imports this module.
+    Snapshots are of type Any here, because :mod:`hand_eye_calib.core.engine.snapshot` imports this
+    module.
 
     Attributes
     ----------
     solve : callable
         ``solve(snapshot, cross_check)`` returns a calibration without frame names. The snapshot has
-        a time offset in seconds and enough pairs. If ``cross_check`` is None, the options decide.
+        a time offset in seconds and enough pairs. If ``cross_check`` is None, the options decide
+        whether the result is cross-checked.
     check : callable
-        ``check(snapshot, calibration)`` checks the streams; the calibration may be None.
+        ``check(snapshot, calibration)`` checks the streams and returns a CheckResult. The
+        calibration may be None.
     least_clock_change_s : float
-        Smallest change of the time offset (s) after which the poses are paired anew.
+        Smallest change of the time offset (s) for which the poses are paired anew.
     is_timed_by_speed : bool
-        Whether the time offset is estimated from speeds, rather than from angular rates.
+        Whether the time offset is estimated from speeds instead of angular rates.
     allowed : mapping
-        Options of whole poses that this kind cannot obey: the name of each option, and the values
-        that may be set all the same.
+        Options that this kind cannot obey: name of the option to the values that are allowed
+        nevertheless, because they change nothing.
     has_conventions : bool
-        Whether checks detect wrong conventions, units and clocks even if no solve succeeds.
+        Whether checks detect wrong conventions, units and clocks even if the solve fails.
     """
 
     solve: Callable[[Any, bool | None], Calibration]
@@ -47,12 +50,12 @@ class Kind:
     has_conventions: bool = False
 
     def require_allowed(self, config: CalibratorConfig) -> None:
-        """Check that no option is set that this kind of data cannot obey.
+        """Raise ConfigError if an option is set that this kind of data cannot obey.
 
         Raises
         ------
         ConfigError
-            If such an option is set; the message names the option.
+            The message contains the name and the value of the option.
         """
         for name, values in self.allowed.items():
             value = getattr(config, name)
@@ -61,6 +64,6 @@ class Kind:
 
 
 def kind_of(config: CalibratorConfig) -> Kind:
-    """Return the kind of data that two streams with these options make together."""
+    """Return the kind of data of two streams with these options."""
     kind: Kind = KINDS[config.measured]()
     return kind

@@ -1,4 +1,4 @@
-"""The kind of data of two streams of poses: solve and check them."""
+"""Kind of data "poses": solve and check two streams of poses."""
 
 from dataclasses import replace
 
@@ -18,9 +18,9 @@ INVERSIONS = frozenset({"parent_invert", "child_invert"})
 
 
 def solve(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
-    """Solve synchronised poses, and cross-check the result.
+    """Solve synchronised poses, and cross-check the result if requested.
 
-    If ``cross_check`` is None, the result is cross-checked unless the user set the reference.
+    If ``cross_check`` is None, the result is cross-checked unless the user has set a reference.
     """
     config = snapshot.config
     pairs = snapshot.pose_pairs
@@ -37,8 +37,8 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
     ----------
     snapshot : Snapshot
     calibration : Calibration, optional
-        A result from these streams. The check uses its time offset, scale and extrinsic. Without a
-        result, the check uses the time offset and the scale of the options if they are numbers.
+        Result of these streams, whose time offset, scale and extrinsic the check uses. Without a
+        result, the check uses the time offset and the scale in the options if they are numbers.
     """
     config = snapshot.config
     result = checking.check_streams(
@@ -65,9 +65,9 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
 
 
 def _known_extrinsic(calibration: Calibration | None) -> checking.Known | None:
-    """Return the extrinsic of a result with its standard deviations.
+    """Return the extrinsic of a result, and its standard deviations (6,); None without a result.
 
-    All standard deviations are infinite if the result does not observe every axis.
+    All standard deviations are infinite if the result does not determine every axis.
     """
     if calibration is None:
         return None
@@ -77,10 +77,11 @@ def _known_extrinsic(calibration: Calibration | None) -> checking.Known | None:
 
 
 def _obsolete_codes(snapshot: Snapshot, calibration: Calibration | None) -> set[str]:
-    """Return the codes of findings that do not apply to these pairs or to this result."""
+    """Return the codes of findings that do not apply to this snapshot or to this result."""
     obsolete = set()
     if len(snapshot.kept):
-        obsolete.add("gaps")  # kept pairs have gaps even if the streams had none
+        # Kept pairs are downsampled, so that they have gaps even if the streams had none.
+        obsolete.add("gaps")
     if calibration:
         unobserved = {DofVerdict.UNOBSERVABLE, DofVerdict.PRIOR}
         if unobserved.isdisjoint(dof.verdict for dof in calibration.observability[:3]):
@@ -88,7 +89,7 @@ def _obsolete_codes(snapshot: Snapshot, calibration: Calibration | None) -> set[
     return obsolete
 
 
-#: The kind of data of two streams of poses.
+#: Kind of data of two streams of poses.
 POSES = Kind(
     solve=solve,
     check=check,

@@ -1,11 +1,12 @@
-"""Choice between two readings of both streams: the second inverts every pose of the first.
+"""Choice between two readings of both streams.
 
-Both readings fit equally well (:class:`~hand_eye_calib.core.checks.hypotheses.Readings`). Two kinds
-of evidence distinguish them: the likelihood of the noise
-(:mod:`~hand_eye_calib.core.noise.readings`) and the shape of the motion. The noise has priority. In
-a small space the shape must support the noise, because there a camera that observes a target has
-the same noise as inverted poses. If the evidence is not clear, both results are reported, and the
-verdict is DO NOT USE.
+A reading is an interpretation of both streams, as poses or as inverse poses of the sensors. The
+second reading inverts all poses of the first one. Both readings fit equally well
+(:class:`~hand_eye_calib.core.checks.hypotheses.Readings`), so two other criteria distinguish them:
+the likelihood of the noise (:mod:`~hand_eye_calib.core.noise.readings`) and the shape of the
+motion. The noise has priority. In a small space the shape must support the noise, because the poses
+of a camera that observes a target have the same noise as inverted poses. If the criteria are not
+clear, both results are reported, and the verdict is DO NOT USE.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -24,13 +25,13 @@ from hand_eye_calib.core.noise.readings import loss_difference
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
 
-# Smallest difference of the losses (log likelihoods) that decides. In 200 recordings without target
-# cameras whose first reading is right, the difference was never below -9.
+# Smallest difference of the losses (log likelihoods) with which the noise decides. In 200
+# recordings without target cameras whose first reading is right, the difference was never below -9.
 CLEAR_NOISE = 20.0
 
 # Smallest absolute `Readings.shape` (a logarithm) that overrules the noise. In 190 recordings the
-# shape never had the wrong sign. The noise misled for a stream almost without errors, whose shape
-# was -2.9.
+# shape never had the wrong sign. The noise was wrong for a stream almost without errors, and there
+# the shape was -2.9.
 _OVERRULING_SHAPE = 2.0
 
 # Smallest `Readings.paths` (a logarithm) that supports the noise in a small space.
@@ -46,7 +47,7 @@ class Choice:
     findings : tuple of Finding
         Findings of the check for the chosen reading.
     doubts : tuple of Finding
-        Findings about the choice itself, to be added to the result.
+        Findings about an uncertain choice, which are added to the result.
     is_repair : bool
         Whether the chosen reading sets options, such as ``child_invert``.
     """
@@ -66,11 +67,12 @@ def choose(
     Parameters
     ----------
     result : CheckResult
-        A check whose ``readings`` are not None.
+        Check whose ``readings`` are not None.
     pairs_of : callable
-        Returns the pose pairs with these options, on one clock.
+        ``pairs_of(options)`` returns the pose pairs with these options, on one clock.
     answer_with : callable
-        Returns the result with these options, on one clock; None if the solve fails.
+        ``answer_with(options)`` returns the result with these options, on one clock; None if the
+        solve fails.
     """
     readings = result.readings
     assert readings is not None
@@ -78,6 +80,7 @@ def choose(
     options = [_options_of(findings) for findings in findings_of_readings]
     difference = _loss_difference(pairs_of(options[0]), pairs_of(options[1]))
     index = decide(readings, difference)
+    # Whether the streams as they are, without an inversion, are the first reading.
     can_be_right = readings.hypotheses[0].is_uninverted
     doubts: tuple[Finding, ...] = ()
     if index is None:
@@ -99,7 +102,7 @@ def choose(
 
 
 def decide(readings: Readings, difference: float) -> int | None:
-    """Return the index of the right reading, or None if the evidence is not clear.
+    """Return the index of the right reading; None if noise and shape do not decide clearly.
 
     Parameters
     ----------
@@ -112,17 +115,17 @@ def decide(readings: Readings, difference: float) -> int | None:
         by_noise = -int(np.sign(difference))
     choice = _vote(readings, by_noise)
     if choice == 0 and readings.hypotheses[0].is_uninverted:
-        # Without clear evidence, the streams stay as they are if nothing supports an inversion.
+        # Without a clear vote, the streams stay as they are if no criterion supports an inversion.
         is_inversion_supported = readings.shape >= 0.0 or by_noise > 0
         choice = 0 if is_inversion_supported else -1
-    # 1 is the second reading, -1 the first; 0 is unclear.
+    # From a vote (1 for the second reading, -1 for the first) to an index.
     return {1: 1, -1: 0}.get(choice)
 
 
 def _vote(readings: Readings, by_noise: int) -> int:
-    """Return 1 for the second reading, -1 for the first, and 0 without clear evidence.
+    """Return 1 for the second reading, -1 for the first, and 0 without a clear vote.
 
-    ``by_noise`` has the same values, for the evidence of the noise alone.
+    ``by_noise`` has the same values, and is the vote of the noise alone.
     """
     by_shape = readings.by_shape
     if by_noise == 0:
@@ -136,15 +139,15 @@ def _vote(readings: Readings, by_noise: int) -> int:
 
 
 def _vote_in_small_space(readings: Readings, by_noise: int) -> int:
-    """Return the vote, see :func:`_vote`, if the shape does not support the noise."""
+    """Return the vote in a small space if the shape does not support the noise, see _vote."""
     by_shape = readings.by_shape
     # The paths alone may support the noise.
     if by_noise * readings.paths > _CLEAR_PATHS:
         return by_noise
-    # Both readings invert a stream, so the streams cannot stay as they are.
+    # If both readings invert a stream, the streams cannot stay as they are.
     if not readings.hypotheses[0].is_uninverted:
         return by_shape or by_noise
-    # Without evidence of the shape, the noise can only confirm the streams as they are.
+    # Without a vote of the shape, the noise can only confirm the streams as they are.
     is_confirmed = by_noise < 0 and by_shape == 0
     return by_noise if is_confirmed else 0
 
@@ -175,7 +178,7 @@ def _loss_difference(first: PosePairs, second: PosePairs) -> float:
 
 
 def _options_of(findings: Collection[Finding]) -> dict[str, float | str]:
-    """Return the options of all findings."""
+    """Return the options that all findings propose."""
     options: dict[str, float | str] = {}
     for suspect in findings:
         options.update(suspect.options)
@@ -185,7 +188,7 @@ def _options_of(findings: Collection[Finding]) -> dict[str, float | str]:
 def _unclear(
     options: Sequence[Options], answers: Sequence[Calibration | None], difference: float
 ) -> Finding:
-    """Return the finding that both readings are possible, with the result of each reading."""
+    """Return the finding that both readings are possible, with the results of both readings."""
     texts = []
     for reading_options, answer in zip(options, answers, strict=True):
         values = options_in_words(reading_options)

@@ -1,9 +1,11 @@
 """From streams to a result: solve, check, repair, and solve at most twice more.
 
-1. Solve the streams as given. If the angular rates clearly show that the clocks differ, try an
-   estimated time offset first.
+1. Solve the streams with the options of the user. If the angular rates clearly prove that the
+clocks
+   differ, try an estimated time offset first.
 2. Check the streams with the result.
-3. Choose between two readings of both streams, if both fit equally well.
+3. Choose between two readings of both streams (as poses, or as inverse poses) if both fit equally
+   well.
 4. If a check is certain of options that repair a stream (units, conventions), solve with them.
 5. If a check is certain that clocks or scales differ, solve with an estimated time offset or scale.
 
@@ -34,22 +36,24 @@ from hand_eye_calib.core.engine.snapshot import MOST_MOVED_S, UNASKED_S, Snapsho
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
 
-#: ``progress(share, step)``: share of the work that is done, 0 to 1, and name of the next step.
+#: Function ``progress(share, step)`` that is called before each step: share of the work that is
+#: finished, 0 to 1, and name of the step.
 Progress: TypeAlias = Callable[[float, str], None]
 
-# Share of the work before the checks, for the progress only; a guess.
+# Share of the work that is finished when the checks begin: an estimate for the display of progress.
 _CHECKS_BEGIN = 0.8
 
 _ESTIMATED_CLOCK: Options = {"time_offset": "estimate"}
 
-# Findings that are certain enough for a second solve, besides those about conventions.
+# Codes of findings, besides those about conventions, that are certain enough for a second solve.
 _CERTAIN_CODES = ("time_offset", "scale", "units", "unit_or_scale")
 
-# Findings whose option is estimated in the second solve, so that the result contains its
-# uncertainty.
+# Codes of findings whose option is estimated in the second solve, so that the result contains the
+# uncertainty of its value.
 _ESTIMATED_CODES = ("time_offset", "scale", "unit_or_scale")
 
-# A clock rate is used if its spread is below this share of the largest time offset.
+# The time offset of the check, with its clock rate, is used if its spread (see TimeOffset) is below
+# this share of the largest offset in the recording.
 _CLEAR_SPREAD = 0.5
 
 
@@ -62,9 +66,9 @@ class _Reading:
     findings : tuple of Finding
         Findings of the check for this reading.
     doubts : tuple of Finding
-        Findings about the choice itself.
+        Findings about an uncertain choice.
     settled : frozenset of str
-        Options that the choice settles.
+        Options that must not be changed after the choice.
     """
 
     findings: tuple[Finding, ...]
@@ -75,17 +79,22 @@ class _Reading:
 def run(
     snapshot: Snapshot, *, checks: bool | None = None, progress: Progress | None = None
 ) -> Attempt:
-    """Calibrate.
+    """Calibrate: solve, check, repair, and return the best attempt.
 
     Parameters
     ----------
     snapshot : Snapshot
-        The streams, and the options.
+        Streams and options.
     checks : bool, optional
-        False skips stream checks, cross-checks and further solves. True cross-checks even if the
-        user set a reference. By default, such a result is not cross-checked.
+        False skips stream checks, cross-checks and further solves. True cross-checks the result
+        even if the user set a reference; by default, such a result is not cross-checked.
     progress : callable, optional
         See :data:`Progress`.
+
+    Returns
+    -------
+    Attempt
+        Best attempt, with its result, its check, and the options that were set automatically.
 
     Raises
     ------
@@ -111,16 +120,15 @@ def review(calibration: Calibration, snapshot: Snapshot, settled: Collection[str
     ----------
     calibration : Calibration
     snapshot : Snapshot
-        The poses and options of the result.
+        Poses and options of the result.
     settled : collection of str
-        Options that an earlier check has settled. They are not changed, as if the user had set
-        them.
+        Options that an earlier check has set. Like options of the user, they are not changed.
     """
     return _best(_checked(calibration, snapshot), settled, None)
 
 
 def _solved_and_checked(snapshot: Snapshot, checks: bool | None, report: Progress) -> Attempt:
-    """Return the best attempt at a snapshot."""
+    """Return the best attempt at a snapshot; ``checks`` is that of :func:`run`."""
     on_clock = _on_another_clock(snapshot)
     if on_clock and on_clock.is_sound and not on_clock.check.readings:
         return _with_estimate_warnings(on_clock, _ESTIMATED_CLOCK, ())
@@ -140,8 +148,8 @@ def _solved_and_checked(snapshot: Snapshot, checks: bool | None, report: Progres
 def _best(first: Attempt, settled: Collection[str], on_clock: Attempt | None) -> Attempt:
     """Return the best attempt: the first one, or one solved again with options from its check.
 
-    ``settled`` are options that must not be changed. ``on_clock`` is the attempt with
-    an estimated time offset, if there is one already.
+    ``settled`` are options that must not be changed. ``on_clock`` is the attempt with an estimated
+    time offset if there is one already.
     """
     reading = _reading_of(first.snapshot, first.check, settled, first.calibration.time_offset_s)
     first = first.with_findings(reading.findings)
@@ -164,8 +172,8 @@ def _best(first: Attempt, settled: Collection[str], on_clock: Attempt | None) ->
 def _on_another_clock(snapshot: Snapshot) -> Attempt | None:
     """Return the attempt with an estimated time offset if the clocks clearly differ, else None.
 
-    Such an attempt first saves the solve without time offset. It is not made if the options or the
-    kind of data exclude a time offset, or if other mistakes must be repaired first.
+    If this attempt is good, the solve without time offset is saved. It is not made if the options
+    or the kind of data exclude a time offset, or if other mistakes must be repaired first.
     """
     config = snapshot.config
     is_free = config.method in ("auto", "adaptive") and config.reference == "auto"
@@ -181,8 +189,8 @@ def _on_another_clock(snapshot: Snapshot) -> Attempt | None:
     smallest_s = abs(preliminary.seconds) - 3.0 * preliminary.sigma_s
     if fit is None or smallest_s < MOST_MOVED_S:
         return None
-    # With wrong conventions or units, the streams are solved as given first: the message of the
-    # repair states this verdict.
+    # If conventions or units are wrong, the streams are first solved as they are, because the
+    # message of the repair contains the verdict of this solve.
     if fit.has_own_unit or fit.unexplained > HOLDS:
         return None
     offset = refine_time_offset(*snapshot.streams, preliminary, snapshot.max_gap_s)
@@ -191,7 +199,7 @@ def _on_another_clock(snapshot: Snapshot) -> Attempt | None:
 
 
 def _clock_is_off(first: Attempt) -> bool:
-    """Return whether the time offset changed so much that the poses must be paired anew."""
+    """Return whether the time offset has changed so much that poses must be paired anew."""
     snapshot = first.snapshot
     calibration = first.calibration
     moved_s = abs(calibration.time_offset_s - float(snapshot.resolved.config.time_offset))
@@ -213,8 +221,8 @@ def _reading_of(
 ) -> _Reading:
     """Decide whether both streams hold poses or inverse poses, if both readings fit equally well.
 
-    ``known_s`` is the time offset (s) that was applied before the check. The check may have found a
-    further one.
+    ``settled`` are options that must not be changed. ``known_s`` is the time offset (s) that was
+    applied before the check; the check may have estimated a further one.
     """
     if INVERSIONS & snapshot.config.given.union(settled):
         return _Reading(_without_readings(result))
@@ -235,9 +243,9 @@ def _reading_of(
 
 
 def _without_readings(result: CheckResult) -> tuple[Finding, ...]:
-    """Return the findings without warnings that both streams are inverse.
+    """Return the findings except warnings that both streams are inverse.
 
-    The options have settled whether they are.
+    The user or an earlier choice has decided about inversions.
     """
     return tuple(
         finding
@@ -250,7 +258,7 @@ def _without_readings(result: CheckResult) -> tuple[Finding, ...]:
 
 
 def _repaired_unsolved(snapshot: Snapshot) -> Attempt | None:
-    """Repair streams that cannot be solved as given; None if no repair is certain."""
+    """Repair streams that cannot be solved as they are; return None if no repair is certain."""
     result = check(snapshot)
     reading = _reading_of(snapshot, result, (), snapshot.config.given_time_offset_s)
     certain_options = _certain(reading.findings, snapshot.config.given)
@@ -267,8 +275,20 @@ def _repaired(
 ) -> Attempt | None:
     """Return the attempt with repaired streams; None if the repaired streams do not agree.
 
-    A time offset or scale is estimated after the repair, or together with the repair if no poses
-    can be paired otherwise.
+    A time offset or scale is estimated after the repair. It is estimated together with the repair
+    if otherwise no poses can be paired.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+    findings : collection of Finding
+        Findings of the check, for the message.
+    certain_options : mapping
+        Options that certainly repair the streams, see :func:`_certain`.
+    settled : collection of str
+        Options that must not be changed.
+    verdict_as_given : str
+        Verdict of the streams as they are, for the message.
     """
     options = {name: value for name, value in certain_options.items() if value != "estimate"}
     second = _solved_with(snapshot, options) if options else None
@@ -294,7 +314,7 @@ def _repaired(
         f": {verdict}; as the streams are: {verdict_as_given}",
     )
     second = second.with_messages({**options, **second.options}, (message, *second.messages))
-    # The lengths of the parent may also differ because the child has its own scale.
+    # A difference of lengths may also be a scale of the child instead of a unit of the parent.
     doubts = [
         replace(finding, severity=Severity.WARNING, options={})
         for finding in findings
@@ -305,9 +325,9 @@ def _repaired(
 
 
 def _contradicts_repair(finding: Finding) -> bool:
-    """Return whether a finding after a repair is about streams that do not agree.
+    """Return whether a finding after a repair proves that the streams still do not agree.
 
-    A difference of lengths that is either a unit or a scale is no contradiction.
+    A difference of lengths that is either a unit or a scale is no such proof.
     """
     return finding.makes_unusable and finding.code != "unit_or_scale"
 
@@ -320,7 +340,8 @@ def _estimated(
 ) -> Attempt:
     """Return the attempt with an estimated time offset or scale, or the first attempt.
 
-    A second solve is made if a check asks for it, and kept if its result is better.
+    There is a second solve if a check is certain of such options, or if the clock is off. Its
+    attempt is returned if it is better or sound.
     """
     fixed = first.snapshot.config.given.union(settled)
     options = dict(certain_options)
@@ -343,10 +364,10 @@ def _estimated(
 
 
 def _unit_doubts(findings: Collection[Finding], calibration: Calibration) -> tuple[Finding, ...]:
-    """Return the doubts whether a difference of lengths is a unit, after the scale is estimated.
+    """Return findings that a difference of lengths, estimated as a scale, may be a wrong unit.
 
-    A doubt is an error if the scale of the check, or that of the result, equals the scale of a unit
-    within its uncertainty.
+    A finding is an error if the scale in the check or in the result equals that of the unit within
+    its uncertainty, otherwise a warning.
     """
     doubts = []
     for finding in findings:
@@ -362,7 +383,7 @@ def _unit_doubts(findings: Collection[Finding], calibration: Calibration) -> tup
 def _with_estimate_warnings(
     attempt: Attempt, options: Options, findings: Collection[Finding]
 ) -> Attempt:
-    """Return the attempt with warnings about the options that were set because of findings."""
+    """Return the attempt with a warning about each option that was set because of findings."""
     reasons = {name: finding.what for finding in findings for name in finding.options}
     calibration = attempt.calibration
     offset_s = calibration.time_offset_s
@@ -383,7 +404,7 @@ def _with_estimate_warnings(
 
 
 def _with_offset_doubt(attempt: Attempt, doubts: Collection[Finding]) -> Attempt:
-    """Return the attempt with doubts, and with a doubt about a large estimated time offset."""
+    """Return the attempt with doubts, and with one more if the estimated time offset is large."""
     offset_s = attempt.calibration.time_offset_s
     doubts = [*doubts]
     if "time_offset" in attempt.options and abs(offset_s) > UNASKED_S:
@@ -397,18 +418,18 @@ def _with_offset_doubt(attempt: Attempt, doubts: Collection[Finding]) -> Attempt
 
 
 def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckResult:
-    """Check the streams of a snapshot; use a result from these streams if there is one."""
+    """Check the streams of a snapshot, with their result if there is one."""
     return kind_of(snapshot.config).check(snapshot, calibration)
 
 
 def _checked(calibration: Calibration, snapshot: Snapshot) -> Attempt:
-    """Return the attempt of a result and the check of its streams."""
+    """Check the streams of a result, and return the attempt."""
     result = check(snapshot, calibration)
     return Attempt(replace(calibration, findings=result.findings), snapshot, result)
 
 
 def _solved_with(snapshot: Snapshot, options: Options) -> Attempt | None:
-    """Return the attempt with other options; None if nothing can be solved with them."""
+    """Solve and check with some options changed; return None if the solve fails."""
     try:
         other = with_options(snapshot, options)
         return _checked(other.estimate(), other)
@@ -417,11 +438,11 @@ def _solved_with(snapshot: Snapshot, options: Options) -> Attempt | None:
 
 
 def _certain(findings: Collection[Finding], fixed: Collection[str]) -> dict[str, float | str]:
-    """Return the options that certainly repair a stream, by name, without ``fixed`` options.
+    """Return the options that certainly repair a stream, except those in ``fixed``.
 
-    Units and conventions are set. Time offset and scale are estimated, so that the result contains
-    their uncertainty. A difference of lengths of a few per cent is only a warning, because odometry
-    with a drifting scale has the same effect.
+    Values of units and conventions are those of the findings. Time offset and scale get the value
+    "estimate", so that the result contains their uncertainty. A difference of lengths of a few per
+    cent is only a warning, because odometry with a drifting scale has the same effect.
     """
     certain_options: dict[str, float | str] = {}
     for finding in findings:

@@ -1,4 +1,4 @@
-"""Results of a session of the node, for the process that writes its pages."""
+"""Result of a session of the node, for the process that writes the pages of the session."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,19 +10,19 @@ from hand_eye_calib.core.results.calibration import Calibration
 
 @dataclass(frozen=True)
 class SessionResult:
-    """A result of the node with its data.
+    """Result of the node with its data.
 
     Attributes
     ----------
     calibration : Calibration
     snapshot : Snapshot
-        The poses and options of the result.
+        Poses and options of the result.
     inputs : dict
         Sources of the poses as plain data: options, topics and statistics.
     with_report : bool
         Whether to write a report.
     others : mapping of str to Snapshot
-        Snapshots of further child sensors with the same parent, by the names of their inputs.
+        Snapshots of further child sensors with the same parent: name of the input to snapshot.
     """
 
     calibration: Calibration

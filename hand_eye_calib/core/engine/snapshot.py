@@ -1,4 +1,4 @@
-"""Snapshots: the poses and options of an estimate, independent of poses that arrive later."""
+"""Snapshots: poses and options for an estimate, which poses that arrive later do not change."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -24,25 +24,25 @@ from hand_eye_calib.core.results.calibration import Calibration
 
 STREAMS = ("parent", "child")
 
-# Smallest time offset (s) for which the poses are paired anew. For a smaller offset, the noise
-# model moves the poses along their velocities.
+# Largest time offset (s) for which poses are not paired anew. The noise model corrects such an
+# offset by moving poses along their velocities.
 MOST_MOVED_S = 0.003
 
-# Largest time offset (s) without a warning, if the user did not ask for an estimate.
+# Largest time offset (s) that is estimated without a warning if the user did not request it.
 UNASKED_S = 1.0
 
-# Largest number of pose pairs of whole trajectories, unless the user sets `max_pairs`: three hours
-# at 10 Hz. The noise model needs 8 kB per pair.
-_MOST_PAIRS = 100_000
+# Largest number of pose pairs of whole trajectories if the user does not set `max_pairs`: three
+# hours at 10 Hz. The noise model needs 8 kB per pair.
+_MAX_PAIRS = 100_000
 
-# Longest gap that the stream checks interpolate across, in median intervals between kept pairs.
-# Downsampled pairs are farther apart than poses.
+# Longest gap in which the stream checks interpolate, in median intervals between kept pairs. Kept
+# pairs are downsampled, so that they are farther apart than poses.
 _GAP_INTERVALS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
 class Snapshot:
-    """Poses and options of an estimate. The estimate may run in any thread or process.
+    """Poses and options for an estimate in any thread or process.
 
     Attributes
     ----------
@@ -52,12 +52,13 @@ class Snapshot:
     buffered_parent, buffered_child : Trajectory
         Poses that are not paired yet, as they were received.
     paired_at : {"parent", "child"} or None
-        Stream whose stamps the pairs have; the slower one if None.
+        Stream whose stamps the pairs have; None for the slower stream.
     parent_names, child_names : StreamFrames
         Names of the frames of each stream.
     warnings : tuple of str
+        Warnings that become part of the result.
     time_offset : TimeOffset or None
-        The time offset of the kept pairs, if it was estimated.
+        Time offset of the kept pairs, if it was estimated.
     """
 
     config: CalibratorConfig
@@ -72,12 +73,12 @@ class Snapshot:
 
     @property
     def parent_frame(self) -> str:
-        """Name of the parent sensor's frame, after an inversion of its poses by the options."""
+        """Name of the parent sensor's frame, also if the options invert the poses."""
         return self._frame("parent")
 
     @property
     def child_frame(self) -> str:
-        """Name of the child sensor's frame, after an inversion of its poses by the options."""
+        """Name of the child sensor's frame, also if the options invert the poses."""
         return self._frame("child")
 
     def _frame(self, stream: str) -> str:
@@ -96,7 +97,7 @@ class Snapshot:
 
     @property
     def frame_warnings(self) -> tuple[str, ...]:
-        """Warnings about sensor frames that have no name, or the name for inverse poses."""
+        """Warnings about sensor frames without a name, or with another name by an inversion."""
         warnings = []
         for stream, frame in zip(STREAMS, (self.parent_frame, self.child_frame), strict=True):
             names, _ = self._names(stream)
@@ -115,7 +116,7 @@ class Snapshot:
         return tuple(warnings)
 
     def _check_frames(self) -> None:
-        """Raise InputError if both sensors have one frame, or an option names the other's frame."""
+        """Raise InputError if both sensors have the same frame, or if options exchange frames."""
         nameless = "a sensor without name"
         for stream in STREAMS:
             names, other = self._names(stream)
@@ -134,9 +135,9 @@ class Snapshot:
 
     @property
     def unpaired(self) -> tuple[Trajectory, Trajectory]:
-        """Trajectories of the poses of parent and child that are not paired yet.
+        """Trajectories of parent and child, of all poses that are not paired yet.
 
-        The options are applied to the poses, and the clock rate to the child's stamps.
+        The options about conventions and units are applied, and the clock rate of the child.
         """
         parent = _corrected(self.buffered_parent, "parent", self.config)
         child = _corrected(self.buffered_child, "child", self.config)
@@ -144,10 +145,10 @@ class Snapshot:
 
     @cached_property
     def resolved(self) -> "Snapshot":
-        """The snapshot with its time offset in seconds.
+        """The same snapshot with its time offset as a number (s).
 
-        If the options ask for an estimate, the offset of the kept pairs is used. If no pairs are
-        kept, the offset is estimated from the buffered poses.
+        If the option ``time_offset`` is "estimate", the number is the offset of the kept pairs. If
+        there are none, it is estimated from the buffered poses.
 
         Raises
         ------
@@ -162,21 +163,21 @@ class Snapshot:
 
     @cached_property
     def correlation(self) -> Correlation:
-        """Correlation of the angular rates of the streams, over all time offsets."""
+        """Best correlation of the angular rates of both streams over all time offsets."""
         if self.time_offset and self.time_offset.correlation.is_clear and not len(self.kept):
             return self.time_offset.correlation
         return correlate_rates(*self.streams, self.max_gap_s)
 
     @property
     def max_gap_s(self) -> float:
-        """Longest gap (s) of the streams across which poses are interpolated."""
+        """Longest gap (s) of :attr:`streams` in which poses are interpolated."""
         if not len(self.kept):
             return self.config.max_gap
         return max(self.config.max_gap, _GAP_INTERVALS * self.streams[0].interval_s)
 
     @cached_property
     def pose_pairs(self) -> PosePairs:
-        """Synchronised pose pairs: the kept pairs, and pairs of the buffered poses.
+        """Synchronised pose pairs: the kept pairs, then pairs of the buffered poses.
 
         Raises the same errors as :attr:`resolved`.
         """
@@ -198,8 +199,8 @@ class Snapshot:
         Parameters
         ----------
         cross_check : bool, optional
-            Whether to compare the result with other references and with both halves. The default
-            is True unless the user set the reference.
+            Whether to compare the result with those of other strides and of both halves. By
+            default, the result is compared unless the user has set a reference.
 
         Raises
         ------
@@ -209,7 +210,7 @@ class Snapshot:
             If both streams have the same sensor frame, or an option names the frame of the other
             stream.
         ConfigError
-            If an option has no meaning for what the streams measure.
+            If an option has no meaning for the quantities that the streams measure.
         """
         self._check_frames()
         kind = kind_of(self.config)
@@ -228,9 +229,10 @@ class Snapshot:
 
     @cached_property
     def streams(self) -> tuple[Trajectory, Trajectory]:
-        """Trajectories of the whole session, each on its own clock.
+        """Trajectories of the whole session, each stream on its own clock.
 
-        If pairs are kept, the trajectories contain the pairs; otherwise the poses as received.
+        If there are kept pairs, the trajectories contain the poses of all pairs; otherwise all
+        poses that were received.
         """
         parent, child = self.unpaired
         if len(self.kept):
@@ -244,7 +246,7 @@ class Snapshot:
         )
 
     def _missing_data(self, n_pairs: int) -> str:
-        """Return a message about the missing data, if too few poses can be paired."""
+        """Return a message about the reason why only ``n_pairs`` poses could be paired."""
         needed = f"{self.config.min_pairs} synchronised pose pairs are needed, found {n_pairs}"
         parent, child = self.unpaired
         child = child.shifted(float(self.config.time_offset))
@@ -267,14 +269,14 @@ class Snapshot:
 
 
 def _measuring(trajectory: Trajectory, measures: str) -> Trajectory:
-    """Set the measured quantity of a trajectory to that of the options."""
+    """Return the trajectory with the measured quantity of the option, unless that is "auto"."""
     if measures in ("auto", trajectory.measures):
         return trajectory
     return replace(trajectory, measures=measures)
 
 
 def _corrected(trajectory: Trajectory, stream: str, config: CalibratorConfig) -> Trajectory:
-    """Apply the options about inverse poses, order of quaternions and scale to a stream.
+    """Return a stream with the options about inversion, quaternions and parent scale applied.
 
     Raises
     ------
@@ -297,23 +299,23 @@ def _corrected(trajectory: Trajectory, stream: str, config: CalibratorConfig) ->
 def whole_snapshot(
     parent: Trajectory, child: Trajectory, options: Mapping[str, object]
 ) -> Snapshot:
-    """Return the Snapshot of two whole trajectories.
+    """Return the snapshot of two whole trajectories.
 
     Parameters
     ----------
     parent, child : Trajectory
     options : mapping
-        Options by their public names. Without ``max_pairs``, up to 100,000 pairs are used.
+        Options by their public names. If ``max_pairs`` is not set, up to 100,000 pairs are used.
     """
     of_streams = {
-        "max_pairs": min(max(len(parent), len(child), 10), _MOST_PAIRS),
+        "max_pairs": min(max(len(parent), len(child), 10), _MAX_PAIRS),
         "parent_measures": parent.measures,
         "child_measures": child.measures,
     }
     config = CalibratorConfig.from_options(of_streams | dict(options))
     warnings: tuple[str, ...] = ()
-    if min(len(parent), len(child)) > config.max_pairs == _MOST_PAIRS:
-        warnings = (f"{_MOST_PAIRS:,} pose pairs are used at most; set max_pairs to use more",)
+    if min(len(parent), len(child)) > config.max_pairs == _MAX_PAIRS:
+        warnings = (f"{_MAX_PAIRS:,} pose pairs are used at most; set max_pairs to use more",)
     return Snapshot(
         config=config,
         buffered_parent=parent,
@@ -333,7 +335,7 @@ def names_of(config: CalibratorConfig, stream: str, sensor: str, world: str) -> 
 def estimated_time_offset(
     config: CalibratorConfig, parent: Trajectory, child: Trajectory
 ) -> TimeOffset:
-    """Estimate the time offset of two streams with the method for their kind of data."""
+    """Estimate the time offset of two streams, from the rates that their kind of data has."""
     of_speed = kind_of(config).is_timed_by_speed
     return estimate_time_offset(parent, child, config.max_gap, of_speed)
 
@@ -341,8 +343,8 @@ def estimated_time_offset(
 def downsample(pose_pairs: PosePairs, max_pairs: int) -> PosePairs:
     """Return at most ``max_pairs`` of the pose pairs.
 
-    In a round, every second pair is a candidate. The candidates whose neighbours differ least in
-    the parent's rotation are dropped. The rounds go on until few enough pairs remain.
+    In each round, every second pair is a candidate. Candidates are dropped if the parent rotates
+    least between their neighbours. The rounds end if at most ``max_pairs`` remain.
     """
     while len(pose_pairs) > max_pairs:
         candidates = np.arange(1, len(pose_pairs) - 1, 2)
@@ -363,17 +365,18 @@ def pair_poses(
     at: str | None,
     kept: PosePairs,
 ) -> PosePairs:
-    """Return the pose pairs of two trajectories that are keyframes and later than ``kept``.
+    """Pair two trajectories; return the pairs that are keyframes and later than ``kept``.
 
     Parameters
     ----------
     config : CalibratorConfig
-        Its time offset is in seconds.
+        Options. Their time offset is a number (s).
     parent, child : Trajectory
-        Each on its own clock.
+        Streams, each on its own clock.
     at : {"parent", "child"} or None
-        Stream whose stamps the pairs have; the slower one if None.
+        Stream whose stamps the pairs have; None for the slower stream.
     kept : PosePairs
+        Earlier pairs.
     """
     pairs = synchronise(parent, child.shifted(float(config.time_offset)), config.max_gap, at)
     if len(kept):

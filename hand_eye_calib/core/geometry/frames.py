@@ -1,6 +1,6 @@
 """Checks of poses from files and users, and the tree of frames of a robot.
 
-A tree of frames is made from a robot description, ``/tf`` or ``/tf_static``.
+The edges of a tree of frames come from a robot description, ``/tf`` or ``/tf_static``.
 """
 
 import math
@@ -22,12 +22,12 @@ from hand_eye_calib.core.geometry.trajectory import (
     far_position,
 )
 
-# Largest deviation of the elements of a matrix from the nearest rotation.
+# Largest difference between an element of a rotation matrix and that of the nearest rotation.
 _ROTATION_WITHIN = 1e-2
 
 # Last row of every transform.
 _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
-# Largest deviation of the last row of a transform from 0 0 0 1.
+# Largest difference between an element of the last row of a transform and 0 0 0 1.
 LAST_ROW_WITHIN = 1e-6
 
 # Words in the name of a fixed frame, such as a map or the origin of an odometry.
@@ -37,18 +37,18 @@ _WORLDS |= {"origin", "init", "mocap", "vicon", "optitrack", "inertial"}
 _TARGETS = {"aruco", "marker", "tag", "apriltag", "charuco", "target", "board", "chessboard"}
 _TARGETS |= {"checkerboard", "pattern", "fiducial", "aprilgrid"}
 
-# Largest number of edges of a tree that a message lists.
-_MOST_LISTED = 50
+# Largest number of edges of a tree in a message.
+_MAX_LISTED = 50
 
 
 def are_null(poses: FloatArray) -> BoolArray:
-    """Return a mask (N,) of null poses among rows x y z qx qy qz qw (N, 7).
+    """Return a mask (N,) of the null poses among rows x y z qx qy qz qw (N, 7).
 
     A null pose has a value that is not finite, or a quaternion of zeros. Trackers publish null
     poses when they are lost.
     """
     is_null = (poses[:, 3:] == 0.0).all(axis=1)
-    # A finite sum proves that all values are finite, in less time than a check of every row.
+    # If the sum is finite, all values are. The sum takes less time than a check of every row.
     with np.errstate(invalid="ignore", over="ignore"):
         total = poses.sum()
     if not np.isfinite(total):
@@ -91,18 +91,19 @@ def checked_pose(position: ArrayLike, quat_xyzw: ArrayLike) -> FloatArray:
 
 
 def pose_of(*values: Any) -> FloatArray:
-    """Return the pose (4, 4) that values of a file describe.
+    """Return the pose (4, 4) for the values of a file, in any of the usual forms.
 
     Parameters
     ----------
     *values
-        A matrix of 12 or 16 numbers; x, y, z, qx, qy, qz, qw; a message; or a translation and a
-        rotation, as matrix, quaternion w, x, y, z, or roll, pitch and yaw in degrees.
+        A matrix of 12 or 16 numbers; or x, y, z, qx, qy, qz, qw; or a message; or a translation
+        and a rotation. The rotation is a matrix, a quaternion w, x, y, z, or roll, pitch and yaw in
+        degrees. Each value may have any form that :func:`numbers_of` accepts.
 
     Raises
     ------
     InputError
-        If the values are no pose.
+        If the values have another form, or are no rigid transform.
     """
     parts = [numbers_of(value) for value in values]
     sizes = tuple(map(len, parts))
@@ -132,7 +133,7 @@ def pose_of(*values: Any) -> FloatArray:
 
 
 def pose_stack(values: Any, label: str) -> FloatArray:
-    """Return the poses (N, 4, 4) that arrays describe, checked.
+    """Return checked poses (N, 4, 4) for arrays in any of the usual forms.
 
     Parameters
     ----------
@@ -161,8 +162,8 @@ def _rigid(Ts: FloatArray, label: str = "") -> FloatArray:
     Raises
     ------
     InputError
-        At the first matrix whose 3x3 part is not a rotation, or whose last row is not 0 0 0 1. The
-        message names the row if there is a ``label``.
+        For the first matrix whose 3x3 part is not a rotation, or whose last row is not 0 0 0 1. If
+        there is a ``label``, the message contains it and the row.
     """
     rotations = se3.nearest_rotation(se3.rotation_of(Ts))
     deviations = np.abs(rotations - se3.rotation_of(Ts)).max(axis=(1, 2), initial=0.0)
@@ -190,7 +191,7 @@ def _numbers(values: Any) -> FloatArray | None:
 
 
 def _pair_of_stacks(values: Any) -> tuple[FloatArray, FloatArray] | None:
-    """Return rotations and translations if the values are such a pair, otherwise None."""
+    """Return rotations and translations if the values are a pair of both, otherwise None."""
     if not isinstance(values, tuple | list) or len(values) != 2:
         return None
     rotations, translations = map(_numbers, values)
@@ -243,9 +244,9 @@ def wrong_last_row(T: FloatArray) -> str:
 
 
 def numbers_of(value: Any) -> list[float]:
-    """Return the numbers of nested lists, a message, OpenCV's matrix or a text, in their order.
+    """Return the numbers in nested lists, in a message, in a matrix of OpenCV or in a text.
 
-    The list is empty for values of any other kind.
+    The numbers are in their order; the list is empty for values of any other kind.
     """
     if isinstance(value, Mapping):
         position = value.get("translation", value.get("position"))
@@ -293,11 +294,11 @@ class StreamFrames:
 
     @property
     def inverse_name(self) -> str:
-        """Name of the sensor's frame if the poses are inverted.
+        """Name of the sensor's frame if the poses of the stream are inverted.
 
-        For transforms camera -> marker of a fixed marker, both frames exchange their roles: the
-        sensor is the camera. For inverse poses odom -> base_link, the sensor remains base_link,
-        because a frame with the name of a world is not a sensor.
+        For transforms camera -> marker of a fixed marker, the frames exchange their roles, so that
+        the sensor is the camera. For inverse poses odom -> base_link, the sensor remains base_link,
+        because odom is the name of a world.
         """
         is_named_otherwise = self.option not in ("", self.sensor)
         if not self.world or is_named_otherwise:
@@ -309,7 +310,7 @@ class StreamFrames:
 
 @dataclass(frozen=True)
 class Extrinsic:
-    """Pose of the child sensor in the parent sensor's frame, as stated by a source.
+    """Pose of the child sensor in the parent sensor's frame, from a file or another source.
 
     Attributes
     ----------
@@ -317,7 +318,7 @@ class Extrinsic:
     origin : str
         Description of the source.
     covariance : (6, 6) array
-        Covariance of the error xi in ``T_parent_child @ exp(xi)``; zero if the source states none.
+        Covariance of the error xi in ``T_parent_child @ exp(xi)``; zero if the source has none.
     is_calibration : bool
         Whether the pose was estimated from the motion of the same sensors.
     """
@@ -368,7 +369,7 @@ class FrameTree:
     def add(
         self, parent: str, frame: str, pose: FloatArray | None = None, is_static: bool = True
     ) -> Edge:
-        """Add an edge, or replace its pose. An edge that was once not static remains so.
+        """Add an edge, or replace its pose. An edge that has moved once is never static again.
 
         Raises
         ------
@@ -415,7 +416,9 @@ class FrameTree:
         return T_frame_of
 
     def route(self, frame: str, of: str) -> tuple[list[str], list[str]]:
-        """Return the path from ``frame`` to ``of``: the frames below the edges up, and down.
+        """Return the edges on the path from ``frame`` to ``of``, by the frames below them.
+
+        The first list are the edges up to the common frame, the second the edges down from there.
 
         Raises
         ------
@@ -431,7 +434,7 @@ class FrameTree:
         return up, down[::-1]
 
     def above(self, frame: str) -> list[str]:
-        """Return the frame, its parent, and so on to the root.
+        """Return the frame, its parent, the parent of its parent, and so on to the root.
 
         Raises
         ------
@@ -449,12 +452,12 @@ class FrameTree:
         return frames
 
     def listing(self) -> str:
-        """List the edges in one line."""
+        """Return a text of one line with all edges."""
         edges = []
         for frame, edge in self.edges.items():
             suffix = " (static)" if edge.is_static else ""
             edges.append(f"{edge.parent}:{frame}{suffix}")
         edges.sort()
-        if len(edges) > _MOST_LISTED:
-            edges[_MOST_LISTED:] = [f"and {len(edges) - _MOST_LISTED} more"]
+        if len(edges) > _MAX_LISTED:
+            edges[_MAX_LISTED:] = [f"and {len(edges) - _MAX_LISTED} more"]
         return f"it has {', '.join(edges) or 'none'}"

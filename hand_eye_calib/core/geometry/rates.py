@@ -12,23 +12,23 @@ from hand_eye_calib.core.geometry import se3
 
 
 class RateIntegrator:
-    """Integrator of the angular rates of one sensor. Rates are passed in blocks of any length."""
+    """Integrator of the angular rates of one sensor, which come in blocks of any length."""
 
     def __init__(self) -> None:
         self._last: tuple[IntArray, FloatArray] | None = None
         self._rotation = np.eye(3)
 
     def rotations(self, stamps_ns: IntArray, rates: FloatArray) -> FloatArray:
-        """Return the orientations of the sensor, relative to its orientation at the first rate.
+        """Integrate further rates; return orientations relative to that at the very first rate.
 
-        A step back in time rotates back.
+        If the stamps go back in time, the sensor rotates back.
 
         Parameters
         ----------
         stamps_ns : (M,) int64 array
             Stamps of the next rates.
         rates : (M, 3) array
-            rad/s, about the axes of the sensor.
+            Angular rates (rad/s) about the axes of the sensor.
 
         Returns
         -------
@@ -42,6 +42,6 @@ class RateIntegrator:
         steps = se3.rotation_exp(means * intervals_s[:, None])
         rotations = self._rotation @ se3.chained(steps)[1:]
         self._last = stamps_ns[-1:].copy(), rates[-1:].copy()
-        # Make the last orientation an exact rotation, because rounding errors add up over hours.
+        # Rounding errors add up over hours, so the last orientation is made an exact rotation.
         self._rotation = se3.nearest_rotation(rotations[-1])
         return rotations

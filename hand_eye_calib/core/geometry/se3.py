@@ -11,12 +11,11 @@ from numpy.typing import ArrayLike
 
 from hand_eye_calib.core.base.arrays import FloatArray
 
-# Angle (rad) below which the coefficients of exp and log come from their Taylor series. At 1e-2 rad
-# the first omitted term is of order angle^6, about 1e-16 relative. The closed forms lose digits to
-# cancellation below.
+# Angle (rad) below which Taylor series replace the closed forms of exp and log, which lose digits
+# by cancellation there. At this angle, the first omitted term is about 1e-16 of the sum.
 _SERIES_ANGLE = 1e-2
 
-# Cosine of the pitch below which roll and yaw are about the same axis, up to rounding.
+# Cosine of the pitch below which roll and yaw are rotations about the same axis, up to rounding.
 _SINGULAR_COSINE = 1e-7
 
 
@@ -37,9 +36,9 @@ def skew(vectors: ArrayLike) -> FloatArray:
 
 
 def vee(matrices: FloatArray) -> FloatArray:
-    """Return vectors (..., 3) of twice the antisymmetric part of matrices (..., 3, 3).
+    """Return vectors v (..., 3) with ``skew(v)`` = M - M', for matrices M (..., 3, 3).
 
-    The vector of a rotation is its axis times twice the sine of its angle.
+    For a rotation matrix, v is the axis times twice the sine of the angle.
     """
     twice = matrices - np.swapaxes(matrices, -1, -2)
     return np.stack([twice[..., 2, 1], twice[..., 0, 2], twice[..., 1, 0]], axis=-1)
@@ -84,7 +83,7 @@ def from_rotation_translation(rotation: ArrayLike, translation: ArrayLike) -> Fl
 def from_quat_xyzw(translation: ArrayLike, quat_xyzw: ArrayLike) -> FloatArray:
     """Return transforms (..., 4, 4) of translations (..., 3), m, and quaternions (..., 4).
 
-    Quaternions are scalar last, and normalised here. The caller checks their length.
+    Quaternions have the scalar last. They are normalised here; callers check their length.
 
     Raises
     ------
@@ -132,8 +131,8 @@ def _about_axes(angles: FloatArray) -> list[FloatArray]:
 def rotation_to_rpy(rotation: ArrayLike) -> FloatArray:
     """Return roll, pitch and yaw (..., 3), rad: the inverse of :func:`rotation_from_rpy`.
 
-    The pitch is from -pi/2 to pi/2. At both ends only the sum or difference of roll and yaw is
-    defined; the yaw is 0 there.
+    The pitch is from -pi/2 to pi/2. At these two values, only the sum or the difference of roll and
+    yaw is defined; the yaw is set to 0.
     """
     R = np.asarray(rotation, dtype=float)
     cosine = np.hypot(R[..., 0, 0], R[..., 1, 0])
@@ -148,8 +147,8 @@ def rotation_to_rpy(rotation: ArrayLike) -> FloatArray:
 def in_other_order(rotations: FloatArray) -> FloatArray:
     """Correct rotations (N, 3, 3) whose Euler angles were read in the wrong convention.
 
-    Roll, pitch and yaw were read as angles about fixed axes. Their source means angles about the
-    moving axes x, y and z (intrinsic), in this order.
+    The angles were read as roll, pitch and yaw about fixed axes. In their source, they are
+    rotations about the moving axes x, y and z (intrinsic), in this order.
     """
     roll, pitch, yaw = _about_axes(rotation_to_rpy(rotations))
     return roll @ pitch @ yaw
@@ -158,9 +157,9 @@ def in_other_order(rotations: FloatArray) -> FloatArray:
 def nearest_rotation(matrices: FloatArray) -> FloatArray:
     """Return the rotations (..., 3, 3) nearest to matrices in the Frobenius norm.
 
-    The direction with the smallest singular value has the sign that makes the determinant 1: motion
-    in a plane does not determine this sign (S. Umeyama, *Least-squares estimation of transformation
-    parameters between two point patterns*, 1991).
+    The singular vector of the smallest singular value gets the sign that makes the determinant 1.
+    Motion in a plane does not determine this sign (S. Umeyama, *Least-squares estimation of
+    transformation parameters between two point patterns*, 1991).
     """
     U, _, V_transposed = np.linalg.svd(matrices)
     U[..., :, 2] *= np.sign(np.linalg.det(U @ V_transposed))[..., None]
@@ -174,7 +173,10 @@ def rotation_log(rotation: ArrayLike) -> FloatArray:
 
 
 def rotations_between(start: FloatArray, end: FloatArray) -> FloatArray:
-    """Return the rotation vectors (N, 3) from orientations (N, 3, 3) to others, in their axes."""
+    """Return rotation vectors (N, 3), rad, from ``start`` to ``end`` (N, 3, 3), in axes of both.
+
+    A rotation vector has the same coordinates in the axes of its start and of its end.
+    """
     return rotation_log(np.swapaxes(start, 1, 2) @ end)
 
 
@@ -189,16 +191,16 @@ def quat_log(quat_xyzw: FloatArray) -> FloatArray:
 
 
 def _scaled_quats(rotations: FloatArray) -> FloatArray:
-    """Return quaternions (N, 4) of any length, scalar last and not negative.
+    """Return quaternions (N, 4), not normalised, of rotation matrices (N, 3, 3).
 
-    All coefficients of a rotation (N, 3, 3) follow from its largest coefficient, so that no digits
-    are lost (S. W. Shepperd, *Quaternion from rotation matrix*, 1978).
+    The scalar is last and not negative. All coefficients are computed from the largest one, so that
+    no digits are lost (S. W. Shepperd, *Quaternion from rotation matrix*, 1978).
     """
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotations.reshape(-1, 9).T
     trace = r00 + r11 + r22
     quats = np.stack([r21 - r12, r02 - r20, r10 - r01, 1.0 + trace], axis=1)
-    # If the trace is positive, the scalar is large enough. Otherwise start from the largest
-    # coefficient of the vector.
+    # If the trace is not negative, the scalar is large enough. Otherwise, the computation starts
+    # from the largest coefficient i of the vector.
     large = np.flatnonzero(trace < 0.0)
     if large.size:
         R = rotations[large]
@@ -252,10 +254,10 @@ def inverse(transforms: ArrayLike) -> FloatArray:
 
 
 def retracted(transform: FloatArray, step: FloatArray) -> FloatArray:
-    """Return a transform (4, 4) after a small step (rho, phi) in the axes of its source frame.
+    """Return a transform (4, 4) after a small step (rho, phi) in its source frame.
 
-    Translation and rotation are applied separately. The result equals ``transform @ exp(step)`` to
-    first order.
+    The result is ``(R Exp(phi), t + R rho)``, which equals ``transform @ exp(step)`` to first
+    order.
     """
     rotation = rotation_of(transform)
     return from_rotation_translation(
@@ -277,9 +279,9 @@ def exp(xi: ArrayLike) -> FloatArray:
 
     Notes
     -----
-    ``t = V rho`` with ``V = I + (1 - cos a)/a^2 [phi] + (a - sin a)/a^3 [phi]^2`` and ``a =
-    |phi|``; Sola, Deray, Atchuthan, *A micro Lie theory for state estimation in robotics*, 2018,
-    eqs 172-174.
+    The translation is ``t = V rho`` with ``V = I + (1 - cos a)/a^2 [phi] + (a - sin a)/a^3
+    [phi]^2`` and ``a = |phi|``: Sola, Deray, Atchuthan, *A micro Lie theory for state estimation in
+    robotics*, 2018, eqs 172-174.
     """
     xi = np.asarray(xi, dtype=float)
     rho = xi[..., :3]
@@ -361,14 +363,15 @@ def rotation_angle(rotation: ArrayLike) -> FloatArray:
 
 
 def interpolate(start: FloatArray, end: FloatArray, fraction: ArrayLike) -> FloatArray:
-    """Return poses along the geodesic of SE(3) from ``start`` to ``end`` (constant twist).
+    """Interpolate poses along the geodesic of SE(3), which is a motion with constant twist.
 
     Parameters
     ----------
     start, end : (..., 4, 4) arrays
         ``T_world_sensor`` at both ends.
     fraction : (...) array
-        0 gives ``start``, 1 gives ``end``; values outside [0, 1] extrapolate the same twist.
+        0 is ``start``, 1 is ``end``. Other values outside of [0, 1] extrapolate with the same
+        twist.
 
     Returns
     -------
@@ -379,12 +382,12 @@ def interpolate(start: FloatArray, end: FloatArray, fraction: ArrayLike) -> Floa
 
 
 def chained(steps: FloatArray) -> FloatArray:
-    """Return the cumulative products (N + 1, k, k) of steps (N, k, k), beginning with the identity.
+    """Return the cumulative products (N + 1, k, k) of steps (N, k, k). The first is the identity.
 
     The steps are rotations or transforms.
     """
     products = np.concatenate([np.eye(steps.shape[-1])[None], steps])
-    # Each pass doubles the number of steps in a product, until all products are complete.
+    # Each pass doubles the number of steps in the products, until all products are complete.
     span = 1
     while span < len(products):
         products[span:] = products[:-span] @ products[span:]
@@ -399,9 +402,13 @@ def put_right(Ts: FloatArray, invert: str = "none", quaternion: str = "xyzw") ->
     ----------
     Ts : (N, 4, 4) array
     invert : {"none", "poses", "orientations"}
-        Part to invert, because the source writes it as that of the world in the sensor's frame.
+        Part that is inverted, because the source states the world's pose in the sensor's frame.
     quaternion : {"xyzw", "wxyz", "yzwx"}
         True order of the four numbers that were read as x y z w.
+
+    Returns
+    -------
+    (N, 4, 4) array
     """
     if quaternion != "xyzw":
         quats = np.roll(to_quat_xyzw(Ts), -quaternion.index("x"), axis=-1)
@@ -421,24 +428,24 @@ def xyz_rpy(T_target_source: FloatArray) -> FloatArray:
 
 # ------------------------------------------------------------- uncertainty of transforms
 
-# Standard deviation (rad) above which an angle is unknown, because the linearisation is not valid.
-_UNKNOWN_ANGLE = 0.3
+# Largest standard deviation (rad) of a known angle. Above it, the linearisation is not valid.
+_MAX_SIGMA_RAD = 0.3
 
-# Gimbal lock: roll and yaw are inseparable if the cosine of the pitch is below this number of
-# standard deviations (rad) of the rotation. Their own standard deviations would exceed 10 deg, and
+# Gimbal lock: roll and yaw are unknown if the cosine of the pitch is below this number of standard
+# deviations (rad) of the rotation. The standard deviations of roll and yaw would exceed 10 deg, and
 # their errors would not be normal.
 _LOCKED_SIGMAS = 5.0
-# Gimbal lock of exact rotations: smallest cosine of the pitch.
+# Gimbal lock for exact rotations: smallest cosine of the pitch with known roll and yaw.
 _LOCKED_COSINE = 1e-4
 
 
 def turned(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Rotate covariances (..., 6, 6) of (rho, phi) by rotations (..., 3, 3).
+    """Rotate covariances (..., 6, 6) of xi = (rho, phi) by rotations R (..., 3, 3).
 
-    The rotated covariance is along and about the parent's axes, the convention of ROS messages
-    (REP 103). To first order, an error xi = (rho, phi) in ``T_parent_child @ exp(xi)`` moves the
-    child's origin by ``R rho``, and rotates the child by ``R phi`` about its own origin. So the
-    lever arm between both sensors has no effect.
+    If R is the rotation of ``T_parent_child``, the result is along and about the parent's axes, the
+    convention of ROS messages (REP 103). To first order, an error xi in ``T_parent_child @
+    exp(xi)`` moves the child's origin by ``R rho`` and rotates the child by ``R phi`` about its own
+    origin. So the lever arm between both sensors has no effect.
     """
     both = block_diagonal(rotation)
     return np.asarray(both @ covariance @ np.swapaxes(both, -1, -2))
@@ -452,9 +459,9 @@ def block_diagonal(rotation: FloatArray) -> FloatArray:
 
 
 def sigmas_in_parent(rotation_parent_child: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return standard deviations (6,) along and about the parent's axes.
+    """Return standard deviations (6,), m and rad, along and about the parent's axes.
 
-    They are infinite if the covariance (6, 6) in the child's frame is not finite.
+    All are infinite if the covariance (6, 6) of xi in the child's frame is not finite.
     """
     if not np.isfinite(covariance).all():
         return np.full(6, np.inf)
@@ -493,9 +500,9 @@ def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArra
         ]
     )
     sigmas = np.sqrt(np.maximum(np.diag(jacobian @ covariance @ jacobian.T), 0.0))
-    sigmas[sigmas > _UNKNOWN_ANGLE] = np.inf
+    sigmas[sigmas > _MAX_SIGMA_RAD] = np.inf
     principal = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance), 0.0))
-    largest = np.max(principal[principal <= _UNKNOWN_ANGLE], initial=0.0)
+    largest = np.max(principal[principal <= _MAX_SIGMA_RAD], initial=0.0)
     cosine_of_pitch = np.hypot(rotation[0, 0], rotation[1, 0])
     if cosine_of_pitch < max(_LOCKED_SIGMAS * largest, _LOCKED_COSINE):
         sigmas[[0, 2]] = np.inf
@@ -503,9 +510,10 @@ def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArra
 
 
 def inverse_covariance(T_target_source: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return the covariance (6, 6) of the inverse transform, in the same convention.
+    """Return the covariance (6, 6) of the inverse of a transform T with covariance C (6, 6) of xi.
 
-    ``inverse(T exp(xi)) = inverse(T) exp(-Ad_T xi)``, so the covariance is ``Ad_T C Ad_T'``.
+    ``inverse(T exp(xi)) = inverse(T) exp(-Ad_T xi)``, so the covariance is ``Ad_T C Ad_T'``. All
+    elements are infinite if C is not finite.
     """
     covariance = np.asarray(covariance, dtype=float)
     if not np.isfinite(covariance).all():

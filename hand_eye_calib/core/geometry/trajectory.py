@@ -4,9 +4,9 @@ Poses are interpolated at a fraction s of an interval of h seconds by
 
     T(s) = T_i exp(s xi_i) exp(-m s (1 - s) h^2 / 2 * bend(s)),    xi_i = Log(T_i^-1 T_i+1).
 
-``bend`` is the second derivative of the pose, from the change of the twist at both ends. m is the
-share of this change that is motion rather than noise, see :func:`corner_corrections`. With m = 0
-the formula is the geodesic of SE(3) of Välimäki et al. 2023.
+``bend`` is the second derivative of the pose, computed from the changes of the twist at both ends.
+m is the share of these changes that is motion; the rest is noise, see :func:`corner_corrections`.
+For m = 0, the formula is the geodesic of SE(3) of Välimäki et al. 2023.
 """
 
 from dataclasses import dataclass, fields
@@ -25,31 +25,34 @@ from hand_eye_calib.core.base.registry import MEASURES
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.geometry import se3
 
-# Largest deviation of a quaternion's length from 1; a larger one is no rounding (bound of tf2).
+# Largest deviation of the length of a quaternion from 1. A larger one is not due to rounding (limit
+# of tf2).
 QUATERNION_NORM_TOLERANCE = 1e-2
 
-# Largest coordinate of a position, in m. Distances from the Earth's centre that are written in
-# millimetres, 6.4e9, are still accepted.
+# Largest coordinate of a position (m). Distances from the Earth's centre in millimetres, about
+# 6.4e9, are still accepted.
 FARTHEST_M = 1e10
 
-# Largest element of R'R - I: a rotation matrix written with six digits passes, a scaled one fails.
+# Largest element of R'R - I for a rotation matrix R. A matrix with six digits passes, a scaled one
+# fails.
 ROTATION_TOLERANCE = 1e-3
 
-# Number of intervals on either side of an interval that distinguish motion from noise.
+# Motion and noise are distinguished by this number of intervals on either side of an interval.
 _NEARBY = 4
 # Number of poses before and after a stamp that interpolation uses.
 REACH = _NEARBY + 2
 
-# The directions of motion are those of steps of this fraction (1 / 50) of the extent of the
-# positions. There must be at least a fifth of this number of steps.
+# A direction of motion is that of a step of the extent of all positions over this number. At least
+# a fifth of this number of steps is needed.
 _STEPS_IN_EXTENT = 50
 
-# Smallest scatter of the direction of motion that makes a convention look wrong.
+# A convention is wrong if its scatter of the direction of motion exceeds this value, see
+# :func:`scatter_of_direction` ...
 STEADY = 0.05
-# Smallest ratio of the scatter in a wrong convention to the scatter in the right one.
+# ... and if it exceeds this multiple of the scatter in another convention.
 CLEARLY = 4.0
 
-# Correlation of neighbouring second differences of white noise.
+# Correlation of neighbouring second differences of white noise: -4 s^2 / (6 s^2).
 _CORRELATION = -2.0 / 3.0
 # Variance of the mean of two neighbouring second differences of white noise, over that of one.
 _VARIANCE_OF_MEAN = 1.0 / 6.0
@@ -58,8 +61,8 @@ _VARIANCE_OF_MEAN = 1.0 / 6.0
 def scatter_of_direction(poses: FloatArray) -> float:
     """Return the scatter of the direction of motion of poses (N, 4, 4) in the sensor's axes.
 
-    The scatter is 0 if the direction never changes, as on vehicles. It is 1 if the sensor moves in
-    all directions, or if there are too few steps.
+    The scatter is 1 minus the length of the mean direction. It is 0 if the direction never changes,
+    as on vehicles, and 1 if the sensor moves in all directions, or if there are too few steps.
     """
     positions = se3.translation_of(poses)
     rotations = se3.rotation_of(poses)
@@ -70,7 +73,7 @@ def scatter_of_direction(poses: FloatArray) -> float:
     rows = np.flatnonzero(np.diff(n_steps_before, prepend=-1.0))
     steps = np.diff(positions[rows], axis=0)
     lengths = np.linalg.norm(steps, axis=1)
-    # While a sensor stands still, noise of the positions adds up to a path without a direction.
+    # During standstill, noise of the positions adds up to a path without a direction.
     is_step = lengths > step_m / 3
     if is_step.sum() < _STEPS_IN_EXTENT / 5:
         return 1.0
@@ -79,7 +82,7 @@ def scatter_of_direction(poses: FloatArray) -> float:
     return 1.0 - float(np.linalg.norm(in_sensor.mean(axis=0)))
 
 
-# Largest difference of the elements (m, or 1) of two poses that count as equal.
+# Two poses are equal if no elements of their matrices (m, or 1) differ by more than this.
 _SAME_POSE = 1e-6
 
 # Smallest and largest stamp, ns.
@@ -113,7 +116,7 @@ class Columns(WithArrays):
         return len(self.columns[0])
 
     def __getitem__(self, index: slice | NDArray[Any]) -> Self:
-        """Return some of the rows, by a slice, a mask or an index array."""
+        """Return a selection of the rows, by a slice, a mask or an array of indices."""
         columns = []
         for column in self.columns:
             columns.append(column[index] if isinstance(column, np.ndarray) else column)
@@ -121,7 +124,7 @@ class Columns(WithArrays):
 
     @classmethod
     def concatenate(cls, *tables: Self) -> Self:
-        """Return the rows of all tables in the given order."""
+        """Return the rows of all tables, one table after the other."""
         columns = zip(*(table.columns for table in tables), strict=True)
         return cls(*map(np.concatenate, columns))
 
@@ -162,7 +165,7 @@ class Trajectory(Columns):
     world_frame: str = ""
     measures: str = "poses"
 
-    # Trajectory of which this one is a copy with shifted stamps: they share the results of _steps.
+    # Trajectory whose stamps were shifted to make this one. Both have the same `_steps`.
     _unshifted: ClassVar[Self | None] = None
 
     def __post_init__(self) -> None:
@@ -203,7 +206,7 @@ class Trajectory(Columns):
         sensor_frame: str = "",
         world_frame: str = "",
     ) -> Self:
-        """Build from translations (N, 3), m, and quaternions (N, 4), scalar last.
+        """Make a trajectory of translations (N, 3), m, and quaternions (N, 4), scalar last.
 
         Raises
         ------
@@ -233,7 +236,7 @@ class Trajectory(Columns):
         sensor_frame: str = "",
         world_frame: str = "",
     ) -> Self:
-        """Build from positions (N, 3), m, of a sensor without orientation.
+        """Make a trajectory of positions (N, 3), m, of a sensor without orientation.
 
         Examples are the antenna of a GNSS receiver and the prism of a total station.
         """
@@ -242,7 +245,7 @@ class Trajectory(Columns):
 
     @classmethod
     def from_rates(cls, stamps_ns: IntArray, rates: ArrayLike, sensor_frame: str = "") -> Self:
-        """Build from angular rates (N, 3), rad/s, of a gyroscope, about the sensor's own axes.
+        """Make a trajectory of angular rates (N, 3), rad/s, of a gyroscope about its own axes.
 
         Raises
         ------
@@ -282,19 +285,20 @@ class Trajectory(Columns):
 
     @property
     def interval_s(self) -> float:
-        """Median time between two poses in seconds; there must be two poses."""
+        """Median time (s) between consecutive poses. There must be at least two poses."""
         return median(np.diff(self.stamps_ns)) * 1e-9
 
     def shifted(self, offset_s: float, rate: float = 0.0, about_ns: int = 0) -> Self:
-        """Return the same poses at shifted stamps.
+        """Return the same poses with shifted stamps.
 
         Parameters
         ----------
         offset_s : float
             Seconds that are added to every stamp.
         rate : float
-            Seconds that are added for each second after ``about_ns``.
+            Further seconds that are added for each second after ``about_ns``.
         about_ns : int
+            Stamp (ns) at which ``rate`` adds nothing.
 
         Raises
         ------
@@ -325,7 +329,7 @@ class Trajectory(Columns):
             return self
         poses = self.poses.copy()
         poses[:, :3, 3] *= scale
-        # Positions in another unit may exceed the largest position: they are not checked.
+        # Positions are not checked, because in another unit they may exceed the largest position.
         return self._unchecked("poses", poses)
 
     def _unchecked(self, name: str, value: NDArray[Any], unshifted: Self | None = None) -> Self:
@@ -339,7 +343,7 @@ class Trajectory(Columns):
 
     @cached_property
     def _steps(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Twists between poses, their changes, and the share of motion in the changes.
+        """Twists between poses, their changes, and the share of motion in these changes.
 
         Returns
         -------
@@ -348,8 +352,9 @@ class Trajectory(Columns):
         changes : (N, 6) array
             Changes of the twist at the poses (m/s^2, rad/s^2); zero at the first and last pose.
         shares : (N - 1, 6) array
-            Share of motion in the mean change of the two ends of each interval. It is the weight
-            that makes this mean most precise, one for translation and one for rotation.
+            Weight with which the mean change at both ends of an interval is the most precise
+            estimate of the change due to motion. All translations of an interval have one weight,
+            and all rotations another.
         """
         if self._unshifted is not None:
             return self._unshifted._steps
@@ -363,6 +368,7 @@ class Trajectory(Columns):
             squares = (vectors**2).sum(axis=1)
             products = _sums_nearby((vectors[1:] * vectors[:-1]).sum(axis=1))
             powers = _sums_nearby(0.5 * (squares[1:] + squares[:-1]))
+            # The correlation is 1 for motion and -2/3 for white noise.
             correlation = products / np.maximum(powers, 1e-300)
             motion = np.clip((correlation - _CORRELATION) / (1.0 - _CORRELATION), 0.0, 1.0)
             noise = (1.0 - motion) * _VARIANCE_OF_MEAN
@@ -442,7 +448,7 @@ def far_position(x: float, y: float, z: float) -> str:
 
 
 def _check_finite(noun: str, rows: FloatArray) -> None:
-    """Raise InputError at the first row (N, K) with a value that is not finite."""
+    """Raise InputError for the first of the rows (N, K) with a value that is not finite."""
     is_finite = np.isfinite(rows).all(axis=1)
     if not is_finite.all():
         raise InputError(
@@ -452,7 +458,7 @@ def _check_finite(noun: str, rows: FloatArray) -> None:
 
 
 def check_poses(poses: FloatArray) -> None:
-    """Raise InputError at the first of poses (N, 4, 4) that is not a rigid transform."""
+    """Raise InputError for the first of the poses (N, 4, 4) that is not a rigid transform."""
     _check_finite("pose", poses.reshape(-1, 16))
     is_far = (np.abs(se3.translation_of(poses)) > FARTHEST_M).any(axis=1)
     if is_far.any():
@@ -480,14 +486,15 @@ def corner_corrections(
 ) -> FloatArray:
     """Return the corrections of poses that were interpolated with a constant twist.
 
-    A constant twist between two poses cuts the corners of a motion: a vibration of angular
-    frequency f, sampled every h seconds, shrinks by (f h)^2 / 12. The changes of the twist at both
-    poses correct this loss, as far as they are motion and not noise.
+    A constant twist between two poses cuts the corners of a motion. The amplitude of a vibration of
+    angular frequency f, sampled every h seconds, decreases by the share (f h)^2 / 12. The changes
+    of the twist at both poses correct this loss, if they are motion and not noise.
 
-    White noise of standard deviation s causes changes of variance 6 s^2, with a covariance of
-    -4 s^2 between neighbours. A well sampled motion causes equal changes. The share of motion is
-    estimated from the correlation of the changes nearby. Halfway between two poses, the standard
-    deviation of white noise is 0.71 (constant twist) to 0.80 of its value at a pose.
+    White noise of poses with standard deviation s causes changes of variance 6 s^2, with a
+    covariance of -4 s^2 between neighbours, in units of h. A well sampled motion causes equal
+    changes at neighbours. So the share of motion is estimated from the correlation of neighbouring
+    changes. Halfway between two poses, the standard deviation of white noise is 0.71 (constant
+    twist) to 0.80 of its value at a pose.
 
     Parameters
     ----------
@@ -504,14 +511,13 @@ def corner_corrections(
     Returns
     -------
     (M, 6) array
-        xi in ``T_world_sensor exp(xi)``.
+        Corrections xi (m, rad), applied as ``T_world_sensor exp(xi)``.
     """
     at_start = changes[start]
     at_end = changes[start + 1]
     bend = ((2.0 - fraction)[:, None] * at_start + (1.0 + fraction)[:, None] * at_end) / 3.0
     interval_s = np.diff(stamps_ns)[start] * 1e-9
-    # Double integral of a constant second derivative; the integral is zero at both ends of the
-    # interval.
+    # Double integral of a constant second derivative that is zero at both ends of the interval.
     half_square_s2 = 0.5 * fraction * (1.0 - fraction) * interval_s**2
     return -half_square_s2[:, None] * shares[start] * bend
 
@@ -527,7 +533,7 @@ def repetitions(trajectory: Trajectory, least_s: float) -> list[tuple[int, int]]
     """
     differences = np.abs(np.diff(trajectory.poses, axis=0))
     is_same = differences.max(axis=(1, 2)) < _SAME_POSE
-    # A period begins where `is_same` becomes true, and ends where it becomes false.
+    # A period begins where `is_same` becomes True, and ends where it becomes False.
     changes = np.diff(np.r_[False, is_same, False].astype(int))
     periods_ns = trajectory.stamps_ns[np.flatnonzero(changes)].reshape(-1, 2)
     is_long = np.diff(periods_ns, axis=1)[:, 0] >= least_s * 1e9
