@@ -12,6 +12,7 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.core.checks.findings import Severity
 from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.extras.stops import robot_world
 from hand_eye_calib.extras.stops.calibrate import calibrate_arm, calibrate_stops
 from hand_eye_calib.extras.stops.closed_form import Stops
 from hand_eye_calib.extras.stops.robot_world import solve
@@ -410,6 +411,33 @@ def test_exact_stops_are_solved_exactly(random, n):
     fit = solve(stops)
     assert np.abs(off(fit.T_parent_child, X)).max() < 1e-7
     assert np.abs(off(fit.T_world_world, Z)).max() < 1e-7
+
+
+def errors_m(fits, Xs):
+    return np.array(
+        [np.linalg.norm(off(fit.T_parent_child, X)[:3]) for fit, X in zip(fits, Xs, strict=True)]
+    )
+
+
+def test_fits_in_both_frames_are_averaged_if_a_robot_has_wrong_dimensions(random, monkeypatch):
+    averaged = []
+    likelier = []
+    truths = []
+    for _ in range(12):
+        X, _, stops = recorded(random, 20)
+        # Errors of the robot that depend on its place.
+        reach_m = 0.005 * np.sin(3.0 * stops.Ts_world_parent[:, :3, 0])
+        robot = stops.Ts_world_parent @ se3.exp(np.c_[reach_m, 0.3 * reach_m])
+        stops = Stops(robot, stops.Ts_world_child)
+        truths.append(X)
+        averaged.append(solve(stops))
+        with monkeypatch.context() as patch:
+            patch.setattr(robot_world, "_LIKELIHOOD_SCALE", 1e-9)
+            likelier.append(solve(stops))
+
+    assert np.mean(errors_m(averaged, truths)) < np.mean(errors_m(likelier, truths))
+    for fit, single in zip(averaged, likelier, strict=True):
+        assert np.all(np.diag(fit.covariance) >= np.diag(single.covariance))
 
 
 def nees_of(fit, X, Z):
