@@ -26,7 +26,7 @@ from hand_eye_calib.extras.stops.closed_form import Stops
 from hand_eye_calib.extras.stops.robot_world import RobotWorld, solve
 from hand_eye_calib.extras.stops.samples import read_arm_samples
 from reproduction.recordings import between
-from reproduction.writing import markdown_table, study_parser
+from reproduction.writing import markdown_table, show, study_parser
 
 # Pairs of the arm's poses: hand and camera within this (s).
 _WITHIN_S = 0.011
@@ -288,27 +288,15 @@ def ntu_viral(folder: Path) -> Iterator[Row]:
     yield Row("NTU VIRAL", figure, f"{chi2:.2f}", "", "3 flights")
 
 
-def page(rows: list[Row]) -> str:
-    """Markdown of all rows."""
-    about = (
-        "How do our errors compare with those that others published for their own recordings?\n"
-        "For readers who compare programs.\n\n"
-        "Both are computed by the same protocol (`python -m reproduction.independent`)."
-    )
-    return f"# Recordings of others\n\n{about}\n\n{markdown_table(map(vars, rows))}\n"
-
-
 def main() -> None:
-    """Measure and print, or write the page."""
-    parser = study_parser("reproduction.independent", __doc__, "write the page there")
+    """Measure all recordings, and print the table or put it into the page."""
+    parser = study_parser("reproduction.independent", __doc__)
     parser.add_argument("--segments", type=int, default=20, help="of Shrimp, for each length")
     arguments = parser.parse_args()
     folder = arguments.data_folder or parser.error("name the recordings with --data-folder")
     rows = [row for study in (ethz, camodocal, moveit, wise, ntu_viral) for row in study(folder)]
-    text = page([*rows, *shrimp(folder, arguments.segments)])
-    if arguments.page:
-        arguments.page.write_text(text, encoding="utf-8")
-    print(text)
+    rows += shrimp(folder, arguments.segments)
+    show(arguments.page, {"recordings": markdown_table(map(vars, rows))})
 
 
 if __name__ == "__main__":

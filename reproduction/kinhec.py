@@ -134,7 +134,7 @@ def table(results: pd.DataFrame) -> Iterator[dict[str, str]]:
 
 
 def _beside(error: float, errors_of_solvers: pd.Series) -> str:
-    """Return our error and the smallest of KinHEC's solvers as text; ours is bold if it is first."""
+    """Return our error and the smallest of KinHEC's solvers as text; ours is bold if first."""
     best = errors_of_solvers.min()
     texts = f"{error:.3f}", f"{best:.3f}"
     if error <= best:

@@ -19,11 +19,11 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import pose_stack
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.records import Residuals
-from hand_eye_calib.extras.stops.checks import LEAST_LEAD
+from hand_eye_calib.extras.stops.checks import MIN_LEAD
 from hand_eye_calib.extras.stops.next_stops import advice_in_words, next_stops
 from hand_eye_calib.extras.stops.robot_world import MIN_STOPS, RobotWorld
 from hand_eye_calib.extras.stops.rough_fit import StopPoses
-from hand_eye_calib.extras.stops.solving import Reading, SolvedStops, solve_checked
+from hand_eye_calib.extras.stops.solving import SetupFit, SolvedStops, solve_checked
 from hand_eye_calib.extras.stops.stop_table import StopTable, stop_table
 from hand_eye_calib.extras.stops.worlds import SETUPS, Worlds
 
@@ -42,21 +42,21 @@ _INVERSIONS = {"parent_invert", "child_invert"}
 # A mount is the identity within so many standard deviations, or within this length (m) and angle
 # (rad).
 _IDENTITY_SIGMAS = 3.0
-_IDENTITY = 0.001
+_MIN_IDENTITY = 0.001
 
 # A camera or target on a hand is nearer to it than this (m), or than twice the distance of its
 # counterpart from the base.
-_ON_HAND_M = 0.3
-_NEARER = 0.5
+_MAX_ON_HAND_M = 0.3
+_MAX_BASE_RATIO = 0.5
 
 # A direction of rotations alone is unknown if its rotation part is longer than this.
 _ROTATION_PART = 0.5
 
 # Share of stops that were left out above which the verdict is USE WITH CARE.
-_LARGEST_LEFT_OUT = 0.1
+_MAX_LEFT_OUT = 0.1
 
 # Largest number of stops that are listed in a message.
-_MOST_LISTED = 8
+_MAX_LISTED = 8
 
 
 def calibrate_stops(
@@ -162,13 +162,13 @@ def calibrate_arm(
     named |= names or {}
     poses = _checked_poses({"robot": robot, "tracking": tracking}, config, is_arm=True)
     solved = solve_checked(poses, config, setup)
-    solved = solved.adding(*_check_reading(solved.reading, setup))
+    solved = solved.adding(*_check_setup(solved.setup_fit, setup))
     warnings = list(solved.warnings)
     if solved.is_usable and not config.given >= _INVERSIONS:
         if not setup:
-            warnings.append(_reading_in_words(solved.reading))
-        solved = solved.adding(*_check_distances(solved.reading, named))
-    return _calibration_of(solved, warnings, _frames_of_arm(named, solved.reading.is_inverse))
+            warnings.append(_setup_in_words(solved.setup_fit))
+        solved = solved.adding(*_check_distances(solved.setup_fit, named))
+    return _calibration_of(solved, warnings, _frames_of_arm(named, solved.setup_fit.is_inverse))
 
 
 # ------------------------------------------------------------------ options and poses
@@ -239,13 +239,13 @@ def _checked_poses(
 # ------------------------------------------------------------------ findings about the fit
 
 
-def _check_reading(reading: Reading, setup: str | None) -> list[Finding]:
+def _check_setup(setup_fit: SetupFit, setup: str | None) -> list[Finding]:
     """Return findings on an arm whose stops fit both setups, or whose sides are the same poses."""
-    if reading.fit.undetermined().size:
+    if setup_fit.fit.undetermined().size:
         return []
-    if _is_copy(reading.fit):
+    if _is_copy(setup_fit.fit):
         return [finding("copied_stops")]
-    if not setup and reading.lead < LEAST_LEAD:
+    if not setup and setup_fit.lead < MIN_LEAD:
         return [finding("both_readings")]
     return []
 
@@ -258,34 +258,34 @@ def _is_copy(fit: RobotWorld) -> bool:
     """
     offsets = np.r_[se3.log(fit.T_parent_child), se3.log(fit.T_world_world)]
     sigmas = np.sqrt(np.diag(fit.covariance))
-    return bool(np.all(np.abs(offsets) < np.maximum(_IDENTITY, _IDENTITY_SIGMAS * sigmas)))
+    return bool(np.all(np.abs(offsets) < np.maximum(_MIN_IDENTITY, _IDENTITY_SIGMAS * sigmas)))
 
 
-def _reading_in_words(reading: Reading) -> str:
+def _setup_in_words(setup_fit: SetupFit) -> str:
     """Return which reading of the samples was taken, and the options of the others."""
-    place = SETUPS["beside" if reading.is_inverse else "hand"]
+    place = SETUPS["beside" if setup_fit.is_inverse else "hand"]
     return (
         f"read as a camera {place}; if that is wrong, one side or both hold inverse poses: give "
         "parent_invert poses (robot), child_invert poses (target), or both; or exchange both sides"
     )
 
 
-def _check_distances(reading: Reading, frames: Mapping[str, str]) -> list[Finding]:
+def _check_distances(setup_fit: SetupFit, frames: Mapping[str, str]) -> list[Finding]:
     """Return a finding if the camera or target on the hand is far from it.
 
     The finding needs a counterpart near the base: then inverse poses are more probable.
     """
-    fit = reading.fit
-    if fit.undetermined().size or not se3.translation_of(reading.stops.Ts_world_child).any():
+    fit = setup_fit.fit
+    if fit.undetermined().size or not se3.translation_of(setup_fit.stops.Ts_world_child).any():
         return []
     on_hand_m = float(np.linalg.norm(se3.translation_of(fit.T_parent_child)))
     from_base_m = float(np.linalg.norm(se3.translation_of(fit.T_world_world)))
     moving = frames["camera"]
     fixed = frames["target"]
-    if reading.is_inverse:
+    if setup_fit.is_inverse:
         on_hand_m, from_base_m = from_base_m, on_hand_m
         moving, fixed = fixed, moving
-    if on_hand_m <= _ON_HAND_M or from_base_m >= _NEARER * on_hand_m:
+    if on_hand_m <= _MAX_ON_HAND_M or from_base_m >= _MAX_BASE_RATIO * on_hand_m:
         return []
     what = (
         f"{moving} would be {on_hand_m:.2g} m from {frames['hand']}, {fixed} {from_base_m:.2g} m "
@@ -300,9 +300,9 @@ def _check_left_out(weights: FloatArray) -> list[Finding]:
     count = len(numbers)
     if count == 0:
         return []
-    if count > _MOST_LISTED:
-        numbers = [*numbers[:_MOST_LISTED], f"{count - _MOST_LISTED} more"]
-    is_large = count > _LARGEST_LEFT_OUT * len(weights)
+    if count > _MAX_LISTED:
+        numbers = [*numbers[:_MAX_LISTED], f"{count - _MAX_LISTED} more"]
+    is_large = count > _MAX_LEFT_OUT * len(weights)
     return [
         finding(
             "outlier_stops",
@@ -339,8 +339,8 @@ def _frames_of_arm(names: Mapping[str, str], is_beside: bool) -> _Frames:
 
 def _calibration_of(solved: SolvedStops, warnings: Sequence[str], frames: _Frames) -> Calibration:
     """Return the result: the fit fused with the prior, its residuals and its findings."""
-    fit = solved.reading.fit
-    stops = solved.reading.stops
+    fit = solved.setup_fit.fit
+    stops = solved.setup_fit.stops
     config = solved.config
     if solved.is_usable:
         solved = solved.adding(*_check_left_out(fit.weights))
@@ -379,8 +379,8 @@ def _calibration_of(solved: SolvedStops, warnings: Sequence[str], frames: _Frame
         reference="stops",
         stamp_ns=0,
         findings=solved.findings,
-        scale=solved.reading.scale,
-        scale_sigma=solved.reading.scale_sigma,
+        scale=solved.setup_fit.scale,
+        scale_sigma=solved.setup_fit.scale_sigma,
         parent_frame=config.parent_frame or frames.parent,
         child_frame=config.child_frame or frames.child,
         parts={"worlds": worlds, "stops": table},
@@ -395,8 +395,8 @@ def _with_advice(table: StopTable, solved: SolvedStops, frames: _Frames) -> Stop
     if is_beside:
         hand = frames.parent_world
     targets = np.repeat([config.target_translation, config.target_rotation], 3)
-    reading = solved.reading
-    start, following = next_stops(reading.stops, reading.fit, hand, is_beside, targets)
+    setup_fit = solved.setup_fit
+    start, following = next_stops(setup_fit.stops, setup_fit.fit, hand, is_beside, targets)
     advice = advice_in_words(start + 1, following)
     return replace(table, start=start + 1, next=following, advice=advice)
 

@@ -1,11 +1,11 @@
-"""Checks of stops before they are solved: rows, rotations, conventions, axes and units.
+"""Checks of stops before the solve: rows, rotations, conventions, axes and units.
 
-Rotations alone reveal wrong rows and angles that were read otherwise
-(:mod:`hand_eye_calib.extras.stops.rotation_checks`). They do not reveal quaternions in another
-order: w x y z read as x y z w turns a rotation into an inverse one, seen from other axes. Only the
-positions contradict. So each usual mistake is undone in turn, and a robust fit of ``A X = Z B``
-decides whether rotations and positions agree without it. The best of these hypotheses are solved,
-and their likelihoods are compared.
+Rotations alone reveal wrong rows and wrong kinds of angles
+(:mod:`hand_eye_calib.extras.stops.rotation_checks`). They do not reveal a wrong order of
+quaternions: w x y z taken for x y z w are the inverse rotations in other axes, which agree, too.
+Then only the positions contradict. So each usual mistake is a hypothesis: the mistake is undone,
+and a rough fit of ``A X = Z B`` measures how well rotations and positions agree. The best
+hypotheses are solved in full and compared by their likelihoods.
 """
 
 import itertools
@@ -24,11 +24,11 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.records import has_error
 from hand_eye_calib.extras.stops.robot_world import solve
 from hand_eye_calib.extras.stops.rotation_checks import (
-    CLEARLY_BETTER,
-    EXPLAINED_SHARE,
-    FEWEST_STOPS,
-    LARGEST_SHARE,
-    UNRELATED_SHARE,
+    MAX_UNEXPLAINED,
+    MIN_IMPROVEMENT,
+    MIN_STOPS_TO_CHECK,
+    SMALL_UNEXPLAINED,
+    UNRELATED_UNEXPLAINED,
     check_angles,
     check_frozen,
     check_rows,
@@ -37,42 +37,42 @@ from hand_eye_calib.extras.stops.rough_fit import (
     Mistakes,
     RoughFit,
     StopPoses,
-    certain_gain,
+    min_certain_gain,
     rough_fit,
     spread,
     turns_about_two_axes,
 )
 
-# Unexplained share of the rotations or the positions from which on there is a warning.
+# Smallest unexplained share of rotations or positions that is a warning.
 _DOUBTFUL_SHARE = 0.12
 
-# Errors of the positions over those that the errors of the rotations cause. Measured: 1 to 5 for
-# three real arms, 1 to 4 for KinHEC with noise. Above the first ratio the positions contradict if
-# too large a share is unexplained; above the second ratio, if this share is.
-_LARGEST_RATIO = 4.0
-_CONTRADICTING_RATIO = 12.0
+# Limits of ``RoughFit.position_ratio``: residuals of positions over the errors that errors of the
+# rotations cause. Measured: 1 to 5 for three real arms, 1 to 4 for KinHEC with noise. Above the
+# first limit, noise does not explain the residuals. Above the second limit, positions contradict if
+# more than the third limit of their spread is unexplained.
+_MAX_POSITION_RATIO = 4.0
+_CONTRADICTING_POSITION_RATIO = 12.0
 _CONTRADICTING_SHARE = 0.08
 
 # Hypotheses whose log likelihoods differ by less than this are equally good: a factor of 1100
 # between the likelihoods. Measured on simulated arms: the log likelihoods of the two setups (camera
 # on the hand, camera beside the arm) differ by at least 95 with four or more stops, and by 0.0 with
 # three.
-LEAST_LEAD = 7.0
+MIN_LEAD = 7.0
 
-# Largest number of hypotheses (mistakes undone) that are solved in full: those with the best rough
-# fits. The others are dropped.
-_MOST_RIVALS = 6
+# Largest number of hypotheses that are solved in full: those with the best rough fits.
+_MAX_RIVALS = 6
 
-# Positions that spread over more than this (m) are not those of an arm in metres.
-_LARGEST_SPREAD_M = 3.0
+# Largest spread (m) of the positions of an arm. A larger one has another unit.
+_MAX_SPREAD_M = 3.0
 
-# Lengths of such positions above this median distance from the origin are millimetres, otherwise
-# centimetres.
-_LARGEST_DISTANCE_CM = 200.0
+# Largest median distance (cm) of positions from their origin in centimetres. Positions with a
+# larger one are in millimetres.
+_MAX_DISTANCE_CM = 200.0
 
-# Largest factor between the lengths of both sides without another unit: the size of a target is
-# not wrong by more.
-_LARGEST_FACTOR = 3.0
+# Largest factor by which the assumed size of a target is wrong. A larger factor between the lengths
+# of both sides is a difference of units.
+_MAX_SIZE_FACTOR = 3.0
 
 # Units of lengths by their factors to metres.
 _CENTIMETRE = 0.01
@@ -81,7 +81,7 @@ _UNITS = {_CENTIMETRE: "centimetres", _MILLIMETRE: "millimetres"}
 
 _UNEXPLAINED = attrgetter("unexplained")
 
-# Codes of conventions that each side may have wrong.
+# Mistakes that each side may have, keys of ``CONVENTIONS``; the first one is no mistake.
 _CODES = ("", "quaternion_order", "quaternion_names", "inverse_orientation")
 
 
@@ -92,13 +92,14 @@ class Examination:
     Attributes
     ----------
     findings : tuple of Finding
-        Errors that no option repairs for certain.
+        Mistakes that are not repaired, because the repair is unknown or uncertain.
     repairs : tuple of Finding
-        Mistakes that their options repair.
+        Mistakes that are certain; the options of each finding repair it.
     scale : float or None
         Rough factor of the child's lengths after the repairs; None if it is not determined.
     child_unit : float
-        Unit of the child's lengths if it is no finding, because the scale is estimated anyway.
+        Factor from the child's unit of length to metres, if the scale is estimated anyway: then
+        another unit is no finding.
     """
 
     findings: tuple[Finding, ...] = ()
@@ -108,16 +109,16 @@ class Examination:
 
 
 def examine(poses: StopPoses, is_scale_free: bool) -> Examination:
-    """Detect usual mistakes in stops.
+    """Detect usual mistakes in stops, and decide which ones are repaired.
 
     Parameters
     ----------
     poses : StopPoses
-        With the options of the user applied.
+        Poses after the options of the user.
     is_scale_free : bool
         Whether the factor of the child's lengths is estimated anyway.
     """
-    if len(poses) < FEWEST_STOPS:
+    if len(poses) < MIN_STOPS_TO_CHECK:
         return Examination()
     findings = [*check_frozen(poses)]
     if all(issue.evidence["share"] < 1.0 for issue in findings):
@@ -130,7 +131,7 @@ def examine(poses: StopPoses, is_scale_free: bool) -> Examination:
         # Rotations about one axis do not determine the conventions of the positions. Only their
         # unit is checked.
         return _with_units(sample, Examination(), is_scale_free)
-    chosen, rivals = _explain(sample)
+    chosen, rivals = _best_hypothesis(sample)
     if axes := _check_axes(sample, chosen):
         return Examination((axes,))
     repairs = tuple(
@@ -149,65 +150,70 @@ def examine(poses: StopPoses, is_scale_free: bool) -> Examination:
 # ------------------------------------------------------------------ conventions
 
 
-def _explain(sample: StopPoses) -> tuple[RoughFit, list[Mistakes]]:
-    """Return the fit that explains the stops, and mistakes that explain them equally well.
+def _best_hypothesis(sample: StopPoses) -> tuple[RoughFit, list[Mistakes]]:
+    """Return the rough fit of the best hypothesis, and rivals that are equally likely.
 
-    The fit is that without mistakes unless some are certain.
+    The best hypothesis is that without mistakes, unless mistakes are certain.
     """
-    plain = [rough_fit(sample, Mistakes(is_inverse=way)) for way in sample.ways]
-    as_given = _best_without_mistakes(plain)
-    if as_given.unexplained < EXPLAINED_SHARE or not sample.has_positions:
+    plain = [
+        rough_fit(sample, Mistakes(is_inverse=is_inverse))
+        for is_inverse in sample.possible_inversions
+    ]
+    as_given = _better_setup(plain)
+    if as_given.unexplained_share < SMALL_UNEXPLAINED or not sample.has_positions:
         return as_given, []
     objectives = {rival: _objective(sample, rival) for rival in _rivals(sample)}
     smallest = min(objectives.values())
     gain = min(_objective(sample, fit) for fit in plain) - smallest
-    good = _simplest([rival for rival in objectives if objectives[rival] < smallest + LEAST_LEAD])
-    if gain < -LEAST_LEAD:
+    good = _with_fewest_mistakes(
+        [rival for rival in objectives if objectives[rival] < smallest + MIN_LEAD]
+    )
+    if gain < -MIN_LEAD:
         return as_given, []
-    if gain < certain_gain(len(sample)):
+    if gain < min_certain_gain(len(sample)):
         return as_given, [rival.mistakes for rival in good]
     best = min(good, key=_UNEXPLAINED)
-    if best.unexplained > LARGEST_SHARE:
+    if best.unexplained_share > MAX_UNEXPLAINED:
         return as_given, []
     return best, [rival.mistakes for rival in good if rival is not best]
 
 
-def _best_without_mistakes(fits: Sequence[RoughFit]) -> RoughFit:
-    """Return the better fit of both setups.
+def _better_setup(fits: Sequence[RoughFit]) -> RoughFit:
+    """Return the better of the fits of both setups (camera on the hand, beside the robot).
 
-    Rotations decide whether the camera is on the hand; positions choose only where they do not.
+    Rotations decide. If both setups explain them about equally, positions decide.
     """
-    largest_turning = CLEARLY_BETTER * min(fit.turning for fit in fits)
-    possible = [fit for fit in fits if fit.turning <= largest_turning]
+    largest_turning = MIN_IMPROVEMENT * min(fit.rotation_share for fit in fits)
+    possible = [fit for fit in fits if fit.rotation_share <= largest_turning]
     return min(possible, key=_UNEXPLAINED)
 
 
-def _simplest(fits: Sequence[RoughFit]) -> list[RoughFit]:
-    """Return the fits with the fewest different mistakes."""
+def _with_fewest_mistakes(fits: Sequence[RoughFit]) -> list[RoughFit]:
+    """Return those fits whose hypotheses have the fewest different mistakes."""
     fewest = min(fit.mistakes.complexity for fit in fits)
     return [fit for fit in fits if fit.mistakes.complexity == fewest]
 
 
 def _rivals(sample: StopPoses) -> list[RoughFit]:
-    """Return the best rough fits with mistakes undone."""
+    """Return the best rough fits of hypotheses with mistakes."""
     rivals = []
     for parent, child, is_inverse in itertools.product(_CODES, _CODES, (False, True)):
-        is_plain = not (parent or child) and is_inverse in sample.ways
+        is_plain = not (parent or child) and is_inverse in sample.possible_inversions
         if not is_plain:
             rivals.append(rough_fit(sample, Mistakes(parent, child, is_inverse)))
     rivals.sort(key=lambda rival: -rival.log_likelihood)
-    return rivals[:_MOST_RIVALS]
+    return rivals[:_MAX_RIVALS]
 
 
 def _objective(sample: StopPoses, fit: RoughFit) -> float:
-    """Return the negative log likelihood of the solved stops, in lengths of the parent."""
+    """Return the negative log likelihood of stops solved under the hypothesis of a rough fit."""
     return solve(sample.without(fit.mistakes, fit.scale or 1.0)).objective
 
 
 def _check_conventions(
     poses: StopPoses, mistakes: Mistakes, rivals: Sequence[Mistakes]
 ) -> list[Finding]:
-    """Return findings of mistakes that cannot be repaired with certainty."""
+    """Return findings on inverse poses, and on rival hypotheses that are equally likely."""
     findings = []
     if mistakes.is_inverse and not poses.is_arm:
         findings.append(finding("inverse_stops", "child", options={"child_invert": "poses"}))
@@ -222,8 +228,8 @@ def _ambiguous(mistakes: Mistakes, rival: Mistakes) -> Finding:
     """Return the finding that two explanations fit equally well, with the options of both."""
     options = _options_of(mistakes)
     rival_options = _options_of(rival)
-    # Each lists every option that either sets, with its default if need be. So the listed options
-    # select one explanation.
+    # Each list has all options that either hypothesis sets, with defaults where necessary. So a
+    # user who sets a list selects one hypothesis.
     first = options | defaults_of(name for name in rival_options if name not in options)
     second = rival_options | defaults_of(name for name in options if name not in rival_options)
     return finding(
@@ -243,7 +249,7 @@ def _options_of(mistakes: Mistakes) -> dict[str, float | str]:
 
 
 def _codes_and_streams(mistakes: Mistakes) -> list[tuple[str, str]]:
-    """Return code and stream of each mistake."""
+    """Return code and stream (parent, child or both) of each mistake."""
     if mistakes.parent == mistakes.child:
         return [(mistakes.parent, "both")] if mistakes.parent else []
     sides = ((mistakes.parent, "parent"), (mistakes.child, "child"))
@@ -251,23 +257,27 @@ def _codes_and_streams(mistakes: Mistakes) -> list[tuple[str, str]]:
 
 
 def _check_agreement(fit: RoughFit) -> list[Finding]:
-    """Return a finding if no usual mistake explains the stops.
-
-    Noise of the rotations explains errors of the positions up to a ratio.
-    """
-    are_too_large = fit.turning > LARGEST_SHARE or fit.placing > UNRELATED_SHARE
-    are_beyond_noise = fit.placing > EXPLAINED_SHARE and fit.beyond > _LARGEST_RATIO
+    """Return a finding if the residuals of the best hypothesis are too large for noise."""
+    are_too_large = (
+        fit.rotation_share > MAX_UNEXPLAINED or fit.position_share > UNRELATED_UNEXPLAINED
+    )
+    are_beyond_noise = (
+        fit.position_share > SMALL_UNEXPLAINED and fit.position_ratio > _MAX_POSITION_RATIO
+    )
     if not (are_too_large or are_beyond_noise):
         return []
-    contradict = fit.placing > _CONTRADICTING_SHARE and fit.beyond > _CONTRADICTING_RATIO
-    if fit.unexplained > LARGEST_SHARE or contradict:
+    contradict = (
+        fit.position_share > _CONTRADICTING_SHARE
+        and fit.position_ratio > _CONTRADICTING_POSITION_RATIO
+    )
+    if fit.unexplained_share > MAX_UNEXPLAINED or contradict:
         severity = Severity.ERROR
-    elif fit.unexplained >= _DOUBTFUL_SHARE:
+    elif fit.unexplained_share >= _DOUBTFUL_SHARE:
         severity = Severity.WARNING
     else:
         return []
-    part = "rotations" if fit.turning > fit.placing else "positions"
-    share = min(fit.unexplained, 1.0)
+    part = "rotations" if fit.rotation_share > fit.position_share else "positions"
+    share = min(fit.unexplained_share, 1.0)
     return [finding("disagreeing_stops", severity=severity, part=part, share=share)]
 
 
@@ -275,17 +285,17 @@ def _check_agreement(fit: RoughFit) -> list[Finding]:
 
 
 def _check_axes(sample: StopPoses, fit: RoughFit) -> Finding | None:
-    """Return a finding if the positions of one side are clearly in other axes.
+    """Return a finding if positions of one side have permuted or flipped axes.
 
-    Other axes must explain more than the best of the other mistakes, whose fit is ``fit``.
+    Such axes must be clearly likelier than the best other hypothesis, whose fit is ``fit``.
     """
-    if fit.unexplained < EXPLAINED_SHARE:
+    if fit.unexplained_share < SMALL_UNEXPLAINED:
         return None
     best = None
-    largest = fit.log_likelihood + certain_gain(len(sample))
-    for way in sample.ways:
-        mistakes = Mistakes(is_inverse=way)
-        if rough_fit(sample, mistakes).turning > LARGEST_SHARE:
+    largest = fit.log_likelihood + min_certain_gain(len(sample))
+    for is_inverse in sample.possible_inversions:
+        mistakes = Mistakes(is_inverse=is_inverse)
+        if rough_fit(sample, mistakes).rotation_share > MAX_UNEXPLAINED:
             continue
         for axes, stream in itertools.product(_other_axes(), ("child", "parent")):
             Ts = getattr(sample, stream)
@@ -293,14 +303,14 @@ def _check_axes(sample: StopPoses, fit: RoughFit) -> Finding | None:
                 se3.rotation_of(Ts), se3.translation_of(Ts) @ axes.T
             )
             other = rough_fit(sample.with_side(stream, turned), mistakes)
-            if other.log_likelihood > largest and other.unexplained < LARGEST_SHARE:
+            if other.log_likelihood > largest and other.unexplained_share < MAX_UNEXPLAINED:
                 best = finding("axes", stream, detail=_axes_in_words(axes))
                 largest = other.log_likelihood
     return best
 
 
 def _other_axes() -> Iterator[FloatArray]:
-    """Yield all matrices (3, 3) that permute and flip the axes, without the identity."""
+    """Yield the 47 matrices (3, 3) that permute and flip axes; the identity is left out."""
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1, -1), repeat=3):
             axes = np.diag(signs) @ np.eye(3)[list(order)]
@@ -321,8 +331,9 @@ def _axes_in_words(axes: FloatArray) -> str:
 
 
 def _with_units(sample: StopPoses, examination: Examination, is_scale_free: bool) -> Examination:
-    """Return the examination with findings or repairs of lengths in other units, and with the scale
-    that remains.
+    """Return the examination with findings or repairs of units of length, and the scale left over.
+
+    The scale left over is the rough factor of the child's lengths once both sides are in metres.
     """
     if not sample.has_positions:
         return examination
@@ -332,7 +343,7 @@ def _with_units(sample: StopPoses, examination: Examination, is_scale_free: bool
     if scale is not None:
         to_metres = scale * of_parent
         nearest = min((1.0, *_UNITS), key=lambda unit: abs(np.log(to_metres / unit)))
-        is_unit = abs(np.log(to_metres / nearest)) < np.log(_LARGEST_FACTOR)
+        is_unit = abs(np.log(to_metres / nearest)) < np.log(_MAX_SIZE_FACTOR)
         of_child = nearest if is_unit else 1.0
         scale = to_metres / of_child
     units = []
@@ -340,7 +351,7 @@ def _with_units(sample: StopPoses, examination: Examination, is_scale_free: bool
         units.append(_unit_finding("parent", "parent_scale", of_parent))
     if of_child != 1.0:
         units.append(_unit_finding("child", "scale", of_child))
-    # Stops of two vehicles may be far apart; an arm is not that large.
+    # The places of two vehicles may really be far apart, so large positions alone prove no unit.
     is_certain = sample.is_arm or (len(units) == 1 and scale is not None)
     examination = replace(examination, scale=scale)
     if is_scale_free and of_child != 1.0:
@@ -356,8 +367,8 @@ def _unit_finding(stream: str, option: str, unit: float) -> Finding:
 
 
 def _unit_of_size(positions: FloatArray) -> float:
-    """Return the factor to metres of positions (N, 3), by their size."""
-    if spread(positions) <= _LARGEST_SPREAD_M:
+    """Return the factor from positions (N, 3) to metres, assumed from their spread."""
+    if spread(positions) <= _MAX_SPREAD_M:
         return 1.0
     distance = median(np.linalg.norm(positions, axis=1))
-    return _CENTIMETRE if distance < _LARGEST_DISTANCE_CM else _MILLIMETRE
+    return _CENTIMETRE if distance < _MAX_DISTANCE_CM else _MILLIMETRE

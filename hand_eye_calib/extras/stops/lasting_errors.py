@@ -1,9 +1,10 @@
-"""Errors of stops that last over several stops, or come back with the place of the arm.
+"""Correlation of the errors of stops.
 
-The errors of a target's pose depend on the view: stops from similar views have similar errors.
-Their correlation is a white share on the diagonal plus an exponential of the distance of views.
-The distance is that between places, or that along the way from stop to stop, over several ranges.
-The restricted likelihood weighs these kernels.
+The error of a target's pose depends on the view, so stops with similar views have similar errors.
+Two kinds of correlation are considered: errors return with the place of the arm, or last along the
+way from stop to stop. The correlation of two stops is ``(1 - w) exp(-d / r)``, with the distance d
+of their views, a range r and a share w of white noise. Several kernels (kind, r, w) are averaged
+with weights of their restricted likelihoods.
 
 Reference: D. A. Harville, *Maximum likelihood approaches to variance component estimation*, JASA
 72, 1977.
@@ -14,23 +15,23 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry import se3
 
-# Range of each kernel (rad of view) and white share of its variance. The first kernel is of errors
-# that do not last, the second of errors that come back with their place; the others are of errors
-# that last along the way from stop to stop.
+# Range (rad of view) and white share of each kernel. The first kernel is white noise. The second
+# belongs to errors that return with the place, the others to errors that last along the way.
 _RANGES_RAD = np.array([0.03, 0.05, *(0.03 * 4.0**k for k in range(6))])
 _WHITE_SHARES = np.array([1.0, *[0.1] * 7])
 _N_BY_PLACE = 2
 
-# Keeps logarithms of zero finite.
+# Added to arguments of logarithms and to divisors, which may be zero.
 _TINY = np.finfo(float).tiny
 
 
-def views_of(Ts_world_parent: FloatArray, Ts_world_child: FloatArray) -> FloatArray:
-    """Return the views (N, 13) of stops.
+def views_of_stops(Ts_world_parent: FloatArray, Ts_world_child: FloatArray) -> FloatArray:
+    """Return the views (N, 13) of stops, whose distances are about angles in rad.
 
-    The columns are the change of the view up to the stop (rad), the rotation matrix over the square
-    root of two, and the place. Places are divided by a usual distance: that to the target, and
-    between stops.
+    Column 0 is the length of the way up to the stop: the sum of the changes of the view. Columns 1
+    to 9 are the rotation matrix over the square root of two, so that the distance of two rotations
+    is about their angle. Columns 10 to 12 are the position of the parent, over the sum of the
+    median distance to the target and the mean way between stops.
     """
     positions = se3.translation_of(Ts_world_parent)
     distances_m = np.linalg.norm(se3.translation_of(Ts_world_child), axis=1)
@@ -43,11 +44,11 @@ def views_of(Ts_world_parent: FloatArray, Ts_world_child: FloatArray) -> FloatAr
 
 
 def rest_weights(views: FloatArray) -> FloatArray:
-    """Return weights (N,), 1 on average, for the stops.
+    """Return weights (N,) of stops, 1 on average, so that a resting arm does not dominate.
 
-    Consecutive stops at one place count as one stop: a resting arm gives many such stops.
+    Consecutive stops at one place together have the weight of one stop.
     """
-    # Length of the way up to each stop (rad of view).
+    # Length of the way up to each stop (rad of view), an increasing sequence.
     way_rad = views[:, 0]
     first = np.searchsorted(way_rad, way_rad - _RANGES_RAD[0])
     end = np.searchsorted(way_rad, way_rad + _RANGES_RAD[0])
@@ -55,8 +56,8 @@ def rest_weights(views: FloatArray) -> FloatArray:
     return np.asarray(weights / weights.mean())
 
 
-def kernels_of(views: FloatArray) -> FloatArray:
-    """Return the correlations (K, N, N) of the errors of stops, by each kernel."""
+def correlations(views: FloatArray) -> FloatArray:
+    """Return the correlations (K, N, N) of the errors of N stops by each of the K kernels."""
     places = np.linalg.norm(views[:, None, 1:] - views[:, 1:], axis=2)
     ways = np.abs(np.subtract.outer(views[:, 0], views[:, 0]))
     n_by_way = len(_RANGES_RAD) - _N_BY_PLACE
@@ -67,11 +68,15 @@ def kernels_of(views: FloatArray) -> FloatArray:
 
 
 def kernel_weights(kernels: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return the probability (K,) of each kernel, times its variance over that of the white kernel.
+    """Return the weight (K,) of each kernel in the average covariance.
+
+    The weight is the kernel's probability times the variance of the errors under this kernel over
+    that under white noise.
 
     Parameters
     ----------
     kernels : (K, N, N) array
+        Correlations of the stops by each kernel.
     rows : (N, 6, M + 1) array
         Derivatives of the errors with respect to M values, and the errors in the last column.
     """
@@ -81,7 +86,7 @@ def kernel_weights(kernels: FloatArray, rows: FloatArray) -> FloatArray:
     whitened = np.linalg.solve(factors, rows.reshape(1, n, -1))
     triangles = np.linalg.qr(whitened.reshape(len(kernels), 6 * n, n_columns), mode="r")
     diagonals = np.abs(np.diagonal(triangles, 0, 1, 2)) + _TINY
-    # The last diagonal element is the length of the errors that no values explain.
+    # The last diagonal element is the length of the residuals after the fit of the M values.
     log_variances = 2.0 * np.log(diagonals[:, -1])
     logs = -0.5 * (6 * n + 1 - n_columns) * log_variances
     logs = logs - np.log(diagonals[:, :-1] + 1e-9).sum(axis=1)

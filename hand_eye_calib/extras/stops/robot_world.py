@@ -1,14 +1,15 @@
-"""Stops: independent poses without an order, ``A_i X = Z B_i`` by robust maximum likelihood.
+"""Robust maximum likelihood estimate of X and Z from stops, ``A_i X = Z B_i``.
 
 A_i is the pose of the parent sensor in its world, such as the hand in the base of a robot. B_i is
-the pose of the child sensor in its own world, such as the camera in the frame of a target. X is the
-pose of the child in the parent, Z the pose of the child's world in the parent's world (robot-world
-calibration; eye-to-hand if the arm carries the target).
+the pose of the child sensor in its world, such as the camera in the frame of a target. X is the
+pose of the child in the parent. Z is the pose of the child's world in the parent's world: the
+target in the base of the robot. The order of the stops has no meaning.
 
-A robot stops, measures and moves on: poses of neighbours contain no more than those of any two
-stops. So each stop is compared with Z. Its error ``xi_i = Log(B_i^-1 Z^-1 A_i X)``, in the frame of
-the child or of its world, has a Student-t distribution with one variance for positions and one for
-rotations.
+The error of stop i is ``xi_i = Log(B_i^-1 Z^-1 A_i X)`` in the frame of the child, or the same
+error in the frame of the child's world. It has a Student-t distribution with one variance for the
+three values of the position and one for those of the rotation. Solve by Gauss-Newton steps with
+weights and variances from the expectation-maximisation algorithm: K. L. Lange, R. J. A. Little,
+J. M. G. Taylor, *Robust statistical modeling using the t distribution*, JASA 84, 1989.
 """
 
 import math
@@ -23,21 +24,23 @@ from hand_eye_calib.core.base.stats import student_weights
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.stops.closed_form import Stops, robust_start
 from hand_eye_calib.extras.stops.lasting_errors import (
+    correlations,
     kernel_weights,
-    kernels_of,
     rest_weights,
-    views_of,
+    views_of_stops,
 )
 
-# A rotation about an axis needs two motions, which are three stops.
+# Fewest stops: X needs two motions with rotations about different axes, which are three stops.
 MIN_STOPS = 3
 
-# Degrees of freedom of the Student-t distribution of errors. Measured: between 4 and 30, motions
-# between stops that were left out close equally well, to 1 %, on recordings of two arms. With
-# normal errors (KinHEC), rotations are 3 % worse at 12 degrees and 2 % at 16 than at 1000.
+# Degrees of freedom of the Student-t distribution of errors. Measured: between 4 and 30 degrees of
+# freedom, stops of two real arms that were not used for the fit agree with it equally well, to 1 %.
+# If errors are normal (KinHEC), errors of the rotation are 3 % larger at 12 and 2 % at 16 than at
+# 1000.
 _DEGREES = 16.0
 
-# Squared distance of six values from which on a stop is an outlier: 1 in 300,000 normal errors.
+# A stop is an outlier if its squared Mahalanobis distance (six values) is larger. Normal errors
+# exceed this limit once in 300,000 stops (chi-square).
 _OUTLIER_SQUARED = 36.0
 
 # Difference of the log likelihoods of both frames of the errors at which the likelier frame has e
@@ -46,30 +49,32 @@ _OUTLIER_SQUARED = 36.0
 # dimensions by 7 to 10 %; above 10, noise of images loses.
 _LIKELIHOOD_SCALE = 10.0
 
-# Degrees of freedom while outliers are detected: few outliers hardly widen so heavy tails.
+# Degrees of freedom while outliers are detected. Tails are so heavy then that a few outliers hardly
+# change the variances.
 _OUTLIER_DEGREES = 3.0
 
 # Number of estimated values: six of X and six of Z.
 _N_VALUES = 12
 
-# Largest number of rounds of weights, variances and a Gauss-Newton step; a step below this many
-# standard deviations ends them.
-_ROUNDS = 60
+# Iterations of weights, variances and a Gauss-Newton step: their largest number, and the step (in
+# standard deviations of the values) below which they have converged.
+_MAX_ROUNDS = 60
 _SMALL_STEP = 1e-2
 
-# Smallest variance of errors (m^2, rad^2): the rounding of copied poses.
-_SMALLEST_VARIANCE = 1e-24
+# Smallest variance of errors (m^2, rad^2): that of rounding in poses without errors.
+_MIN_VARIANCE = 1e-24
 
-# A direction is determined if the squared rotations between stops that reveal it exceed this
-# multiple of the squared error of a rotation, which looks like a rotation itself.
+# A direction of X is observable if the mean squared rotation between stops that determines it
+# exceeds this multiple of the variance of a measured rotation. Below it, errors of the rotations
+# may pass for rotations.
 _DETERMINED = 8.0
 
-# Standard deviation of the scale of distances to a target, as a share: a usual error of the size of
-# the target or of the focal length.
+# Prior standard deviation of the scale of the child's lengths, as a share: a usual error of the
+# size of a target or of a focal length.
 STRETCH = 0.03
 
-# Largest number of stops whose lasting errors are computed together.
-_MOST_AT_ONCE = 300
+# Largest number of stops whose correlations are computed together: memory grows with its square.
+_MAX_STOPS_AT_ONCE = 300
 
 
 @dataclass(frozen=True)
@@ -83,23 +88,25 @@ class RobotWorld:
     T_world_world : (4, 4) array
         Z: pose of the child's world in the parent's world.
     covariance : (12, 12) array
-        Covariance of the right perturbations (rho, phi) of X, then of Z, in the frames of the child
-        and of its world. Undetermined directions have large variances.
+        Covariance of the right perturbations (rho, phi) of X in the frame of the child, then of
+        those of Z in the frame of the child's world. Unobservable directions have large variances.
     information : (12, 12) array
-        Fisher information of the same if the errors of each stop are independent and normal.
+        Fisher information about the same perturbations if errors of stops are independent.
     weights : (N,) array
-        Weight of each stop: 1 for errors as large as the levels, less for larger ones, 0 for an
-        outlier.
+        Weight of each stop: 1 for errors up to the standard deviations, less for larger errors, 0
+        for an outlier.
     level_m, level_rad : float
         Standard deviations of the errors of a stop's position and rotation, per axis.
     objective : float
-        Negative log likelihood.
+        Negative log likelihood, up to a constant.
     converged : bool
-    scale_step, scale_sigma : float
-        Share by which longer positions of the child would fit best, to first order, and its
-        standard deviation; infinite if the stops do not determine it.
+        Whether the last step of the fit was small.
+    scale_step : float
+        Relative change of the scale of the child's lengths that would fit best, to first order.
+    scale_sigma : float
+        Standard deviation of ``scale_step``; infinite if the stops do not determine the scale.
     scale_inflation : float
-        Factor of the variance of the scale for errors that last over several stops.
+        Factor by which errors that last over several stops increase the variance of the scale.
     """
 
     T_parent_child: FloatArray
@@ -116,28 +123,28 @@ class RobotWorld:
     scale_inflation: float = 1.0
 
     def undetermined(self) -> FloatArray:
-        """Return the directions (6, K), as right perturbations, of X that are unknown."""
+        """Return the unobservable directions (6, K) of X, as right perturbations."""
         to_others = self.information[:6, 6:]
         others = np.linalg.pinv(self.information[6:, 6:], hermitian=True)
         marginal = self.information[:6, :6] - to_others @ others @ to_others.T
         levels = np.repeat([self.level_m, self.level_rad], 3)
         n_used = max(int(np.sum(self.weights > 0.0)), 1)
-        # In units of the errors of a stop: the squared rotations between stops (rad^2).
+        # The information of X times the variances of a stop: mean squared rotations (rad^2).
         squared_turns = marginal * np.outer(levels, levels) / n_used
         eigenvalues, directions = np.linalg.eigh(squared_turns)
         return directions[:, eigenvalues < _DETERMINED * self.level_rad**2]
 
 
 def solve(stops: Stops, stretch: float = STRETCH) -> RobotWorld:
-    """Return the most likely X and Z.
+    """Estimate X and Z, with their covariance.
 
     Parameters
     ----------
     stops : Stops
         At least three.
     stretch : float
-        Prior standard deviation, as a share, of the scale of the child's lengths; infinite if
-        nothing is known of it. The covariance contains its effect.
+        Prior standard deviation of the scale of the child's lengths, as a share; infinite without
+        prior knowledge. The scale itself stays 1. The covariance contains its uncertainty.
 
     Raises
     ------
@@ -146,11 +153,10 @@ def solve(stops: Stops, stretch: float = STRETCH) -> RobotWorld:
 
     Notes
     -----
-    The start has a closed form: rotations by M. Shah, *Solving the robot-world/hand-eye calibration
-    problem using the Kronecker product*, Journal of Mechanisms and Robotics 5(3), 2013, eq. 18,
-    then translations by linear least squares. Outliers are detected with heavy tails and left out.
-    Both frames of the errors are tried, the child's and that of its world (a target whose pose a
-    camera measured). The fits are averaged with weights of their likelihoods.
+    The start is the closed form of :mod:`hand_eye_calib.extras.stops.closed_form`. Outliers are
+    detected with heavy tails and left out. Errors may be normal in the frame of the child or in
+    that of the child's world (a target whose pose a camera measures). Both are fitted, and the fits
+    are averaged with weights of their likelihoods.
     """
     if len(stops) < MIN_STOPS:
         raise NotEnoughDataError(
@@ -158,7 +164,7 @@ def solve(stops: Stops, stretch: float = STRETCH) -> RobotWorld:
             "are necessary; 15 or more are better"
         )
     start = robust_start(stops)
-    views = views_of(stops.Ts_world_parent, stops.Ts_world_child)
+    views = views_of_stops(stops.Ts_world_parent, stops.Ts_world_child)
     rests = rest_weights(views)
     fits = [_fit_without_outliers(stops, start, in_world, rests) for in_world in (False, True)]
     in_world = fits[1].objective < fits[0].objective
@@ -172,10 +178,10 @@ def solve(stops: Stops, stretch: float = STRETCH) -> RobotWorld:
 
 
 def _averaged(best: RobotWorld, other: RobotWorld) -> RobotWorld:
-    """Return the fit in the likelier frame, moved towards the fit in the other frame.
+    """Return the average of the fits with errors in either frame, weighted by their likelihoods.
 
-    Both are weighted by their likelihoods. The covariance contains their scatter. A fit in the
-    other frame that contradicts the best one is ignored.
+    The covariance contains the scatter of both fits. If ``other`` contradicts ``best``, the result
+    is ``best``.
     """
     offsets = [
         se3.log(se3.inverse(best.T_parent_child) @ other.T_parent_child),
@@ -201,9 +207,13 @@ def _fit_without_outliers(
     in_world: bool,
     rests: FloatArray,
 ) -> RobotWorld:
-    """Detect outliers with heavy tails, and fit the other stops."""
+    """Detect outliers with heavy tails, then fit the other stops.
+
+    The errors are in the frame of the child's world if ``in_world``, else in that of the child.
+    ``rests`` (N,) are weights of stops at one place. The result's weights are 0 for outliers.
+    """
     n = len(stops)
-    # With heavier tails a few stops fit exactly, and all others are outliers.
+    # With fewer degrees of freedom, a few stops would fit exactly and all others be outliers.
     fewest_degrees = 16.0 / (n - 2)
     rough = _fit(stops, start, in_world, max(fewest_degrees, _OUTLIER_DEGREES), rests)
     is_kept = rough.weights > 0.0
@@ -216,7 +226,7 @@ def _fit_without_outliers(
     )
     weights = np.zeros(n)
     weights[is_kept] = fit.weights
-    # Each stop that is left out counts as an outlier at the limit.
+    # In the objective, each outlier has the squared distance of the limit.
     log_levels = 6.0 * (np.log(fit.level_m) + np.log(fit.level_rad))
     n_left_out = float(np.sum(weights == 0.0))
     objective = fit.objective + 0.5 * n_left_out * (log_levels + _OUTLIER_SQUARED)
@@ -229,11 +239,10 @@ def _fit_without_outliers(
 def _linearise(
     stops: Stops, X: FloatArray, Z: FloatArray, in_world: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the errors (N, 6) of stops, and their derivatives (N, 6, 12).
+    """Return the errors xi (N, 6) of stops, and their derivatives (N, 6, 12).
 
-    The derivatives are with respect to X and Z.
-
-    ``in_world`` chooses the frame of the errors: the world of the child, rather than the child.
+    The derivatives are with respect to the right perturbations of X and Z. The errors are in the
+    frame of the child's world if ``in_world``, else in the frame of the child.
     """
     predicted = se3.inverse(Z) @ stops.Ts_world_parent @ X
     measured = se3.inverse(stops.Ts_world_child)
@@ -251,9 +260,10 @@ def _linearise(
 def _variances(
     stops: Stops, squared: FloatArray, weights: FloatArray, degrees: float
 ) -> FloatArray:
-    """Return the variances (2,) of positions and rotations.
+    """Estimate the variances (2,) per axis of positions (m^2) and rotations (rad^2).
 
-    If all positions may fit exactly, both are one level, over the spread of the places.
+    Four stops or fewer do not determine both: the positions may fit exactly. Then the variance of
+    positions is that of rotations times the variance of the child's positions.
 
     Parameters
     ----------
@@ -261,32 +271,36 @@ def _variances(
     squared : (N, 2) array
         Squared errors of positions and rotations.
     weights : (N,) array
+        Weights of the stops.
     degrees : float
         Degrees of freedom of the Student-t distribution.
     """
     n = len(stops)
-    # Estimated values make the errors smaller.
+    # Degrees of freedom of either variance: the fit uses half of the twelve values for each.
     n_free = max(3.0 * n - 0.5 * _N_VALUES, 0.5)
-    # Sum of the weights at convergence. Variances that use it from the start settle sooner:
+    # Sum of the weights at convergence. The variances converge sooner if they are normalised by it:
     # C. Liu, D. B. Rubin, Y. N. Wu, *Parameter expansion to accelerate EM*, Biometrika 85, 1998.
     final_sum = ((degrees + 6.0) * n - 2.0 * n_free) / degrees
     means = final_sum / weights.sum() * (weights @ squared) / n_free
     if 3 * n <= _N_VALUES:
-        places_m2 = se3.translation_of(stops.Ts_world_child).var(axis=0).sum() + _SMALLEST_VARIANCE
+        places_m2 = se3.translation_of(stops.Ts_world_child).var(axis=0).sum() + _MIN_VARIANCE
         means = means @ [0.5 / places_m2, 0.5] * np.array([places_m2, 1.0])
-    return np.maximum(means, _SMALLEST_VARIANCE)
+    return np.maximum(means, _MIN_VARIANCE)
 
 
 def _products(rows: FloatArray) -> FloatArray:
-    """Return the products (n, n) of the columns of rows (N, 6, n)."""
+    """Return ``J' J`` (n, n) of stacked rows J (N, 6, n)."""
     columns = rows.reshape(-1, rows.shape[2])
     return columns.T @ columns
 
 
 def _gauss_newton_step(products: FloatArray) -> FloatArray:
-    """Return the step (n,) of the products (n + 1, n + 1) of derivatives and errors."""
+    """Return the Gauss-Newton step (n,).
+
+    ``products`` (n + 1, n + 1) are ``[J e]' [J e]`` of the whitened derivatives J and errors e.
+    """
     normal = products[:-1, :-1]
-    # Undetermined directions stay where they are.
+    # The step along unobservable directions is zero.
     damping = 1e-13 * np.trace(normal) * np.eye(len(normal))
     return -np.linalg.solve(normal + damping, products[:-1, -1])
 
@@ -298,7 +312,7 @@ def _fit(
     degrees: float,
     rests: FloatArray,
 ) -> RobotWorld:
-    """Estimate weights, variances and Gauss-Newton steps in turn.
+    """Fit X and Z by alternating variances, weights and Gauss-Newton steps.
 
     Parameters
     ----------
@@ -306,7 +320,7 @@ def _fit(
     start : two (4, 4) arrays
         X and Z to start from.
     in_world : bool
-        Whether errors are normal in the frame of the child's world, rather than in the child's.
+        Whether the errors are in the frame of the child's world, else in that of the child.
     degrees : float
         Degrees of freedom of the Student-t distribution.
     rests : (N,) array
@@ -315,7 +329,7 @@ def _fit(
     X, Z = start
     n = len(stops)
     weights = rests
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         errors, jacobian = _linearise(stops, X, Z, in_world)
         squared = np.sum(errors.reshape(n, 2, 3) ** 2, axis=2)
         variances = _variances(stops, squared, weights, degrees)
@@ -331,11 +345,10 @@ def _fit(
         converged = bool(-step @ products[:-1, -1] < _SMALL_STEP**2)
         if converged:
             break
-    # Information of normal errors under a Student-t likelihood: Lange, Little, Taylor, *Robust
-    # statistical modeling using the t distribution*, JASA 84, 1989, section 4.
+    # Expected information of the Student-t likelihood: Lange, Little, Taylor 1989, section 4.
     rows *= np.sqrt((degrees + 6.0) / (degrees + 8.0) * rests / weights)[:, None, None]
     fisher = _products(rows)[:-1, :-1]
-    # Prior of undetermined directions: a thousand times the errors of a stop.
+    # Prior of unobservable directions: a thousand times the standard deviations of a stop.
     weak_prior = np.diag(np.tile(np.repeat(1e-6 / variances, 3), 2))
     objective = 1.5 * n * np.log(variances).sum()
     objective += 0.5 * (degrees + 6.0) * rests @ np.log1p(distances / degrees)
@@ -357,18 +370,19 @@ def _fit(
 
 
 class _Stretch(NamedTuple):
-    """Effect of longer positions of the child, to first order.
+    """Effect of an unknown scale of the child's lengths, to first order.
 
     Attributes
     ----------
-    step, sigma : float
-        Share by which longer positions would fit best, and its standard deviation; infinite if the
-        stops do not determine it.
+    step : float
+        Relative change of the scale that would fit best.
+    sigma : float
+        Standard deviation of ``step``; infinite if the stops do not determine the scale.
     scores : (12, 12) array
-        Covariance that the unknown scale adds to the scores (the products of the errors and their
-        derivatives with respect to the values).
+        Covariance that the unknown scale adds to that of the scores ``J' e``, where J are the
+        whitened derivatives with respect to X and Z and e the whitened errors.
     inflation : float
-        Factor of the variance for lasting errors.
+        Factor by which errors that last over several stops increase the variance of the scale.
     """
 
     step: float
@@ -385,31 +399,35 @@ def _with_lasting_errors(
     views: FloatArray,
     stretch: float,
 ) -> RobotWorld:
-    """Return a fit with the covariance for lasting errors, and for targets of another size.
+    """Return a fit whose covariance allows for correlated errors and for an unknown scale.
+
+    Errors of stops may be correlated (last over several stops, or return with the place of the
+    arm). The covariance is ``H^-1 S H^-1`` with the information H and the covariance S of the
+    scores under these correlations (sandwich estimator).
 
     Parameters
     ----------
     stops : Stops
-        Those that were not left out.
+        Without outliers.
     fit : RobotWorld
     in_world : bool
-        Frame of the errors, as of :func:`_linearise`.
+        Whether the errors are in the frame of the child's world, else in that of the child.
     rests : (N,) array
         Weights of stops at one place.
     views : (N, 13) array
-        Of :func:`views_of`.
+        Views of the stops, from :func:`views_of_stops`.
     stretch : float
         Prior standard deviation of the scale, as a share.
     """
     rows = whitened_rows(stops, fit, in_world)
     weighted = rows * np.sqrt(fit.weights[fit.weights > 0.0])[:, None, None]
-    first = slice(_MOST_AT_ONCE)
-    shares = kernel_weights(kernels_of(views[first]), weighted[first])
-    # Covariance that lasting errors add to the scores of X, Z and the scale.
+    first = slice(_MAX_STOPS_AT_ONCE)
+    shares = kernel_weights(correlations(views[first]), weighted[first])
+    # Covariance that correlations add to the scores of X, Z and the scale.
     lasting = np.zeros((13, 13))
-    n_parts = -(-len(stops) // _MOST_AT_ONCE)
+    n_parts = -(-len(stops) // _MAX_STOPS_AT_ONCE)
     for part in np.array_split(np.arange(len(stops)), n_parts):
-        kernel = np.tensordot(shares, kernels_of(views[part]), 1)
+        kernel = np.tensordot(shares, correlations(views[part]), 1)
         kernel = rests[part, None] * kernel * rests[part] - np.diag(rests[part])
         by_values = np.swapaxes(rows[part, :, :13], 0, 1)
         lasting += np.einsum("kni,knj->ij", by_values, kernel @ by_values)
@@ -417,7 +435,7 @@ def _with_lasting_errors(
     whitened = np.sqrt(rests)[:, None, None] * weighted
     longer = _stretch_of(whitened.reshape(-1, 14), lasting, stretch)
     scores = lasting[:12, :12] + longer.scores
-    # Few stops hardly determine the levels.
+    # Few stops hardly determine the variances of the errors.
     level_factor = 1.0 + 2.0 / max(3.0 * len(stops) - 0.5 * _N_VALUES, 0.5)
     covariance = level_factor * (fit.covariance + fit.covariance @ scores @ fit.covariance)
     return replace(
@@ -430,10 +448,11 @@ def _with_lasting_errors(
 
 
 def whitened_rows(stops: Stops, fit: RobotWorld, in_world: bool) -> FloatArray:
-    """Return derivatives and errors (N, 6, 14) of stops, in units of their levels.
+    """Return derivatives and errors (N, 6, 14) of stops, over the standard deviations of errors.
 
-    The columns are the derivatives with respect to X and Z (12), that with respect to longer
-    positions of the child (1), and the errors (1).
+    The columns are the derivatives with respect to X and Z (12), the derivative with respect to the
+    scale of the child's lengths (1), and the errors (1). The errors are in the frame of the child's
+    world if ``in_world``, else in that of the child.
     """
     errors, jacobian = _linearise(stops, fit.T_parent_child, fit.T_world_world, in_world)
     by_length = np.zeros((len(stops), 6))
@@ -447,26 +466,26 @@ def whitened_rows(stops: Stops, fit: RobotWorld, in_world: bool) -> FloatArray:
 
 
 def _stretch_of(rows: FloatArray, lasting: FloatArray, stretch: float) -> _Stretch:
-    """Return the effect of longer positions of the child.
+    """Return the effect of an unknown scale of the child's lengths.
 
     Parameters
     ----------
     rows : (6 N, 14) array
-        Of :func:`whitened_rows`.
+        Weighted rows of :func:`whitened_rows`.
     lasting : (13, 13) array
-        Covariance that lasting errors add to the scores of X, Z and the scale.
+        Covariance that correlations of errors add to the scores of X, Z and the scale.
     stretch : float
         Prior standard deviation of the scale, as a share.
     """
     size = np.sum(rows**2)
     products = rows.T @ rows + 1e-12 * size * np.eye(14)
-    # What is left of longer positions and errors once X and Z are fitted.
+    # Components of the scale's derivative, and of the errors along it, that X and Z cannot explain.
     by_length, by_errors = np.linalg.cholesky(products)[12:, 12]
     direction = np.append(-np.linalg.solve(products[:12, :12], products[:12, 12]), 1.0)
     inflation = max(1.0 + float(direction @ lasting @ direction) / float(by_length**2), 1.0)
     step = 0.0
     sigma = math.inf
-    # What keeps the matrix definite is no information about the scale.
+    # The regularisation of ``products`` alone would give a value below this limit.
     if by_length > 2e-6 * math.sqrt(float(size)):
         step = -by_errors / by_length
         sigma = math.sqrt(inflation) / by_length

@@ -1,8 +1,8 @@
-"""Checks of stops that need their rotations alone: frozen poses, wrong rows, angles read otherwise.
+"""Checks of stops that use rotations only: frozen poses, wrong rows, wrong kinds of angles.
 
-Between any two stops both sensors rotate through the same angle, whatever the extrinsic is. So the
-matrices (N, N) of the angles between all stops are equal on both sides. Rows that do not belong
-together break this, and so do Euler angles that were read as rotation vectors.
+Between two stops both sensors rotate by the same angle, whatever the extrinsic is. So the matrices
+(N, N) of the angles between all stops are equal for parent and child. They differ if rows do not
+belong together, or if Euler angles were taken for rotation vectors.
 """
 
 from collections.abc import Callable, Iterator
@@ -15,8 +15,8 @@ from hand_eye_calib.core.base.stats import median, medians
 from hand_eye_calib.core.checks.findings import Finding, finding
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.stops.rough_fit import (
-    LEAST_TURN_RAD,
-    MOST_COMPARED,
+    MAX_COMPARED,
+    MIN_TURN_RAD,
     Mistakes,
     StopPoses,
     above_diagonal,
@@ -25,63 +25,65 @@ from hand_eye_calib.extras.stops.rough_fit import (
     rough_fit,
 )
 
-# Fewest stops that can contradict: four have twelve coordinates for seven unknown lengths.
-FEWEST_STOPS = 6
+# Fewest stops that are checked. Four stops have twelve coordinates, and seven lengths (translations
+# of X and Z, scale) fit to them: fewer than six stops hardly contradict any hypothesis.
+MIN_STOPS_TO_CHECK = 6
 
-# Rows in another order, or angles read otherwise, are right if the rotations agree so many times
-# better.
-CLEARLY_BETTER = 3.0
+# Another order of rows, or another kind of angles, is accepted if the median difference of the
+# angles between stops becomes smaller by this factor.
+MIN_IMPROVEMENT = 3.0
 
-# Largest unexplained shares of the rotations: explained, to be tried otherwise, and not belonging
-# together. Measured: three real arms (MoveIt, ETHZ, CamOdoCal) leave 0.015 to 0.07, simulated arms
-# 0.01, sides that do not belong together 0.5.
-EXPLAINED_SHARE = 0.04
-LARGEST_SHARE = 0.3
-UNRELATED_SHARE = 0.5
+# Unexplained shares (median residual over spread). Below the first limit the stops are explained.
+# Above the second one a hypothesis is wrong. Above the third one both sides do not belong together.
+# Measured: three real arms (MoveIt, ETHZ, CamOdoCal) have 0.015 to 0.07, simulated arms 0.01, sides
+# that do not belong together 0.5.
+SMALL_UNEXPLAINED = 0.04
+MAX_UNEXPLAINED = 0.3
+UNRELATED_UNEXPLAINED = 0.5
 
-# A repeated pose differs from the one before by less than this (m, rad), by rounding.
+# Largest difference (m, rad) between a pose and the one before if it is a repetition: rounding.
 _ROUNDING = 1e-6
 
-# Largest shift of rows that is tried.
-_LARGEST_SHIFT = 3
+# Largest number of rows by which one side is shifted for a test.
+_MAX_SHIFT = 3
 
-# Gain of log likelihood for each pair of stops from which on a block of rows is shifted. Measured
-# on 7 to 30 stops of KinHEC and of simulated arms: at most 0.21 without a fault; 0.4 or more in
-# 99 % of the sets with a missing row.
-_LEAST_BLOCK_GAIN = 0.3
+# Rows are shifted from some row on if this increases the log likelihood, for each pair of stops, by
+# more than this limit. Measured on 7 to 30 stops of KinHEC and of simulated arms: at most 0.21
+# without a fault; 0.4 or more in 99 % of the sets with a missing row.
+_MIN_BLOCK_GAIN = 0.3
 
-# Readings of angles that leave less than this times the smallest difference agree equally well.
-_ABOUT_EQUAL = 1.5
+# Kinds of angles whose differences are within this factor of the smallest one agree equally well.
+_MAX_EQUAL_RATIO = 1.5
 
-# Random orders of rows that are compared with the given one.
-_RANDOM_ORDERS = 8
+# Number of random orders of rows that the given order is compared with.
+_N_RANDOM_ORDERS = 8
 
 _BOTH_WAYS = (("parent", "child"), ("child", "parent"))
 
 
 def check_frozen(poses: StopPoses) -> Iterator[Finding]:
-    """Yield a finding for a side that repeats its pose while the other side rotates."""
+    """Yield a finding for each side that repeats a pose while the other side rotates."""
     for stream, other in _BOTH_WAYS:
         own = getattr(poses, stream)
         others = se3.rotation_of(getattr(poses, other))
         steps = se3.log(se3.inverse(own[:-1]) @ own[1:])
         is_repeated = np.abs(steps).max(axis=1) < _ROUNDING
         turns_rad = se3.rotation_angle(np.swapaxes(others[:-1], 1, 2) @ others[1:])
-        share = float(np.mean(is_repeated & (turns_rad > LEAST_TURN_RAD)))
+        share = float(np.mean(is_repeated & (turns_rad > MIN_TURN_RAD)))
         if share == 0.0:
             continue
-        is_frozen_throughout = is_repeated.all() and median(turns_rad) > LEAST_TURN_RAD
+        is_frozen_throughout = is_repeated.all() and median(turns_rad) > MIN_TURN_RAD
         share = 1.0 if is_frozen_throughout else min(share, 0.99)
         yield finding("frozen_stops", stream, share=share)
 
 
 def check_rows(poses: StopPoses) -> Iterator[Finding]:
-    """Yield a finding if the sides agree only with rows shifted or in another order."""
-    of_parent = angles_between(poses.parent[:MOST_COMPARED])
-    of_child = angles_between(poses.child[:MOST_COMPARED])
+    """Yield a finding if rotations of both sides agree only with rows shifted or reordered."""
+    of_parent = angles_between(poses.parent[:MAX_COMPARED])
+    of_child = angles_between(poses.child[:MAX_COMPARED])
     difference_rad = median_difference(of_parent, of_child)
     best = ""
-    smallest_rad = difference_rad / CLEARLY_BETTER
+    smallest_rad = difference_rad / MIN_IMPROVEMENT
     for order in _usual_orders(len(of_parent)):
         reordered_parent = of_parent[np.ix_(order.parent_rows, order.parent_rows)]
         reordered_child = of_child[np.ix_(order.child_rows, order.child_rows)]
@@ -89,15 +91,15 @@ def check_rows(poses: StopPoses) -> Iterator[Finding]:
         if reordered_rad < smallest_rad:
             best = order.text
             smallest_rad = reordered_rad
-    # Poses that hardly differ agree in any order.
-    if best and difference_rad > LEAST_TURN_RAD / 2:
+    # If the orientations hardly differ, any order agrees.
+    if best and difference_rad > MIN_TURN_RAD / 2:
         yield finding("rows", text=best)
     else:
         yield from _check_shifted_block(of_parent, of_child)
 
 
 class _Order(NamedTuple):
-    """An order of rows in which both sides may belong together."""
+    """Rows of the parent and of the child that may belong together, and the order as text."""
 
     text: str
     parent_rows: IntArray
@@ -105,10 +107,10 @@ class _Order(NamedTuple):
 
 
 def _usual_orders(n: int) -> Iterator[_Order]:
-    """Yield the orders of n rows that usual mistakes lead to."""
+    """Yield orders of n rows that undo usual mistakes: shifts, reversal, files sorted by name."""
     rows = np.arange(n)
-    for shift in range(1, _LARGEST_SHIFT + 1):
-        if n - shift < FEWEST_STOPS:
+    for shift in range(1, _MAX_SHIFT + 1):
+        if n - shift < MIN_STOPS_TO_CHECK:
             continue
         by_rows = "by 1 row" if shift == 1 else f"by {shift} rows"
         later = rows[shift:]
@@ -126,7 +128,7 @@ def _usual_orders(n: int) -> Iterator[_Order]:
 
 
 def _check_shifted_block(of_parent: FloatArray, of_child: FloatArray) -> Iterator[Finding]:
-    """Yield a finding if rows agree from some row on only with one side shifted by one row.
+    """Yield a finding if one side misses a row: from there on, its rows are shifted by one.
 
     Parameters
     ----------
@@ -135,23 +137,23 @@ def _check_shifted_block(of_parent: FloatArray, of_child: FloatArray) -> Iterato
     """
     blocks = [_likeliest_block(of_parent, of_child), _likeliest_block(of_child, of_parent)]
     gain, first_row = max(blocks)
-    if gain > _LEAST_BLOCK_GAIN:
+    if gain > _MIN_BLOCK_GAIN:
         text = f"from row {first_row + 1} on if one side is moved by one row"
         yield finding("rows", text=text)
 
 
-def _likeliest_block(of_one: FloatArray, of_other: FloatArray) -> tuple[float, int]:
-    """Return gain and first row of the likeliest block in which row i belongs to row i + 1.
+def _likeliest_block(angles: FloatArray, angles_of_other: FloatArray) -> tuple[float, int]:
+    """Return the gain of shifting the likeliest block of rows by one, and its first row.
 
-    The gain is that of the log likelihood, per pair of stops.
-
-    Differences of the angles (N, N) between stops have a Cauchy distribution. Its scale is the
-    20 % quantile in place or shifted by one row: whichever is smaller.
+    In the block, which reaches to the last row, row i of ``angles`` (N, N) belongs to row i + 1 of
+    ``angles_of_other``. The gain of log likelihood is per pair of stops. Differences of angles have
+    a Cauchy distribution. Its scale is their 20 % quantile without or with the shift, whichever is
+    smaller.
     """
-    in_place = np.abs(of_one - of_other)[:-1, :-1]
-    shifted = np.abs(of_one[:-1, :-1] - of_other[1:, 1:])
-    # Between a row in place and a shifted row.
-    across = np.abs(of_one[:-1, :-1] - of_other[:-1, 1:])
+    in_place = np.abs(angles - angles_of_other)[:-1, :-1]
+    shifted = np.abs(angles[:-1, :-1] - angles_of_other[1:, 1:])
+    # Angles between a row before the block and a row in the block.
+    across = np.abs(angles[:-1, :-1] - angles_of_other[:-1, 1:])
     quantiles_rad = [np.quantile(above_diagonal(off), 0.2) for off in (in_place, shifted)]
     scale_rad = min(quantiles_rad) + _ROUNDING
     in_place, shifted, across = [
@@ -166,7 +168,7 @@ def _likeliest_block(of_one: FloatArray, of_other: FloatArray) -> tuple[float, i
     return float(gain), int(np.argmin(costs))
 
 
-# ------------------------------------------------------------------ angles read otherwise
+# ------------------------------------------------------------------ kinds of angles
 
 _Conversion: TypeAlias = Callable[[FloatArray], FloatArray]
 
@@ -189,16 +191,17 @@ def _reversed_angles(rotations: FloatArray) -> FloatArray:
 
 
 def _long_vectors(rotations: FloatArray) -> FloatArray:
-    """Return the rotation vectors (N, 3) beyond half a turn of the same rotations."""
+    """Return rotation vectors (N, 3) longer than half a turn: the same rotations the other way."""
     vectors = se3.rotation_log(rotations)
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True) + 1e-12
     return np.asarray(vectors * (1.0 - 2.0 * np.pi / lengths))
 
 
 def _vectors_of_one_sign(rotations: FloatArray) -> FloatArray:
-    """Return rotation vectors (N, 3) with one sign along their main axis.
+    """Return rotation vectors (N, 3) with the same sign along their main axis.
 
-    The rotation vectors of a tool that points down are near half a turn, of one sign.
+    Rotations of a tool that points down are near half a turn, where the sign of a rotation vector
+    is arbitrary. Robots print them with one sign.
     """
     vectors = se3.rotation_log(rotations)
     main_axis = int(np.argmax(medians(np.abs(vectors.T))))
@@ -211,7 +214,7 @@ _FIXED = "angles about the fixed axes x, y, z (roll, pitch, yaw)"
 _MOVING = "angles about the moving axes x, y, z"
 _REVERSED = "angles about the fixed axes x, y, z in the order yaw, pitch, roll (A, B, C)"
 
-# Rotations (N, 3, 3) of three numbers (N, 3), by what the numbers are.
+# For each kind of angles: the function from three numbers (N, 3) to rotations (N, 3, 3).
 _ROTATIONS_OF: dict[str, _Conversion] = {
     _VECTORS: se3.rotation_exp,
     _FIXED: se3.rotation_from_rpy,
@@ -219,7 +222,8 @@ _ROTATIONS_OF: dict[str, _Conversion] = {
     _REVERSED: _rotations_of_reversed_angles,
 }
 
-# The three numbers of rotations, by what the numbers are; vectors are ambiguous by a turn.
+# For each kind of angles: the function from rotations to three numbers. Rotation vectors are
+# ambiguous by a full turn, so they have three functions.
 _NUMBERS_OF: tuple[tuple[str, _Conversion], ...] = (
     (_VECTORS, se3.rotation_log),
     (_VECTORS, _long_vectors),
@@ -230,8 +234,11 @@ _NUMBERS_OF: tuple[tuple[str, _Conversion], ...] = (
 )
 
 
-class _AngleReading(NamedTuple):
-    """Another reading of the numbers of one side's rotations."""
+class _AngleKind(NamedTuple):
+    """Rotations of one side with their three numbers taken for another kind of angles.
+
+    ``difference_rad`` is the median difference of the angles between stops to the other side's.
+    """
 
     difference_rad: float
     stream: str
@@ -239,42 +246,42 @@ class _AngleReading(NamedTuple):
     poses: StopPoses
 
     @property
-    def unexplained(self) -> float:
-        """Share that a rough fit leaves unexplained with these rotations."""
-        fits = [rough_fit(self.poses, Mistakes(is_inverse=way)) for way in (False, True)]
-        return min(fit.unexplained for fit in fits)
+    def unexplained_share(self) -> float:
+        """Unexplained share of the better setup with these rotations."""
+        fits = [
+            rough_fit(self.poses, Mistakes(is_inverse=is_inverse)) for is_inverse in (False, True)
+        ]
+        return min(fit.unexplained_share for fit in fits)
 
 
 def check_angles(poses: StopPoses) -> Iterator[Finding]:
-    """Yield a finding if the rotations agree only with their numbers read as other angles, or in no
-    way.
-    """
+    """Yield a finding if rotations agree only as another kind of angles, or do not agree at all."""
     sample = poses.sample()
     of_parent = angles_between(sample.parent)
     of_child = angles_between(sample.child)
     difference_rad = median_difference(of_parent, of_child)
     turn_rad = max(median(above_diagonal(of_parent)), median(above_diagonal(of_child)))
-    are_equal = difference_rad < LARGEST_SHARE * LEAST_TURN_RAD
-    if are_equal or difference_rad < EXPLAINED_SHARE * turn_rad:
+    are_equal = difference_rad < MAX_UNEXPLAINED * MIN_TURN_RAD
+    if are_equal or difference_rad < SMALL_UNEXPLAINED * turn_rad:
         return
-    within_rad = min(difference_rad / CLEARLY_BETTER, LARGEST_SHARE * turn_rad)
-    readings = [*_readings(sample, "parent", of_child), *_readings(sample, "child", of_parent)]
-    agreeing = [reading for reading in readings if reading.difference_rad < within_rad]
+    within_rad = min(difference_rad / MIN_IMPROVEMENT, MAX_UNEXPLAINED * turn_rad)
+    kinds = [*_other_kinds(sample, "parent", of_child), *_other_kinds(sample, "child", of_parent)]
+    agreeing = [kind for kind in kinds if kind.difference_rad < within_rad]
     if agreeing:
-        smallest_rad = min(reading.difference_rad for reading in agreeing)
-        best = [
-            reading for reading in agreeing if reading.difference_rad <= _ABOUT_EQUAL * smallest_rad
-        ]
-        chosen = min(best, key=lambda reading: reading.unexplained)
+        smallest_rad = min(kind.difference_rad for kind in agreeing)
+        best = [kind for kind in agreeing if kind.difference_rad <= _MAX_EQUAL_RATIO * smallest_rad]
+        chosen = min(best, key=lambda kind: kind.unexplained_share)
         yield finding("angles", chosen.stream, detail=chosen.text)
-    elif difference_rad > LEAST_TURN_RAD and _are_unrelated(of_parent, of_child):
+    elif difference_rad > MIN_TURN_RAD and _are_unrelated(of_parent, of_child):
         yield finding("unrelated_stops", off_deg=float(np.degrees(difference_rad)))
 
 
-def _readings(sample: StopPoses, stream: str, of_other: FloatArray) -> Iterator[_AngleReading]:
-    """Yield other readings of the rotations of a stream.
+def _other_kinds(
+    sample: StopPoses, stream: str, angles_of_other: FloatArray
+) -> Iterator[_AngleKind]:
+    """Yield the rotations of a stream, taken for each other kind of angles.
 
-    ``of_other`` has the angles (N, N) between the stops of the other side, rad.
+    ``angles_of_other`` are the angles (N, N) between the stops of the other stream, rad.
     """
     Ts = getattr(sample, stream)
     for read_as, numbers_of in _NUMBERS_OF:
@@ -284,8 +291,8 @@ def _readings(sample: StopPoses, stream: str, of_other: FloatArray) -> Iterator[
                 continue
             rotations = rotations_of(numbers)
             reread = se3.from_rotation_translation(rotations, se3.translation_of(Ts))
-            yield _AngleReading(
-                difference_rad=median_difference(angles_between(reread), of_other),
+            yield _AngleKind(
+                difference_rad=median_difference(angles_between(reread), angles_of_other),
                 stream=stream,
                 text=f"{meant}, not {read_as}",
                 poses=sample.with_side(stream, reread),
@@ -293,11 +300,11 @@ def _readings(sample: StopPoses, stream: str, of_other: FloatArray) -> Iterator[
 
 
 def _are_unrelated(of_parent: FloatArray, of_child: FloatArray) -> bool:
-    """Return whether both sides agree hardly better than in random orders of the rows."""
+    """Return whether both sides agree hardly better than with their rows in random order."""
     random = np.random.default_rng(0)
     in_random_order_rad = []
-    for _ in range(_RANDOM_ORDERS):
+    for _ in range(_N_RANDOM_ORDERS):
         rows = random.permutation(len(of_child))
         in_random_order_rad.append(median_difference(of_parent, of_child[np.ix_(rows, rows)]))
     difference_rad = median_difference(of_parent, of_child)
-    return difference_rad > UNRELATED_SHARE * median(in_random_order_rad)
+    return difference_rad > UNRELATED_UNEXPLAINED * median(in_random_order_rad)

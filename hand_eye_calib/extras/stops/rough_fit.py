@@ -1,10 +1,11 @@
-"""Robust closed-form fit of stops under an assumed mistake of their conventions.
+"""Fast robust fit of stops, to test a hypothesis about their conventions.
 
+A hypothesis is a mistake, such as a wrong order of quaternions, that is undone before the fit.
 Stops obey ``A_i X = Z B_i``, see :mod:`hand_eye_calib.extras.stops.robot_world`. Rotations are
-fitted first, by M. Shah's closed form with Cauchy weights. Then the translations of X and Z, and a
-factor s of the child's lengths, follow from a robust linear regression of
-``R_A t_X - t_Z - s R_Z t_B = -t_A``. The residuals are compared with the spread of the poses, and
-with the errors of positions that the errors of the rotations cause.
+fitted first, by M. Shah's closed form with Cauchy weights. Translations of X and Z, and a scale s
+of the child's lengths, follow from a robust linear regression of
+``R_A t_X - t_Z - s R_Z t_B = -t_A``. Right conventions leave small residuals: small beside the
+spread of the poses, and as small as errors of the rotations let expect.
 """
 
 from dataclasses import dataclass, replace
@@ -17,28 +18,28 @@ from hand_eye_calib.core.checks.findings import CONVENTIONS
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.stops.closed_form import Stops, closest_rotations
 
-# Largest number of stops that are compared with each other: the time grows with its square.
-MOST_COMPARED = 150
+# Largest number of stops that are compared with each other. The time grows with its square.
+MAX_COMPARED = 150
 
-# Rounds of reweighting of a fit.
-_ROUNDS = 8
+# Iterations of the robust weights of a fit.
+_MAX_ROUNDS = 8
 
-# A hand or a target that rotates less than this between stops (rad) hardly rotates: 3 deg.
-LEAST_TURN_RAD = 0.05
+# Rotations between stops below this angle (rad, 3 deg) are too small to judge conventions.
+MIN_TURN_RAD = 0.05
 
-# Division by a length (m) or an angle (rad) of exact poses.
+# Smallest divisor, where lengths (m) or angles (rad) of poses without noise may be zero.
 _TINY = 1e-12
 
-# A mistake, or a factor of lengths, is certain if the log likelihood gains this much, and the
-# logarithm of 2 for each of the three coordinates of each stop. Measured: mistakes in 30 stops of
-# KinHEC with strong noise gain 190 to 400, where 62 are asked for.
-_LEAST_GAIN = 36.0
+# A mistake is certain if undoing it increases the log likelihood by at least both of these: a
+# constant, and log 2 for each coordinate (three for each stop), as if the errors were halved.
+# Measured: mistakes in 30 stops of KinHEC with strong noise gain 190 to 400; the limit is 62 there.
+_MIN_GAIN = 36.0
 _GAIN_PER_COORDINATE = float(np.log(2.0))
 
 
 @dataclass(frozen=True)
 class StopPoses:
-    """Poses of both sensors at N stops, in the conventions of their source.
+    """Poses of both sensors at N stops, in the conventions of the user's files.
 
     Attributes
     ----------
@@ -46,7 +47,7 @@ class StopPoses:
         Poses of the parent sensor in its world, and of the child sensor in its own world. For an
         arm: poses of the hand in the base, and of the target in the camera.
     is_arm : bool
-        True for an arm: both setups are tried, a camera on the hand and beside the robot.
+        True for an arm: the camera may be on the hand or beside the robot.
     has_positions : bool
         False if only the rotations are known.
     """
@@ -60,14 +61,14 @@ class StopPoses:
         return len(self.parent)
 
     @property
-    def ways(self) -> tuple[bool, ...]:
-        """Values of ``Mistakes.is_inverse`` that are no mistake."""
+    def possible_inversions(self) -> tuple[bool, ...]:
+        """Values of ``Mistakes.is_inverse`` that are possible without a mistake."""
         return (False, True) if self.is_arm else (False,)
 
     def sample(self) -> "StopPoses":
-        """Return at most 150 of the stops, evenly spread."""
+        """Return at most ``MAX_COMPARED`` of the stops, evenly spread."""
         n = len(self)
-        rows = np.unique(np.linspace(0, n - 1, min(n, MOST_COMPARED)).astype(np.int64))
+        rows = np.unique(np.linspace(0, n - 1, min(n, MAX_COMPARED)).astype(np.int64))
         return replace(self, parent=self.parent[rows], child=self.child[rows])
 
     def with_side(self, stream: str, Ts: FloatArray) -> "StopPoses":
@@ -75,7 +76,7 @@ class StopPoses:
         return replace(self, parent=Ts) if stream == "parent" else replace(self, child=Ts)
 
     def without(self, mistakes: "Mistakes", scale: float = 1.0) -> Stops:
-        """Return A and B of ``A X = Z B`` with mistakes undone and the child's lengths scaled."""
+        """Return stops of ``A X = Z B``, with mistakes undone and the child's lengths scaled."""
         A = _in_usual_convention(self.parent, mistakes.parent)
         B = _in_usual_convention(scaled(self.child, scale), mistakes.child)
         if self.is_arm:
@@ -87,12 +88,12 @@ class StopPoses:
 
 @dataclass(frozen=True)
 class Mistakes:
-    """Assumed mistakes of the conventions of stops.
+    """Hypothesis about mistakes in the conventions of stops.
 
     Attributes
     ----------
     parent, child : str
-        Codes of the conventions that are wrong, keys of ``CONVENTIONS``; empty for none.
+        Mistake of each side, a key of ``CONVENTIONS`` such as ``quaternion_order``; empty for none.
     is_inverse : bool
         Whether one side has inverse poses. For an arm: whether the camera is beside the robot.
     """
@@ -109,53 +110,55 @@ class Mistakes:
 
 @dataclass(frozen=True)
 class RoughFit:
-    """Quality of a robust closed-form fit of ``A X = Z B``.
+    """Quality of a rough fit of ``A X = Z B`` under a hypothesis.
 
     Attributes
     ----------
     mistakes : Mistakes
-        Undone before the fit.
-    turning, placing : float
-        Unexplained shares of the rotations and of the positions: median residual over spread.
-    beyond : float
-        Median residual of the positions over the error that the rotation residuals cause.
+        Hypothesis: mistakes that were undone before the fit.
+    rotation_share, position_share : float
+        Unexplained shares of the rotations and of the positions: median residual over spread. A
+        perfect fit has 0; sides that do not belong together have about 1.
+    position_ratio : float
+        Median residual of the positions, over the position error that errors of the rotations cause
+        at the distance of the target.
     scale : float or None
         Factor of the child's lengths; None if the stops do not determine it.
     log_likelihood : float
-        Of the median residuals, up to a constant.
+        Log likelihood of the median residuals, up to a constant.
     """
 
     mistakes: Mistakes
-    turning: float
-    placing: float
-    beyond: float = 0.0
+    rotation_share: float
+    position_share: float
+    position_ratio: float = 0.0
     scale: float | None = None
     log_likelihood: float = 0.0
 
     @property
-    def unexplained(self) -> float:
-        """The larger one of both shares."""
-        return max(self.turning, self.placing)
+    def unexplained_share(self) -> float:
+        """Larger of the unexplained shares of rotations and positions."""
+        return max(self.rotation_share, self.position_share)
 
 
-def certain_gain(n_stops: int) -> float:
-    """Return the gain of log likelihood from which on a mistake in so many stops is certain."""
-    return max(_LEAST_GAIN, 3.0 * n_stops * _GAIN_PER_COORDINATE)
+def min_certain_gain(n_stops: int) -> float:
+    """Return the smallest gain of log likelihood that makes a mistake in n stops certain."""
+    return max(_MIN_GAIN, 3.0 * n_stops * _GAIN_PER_COORDINATE)
 
 
 def scaled(Ts: FloatArray, factor: float) -> FloatArray:
-    """Return poses (N, 4, 4) with their lengths multiplied by a factor."""
+    """Return poses (N, 4, 4) with their translations multiplied by a factor."""
     return se3.from_rotation_translation(se3.rotation_of(Ts), factor * se3.translation_of(Ts))
 
 
 def angles_between(Ts: FloatArray) -> FloatArray:
-    """Return the angles (N, N), rad, of the rotations between stops."""
+    """Return the angles (N, N) of the rotations between all pairs of stops, rad."""
     quats = se3.to_quat_xyzw(Ts)
     return np.asarray(2.0 * np.arccos(np.clip(np.abs(quats @ quats.T), 0.0, 1.0)))
 
 
 def above_diagonal(angles: FloatArray) -> FloatArray:
-    """Return the values of a symmetric matrix (N, N) above its diagonal."""
+    """Return the N (N - 1) / 2 values of a matrix (N, N) above its diagonal."""
     return np.asarray(angles[np.triu_indices(len(angles), 1)])
 
 
@@ -165,26 +168,26 @@ def median_difference(first: FloatArray, second: FloatArray) -> float:
 
 
 def spread(positions: FloatArray) -> float:
-    """Return the median distance (m) of positions (N, 3) from their median."""
+    """Return the median distance (m) of positions (N, 3) from their median position."""
     return median(np.linalg.norm(positions - medians(positions.T), axis=1))
 
 
 def turns_about_two_axes(Ts: FloatArray) -> bool:
-    """Return whether poses (N, 4, 4) differ by 3 deg or more about at least two axes."""
+    """Return whether the orientations (N, 4, 4) vary by more than 3 deg (rms) about two axes."""
     rotations = se3.rotation_of(Ts)
     central = rotations[int(np.argmin(medians(angles_between(Ts))))]
     vectors = se3.rotation_log(central.T @ rotations)
     sizes_rad = np.linalg.svd(vectors, compute_uv=False) / np.sqrt(len(vectors))
-    return bool(sizes_rad[1] > LEAST_TURN_RAD)
+    return bool(sizes_rad[1] > MIN_TURN_RAD)
 
 
 def rough_fit(poses: StopPoses, mistakes: Mistakes) -> RoughFit:
-    """Fit stops with mistakes undone, with a factor of the child's lengths if it is determined."""
+    """Fit stops with mistakes undone, and a scale of the child's lengths if it is determined."""
     stops = poses.without(mistakes)
     A = stops.Ts_world_parent
     B = stops.Ts_world_child
     weights = np.ones(len(A))
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         X, Z = closest_rotations(se3.rotation_of(A), se3.rotation_of(B), weights)
         angles_rad = se3.rotation_angle(
             np.swapaxes(Z @ se3.rotation_of(B), 1, 2) @ se3.rotation_of(A) @ X
@@ -192,25 +195,25 @@ def rough_fit(poses: StopPoses, mistakes: Mistakes) -> RoughFit:
         weights = robust_weights("cauchy", (angles_rad / max(median(angles_rad), _TINY)) ** 2)
     error_rad = median(angles_rad)
     turns_rad = [median(above_diagonal(angles_between(Ts))) for Ts in (A, B)]
-    # Rotations of few degrees are not judged: noise may be as large.
-    turning = error_rad / max(*turns_rad, LEAST_TURN_RAD)
+    # Noise may be as large as rotations of few degrees, so the share is limited for these.
+    rotation_share = error_rad / max(*turns_rad, MIN_TURN_RAD)
     if not poses.has_positions:
-        return RoughFit(mistakes, turning, 0.0)
-    placing, error_m, scale = _fit_positions(A, B, Z)
+        return RoughFit(mistakes, rotation_share, 0.0)
+    position_share, error_m, scale = _fit_positions(A, B, Z)
     distance_m = (scale or 1.0) * median(np.linalg.norm(se3.translation_of(B), axis=1))
     logs = np.log(max(error_rad, _TINY)) + np.log(max(error_m, _TINY))
     return RoughFit(
         mistakes=mistakes,
-        turning=turning,
-        placing=placing,
-        beyond=error_m / max(error_rad * distance_m, _TINY),
+        rotation_share=rotation_share,
+        position_share=position_share,
+        position_ratio=error_m / max(error_rad * distance_m, _TINY),
         scale=scale,
         log_likelihood=-3.0 * len(A) * float(logs),
     )
 
 
 def _in_usual_convention(Ts: FloatArray, code: str) -> FloatArray:
-    """Return poses with the mistake of a code undone."""
+    """Return poses with one mistake, a key of ``CONVENTIONS``, undone; unchanged if it is empty."""
     if not code:
         return Ts
     option, value = CONVENTIONS[code]
@@ -220,8 +223,9 @@ def _in_usual_convention(Ts: FloatArray, code: str) -> FloatArray:
 def _fit_positions(
     A: FloatArray, B: FloatArray, R_Z: FloatArray
 ) -> tuple[float, float, float | None]:
-    """Return the unexplained share of the positions, their median residual (m), and the factor of
-    the child's lengths; None if the stops do not determine the factor.
+    """Return unexplained share and median residual (m) of the positions, and the child's scale.
+
+    The scale is a factor of the child's lengths; None if the stops do not determine it.
     """
     of_parent = se3.translation_of(A)
     of_child = se3.translation_of(B) @ R_Z.T
@@ -231,16 +235,20 @@ def _fit_positions(
     error_of_none, _ = _regression(levers, of_parent)
     error_of_free, values = _regression(with_factor, of_parent)
     scale = float(values[6])
-    gain = certain_gain(len(A)) / (3.0 * len(A))
+    gain = min_certain_gain(len(A)) / (3.0 * len(A))
     if scale > 0.0 and error_of_none > error_of_free * np.exp(gain):
         smaller_spread = min(spread(of_parent), scale * spread(of_child))
         return error_of_free / max(smaller_spread, _TINY), error_of_free, scale
-    # A hand that moves about one point, or a fault: one unit of length.
+    # The scale is not determined: the hand only rotates about one point, or there is a mistake.
+    # Then both sides must have one unit of length.
     error, _ = _regression(levers, of_parent - of_child)
     return error / max(spread(of_parent), spread(of_child), _TINY), error, None
 
 
 def _regression(rows: FloatArray, positions: FloatArray) -> tuple[float, FloatArray]:
-    """Return the median length of ``rows @ values + positions``, and the robust values (k,)."""
-    values, lengths = robust_regression("cauchy", rows, -positions, _ROUNDS, median)
+    """Return the median residual (m) of ``rows @ values = -positions``, and the values (k,).
+
+    The regression is robust (Cauchy weights). ``rows`` (N, 3, k), ``positions`` (N, 3).
+    """
+    values, lengths = robust_regression("cauchy", rows, -positions, _MAX_ROUNDS, median)
     return median(lengths), values

@@ -13,7 +13,7 @@ from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.checks.findings import Finding, finding, repair_message
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.records import gravest_first, has_error
-from hand_eye_calib.extras.stops.checks import LEAST_LEAD, Examination, examine
+from hand_eye_calib.extras.stops.checks import MIN_LEAD, Examination, examine
 from hand_eye_calib.extras.stops.closed_form import Stops
 from hand_eye_calib.extras.stops.robot_world import RobotWorld, solve
 from hand_eye_calib.extras.stops.rough_fit import (
@@ -26,23 +26,23 @@ from hand_eye_calib.extras.stops.worlds import SETUPS
 
 # A scale is not 1 if its likelihood is that of so many standard deviations, and if it differs by
 # this share.
-_SCALE_SIGMAS = 3.0
-_SCALE_SHARE = 0.01
+_MIN_SCALE_SIGMAS = 3.0
+_MIN_SCALE_CHANGE = 0.01
 
 # A scale beyond this factor is not that of a target of another size.
-_LARGEST_SIZE = 10.0
+_MAX_SIZE_RATIO = 10.0
 
 # Rounds of the search for the scale; a step below this share of a standard deviation ends it.
-_SCALE_ROUNDS = 10
+_MAX_SCALE_ROUNDS = 10
 _SMALL_STEP = 0.02
 
 # Stops whose median rotation is larger than this (rad; 10 deg) determine all directions, unless
 # their errors are larger than those of any camera.
-_FAR_RAD = 0.17
+_LARGE_TURN_RAD = 0.17
 
 
 @dataclass(frozen=True)
-class Reading:
+class SetupFit:
     """Stops read with the camera at one place, and their fit.
 
     Attributes
@@ -69,7 +69,7 @@ class Reading:
 class SolvedStops:
     """Solved stops: their reading, and the options, findings and warnings that lead to it."""
 
-    reading: Reading
+    setup_fit: SetupFit
     config: CalibratorConfig
     findings: tuple[Finding, ...]
     warnings: tuple[str, ...]
@@ -132,18 +132,20 @@ def solve_checked(
     repaired = _repaired(poses, config)
     poses = repaired.poses
     findings = repaired.findings
-    reading = _likelier_reading(poses, repaired.rough_scale, setup)
-    if setup and reading.lead < -LEAST_LEAD:
-        other = "hand" if reading.is_inverse else "beside"
+    setup_fit = _likelier_setup(poses, repaired.rough_scale, setup)
+    if setup and setup_fit.lead < -MIN_LEAD:
+        other = "hand" if setup_fit.is_inverse else "beside"
         findings.insert(0, finding("setup", place=SETUPS[setup], other=SETUPS[other]))
-    reading = _with_settled_scale(reading, repaired, setup)
-    findings += _check_unknown(poses, reading.fit, findings)
-    reading = replace(
-        reading,
-        scale=repaired.unit * reading.scale,
-        scale_sigma=repaired.unit * reading.scale_sigma,
+    setup_fit = _with_checked_scale(setup_fit, repaired, setup)
+    findings += _check_unknown(poses, setup_fit.fit, findings)
+    setup_fit = replace(
+        setup_fit,
+        scale=repaired.unit * setup_fit.scale,
+        scale_sigma=repaired.unit * setup_fit.scale_sigma,
     )
-    return SolvedStops(reading, repaired.config, gravest_first(findings), tuple(repaired.warnings))
+    return SolvedStops(
+        setup_fit, repaired.config, gravest_first(findings), tuple(repaired.warnings)
+    )
 
 
 # ------------------------------------------------------------------ options and repairs
@@ -227,22 +229,22 @@ def _options_of(repairs: Sequence[Finding], config: CalibratorConfig) -> dict[st
 # ------------------------------------------------------------------ setup and scale
 
 
-def _likelier_reading(poses: StopPoses, scale: float, setup: str | None) -> Reading:
+def _likelier_setup(poses: StopPoses, scale: float, setup: str | None) -> SetupFit:
     """Return the likelier reading of stops, or the reading of a setup.
 
     The lead of a setup is negative if the other one is likelier.
     """
-    readings = []
-    for is_inverse in poses.ways:
+    setup_fits = []
+    for is_inverse in poses.possible_inversions:
         stops = poses.without(Mistakes(is_inverse=is_inverse), scale)
-        readings.append(Reading(solve(stops), stops, is_inverse, scale))
+        setup_fits.append(SetupFit(solve(stops), stops, is_inverse, scale))
     if not poses.is_arm:
-        return readings[0]
+        return setup_fits[0]
     if setup is None:
-        readings.sort(key=lambda reading: reading.fit.objective)
+        setup_fits.sort(key=lambda setup_fit: setup_fit.fit.objective)
     elif setup == "beside":
-        readings.reverse()
-    chosen, other = readings
+        setup_fits.reverse()
+    chosen, other = setup_fits
     return replace(chosen, lead=other.fit.objective - chosen.fit.objective)
 
 
@@ -251,11 +253,11 @@ def _determines_scale(poses: StopPoses, findings: Sequence[Finding]) -> bool:
     return not has_error(findings) and poses.has_positions and turns_about_two_axes(poses.parent)
 
 
-def _with_free_scale(poses: StopPoses, reading: Reading) -> Reading:
+def _with_estimated_scale(poses: StopPoses, setup_fit: SetupFit) -> SetupFit:
     """Return a reading with the factor of the child's lengths estimated."""
-    mistakes = Mistakes(is_inverse=reading.is_inverse)
-    scale = reading.scale
-    for _ in range(_SCALE_ROUNDS):
+    mistakes = Mistakes(is_inverse=setup_fit.is_inverse)
+    scale = setup_fit.scale
+    for _ in range(_MAX_SCALE_ROUNDS):
         stops = poses.without(mistakes, scale)
         fit = solve(stops, stretch=np.inf)
         if not np.isfinite(fit.scale_sigma):
@@ -264,10 +266,10 @@ def _with_free_scale(poses: StopPoses, reading: Reading) -> Reading:
             break
         scale *= 1.0 + float(np.clip(fit.scale_step, -0.5, 1.0))
     sigma = scale * fit.scale_sigma
-    return replace(reading, fit=fit, stops=stops, scale=scale, scale_sigma=sigma)
+    return replace(setup_fit, fit=fit, stops=stops, scale=scale, scale_sigma=sigma)
 
 
-def _with_settled_scale(reading: Reading, repaired: _Repaired, setup: str | None) -> Reading:
+def _with_checked_scale(setup_fit: SetupFit, repaired: _Repaired, setup: str | None) -> SetupFit:
     """Return the reading with the child's lengths as they are, or times an estimated scale.
 
     A scale that is clearly not 1 becomes a finding, unless the user allows the scale to be
@@ -276,18 +278,18 @@ def _with_settled_scale(reading: Reading, repaired: _Repaired, setup: str | None
     poses = repaired.poses
     config = repaired.config
     if config.scale == "estimate":
-        return _with_free_scale(poses, reading)
-    as_given = reading
-    if reading.scale != 1.0:
-        as_given = _likelier_reading(poses, 1.0, setup)
+        return _with_estimated_scale(poses, setup_fit)
+    as_given = setup_fit
+    if setup_fit.scale != 1.0:
+        as_given = _likelier_setup(poses, 1.0, setup)
     if not _determines_scale(poses, repaired.findings):
         return as_given
-    free = _with_free_scale(poses, reading)
+    free = _with_estimated_scale(poses, setup_fit)
     is_auto = config.scale == "auto"
     has_other_unit = is_auto and repaired.unit != 1.0
-    if not (has_other_unit or _is_not_one(poses, free, as_given)):
+    if not (has_other_unit or _is_clearly_not_one(poses, free, as_given)):
         return as_given
-    is_size = 1.0 / _LARGEST_SIZE < free.scale < _LARGEST_SIZE
+    is_size = 1.0 / _MAX_SIZE_RATIO < free.scale < _MAX_SIZE_RATIO
     scale = repaired.unit * free.scale
     sigma = repaired.unit * free.scale_sigma
     is_allowed = is_auto and is_size
@@ -306,18 +308,18 @@ def _with_settled_scale(reading: Reading, repaired: _Repaired, setup: str | None
     return free
 
 
-def _is_not_one(poses: StopPoses, free: Reading, as_given: Reading) -> bool:
+def _is_clearly_not_one(poses: StopPoses, free: SetupFit, as_given: SetupFit) -> bool:
     """Return whether an estimated scale is certainly not 1, by the ratio of likelihoods."""
-    if abs(np.log(free.scale)) < _SCALE_SHARE:
+    if abs(np.log(free.scale)) < _MIN_SCALE_CHANGE:
         return False
-    least_gain = 0.5 * _SCALE_SIGMAS**2 * free.fit.scale_inflation
+    least_gain = 0.5 * _MIN_SCALE_SIGMAS**2 * free.fit.scale_inflation
     gain = as_given.fit.objective - free.fit.objective
     if free.scale < 1.0 and gain > least_gain:
         gain = _gain_in_measured_lengths(poses, free, as_given)
     return bool(gain > least_gain)
 
 
-def _gain_in_measured_lengths(poses: StopPoses, free: Reading, as_given: Reading) -> float:
+def _gain_in_measured_lengths(poses: StopPoses, free: SetupFit, as_given: SetupFit) -> float:
     """Return the largest gain of log likelihood by a scale between the estimated one and 1.
 
     Residuals of positions shrink with the child's lengths, and so does noise of these lengths. The
@@ -330,7 +332,7 @@ def _gain_in_measured_lengths(poses: StopPoses, free: Reading, as_given: Reading
         return fit.objective - 3.0 * len(poses) * log_scale
 
     bounds = (float(np.log(free.scale)), 0.0)
-    best = minimize_scalar(objective, bounds=bounds, options={"xatol": _SCALE_SHARE})
+    best = minimize_scalar(objective, bounds=bounds, options={"xatol": _MIN_SCALE_CHANGE})
     return as_given.fit.objective - float(best.fun)
 
 
@@ -343,7 +345,7 @@ def _check_unknown(poses: StopPoses, fit: RobotWorld, findings: Sequence[Finding
         return [finding("turning_about_one_axis")] if poses.has_positions else []
     rotations = se3.rotation_of(poses.parent)
     turn_rad = median(se3.rotation_angle(rotations[0].T @ rotations))
-    if has_error(findings) or not fit.undetermined().size or turn_rad < _FAR_RAD:
+    if has_error(findings) or not fit.undetermined().size or turn_rad < _LARGE_TURN_RAD:
         return []
     share = min(float(np.sqrt(3.0)) * fit.level_rad / turn_rad, 1.0)
     return [finding("disagreeing_stops", part="rotations", share=share)]
