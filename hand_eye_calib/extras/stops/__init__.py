@@ -1,4 +1,4 @@
-"""Poses that are stops: the samples of an arm, rows of two files, a hand and images of a target."""
+"""Calibration from stops: samples of an arm, rows of two files, or a hand and images."""
 
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from hand_eye_calib.core.base.registry import (
     Route,
 )
 
-# Files of an arm's samples.
+# Suffixes of files with the samples of an arm.
 _SAMPLES = (".json", ".yaml", ".yml", ".samples", ".npz")
 
 
@@ -67,7 +67,7 @@ def _add_arguments(parser: Any) -> None:
 
 
 def _are_stops(arguments: Any) -> bool:
-    """Return whether arguments ask for stops; refuse contradictions."""
+    """Return whether the arguments name stops; raise ConfigError if they contradict."""
     are_images = bool(arguments.target) and not arguments.child_topic
     if not arguments.child_topic and are_images != bool(arguments.camera):
         raise ConfigError("--target and --camera go together: a target and a camera's intrinsics")
@@ -80,7 +80,7 @@ def _are_stops(arguments: Any) -> bool:
 
 
 def _refuse_without_arm(arguments: Any, is_arm: bool, has_hand_file: bool) -> None:
-    """Refuse options of an arm, and of the file of its hand, if there is none."""
+    """Raise ConfigError for an option of an arm, or of the file of its hand, without such input."""
     if arguments.setup and not is_arm:
         raise ConfigError(
             "--setup says where the camera of an arm is; it needs the samples of an arm or --target"

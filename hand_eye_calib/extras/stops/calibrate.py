@@ -1,4 +1,4 @@
-"""Calibrations from stops of an arm or of two sensors: ``A X = Z B`` checked, solved and judged."""
+"""Calibrate an arm or two sensors from stops: check and solve ``A X = Z B``, assess the result."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -27,7 +27,7 @@ from hand_eye_calib.extras.stops.solving import SetupFit, SolvedStops, solve_che
 from hand_eye_calib.extras.stops.stop_table import StopTable, stop_table
 from hand_eye_calib.extras.stops.worlds import SETUPS, Worlds
 
-# Options that stops obey, and the beginnings of the names of further ones.
+# Options that apply to stops, and the first parts of the names of further options that do.
 _OBEYED = {"min_pairs", "parent_frame", "child_frame", "scale", "parent_scale"}
 _OBEYED |= {
     f"{stream}_{name}"
@@ -36,26 +36,27 @@ _OBEYED |= {
 }
 _OBEYED_GROUPS = ("prior_", "target_")
 
-# Options that decide how inverse poses are read.
+# Options that declare inverse poses.
 _INVERSIONS = {"parent_invert", "child_invert"}
 
-# A mount is the identity within so many standard deviations, or within this length (m) and angle
-# (rad).
+# A mount is the identity if all of its values are below this many standard deviations, or below
+# this limit (m, rad).
 _IDENTITY_SIGMAS = 3.0
 _MIN_IDENTITY = 0.001
 
-# A camera or target on a hand is nearer to it than this (m), or than twice the distance of its
-# counterpart from the base.
+# Poses of an arm may be inverse if the sensor or target on the hand is farther from it than this
+# (m), and if its counterpart is nearer to the base than this share of that distance.
 _MAX_ON_HAND_M = 0.3
 _MAX_BASE_RATIO = 0.5
 
-# A direction of rotations alone is unknown if its rotation part is longer than this.
+# An unobservable direction (unit vector of translation and rotation) is one of the rotation if its
+# rotation part is longer than this.
 _ROTATION_PART = 0.5
 
-# Share of stops that were left out above which the verdict is USE WITH CARE.
+# Share of outliers above which the verdict is USE WITH CARE.
 _MAX_LEFT_OUT = 0.1
 
-# Largest number of stops that are listed in a message.
+# Largest number of outliers that a message lists.
 _MAX_LISTED = 8
 
 
@@ -64,7 +65,7 @@ def calibrate_stops(
     Ts_world_child: Any,
     config: CalibratorConfig | None = None,
 ) -> Calibration:
-    """Solve and assess stops, which are poses without an order.
+    """Calibrate two sensors from stops: pairs of poses whose order has no meaning.
 
     Parameters
     ----------
@@ -119,8 +120,8 @@ def calibrate_arm(
 ) -> Calibration:
     """Calibrate a camera on a robot's hand, or beside the robot with the target on the hand.
 
-    Without ``setup`` both places are tried: only one of them leaves small errors. The four arrays
-    of ``cv2.calibrateHandEye`` are taken in its order, too:
+    Without ``setup`` both places of the camera are tried, and the one that fits is taken. The four
+    arrays of ``cv2.calibrateHandEye`` may be given in the same order:
     ``calibrate_arm(R_gripper2base, t_gripper2base, R_target2cam, t_target2cam)``.
 
     Parameters
@@ -175,14 +176,14 @@ def calibrate_arm(
 
 
 def _are_arrays_of_opencv(config: Any, names: Any) -> bool:
-    """Return whether the options and the names of an arm are R_target2cam and t_target2cam."""
+    """Return whether the third and fourth argument are arrays: R_target2cam and t_target2cam."""
     has_options = isinstance(config, CalibratorConfig | None)
     has_names = isinstance(names, Mapping | None)
     return not (has_options or has_names)
 
 
 def _checked(config: CalibratorConfig | None) -> CalibratorConfig:
-    """Return the options.
+    """Return the options, or the default ones.
 
     Raises
     ------
@@ -213,7 +214,10 @@ def _checked(config: CalibratorConfig | None) -> CalibratorConfig:
 def _checked_poses(
     sides: Mapping[str, Any], config: CalibratorConfig, is_arm: bool = False
 ) -> StopPoses:
-    """Return the poses of both sides, by the names of the sides in messages."""
+    """Return the poses of parent and child as stacks; ``sides`` are their values by name.
+
+    Positions are zero if only rotations are measured.
+    """
     parent, child = [pose_stack(values, side) for side, values in sides.items()]
     n_stops = len(parent)
     if n_stops != len(child):
@@ -240,7 +244,7 @@ def _checked_poses(
 
 
 def _check_setup(setup_fit: SetupFit, setup: str | None) -> list[Finding]:
-    """Return findings on an arm whose stops fit both setups, or whose sides are the same poses."""
+    """Return a finding if both sides of an arm have the same poses, or if both setups fit."""
     if setup_fit.fit.undetermined().size:
         return []
     if _is_copy(setup_fit.fit):
@@ -251,10 +255,9 @@ def _check_setup(setup_fit: SetupFit, setup: str | None) -> list[Finding]:
 
 
 def _is_copy(fit: RobotWorld) -> bool:
-    """Return whether both mounts are the identity.
+    """Return whether X and Z are the identity, so that both sides have the same poses.
 
-    Both sides then hold the same poses: camera and target cannot both be exactly at the origins of
-    hand and base.
+    A real camera and target are not both at the origins of hand and base.
     """
     offsets = np.r_[se3.log(fit.T_parent_child), se3.log(fit.T_world_world)]
     sigmas = np.sqrt(np.diag(fit.covariance))
@@ -262,7 +265,7 @@ def _is_copy(fit: RobotWorld) -> bool:
 
 
 def _setup_in_words(setup_fit: SetupFit) -> str:
-    """Return which reading of the samples was taken, and the options of the others."""
+    """Return the assumed place of the camera as text, with the options for inverse poses."""
     place = SETUPS["beside" if setup_fit.is_inverse else "hand"]
     return (
         f"read as a camera {place}; if that is wrong, one side or both hold inverse poses: give "
@@ -271,9 +274,10 @@ def _setup_in_words(setup_fit: SetupFit) -> str:
 
 
 def _check_distances(setup_fit: SetupFit, frames: Mapping[str, str]) -> list[Finding]:
-    """Return a finding if the camera or target on the hand is far from it.
+    """Return a finding if distances of camera and target suggest inverse poses.
 
-    The finding needs a counterpart near the base: then inverse poses are more probable.
+    They do if the camera or target on the hand is far from the hand, while its counterpart is near
+    the base. ``frames`` has the names of base, hand, camera and target.
     """
     fit = setup_fit.fit
     if fit.undetermined().size or not se3.translation_of(setup_fit.stops.Ts_world_child).any():
@@ -295,7 +299,7 @@ def _check_distances(setup_fit: SetupFit, frames: Mapping[str, str]) -> list[Fin
 
 
 def _check_left_out(weights: FloatArray) -> list[Finding]:
-    """Return a finding if stops were left out, with their numbers from 1."""
+    """Return a finding with the numbers (from 1) of the stops that are outliers, if any."""
     numbers = [str(row + 1) for row in np.flatnonzero(weights == 0.0)]
     count = len(numbers)
     if count == 0:
@@ -318,9 +322,9 @@ def _check_left_out(weights: FloatArray) -> list[Finding]:
 
 
 class _Frames(NamedTuple):
-    """Names of the frames of both sensors and of their worlds, and the setup of an arm.
+    """Default names of the frames of both sensors and of their worlds, and the setup of an arm.
 
-    Options may name the sensors otherwise.
+    ``setup`` is "hand" or "beside" for an arm, else empty.
     """
 
     parent: str
@@ -331,14 +335,14 @@ class _Frames(NamedTuple):
 
 
 def _frames_of_arm(names: Mapping[str, str], is_beside: bool) -> _Frames:
-    """Return the frames of an arm, by the names of base, hand, camera and target."""
+    """Return the frames of an arm; ``names`` are those of base, hand, camera and target."""
     if is_beside:
         return _Frames(names["base"], names["camera"], names["hand"], names["target"], "beside")
     return _Frames(names["hand"], names["camera"], names["base"], names["target"], "hand")
 
 
 def _calibration_of(solved: SolvedStops, warnings: Sequence[str], frames: _Frames) -> Calibration:
-    """Return the result: the fit fused with the prior, its residuals and its findings."""
+    """Return the result: the fit fused with the prior, with residuals, findings and advice."""
     fit = solved.setup_fit.fit
     stops = solved.setup_fit.stops
     config = solved.config
@@ -388,7 +392,7 @@ def _calibration_of(solved: SolvedStops, warnings: Sequence[str], frames: _Frame
 
 
 def _with_advice(table: StopTable, solved: SolvedStops, frames: _Frames) -> StopTable:
-    """Return the table of stops with advice on the next ones."""
+    """Return the table of stops, with advice on the next stops to record."""
     config = solved.config
     is_beside = frames.setup == "beside"
     hand = config.parent_frame or frames.parent
@@ -402,15 +406,16 @@ def _with_advice(table: StopTable, solved: SolvedStops, frames: _Frames) -> Stop
 
 
 def _without_positions(covariance: FloatArray) -> FloatArray:
-    """Return the covariance (6, 6) of a transform whose translation is unknown."""
+    """Return a covariance (6, 6) with the translation replaced by an unknown one."""
     without = np.diag(UNKNOWN_SIGMAS**2)
     without[3:, 3:] = covariance[3:, 3:]
     return without
 
 
 def _with_unknown_positions(unknown: FloatArray) -> FloatArray:
-    """Return unknown directions (6, K) of rotations alone: all translations, and those about which
-    the rotation is unknown.
+    """Return the unobservable directions (6, K) if only rotations are measured.
+
+    They are the three translations, and the rotations among the directions ``unknown`` (6, K).
     """
     is_rotation = np.linalg.norm(unknown[3:], axis=0) > _ROTATION_PART
     rotations = unknown[3:, is_rotation]

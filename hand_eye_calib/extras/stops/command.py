@@ -1,7 +1,7 @@
 """Command ``calibrate`` for stops.
 
-Stops are the samples of an arm, the poses of two files by their rows, or the poses of a hand and
-images of a target.
+Input is a file with the samples of an arm, two files whose rows belong together, or a file with the
+poses of a hand and a folder with images of a target.
 """
 
 from argparse import Namespace
@@ -33,7 +33,14 @@ from hand_eye_calib.offline.cli.reading import read_files
 
 
 def solved(arguments: Namespace) -> tuple[Calibration, Document]:
-    """Return the calibration, and the sources of the poses in plain values."""
+    """Calibrate from the stops that the arguments name.
+
+    Returns
+    -------
+    result : Calibration
+    sources : Document
+        Files and numbers of poses, for the result file.
+    """
     options = options_from(arguments)
     config = CalibratorConfig.from_options(options)
     _refuse_ignored(arguments)
@@ -54,7 +61,7 @@ def solved(arguments: Namespace) -> tuple[Calibration, Document]:
 def _from_two_files(
     arguments: Namespace, config: CalibratorConfig, options: Options
 ) -> tuple[Calibration, Document]:
-    """Calibrate two sensors from the rows of two files."""
+    """Calibrate two sensors from two files whose rows belong together."""
     if arguments.parent_angles:
         parent = _robot(arguments)
         (child,) = _read(arguments, arguments.paths[1:], options)
@@ -69,7 +76,7 @@ def _from_two_files(
 def _from_images(
     arguments: Namespace, config: CalibratorConfig, options: Options
 ) -> tuple[Calibration, Document]:
-    """Calibrate an arm from a file of the poses of its hand and a folder of images of a target."""
+    """Calibrate an arm from a file with poses of its hand and a folder with images of a target."""
     hand_path, folder = map(Path, arguments.paths)
     target_images = TARGET_IMAGES["folder"]()
     if not folder.is_dir():
@@ -96,20 +103,20 @@ def _from_images(
 def _read(
     arguments: Namespace, paths: Sequence[str | Path], options: Options
 ) -> Sequence[Trajectory]:
-    """Read trajectory files, and print what was repaired."""
+    """Read trajectory files, and print their repairs and warnings."""
     files = read_files(arguments, paths, options)
     note(*files.repairs, *files.warnings)
     return files.trajectories
 
 
 def _robot(arguments: Namespace) -> Trajectory:
-    """Read the poses of the hand in the convention of its robot."""
+    """Read the poses of the hand, the first path, in the convention of its robot."""
     poses = read_robot_poses(Path(arguments.paths[0]), arguments.parent_angles)
     return Trajectory(np.arange(len(poses)), poses)
 
 
 def _require_equal(paths: Sequence[str | Path], n_parent: int, n_child: int) -> None:
-    """Check that both sides have as many stops."""
+    """Raise InputError if both sides have different numbers of stops."""
     if n_parent != n_child:
         raise InputError(
             f"{paths[0]} has {n_parent} poses and {paths[1]} {n_child}: stops are paired by the "
@@ -122,13 +129,13 @@ def _input(path: str | Path, n_poses: int) -> Document:
 
 
 def _inputs(arguments: Namespace, n_parent: int, n_child: int) -> Document:
-    """Return the sources of both sides in plain values."""
+    """Return file and number of poses of both sides, for the result file."""
     parent_path, child_path = arguments.paths
     return {"parent": _input(parent_path, n_parent), "child": _input(child_path, n_child)}
 
 
 def _refuse_ignored(arguments: Namespace) -> None:
-    """Refuse arguments that have no meaning for stops."""
+    """Raise ConfigError for an argument that has no effect on stops."""
     if arguments.pair_by == "time":
         raise ConfigError("--pair-by time has no meaning for stops, which have no stamps; give row")
     names = ["topics"]
@@ -143,7 +150,10 @@ def _refuse_ignored(arguments: Namespace) -> None:
 
 
 def _measuring(config: CalibratorConfig, streams: Mapping[str, Trajectory]) -> CalibratorConfig:
-    """Set what each stream measures to what its file contains, unless the user set an option."""
+    """Return the options with the kind of data of each stream taken from its file.
+
+    An option of the user other than ``auto`` wins.
+    """
     for stream, trajectory in streams.items():
         if trajectory.measures not in ("poses", "rotations"):
             raise ConfigError(

@@ -1,4 +1,4 @@
-"""The command ``arm``: calibrate the camera of an arm from its stops."""
+"""Command ``arm``: calibrate the camera of an arm from its stops."""
 
 from typing import Any
 

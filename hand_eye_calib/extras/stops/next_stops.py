@@ -1,9 +1,9 @@
 """Advice on the next stops of an arm: rotations of the hand that reduce the uncertainty most.
 
-A candidate is one of the present stops with the hand turned about one of its own axes, and moved
-such that the target stays in its place in the image. Its measurement adds ``J' J`` to the
-information of X and Z, with J the derivatives of the errors in units of their levels. Candidates
-are chosen in turn. Each minimises the sum of the variances of X over the squared targets
+A candidate starts from one of the recorded stops. The hand is turned about one of its axes, and
+moved so that the target keeps its place in the image. The stop adds ``J' J`` to the information
+about X and Z, with J the derivatives of its errors over their standard deviations. Candidates are
+chosen one after the other. Each minimises the sum of the variances of X over the squared targets
 (A-optimality): F. Pukelsheim, *Optimal design of experiments*, SIAM 2006.
 """
 
@@ -23,16 +23,16 @@ from hand_eye_calib.extras.stops.rough_fit import angles_between
 # Number of stops that are advised.
 _N_NEXT = 3
 
-# Angle of the advised turns (deg): a flat target is still well visible.
+# Angle of the advised turns (deg). A flat target is still visible well at this angle.
 _TURN_DEG = 30
 
-# Prior standard deviation of unknown directions, in levels of the errors of a stop.
+# Prior standard deviation of unobservable directions, in standard deviations of a stop's errors.
 _PRIOR_LEVELS = 1e3
 
 
 @dataclass(frozen=True)
 class NextStop:
-    """A stop to add: turn ``frame`` by ``angle_deg`` about its own ``axis`` (x, y or z)."""
+    """A stop to add: turn ``frame``, the hand, by ``angle_deg`` about its axis (x, y or z)."""
 
     axis: str
     angle_deg: float
@@ -45,23 +45,30 @@ class NextStop:
 def next_stops(
     stops: Stops, fit: RobotWorld, frame: str, is_inverse: bool, targets: FloatArray
 ) -> tuple[int, tuple[NextStop, ...]]:
-    """Return the row of the stop to start from, and the next stops, the most useful first.
+    """Choose the next stops of an arm, the most useful first.
 
     Parameters
     ----------
     stops : Stops
+        Recorded stops.
     fit : RobotWorld
-        Of one child and one world.
+        Their fit.
     frame : str
-        Name of the frame that turns: the hand.
+        Name of the frame of the hand, which turns.
     is_inverse : bool
-        Whether the stops have the inverse poses of ``frame``: a camera beside the robot.
+        True for a camera beside the robot: then the stops have the inverse poses of the hand.
     targets : (6,) array
-        Standard deviations (m, rad) that x, y, z and the rotations should have.
+        Wanted standard deviations of X: x, y, z (m) and the rotations (rad).
+
+    Returns
+    -------
+    start : int
+        Row of the stop that the turns start from.
+    next_stops : tuple of NextStop
     """
-    # The smallest median angle to the other stops.
+    # The most central orientation.
     start = int(np.argmin(medians(angles_between(stops.Ts_world_parent))))
-    # By its candidate, the information that a stop adds.
+    # Information that each candidate adds.
     gains = {}
     for axis, angle_deg in itertools.product("xyz", (_TURN_DEG, -_TURN_DEG)):
         vector = np.radians(angle_deg) * np.eye(3)["xyz".index(axis)]
@@ -80,7 +87,7 @@ def next_stops(
 
 
 def advice_in_words(number: int, stops: tuple[NextStop, ...]) -> str:
-    """Return the advice in a sentence; ``number`` is that of the stop to start from."""
+    """Return the advice as a sentence; ``number`` (from 1) is the stop to start from."""
     turns = listing([str(stop) for stop in stops])
     return (
         f"record {len(stops)} more stops from stop {number}, with the target still in the image: "
@@ -89,9 +96,10 @@ def advice_in_words(number: int, stops: tuple[NextStop, ...]) -> str:
 
 
 def _turned(stop: Stops, fit: RobotWorld, vector: FloatArray, is_inverse: bool) -> Stops:
-    """Return a stop (1) with the hand turned by a rotation vector (3,) in its own axes.
+    """Return a stop with the hand turned by a rotation vector (3,), given in its own axes.
 
-    The target keeps its place in the camera.
+    The hand is moved so that the target keeps its position in the camera. ``is_inverse`` as in
+    :func:`next_stops`.
     """
     X = fit.T_parent_child
     Z = fit.T_world_world
@@ -106,6 +114,6 @@ def _turned(stop: Stops, fit: RobotWorld, vector: FloatArray, is_inverse: bool) 
 
 
 def _cost(information: FloatArray, targets: FloatArray) -> float:
-    """Return the sum of the variances of X over the squared targets."""
+    """Return the cost of an information (12, 12): sum of variances of X over squared targets."""
     variances = np.diag(np.linalg.inv(information))[:6]
     return float(np.sum(variances / targets**2))

@@ -1,8 +1,9 @@
-"""Poses of an arm with a file for each pose, such as ``pose_fPe_1.yaml`` and ``pose_cPo_1.yaml``.
+"""Read folders with a file for each pose of an arm, such as ``pose_fPe_1.yaml`` of ViSP.
 
-The file contains a matrix (4 x 4 or 3 x 4), ``x y z qx qy qz qw``, or a position and a rotation
-vector (ViSP). It is text, YAML, JSON, or YAML of OpenCV (Zivid). The name contains the number of
-the stop and, if the folder has poses of both sides, a word for the side.
+A file contains a matrix (4 x 4 or 3 x 4), ``x y z qx qy qz qw``, or a position and a rotation
+vector (ViSP). Formats are text, YAML, JSON, and YAML of OpenCV (Zivid). The name of the file has
+the number of the stop. The name of the file or of its folder has a word for the side, such as
+``robot`` or ``target``.
 """
 
 import re
@@ -22,23 +23,23 @@ from hand_eye_calib.formats.yaml_files import read_yaml
 
 _SUFFIXES = (".yaml", ".yml", ".json", ".txt")
 
-# Words in the names of files. ViSP names the pose of b in a ``aPb``: e is the end effector, o the
-# object.
+# Words for the sides in names of files. ViSP names the pose of b in a ``aPb``, where f is the base,
+# e the end effector, c the camera and o the object (target).
 _ROBOT_WORDS = {"pe", "robot", "hand", "gripper", "flange", "ee", "eef", "tcp", "tool"}
 _TARGET_WORDS = {"po", "target", "marker", "board", "tag", "object", "camera", "cam", "tracking"}
 
-# Name without its suffix: words, the number of the stop.
+# Name of a file without its suffix: words, then the number of the stop.
 _NUMBERED_NAME = re.compile(r"(.*?)([0-9]{1,9})")
 
-# Numbers of a position and a rotation vector.
+# Count of numbers of a position and a rotation vector.
 _N_OF_VECTOR = 6
 
 
 def files_of_sides(folder: Path) -> tuple[dict[int, Path], dict[int, Path]]:
-    """Return the files of the robot and of the target in a folder, by the number of the stop.
+    """Return the files of the robot and those of the target in a folder, by number of the stop.
 
-    Poses are in the folder, or in a folder of their own for each side. Files without a word for the
-    side are ignored.
+    The files are in the folder itself or in its subfolders. Files without a word for the side are
+    ignored.
     """
     robot: dict[int, Path] = {}
     target: dict[int, Path] = {}
@@ -58,7 +59,7 @@ def files_of_sides(folder: Path) -> tuple[dict[int, Path], dict[int, Path]]:
 
 
 def is_pose_folder(path: Path) -> bool:
-    """Return whether a folder has files of the robot and of the target."""
+    """Return whether a path is a folder with pose files of the robot and of the target."""
     return path.is_dir() and all(files_of_sides(path))
 
 
@@ -68,7 +69,7 @@ def read_pose_folder(folder: Path) -> tuple[FloatArray, FloatArray]:
     Raises
     ------
     InputError
-        If a file has no pose, or a stop has not both poses.
+        If a file has no pose, or a stop has the pose of one side only.
     """
     robot, target = files_of_sides(folder)
     if not (robot and target):
@@ -100,7 +101,7 @@ def _read_pose(path: Path) -> FloatArray:
 
 
 def _only_value(document: Any) -> Any:
-    """Return the value of a document of one name, such as ``PoseState`` of Zivid."""
+    """Return the value of a document with a single name, such as ``PoseState`` of Zivid."""
     while isinstance(document, Mapping) and len(document) == 1:
         (document,) = document.values()
     return document

@@ -1,4 +1,4 @@
-"""Poses of a robot's hand as its controller prints them: a position and angles.
+"""Convert poses that a robot's controller displays: a position and angles in its convention.
 
 R is the rotation of the hand in the base; Rx, Ry and Rz are rotations about the axes x, y and z.
 
@@ -34,17 +34,17 @@ from hand_eye_calib.formats.files import read_text
 # Axes of the angles as SciPy names them: small letters are fixed axes, capitals moving ones.
 _AXES = {"fanuc": "xyz", "kawasaki": "ZYZ", "kuka": "ZYX", "yaskawa": "xyz"}
 
-#: Robots whose angles are known.
+#: Makers of robots whose convention of angles is implemented.
 ROBOTS = ("abb", "fanuc", "kawasaki", "kuka", "ur", "yaskawa")
 
 
 def robot_poses(rows: Any, robot: str) -> FloatArray:
-    """Return the poses (N, 4, 4) of a hand in its base.
+    """Return the poses (N, 4, 4) of a robot's hand in its base.
 
     Parameters
     ----------
     rows : (N, 6) or (N, 7) array-like
-        Position, then the angles or the quaternion of the robot. Positions keep their unit.
+        Position, then angles or quaternion in the robot's convention. Positions keep their unit.
     robot : {"abb", "fanuc", "kawasaki", "kuka", "ur", "yaskawa"}
         Maker of the robot.
 
@@ -74,7 +74,7 @@ def robot_poses(rows: Any, robot: str) -> FloatArray:
 
 
 def _rotations(angles: FloatArray, robot: str) -> FloatArray:
-    """Return the rotations (N, 3, 3) of three angles (N, 3)."""
+    """Return the rotations (N, 3, 3) of angles (N, 3) in the robot's convention and unit."""
     if robot == "ur":
         return se3.rotation_exp(angles)
     rotations = Rotation.from_euler(_AXES[robot], angles, degrees=True)
@@ -82,9 +82,9 @@ def _rotations(angles: FloatArray, robot: str) -> FloatArray:
 
 
 def read_robot_poses(path: Path, robot: str) -> FloatArray:
-    """Return the poses (N, 4, 4) of a text file with a pose on each line.
+    """Read the poses (N, 4, 4) of a robot from a text file with one pose on each line.
 
-    Empty lines, and the first line if it has names, are skipped.
+    Empty lines are skipped, and so is a first line with names of columns.
     """
     rows = []
     lines = read_text(path, "poses of a robot").splitlines()

@@ -28,10 +28,10 @@ from hand_eye_calib.formats.files import LONGEST_NAME, path_of
 from hand_eye_calib.formats.npz import read_arrays
 from hand_eye_calib.formats.yaml_files import read_yaml
 
-# Names of both poses of a sample: the robot's, the target's.
+# Names of the two poses of a sample in files of other programs: robot first, then target.
 _NAMES = (("effector_wrt_world", "object_wrt_sensor"), ("robot", "tracking"), ("robot", "optical"))
 
-# Names of frames in files of easy_handeye and easy_handeye2.
+# Keys of the names of frames in files of easy_handeye and easy_handeye2.
 _FRAMES = {
     "base": "robot_base_frame",
     "hand": "robot_effector_frame",
@@ -45,9 +45,10 @@ _EXPECTED = (
     "R_gripper2base, t_gripper2base, R_target2cam, t_target2cam (OpenCV)"
 )
 
-# Argument of OpenCV's solvers: the quantity, and the frames that it leads from and to.
+# Name of an argument of OpenCV's solvers, such as R_gripper2base: quantity, source frame, target
+# frame.
 _OPENCV_NAME = re.compile(r"([a-z]+)_([a-z]+)2([a-z]+)")
-# Name of a value of one stop, such as R_gripper2base_0.
+# Name of the value of one stop, such as R_gripper2base_0.
 _NUMBERED_NAME = re.compile(r"(.*[a-z])_?([0-9]{1,9})")
 _QUANTITIES = {
     "r": "rotation",
@@ -67,7 +68,7 @@ _OPENCV_FRAMES = {
 
 @dataclass(frozen=True)
 class ArmSamples:
-    """Samples of an arm.
+    """Samples of an arm: at N stops, the pose of the hand and that of the target.
 
     Attributes
     ----------
@@ -76,7 +77,7 @@ class ArmSamples:
     tracking : (N, 4, 4) array
         Poses of the target in the camera.
     frames : mapping of str to str
-        Names of base, hand, camera and target, if the file has them.
+        Names of the frames by the keys base, hand, camera and target; empty if the file has none.
 
     Raises
     ------
@@ -131,13 +132,13 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
 
 
 def _listed_samples(path: str | Path, document: Any) -> ArmSamples:
-    """Return the samples of a document with a sample for each stop."""
+    """Return the samples of a document that lists the stops one by one (MoveIt, easy_handeye)."""
     frames: dict[str, str] = {}
     is_inverse = False
     if isinstance(document, Mapping) and "samples" in document:
         parameters = document.get("parameters") or {}
         frames = {name: parameters[key] for name, key in _FRAMES.items() if parameters.get(key)}
-        # ``robot`` is the pose of the base in the hand then.
+        # For eye_on_base, easy_handeye stores the pose of the base in the hand as ``robot``.
         is_inverse = parameters.get("calibration_type") == "eye_on_base"
         document = document["samples"]
     elif isinstance(document, Mapping):
@@ -155,7 +156,7 @@ def _listed_samples(path: str | Path, document: Any) -> ArmSamples:
 
 
 def _stacked_samples(stacks: Mapping[str, FloatArray]) -> ArmSamples:
-    """Return the samples of two stacks of poses, (N, 4, 4) or (N, 7)."""
+    """Return the samples of the arrays of an .npz: two stacks of poses, (N, 4, 4) or (N, 7)."""
     for names in _NAMES:
         if {*names} <= stacks.keys():
             robot, tracking = (pose_stack(stacks[name], name) for name in names)
@@ -186,8 +187,8 @@ def _both_poses(sample: Any) -> Sequence[Any]:
 
 
 def _opencv_samples(document: Mapping[str, Any]) -> ArmSamples | None:
-    """Return the samples of OpenCV's arguments, such as R_gripper2base; None if there are none."""
-    # Rotation and translation by the frames that they lead from and to.
+    """Return the samples of a document with OpenCV's arguments; None if they are missing."""
+    # For each pair of source and target frame: rotation and translation.
     transforms: dict[tuple[str, str], dict[str, Any]] = {}
     for name, value in _with_stacks(document).items():
         match = _OPENCV_NAME.fullmatch(name)
@@ -205,7 +206,10 @@ def _opencv_samples(document: Mapping[str, Any]) -> ArmSamples | None:
 def _opencv_poses(
     transforms: Mapping[tuple[str, str], Mapping[str, Any]], source: str, target: str
 ) -> FloatArray | None:
-    """Return poses (N, 4, 4) of a frame in another; None if they are given neither way."""
+    """Return the poses (N, 4, 4) of frame ``source`` in frame ``target``; None if missing.
+
+    Inverse poses (of ``target`` in ``source``) are inverted.
+    """
     for frames in ((source, target), (target, source)):
         transform = transforms.get(frames, {})
         if {"rotation", "translation"} <= transform.keys():
@@ -216,7 +220,7 @@ def _opencv_poses(
 
 
 def _with_stacks(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a document by names in lower case, with the values of numbered names as lists."""
+    """Return a document with names in lower case; values of numbered names become lists."""
     values: dict[str, Any] = {}
     stacks: dict[str, dict[int, Any]] = {}
     for key, value in document.items():
@@ -232,9 +236,10 @@ def _with_stacks(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _arrays_of(rotations: Any, translations: Any) -> tuple[Any, Any]:
-    """Return rotations and translations of a FileStorage of OpenCV as arrays; others unchanged.
+    """Return rotations and translations of a FileStorage of OpenCV as arrays.
 
-    A FileStorage has one matrix of all stops, or a list with a matrix for each stop.
+    A FileStorage has one matrix of all stops, or a list with a matrix for each stop. Other values
+    are returned unchanged.
     """
     if not (_are_matrices(rotations) and _are_matrices(translations)):
         return rotations, translations
@@ -251,7 +256,7 @@ def _arrays_of(rotations: Any, translations: Any) -> tuple[Any, Any]:
 
 
 def _are_matrices(value: Any) -> bool:
-    """Return whether a value is a matrix of a FileStorage, or a list of them."""
+    """Return whether a value is a matrix of a FileStorage, or a list of such matrices."""
     matrices = value if isinstance(value, list) else [value]
     return all(isinstance(matrix, Mapping) for matrix in matrices)
 

@@ -1,4 +1,4 @@
-"""Solve of stops: check them, repair what is certain, choose the setup, settle the scale."""
+"""Solve stops: check them, repair certain mistakes, choose the setup, check the scale."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,37 +24,43 @@ from hand_eye_calib.extras.stops.rough_fit import (
 )
 from hand_eye_calib.extras.stops.worlds import SETUPS
 
-# A scale is not 1 if its likelihood is that of so many standard deviations, and if it differs by
-# this share.
+# The scale of the child's lengths is not 1 if the likelihood says so with this many standard
+# deviations, and if it differs from 1 by more than this share.
 _MIN_SCALE_SIGMAS = 3.0
 _MIN_SCALE_CHANGE = 0.01
 
-# A scale beyond this factor is not that of a target of another size.
+# Largest factor between the assumed and the true size of a target. A larger scale has another
+# cause.
 _MAX_SIZE_RATIO = 10.0
 
-# Rounds of the search for the scale; a step below this share of a standard deviation ends it.
+# Iterations of the estimate of the scale: their largest number, and the step (as a share of its
+# standard deviation) below which it has converged.
 _MAX_SCALE_ROUNDS = 10
 _SMALL_STEP = 0.02
 
-# Stops whose median rotation is larger than this (rad; 10 deg) determine all directions, unless
-# their errors are larger than those of any camera.
+# Median rotation of stops (rad, 10 deg) above which all directions are observable for any camera.
+# If one is not, the stops contradict each other.
 _LARGE_TURN_RAD = 0.17
 
 
 @dataclass(frozen=True)
 class SetupFit:
-    """Stops read with the camera at one place, and their fit.
+    """Fit of stops under one setup: for an arm, the camera on the hand or beside the robot.
 
     Attributes
     ----------
     fit : RobotWorld
+        Result of the fit.
     stops : Stops
+        Poses A and B of ``A X = Z B`` under the setup.
     is_inverse : bool
-        Whether one side is taken as inverse: for an arm, the camera is beside the robot.
-    scale, scale_sigma : float
-        Factor of the child's lengths and its standard deviation; 0 if it was not estimated.
+        True if the poses of one side were inverted: the camera is beside the robot.
+    scale : float
+        Factor that the child's lengths were multiplied by.
+    scale_sigma : float
+        Standard deviation of ``scale``; 0 if the scale was not estimated.
     lead : float
-        How much larger the objective of the other place of the camera is.
+        Log likelihood of this setup minus that of the other one.
     """
 
     fit: RobotWorld
@@ -67,7 +73,7 @@ class SetupFit:
 
 @dataclass(frozen=True)
 class SolvedStops:
-    """Solved stops: their reading, and the options, findings and warnings that lead to it."""
+    """Solved stops: the fit, the options with repairs, the findings and the warnings."""
 
     setup_fit: SetupFit
     config: CalibratorConfig
@@ -76,29 +82,31 @@ class SolvedStops:
 
     @property
     def is_usable(self) -> bool:
-        """Whether no finding forbids the use of the result."""
+        """Whether no finding is an error."""
         return not has_error(self.findings)
 
     def adding(self, *findings: Finding) -> "SolvedStops":
-        """Return the solved stops with further findings."""
+        """Return a copy with further findings."""
         return replace(self, findings=gravest_first((*self.findings, *findings)))
 
 
 @dataclass(frozen=True)
 class _Repaired:
-    """Stops in the usual convention and in metres.
+    """Stops after the repair of conventions and units.
 
     Attributes
     ----------
     poses : StopPoses
+    poses : StopPoses
+        Poses in the usual convention and in metres.
     config : CalibratorConfig
-        With the options that repair the stops.
+        Options of the user, and those of the repairs.
     unit : float
-        Factor that the child's lengths were multiplied by.
+        Factor that converted the child's lengths to metres.
     rough_scale : float
-        Further factor of the child's lengths, from a rough fit; 1 if it is unknown.
+        Further factor of the child's lengths by a rough fit, as a start; 1 if it is unknown.
     findings, warnings : lists
-        Findings, and warnings about repairs; the solve adds to both.
+        Findings, and warnings about repairs. The solve appends to both.
     """
 
     poses: StopPoses
@@ -112,13 +120,14 @@ class _Repaired:
 def solve_checked(
     poses: StopPoses, config: CalibratorConfig, setup: str | None = None
 ) -> SolvedStops:
-    """Check stops, repair what is certain, and solve.
+    """Check stops, repair certain mistakes, and solve.
 
     Parameters
     ----------
     poses : StopPoses
-        In the conventions of their source.
+        Poses in the conventions of the user's files.
     config : CalibratorConfig
+        Options of the user.
     setup : {"hand", "beside"}, optional
         Place of the camera of an arm. Default: the likelier one.
 
@@ -152,13 +161,13 @@ def solve_checked(
 
 
 def _repaired(poses: StopPoses, config: CalibratorConfig) -> _Repaired:
-    """Check stops, and repair what is certain and not set by the user."""
+    """Check stops, and repair certain mistakes unless the user set the option."""
     is_scale_free = config.scale in ("auto", "estimate")
     examination = examine(_in_metres(poses, config, config.given_scale), is_scale_free)
-    # The unit of the child's lengths is a part of a scale that is estimated.
+    # If the scale is estimated, it contains the unit of the child's lengths.
     unit = config.given_scale * examination.child_unit
     findings, repairs = _with_user_options(examination, config)
-    # The rough scale is that of lengths whose units are put right.
+    # The rough scale holds only if all repairs are done.
     is_whole = len(repairs) == len(examination.repairs)
     rough_scale = examination.scale if is_whole else None
     warnings = []
@@ -172,7 +181,10 @@ def _repaired(poses: StopPoses, config: CalibratorConfig) -> _Repaired:
 
 
 def _in_metres(poses: StopPoses, config: CalibratorConfig, child_unit: float) -> StopPoses:
-    """Return poses in the usual convention, by the options and the child's factor to metres."""
+    """Return poses in metres and in the usual convention, by the options.
+
+    ``child_unit`` is the factor from the child's lengths to metres.
+    """
     parent = se3.put_right(poses.parent, config.parent_invert, config.parent_quaternion)
     child = se3.put_right(poses.child, config.child_invert, config.child_quaternion)
     return replace(
@@ -183,13 +195,13 @@ def _in_metres(poses: StopPoses, config: CalibratorConfig, child_unit: float) ->
 def _with_user_options(
     examination: Examination, config: CalibratorConfig
 ) -> tuple[list[Finding], list[Finding]]:
-    """Return findings and repairs; a repair of an option that the user set becomes a finding."""
+    """Return findings and repairs; a repair becomes a finding if the user set its option."""
     findings = []
     for issue in examination.findings:
         if issue.code != "ambiguous":
             findings.append(_with_user_values(issue, config))
         elif not {*issue.options} <= config.given:
-            # A user who sets the conventions of both sides has decided.
+            # The user has decided if all options of the finding are set.
             findings.append(issue)
     settled_codes = {issue.code for issue in examination.repairs if {*issue.options} & config.given}
     repairs = []
@@ -202,12 +214,16 @@ def _with_user_options(
 
 
 def _with_user_values(issue: Finding, config: CalibratorConfig) -> Finding:
-    """Return a finding whose options include the values that the user set."""
+    """Return a finding whose options take account of the values that the user set.
+
+    The checks see poses after these options. Option values are combined: factors are multiplied,
+    and a convention that is undone twice returns to its default.
+    """
     options: dict[str, float | str] = {}
     for name, value in issue.options.items():
         current = getattr(config, name)
         if current == value or {current, value} == {"wxyz", "yzwx"}:
-            # A convention that is undone twice, or by its contrary, was right before.
+            # The user's option undoes a convention that was right before.
             options[name] = getattr(CalibratorConfig, name)
         elif isinstance(value, float) and isinstance(current, float):
             options[name] = value * current
@@ -217,7 +233,7 @@ def _with_user_values(issue: Finding, config: CalibratorConfig) -> Finding:
 
 
 def _options_of(repairs: Sequence[Finding], config: CalibratorConfig) -> dict[str, Any]:
-    """Return the options of all repairs; parent_scale is multiplied by the factor of the user."""
+    """Return the options of all repairs; ``parent_scale`` includes the factor of the user."""
     options: dict[str, Any] = {}
     for repair in repairs:
         options |= repair.options
@@ -230,9 +246,9 @@ def _options_of(repairs: Sequence[Finding], config: CalibratorConfig) -> dict[st
 
 
 def _likelier_setup(poses: StopPoses, scale: float, setup: str | None) -> SetupFit:
-    """Return the likelier reading of stops, or the reading of a setup.
+    """Return the fit of the likelier setup, or of the setup that the user chose.
 
-    The lead of a setup is negative if the other one is likelier.
+    ``scale`` is a factor of the child's lengths.
     """
     setup_fits = []
     for is_inverse in poses.possible_inversions:
@@ -249,12 +265,12 @@ def _likelier_setup(poses: StopPoses, scale: float, setup: str | None) -> SetupF
 
 
 def _determines_scale(poses: StopPoses, findings: Sequence[Finding]) -> bool:
-    """Return whether stops without errors determine the factor of the child's lengths."""
+    """Return whether the stops determine the scale of the child's lengths: no error, two axes."""
     return not has_error(findings) and poses.has_positions and turns_about_two_axes(poses.parent)
 
 
 def _with_estimated_scale(poses: StopPoses, setup_fit: SetupFit) -> SetupFit:
-    """Return a reading with the factor of the child's lengths estimated."""
+    """Return the fit with the scale of the child's lengths estimated by iterated linear steps."""
     mistakes = Mistakes(is_inverse=setup_fit.is_inverse)
     scale = setup_fit.scale
     for _ in range(_MAX_SCALE_ROUNDS):
@@ -270,10 +286,10 @@ def _with_estimated_scale(poses: StopPoses, setup_fit: SetupFit) -> SetupFit:
 
 
 def _with_checked_scale(setup_fit: SetupFit, repaired: _Repaired, setup: str | None) -> SetupFit:
-    """Return the reading with the child's lengths as they are, or times an estimated scale.
+    """Return the fit with the child's lengths as they are, or multiplied by an estimated scale.
 
-    A scale that is clearly not 1 becomes a finding, unless the user allows the scale to be
-    estimated.
+    The scale is estimated if it is clearly not 1, or if the user asks for it. The first case is
+    added to the findings of ``repaired`` unless the option ``scale`` allows it.
     """
     poses = repaired.poses
     config = repaired.config
@@ -309,7 +325,7 @@ def _with_checked_scale(setup_fit: SetupFit, repaired: _Repaired, setup: str | N
 
 
 def _is_clearly_not_one(poses: StopPoses, free: SetupFit, as_given: SetupFit) -> bool:
-    """Return whether an estimated scale is certainly not 1, by the ratio of likelihoods."""
+    """Return whether an estimated scale is clearly not 1, by a likelihood ratio test."""
     if abs(np.log(free.scale)) < _MIN_SCALE_CHANGE:
         return False
     least_gain = 0.5 * _MIN_SCALE_SIGMAS**2 * free.fit.scale_inflation
@@ -320,10 +336,12 @@ def _is_clearly_not_one(poses: StopPoses, free: SetupFit, as_given: SetupFit) ->
 
 
 def _gain_in_measured_lengths(poses: StopPoses, free: SetupFit, as_given: SetupFit) -> float:
-    """Return the largest gain of log likelihood by a scale between the estimated one and 1.
+    """Return the gain of log likelihood by a scale below 1, per density of measured lengths.
 
-    Residuals of positions shrink with the child's lengths, and so does noise of these lengths. The
-    log density of the lengths as they were measured has the term ``3 log(scale)`` for each stop.
+    A scale below 1 makes residuals smaller because it shrinks the child's positions with their
+    noise. The density of the measured (unscaled) positions has the additional term
+    ``3 log(scale)`` in its logarithm for each stop. The scale is optimised under this density,
+    between the estimated scale and 1.
     """
     mistakes = Mistakes(is_inverse=free.is_inverse)
 
@@ -337,9 +355,9 @@ def _gain_in_measured_lengths(poses: StopPoses, free: SetupFit, as_given: SetupF
 
 
 def _check_unknown(poses: StopPoses, fit: RobotWorld, findings: Sequence[Finding]) -> list[Finding]:
-    """Return a finding if directions are unknown.
+    """Return a finding if directions of X are unobservable.
 
-    Stops that turn about one axis leave directions unknown, and so do contradicting stops.
+    The cause is that the stops rotate about one axis only, or that they contradict each other.
     """
     if not turns_about_two_axes(poses.parent):
         return [finding("turning_about_one_axis")] if poses.has_positions else []

@@ -1,4 +1,4 @@
-"""Residuals and views of single stops, and advice on the next stops, as a part of results."""
+"""Table of stops in a result: residual and view of each stop, and advice on the next ones."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -15,20 +15,20 @@ from hand_eye_calib.extras.stops.next_stops import NextStop
 
 @dataclass(frozen=True)
 class Stop:
-    """One stop.
+    """One row of the table.
 
     Attributes
     ----------
     number : int
-        From 1, in the order of the input.
+        Number of the stop, from 1 in the order of the input.
     residual_m, residual_deg : float
-        Distance and angle between the measured pose and that of the result.
+        Distance and angle between the measured pose and the pose that the result predicts.
     is_used : bool
-        False if the stop was left out as an outlier.
+        False for an outlier, which the fit leaves out.
     position_m : tuple of 3 floats
-        Child sensor in its world: the camera in the frame of the target.
+        Position of the child sensor in its world: of the camera in the frame of the target.
     direction : tuple of 3 floats
-        Unit vector of the child sensor's z axis, in its world: the optical axis.
+        Optical axis: unit vector of the child sensor's z axis, in its world.
     """
 
     number: int
@@ -41,17 +41,18 @@ class Stop:
 
 @dataclass(frozen=True)
 class StopTable:
-    """All stops of a result.
+    """All stops of a result, and advice.
 
     Attributes
     ----------
     rows : tuple of Stop
+        All stops in the order of the input.
     start : int
-        Number of the stop that the next stops start from.
+        Number of the stop that the advised stops start from; 0 without advice.
     next : tuple of NextStop
-        Stops to add, the most useful first; empty if the stops contradict each other.
+        Advised stops, the most useful first; empty if the stops contradict each other.
     advice : str
-        The next stops in a sentence.
+        Advised stops as a sentence.
     """
 
     rows: tuple[Stop, ...]
@@ -63,7 +64,17 @@ class StopTable:
 def stop_table(
     errors: FloatArray, weights: FloatArray, Ts_world_child: FloatArray
 ) -> tuple[Stop, ...]:
-    """Return the stops of errors (N, 6), weights (N,) and poses (N, 4, 4) in the child's world."""
+    """Return the rows of a table.
+
+    Parameters
+    ----------
+    errors : (N, 6) array
+        Residuals of the stops: translation (m), rotation (rad).
+    weights : (N,) array
+        Weights of the stops; 0 for outliers.
+    Ts_world_child : (N, 4, 4) array
+        Measured poses of the child in its world.
+    """
     distances_m = np.linalg.norm(errors[:, :3], axis=1)
     angles_deg = np.degrees(np.linalg.norm(errors[:, 3:], axis=1))
     positions_m = map(tuple, se3.translation_of(Ts_world_child).tolist())
@@ -80,21 +91,21 @@ def stop_table(
 
 
 class StopsPart(Part):
-    """The part ``stops``; documents of other results have no such field."""
+    """Part ``stops`` of a result; documents of results without stops have no such field."""
 
     def __init__(self) -> None:
         super().__init__("stops", lambda: StopTable)
 
     def write(self, value: StopTable | None) -> Document:
-        """Return the field of a document."""
+        """Return the field ``stops`` of a document; none without the part."""
         return {} if value is None else {"stops": value}
 
     def advice(self, value: StopTable, result: Any) -> str:
-        """Return which stops to add."""
+        """Return the advice on the next stops as a sentence; empty if there is none."""
         return value.advice
 
     def facts(self, value: StopTable, result: Any) -> list[str]:
-        """Return the residual of each stop."""
+        """Return a line with the residual of each stop."""
         return [f"residuals of the stops: {'; '.join(map(_row_in_words, value.rows))}"]
 
 

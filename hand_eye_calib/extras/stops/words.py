@@ -1,4 +1,4 @@
-"""Sentences of the findings about stops."""
+"""Texts of the findings about stops: message, advice, probable cause."""
 
 from hand_eye_calib.core.checks.words import FindingWords
 from hand_eye_calib.core.results.records import Severity

@@ -1,4 +1,4 @@
-"""Pose of the child's world in the parent's world, as a part of results of stops."""
+"""Part of a result of stops: the pose of the child's world in the parent's world."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -12,27 +12,27 @@ from hand_eye_calib.core.geometry.se3 import inverse_covariance
 from hand_eye_calib.core.results.document import covariance_of, matrix_of, transform_of
 from hand_eye_calib.core.results.parts import ExtraTransform, Part
 
-# Where the camera of an arm is, by the values of the option ``setup``.
+# Values of the option ``setup`` (place of the camera of an arm), and their text.
 SETUPS = {"hand": "on the hand", "beside": "beside the robot"}
 
-# Attributes that are texts.
+# Attributes of :class:`Worlds` whose values are texts.
 _TEXTS = ("parent_world_frame", "child_world_frame", "setup")
 
 
 @dataclass(frozen=True, eq=False)
 class Worlds:
-    """Z of A X = Z B.
+    """Solution Z of ``A X = Z B``: the pose between both worlds, and the names of the frames.
 
     Attributes
     ----------
     T_world_world : (4, 4) array
         Pose of the child's world in the parent's world.
     cov_world_world : (6, 6) array
-        Covariance of ``T_world_world``, in the child's world.
+        Covariance of right perturbations of ``T_world_world``, in the frame of the child's world.
     parent_world_frame, child_world_frame : str
+        Names of the frames.
     setup : {"", "hand", "beside"}
-        Whether the camera is on the hand or beside the robot; empty if the poses are not those of
-        an arm.
+        Place of the camera of an arm: on the hand or beside the robot; empty without an arm.
     """
 
     T_world_world: FloatArray
@@ -47,7 +47,7 @@ class Worlds:
 
 
 class WorldsPart(Part):
-    """The part ``worlds``: five attributes of a result, and as many fields of a document."""
+    """Part ``worlds`` of a result: five attributes, and the same five fields of a document."""
 
     def __init__(self) -> None:
         super().__init__("worlds", lambda: Worlds)
@@ -58,7 +58,7 @@ class WorldsPart(Part):
         }
 
     def attribute(self, value: Worlds, name: str) -> Any:
-        """Return an attribute of a result that has the part."""
+        """Return the attribute of the result with this name."""
         return getattr(value, name)
 
     def write(self, value: Worlds | None) -> Document:
@@ -79,7 +79,7 @@ class WorldsPart(Part):
         return document
 
     def read(self, document: Mapping[str, Any]) -> Worlds | None:
-        """Return the part of a document; None if it has none."""
+        """Return the part that a document contains; None if there is none."""
         if document.get("T_world_world") is None:
             return None
         return Worlds(
@@ -89,7 +89,7 @@ class WorldsPart(Part):
         )
 
     def invert(self, value: Worlds) -> Worlds:
-        """Return the part of the result with both sensors exchanged."""
+        """Return the part for the inverse result, whose parent and child are exchanged."""
         T = value.T_world_world
         return replace(
             value,
@@ -100,7 +100,7 @@ class WorldsPart(Part):
         )
 
     def transforms(self, value: Worlds) -> dict[str, ExtraTransform]:
-        """Return the transform between the worlds."""
+        """Return the transform between both worlds, for documents and exports."""
         transform = ExtraTransform(
             value.T_world_world,
             value.child_world_frame,
@@ -110,7 +110,7 @@ class WorldsPart(Part):
         return {"T_world_world": transform}
 
     def headline(self, value: Worlds) -> str:
-        """Return where the camera is, and the option for the other place; empty without an arm."""
+        """Return the place of the camera and the option for the other one; empty without arm."""
         if value.setup not in SETUPS:
             return ""
         other = "beside" if value.setup == "hand" else "hand"
