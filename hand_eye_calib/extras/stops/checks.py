@@ -79,7 +79,7 @@ _CENTIMETRE = 0.01
 _MILLIMETRE = 0.001
 _UNITS = {_CENTIMETRE: "centimetres", _MILLIMETRE: "millimetres"}
 
-_UNEXPLAINED = attrgetter("unexplained")
+_UNEXPLAINED = attrgetter("unexplained_share")
 
 # Mistakes that each side may have, keys of ``CONVENTIONS``; the first one is no mistake.
 _CODES = ("", "quaternion_order", "quaternion_names", "inverse_orientation")
@@ -120,10 +120,7 @@ def examine(poses: StopPoses, is_scale_free: bool) -> Examination:
     """
     if len(poses) < MIN_STOPS_TO_CHECK:
         return Examination()
-    findings = [*check_frozen(poses)]
-    if all(issue.evidence["share"] < 1.0 for issue in findings):
-        findings += check_rows(poses)
-    findings = findings or [*check_angles(poses)]
+    findings = _check_rotations(poses)
     if findings:
         return Examination(tuple(findings))
     sample = poses.sample()
@@ -147,6 +144,17 @@ def examine(poses: StopPoses, is_scale_free: bool) -> Examination:
     return _with_units(sample, replace(examination, scale=chosen.scale), is_scale_free)
 
 
+def _check_rotations(poses: StopPoses) -> list[Finding]:
+    """Return findings of the checks that use rotations only.
+
+    Rows are not checked if one side is frozen throughout; angles only if nothing else was found.
+    """
+    findings = [*check_frozen(poses)]
+    if all(issue.evidence["share"] < 1.0 for issue in findings):
+        findings += check_rows(poses)
+    return findings or [*check_angles(poses)]
+
+
 # ------------------------------------------------------------------ conventions
 
 
@@ -164,18 +172,18 @@ def _best_hypothesis(sample: StopPoses) -> tuple[RoughFit, list[Mistakes]]:
         return as_given, []
     objectives = {rival: _objective(sample, rival) for rival in _rivals(sample)}
     smallest = min(objectives.values())
+    # Log likelihood that undoing the mistakes of the best rival gains.
     gain = min(_objective(sample, fit) for fit in plain) - smallest
-    good = _with_fewest_mistakes(
-        [rival for rival in objectives if objectives[rival] < smallest + MIN_LEAD]
-    )
     if gain < -MIN_LEAD:
         return as_given, []
+    likely = [rival for rival in objectives if objectives[rival] < smallest + MIN_LEAD]
+    likely = _with_fewest_mistakes(likely)
     if gain < min_certain_gain(len(sample)):
-        return as_given, [rival.mistakes for rival in good]
-    best = min(good, key=_UNEXPLAINED)
+        return as_given, [rival.mistakes for rival in likely]
+    best = min(likely, key=_UNEXPLAINED)
     if best.unexplained_share > MAX_UNEXPLAINED:
         return as_given, []
-    return best, [rival.mistakes for rival in good if rival is not best]
+    return best, [rival.mistakes for rival in likely if rival is not best]
 
 
 def _better_setup(fits: Sequence[RoughFit]) -> RoughFit:
@@ -183,8 +191,8 @@ def _better_setup(fits: Sequence[RoughFit]) -> RoughFit:
 
     Rotations decide. If both setups explain them about equally, positions decide.
     """
-    largest_turning = MIN_IMPROVEMENT * min(fit.rotation_share for fit in fits)
-    possible = [fit for fit in fits if fit.rotation_share <= largest_turning]
+    max_share = MIN_IMPROVEMENT * min(fit.rotation_share for fit in fits)
+    possible = [fit for fit in fits if fit.rotation_share <= max_share]
     return min(possible, key=_UNEXPLAINED)
 
 
@@ -258,25 +266,21 @@ def _codes_and_streams(mistakes: Mistakes) -> list[tuple[str, str]]:
 
 def _check_agreement(fit: RoughFit) -> list[Finding]:
     """Return a finding if the residuals of the best hypothesis are too large for noise."""
-    are_too_large = (
-        fit.rotation_share > MAX_UNEXPLAINED or fit.position_share > UNRELATED_UNEXPLAINED
-    )
-    are_beyond_noise = (
-        fit.position_share > SMALL_UNEXPLAINED and fit.position_ratio > _MAX_POSITION_RATIO
-    )
+    rotation_share = fit.rotation_share
+    position_share = fit.position_share
+    ratio = fit.position_ratio
+    are_too_large = rotation_share > MAX_UNEXPLAINED or position_share > UNRELATED_UNEXPLAINED
+    are_beyond_noise = position_share > SMALL_UNEXPLAINED and ratio > _MAX_POSITION_RATIO
     if not (are_too_large or are_beyond_noise):
         return []
-    contradict = (
-        fit.position_share > _CONTRADICTING_SHARE
-        and fit.position_ratio > _CONTRADICTING_POSITION_RATIO
-    )
+    contradict = position_share > _CONTRADICTING_SHARE and ratio > _CONTRADICTING_POSITION_RATIO
     if fit.unexplained_share > MAX_UNEXPLAINED or contradict:
         severity = Severity.ERROR
     elif fit.unexplained_share >= _DOUBTFUL_SHARE:
         severity = Severity.WARNING
     else:
         return []
-    part = "rotations" if fit.rotation_share > fit.position_share else "positions"
+    part = "rotations" if rotation_share > position_share else "positions"
     share = min(fit.unexplained_share, 1.0)
     return [finding("disagreeing_stops", severity=severity, part=part, share=share)]
 

@@ -186,14 +186,7 @@ def rough_fit(poses: StopPoses, mistakes: Mistakes) -> RoughFit:
     stops = poses.without(mistakes)
     A = stops.Ts_world_parent
     B = stops.Ts_world_child
-    weights = np.ones(len(A))
-    for _ in range(_MAX_ROUNDS):
-        X, Z = closest_rotations(se3.rotation_of(A), se3.rotation_of(B), weights)
-        angles_rad = se3.rotation_angle(
-            np.swapaxes(Z @ se3.rotation_of(B), 1, 2) @ se3.rotation_of(A) @ X
-        )
-        weights = robust_weights("cauchy", (angles_rad / max(median(angles_rad), _TINY)) ** 2)
-    error_rad = median(angles_rad)
+    error_rad, Z = _fit_rotations(se3.rotation_of(A), se3.rotation_of(B))
     turns_rad = [median(above_diagonal(angles_between(Ts))) for Ts in (A, B)]
     # Noise may be as large as rotations of few degrees, so the share is limited for these.
     rotation_share = error_rad / max(*turns_rad, MIN_TURN_RAD)
@@ -210,6 +203,17 @@ def rough_fit(poses: StopPoses, mistakes: Mistakes) -> RoughFit:
         scale=scale,
         log_likelihood=-3.0 * len(A) * float(logs),
     )
+
+
+def _fit_rotations(R_A: FloatArray, R_B: FloatArray) -> tuple[float, FloatArray]:
+    """Return the median residual (rad) of ``R_A X = Z R_B``, and the rotation Z (3, 3)."""
+    weights = np.ones(len(R_A))
+    for _ in range(_MAX_ROUNDS):
+        X, Z = closest_rotations(R_A, R_B, weights)
+        angles_rad = se3.rotation_angle(np.swapaxes(Z @ R_B, 1, 2) @ R_A @ X)
+        error_rad = median(angles_rad)
+        weights = robust_weights("cauchy", (angles_rad / max(error_rad, _TINY)) ** 2)
+    return error_rad, Z
 
 
 def _in_usual_convention(Ts: FloatArray, code: str) -> FloatArray:

@@ -308,20 +308,25 @@ def _with_checked_scale(setup_fit: SetupFit, repaired: _Repaired, setup: str | N
     is_size = 1.0 / _MAX_SIZE_RATIO < free.scale < _MAX_SIZE_RATIO
     scale = repaired.unit * free.scale
     sigma = repaired.unit * free.scale_sigma
-    is_allowed = is_auto and is_size
-    if not is_allowed:
+    if not (is_auto and is_size):
         issue = finding("target_scale", "child", scale=scale, sigma=sigma, times=1.0 / scale)
         repaired.findings.append(replace(issue, options={"scale": "estimate"}))
     if not is_size or config.is_known("scale"):
         return as_given
-    undo: object = "none"
-    if repaired.unit != 1.0 and not is_auto:
-        undo = repaired.unit
-    repaired.warnings.append(
-        f"solved with the child's lengths times {scale:.4f} +/- {sigma:.4f}; to take them as they "
-        f"are, give scale {undo}"
-    )
+    repaired.warnings.append(_scale_in_words(scale, sigma, 1.0 if is_auto else repaired.unit))
     return free
+
+
+def _scale_in_words(scale: float, sigma: float, unit: float) -> str:
+    """Return the estimated scale as text, with the option for the lengths as they are.
+
+    ``unit`` is the factor from the child's lengths to metres if the option must contain it, else 1.
+    """
+    option = "none" if unit == 1.0 else unit
+    return (
+        f"solved with the child's lengths times {scale:.4f} +/- {sigma:.4f}; to take them as they "
+        f"are, give scale {option}"
+    )
 
 
 def _is_clearly_not_one(poses: StopPoses, free: SetupFit, as_given: SetupFit) -> bool:
