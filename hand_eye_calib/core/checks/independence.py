@@ -5,6 +5,7 @@ through an assumed transform. The result would then only return that transform.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.blocks import Blocks, jackknife_covariance
@@ -92,13 +93,15 @@ _LATE = 2
 # Shortest path (m) on which a filter is found so: errors of a sensor may also be correlated for a
 # second and no longer.
 _STEADY_PATH_M = 190.0
-# Largest noise of the difference of both streams, as a multiple of the noise of the noisier stream,
-# if one stream was computed from the other: the noise of a copy contains that of its source. The
-# noise of two sensors adds up.
-_NOISE_OF_COPY = 1.1
-# Smallest such multiple. Below it, the noisier stream consists of motion, or the copy has so little
-# noise of its own that other checks detect it (_SHARED).
-_LEAST_NOISE = 0.33
+# Noise of the difference of both streams if one stream was computed from the other, as a multiple
+# of the noise of the noisier stream. The noise of a copy contains that of its source; the noise of
+# two sensors adds up. Below the smallest multiple the noisier stream consists of motion, or the
+# copy has so little noise of its own that other checks detect it (_SHARED).
+_NOISE_OF_COPY = (0.33, 1.1)
+# The factor of a regression of the noise of a copy on the noise of its source is about 1; that of
+# two sensors is 0. Limit between them, and standard deviations from which on a factor is clear.
+_CONTAINED = 0.5
+_CONTAINED_SIGMAS = 4.0
 # Largest number of poses that are compared.
 _MOST_POSES = 2000
 
@@ -350,17 +353,58 @@ def _is_noise_shared(pose_pairs: PosePairs, X: FloatArray) -> bool:
     Noise is white in the upper half of the spectrum. Positions or orientations without white noise
     are not compared.
     """
-    of_parent = _second_differences(pose_pairs.Ts_pw_p @ X)
-    of_child = _second_differences(pose_pairs.Ts_cw_c)
-    is_calm = _is_calm(of_parent, of_child)[:, None, None]
-    quarters = _upper_quarters(np.stack([of_parent, of_child, of_child - of_parent]) * is_calm)
+    streams = np.stack(
+        [_second_differences(Ts) for Ts in (pose_pairs.Ts_pw_p @ X, pose_pairs.Ts_cw_c)]
+    )
+    streams = streams * _is_calm(*streams)[:, None, None]
+    quarters = _upper_quarters(np.concatenate([streams, [streams[1] - streams[0]]]))
     # Positions and orientations of two quarters, (2, 2).
     of_noisier = quarters[:, :2].max(axis=1)
-    of_difference = quarters[:, 2]
+    shares = (quarters[:, 2].sum(axis=0) / of_noisier.sum(axis=0)) ** 0.5
+    lowest, highest = _NOISE_OF_COPY
     is_white = of_noisier.max(axis=0) < _FLAT * of_noisier.min(axis=0)
-    shares = of_difference.sum(axis=0) / of_noisier.sum(axis=0)
-    is_noise = is_white & (shares > _LEAST_NOISE**2)
-    return bool(is_noise.any() and (shares[is_noise] < _NOISE_OF_COPY**2).all())
+    is_noise = is_white & (shares > lowest)
+    if not is_noise.any() or (shares[is_noise] > highest).any():
+        return False
+    of_parent, of_child = quarters[:, :2].sum(axis=0)
+    is_parent_noisier = (of_parent > of_child)[:, None]
+    streams = np.where(is_parent_noisier, streams[::-1], streams)
+    factors, sigmas = _factors_of_noise(streams)
+    is_contained = (factors > _CONTAINED) & (factors > _CONTAINED_SIGMAS * sigmas)
+    is_foreign = factors + _CONTAINED_SIGMAS * sigmas < _CONTAINED
+    return bool(is_contained[is_noise].any() and not is_foreign[is_noise].any())
+
+
+def _factors_of_noise(streams: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Regress the noise of the second of two streams on the noise of the first.
+
+    ``streams`` (2, N, 2, 3) are second differences of positions and orientations.
+
+    Returns
+    -------
+    (2,) array, (2,) array
+        Factors of positions and of orientations, and their standard deviations.
+    """
+    spectra = _upper_spectra(streams)
+    source, copy = spectra
+    power = (np.abs(source) ** 2).sum(axis=(0, 2))
+    factors = (source.conj() * copy).real.sum(axis=(0, 2)) / np.maximum(power, 1e-300)
+    residuals = copy - factors[:, None] * source
+    # The real part of a coefficient has half of its power.
+    variances = 0.5 * (np.abs(residuals) ** 2).mean(axis=(0, 2)) / np.maximum(power, 1e-300)
+    return factors, np.sqrt(variances)
+
+
+def _upper_spectra(second_differences: FloatArray) -> NDArray[np.complex128]:
+    """Return the upper half of the spectra (S, F, 2, 3) of poses, from second differences.
+
+    ``second_differences`` is (S, N, 2, 3). The rise of the spectrum with the frequency, which
+    differences cause, is removed.
+    """
+    spectra = np.fft.rfft(second_differences, axis=1)
+    angles = np.linspace(1e-3, np.pi / 2.0, spectra.shape[1])
+    spectra /= (2.0 * np.sin(angles))[:, None, None] ** 3
+    return np.asarray(spectra[:, spectra.shape[1] // 2 :])
 
 
 def _size_of_changes(values: FloatArray, n_poses: int) -> FloatArray:
