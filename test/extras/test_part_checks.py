@@ -52,10 +52,10 @@ def test_a_fault_of_a_part_of_the_poses_is_named_and_never_to_be_used(kind, faul
 
 # Faults of a path, and the code of the finding on machines that move in other ways.
 OF_THE_PATH = [
-    ("low-passed 200 ms", "smoothed_positions", ["hand", "agv"]),
+    ("low-passed 200 ms", "smoothed_positions", ["hand", "agv", "drone"]),
     ("smoothed 250 ms", "smoothed_positions", ["car", "drone_slam", "agv"]),
     ("constant height", "axis_scale", ["hand", "agv"]),
-    ("height in feet", "axis_scale", ["excavator"]),
+    ("height in feet", "axis_scale", ["excavator", "agv"]),
     ("height 300 ms late", "axis_lag", ["hand", "car"]),
 ]
 
@@ -70,6 +70,13 @@ def test_a_fault_of_the_path_is_named_and_its_error_is_within_sigma(fault, code,
     assert result.verdict is not hec.Verdict.USE
     truth = part_faults.positions(platform, fault, SEED).truth
     assert part_faults.distance("positions", result, truth) < 2.5
+
+
+@pytest.mark.parametrize("platform", ["hand", "drone"])
+def test_a_delay_of_positions_is_estimated(platform):
+    result = solved("positions", "delayed 150 ms", platform)
+    assert codes(result) == []
+    assert result.time_offset_s == pytest.approx(-0.15, abs=0.02)
 
 
 def test_positions_too_few_to_detect_smoothing_are_to_be_used_with_care():

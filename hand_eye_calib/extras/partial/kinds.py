@@ -49,8 +49,28 @@ _COARSE_INTERVALS = 0.2
 
 
 def _solve_positions(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
-    """Estimate the lever arm; positions have no cross-check."""
-    return _solve(snapshot, estimate_lever_arm)
+    """Estimate the lever arm; positions have no cross-check.
+
+    A delay or a low-pass filter may make positions look unrelated to the poses. Speeds determine
+    the delay then, and the solve is repeated.
+    """
+    result = _solve(snapshot, estimate_lever_arm)
+    config = snapshot.config
+    if not _is_unrelated(result) or len(snapshot.kept) or "time_offset" in config.given:
+        return result
+    known_s = float(config.time_offset)
+    parent, child = snapshot.streams
+    correlation = correlate_rates(parent, child.shifted(known_s), config.max_gap, of_speed=True)
+    if not correlation.is_clear or not MOST_MOVED_S < abs(correlation.offset_s) < UNASKED_S:
+        return result
+    config = replace(config, time_offset=known_s + correlation.offset_s)
+    shifted = _solve(replace(snapshot, config=config), estimate_lever_arm)
+    return result if _is_unrelated(shifted) else shifted
+
+
+def _is_unrelated(calibration: Calibration) -> bool:
+    """Return whether the solve did not explain the positions."""
+    return any(found.code == "unrelated" for found in calibration.findings)
 
 
 def _solve_rotations(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
