@@ -170,7 +170,7 @@ def test_the_word_is_large_on_a_phone_and_larger_on_a_wide_screen(page):
 
 def test_the_title_is_the_word_of_the_newest_view(page):
     assert page.browser.evaluate("document.title") == f"{Tone.BUSY.value} GO ON"
-    assert page.get("#said", "textContent").startswith(f"{Tone.BUSY.value} GO ON")
+    assert page.get("#announcement", "textContent").startswith(f"{Tone.BUSY.value} GO ON")
     page.show(MOVED)
     assert page.browser.evaluate("document.title") == f"{Tone.BAD.value} MOUNT MOVED"
     assert page.wait_for_connection("✓") == "✓ connected"
@@ -286,7 +286,7 @@ WITH_PRIOR = replace(
 
 def choose(page, axis):
     page.browser.evaluate(
-        f"asked.value = {json.dumps(axis)}; asked.dispatchEvent(new Event('change'))"
+        f"axisByHand.value = {json.dumps(axis)}; axisByHand.dispatchEvent(new Event('change'))"
     )
 
 
@@ -302,7 +302,7 @@ def test_an_axis_measured_by_hand_is_sent(page):
 
 def test_the_unit_and_the_button_to_remove_follow_the_axis(page):
     page.show(WITH_PRIOR)
-    options = "[...asked.options].map((option) => option.value)"
+    options = "[...axisByHand.options].map((option) => option.value)"
     assert page.browser.evaluate(options) == ["z", "yaw"]
     assert (page.get("#unit", "textContent"), page.get("#forget", "hidden")) == ("m", False)
     choose(page, "yaw")
@@ -313,7 +313,7 @@ def test_a_chosen_axis_stays_when_the_axes_change(page):
     page.show(WITH_PRIOR)
     choose(page, "yaw")
     page.show(replace(WITH_PRIOR, word="GO ON", by_hand=("yaw", "z", "x")))
-    assert page.get("#asked", "value") == "yaw"
+    assert page.get("#by-hand-axis", "value") == "yaw"
 
 
 def test_a_prior_is_removed(page):

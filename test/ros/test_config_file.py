@@ -1,4 +1,4 @@
-"""config/calibrator.yaml and launch/calibrator.launch.py say what the code says.
+"""config/calibrator.yaml and launch/calibrator.launch.py agree with the code.
 
 ``python test/ros/test_config_file.py > config/calibrator.yaml`` writes the file anew after an
 option has changed.
@@ -14,9 +14,10 @@ from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.core.base.option import option_name
 
 HEADER = """\
-# Parameters of the node calibrator: all there are, at their defaults.
-# Numbers with a decimal point must keep it: to ROS, 2 and 2.0 are of different types.
-# Options in comments are not set here: what is set counts as known, even if it is the default.
+# All parameters of the node calibrator, with their defaults.
+# Keep the decimal point of a number: for ROS, 2 and 2.0 have different types.
+# A parameter in a comment is not set: a check may choose its value. A check never changes a value
+# that is set, even if it is the default.
 """
 CONVENTIONS = [
     f"{stream}_{kind}" for stream in ("parent", "child") for kind in ("invert", "quaternion")
@@ -31,7 +32,7 @@ def fields():
 
 
 def expected_file():
-    """The file as the option dataclasses want it."""
+    """The file that the option dataclasses define."""
     lines = [HEADER + "/**:", "  ros__parameters:"]
     section = None
     for field in fields():

@@ -1,153 +1,170 @@
 "use strict";
 
-// The key comes with the address that the terminal shows.
+// The address of the page contains the key, which every request needs.
 const address = new URLSearchParams(location.search);
-const part = (id) => document.getElementById(id);
-const view = part("view"), connection = part("connection"), form = part("by-hand");
-const sound = part("sound"), links = document.querySelectorAll("a[data-file]");
-const asked = part("asked");
+const element = (id) => document.getElementById(id);
+const view = element("view"), connection = element("connection"), form = element("by-hand");
+const sound = element("sound"), links = document.querySelectorAll("a[data-file]");
+const axisByHand = element("by-hand-axis");
 const footer = document.querySelector("footer");
 const buttons = document.querySelectorAll("button[data-request]");
 
-// The server sends something every second. A connection that is silent for longer is opened anew:
-// a phone that was asleep or out of reach does not notice by itself.
-const SILENT_MS = 4000, RETRY_MS = 1000;
+// The server sends an event every second. After a longer silence (ms) the page connects again: a
+// phone that was asleep or out of reach does not notice that its connection is lost.
+const MAX_SILENCE_MS = 4000;
+// Period (ms) at which the page checks its connection.
+const CHECK_PERIOD_MS = 1000;
+// Priors that are set, by axis.
 let priors = {};
-let source = null, heardAt = 0, lostAt = null, isOld = false, tones = null;
+// Connection to the server, and the times of its last event and of its loss.
+let source = null, receivedAt = 0, lostAt = null;
+// Whether the server has another key, so that the address of this page is useless.
+let isOldAddress = false;
+// Output of sounds; null while sounds are off.
+let audio = null;
 let lastSentence = "";
 
+// Colour of the page's icon, by tone.
 const ICONS = {good: "#11703a", busy: "#0b5cad", act: "#c77700", bad: "#b3211c", unknown: "#6b4a8a"};
 
-function show(isLive) {
+function showConnection(isLive) {
   if (!isLive && lostAt === null) lostAt = Date.now();
   if (isLive) lostAt = null;
   const at = new Date(lostAt).toLocaleTimeString([], {hour: "2-digit", minute: "2-digit"});
+  let text = `✗ CONNECTION LOST at ${at}, trying again ...`;
+  if (isOldAddress) text = "✗ OLD ADDRESS: open the address that watch shows now";
+  if (isLive) text = "✓ connected";
   connection.classList.toggle("lost", !isLive);
-  connection.textContent = isLive ? "✓ connected"
-    : isOld ? "✗ OLD ADDRESS: open the address that watch shows now"
-    : `✗ CONNECTION LOST at ${at}, trying again ...`;
+  connection.textContent = text;
   for (const button of buttons) button.disabled = !isLive;
 }
 
-// Who drives does not look at the page: let the phone shake, and sound, when it says something
-// else; high for what is good, low for what is bad.
-function call(tone) {
-  const mayShake = navigator.userActivation?.hasBeenActive !== false;
-  if (navigator.vibrate && mayShake) navigator.vibrate([200, 100, 200]);
-  if (tones === null) return;
-  const beep = tones.createOscillator();
+// A driver does not look at the page. So the phone vibrates and beeps at each new headline: with a
+// high tone if it is good, with a low tone if it is bad.
+function alertPerson(tone) {
+  // Browsers refuse vibration before the first touch.
+  const mayVibrate = navigator.userActivation?.hasBeenActive !== false;
+  if (navigator.vibrate && mayVibrate) navigator.vibrate([200, 100, 200]);
+  if (audio === null) return;
+  const beep = audio.createOscillator();
   beep.frequency.value = {good: 1047, bad: 262, act: 392}[tone] || 659;
-  beep.connect(tones.destination);
+  beep.connect(audio.destination);
   beep.start();
-  beep.stop(tones.currentTime + (tone === "bad" ? 1.2 : 0.3));
+  beep.stop(audio.currentTime + (tone === "bad" ? 1.2 : 0.3));
 }
 
-function put(html) {
+// Display the HTML of a view, and the buttons and links that its first element lists.
+function display(html) {
   view.innerHTML = html;
-  const state = part("state"), shown = state.dataset.buttons.split(" ");
+  const state = element("state"), requests = state.dataset.buttons.split(" ");
   for (const button of buttons) {
-    button.hidden = !shown.includes(button.dataset.request);
-    button.classList.toggle("main", shown[0] === button.dataset.request
-      && !["solve", "reset"].includes(shown[0]));
+    button.hidden = !requests.includes(button.dataset.request);
+    // The first request is recommended, except solve and reset.
+    button.classList.toggle("main", requests[0] === button.dataset.request
+      && !["solve", "reset"].includes(requests[0]));
   }
-  footer.hidden = ["", "reset"].includes(shown[0]);
-  part("files").hidden = state.dataset.files === "";
-  offer(state.dataset.byHand.split(" ").filter(Boolean), JSON.parse(state.dataset.priors));
+  footer.hidden = ["", "reset"].includes(requests[0]);
+  element("files").hidden = state.dataset.files === "";
+  offerAxes(state.dataset.byHand.split(" ").filter(Boolean), JSON.parse(state.dataset.priors));
   for (const link of links) {
     link.hidden = !state.dataset.files.split(" ").includes(link.dataset.file);
   }
   const headline = view.querySelector(".headline").innerText;
-  // A sentence that differs only in its numbers is not new.
+  // A headline that differs only in its numbers is not new.
   const sentence = headline.replace(/[\d.,]+( (s|min|h)\b)?/g, "");
   if (sentence !== lastSentence) {
-    call(state.className);
-    part("said").textContent = headline;
+    alertPerson(state.className);
+    element("announcement").textContent = headline;
   }
   lastSentence = sentence;
   document.title = view.querySelector("h1").textContent;
   const colour = encodeURIComponent(ICONS[state.className]);
-  part("icon").href = "data:image/svg+xml,<svg xmlns='http://www.w3.org/2000/svg' "
+  element("icon").href = "data:image/svg+xml,<svg xmlns='http://www.w3.org/2000/svg' "
     + `viewBox='0 0 9 9'><circle cx='4.5' cy='4.5' r='4' fill='${colour}'/></svg>`;
 }
 
-// The axes that can be measured by hand, and the priors that are set. What somebody has chosen and
-// typed stays.
-function offer(axes, set) {
-  priors = set;
+// Fill the form for values measured by hand. The axis that a person has chosen and the values that
+// a person has typed stay.
+function offerAxes(axes, newPriors) {
+  priors = newPriors;
   form.hidden = axes.length === 0;
-  if (asked.dataset.axes !== axes.join(" ")) {
-    const chosen = asked.value;
-    asked.dataset.axes = axes.join(" ");
-    asked.innerHTML = axes.map((axis) => `<option>${axis}</option>`).join("");
-    asked.value = axes.includes(chosen) ? chosen : axes[0] || "";
+  if (axisByHand.dataset.axes !== axes.join(" ")) {
+    const chosen = axisByHand.value;
+    axisByHand.dataset.axes = axes.join(" ");
+    axisByHand.innerHTML = axes.map((axis) => `<option>${axis}</option>`).join("");
+    axisByHand.value = axes.includes(chosen) ? chosen : axes[0] || "";
   }
-  choose();
+  updateForm();
 }
 
-function choose() {
-  part("unit").textContent = "xyz".includes(asked.value) ? "m" : "deg";
-  part("forget").hidden = !(asked.value in priors);
+// Display the unit of the chosen axis, and the button that removes its prior.
+function updateForm() {
+  element("unit").textContent = "xyz".includes(axisByHand.value) ? "m" : "deg";
+  element("forget").hidden = !(axisByHand.value in priors);
 }
 
 function connect() {
   if (source !== null) source.close();
-  heardAt = Date.now();
+  receivedAt = Date.now();
   source = new EventSource("events?" + address);
   source.onmessage = (event) => {
-    heardAt = Date.now();
-    show(true);
-    if (event.data) put(event.data);
+    receivedAt = Date.now();
+    showConnection(true);
+    if (event.data) display(event.data);
   };
-  source.onerror = () => { source.close(); show(false); look(); };
+  source.onerror = () => { source.close(); showConnection(false); checkAddress(); };
 }
 
-// Another user's server, or one that could not keep its key: no reconnecting finds it.
-async function look() {
+// The server refuses the key if it is the server of another user, or if it could not store its key
+// at the last start. Then a new connection fails, too.
+async function checkAddress() {
   try {
-    isOld = (await fetch("page.html?" + address, {method: "GET"})).status === 403;
-  } catch (error) { isOld = false; }
+    isOldAddress = (await fetch("page.html?" + address, {method: "GET"})).status === 403;
+  } catch (error) { isOldAddress = false; }
 }
 
 setInterval(() => {
   const isClosed = source.readyState === EventSource.CLOSED;
-  if (isClosed || Date.now() - heardAt > SILENT_MS) { show(false); connect(); }
-}, RETRY_MS);
+  if (isClosed || Date.now() - receivedAt > MAX_SILENCE_MS) { showConnection(false); connect(); }
+}, CHECK_PERIOD_MS);
 
+// Send a request to the server; ``more`` are further arguments, such as "&axis=z".
 async function post(request, more = "") {
   try {
     const answer = await fetch(request + "?" + address + more, {method: "POST"});
-    if (!answer.ok) show(false);
-  } catch (error) { show(false); }
+    if (!answer.ok) showConnection(false);
+  } catch (error) { showConnection(false); }
 }
 
 for (const link of links) link.href = link.dataset.file + "?" + address;
 for (const button of buttons) {
   button.addEventListener("click", () => {
     if (button.dataset.sure && !confirm(button.dataset.sure)) return;
-    const set = Object.entries(priors).map(([axis, prior]) => `${axis} = ${prior}`).join(", ");
+    // A reset keeps the priors unless the person removes them.
+    const texts = Object.entries(priors).map(([axis, prior]) => `${axis} = ${prior}`).join(", ");
     const isReset = button.dataset.request === "reset";
-    if (isReset && set && confirm(`Remove the prior, too? It is ${set}.`)) post("forget");
+    if (isReset && texts && confirm(`Remove the prior, too? It is ${texts}.`)) post("forget");
     post(button.dataset.request);
   });
 }
 
 form.addEventListener("submit", (event) => {
   event.preventDefault();
-  const given = new URLSearchParams(new FormData(form));
-  given.set("axis", asked.value);
-  post("prior", "&" + given);
+  const values = new URLSearchParams(new FormData(form));
+  values.set("axis", axisByHand.value);
+  post("prior", "&" + values);
 });
-asked.addEventListener("change", choose);
-part("forget").addEventListener("click", () => post("forget", "&axis=" + asked.value));
+axisByHand.addEventListener("change", updateForm);
+element("forget").addEventListener("click", () => post("forget", "&axis=" + axisByHand.value));
 
-// Browsers allow sound only after a touch, and a screen that stays on only to pages that come over
-// https or from the same computer.
+// Browsers permit sound only after a touch, hence the button.
 sound.addEventListener("click", () => {
-  tones = tones === null ? new AudioContext() : null;
-  sound.textContent = tones ? "Sound: on" : "Sound: off";
-  sound.setAttribute("aria-pressed", String(tones !== null));
+  audio = audio === null ? new AudioContext() : null;
+  sound.textContent = audio ? "Sound: on" : "Sound: off";
+  sound.setAttribute("aria-pressed", String(audio !== null));
 });
 
+// Keep the screen on. Browsers permit that only to pages over https or from the same computer.
 function stayOn() {
   if (navigator.wakeLock && document.visibilityState === "visible") {
     navigator.wakeLock.request("screen").catch(() => {});
