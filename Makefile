@@ -13,7 +13,7 @@
 #   make gate-quick    the same on fewer recordings; one minute
 #   make bench         benchmarks against the baseline; two minutes (BENCH_ARGS=--full: four)
 #   make bench-node    load, soak and crashes of the node; about four minutes
-#   make sessions      eleven live sessions of the node, and whether all its surfaces agree; 20 minutes
+#   make sessions      twelve live sessions of the node, and whether all its surfaces agree; 20 minutes
 #                      (SESSIONS='"knock" "parked"' for some)
 #   make dist          wheel and sdist in dist/, checked (RELEASE=1: only if nothing is a placeholder)
 #   make try-dist      make dist, then install wheel and sdist in clean environments and calibrate

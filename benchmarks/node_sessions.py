@@ -1,4 +1,4 @@
-"""Ten live sessions of the real node: do all surfaces agree, second by second?
+"""Twelve live sessions of the real node: do all surfaces agree, second by second?
 
     OMP_NUM_THREADS=1 python benchmarks/node_sessions.py [SESSION ...] [--out DIRECTORY]
 
@@ -6,7 +6,8 @@ Each session is a minute or two of simulated driving, published in real time, wi
 (a knock, a stream that stops, a wrong ``installed`` ...). A witness records the state of the node,
 its topics, ``/diagnostics``, ``/tf_static``, the page of ``watch``, the log and the saved files.
 They are compared at every second. Prints a table and fails (exit code 1) at a contradiction, or if
-a session does not end as it should. With ``--out``, all headlines of the page are kept.
+a session does not end as it should. With ``--out``, all pages and headlines are kept
+(``watch_picture.py`` makes a moving picture of them).
 """
 
 import argparse
@@ -14,6 +15,7 @@ import contextlib
 import dataclasses
 import http.client
 import itertools
+import json
 import math
 import multiprocessing
 import os
@@ -50,7 +52,7 @@ from std_msgs.msg import String  # noqa: E402
 from suite.table import Table, show  # noqa: E402
 
 from hand_eye_calib.core.geometry import se3  # noqa: E402
-from hand_eye_calib.extras.simulation.drive import simulate_drive  # noqa: E402
+from hand_eye_calib.extras.simulation.drive import add_noise, simulate_drive  # noqa: E402
 from hand_eye_calib.extras.simulation.options import HILLY_DRIVE, REALISTIC  # noqa: E402
 from hand_eye_calib.formats.results import load_result  # noqa: E402
 from hand_eye_calib.online.live.progress import AXIS_KEYS  # noqa: E402
@@ -84,6 +86,7 @@ class Streams:
     child_s: np.ndarray
     Ts_child: np.ndarray
     T_parent_child: np.ndarray
+    T_pw_cw: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -144,35 +147,63 @@ def end_child(streams):
     streams.Ts_child = streams.Ts_child[keep]
 
 
+def nearest(times_s, wanted_s):
+    """Return the index of the pose that is nearest to each wanted time."""
+    return np.abs(times_s - wanted_s[:, None]).argmin(axis=1)
+
+
 def park(streams):
     """Stand still from 25 to 55 s; the drive goes on from there."""
     for name in ("parent", "child"):
         times_s = getattr(streams, f"{name}_s")
         Ts = getattr(streams, f"Ts_{name}")
         moving_s = np.where(times_s < 25.0, times_s, np.maximum(25.0, times_s - 30.0))
-        nearest = np.searchsorted(times_s, moving_s).clip(max=len(Ts) - 1)
-        setattr(streams, f"Ts_{name}", Ts[nearest])
+        setattr(streams, f"Ts_{name}", Ts[nearest(times_s, moving_s)])
+
+
+def replace_start(streams, until_s, motion):
+    """Replace the motion of the body before a time.
+
+    ``motion(seconds, Ts)`` returns the new poses of the body in its frame at ``until_s``. The
+    arguments are times (s) relative to ``until_s``, and the old poses.
+    """
+    T_pw_body = streams.Ts_parent[np.abs(streams.parent_s - until_s).argmin()]
+    T_cw_pw = se3.inverse(streams.T_pw_cw)
+    for name, T_world_pw, T_body_sensor in (
+        ("parent", np.eye(4), np.eye(4)),
+        ("child", T_cw_pw, streams.T_parent_child),
+    ):
+        times_s = getattr(streams, f"{name}_s")
+        Ts = getattr(streams, f"Ts_{name}")
+        T_world_body = T_world_pw @ T_pw_body
+        is_early = times_s < until_s
+        Ts_body = se3.inverse(T_world_body) @ Ts[is_early] @ se3.inverse(T_body_sensor)
+        Ts_new = motion(times_s[is_early] - until_s, Ts_body)
+        Ts[is_early] = T_world_body @ Ts_new @ T_body_sensor
 
 
 def start_straight(streams):
-    """Drive straight on for the first 25 s."""
-    for name in ("parent", "child"):
-        times_s = getattr(streams, f"{name}_s")
-        Ts = getattr(streams, f"Ts_{name}")
-        # The body moves with 1.5 m/s along its x axis until it is where the drive begins.
-        to_start_m = 1.5 * np.minimum(times_s - 25.0, 0.0)
-        driven = np.searchsorted(times_s, times_s - 25.0).clip(max=len(Ts) - 1)
-        moved = Ts[np.where(times_s < 25.0, 0, driven)]
-        if name == "child":
-            T_child_parent = se3.inverse(streams.T_parent_child)
-            moved = moved @ T_child_parent
-        ahead = se3.from_rotation_translation(
-            np.eye(3), np.column_stack([to_start_m, 0 * to_start_m, 0 * to_start_m])
+    """Drive straight on at 1.5 m/s for the first 25 s."""
+
+    def straight(seconds, Ts):
+        Ts = np.tile(np.eye(4), (len(Ts), 1, 1))
+        Ts[:, 0, 3] = 1.5 * seconds
+        return Ts
+
+    replace_start(streams, 25.0, straight)
+
+
+def start_flat(streams):
+    """Drive on a flat floor for the first 45 s."""
+
+    def flat(seconds, Ts):
+        rpy = np.zeros((len(Ts), 3))
+        rpy[:, 2] = np.arctan2(Ts[:, 1, 0], Ts[:, 0, 0])
+        return se3.from_rotation_translation(
+            se3.rotation_from_rpy(rpy), Ts[:, :3, 3] * [1.0, 1.0, 0.0]
         )
-        moved = moved @ ahead
-        if name == "child":
-            moved = moved @ streams.T_parent_child
-        setattr(streams, f"Ts_{name}", moved)
+
+    replace_start(streams, 45.0, flat)
 
 
 QUIET = {"target.translation": 0.04, "target.rotation": 0.0105}
@@ -193,7 +224,14 @@ SESSIONS = {
     "two publishers": Session(
         60.0, "BAD INPUT|CHECK", second_publisher_s=30.0, must_appear="publishers"
     ),
-    "straight start": Session(110.0, "DONE", parameters=QUIET, accident=start_straight),
+    "straight start": Session(90.0, "DONE", parameters=QUIET, accident=start_straight),
+    "flat start": Session(
+        120.0,
+        "DONE",
+        parameters=QUIET | {"installed": ""},
+        accident=start_flat,
+        must_appear="HAS MOVED",
+    ),
     "parked": Session(120.0, "DONE", parameters=QUIET, accident=park),
     "child silent for 20 s": Session(
         110.0, "DONE", parameters=QUIET, accident=stop_child, must_appear="PAUSED|CHECK INPUT"
@@ -212,16 +250,20 @@ def simulated(session, seed):
         child_rate=child_hz,
         start_time=0.0,
     )
-    drive = simulate_drive(seed, config, REALISTIC)
+    drive = simulate_drive(seed, config)
     streams = Streams(
         drive.parent.stamps_ns * 1e-9,
         drive.parent.poses.copy(),
         drive.child.stamps_ns * 1e-9,
         drive.child.poses.copy(),
         drive.T_parent_child,
+        drive.T_pw_cw,
     )
     if session.accident:
         session.accident(streams)
+    streams.Ts_parent, streams.Ts_child = add_noise(
+        streams.Ts_parent, streams.Ts_child, REALISTIC, np.random.default_rng(seed)
+    )
     return streams, drive.T_parent_child
 
 
@@ -589,17 +631,12 @@ def main():
             all_problems += [f"{name}, {second} s: {text}" for second, text in problems]
             seen = dict.fromkeys(page.headline for _, page in witness.pages)
             (folder / "headlines.txt").write_text("\n".join(seen) + "\n")
-            for index, (_, page) in enumerate(one_page_per_word(witness.pages)):
-                (folder / f"page_{index}.html").write_text(page.html)
+            lines = [json.dumps([at_s, page.html]) for at_s, page in witness.pages]
+            (folder / "pages.jsonl").write_text("\n".join(lines) + "\n")
             print(name, row, *problems[:5], sep="\n   ", flush=True)
     show([Table("Live sessions", [*HEADINGS, "contradictions"], rows)])
     print("\n".join(all_problems))
     return bool(all_problems)
-
-
-def one_page_per_word(pages):
-    """Return the last page of each run of equal headline words."""
-    return [list(group)[-1] for _, group in itertools.groupby(pages, key=lambda row: row[1].word)]
 
 
 if __name__ == "__main__":

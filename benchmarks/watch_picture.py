@@ -1,0 +1,113 @@
+"""Make a moving picture of the page of ``watch`` from a recorded session.
+
+    python benchmarks/node_sessions.py "flat start" --out SESSIONS
+    python benchmarks/watch_picture.py SESSIONS/session_8/pages.jsonl docs/images/watch.webp
+
+Every headline is displayed for two seconds, by the real page in Chromium, at the size of a phone.
+"""
+
+import base64
+import http.server
+import io
+import itertools
+import json
+import re
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+from PIL import Image
+
+PROJECT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(PROJECT), str(PROJECT / "test")]
+
+from browser import Browser  # noqa: E402
+from node_sessions import Page  # noqa: E402
+
+from hand_eye_calib.online.watch import web  # noqa: E402
+
+PAGE_FILES = Path(web.__file__).parent / "page"
+MEDIA_TYPES = {".css": "text/css", ".js": "text/javascript", ".html": "text/html"}
+
+# Size of the picture (pixels) and time for which a page is displayed (ms).
+WIDTH = 390
+HEIGHT = 700
+FRAME_MS = 2000
+
+# Headlines of the start and the end that explain nothing.
+LEFT_OUT = ("NO NODE", "CHECK INPUT", "ENDED")
+
+
+class Player(http.server.BaseHTTPRequestHandler):
+    """Serves the page, and sends ``server.html`` whenever it changes."""
+
+    protocol_version = "HTTP/1.1"
+
+    def do_GET(self):
+        name = self.path.partition("?")[0].strip("/") or "page.html"
+        self.send_response(200)
+        self.close_connection = True
+        if name == "events":
+            self.send_header("Content-Type", "text/event-stream")
+            self.end_headers()
+            self._send_events()
+            return
+        file = PAGE_FILES / name
+        self.send_header("Content-Type", MEDIA_TYPES[file.suffix])
+        self.end_headers()
+        self.wfile.write(file.read_bytes())
+
+    def _send_events(self):
+        sent = None
+        while self.server.html is not None:
+            if self.server.html != sent:
+                sent = self.server.html
+                self.wfile.write(f"data: {sent}\n\n".encode())
+                self.wfile.flush()
+            time.sleep(0.05)
+
+    def log_message(self, format, *args):
+        """Log nothing."""
+
+
+def chosen_pages(file):
+    """Return the last page of each headline of a session, in order; its numbers may differ."""
+    rows = [json.loads(line) for line in file.read_text().splitlines()]
+    pages = [Page(html) for _, html in rows]
+    pages = [page for page in pages if page.word not in LEFT_OUT]
+    groups = itertools.groupby(pages, lambda page: re.sub(r"[\d.]+", "#", page.headline))
+    return [list(group)[-1] for _, group in groups]
+
+
+def photographs(pages):
+    """Yield a picture of each page."""
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Player)
+    server.html = ""
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    with tempfile.TemporaryDirectory() as folder:
+        browser = Browser(folder)
+        browser.open(f"http://127.0.0.1:{server.server_port}/?key=picture")
+        size = {"width": WIDTH, "height": HEIGHT, "deviceScaleFactor": 1, "mobile": True}
+        browser.call("Emulation.setDeviceMetricsOverride", **size)
+        for page in pages:
+            server.html = page.html
+            headline = json.dumps(page.headline.partition(": ")[2][:40])
+            browser.wait_for(f"document.body.innerText.includes({headline})")
+            data = browser.call("Page.captureScreenshot", format="png")["data"]
+            yield Image.open(io.BytesIO(base64.b64decode(data)))
+        server.html = None
+        browser.close()
+    server.shutdown()
+
+
+def main():
+    source, target = map(Path, sys.argv[1:])
+    first, *others = photographs(chosen_pages(source))
+    first.save(target, save_all=True, append_images=others, duration=FRAME_MS, loop=0, quality=60)
+    print(f"{target}: {1 + len(others)} pages, {target.stat().st_size / 1000:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()
