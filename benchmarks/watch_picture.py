@@ -11,7 +11,6 @@ import http.server
 import io
 import itertools
 import json
-import re
 import sys
 import tempfile
 import threading
@@ -35,6 +34,9 @@ MEDIA_TYPES = {".css": "text/css", ".js": "text/javascript", ".html": "text/html
 WIDTH = 390
 HEIGHT = 700
 FRAME_MS = 2000
+
+# Number of letters by which sentences are recognised as the same.
+SAME_START = 25
 
 # Headlines of the start and the end that explain nothing.
 LEFT_OUT = ("NO NODE", "CHECK INPUT", "ENDED")
@@ -73,11 +75,11 @@ class Player(http.server.BaseHTTPRequestHandler):
 
 
 def chosen_pages(file):
-    """Return the last page of each headline of a session, in order; its numbers may differ."""
+    """Return the last page of each sentence of a session, in order; its numbers may differ."""
     rows = [json.loads(line) for line in file.read_text().splitlines()]
     pages = [Page(html) for _, html in rows]
     pages = [page for page in pages if page.word not in LEFT_OUT]
-    groups = itertools.groupby(pages, lambda page: re.sub(r"[\d.]+", "#", page.headline))
+    groups = itertools.groupby(pages, lambda page: page.headline[:SAME_START])
     return [list(group)[-1] for _, group in groups]
 
 
