@@ -167,6 +167,14 @@ def test_the_time_left_only_shrinks_by_one_step_at_a_result():
     assert times_s == [180.0, 120.0, 120.0, 120.0, 90.0, 0.0, 15.0, 15.0]
 
 
+def test_the_time_of_a_confirmation_does_not_follow_a_longer_estimate():
+    goal = Goal(TARGETS)
+    goal.add(result(sigmas_m=0.06), seen(70.0))
+    assert goal.progress.seconds_left > 240.0
+    within = goal.add(result(sigmas_m=0.01), seen(80.0))
+    assert within.sentence.startswith("Confirming, 60 s: ")  # half of 80 s, in steps
+
+
 def test_a_much_longer_time_left_is_a_new_estimate():
     goal = Goal(TARGETS)
     goal.add(result(sigmas_m=0.0205), seen(40.0))
