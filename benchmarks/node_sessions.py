@@ -182,28 +182,29 @@ def replace_start(streams, until_s, motion):
         Ts[is_early] = T_world_body @ Ts_new @ T_body_sensor
 
 
+def straight(seconds, Ts):
+    """Drive straight on at 1.5 m/s."""
+    Ts = np.tile(np.eye(4), (len(Ts), 1, 1))
+    Ts[:, 0, 3] = 1.5 * seconds
+    return Ts
+
+
+def flat(seconds, Ts):
+    """Keep x, y and yaw."""
+    rpy = np.zeros((len(Ts), 3))
+    rpy[:, 2] = np.arctan2(Ts[:, 1, 0], Ts[:, 0, 0])
+    return se3.from_rotation_translation(se3.rotation_from_rpy(rpy), Ts[:, :3, 3] * [1.0, 1.0, 0.0])
+
+
 def start_straight(streams):
-    """Drive straight on at 1.5 m/s for the first 25 s."""
-
-    def straight(seconds, Ts):
-        Ts = np.tile(np.eye(4), (len(Ts), 1, 1))
-        Ts[:, 0, 3] = 1.5 * seconds
-        return Ts
-
+    """Drive straight on for the first 25 s."""
     replace_start(streams, 25.0, straight)
 
 
 def start_flat(streams):
-    """Drive on a flat floor for the first 45 s."""
-
-    def flat(seconds, Ts):
-        rpy = np.zeros((len(Ts), 3))
-        rpy[:, 2] = np.arctan2(Ts[:, 1, 0], Ts[:, 0, 0])
-        return se3.from_rotation_translation(
-            se3.rotation_from_rpy(rpy), Ts[:, :3, 3] * [1.0, 1.0, 0.0]
-        )
-
-    replace_start(streams, 45.0, flat)
+    """Drive on a flat floor for the first 65 s, straight on for the first 30 s of them."""
+    replace_start(streams, 65.0, flat)
+    replace_start(streams, 30.0, straight)
 
 
 QUIET = {"target.translation": 0.04, "target.rotation": 0.0105}
@@ -225,8 +226,8 @@ SESSIONS = {
         60.0, "BAD INPUT|CHECK", second_publisher_s=30.0, must_appear="publishers"
     ),
     "straight start": Session(90.0, "DONE", parameters=QUIET, accident=start_straight),
-    "flat start": Session(
-        120.0,
+    "straight, curves, ramps": Session(
+        140.0,
         "DONE",
         parameters=QUIET | {"installed": ""},
         accident=start_flat,

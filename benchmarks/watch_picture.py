@@ -1,12 +1,13 @@
 """Make a moving picture of the page of ``watch`` from a recorded session.
 
-    python benchmarks/node_sessions.py "flat start" --out SESSIONS
+    python benchmarks/node_sessions.py "straight, curves, ramps" --out SESSIONS
     python benchmarks/watch_picture.py SESSIONS/session_8/pages.jsonl docs/images/watch.webp
 
 Every headline is displayed for two seconds, by the real page in Chromium, at the size of a phone.
 """
 
 import base64
+import contextlib
 import http.server
 import io
 import itertools
@@ -49,8 +50,8 @@ class Player(http.server.BaseHTTPRequestHandler):
 
     def do_GET(self):
         name = self.path.partition("?")[0].strip("/") or "page.html"
-        self.send_response(200)
         self.close_connection = True
+        self.send_response(200)
         if name == "events":
             self.send_header("Content-Type", "text/event-stream")
             self.end_headers()
@@ -62,6 +63,11 @@ class Player(http.server.BaseHTTPRequestHandler):
         self.wfile.write(file.read_bytes())
 
     def _send_events(self):
+        # The browser may close the page at any time.
+        with contextlib.suppress(BrokenPipeError):
+            self._send_changes()
+
+    def _send_changes(self):
         sent = None
         while self.server.html is not None:
             if self.server.html != sent:
