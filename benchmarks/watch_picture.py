@@ -1,11 +1,13 @@
-"""Make a moving picture of the page of ``watch`` from a recorded session.
+"""Make pictures of the page of ``watch`` from a recorded session.
 
     python benchmarks/node_sessions.py "straight, curves, ramps" --out SESSIONS
     python benchmarks/watch_picture.py SESSIONS/session_8/pages.jsonl docs/images/watch.webp
 
 Every headline is displayed for two seconds, by the real page in Chromium, at the size of a phone.
+With ``--headline TEXT``, the picture is the last page whose headline begins so.
 """
 
+import argparse
 import base64
 import contextlib
 import http.server
@@ -31,8 +33,7 @@ from hand_eye_calib.online.watch import web  # noqa: E402
 PAGE_FILES = Path(web.__file__).parent / "page"
 MEDIA_TYPES = {".css": "text/css", ".js": "text/javascript", ".html": "text/html"}
 
-# Size of the picture (pixels) and time for which a page is displayed (ms).
-WIDTH = 390
+# Height of the picture (pixels), and time for which a page is displayed (ms).
 HEIGHT = 700
 FRAME_MS = 2000
 
@@ -89,7 +90,7 @@ def chosen_pages(file):
     return [list(group)[-1] for _, group in groups]
 
 
-def photographs(pages):
+def photographs(pages, width):
     """Yield a picture of each page."""
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Player)
     server.html = ""
@@ -97,7 +98,7 @@ def photographs(pages):
     with tempfile.TemporaryDirectory() as folder:
         browser = Browser(folder)
         browser.open(f"http://127.0.0.1:{server.server_port}/?key=picture")
-        size = {"width": WIDTH, "height": HEIGHT, "deviceScaleFactor": 1, "mobile": True}
+        size = {"width": width, "height": HEIGHT, "deviceScaleFactor": 1, "mobile": True}
         browser.call("Emulation.setDeviceMetricsOverride", **size)
         for page in pages:
             server.html = page.html
@@ -111,10 +112,23 @@ def photographs(pages):
 
 
 def main():
-    source, target = map(Path, sys.argv[1:])
-    first, *others = photographs(chosen_pages(source))
-    first.save(target, save_all=True, append_images=others, duration=FRAME_MS, loop=0, quality=60)
-    print(f"{target}: {1 + len(others)} pages, {target.stat().st_size / 1000:.0f} kB")
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("pages", type=Path, help="pages.jsonl of a session")
+    parser.add_argument("target", type=Path, help="picture to write")
+    parser.add_argument("--headline", default="", help="beginning of the only headline")
+    parser.add_argument("--width", type=int, default=390, help="pixels. Default: a phone")
+    arguments = parser.parse_args()
+    pages = chosen_pages(arguments.pages)
+    if arguments.headline:
+        pages = [page for page in pages if page.headline.startswith(arguments.headline)][-1:]
+    first, *others = photographs(pages, arguments.width)
+    if others:
+        moving = {"save_all": True, "append_images": others, "duration": FRAME_MS, "loop": 0}
+        first.save(arguments.target, quality=60, **moving)
+    else:
+        first.save(arguments.target)
+    size_kb = arguments.target.stat().st_size / 1000
+    print(f"{arguments.target}: {1 + len(others)} pages, {size_kb:.0f} kB")
 
 
 if __name__ == "__main__":
