@@ -1,4 +1,4 @@
-"""A sensor in the frame of its vehicle, with the parameters of the wheels."""
+"""Calibration of a sensor in the frame of its vehicle, with the parameters of the wheels."""
 
 from typing import Any
 
@@ -18,7 +18,10 @@ from hand_eye_calib.core.base.registry import (
 
 
 def register() -> None:
-    """Register vehicles as a kind of data, their parameters, and readers of wheel data."""
+    """Register vehicles as a kind of data, their parameters, and readers of wheel data.
+
+    The registered functions import their modules only when they are called.
+    """
     needs = "wheels need the poses of a sensor"
     for word in ("wheels", "wheel_odometry", "steering", "omni", "driving"):
         MEASURES[word] = Measure("vehicle", needs, read_as="poses", is_parent=True)
@@ -36,12 +39,14 @@ def register() -> None:
 
 
 def _vehicle() -> Any:
+    """Return the kind of data "vehicle"."""
     from hand_eye_calib.extras.vehicle.kinds import VEHICLE
 
     return VEHICLE
 
 
 def _parameters() -> Any:
+    """Return the part of results with the parameters of the wheels."""
     from hand_eye_calib.core.results.parts import Part
     from hand_eye_calib.extras.vehicle.parameters import VehicleParameters, details
 
@@ -49,18 +54,21 @@ def _parameters() -> Any:
 
 
 def _words() -> Any:
+    """Return the sentences of the findings about vehicles."""
     from hand_eye_calib.extras.vehicle.words import WORDS
 
     return WORDS
 
 
 def _wheels(*file: Any) -> Any:
+    """Read a csv file of wheel data; None for other files."""
     from hand_eye_calib.extras.vehicle.wheel_files import table_of_wheels
 
     return table_of_wheels(*file)
 
 
 def _add_arguments(parser: Any) -> None:
+    """Add the option for a sensor without wheel data to the command line."""
     words = (
         "the only PATH is the trajectory file of a sensor on a vehicle without wheel data: "
         "estimate its x, roll, pitch and yaw on the rear axle"
@@ -69,6 +77,7 @@ def _add_arguments(parser: Any) -> None:
 
 
 def _is_alone(arguments: Any) -> bool:
+    """Whether the command is for a sensor without wheel data; a ConfigError for several paths."""
     if arguments.on_vehicle and len(arguments.paths) != 1:
         raise ConfigError(
             "--on-vehicle takes the trajectory file of one sensor; with wheel data leave it out: "
@@ -78,6 +87,7 @@ def _is_alone(arguments: Any) -> bool:
 
 
 def _calibrate(arguments: Any, _: Any) -> int:
+    """Calibrate a sensor without wheel data, and return the exit code."""
     from hand_eye_calib.extras.vehicle.calibrate import calibrate_alone
 
     return calibrate_alone(arguments)

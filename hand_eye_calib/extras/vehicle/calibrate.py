@@ -19,16 +19,16 @@ def calibrate_vehicle(
 ) -> Calibration:
     """Estimate the pose of a sensor in the frame of its vehicle, and the size of the wheels.
 
-    The frame is that of the driven or rear axle: x ahead, y left, z up. A flat floor does not
-    determine z; without wheel data, y is unknown, too.
+    The frame of the vehicle is in the middle of the driven or rear axle: x ahead, y left, z up. A
+    drive on a flat floor does not determine z. Without wheel data, it does not determine y, either.
 
     Parameters
     ----------
     sensor : Trajectory, path, array or DataFrame
         Poses of the sensor in its own world, m.
     wheels : Trajectory or path, optional
-        A csv file of wheel data, or :func:`hand_eye_calib.wheel_trajectory`. For the poses of
-        wheel odometry set ``parent_measures`` to ``wheel_odometry`` or ``omni``.
+        A csv file of wheel data, or the result of :func:`hand_eye_calib.wheel_trajectory`. For the
+        poses of wheel odometry, set ``parent_measures`` to ``wheel_odometry`` or ``omni``.
     **options
         Options of :func:`hand_eye_calib.calibrate`; the parent is the vehicle, the child the
         sensor.
@@ -36,7 +36,7 @@ def calibrate_vehicle(
     Returns
     -------
     Calibration
-        ``result.wheels`` has the parameters of the wheels.
+        ``result.wheels`` contains the parameters of the wheels.
 
     Raises
     ------
@@ -56,7 +56,11 @@ def calibrate_vehicle(
 
 
 def _driving(sensor: Trajectory) -> Trajectory:
-    """Return a parent stream that states only that the sensor is on a vehicle."""
+    """Return the parent stream for a sensor without wheel data.
+
+    Its kind of data, "driving", means that only the limits of a vehicle's motion are used, not the
+    poses of the stream.
+    """
     return replace(sensor, sensor_frame="base_link", world_frame="", measures="driving")
 
 

@@ -1,4 +1,7 @@
-"""Wheels and a sensor, or a sensor on a vehicle alone, as a kind of data on the road."""
+"""The kind of data "vehicle": wheels and a sensor with poses, or such a sensor alone.
+
+A kind supplies the functions that solve and check its data, see :mod:`..core.engine.kinds`.
+"""
 
 import numpy as np
 
@@ -34,34 +37,40 @@ from hand_eye_calib.extras.vehicle.solving import (
 )
 from hand_eye_calib.extras.vehicle.wheels import MODELS, steps_of
 
-# Durations of the windows (s). Without wheels, the curvature of a window must be constant.
+# Duration of a window (s) with wheel data.
 _WINDOW_S = 0.5
+# Duration of a window (s) without wheel data, in which the curvature must be nearly constant.
 _WINDOW_ALONE_S = 0.3
 
-# The vehicle rests in a window with less than this share of the usual motion, a quantile.
-_AT_REST = 0.05
+# Quantile of the motions, or of their deviations, that is taken as the usual size.
 _USUAL = 0.9
+# The vehicle rests in a window if it moves by less than this share of the usual motion.
+_AT_REST = 0.05
 
-# Smaller motions (m, rad) across the plane of a sensor are rounding: its poses are of two
-# dimensions.
+# Poses are of two dimensions if they move across the plane by less than this (m, rad): rounding.
 _FLAT = 1e-6
+# Poses at the start of a window may be early by this time (s): rounding.
+_ROUNDING_S = 1e-6
 
-# The drive determines the pose if the motion has this many times the information of noise: 168 and
-# more in simulated figures of eight, below 2 on straight roads and on one circle.
+# The drive determines an axis if its information is at least this multiple of that of noise. The
+# multiple is 168 and more in simulated figures of eight, below 2 on straight roads and on one
+# circle.
 _MIN_SIGNAL_TO_NOISE = 10.0
 
-# Share of the forward motion or of the turns that wheels and sensor have not in common, from which
-# on they seem to be of two drives, and from which on they are: 0.02 in simulated drives with slip.
+# Share of the forward motion or of the turns that wheels and sensor do not have in common. Above
+# this share they are probably not of the same drive. It is 0.02 in simulated drives with slip.
 _UNRELATED = 0.1
+# Above this share the result is unusable.
 _UNUSABLE = 0.3
 
-# Both halves of a drive disagree above this many joint standard deviations.
-_APART_SIGMAS = 3.3
+# The halves of a drive contradict each other above this many joint standard deviations.
+_MAX_SIGMAS_OF_HALVES = 3.3
 
-# The vehicle drives the same curve if the turns (rad) of its windows differ by less from it.
+# The vehicle always drives the same curve if the turns (rad) of its windows usually deviate from
+# those of a constant curvature by less than this.
 _VARIED_TURN = 0.02
 
-# Options that have no meaning for a vehicle, and their only values.
+# Options that have no meaning for a vehicle, and the values that are accepted.
 _ALLOWED: dict[str, tuple[object, ...]] = {
     "method": ("auto", "adaptive"),
     "reference": ("auto",),
@@ -75,7 +84,15 @@ _ALLOWED: dict[str, tuple[object, ...]] = {
 
 
 def _solve(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
-    """Estimate the pose of the sensor on the vehicle; the road adds the names of the frames."""
+    """Estimate the pose of the sensor on the vehicle. The caller adds the names of the frames.
+
+    ``cross_check`` has no effect.
+
+    Raises
+    ------
+    NotEnoughDataError
+        If the vehicle moves for too short a time.
+    """
     config = snapshot.config
     wheels, _ = snapshot.streams
     pairs = snapshot.pose_pairs
@@ -107,26 +124,33 @@ def _drive(
     offset_s: float,
     window_s: float,
 ) -> Drive:
-    """Return the windows in which the vehicle moves, without gaps, and the data of the wheels."""
+    """Return the motions in windows, and the data of the wheels.
+
+    Windows in which the vehicle rests, and windows with a gap, are skipped. ``offset_s`` is the
+    clock offset of the sensor.
+    """
     start_ns = pairs.stamps_ns[0]
     times_s = np.asarray((pairs.stamps_ns - start_ns) * 1e-9, dtype=float)
     begin_s = np.arange(0.0, times_s[-1], window_s)
-    rows = np.unique(np.searchsorted(times_s, begin_s - _FLAT))
-    poses = pairs.Ts_cw_c[rows]
+    # Indices of the poses at the ends of the windows.
+    ends = np.unique(np.searchsorted(times_s, begin_s - _ROUNDING_S))
+    poses = pairs.Ts_cw_c[ends]
     xi = se3.log(se3.inverse(poses[:-1]) @ poses[1:])
-    moved = np.linalg.norm(xi[:, :3], axis=1)
-    turned = np.linalg.norm(xi[:, 3:], axis=1)
-    is_used = (moved > _AT_REST * quantile(moved, _USUAL)) | (
-        turned > _AT_REST * quantile(turned, _USUAL)
-    )
-    is_used &= np.diff(times_s[rows]) < window_s + config.max_gap
+    lengths = np.linalg.norm(xi[:, :3], axis=1)
+    turns = np.linalg.norm(xi[:, 3:], axis=1)
+    is_moving = lengths > _AT_REST * quantile(lengths, _USUAL)
+    is_turning = turns > _AT_REST * quantile(turns, _USUAL)
+    has_no_gap = np.diff(times_s[ends]) < window_s + config.max_gap
+    is_used = (is_moving | is_turning) & has_no_gap
     xi = xi[is_used]
-    # Pairs are on the parent's clock with the offset of the options.
-    clock_s = times_s[rows] + offset_s - config.given_time_offset_s
+    # The stamps of pairs already contain the offset of the options.
+    clock_s = times_s[ends] + offset_s - config.given_time_offset_s
     model = MODELS.get(config.parent_measures)
+    # Without wheels, forward motion and turns are not known. Poses of two dimensions have neither
+    # upward motion nor roll and pitch.
     components = [1, 2, 3, 4] if model is None else [0, 1, 2, 3, 4, 5]
     if np.abs(xi[:, 2:5]).max(initial=0.0) < _FLAT:
-        components = [number for number in components if number not in (2, 3, 4)]
+        components = [index for index in components if index not in (2, 3, 4)]
     return Drive(
         xi=xi,
         ends_s=np.stack([clock_s[:-1], clock_s[1:]])[:, is_used],
@@ -138,24 +162,29 @@ def _drive(
 
 
 def _is_flat(drive: Drive) -> bool:
+    """Whether the poses of the sensor are of two dimensions."""
     return 2 not in drive.components
 
 
-# ------------------------------------------------------------------ the result
+# ---- result
 
 
 def _calibration(
     fit: Fit, drive: Drive, pairs: PosePairs, offset_s: float, config: CalibratorConfig
 ) -> Calibration:
-    """Return the result of a fit: pose, parameters of the wheels, clock and findings."""
+    """Return the result of a fit: pose, parameters of the wheels, clock offset and findings.
+
+    ``offset_s`` is the clock offset that the drive was made with; the fit estimates its remainder.
+    """
     kind = "vehicle" if drive.model else "vehicle_alone"
     if _is_flat(drive):
         kind += "_2d"
     findings = _check_fit(fit, drive)
     unknown_axes = OUT_OF_REACH[kind]
-    if any(found.makes_unusable for found in findings):
+    if any(item.makes_unusable for item in findings):
         unknown_axes = AXES
     T = fit.T_base_sensor
+    # Covariance (6, 6) of the pose in the axes of the vehicle; row and column 2 are those of z.
     in_base = np.insert(np.insert(fit.covariance[:CLOCK, :CLOCK], 2, 0.0, axis=0), 2, 0.0, axis=1)
     to_child = se3.block_diagonal(se3.rotation_of(T).T)
     unknown = to_child[:, [AXES.index(axis) for axis in unknown_axes]]
@@ -164,14 +193,15 @@ def _calibration(
     floor = np.zeros((6, 6))
     if config.child_kind == "odometry":
         speed_m_s = covariance.usual_speed(pairs.stamps_ns, se3.translation_of(pairs.Ts_cw_c))
-        # The floor is that of two odometries.
+        # Half of the floor, which is that of two odometries: only the sensor has one here.
         floor = 0.5 * covariance.common_mode_floor(speed_m_s)
-    whole = np.zeros(drive.xi.shape)
-    whole[:, drive.components] = fit.residuals
+    # Residuals (K, 6), with zeros for the components that are not compared.
+    all_residuals = np.zeros(drive.xi.shape)
+    all_residuals[:, drive.components] = fit.residuals
     start_ns, end_ns = pairs.stamps_ns[0] + np.round(drive.ends_s * 1e9).astype(np.int64)
     residuals = Residuals(
-        translation=whole[:, :3],
-        rotation=whole[:, 3:] @ se3.rotation_of(T),
+        translation=all_residuals[:, :3],
+        rotation=all_residuals[:, 3:] @ se3.rotation_of(T),
         weights=fit.weights,
         start_ns=start_ns,
         end_ns=end_ns,
@@ -200,36 +230,55 @@ def _calibration(
 
 
 def _check_fit(fit: Fit, drive: Drive) -> tuple[Finding, ...]:
-    """Detect drives that determine nothing, other machines, and mounts that moved."""
-    rows = {"x": 0, "yaw": YAW} | ({"y": Y} if drive.model else {})
-    ratios = fit.signal_to_noise(drive.components)
-    hidden = [axis for axis in rows if ratios[axis] < _MIN_SIGNAL_TO_NOISE]
-    if hidden or not fit.converged:
-        lengths = np.linalg.norm(drive.xi[:, :3], axis=1)
-        turns = np.linalg.norm(drive.xi[:, 3:], axis=1)
-        curvature = lengths @ turns / (lengths @ lengths)
-        is_varied = quantile(np.abs(turns - curvature * lengths), _USUAL) > _VARIED_TURN
-        key = "unrelated_wheels" if is_varied else "one_motion"
-        return (finding(key, axes=listing(hidden or [*rows])),)
+    """Return the finding about a fit, if there is one.
+
+    It detects drives that do not determine the pose, wheels that are those of another drive, and
+    mounts that moved during the drive.
+    """
+    # Indices of the unknowns of the axes that are estimated.
+    index_of = {"x": 0, "yaw": YAW}
     if drive.model:
-        axle = drive.measured(fit.T_base_sensor)[:, drive.components]
-        shares = np.sqrt(np.diag(fit.noise) / np.mean(axle**2, axis=0))
-        share = float(max(shares[0], shares[-1]))
+        index_of["y"] = Y
+    ratios = fit.signal_to_noise(drive.components)
+    undetermined = [axis for axis in index_of if ratios[axis] < _MIN_SIGNAL_TO_NOISE]
+    if undetermined or not fit.converged:
+        key = "unrelated_wheels" if _has_varied_turns(drive) else "one_motion"
+        return (finding(key, axes=listing(undetermined or [*index_of])),)
+    if drive.model:
+        share = _unrelated_share(fit, drive)
         if share > _UNRELATED:
             severity = Severity.ERROR if share > _UNUSABLE else Severity.WARNING
             return (finding("unrelated_wheels", severity=severity),)
-    # Each half has twice the variance, and their difference four times.
+    # The estimate of a half has twice the variance, so the difference of both has four times it.
     sigmas = np.abs(np.subtract(*fit.halves)) / (2.0 * np.sqrt(np.diag(fit.covariance)))
-    apart = [axis for axis, row in rows.items() if sigmas[row] > _APART_SIGMAS]
-    return (finding("vehicle_halves", axes=listing(apart)),) if apart else ()
+    different = [axis for axis, index in index_of.items() if sigmas[index] > _MAX_SIGMAS_OF_HALVES]
+    return (finding("vehicle_halves", axes=listing(different)),) if different else ()
+
+
+def _has_varied_turns(drive: Drive) -> bool:
+    """Whether the vehicle drives curves of different curvature."""
+    lengths = np.linalg.norm(drive.xi[:, :3], axis=1)
+    turns = np.linalg.norm(drive.xi[:, 3:], axis=1)
+    curvature = lengths @ turns / (lengths @ lengths)
+    return quantile(np.abs(turns - curvature * lengths), _USUAL) > _VARIED_TURN
+
+
+def _unrelated_share(fit: Fit, drive: Drive) -> float:
+    """Return the share of the motion that wheels and sensor do not have in common.
+
+    This is the larger of the shares of the first component (forward) and the last (turn).
+    """
+    axle = drive.measured(fit.T_base_sensor)[:, drive.components]
+    shares = np.sqrt(np.diag(fit.noise) / np.mean(axle**2, axis=0))
+    return float(max(shares[0], shares[-1]))
 
 
 def _check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckResult:
-    """Return the findings of the solve, and of the stream of the sensor."""
+    """Return the findings about the calibration and about the stream of the sensor."""
     findings = [*calibration.findings] if calibration else []
     findings += check_stream(snapshot.streams[1], "child", snapshot.config.max_gap)
     return CheckResult(gravest_first(findings))
 
 
-#: Wheels and a sensor with poses, or a sensor alone.
+#: The kind of data "vehicle".
 VEHICLE = Kind(_solve, _check, MOST_MOVED_S, _ALLOWED)

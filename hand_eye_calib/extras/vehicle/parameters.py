@@ -1,17 +1,17 @@
-"""Parameters of the wheels, as a part of results."""
+"""Estimated parameters of the wheels of a vehicle, as a part of its result."""
 
 from dataclasses import dataclass
 from typing import Any
 
 from hand_eye_calib.core.base.text import with_sigma
 
-# Units of parameters, by the end of their names. Radii have none: see VehicleParameters.
+# Units of parameters, by the last word of their names. Other parameters are written without a unit.
 _UNITS = {"separation": " m", "wheelbase": " m", "offset": " rad", "curvature": " 1/m"}
 
 
 @dataclass(frozen=True)
 class VehicleParameter:
-    """Parameter of the wheels and its standard deviation, in m, rad, 1/m or without a unit."""
+    """Parameter of the wheels, with its standard deviation in the same unit."""
 
     name: str
     value: float
@@ -25,10 +25,11 @@ class VehicleParameters:
     Attributes
     ----------
     parameters : tuple of VehicleParameter
-        Radii are metres per unit of the wheel data: metres if the data are in rad/s, and factors
-        if they are in m/s. Multipliers multiply the values that an odometry was made with.
+        Lengths are in m, angles in rad, curvatures in 1/m. A radius is in m if the wheel data are
+        in rad/s, and a factor if they are in m/s. A multiplier is the factor by which the value in
+        the configuration of the wheel odometry must be multiplied.
     slip_share : float
-        Share of the time in which wheels and sensor disagree, because the wheels slip.
+        Share of the time (0 to 1) in which wheels and sensor disagree, because the wheels slip.
     """
 
     parameters: tuple[VehicleParameter, ...]
@@ -40,7 +41,7 @@ class VehicleParameters:
 
 
 def details(wheels: VehicleParameters, result: Any) -> list[str]:
-    """Return lines about the wheels for a person."""
+    """Return lines for the user about the parameters of the wheels."""
     lines = []
     for parameter in wheels.parameters:
         value_and_sigma = with_sigma(parameter.value, parameter.sigma, 4)

@@ -1,22 +1,25 @@
 """Estimate the pose of a sensor on a vehicle and the parameters of its wheels.
 
-A motion of the sensor over about half a second has the logarithm xi = (rho, phi). The same motion
-of the axle has the logarithm ``Ad(X) xi``, with the pose X of the sensor in the frame of the axle.
-The wheels predict it as a motion in the plane:
+The drive is divided into windows of about half a second. The motion of the sensor in window i has
+the logarithm xi_i = (rho, phi). The motion of the axle has the logarithm ``Ad(X) xi_i``, where X is
+the pose of the sensor in the frame of the axle. The wheels predict the motion A_i of the axle in
+the plane. The residual is
 
     e_i = Log A_i(wheels, clock offset, side slip) - Ad(X) xi_i .
 
-Without wheels, only the components that a vehicle cannot have are compared: it does not move
-sideways or up, and does not roll or pitch. On curves the axle slips outwards by an angle that is
-proportional to the lateral acceleration. Windows have weights of Student's t distribution, and none
-beyond its tail, so that slip of the wheels counts little. The covariance is the sum of
+Without wheels, the residual has only the components that must be zero for a vehicle: sideways and
+upward motion, roll and pitch. In curves the axle slips outwards by an angle that is proportional to
+the lateral acceleration (side slip). Windows have weights of Student's t distribution. Windows in
+the tail of this distribution, where the wheels slip, have weight 0. The covariance is the sum of
 
-- the jackknife over blocks of time, which contains correlated slip, times a factor: weights change
-  with the residuals, which makes the answer less certain than the same weights of a table;
-- what the priors leave open;
-- two fifths of the difference to the answer over windows twice as long;
-- three twentieths of the difference to the answer without weights, for slip that is not detected;
-- what noise of the turns takes away from x and y.
+- the jackknife over blocks of time, which contains time-correlated slip. A factor enlarges it,
+  because the weights depend on the residuals, so that the estimate is less certain than with fixed
+  weights;
+- the uncertainty of the priors;
+- the square of 2/5 of the difference to the estimate over windows twice as long;
+- the square of 3/20 of the difference to the estimate without weights, for slip that is not
+  detected;
+- the square of the bias of x and y that noise of the turns may cause.
 """
 
 from collections.abc import Sequence
@@ -30,61 +33,71 @@ from hand_eye_calib.core.base.stats import CHI2, STUDENT
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.vehicle.wheels import WheelModel, motions
 
-# Unknowns: x, y (m) and rotations about x, y, z of the axle (rad) of the sensor; the clock offset
-# (s); the slip angle per lateral acceleration (rad s^2/m); then the parameters of the wheels.
+# Order of the U unknowns. The pose of the sensor: x, y (m) and rotations about the axes x, y, z of
+# the axle (rad). The other unknowns: the clock offset (s), the slip angle per lateral acceleration
+# (rad s^2/m), and the parameters of the wheels.
 Y = 1
 TILT = (2, 3)
 YAW = 4
 CLOCK = 5
 
-# Prior standard deviations of these unknowns. They keep the iteration in bounds. That of the slip
-# angle is real: the rear axles of cars have 0.003 to 0.007 (2 to 4 deg per g).
+# Prior standard deviations of the unknowns before the parameters of the wheels, in their units.
+# They keep the iteration in bounds. Only the last is a real prior: the slip angle of rear axles of
+# cars is 0.003 to 0.007 rad per m/s^2 (2 to 4 deg per g).
 _PRIOR_SIGMAS = (3.0, 3.0, 1.0, 1.0, 1.0, 0.2, 0.005)
 # Number of unknowns before the parameters of the wheels.
 N_FIXED = len(_PRIOR_SIGMAS)
-# Prior standard deviation of a parameter of the wheels: a share of its start, and an offset.
+# Prior standard deviation of a parameter of the wheels: this share of its first value ...
 _PARAMETER_SHARE = 0.3
+# ... plus this value, in the unit of the parameter.
 _PARAMETER_SIGMA = 0.03
-# Prior standard deviation of an unknown that is not estimated.
+# Prior standard deviation of an unknown that keeps its first value, in its unit.
 _FIXED_SIGMA = 1e-6
 
-# Number of blocks of the jackknife: blocks of some seconds, longer than a slip.
+# Number of blocks of the jackknife. A block lasts some seconds, longer than a slip of the wheels.
 BLOCKS = 30
 
-# Probability of a larger Mahalanobis distance, below which a window has no weight.
+# A window has weight 0 if noise exceeds its Mahalanobis distance with less than this probability.
 _TAIL = 0.01
 
-# Shares of the differences to other answers that are added, measured on simulated drives.
+# Share of the difference to the estimate over longer windows that is one standard deviation
+# (measured on simulated drives).
 _SHARE_OF_LONGER = 0.4
+# The same share for the estimate without weights.
 _SHARE_OF_UNWEIGHTED = 0.15
 
+# Largest number of Gauss-Newton steps.
 _MAX_ROUNDS = 20
+# Number of updates of weights and noise in a step.
 _NOISE_ROUNDS = 5
-# The iteration ends below this step, in standard deviations.
+# The iteration ends if a step is below this number of standard deviations.
 _STEP_SIGMAS = 0.01
 # Step of numerical derivatives, in the unit of each unknown.
 _STEP = 1e-6
-# Smallest variance of a component (m^2 or rad^2), for data without noise.
-_LEAST_VARIANCE = 1e-14
+# Variance of turns (rad^2) that is assumed if the poses have neither turns nor tilt to compare.
+_TURN_VARIANCE = 1e-6
+# Smallest variance of a component of the residual (m^2 or rad^2), for data without noise.
+_MIN_VARIANCE = 1e-14
 
 
 @dataclass(frozen=True)
 class Drive:
-    """Motions of a sensor and the data of wheels.
+    """Motions of a sensor in K windows, and the data of the wheels.
 
     Attributes
     ----------
     xi : (K, 6) array
         Logarithms (rho, phi) of the motions, in the frame of the sensor.
     ends_s : (2, K) array
-        Times of both ends of the motions.
+        Times of the start and of the end of the windows.
     stamps_s : (N + 1,) array
+        Times of the wheel data.
     steps : (3, N) array
-        Steps of the unit vehicle between the stamps.
+        Steps of the unit vehicle between these times, see :mod:`.wheels`.
     model : WheelModel or None
         None without wheels.
     components : sequence of int
-        Components of e that are compared, out of six.
+        Indices of the C components of e (of six) that are compared.
     """
 
     xi: FloatArray
@@ -95,11 +108,15 @@ class Drive:
     components: Sequence[int]
 
     def measured(self, T: FloatArray) -> FloatArray:
-        """Return the motions (K, 6) of the axle by the sensor at this pose (4, 4)."""
+        """Return the motions (K, 6) of the axle, measured by the sensor if its pose is T (4, 4)."""
         return self.xi @ se3.adjoint(T).T
 
     def predicted(self, T: FloatArray, others: FloatArray) -> FloatArray:
-        """Return the motions (K, 6) of the axle by the wheels; without wheels, only the slip."""
+        """Return the motions (K, 6) of the axle that the wheels predict.
+
+        Without wheels, only the side slip is predicted, from the motion of the sensor at the pose
+        T. ``others`` are the unknowns except the pose.
+        """
         clock_s, slip = others[:2]
         predicted = np.zeros(self.xi.shape)
         if self.model is None:
@@ -114,23 +131,26 @@ class Drive:
         return predicted
 
     def rows(self, T: FloatArray, others: FloatArray) -> FloatArray:
-        """Return the equations (K, C, U + 1) of a step of the unknowns: derivatives of e, and -e.
+        """Return the linear equations (K, C, U + 1) of a step of the U unknowns.
 
-        Derivatives with respect to the pose do not need the wheels again.
+        The columns are the derivatives of e with respect to the unknowns, and -e.
         """
         predicted = self.predicted(T, others)
         residuals = predicted - self.measured(T)
         columns = []
-        for number, step in enumerate(_STEP * np.eye(CLOCK + len(others))):
-            ahead = moved(T, others, step)
-            if self.model is None or number >= CLOCK:
-                predicted = self.predicted(*ahead)
-            columns.append((predicted - self.measured(ahead[0]) - residuals) / _STEP)
+        for index, step in enumerate(_STEP * np.eye(CLOCK + len(others))):
+            new_T, new_others = apply_step(T, others, step)
+            # The prediction of the wheels does not depend on the pose.
+            if self.model is None or index >= CLOCK:
+                predicted = self.predicted(new_T, new_others)
+            columns.append((predicted - self.measured(new_T) - residuals) / _STEP)
         return np.stack([*columns, -residuals], axis=-1)[:, self.components]
 
 
-def moved(T: FloatArray, others: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return a pose and the other unknowns after a step (U,) of all."""
+def apply_step(
+    T: FloatArray, others: FloatArray, step: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the pose and the other unknowns after a step (U,) of all unknowns."""
     rotation = se3.rotation_exp(step[Y + 1 : CLOCK]) @ se3.rotation_of(T)
     translation = se3.translation_of(T) + np.append(step[: Y + 1], 0.0)
     return se3.from_rotation_translation(rotation, translation), others + step[CLOCK:]
@@ -145,18 +165,20 @@ class Fit:
     T_base_sensor : (4, 4) array
         Pose of the sensor in the frame of the axle, with z = 0.
     others : (U - 5,) array
-        Clock offset, side slip and parameters of the wheels.
+        Unknowns except the pose: clock offset, side slip and parameters of the wheels.
     covariance : (U, U) array
+        Covariance of all unknowns.
     residuals : (K, C) array
     weights : (K,) array
+        Weights of the windows, from 0 to 1.
     noise : (C, C) array
         Covariance of the residuals.
     information : (U,) array
-        Information on each unknown that is left when all others are free.
+        Information on each unknown if all other unknowns are free: the inverse variance.
     halves : (2, U) array
-        Answers of both halves of the drive, less the estimate.
+        Estimates from each half of the drive alone, minus the estimate.
     objective : float
-        Weighted squares of e, whitened.
+        Weighted sum of squares of the whitened residuals.
     converged : bool
     """
 
@@ -172,19 +194,22 @@ class Fit:
     converged: bool
 
     def signal_to_noise(self, components: Sequence[int]) -> dict[str, float]:
-        """Return the information on x, y and yaw over that of motions which are only noise.
+        """Return the information on x, y and yaw as a multiple of that of motions of noise only.
 
-        Noise of the turns looks like turning, and makes x and y too small by the inverse.
+        Noise of the turns looks like turning of the vehicle. Its information makes x and y too
+        small, by the inverse of this multiple. ``components`` are those of the drive.
         """
         variances = dict(zip(components, np.diag(self.noise).tolist(), strict=True))
         left = variances[1]
         forward = variances.get(0, left)
-        # Without wheels, the noise of roll and pitch stands for that of the turns.
-        turn = variances.get(5, variances.get(3, _STEP))
-        of_noise = {"x": turn / left, "y": turn / forward, "yaw": 1.0}
-        rows = zip(of_noise.items(), (0, Y, YAW), strict=True)
+        # Without wheels, the noise of turns is not known: use that of roll.
+        turn = variances.get(5, variances.get(3, _TURN_VARIANCE))
         n_windows = len(self.weights)
-        return {name: self.information[row] / (size * n_windows) for (name, size), row in rows}
+        return {
+            "x": self.information[0] / (turn / left * n_windows),
+            "y": self.information[Y] / (turn / forward * n_windows),
+            "yaw": self.information[YAW] / n_windows,
+        }
 
 
 def fit_drive(drive: Drive, longer: Drive, fixed: Sequence[int]) -> Fit:
@@ -193,13 +218,14 @@ def fit_drive(drive: Drive, longer: Drive, fixed: Sequence[int]) -> Fit:
     Parameters
     ----------
     drive, longer : Drive
-        The drive in windows, and in windows twice as long.
+        The drive in windows, and the same drive in windows twice as long.
     fixed : sequence of int
-        Unknowns that stay at their start.
+        Indices of the unknowns that keep their first value.
     """
     T, others = start_of(drive)
-    of_wheels = _PARAMETER_SHARE * np.abs(others[2:]) + _PARAMETER_SIGMA
-    sigmas = np.append(_PRIOR_SIGMAS, of_wheels)
+    # Prior standard deviations of all unknowns.
+    wheel_sigmas = _PARAMETER_SHARE * np.abs(others[2:]) + _PARAMETER_SIGMA
+    sigmas = np.append(_PRIOR_SIGMAS, wheel_sigmas)
     sigmas[list(fixed)] = _FIXED_SIGMA
     fit = _solve(drive, T, others, sigmas)
     covariance = fit.covariance
@@ -207,21 +233,22 @@ def fit_drive(drive: Drive, longer: Drive, fixed: Sequence[int]) -> Fit:
         (_solve(longer, T, others, sigmas), _SHARE_OF_LONGER),
         (_solve(drive, T, others, sigmas, is_weighted=False), _SHARE_OF_UNWEIGHTED),
     ]
-    for other, share in alternatives:
-        apart = share * _difference(
-            other.T_base_sensor, other.others, fit.T_base_sensor, fit.others
+    for alternative, share in alternatives:
+        difference = share * _difference(
+            alternative.T_base_sensor, alternative.others, fit.T_base_sensor, fit.others
         )
-        covariance = covariance + np.outer(apart, apart)
+        covariance = covariance + np.outer(difference, difference)
     ratios = fit.signal_to_noise(drive.components)
-    too_small = np.zeros(len(sigmas))
-    too_small[:2] = fit.T_base_sensor[:2, 3] / [ratios["x"], ratios["y"]]
-    return replace(fit, covariance=covariance + np.outer(too_small, too_small))
+    # Bias of x and y towards zero, from noise of the turns.
+    bias = np.zeros(len(sigmas))
+    bias[:2] = fit.T_base_sensor[:2, 3] / [ratios["x"], ratios["y"]]
+    return replace(fit, covariance=covariance + np.outer(bias, bias))
 
 
 def _difference(
     T: FloatArray, others: FloatArray, from_T: FloatArray, from_others: FloatArray
 ) -> FloatArray:
-    """Return the step (U,) of the unknowns between two estimates."""
+    """Return the step (U,) that leads from the estimate ``from_...`` to the other estimate."""
     turn = se3.rotation_log(se3.rotation_of(T) @ se3.rotation_of(from_T).T)
     return np.concatenate([(T - from_T)[:2, 3], turn, others - from_others])
 
@@ -233,8 +260,22 @@ def _solve(
     sigmas: FloatArray,
     is_weighted: bool = True,
 ) -> Fit:
-    """Minimise the squares of e and of the priors about the start."""
+    """Minimise the weighted squares of e and of the priors, by Gauss-Newton steps.
+
+    Parameters
+    ----------
+    drive : Drive
+    start : (4, 4) array
+        First pose, which is also the mean of its prior.
+    others : (U - 5,) array
+        First values of the other unknowns, which are also the means of their priors.
+    sigmas : (U,) array
+        Prior standard deviations of all unknowns.
+    is_weighted : bool
+        Whether windows have weights of Student's t distribution.
+    """
     everything = range(len(sigmas))
+    # Products of the prior equations: information, and its product with the step to the prior mean.
     prior = np.zeros((len(sigmas) + 1, len(sigmas) + 1))
     prior[:-1, :-1] = np.diag(sigmas**-2.0)
     T = start
@@ -248,14 +289,16 @@ def _solve(
         prior[:-1, -1] = -_difference(T, others, start, first_others) / sigmas**2
         table = blocks.total + prior
         step = solve(table, everything)
-        T, others = moved(T, others, step)
-        model = inverse(table[:-1, :-1])
+        T, others = apply_step(T, others, step)
+        model = inverse(table[:-1, :-1])  # covariance (U, U) if windows are independent
         sigmas_of_step = np.sqrt(np.diag(model))
         converged = bool((np.abs(step) < _STEP_SIGMAS * sigmas_of_step + _STEP).all())
         if converged:
             break
     spread = jackknife_covariance(solve(blocks.without() + prior, everything))
     if is_weighted:
+        # Ratio of the scatter of an estimate with weights of Student's t distribution to that with
+        # fixed weights.
         n_components = len(drive.components)
         spread *= ((STUDENT + n_components + 2.0) / (STUDENT + n_components)) ** 2
     return Fit(
@@ -275,61 +318,73 @@ def _solve(
 def _weights(
     residuals: FloatArray, noise: FloatArray, is_weighted: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Return weights (K,) of residuals (K, C), and their covariance (C, C).
+    """Return the weights (K,) of residuals (K, C), and the covariance (C, C) of the residuals.
+
+    ``noise`` is the covariance of the previous step; empty at the first step. Without weights
+    (``is_weighted`` false), all weights are 1.
 
     K. L. Lange, R. J. A. Little, J. M. G. Taylor, *Robust statistical modeling using the t
     distribution*, JASA 84, 1989.
     """
     n_windows, n_components = residuals.shape
-    least = _LEAST_VARIANCE * np.eye(n_components)
+    minimum = _MIN_VARIANCE * np.eye(n_components)
     if not noise.size:
-        noise = np.diag(np.median(residuals**2, axis=0) / CHI2[0.5][1]) + least
+        noise = np.diag(np.median(residuals**2, axis=0) / CHI2[0.5][1]) + minimum
     weights = np.ones(n_windows)
     for _ in range(_NOISE_ROUNDS):
         squared = np.einsum("kc,cd,kd->k", residuals, inverse(noise), residuals)
         if is_weighted:
             weights = (STUDENT + n_components) / (STUDENT + squared)
-        noise = (weights[:, None] * residuals).T @ residuals / n_windows + least
+        noise = (weights[:, None] * residuals).T @ residuals / n_windows + minimum
     if is_weighted:
         weights[squared > CHI2[_TAIL][n_components]] = 0.0
     return weights, noise
 
 
 def start_of(drive: Drive) -> tuple[FloatArray, FloatArray]:
-    """Return a first pose of the sensor, and the other unknowns.
+    """Return a first pose (4, 4) of the sensor, and first values of the other unknowns.
 
-    The axis of the sensor's turning is up. In level axes, with complex numbers, the displacement of
-    the sensor is ``exp(-i yaw) (length m + i turn p)``: m is the displacement of the unit vehicle,
-    and p the place of the sensor. It is linear in ``length exp(-i yaw)`` and ``exp(-i yaw) p``.
-    Without wheels, m is the length of the displacement; the sensor's axis z is up, or -y of a
-    camera.
+    The vehicle turns about the vertical, so the main axis of the rotations is up or down. In level
+    axes of the sensor, with complex numbers for vectors in the plane, its displacement in a window
+    is ``d = exp(-i yaw) (s m + i a p)``: m is the displacement of the unit vehicle, s the ratio of
+    lengths, a the turn, and p the position of the sensor. Least squares yields the factors
+    ``s exp(-i yaw)`` of m and ``exp(-i yaw) p`` of ``i a``.
+
+    Wheels determine whether the axis is up. Without wheels, z of the sensor (or -y of a camera) is
+    up, and m is the length of d: the vehicle drives ahead.
     """
     rotations = drive.xi[:, 3:]
-    up = np.linalg.eigh(rotations.T @ rotations)[1][:, -1]
-    turns = rotations @ up
+    axis = np.linalg.eigh(rotations.T @ rotations)[1][:, -1]
+    turns = rotations @ axis
     if drive.model is None:
-        main = int(np.argmax(np.abs(up)))
-        ratio = -up[main] if main == 1 else up[main]
-        lengths = np.linalg.norm(drive.xi[:, :3], axis=1)
+        main = int(np.argmax(np.abs(axis)))
+        turn_ratio = -axis[main] if main == 1 else axis[main]
+        displacements = np.linalg.norm(drive.xi[:, :3], axis=1)
     else:
-        totals = np.insert(np.cumsum(drive.steps, axis=1), 0, 0.0, axis=1)
-        before, after = np.swapaxes(
-            [np.interp(drive.ends_s, drive.stamps_s, total) for total in totals], 0, 1
-        )
-        forward, left, unit_turns = after - before
-        lengths = forward + 1j * left
-        ratio = turns @ unit_turns / (unit_turns @ unit_turns + _LEAST_VARIANCE)
-    up, turns = np.sign(ratio) * up, np.sign(ratio) * turns
+        forward, left, unit_turns = _motions_of_unit_vehicle(drive)
+        displacements = forward + 1j * left
+        turn_ratio = turns @ unit_turns / (unit_turns @ unit_turns + _MIN_VARIANCE)
+    up = np.sign(turn_ratio) * axis
+    turns = np.sign(turn_ratio) * turns
+    # Level axes of the sensor: any direction perpendicular to up is the first axis.
     ahead = np.linalg.svd(up[None])[2][1]
     level = np.stack([ahead, np.cross(up, ahead), up])
     x, y, _ = level @ drive.xi[:, :3].T
-    columns = np.column_stack([lengths, 1j * turns])
-    factor, place = np.linalg.lstsq(columns, x + 1j * y, rcond=None)[0]
-    unit = factor / abs(factor)
-    yaw = se3.rotation_exp([0.0, 0.0, -np.angle(unit)])
-    place = place / unit
-    T = se3.from_rotation_translation(yaw @ level, [place.real, place.imag, 0.0])
+    columns = np.column_stack([displacements, 1j * turns])
+    factor, rotated_position = np.linalg.lstsq(columns, x + 1j * y, rcond=None)[0]
+    length_ratio = abs(factor)
+    direction = factor / length_ratio  # exp(-i yaw)
+    yaw = se3.rotation_exp([0.0, 0.0, -np.angle(direction)])
+    position = rotated_position / direction
+    T = se3.from_rotation_translation(yaw @ level, [position.real, position.imag, 0.0])
     parameters: tuple[float, ...] = ()
     if drive.model is not None:
-        parameters = drive.model.parameters_of(abs(factor), abs(ratio))
+        parameters = drive.model.parameters_of(length_ratio, abs(turn_ratio))
     return T, np.array([0.0, 0.0, *parameters])
+
+
+def _motions_of_unit_vehicle(drive: Drive) -> FloatArray:
+    """Return the sums (3, K) of the steps in each window: forward, left and turn."""
+    totals = np.insert(np.cumsum(drive.steps, axis=1), 0, 0.0, axis=1)
+    at_ends = np.array([np.interp(drive.ends_s, drive.stamps_s, total) for total in totals])
+    return at_ends[:, 1] - at_ends[:, 0]

@@ -1,4 +1,7 @@
-"""Read csv files of wheel data as the path of a unit vehicle."""
+"""Read csv files of wheel data, and convert them to the path of a unit vehicle.
+
+The unit vehicle has wheels of radius 1, see :mod:`.wheels`.
+"""
 
 import re
 from collections.abc import Callable
@@ -17,7 +20,7 @@ from hand_eye_calib.formats.trajectory_files.reading import FileOptions
 from hand_eye_calib.formats.trajectory_files.stamps import stamps_in_ns
 from hand_eye_calib.formats.trajectory_files.table import Table
 
-# What a csv file measures, by the names of its columns behind that of the stamps.
+# Kind of wheel data in a csv file, by the names of its columns after the column of stamps.
 _COLUMNS = {
     r"left\w*,right\w*": "wheels",
     r"(speed|v|velocity)\w*,(steering|angle)\w*": "steering",
@@ -25,7 +28,8 @@ _COLUMNS = {
     r"vx\w*,vy\w*,wz\w*": "omni",
 }
 
-# Forward speed, left speed and yaw rate of the unit vehicle, from wheel data.
+# Functions that compute forward speed, left speed and yaw rate of the unit vehicle from the columns
+# of wheel data.
 _RATES: dict[str, Callable[..., tuple[ArrayLike, ...]]] = {
     "wheels": lambda left, right: ((left + right) / 2.0, 0.0 * left, (right - left) / UNIT_TRACK),
     "steering": lambda speed, angle: (speed, 0.0 * speed, speed * np.tan(angle)),
@@ -33,27 +37,29 @@ _RATES: dict[str, Callable[..., tuple[ArrayLike, ...]]] = {
     "omni": lambda forward, left, turn: (forward, left, turn),
 }
 
+# Number of columns of wheel data without the stamps.
 _N_COLUMNS = {"wheels": 2, "steering": 2, "wheel_odometry": 2, "omni": 3}
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
 def wheel_trajectory(stamps_ns: IntArray, values: ArrayLike, measures: str) -> Trajectory:
-    """Return wheel data as a parent for :func:`hand_eye_calib.calibrate`.
+    """Convert wheel data to a parent stream for :func:`hand_eye_calib.calibrate`.
 
     Parameters
     ----------
     stamps_ns : (N,) int64 array
     values : (N, 2) or (N, 3) array
-        Rates at the stamps: of the left and right wheel (``wheels``), speed and steering angle in
-        rad (``steering``), forward speed and yaw rate (``wheel_odometry``), or forward speed, left
-        speed and yaw rate (``omni``). Speeds may be rad/s of wheels or m/s.
+        Values at the stamps: rates of the left and the right wheel (``wheels``); speed and
+        steering angle, rad (``steering``); forward speed and yaw rate, rad/s (``wheel_odometry``);
+        or forward speed, left speed and yaw rate (``omni``). Rates and speeds are in rad/s of the
+        wheels or in m/s.
     measures : {"wheels", "steering", "wheel_odometry", "omni"}
 
     Returns
     -------
     Trajectory
-        Path of a vehicle with wheels of radius 1, a track of 5 and a wheelbase of 1.
+        Path of the unit vehicle, which has wheels of radius 1, a track of 5 and a wheelbase of 1.
 
     Raises
     ------
@@ -80,12 +86,13 @@ def wheel_trajectory(stamps_ns: IntArray, values: ArrayLike, measures: str) -> T
     durations_s = np.diff(stamps_ns) * 1e-9
     if not (durations_s > 0.0).all():
         raise InputError("stamps of wheel data must increase; sort the rows, drop repeated stamps")
+    # Between two stamps, the mean of both rows is used.
     rates = _RATES[measures](*(values[:-1] + values[1:]).T / 2.0)
     return trajectory_of(stamps_ns, np.stack(rates) * durations_s, measures)
 
 
 def table_of_wheels(path: str | Path, data: bytes, options: FileOptions) -> Table | None:
-    """Return the poses of the unit vehicle in a csv file of wheel data; None for other files.
+    """Read a csv file of wheel data as a table of poses of the unit vehicle; None for other files.
 
     Raises
     ------
@@ -99,9 +106,11 @@ def table_of_wheels(path: str | Path, data: bytes, options: FileOptions) -> Tabl
     if not kinds:
         return None
     rows = []
-    for number, text in enumerate(data.decode().splitlines(), 1):
-        if text.strip() and (number > 1 or options.columns):
-            rows.append((number, [*text.split(","), "0"]))
+    for line_number, text in enumerate(data.decode().splitlines(), 1):
+        # Without the option `columns`, the first line contains the names.
+        if text.strip() and (line_number > 1 or options.columns):
+            rows.append((line_number, [*text.split(","), "0"]))
+    # The table reads three values as positions. The zero at the end replaces a missing third value.
     n_values = names.count(",") + 1
     rates = Table(path, (stamp, "x", "y", "z"), "positions")
     rates.fill(rows, lambda cells: cells[:4])

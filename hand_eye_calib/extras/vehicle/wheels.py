@@ -1,15 +1,18 @@
-"""Wheel data, their models, and the motions of the axle that they predict.
+"""Models of wheels, which predict the motion of the axle from wheel data.
 
 Wheel data are stored as the path of a unit vehicle, which has wheels of radius 1, a wheelbase of 1
-and a track of B = 5. A step of the path has a forward part, a left part and a turn (dx, dy, da).
+and a track of B = 5. A step of the path is forward, left and a turn: (dx, dy, da). From this step,
+a model with the parameters of the real wheels computes the step of the axle (m, m, rad).
 
-- Two driven wheels turn by l = dx - B da / 2 and r = dx + B da / 2. The axle moves by
+- Two driven wheels with radii R_l, R_r turn by l = dx - B da / 2 and r = dx + B da / 2:
   forward = (R_l l + R_r r) / 2,  turn = (R_r r - R_l l) / track.
-- Odometry of two wheels: forward = k dx,  turn = k da / k_track + curvature forward.
-- Steering: tan(angle) = da / dx,  forward = R dx,  turn = forward tan(angle - offset) / wheelbase.
-- Omnidirectional: forward = k_x dx,  left = k_y dy,  turn = k_a da.
+- Odometry of two wheels, with multipliers k and k_track and an additional curvature:
+  forward = k dx,  turn = k da / k_track + curvature forward.
+- Steering, with radius R and an offset of the angle: tan(angle) = da / dx,  forward = R dx,
+  turn = forward tan(angle - offset) / wheelbase.
+- Omnidirectional, with multipliers: forward = k_x dx,  left = k_y dy,  turn = k_a da.
 
-Places in the plane are complex numbers.
+Positions in the plane are complex numbers x + i y.
 
 Reference: A. Censi, A. Franchi, L. Marchionni, G. Oriolo, *Simultaneous calibration of odometry and
 sensor parameters for mobile robots*, IEEE Trans. Robotics 29, 2013.
@@ -24,10 +27,12 @@ from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 
-# Track of the unit vehicle in radii of its wheels, as of a usual robot: its turns are as large.
+# Track of the unit vehicle, as a multiple of the radius of its wheels. A usual robot has the same
+# ratio, so that its turns have a usual size.
 UNIT_TRACK = 5.0
 
-# Added to lengths to divide by (unit of the wheel data): a vehicle at rest has no steering angle.
+# Added to lengths (unit of the wheel data) before a division by them, because a vehicle at rest has
+# the length 0.
 _SMALL = 1e-12
 
 
@@ -39,10 +44,11 @@ class WheelModel(NamedTuple):
     names : sequence of str
         Names of the P parameters.
     steps_of : callable
-        ``steps_of(parameters, dx, dy, da)`` returns forward, left and turn of the axle (N,).
+        ``steps_of(parameters, dx, dy, da)`` returns forward, left and turn (N,) of the axle.
     parameters_of : callable
-        ``parameters_of(length, turn)`` returns parameters (P,) of equal wheels, from the ratios of
-        lengths and of turns to those of the unit vehicle.
+        First values (P,) of the parameters. ``parameters_of(length, turn)`` computes them from the
+        ratios of the lengths and of the turns of the axle to those of the unit vehicle. Both wheels
+        get the same radius.
     """
 
     names: tuple[str, ...]
@@ -53,6 +59,7 @@ class WheelModel(NamedTuple):
 def _two_wheels(
     parameters: FloatArray, dx: FloatArray, dy: FloatArray, da: FloatArray
 ) -> tuple[FloatArray, ...]:
+    """Return the steps of an axle with two driven wheels."""
     left_radius, right_radius, track = parameters
     half_turn = UNIT_TRACK * da / 2.0
     left = left_radius * (dx - half_turn)
@@ -63,6 +70,7 @@ def _two_wheels(
 def _odometry(
     parameters: FloatArray, dx: FloatArray, dy: FloatArray, da: FloatArray
 ) -> tuple[FloatArray, ...]:
+    """Return the steps of an axle with the odometry of two wheels."""
     radius, track, curvature = parameters
     forward = radius * dx
     return forward, dy, radius * da / track + curvature * forward
@@ -71,6 +79,7 @@ def _odometry(
 def _steering(
     parameters: FloatArray, dx: FloatArray, dy: FloatArray, da: FloatArray
 ) -> tuple[FloatArray, ...]:
+    """Return the steps of the rear axle of a vehicle with a steering angle."""
     radius, wheelbase, offset = parameters
     forward = radius * dx
     angle = np.arctan(da / (dx + _SMALL))
@@ -80,11 +89,13 @@ def _steering(
 def _omni(
     parameters: FloatArray, dx: FloatArray, dy: FloatArray, da: FloatArray
 ) -> tuple[FloatArray, ...]:
+    """Return the steps of an omnidirectional vehicle."""
     forward_factor, left_factor, turn_factor = parameters
     return forward_factor * dx, left_factor * dy, turn_factor * da
 
 
-#: Models by what the wheels measure. Names of ``diff_drive_controller`` where it has them.
+#: Models by the kind of wheel data. Parameters that ``diff_drive_controller`` also has are named
+#: like there.
 MODELS = {
     "wheels": WheelModel(
         ("left_wheel_radius", "right_wheel_radius", "wheel_separation"),
@@ -110,43 +121,59 @@ MODELS = {
 
 
 def path_of(steps: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return places (N + 1,), complex, and headings (N + 1,) of steps (3, N) of constant twist."""
+    """Return the positions (N + 1,), complex, and headings (N + 1,), rad, after steps (3, N).
+
+    A step is an arc: forward and left are along the arc, and the turn is constant per length. The
+    path begins at 0 with the heading 0.
+    """
     forward, left, turns = steps
     headings = np.append(0.0, np.cumsum(turns))
+    # The chord of an arc has the direction of its middle, and the length of the arc times
+    # sin(turn / 2) / (turn / 2). numpy's sinc(x) is sin(pi x) / (pi x).
     middle = headings[:-1] + turns / 2.0
-    moved = (forward + 1j * left) * np.exp(1j * middle) * np.sinc(turns / (2.0 * np.pi))
-    return np.append(0.0, np.cumsum(moved)), headings
+    chords = (forward + 1j * left) * np.exp(1j * middle) * np.sinc(turns / (2.0 * np.pi))
+    return np.append(0.0, np.cumsum(chords)), headings
 
 
-def steps_between(moved: FloatArray, headings: FloatArray, turns: FloatArray) -> FloatArray:
-    """Return steps (3, N) from displacements (N,), complex, headings at their start, and turns."""
-    arcs = moved * np.exp(-1j * (headings + turns / 2.0)) / np.sinc(turns / (2.0 * np.pi))
+def steps_between(chords: FloatArray, headings: FloatArray, turns: FloatArray) -> FloatArray:
+    """Return the steps (3, N) with these chords; the inverse of :func:`path_of`.
+
+    ``chords`` (N,) are the displacements, complex, ``headings`` (N,) those at the start of each
+    step, and ``turns`` (N,) those of the steps, rad.
+    """
+    arcs = chords * np.exp(-1j * (headings + turns / 2.0)) / np.sinc(turns / (2.0 * np.pi))
     return np.stack([arcs.real, arcs.imag, turns])
 
 
 def trajectory_of(stamps_ns: IntArray, steps: FloatArray, measures: str) -> Trajectory:
     """Return the path of the unit vehicle from its steps (3, N - 1) between stamps (N,)."""
-    places, headings = path_of(steps)
+    positions, headings = path_of(steps)
     poses = se3.from_rotation_translation(
         se3.rotation_exp(headings[:, None] * [0.0, 0.0, 1.0]),
-        np.stack([places.real, places.imag, np.zeros(len(places))], axis=-1),
+        np.stack([positions.real, positions.imag, np.zeros(len(positions))], axis=-1),
     )
     return Trajectory(stamps_ns, poses, "base_link", "", measures)
 
 
 def steps_of(trajectory: Trajectory) -> FloatArray:
     """Return the steps (3, N - 1) of the path of a unit vehicle."""
-    places = trajectory.poses[:, 0, 3] + 1j * trajectory.poses[:, 1, 3]
+    positions = trajectory.poses[:, 0, 3] + 1j * trajectory.poses[:, 1, 3]
     headings = np.unwrap(np.arctan2(trajectory.poses[:, 1, 0], trajectory.poses[:, 0, 0]))
-    return steps_between(np.diff(places), headings[:-1], np.diff(headings))
+    return steps_between(np.diff(positions), headings[:-1], np.diff(headings))
 
 
 def motions(stamps_s: FloatArray, steps: FloatArray, ends_s: FloatArray) -> FloatArray:
-    """Return the motions (3, K) from steps (3, N) between stamps (N + 1,).
+    """Return the motion (3, K) in each window: forward, left and turn along one arc.
 
-    ``ends_s`` (2, K) are the times of both ends of the motions.
+    Parameters
+    ----------
+    stamps_s : (N + 1,) array
+    steps : (3, N) array
+        Steps of the axle between the stamps.
+    ends_s : (2, K) array
+        Times of the start and of the end of the windows.
     """
-    places, headings = path_of(steps)
-    start, end = np.interp(ends_s, stamps_s, places)
+    positions, headings = path_of(steps)
+    start, end = np.interp(ends_s, stamps_s, positions)
     start_heading, end_heading = np.interp(ends_s, stamps_s, headings)
     return steps_between(end - start, start_heading, end_heading - start_heading)
