@@ -1,4 +1,4 @@
-"""Monitor the mount while the robot drives."""
+"""Monitor that detects, while the robot drives, whether a sensor has moved on its mount."""
 
 from typing import Any
 
@@ -6,18 +6,20 @@ from hand_eye_calib.core.base.registry import COMPARISONS, MOUNT_MONITORS
 
 
 def register() -> None:
-    """Register the monitor of the mount for the node, and the comparison of its digests."""
+    """Register the monitor for the node, and the comparison of its digests for ``compare``."""
     MOUNT_MONITORS["installed"] = _watch
     COMPARISONS["digests of the monitor"] = _compare
 
 
 def _compare(arguments: Any) -> int | None:
+    """Compare digests, and return the exit code; None if the arguments are no digests."""
     from hand_eye_calib.extras.mount.history import compare_digests
 
     return compare_digests(arguments)
 
 
 def _watch(session: Any, *parts: Any) -> Any:
+    """Return the monitor of a live session, and limit the poses that the session stores."""
     from hand_eye_calib.extras.mount.monitor import LIMITS, MountWatch
 
     session.watch_only(LIMITS)

@@ -1,8 +1,8 @@
-"""Digests of monitored sessions: the evidence of a session on the mount, in a file below 10 kB.
+"""Digests: what a monitored session contains about the mount, in a file below 10 kB.
 
-A digest contains the evidence ``[H S]`` of the whole session on a shift of the child sensor from
-the installed extrinsic (:mod:`hand_eye_calib.core.assessment.moved`). The evidence is divided by
-its long-run variance, so that the evidence of several sessions can be added.
+A digest contains the information matrix H and the score S of the whole session on a shift of the
+child sensor from the installed extrinsic (:mod:`hand_eye_calib.core.assessment.moved`). Both are
+divided by the long-run variance of the scores, so that H and S of several sessions can be added.
 """
 
 import json
@@ -17,40 +17,42 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.plain import from_plain, plain
 
-# Directory of the digests, in the output directory of the node.
+# Name of the folder of digests in the output directory of the node.
 FOLDER = "digests"
 
-# First key of a file, which distinguishes it from other JSON.
+# First key in the file of a digest, which other JSON files do not have.
 _KIND = "mount_digest"
 
-# Shapes of the arrays.
+# Shapes of the arrays in a digest.
 _SHAPES = {"installed": (4, 4), "covariance": (6, 6), "wander": (6, 6), "evidence": (6, 7)}
 
-# Largest size of a file (bytes) that is read.
+# Larger files (bytes) are not read, because they are no digests.
 _LARGEST = 100_000
 
 
 @dataclass(frozen=True, eq=False)
 class Digest:
-    """Evidence of one monitored session on the mount.
+    """What one monitored session contains about the mount.
 
     Attributes
     ----------
     parent_frame, child_frame : str
     start_ns, end_ns : int
-        Stamps of the session's motion (ns).
+        Stamps of the first and last second of motion (ns).
     seconds : int
-        Seconds of motion.
+        Duration of the motion (s).
     installed : (4, 4) array
-        The installed pose of the child in the parent.
+        Installed pose of the child sensor in the parent sensor's frame.
     covariance : (6, 6) array
-        Covariance of the offset from the installed extrinsic before a shift, in the child's frame.
+        Covariance of the offset from the installed extrinsic that exists without any shift, in the
+        child's frame.
     wander : (6, 6) array
-        Covariance of the common-mode error from session to session, in the child's frame.
+        Covariance of the part of this offset that differs from session to session, in the child's
+        frame.
     evidence : (6, 7) array
-        ``[H S]`` on a shift in the child's frame.
+        Information H and score S, ``[H S]``, on a shift in the child's frame.
     alarm : str
-        Sentence of the monitor's alarm; empty without an alarm.
+        Text of the monitor's alarm; empty without an alarm.
     """
 
     parent_frame: str
@@ -66,7 +68,7 @@ class Digest:
 
     @property
     def day(self) -> str:
-        """Day and time of the session's start (UTC)."""
+        """Date and time of the session's start (UTC), as text."""
         start = datetime.fromtimestamp(self.start_ns * 1e-9, UTC)
         return start.strftime("%Y-%m-%d %H:%M")
 
@@ -74,7 +76,8 @@ class Digest:
 def write_digest(directory: Path, digest: Digest) -> Path:
     """Write a digest into the folder ``digests`` of an output directory, and return its path.
 
-    The name of the file is the time of the session's start, so that files of later sessions follow.
+    The name of the file is the time of the session's start, so that sorted names are in order of
+    time.
     """
     folder = directory / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
@@ -90,7 +93,7 @@ def read_digest(path: Path) -> Digest | None:
     Raises
     ------
     InputError
-        If the file is a digest that cannot be used.
+        If the file is a digest with missing or invalid values.
     """
     if not path.is_file() or path.stat().st_size > _LARGEST or path.suffix != ".json":
         return None
@@ -112,15 +115,18 @@ def read_digest(path: Path) -> Digest | None:
 
 
 def read_digests(paths: list[Path]) -> list[Digest] | None:
-    """Return the digests in files and folders, the earliest first; None if there is another file.
+    """Return the digests in files and folders, in order of time.
+
+    None is returned if a path has no digests, or has a file that is no digest.
 
     Raises
     ------
     InputError
-        If a digest cannot be used, or if they are of different mounts.
+        If a digest has invalid values, or if digests are those of different mounts.
     """
     digests = []
     for path in paths:
+        # The path may be an output directory of the node, a folder of digests, or a digest.
         folder = path / FOLDER if (path / FOLDER).is_dir() else path
         files = sorted(folder.glob("*.json")) if folder.is_dir() else [folder]
         read = [read_digest(file) for file in files]

@@ -1,12 +1,14 @@
-"""History of a mount from the digests of its sessions, with the changes in it.
+"""History of a mount: changes between sessions, detected from the digests of the sessions.
 
-The offset of the child from the installed pose in session k is d + u_k, with the common-mode error
-u_k ~ N(0, W). The evidence [H_k S_k] of the session measures this offset. From session c on, after
-a change, the offset is d + s + u_k.
+In session k, the offset of the child sensor from the installed pose is d + u_k, with an error
+u_k ~ N(0, W) that differs from session to session. The information H_k and the score S_k in the
+digest measure this offset. If the mount changes before session c, the offset is d + s + u_k from
+session c on, with the shift s.
 
-The change is the c with the largest likelihood ratio of a shift s against none, as in the monitor
-(:mod:`hand_eye_calib.extras.mount.monitor`). The sessions before and after a change are searched
-again (binary segmentation: A. Scott, M. Knott, *A cluster analysis method*, 1974).
+The change is at the session c with the largest likelihood ratio of a shift against no shift, as in
+the monitor (:mod:`hand_eye_calib.extras.mount.monitor`). The sessions before and after this change
+are then searched for further changes (binary segmentation: A. Scott, M. Knott, *A cluster analysis
+method*, 1974).
 """
 
 import argparse
@@ -28,7 +30,7 @@ from hand_eye_calib.extras.mount.monitor import KNOCKS, TUNING
 from hand_eye_calib.offline.cli.options import print_result
 from hand_eye_calib.online.live.progress import AXIS_KEYS
 
-# Covariance of an unknown offset.
+# Covariance (6, 6) of an offset about which nothing is known.
 _UNKNOWN = np.diag(change.UNKNOWN**2)
 
 
@@ -39,10 +41,11 @@ class Changepoint:
     Attributes
     ----------
     index : int
-        First session after the change.
+        Index of the first session after the change.
     log_ratio : float
+        Logarithm of the likelihood ratio of this change against no change.
     shift : Moved
-        Along and about the axes of the parent sensor's frame.
+        Shift along and about the axes of the parent sensor's frame.
     """
 
     index: int
@@ -51,40 +54,43 @@ class Changepoint:
 
 
 def find_changes(digests: Sequence[Digest]) -> list[Changepoint]:
-    """Return the changes of the mount between sessions, the earliest first.
+    """Return the changes of the mount, in order of time.
 
-    A change at the first session is one from the installed pose.
+    A change with index 0 means that the mount differs from the installed pose in the first session.
     """
     if not digests:
         return []
-    tables = np.array([_with_wander(digest) for digest in digests])
+    tables = np.array([_evidence_on_common_offset(digest) for digest in digests])
     to_parent = se3.block_diagonal(se3.rotation_of(digests[0].installed))
-    found = _changes(tables, 0, digests[0].covariance, to_parent, cuts_from=0)
-    return sorted(found, key=lambda changepoint: changepoint.index)
+    changes = _changes(tables, 0, digests[0].covariance, to_parent, cuts_from=0)
+    return sorted(changes, key=lambda changepoint: changepoint.index)
 
 
-def _with_wander(digest: Digest) -> FloatArray:
-    """Return the evidence (6, 7) of a session on the offset that all sessions share."""
+def _evidence_on_common_offset(digest: Digest) -> FloatArray:
+    """Return the evidence ``[H S]`` (6, 7) of a session on the offset d that all sessions share.
+
+    It is weaker than the evidence in the digest, because the session also has its own error u_k.
+    """
     return shift_evidence(digest.evidence, np.zeros(6), digest.wander)
 
 
 def _changes(
     tables: FloatArray, start: int, prior: FloatArray, to_parent: FloatArray, cuts_from: int
 ) -> Iterator[Changepoint]:
-    """Yield the changes within sessions.
+    """Yield the changes within a sequence of n sessions, by binary segmentation.
 
     Parameters
     ----------
     tables : (n, 6, 7) array
-        Evidence of each session.
+        Evidence of each session on the common offset.
     start : int
-        Index of the first session.
+        Index of the first session of the sequence among all sessions.
     prior : (6, 6) array
-        Covariance of the offset before the sessions.
+        Prior covariance of the offset at the begin of the sequence.
     to_parent : (6, 6) array
         Rotation of tangent vectors from the child's to the parent's frame.
     cuts_from : int
-        First session that may follow a change.
+        First session of the sequence before which a change is possible: 0 or 1.
     """
     cuts = np.arange(cuts_from, len(tables))
     if not len(cuts):
@@ -92,6 +98,7 @@ def _changes(
     blocks = Blocks(tables)
     after = blocks.since(cuts)
     before = blocks.total - after
+    # Offset before each possible change, and its covariance.
     covariances = inverse(inverse(prior) + information(before))
     offsets = se3.times(covariances, score(before))
     shifts = shift_evidence(after, offsets, covariances)
@@ -106,7 +113,7 @@ def _changes(
 
 
 def _shift_of(table: FloatArray, to_parent: FloatArray) -> change.Moved:
-    """Return a shift from its evidence."""
+    """Return the most likely shift from the evidence ``[H S]`` (6, 7) on it."""
     prior = inverse(moved.shift_covariance(1.0, 1.0))
     covariance = np.linalg.inv(information(table) + prior)
     values = to_parent @ covariance @ score(table)
@@ -114,14 +121,14 @@ def _shift_of(table: FloatArray, to_parent: FloatArray) -> change.Moved:
 
 
 def compare_digests(arguments: argparse.Namespace) -> int | None:
-    """Print the history of a mount, and return the exit code of ``compare``.
+    """Print the history of a mount, and return the exit code of ``compare``: 4 after a change.
 
     None is returned if the arguments are no digests.
 
     Raises
     ------
     ConfigError
-        If the arguments name another installed transform than the digests.
+        If the arguments name an installed transform, because the digests already contain it.
     """
     digests = read_digests([Path(path) for path in arguments.results])
     if digests is None:
@@ -145,7 +152,7 @@ def compare_digests(arguments: argparse.Namespace) -> int | None:
 
 
 def _lines(digests: Sequence[Digest], changes: Sequence[Changepoint]) -> Iterator[str]:
-    """Yield the verdict, and a line for each session and each change."""
+    """Yield the lines for the terminal: the verdict, then a line for each session and change."""
     first = digests[0]
     mount = f"Mount of {first.child_frame} on {first.parent_frame}"
     sessions = counted(len(digests), "session")
@@ -163,8 +170,8 @@ def _lines(digests: Sequence[Digest], changes: Sequence[Changepoint]) -> Iterato
         if changepoint := by_index.get(index):
             yield f"  -- moved before {digest.day}: {changepoint.shift.what}"
             offset = np.zeros((6, 7))
-        # Sessions since the last change share one offset, so that its standard deviation shrinks.
-        offset = offset + _with_wander(digest)
+        # All sessions since the last change have the same offset, so their evidence is added.
+        offset = offset + _evidence_on_common_offset(digest)
         shift = _shift_of(offset, se3.block_diagonal(se3.rotation_of(digest.installed)))
         cells = [
             f"{amount(axis, row.difference)} +/- {amount(axis, row.sigma)}"

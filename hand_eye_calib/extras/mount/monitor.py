@@ -1,21 +1,21 @@
 """Option ``monitor: true``: detect a shift of the child sensor from the installed extrinsic.
 
-The monitor runs for days in constant memory. Each second k of motion adds its evidence on a shift
-d, the information H_k and the score S_k (:mod:`hand_eye_calib.core.assessment.moved`):
+The monitor runs for days in constant memory. Each second k of motion yields the information H_k and
+the score S_k on a shift (:mod:`hand_eye_calib.core.assessment.moved`). With the long-run variance f
+of the scores and the prior covariance L of a shift,
 
-    H = sum H_k / f,   S = sum S_k / f      over the last 3 s, 4 s, ... 20 min, and over everything
+    H = sum H_k / f,   S = sum S_k / f      over the last 3 s, 4 s, ... 20 min, and over all seconds
     log ratio = 1/2 S' (H + L^-1)^-1 S - 1/2 log|I + L H|
 
-with the long-run variance f, by the real scatter of the scores over time. An alarm is raised if the
-largest ratio exceeds a threshold: the generalised likelihood ratio test of M. Basseville, I.
-Nikiforov, *Detection of abrupt changes*, 1993.
+An alarm is raised if the largest ratio exceeds a threshold: the generalised likelihood ratio test
+of M. Basseville, I. Nikiforov, *Detection of abrupt changes*, 1993.
 
-The offset from the installed extrinsic before a shift comes from the uncertainty of the extrinsic
-and from the common-mode error of both odometries
-(:mod:`hand_eye_calib.core.assessment.covariance`). The motion before the shift estimates it. A
-drifting scale, for example of visual odometry, looks like a lever arm in curves: each second has
-its own scale parameter. A sensor at rest adds nothing. docs/session.md lists the shifts that the
-monitor detects.
+Even before a shift, the pose has an offset from the installed extrinsic. Its prior covariance is
+that of the extrinsic plus the common-mode error of both odometries
+(:mod:`hand_eye_calib.core.assessment.covariance`). The offset is estimated from the motion before
+the shift. A scale that drifts, for example of visual odometry, looks like a shift of the lever arm
+in curves. Therefore each second has a scale parameter of its own. A sensor at rest adds nothing.
+docs/session.md lists the shifts that the monitor detects.
 """
 
 from collections.abc import Callable
@@ -47,71 +47,77 @@ from hand_eye_calib.online.live.state import Level, MountState, Outcome, by_axis
 
 @dataclass(frozen=True)
 class Tuning:
-    """Numbers of the monitor; times are seconds of motion unless stated otherwise.
+    """Numbers of the monitor. Times are seconds of motion unless stated otherwise.
 
-    docs/session.md lists the shifts that are detected with them.
+    docs/session.md lists the shifts that are detected with these numbers.
     """
 
-    # Log likelihood ratio from which on the mount has moved.
+    # Smallest logarithm of the likelihood ratio that raises an alarm.
     threshold: float = 10.0
-    # Longest motion that counts as one over a second, as a multiple of a second.
-    most_late: float = 1.5
-    # At most one motion begins in each step of this length (ns).
+    # Largest duration of a motion that should last one second (s).
+    max_motion_s: float = 1.5
+    # At most one motion begins in each interval of this length (ns).
     step_ns: int = 100_000_000
-    # A second counts if the sensors move by this distance within it (m) ...
-    least_motion_m: float = 0.05
-    # ... or rotate by this angle (rad) ...
-    least_rotation_rad: float = float(np.radians(1.5))
+    # A second is used if the sensors move by at least this distance within it (m) ...
+    min_motion_m: float = 0.05
+    # ... or rotate by at least this angle (rad) ...
+    min_rotation_rad: float = float(np.radians(1.5))
     # ... and by this multiple of the rotation noise.
-    least_of_noise: float = 3.0
-    # Time from which the noise is learned before the first test.
+    min_rotation_per_noise: float = 3.0
+    # Duration of the motion from which the noise is estimated before the first test.
     learning_s: int = 120
-    # Newest seconds whose evidence is kept one by one.
+    # Number of the newest seconds whose evidence is stored separately.
     memory_s: int = 1200
-    # Shortest time since a shift: longer than the motions, so that one jump of a trajectory is no
-    # shift.
+    # Shortest tested time since a shift. It is longer than a motion, so that a single jump of a
+    # trajectory is not taken for a shift.
     shortest_s: int = 3
-    # Number of tested times since a shift.
+    # Number of tested times since a shift, in geometric steps.
     lags: int = 16
     # Time constant of the estimate of the noise.
     noise_memory_s: float = 900.0
-    # Time constant with which older evidence is forgotten.
+    # Time constant with which evidence older than the memory decays.
     old_memory_s: float = 20_000.0
-    # Factor of the variances of the installed extrinsic.
-    caution: float = 2.0
-    # Standard deviation of the common-mode error from hour to hour, as a share.
+    # Factor by which the covariance of the installed extrinsic is multiplied, as a safety margin.
+    covariance_factor: float = 2.0
+    # Standard deviation of the change of the common-mode error from hour to hour, as a share of the
+    # common-mode error.
     wander: float = 0.25
-    # Standard deviation of the child's scale in a second. A scale that drifts by 0.5 % is wrong for
-    # a minute; as independent errors of seconds, this is sqrt(60) times as much.
+    # Prior standard deviation of the child's scale in a second. A scale that drifts by 0.5 % stays
+    # wrong for a minute. As independent errors of 60 seconds, this is sqrt(60) times as much.
     scale_sigma: float = 0.04
-    # Lengths (s) of the windows whose scores give the long-run variance.
+    # Lengths (s) of the windows from whose scores the long-run variance is estimated.
     windows_s: tuple[int, ...] = (10, 30, 90, 240)
-    # Interval of its estimates.
+    # Interval between estimates of the long-run variance.
     long_run_every_s: int = 10
-    # Prior long-run variance.
+    # Prior value of the long-run variance.
     assumed: float = 10.0
-    # Weight of the prior in windows; fewer windows are no evidence.
+    # Weight of the prior value, as a number of windows. With fewer windows than this, the long-run
+    # variance is not estimated.
     assumed_windows: int = 4
-    # Largest score of a window, as a multiple of the typical one: a shift spoils some windows.
-    most_of_typical: float = 20.0
-    # Information of the expected shifts that is added to that of the motion, as a share.
+    # Larger scores of windows are limited to this multiple of the median, because a shift within a
+    # window increases its score.
+    max_of_median: float = 20.0
+    # Share of the prior information of a shift that is added to the information of the motion, to
+    # keep it regular.
     ridge: float = 1e-3
-    # Duration of the session for which visible shifts are reported.
+    # Duration of the motion for which detectable shifts are reported.
     session_s: float = 600.0
 
 
 TUNING = Tuning()
 
+# Tested times since a shift (s).
 _LAGS = np.geomspace(TUNING.shortest_s, TUNING.memory_s, TUNING.lags).round().astype(int)
 _SECOND_NS = 1_000_000_000
 
-# Covariances of expected shifts: a translation, a rotation, or both. A shift that only rotates the
-# sensor is detected sooner with the second.
+# Prior covariances (3, 6, 6) of shifts: only a translation, only a rotation, or both. A shift that
+# only rotates the sensor is detected sooner with the second covariance than with the third.
 KNOCKS = np.array(
     [moved.shift_covariance(radians=1e-6), moved.shift_covariance(1e-6), moved.shift_covariance()]
 )
 
-# Limits of a session that is only monitored: poses are paired soon, and few are kept.
+# Limits of a session that is monitored but not calibrated: poses are paired soon, and few poses are
+# stored.
 LIMITS = BufferLimits(
     capacity=4_000, pairing_starts=32, batch=64, batch_every=16, late_ns=500_000_000
 )
@@ -119,18 +125,18 @@ LIMITS = BufferLimits(
 
 @dataclass(frozen=True)
 class _Second:
-    """Motions that begin within one second of motion.
+    """K motions that begin within the same second. Each motion lasts about one second.
 
     Attributes
     ----------
     stamp_ns : int
+        Start of the second, on the parent's clock.
     motions : MotionPairs
-        K motions over a second.
     residuals : (K, 6) array
-        At the installed extrinsic.
+        Residuals of A X = X B at the installed extrinsic X.
     jacobians : (K, 6, 7) array
-        Negative derivatives of the residuals with respect to a shift and to the logarithm of the
-        child's scale.
+        J in ``residuals = -J parameters + noise``. The parameters are the shift (6,) and the
+        logarithm of the child's scale.
     """
 
     stamp_ns: int
@@ -150,7 +156,9 @@ class Alarm:
     raised_ns : int
         Time of its detection, on the parent's clock.
     shift : Moved
+        Shift along and about the axes of the parent sensor's frame.
     log_ratio : float
+        Logarithm of the likelihood ratio of the shift against no shift.
     """
 
     since_ns: int
@@ -159,13 +167,13 @@ class Alarm:
     log_ratio: float
 
     def __str__(self) -> str:
-        """Describe the axes that have moved, by how much, and since when (local time)."""
+        """Return the axes that have moved, by how much, and since when (local time), as text."""
         since = datetime.fromtimestamp(self.since_ns * 1e-9).isoformat(" ", timespec="minutes")
         return f"the mount has moved: {self.shift.what}, since about {since}"
 
 
 class MountMonitor:
-    """Monitors the pose of the child sensor in the parent sensor's frame.
+    """Monitor of the pose of the child sensor in the parent sensor's frame.
 
     Parameters
     ----------
@@ -177,24 +185,24 @@ class MountMonitor:
     Attributes
     ----------
     alarm : Alarm or None
-        The detected shift.
+        Detected shift.
     seconds : int
-        Seconds of motion so far.
+        Duration of the motion so far (s).
     is_learning : bool
-        Whether the noise is still learned, and nothing is tested.
+        True while the first motions are collected to estimate the noise. Nothing is tested yet.
     long_run : float
-        Long-run variance of the scores in units of their information.
+        Long-run variance f of the scores, relative to their variance without correlation in time.
     """
 
     def __init__(self, T_parent_child: FloatArray, covariance: FloatArray) -> None:
         self._installed = np.asarray(T_parent_child, dtype=float)
-        self._covariance = TUNING.caution * np.asarray(covariance, dtype=float)
+        self._covariance = TUNING.covariance_factor * np.asarray(covariance, dtype=float)
         self._wander = np.zeros((6, 6))
         self._noise = np.zeros((6, 6))
         self._learning: list[_Second] = []
         self.is_learning = True
         self._tail = PosePairs.empty()
-        # Evidence of the newest seconds of motion, and the sum of older ones.
+        # Stamps and evidence of the newest seconds of motion, and the sum of older evidence.
         self._stamps_ns: IntArray = np.zeros(0, dtype=np.int64)
         self._seconds = Blocks(np.zeros((0, 6, 7)))
         self._old = np.zeros((6, 7))
@@ -212,7 +220,7 @@ class MountMonitor:
         Returns
         -------
         Alarm or None
-            A new alarm, if these poses raise it.
+            The alarm if these poses raise it; None if it was raised before.
         """
         had_alarm = self.alarm is not None
         raised = None
@@ -232,33 +240,38 @@ class MountMonitor:
         return raised
 
     def restart(self) -> None:
-        """Start again with stamps of any time, without loss of what was learned."""
+        """Accept earlier stamps again; the noise and the evidence are kept."""
         self._tail = PosePairs.empty()
         self._last_s = -1
 
-    # ------------------------------------------------------------- the motions
+    # ---- motions
 
     def _by_second(self, pose_pairs: PosePairs) -> list[_Second]:
-        """Return motions over a second that end in these poses, by the second of their begin."""
+        """Return the motions that the new poses complete, grouped by the second of their start.
+
+        Only complete seconds are returned. The poses of an incomplete second are stored.
+        """
         if len(self._tail) and len(pose_pairs):
-            late_ns = int(pose_pairs.stamps_ns[0] - self._tail.stamps_ns[-1])
-            if not 0 < late_ns <= TUNING.most_late * _SECOND_NS:
+            gap_ns = int(pose_pairs.stamps_ns[0] - self._tail.stamps_ns[-1])
+            if not 0 < gap_ns <= TUNING.max_motion_s * _SECOND_NS:
                 self._tail = PosePairs.empty()
         poses = PosePairs.concatenate(self._tail, pose_pairs)
         poses = poses[np.unique(poses.stamps_ns // TUNING.step_ns, return_index=True)[1]]
         stamps_ns = poses.stamps_ns
         seconds = poses.stamps_ns // _SECOND_NS
+        # A motion lasts from pose i to the first pose j that is at least one second later.
         j = np.searchsorted(stamps_ns, stamps_ns + _SECOND_NS)
-        # A second is complete once a motion of the next second has its end.
+        # A second is complete if a motion that starts in the next second has its end.
         has_end = j < len(stamps_ns)
         incomplete_s = int(seconds[has_end][-1]) if has_end.any() else -1
         self._tail = poses[seconds >= incomplete_s]
         i = np.flatnonzero(has_end & (seconds < incomplete_s) & (seconds > self._last_s))
-        i = i[stamps_ns[j[i]] - stamps_ns[i] <= TUNING.most_late * _SECOND_NS]
+        i = i[stamps_ns[j[i]] - stamps_ns[i] <= TUNING.max_motion_s * _SECOND_NS]
         self._last_s = max(self._last_s, incomplete_s - 1)
         pairs = pairs_between(poses.Ts_pw_p, poses.Ts_cw_c, i, j[i])
         second_of_pair = seconds[i]
         residuals, jacobians = moved.residuals_and_jacobians(pairs, self._installed)
+        # Column for the logarithm of the child's scale, which changes only the translation.
         by_scale = -se3.inverse(pairs.Ts_childi_childj)[:, :3, 3:]
         jacobians = np.append(jacobians, np.pad(by_scale, ((0, 0), (0, 3), (0, 0))), axis=2)
         complete = []
@@ -269,18 +282,21 @@ class MountMonitor:
         return complete
 
     def _learn(self, second: _Second) -> None:
-        """Collect motions; once there are enough, learn the noise about their own answer."""
+        """Collect the first seconds. From enough seconds, estimate the noise, and begin to test.
+
+        The noise is the scatter of the residuals about the shift that fits these seconds best.
+        """
         self._learning.append(second)
         if len(self._learning) < TUNING.learning_s:
             return
-        learned = self._learning
+        seconds = self._learning
         self._learning = []
-        pairs = MotionPairs.concatenate(*(second.motions for second in learned))
-        # Motions count as independent, each over one step.
+        pairs = MotionPairs.concatenate(*(item.motions for item in seconds))
+        # Number the poses so that the motions count as independent, each over one step.
         index = np.arange(len(pairs))
         pairs = replace(pairs, i=index, j=index + 1)
-        residuals = np.concatenate([second.residuals for second in learned])
-        jacobians = np.concatenate([second.jacobians[:, :, :6] for second in learned])
+        residuals = np.concatenate([item.residuals for item in seconds])
+        jacobians = np.concatenate([item.jacobians[:, :, :6] for item in seconds])
         self.is_learning = False
         self._noise, _ = moved.noise_covariance(residuals)
         for _ in range(2):
@@ -293,22 +309,27 @@ class MountMonitor:
         floor += moved.shift_covariance(1e-3, 1e-4)  # keeps the covariance regular
         self._covariance = self._covariance + floor
         self._wander = TUNING.wander**2 * floor
-        for second in learned:
-            self._add_evidence(second)
+        for item in seconds:
+            self._add_evidence(item)
 
     def _add_evidence(self, second: _Second) -> None:
-        """Add the evidence of a second, for an unknown scale in it, and update the noise."""
+        """Add the evidence of a second on a shift, and update the estimate of the noise.
+
+        The scale of the child in this second is unknown, and is eliminated from the evidence.
+        """
         n_seconds = len(self._seconds.sums)
         if self.seconds % TUNING.long_run_every_s == 0 and n_seconds >= TUNING.learning_s:
             self._centre = moved.most_likely(self._seconds.total, TUNING.ridge)
         shift = np.append(self._centre, 0.0)
         table, scatter = _evidence(second.residuals, second.jacobians, self._noise, shift)
-        # Eliminate the scale, with its prior, from the evidence [H S] (7, 8).
+        # Eliminate the scale (row and column 6), with its prior, from the evidence [H S] (7, 8) by
+        # the Schur complement.
         scale_information = table[6, 6] + self.long_run / TUNING.scale_sigma**2
         by_scale = np.delete(table[6], 6)
         table = np.delete(table[:6], 6, axis=1) - np.outer(
             table[:6, 6] / scale_information, by_scale
         )
+        # The oldest second leaves the memory. After an alarm, the old evidence must not change.
         if n_seconds == TUNING.memory_s and self.alarm is None:
             self._old = (1.0 - 1.0 / TUNING.old_memory_s) * self._old + self._seconds.sums[0]
         stamps_ns = np.append(self._stamps_ns, np.int64(second.stamp_ns))
@@ -317,13 +338,17 @@ class MountMonitor:
         self._seconds = Blocks(tables[-TUNING.memory_s :])
         share = 1.0 / TUNING.noise_memory_s
         self._noise = (1.0 - share) * self._noise + share * scatter
+        # Mean over the last 100 seconds.
         n_averaged = min(n_seconds + 1, 100)
         self._motions_per_s += (len(second.residuals) - self._motions_per_s) / n_averaged
 
-    # ------------------------------------------------------------- the test
+    # ---- test
 
     def _test(self) -> None:
-        """Raise an alarm, or update an alarm that has become clearer."""
+        """Raise an alarm if the largest ratio exceeds the threshold.
+
+        If there is an alarm already, its shift is updated when the ratio has grown.
+        """
         if self.seconds % TUNING.long_run_every_s == 0 or self.seconds <= TUNING.learning_s:
             self.long_run = _long_run_variance(self._seconds, self.long_run)
         if len(self._stamps_ns) < _LAGS[0]:
@@ -331,8 +356,8 @@ class MountMonitor:
         lags, tables = self._shifts()
         ratios = moved.log_ratio(tables, KNOCKS[:, None]).max(axis=0)
         best = int(np.argmax(ratios))
-        least_ratio = self.alarm.log_ratio if self.alarm else TUNING.threshold
-        if ratios[best] < least_ratio:
+        threshold = self.alarm.log_ratio if self.alarm else TUNING.threshold
+        if ratios[best] < threshold:
             return
         H = information(tables[best])
         S = score(tables[best])
@@ -352,15 +377,17 @@ class MountMonitor:
         )
 
     def _shifts(self) -> tuple[IntArray, FloatArray]:
-        """Return the evidence of a shift at each tested time.
+        """Return the evidence on a shift at each tested time.
 
-        It includes the long-run variance and the uncertainty of the offset before the shift.
+        The evidence is divided by the long-run variance, and reduced by the uncertainty of the
+        offset before the shift.
 
         Returns
         -------
         lags : (l,) int array
-            Seconds since the shift; the last lag is the whole memory.
+            Seconds since the shift. The last value is the whole memory, for a shift before it.
         tables : (l, 6, 7) array
+            Information H and score S, ``[H S]``, for each lag.
         """
         n_seconds = len(self._stamps_ns)
         lags = _LAGS[: np.searchsorted(_LAGS, n_seconds, side="right")]
@@ -373,7 +400,7 @@ class MountMonitor:
         return np.append(lags, n_seconds), tables
 
     def digest(self, parent_frame: str, child_frame: str) -> Digest | None:
-        """Return the evidence of the session on the mount; None while the noise is learned."""
+        """Return the digest of the session; None until the noise is estimated."""
         if self.is_learning:
             return None
         return Digest(
@@ -392,8 +419,9 @@ class MountMonitor:
     def visible(self, seconds: float) -> FloatArray:
         """Return the shifts (6,) that are detected in nine of ten cases.
 
-        They are along (m) and about (rad) each axis of the parent sensor, after so many seconds of
-        motion like the motion so far. They are infinite while learning.
+        The shifts are along (m) and about (rad) each axis of the parent sensor. They are detected
+        within ``seconds`` of motion like the motion so far. All are infinite until the noise is
+        estimated.
         """
         if self.is_learning:
             return np.full(6, np.inf)
@@ -401,19 +429,22 @@ class MountMonitor:
         before = (information(self._old) + H) / self.long_run
         cov_before = np.linalg.inv(np.linalg.inv(self._covariance) + before) + self._wander
         H = H / len(self._stamps_ns)
-        # Subtract the spurious translation information that rotation noise produces: rotations that
-        # never took place reveal nothing.
-        turns = se3.skew(np.eye(3))
+        # Subtract the spurious information on the translation that rotation noise produces:
+        # sum_jk noise_jk G_j' precision G_k, with the generators G_j (3, 3) of rotations.
+        generators = se3.skew(np.eye(3))
         precision = np.linalg.inv(self._noise)[:3, :3]
-        spurious = np.einsum("jk,jai,ab,kbl->il", self._noise[3:, 3:], turns, precision, turns)
+        spurious = np.einsum(
+            "jk,jai,ab,kbl->il", self._noise[3:, 3:], generators, precision, generators
+        )
         H[:3, :3] -= self._motions_per_s * spurious
         H *= seconds / self.long_run
+        # Covariance from H, with a very weak prior that limits axes without information.
         scale = np.sqrt(np.diag(moved.shift_covariance(100.0, np.pi)))
         values, vectors = np.linalg.eigh(scale[:, None] * H * scale)
         root = scale[:, None] * vectors / np.sqrt(1.0 + np.maximum(values, 0.0))
         covariance = root @ root.T + cov_before
-        # The ratio of a shift of z standard deviations along or about an axis is
-        # (z^2 - log_volume) / 2.
+        # A shift of z standard deviations has the log ratio (z^2 - log|I + L C^-1|) / 2, with the
+        # covariance C and the prior covariance L of a translation or of a rotation.
         volumes = np.eye(6) + KNOCKS[:2] @ np.linalg.inv(covariance)
         log_volumes = np.linalg.slogdet(volumes)[1]
         detected_sigmas = np.sqrt(2.0 * TUNING.threshold + log_volumes) + NINE_TIMES_OUT_OF_TEN
@@ -422,13 +453,13 @@ class MountMonitor:
 
 
 def _is_motion(motions: MotionPairs, noise: FloatArray) -> bool:
-    """Whether the sensors move: at rest, noise would look like information."""
+    """Whether the sensors move in these motions. At rest, noise would look like information."""
     parent = motions.Ts_parenti_parentj
     angle_rad = np.median(se3.rotation_angle(se3.rotation_of(parent)))
     distance_m = np.median(np.linalg.norm(se3.translation_of(parent), axis=1))
     noise_rad = float(np.sqrt(np.trace(noise[3:, 3:]) / 3))
-    least_rad = max(TUNING.least_rotation_rad, TUNING.least_of_noise * noise_rad)
-    return bool(angle_rad > least_rad or distance_m > TUNING.least_motion_m)
+    min_rad = max(TUNING.min_rotation_rad, TUNING.min_rotation_per_noise * noise_rad)
+    return bool(angle_rad > min_rad or distance_m > TUNING.min_motion_m)
 
 
 def _evidence(
@@ -437,9 +468,10 @@ def _evidence(
     noise: FloatArray,
     shift: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the evidence (p, p + 1) of motions on p parameters, and their scatter (6, 6).
+    """Return the evidence (p, p + 1) of motions on p parameters, and the scatter (6, 6).
 
-    The weights and the scatter are about the residuals after a shift (p,), zero by default.
+    Motions with large residuals get smaller weights. Weights and scatter are computed from the
+    residuals that remain with the parameters ``shift`` (p,), zero by default.
     """
     centred = residuals if shift is None else residuals + jacobians @ shift
     squared = np.einsum("ki,ki->k", centred @ np.linalg.inv(noise), centred)
@@ -449,10 +481,10 @@ def _evidence(
 
 
 def _long_run_variance(seconds: Blocks, previous: float) -> float:
-    """Return the long-run variance of the scores in units of their information.
+    """Return the long-run variance of the scores, relative to the variance without correlation.
 
-    It is the largest over windows of several lengths, about the answer of all seconds; the previous
-    value while there are too few windows.
+    For windows of several lengths, the squared scores about the best shift are averaged, and the
+    largest mean is used. With too few windows of every length, ``previous`` is returned.
     """
     shift = moved.most_likely(seconds.total, TUNING.ridge)
     prior = TUNING.assumed_windows * TUNING.assumed
@@ -463,22 +495,22 @@ def _long_run_variance(seconds: Blocks, previous: float) -> float:
             break
         windows = Blocks(seconds.sums[-n_windows * length :]).merged(n_windows)
         squares = moved.squares_about(windows.sums, shift, TUNING.ridge)
-        limited = np.minimum(squares, TUNING.most_of_typical * np.median(squares))
+        limited = np.minimum(squares, TUNING.max_of_median * np.median(squares))
         variances.append((limited.sum() / 6 + prior) / (n_windows + TUNING.assumed_windows))
     return max(variances, default=previous)
 
 
 class MountWatch:
-    """Monitor of a live session: takes its pose pairs about once a second.
+    """Monitor of a live session; the node calls :meth:`look` about once a second.
 
     Parameters
     ----------
     session : LiveSession
     installed : callable
-        Returns the pose of the child's frame in the parent's frame by the names of both; None while
-        it is unknown.
+        ``installed(parent_frame, child_frame)`` returns the installed pose; None while this pose is
+        unknown.
     why_unknown : callable
-        Returns the reason why it is unknown.
+        Returns why the installed pose is unknown, as text.
     log : NodeLog
     """
 
@@ -498,7 +530,7 @@ class MountWatch:
         self._frames = ("", "")
 
     def restart(self) -> None:
-        """Start again after the stamps have jumped back, without loss of what was learned."""
+        """Accept earlier stamps after the stamps have jumped back; noise and evidence are kept."""
         self._last_ns = -1
         if self._monitor is not None:
             self._monitor.restart()
@@ -520,7 +552,7 @@ class MountWatch:
                 self._log.error(str(alarm))
 
     def save(self, directory: Path) -> Outcome:
-        """Write the digest of the session; return whether it is written, and a line about it."""
+        """Write the digest; return whether this succeeded, and a line about it for the user."""
         digest = self._monitor.digest(*self._frames) if self._monitor else None
         if digest is None:
             return False, "no digest of the mount yet: the noise is being learned"
@@ -535,7 +567,7 @@ class MountWatch:
         return True, text
 
     def state(self) -> MountState:
-        """Return whether the mount has moved, and the shifts that are visible on this robot."""
+        """Return the state for ``/diagnostics``: alarm, or detectable shifts on this robot."""
         monitor = self._monitor
         if monitor is None:
             return MountState(level=Level.WARN, text=self._why_unknown() or "no poses yet")

@@ -1,4 +1,4 @@
-"""Rigs: three sensors or more."""
+"""Calibration of rigs: three sensors or more on one body."""
 
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from hand_eye_calib.core.base.registry import (
 
 
 def register() -> None:
-    """Register the command ``rig``, its route, and the pages of a session of a rig."""
+    """Register the command ``rig``, ``calibrate`` for three sensors, and the files of a session."""
     PUBLIC_NAMES["RigCalibration"] = "hand_eye_calib.extras.rig.rig"
     PUBLIC_NAMES["calibrate_rig"] = "hand_eye_calib.extras.rig.rig"
     COMMANDS["rig"] = Command("calibrate three sensors or more together", _rig)
@@ -24,12 +24,14 @@ def register() -> None:
 
 
 def _rig() -> Any:
+    """Return the command ``rig``."""
     from hand_eye_calib.extras.rig.job import RIG
 
     return RIG
 
 
 def _session_rig(directory: Path, session: Any) -> None:
+    """Write the files of a rig for a session with further sensors."""
     if session.others:
         from hand_eye_calib.extras.rig.page import write_session_rig
 
@@ -37,6 +39,7 @@ def _session_rig(directory: Path, session: Any) -> None:
 
 
 def _add_arguments(parser: Any) -> None:
+    """Add the option for the topics of a rig to ``calibrate``."""
     topics = (
         "topics with poses of three sensors or more, or frames such as "
         "odom:lidar: all are solved together, in the frame of the first "
@@ -46,6 +49,13 @@ def _add_arguments(parser: Any) -> None:
 
 
 def _is_rig(arguments: Any) -> bool:
+    """Whether ``calibrate`` or ``replay`` was called for a rig: several topics, or three files.
+
+    Raises
+    ------
+    ConfigError
+        For options that a rig does not have.
+    """
     if arguments.topics:
         for name in ("parent_topic", "child_topic", "batch", "list"):
             if getattr(arguments, name, None):
@@ -60,6 +70,7 @@ def _is_rig(arguments: Any) -> bool:
 
 
 def _calibrate_rig(arguments: Any, restore_urls: Any) -> int:
+    """Calibrate a rig, and return the exit code."""
     from hand_eye_calib.extras.rig.command import calibrate_rig
 
     return calibrate_rig(arguments, restore_urls)

@@ -1,4 +1,4 @@
-"""Rigs on the command line: calibrate three sensors or more, print and save the result."""
+"""The command line for rigs: calibrate three sensors or more, print and save the result."""
 
 import argparse
 from typing import TYPE_CHECKING, NamedTuple
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 def calibrate_rig(arguments: argparse.Namespace, restore_urls: "RestoreUrls") -> int:
     """Calibrate a rig, print it, and save it if ``--out`` is set; return the exit code.
 
-    The data are a trajectory file for each sensor, or topics of bags. ``restore_urls`` replaces
-    paths of downloaded bags by their URLs in plain values.
+    The arguments name a trajectory file for each sensor, or topics of bags. ``restore_urls``
+    replaces the paths of downloaded bags by their URLs, in plain values.
     """
     from hand_eye_calib.extras.rig import rig as of_rig
     from hand_eye_calib.formats.results import keep_earlier_results, save_rig
@@ -55,7 +55,7 @@ def calibrate_rig(arguments: argparse.Namespace, restore_urls: "RestoreUrls") ->
     try:
         print_result(as_lines(rig, arguments.verbose), document)
     finally:
-        # Write the report even if the reader of the printed lines has ended.
+        # Write the report even if printing fails, because the reader of the output has ended.
         if arguments.out:
             from hand_eye_calib.extras.rig.page import write_rig_report
 
@@ -64,7 +64,7 @@ def calibrate_rig(arguments: argparse.Namespace, restore_urls: "RestoreUrls") ->
 
 
 class _Readings(NamedTuple):
-    """Trajectories of a rig, the names of their files or topics, their origin, and warnings."""
+    """Input of a rig: trajectories, names of their files or topics, provenance, and warnings."""
 
     trajectories: "list[Trajectory]"
     names: list[str]
@@ -73,7 +73,7 @@ class _Readings(NamedTuple):
 
 
 def _read_topics(arguments: argparse.Namespace) -> _Readings:
-    """Read the topics of a bag."""
+    """Read the trajectories of a rig from the topics of bags."""
     from hand_eye_calib.formats.bags.reader import PoseBag
     from hand_eye_calib.formats.bags.sources import source_of
     from hand_eye_calib.formats.results import fingerprint
@@ -94,7 +94,7 @@ def _read_topics(arguments: argparse.Namespace) -> _Readings:
 
 
 def _read_files(arguments: argparse.Namespace) -> _Readings:
-    """Read a trajectory file of each sensor."""
+    """Read the trajectories of a rig from a file for each sensor."""
     refuse_stamps(arguments)
     names = [*map(str, arguments.paths)]
     files = read_files(arguments, arguments.paths, {})
@@ -103,7 +103,7 @@ def _read_files(arguments: argparse.Namespace) -> _Readings:
 
 
 def _by_frame(readings: _Readings) -> "dict[str, Trajectory]":
-    """Return the trajectories by the frames of their sensors, which must differ."""
+    """Return the trajectories by the frames of their sensors; a ConfigError if frames are equal."""
     sensors: dict[str, Trajectory] = {}
     for trajectory, name in zip(readings.trajectories, readings.names, strict=True):
         frame = trajectory.sensor_frame or name
@@ -117,9 +117,9 @@ def _by_frame(readings: _Readings) -> "dict[str, Trajectory]":
 
 
 def as_lines(rig: "RigCalibration", with_details: bool = False) -> list[str]:
-    """Return the lines of a rig for a terminal: extrinsics and closures.
+    """Return the lines for the terminal: extrinsics and closures.
 
-    With details, quaternions and facts about each solution are added.
+    With details, the quaternion and a summary of each result are added.
     """
     lines = [f"{rig.verdict.value}: {len(rig.sensors)} sensors", ""]
     for calibration in rig.calibrations:

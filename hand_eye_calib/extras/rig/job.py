@@ -5,7 +5,8 @@ from typing import Any
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.offline.cli.jobs import Job
 
-_FEWEST_SENSORS = 3
+# Smallest number of sensors of a rig.
+_MIN_SENSORS = 3
 
 _BRIEF = """\
 PATH:
@@ -23,10 +24,11 @@ examples:
 
 
 def _prepare(arguments: Any) -> None:
+    """Raise a ConfigError if the arguments name fewer than three sensors."""
     n_sensors = len(arguments.topics or arguments.paths)
-    if n_sensors < _FEWEST_SENSORS:
+    if n_sensors < _MIN_SENSORS:
         raise ConfigError(
-            f"rig needs {_FEWEST_SENSORS} sensors or more, got {n_sensors}: pass a trajectory file "
+            f"rig needs {_MIN_SENSORS} sensors or more, got {n_sensors}: pass a trajectory file "
             "of each, or a bag with --topics A B C; calibrate is for two sensors"
         )
 

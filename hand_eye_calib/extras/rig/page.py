@@ -1,4 +1,4 @@
-"""Report of a rig: poses of its sensors, and closures of three sensors."""
+"""Report of a rig: the poses of its sensors, and the closure errors."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,17 +11,17 @@ from hand_eye_calib.offline.cli.reporting import write_page
 from hand_eye_calib.offline.report.report import TONES, page
 from hand_eye_calib.offline.report.views import figure_of_views
 
-# Frame of a child sensor without a name. A rig uses the name of the input for such a sensor.
+# Default name of a child sensor's frame. In a rig, such a sensor gets the name of its stream.
 _NAMELESS = "child_sensor"
 
 
 def write_rig_report(directory: Path, rig: RigCalibration, names: Sequence[str]) -> None:
-    """Write the report of a rig; ``names`` are files, topics or frames of its sensors."""
+    """Write the report of a rig; ``names`` are the files, topics or frames of its sensors."""
     write_page(directory, lambda: render_rig(rig, names))
 
 
 def render_rig(rig: RigCalibration, inputs: Sequence[str]) -> str:
-    """Return the report of a rig as HTML; ``inputs`` are the sources of its trajectories."""
+    """Return the report of a rig as HTML; ``inputs`` are the files, topics or frames."""
     return page(
         Path(__file__).with_name("rig.html"),
         TONES[rig.verdict.value],
@@ -38,19 +38,21 @@ def render_rig(rig: RigCalibration, inputs: Sequence[str]) -> str:
 
 
 def write_session_rig(directory: Path, session: SessionResult) -> None:
-    """Solve for all sensors of a session together, and write the files and the page.
+    """Calibrate all sensors of a session together, and write the files and the report.
 
-    A time offset or a scale that is a number applies to the first child only.
+    A numeric time offset or scale applies to the first child only, so its trajectory is corrected
+    before.
     """
     config = session.snapshot.config
     parent, child = session.snapshot.streams
-    of_all = ["method", "max_gap", "target.translation", "target.rotation"]
+    # Options that apply to all sensors.
+    names = ["method", "max_gap", "target.translation", "target.rotation"]
     if isinstance(config.time_offset, str):
-        of_all.append("time_offset")
+        names.append("time_offset")
     else:
         child = child.shifted(config.time_offset)
     if isinstance(config.scale, str):
-        of_all.append("scale")
+        names.append("scale")
     else:
         child = child.scaled(config.scale)
     sensors = {session.snapshot.parent_frame: parent, session.snapshot.child_frame: child}
@@ -58,7 +60,7 @@ def write_session_rig(directory: Path, session: SessionResult) -> None:
         frame = other.child_frame
         sensors[name if frame in {*sensors, _NAMELESS} else frame] = other.streams[1]
     options = config.to_options()
-    rig = calibrate_rig(sensors, {name: options[name] for name in of_all})
+    rig = calibrate_rig(sensors, {name: options[name] for name in names})
     inputs = {**session.inputs, "sensors": list(rig.sensors)}
     save_rig(rig.to_dict(), rig.calibrations, directory / "rig", inputs)
     write_rig_report(directory / "rig", rig, rig.sensors)

@@ -1,8 +1,9 @@
 """Extrinsics of three sensors or more, and the closure test.
 
 Model: X_1k is the pose of sensor k in the frame of the first sensor. The first sensor is calibrated
-with every other sensor, and each other sensor with its neighbour in the list. These results close
-if X_1k X_k(k+1) = X_1(k+1). Weighted least squares distributes the closure errors among the X_1k.
+with each other sensor, which yields X_1k. From the second sensor on, each sensor is calibrated with
+the next sensor in the list, which yields X_k(k+1). Without errors, X_1k X_k(k+1) = X_1(k+1). The
+difference is the closure error. Weighted least squares distributes it among the X_1k.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import synchronise
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
 
-# Beginnings of the names of options that apply to two sensors only.
+# Beginnings of the names of options that a rig does not have, because they concern two sensors.
 _OF_ONE_PAIR = ("parent_", "child_", "base_frame", "prior")
 
 
@@ -40,12 +41,12 @@ def calibrate_rig(
     time_offset: str | None = None,
     scale: str | None = None,
 ) -> RigCalibration:
-    """Estimate the poses of all sensors of a rig in the frame of the first one.
+    """Estimate the poses of all sensors of a rig in the frame of the first sensor.
 
-    Every other sensor is calibrated with the first one, as by
+    Each other sensor is calibrated with the first sensor, as by
     :func:`~hand_eye_calib.offline.calibrate.calibrate`, and with its neighbour in the list. The
-    closure errors test these results. They are then distributed, so that all chains of extrinsics
-    between two sensors agree.
+    closure errors test these results. Then the closure errors are distributed, so that all chains
+    of extrinsics between two sensors agree.
 
     Parameters
     ----------
@@ -55,8 +56,8 @@ def calibrate_rig(
         Options by their public names, such as method, max_gap or target.translation; see
         :class:`~hand_eye_calib.core.base.config.CalibratorConfig`.
     time_offset, scale : str, optional
-        "estimate", for the scale also "auto" or "none". The option applies to every sensor relative
-        to the first one.
+        "estimate"; for the scale also "auto" or "none". The option applies to each sensor relative
+        to the first sensor.
 
     Raises
     ------
@@ -82,22 +83,24 @@ def calibrate_rig(
         for name, trajectory in trajectories.items()
     ]
     attempts = [run(whole_snapshot(first, other, options)) for other in others]
+    # Results with the first sensor, and the other trajectories on the clock and in the unit of the
+    # first trajectory.
     star = [attempt.calibration for attempt in attempts]
     aligned = [_aligned(other, attempt) for other, attempt in zip(others, attempts, strict=True)]
     max_gap_s = attempts[0].snapshot.config.max_gap
     neighbours = [
-        _between(before, after, calibration.method, max_gap_s)
-        for calibration, before, after in zip(star, aligned, aligned[1:], strict=False)
+        _between(parent, child, calibration.method, max_gap_s)
+        for calibration, parent, child in zip(star, aligned, aligned[1:], strict=False)
     ]
     sensors = (first.sensor_frame, *(calibration.child_frame for calibration in star))
     return RigCalibration.of(sensors, star, neighbours)
 
 
 def _aligned(child: Trajectory, attempt: Attempt) -> Trajectory:
-    """Return the poses of a child with the convention, unit and clock of an attempt.
+    """Return the poses of a child, corrected by the conventions, scale and clock of an attempt.
 
-    The frame is that of the result. It differs from the stream's if poses are inverted, such as
-    poses of a marker that a camera observes.
+    The sensor's frame is that of the result. The frame of the stream differs if its poses are
+    inverted, such as poses of a marker in a camera.
     """
     config = attempt.snapshot.config
     calibration = attempt.calibration
@@ -106,16 +109,16 @@ def _aligned(child: Trajectory, attempt: Attempt) -> Trajectory:
     return child.scaled(calibration.scale).shifted(calibration.time_offset_s)
 
 
-def _between(before: Trajectory, after: Trajectory, method: str, max_gap_s: float) -> Calibration:
-    """Calibrate two neighbours that have the same clock and unit of length already."""
-    pairs = synchronise(before, after, max_gap_s)
+def _between(parent: Trajectory, child: Trajectory, method: str, max_gap_s: float) -> Calibration:
+    """Calibrate two neighbours in the list, which already have the same clock and unit."""
+    pairs = synchronise(parent, child, max_gap_s)
     config = CalibratorConfig(method=method, max_pairs=max(len(pairs), 10))
     calibration = solve_poses(pairs, config).calibration()
-    return replace(calibration, parent_frame=before.sensor_frame, child_frame=after.sensor_frame)
+    return replace(calibration, parent_frame=parent.sensor_frame, child_frame=child.sensor_frame)
 
 
 def _require_rig(trajectories: Mapping[str, Trajectory], options: Mapping[str, Any]) -> None:
-    """Raise InputError or ConfigError if a rig cannot have these trajectories or options."""
+    """Raise an InputError for unusable trajectories, a ConfigError for options of two sensors."""
     require_type("trajectories", trajectories, Mapping)
     for trajectory in trajectories.values():
         require_type("each trajectory", trajectory, Trajectory)
@@ -140,28 +143,29 @@ def _require_rig(trajectories: Mapping[str, Trajectory], options: Mapping[str, A
             )
 
 
-# Variance (m^2, rad^2) above which a direction is unknown.
+# Directions with a larger variance (m^2, rad^2) are not determined, and not part of a closure.
 _UNKNOWN = 1.0
 
-# Smallest variance (m^2, rad^2) of a result, for poses without noise.
+# Added to the variances (m^2, rad^2) of a result, which are zero for poses without noise.
 _ROUNDING = 1e-16
 
 
 @dataclass(frozen=True)
 class Closure:
-    """Closure error of three results, each for two of three sensors a, b and c.
+    """Closure error of the three results for pairs of three sensors a, b and c.
 
     Attributes
     ----------
     sensors : (str, str, str)
+        Frames of a, b and c.
     translation_m, rotation_rad : float
-        Size of ``T_ab T_bc T_ca`` along directions that all three results determine. The product is
-        the identity without errors.
+        Norms of the translation and rotation of ``T_ab T_bc T_ca``, which is the identity without
+        errors. Only directions that all three results determine are counted.
     chi2 : float
-        Squared size in standard deviations of independent results. The results share sensors, so
-        chi2 tends to be too small.
+        Squared Mahalanobis distance of this product from the identity, as if the three results were
+        independent. Results of the same sensor have common errors, so chi2 tends to be too small.
     dof : int
-        Number of the directions.
+        Number of the determined directions: degrees of freedom of chi2.
     """
 
     sensors: tuple[str, str, str]
@@ -172,12 +176,12 @@ class Closure:
 
     @property
     def closes(self) -> bool:
-        """Whether chi2 is not significant at 1 %."""
+        """Whether chi2 is below the limit that chance exceeds in 1 % of cases."""
         return self.dof == 0 or self.chi2 <= CHI2[0.01][self.dof]
 
     @property
     def sentence(self) -> str:
-        """Closure error in one sentence."""
+        """The closure error in one sentence for the user."""
         outcome = "closes" if self.closes else "DOES NOT CLOSE"
         return (
             f"{' - '.join(self.sensors)} {outcome}: off by {length(self.translation_m)} and "
@@ -188,18 +192,18 @@ class Closure:
 
 @dataclass(frozen=True)
 class RigCalibration:
-    """The extrinsics of all sensors of a rig.
+    """Extrinsics of all sensors of a rig.
 
     Attributes
     ----------
     sensors : tuple of str
         Frames of the S sensors. All extrinsics are poses in the first frame.
     calibrations : tuple of Calibration
-        S - 1 results: every other sensor in the frame of the first sensor.
+        S - 1 results: each other sensor in the frame of the first sensor.
     neighbours : tuple of Calibration
-        S - 2 results: every sensor from the third on in the frame of its predecessor.
+        S - 2 results: each sensor from the third on, in the frame of the sensor before it.
     closures : tuple of Closure
-        S - 2 closures: the first sensor with two neighbours in the list.
+        S - 2 closure errors: the first sensor with two neighbours in the list.
 
     Examples
     --------
@@ -220,9 +224,16 @@ class RigCalibration:
         star: Sequence[Calibration],
         neighbours: Sequence[Calibration],
     ) -> RigCalibration:
-        """Return the rig from results for two sensors each.
+        """Return a rig, with the closure errors of these results distributed.
 
-        The closure errors are distributed by the covariances of the results.
+        Parameters
+        ----------
+        sensors : tuple of str
+            Frames of the sensors.
+        star : sequence of Calibration
+            Each other sensor in the frame of the first sensor.
+        neighbours : sequence of Calibration
+            Each sensor from the third on, in the frame of the sensor before it.
         """
         triangles = zip(star, neighbours, star[1:], strict=False)
         closures = tuple(closure(*results) for results in triangles)
@@ -237,7 +248,7 @@ class RigCalibration:
         return f"{self.verdict.value}: {listing(self.sensors)}"
 
     def with_warnings(self, warnings: Sequence[str]) -> RigCalibration:
-        """Return the rig with further warnings on every extrinsic."""
+        """Return the rig with these warnings added to each extrinsic."""
         calibrations = [
             replace(calibration, warnings=(*calibration.warnings, *warnings))
             for calibration in self.calibrations
@@ -246,7 +257,7 @@ class RigCalibration:
 
     @property
     def verdict(self) -> Verdict:
-        """The gravest verdict of all extrinsics."""
+        """Worst verdict of all extrinsics."""
         verdicts = [calibration.verdict for calibration in self.calibrations]
         return max(verdicts, key=[*Verdict].index)
 
@@ -259,8 +270,9 @@ class RigCalibration:
     def _steps(self) -> FloatArray:
         """Return the changes (S - 1, 6) of the extrinsics that distribute the closure errors.
 
-        The changes are in the frame of the first sensor. They solve the normal equations ``H x =
-        s`` of weighted least squares.
+        The change x_k of X_1k is in the frame of the first sensor: ``Exp(x_k) X_1k``. A neighbour
+        with the closure error e_k adds the equation ``x_(k+1) - x_k = e_k``. The changes solve the
+        normal equations ``H x = s`` of weighted least squares.
         """
         K = len(self.calibrations)
         H = np.zeros((K, 6, K, 6))
@@ -268,10 +280,10 @@ class RigCalibration:
         for k, calibration in enumerate(self.calibrations):
             H[k, :, k] += np.linalg.inv(_in_first(calibration, self.Xs[k + 1]))
         for k, neighbour in enumerate(self.neighbours):
-            before = self.Xs[k + 1]
-            after = self.Xs[k + 2]
-            error = se3.log(before @ neighbour.T_parent_child @ se3.inverse(after))
-            weight = np.linalg.inv(_in_first(neighbour, after))
+            parent = self.Xs[k + 1]
+            child = self.Xs[k + 2]
+            error = se3.log(parent @ neighbour.T_parent_child @ se3.inverse(child))
+            weight = np.linalg.inv(_in_first(neighbour, child))
             for row, sign in ((k + 1, 1.0), (k, -1.0)):
                 s[row] += sign * weight @ error
                 H[row, :, k + 1] += sign * weight
@@ -280,16 +292,16 @@ class RigCalibration:
         return np.asarray(steps.reshape(K, 6))
 
     def T(self, first: str, second: str) -> FloatArray:
-        """Return the pose (4, 4) of the second sensor in the frame of the first."""
-        before, after = self.Xs[[self.sensors.index(first), self.sensors.index(second)]]
-        return se3.inverse(before) @ after
+        """Return the pose (4, 4) of the sensor ``second`` in the frame of the sensor ``first``."""
+        X_first, X_second = self.Xs[[self.sensors.index(first), self.sensors.index(second)]]
+        return se3.inverse(X_first) @ X_second
 
     def covariance(self, first: str, second: str) -> FloatArray:
         """Return the covariance (6, 6) of xi = (rho, phi) in ``T(first, second) @ Exp(xi)``.
 
-        The covariance (m, rad) is that of the result for both sensors, with the allowance. Without
-        such a result, it is the sum of the covariances of both sensors relative to the first sensor
-        of the rig. The sum contains the errors of the first sensor twice.
+        The covariance (m, rad) includes the allowance. It is that of the result for these two
+        sensors. Two sensors without such a result get the sum of their covariances relative to the
+        first sensor of the rig. This sum contains the errors of the first sensor twice.
         """
         return self._covariance(first, second, with_allowance=True)
 
@@ -298,13 +310,16 @@ class RigCalibration:
         return self._covariance(first, second, with_allowance=False)
 
     def _covariance(self, first: str, second: str, with_allowance: bool) -> FloatArray:
-        near, far = sorted(map(self.sensors.index, (first, second)))
-        if near == far:
+        """Return :meth:`covariance`, with or without the allowance."""
+        low, high = sorted(map(self.sensors.index, (first, second)))
+        if low == high:
             return np.zeros((6, 6))
-        if 0 < near == far - 1:
-            results = [(self.neighbours[near - 1], self.Xs[far])]
+        # Results whose covariances are added, with the poses of their child sensors.
+        if low > 0 and high == low + 1:
+            results = [(self.neighbours[low - 1], self.Xs[high])]
         else:
-            results = [(self.calibrations[k - 1], self.Xs[k]) for k in (near, far) if k]
+            results = [(self.calibrations[k - 1], self.Xs[k]) for k in (low, high) if k > 0]
+        # Add in the frame of the rig's first sensor, and transform the sum to the second sensor.
         to_second = se3.adjoint(self.T(second, self.sensors[0]))
         in_first = np.sum([_in_first(*result, with_allowance) for result in results], axis=0)
         return np.asarray(to_second @ in_first @ to_second.T)
@@ -324,7 +339,10 @@ class RigCalibration:
 
 
 def _in_first(calibration: Calibration, X: FloatArray, with_allowance: bool = False) -> FloatArray:
-    """Return the covariance (6, 6) of a result in the frame in which its child has the pose X."""
+    """Return the covariance (6, 6) of a result in another frame than that of its child.
+
+    X is the pose (4, 4) of the child in this frame.
+    """
     adjoint = se3.adjoint(X)
     covariance = calibration.covariance_measured + _ROUNDING * np.eye(6)
     if with_allowance:
@@ -333,18 +351,26 @@ def _in_first(calibration: Calibration, X: FloatArray, with_allowance: bool = Fa
 
 
 def closure(to_second: Calibration, between: Calibration, to_third: Calibration) -> Closure:
-    """Return the closure of the results for a -> b, b -> c and a -> c."""
+    """Return the closure error of three sensors a, b and c.
+
+    Parameters
+    ----------
+    to_second, between, to_third : Calibration
+        Results for b in a, c in b, and c in a.
+    """
     chain = to_second.T_parent_child @ between.T_parent_child
     covariance = _in_first(to_second, to_second.T_parent_child) + _in_first(between, chain)
     covariance += _in_first(to_third, to_third.T_parent_child)
     variances, axes = np.linalg.eigh(covariance)
-    is_known = variances < _UNKNOWN
-    along = axes[:, is_known].T @ se3.log(chain @ to_third.T_child_parent)
-    error = axes[:, is_known] @ along
+    is_determined = variances < _UNKNOWN
+    directions = axes[:, is_determined]
+    # Components of the closure error along the determined directions.
+    components = directions.T @ se3.log(chain @ to_third.T_child_parent)
+    error = directions @ components
     return Closure(
         sensors=(to_second.parent_frame, to_second.child_frame, to_third.child_frame),
         translation_m=float(np.linalg.norm(error[:3])),
         rotation_rad=float(np.linalg.norm(error[3:])),
-        chi2=float((along**2 / variances[is_known]).sum()),
-        dof=int(is_known.sum()),
+        chi2=float((components**2 / variances[is_determined]).sum()),
+        dof=len(components),
     )

@@ -1,4 +1,4 @@
-"""Simulate drives with known truth, and run the demo."""
+"""Simulation of drives with a known extrinsic, and the demo."""
 
 from typing import Any
 
@@ -15,12 +15,14 @@ def register() -> None:
 
 
 def _simulate() -> Any:
+    """Return the module of the command ``simulate``."""
     from hand_eye_calib.extras.simulation import simulate
 
     return simulate
 
 
 def _demo() -> Any:
+    """Return the module of the command ``demo``."""
     from hand_eye_calib.extras.simulation import demo
 
     return demo

@@ -1,6 +1,6 @@
-"""Command ``demo``: calibrate a simulated recording from its bag and with the live node.
+"""Command ``demo``: calibrate a simulated recording, from its bag and with the live node.
 
-Both results are compared with the truth.
+Both results are compared with the true extrinsic.
 """
 
 import argparse
@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 
 TOPICS = {"parent": "/lidar/odometry", "child": "/camera/odometry"}
 
-# A drive of one minute.
+# Drive of one minute that the demo simulates.
 DRIVE = dataclasses.replace(HILLY_DRIVE, poses=600, parent_frame="lidar", child_frame="camera")
 
-# Factor by which the playback is faster than the recording.
+# Ratio of the speed of the playback to that of the recording.
 PLAY_SPEED = 20.0
 
 
@@ -74,7 +74,8 @@ def run(arguments: argparse.Namespace) -> int:
     note(f"2/4 calibrated offline; playing the bag to the live node at {PLAY_SPEED:g} times speed")
     # Robots on the network must not receive simulated odometry.
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    # From domain 102 on, the ports overlap with those that Linux assigns to clients.
+    # Use a domain from 1 to 100. The ports of domains from 102 on may be in use, because Linux
+    # assigns them to clients.
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     node = _node(arguments.out / "node.log")
     with waiting_for("playing"), PoseBag(bag_path) as bag, node as check:
@@ -89,16 +90,20 @@ def run(arguments: argparse.Namespace) -> int:
 
 @contextmanager
 def _node(log_path: Path) -> Iterator[Callable[[], None]]:
-    """Run the node in its own process; yield a function that raises an error if it has ended."""
+    """Run the node in its own process, and stop it at the end of the context.
+
+    The context yields ``check()``, which raises a HandEyeCalibError if the node has ended.
+    """
     command = [sys.executable, "-m", "hand_eye_calib", "calibrator", "--ros-args"]
-    # The player calls ~/solve when all poses are sent.
+    # Do not solve before all poses are sent. The player then calls ~/solve.
     command += ["-p", "solve_period:=1000.0"]
     for stream, topic in TOPICS.items():
         command += ["-r", f"{stream}_odom:={topic}"]
-        # Best effort may lose messages at this speed, but both results must use the same messages.
+        # Both results must use the same messages, but best effort may lose some at this speed.
         command += ["-p", f"qos_overrides.{topic}.subscription.reliability:=reliable"]
 
     def check() -> None:
+        """Raise a HandEyeCalibError if the node has ended."""
         if process.poll() is not None:
             raise HandEyeCalibError(
                 f"the node ended with exit code {process.returncode}; see {log_path}"
@@ -120,7 +125,10 @@ def _node(log_path: Path) -> Iterator[Callable[[], None]]:
 
 
 def _lines(drive: "SimulatedDrive", offline: "Calibration", live: "ndarray") -> Iterator[str]:
-    """Yield the verdict, the truth, and both results with their errors."""
+    """Yield lines with the verdict, the truth, and both results with their errors.
+
+    ``live`` is ``T_parent_child`` (4, 4) of the node.
+    """
     from hand_eye_calib.core.geometry import se3
     from hand_eye_calib.core.geometry.se3 import absolute_errors
 

@@ -1,8 +1,8 @@
 """Simulate a ground vehicle with two sensors on hills, and the errors of odometry and SLAM.
 
-Reference: Välimäki et al. 2023, section 4.1. If the article's text differs from its published
-trajectories, the simulation follows the trajectories: the value called sigma^2 is a standard
-deviation, jumps last until the end, and only the child sensor drifts.
+Reference: Välimäki et al. 2023, section 4.1. The text of the article differs from its published
+trajectories in three points. The simulation follows the trajectories: the value called sigma^2 is a
+standard deviation, a jump shifts all later poses, and only the child sensor drifts.
 """
 
 from collections.abc import Sequence
@@ -18,12 +18,12 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory, WithArrays
 from hand_eye_calib.extras.simulation import options
 
-# Position at the start of the published drives, in units of the arguments of the surface. The
-# vehicle starts along x.
+# Position (x, y) at the start of the published drives, in units of ``terrain_scale``. The vehicle
+# starts in the direction of x.
 _START = np.array([0.0, 0.5])
 # Time from the start of the published drives to their first pose (s).
 _LEAD_S = 0.1
-# Duration of the first yaw rate of the published drives (s).
+# Time for which the first yaw rate of the published drives is constant (s).
 _FIRST_HOLD_S = 0.4
 # Largest offset of the child sensor along each axis of the parent (m).
 _LARGEST_OFFSET_M = 0.5
@@ -35,7 +35,7 @@ _NO_NOISE = options.NoiseConfig()
 
 @dataclass(frozen=True, eq=False)
 class SimulatedDrive(WithArrays):
-    """Trajectories of both sensors, and the truth.
+    """Simulated trajectories of both sensors, and the truth.
 
     Attributes
     ----------
@@ -109,8 +109,8 @@ def simulate_drive(
     Parameters
     ----------
     seed : int or sequence of int
-        Equal seeds make equal drives, whatever the noise. They also make equal random numbers for
-        the noise, which its levels multiply.
+        Equal seeds make equal drives for any noise. The random numbers of the noise are then equal,
+        too; the levels of ``noise`` multiply them.
     config : DriveConfig
     noise : NoiseConfig
 
@@ -130,13 +130,15 @@ def simulate_drive(
     rotation = se3.rotation_of(se3.from_quat_xyzw(np.zeros(3), extrinsic_rng.standard_normal(4)))
     offset = extrinsic_rng.uniform(-_LARGEST_OFFSET_M, _LARGEST_OFFSET_M, 3)
     T_parent_child = se3.from_rotation_translation(rotation, offset)
-    # Yaw, pitch, roll (rad) and translation (m) are each the difference of two uniform numbers.
+    # Pose of the child's world: yaw, pitch, roll (rad) and translation (m) are differences of two
+    # uniform random numbers each.
     angles, translation = extrinsic_rng.uniform(size=(2, 3)) - extrinsic_rng.uniform(size=(2, 3))
     T_pw_cw = se3.from_rotation_translation(se3.rotation_from_rpy(angles[::-1]), translation)
     Ts_cw_c = se3.inverse(T_pw_cw) @ Ts_pw_p_at_child @ T_parent_child
     Ts_pw_p, Ts_cw_c = add_noise(Ts_pw_p, Ts_cw_c, noise, noise_rng)
 
     def trajectory(times_s: FloatArray, Ts_world_sensor: FloatArray, frame: str) -> Trajectory:
+        """Return a trajectory with stamps that begin at the start time of the drive."""
         stamps_ns = round(config.start_time * 1e9) + np.round(times_s * 1e9).astype(np.int64)
         return Trajectory(stamps_ns, Ts_world_sensor, frame, f"{frame}_odom")
 
@@ -151,17 +153,20 @@ def simulate_drive(
 def _ground_track(
     config: options.DriveConfig, rng: np.random.Generator, times_s: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return positions (N, 2), m, and headings (N,), rad, at times (N,), s, since the start.
+    """Return the positions (N, 2), m, and headings (N,), rad, at times (N,), s, since the start.
 
-    The track consists of circular arcs, because each yaw rate is constant for its hold time.
+    The track consists of circular arcs, because each random yaw rate is constant for a hold time.
     """
+    # Duration, yaw rate, start time and first heading of each arc.
     holds_s = np.full(int(times_s.max() // config.hold_time) + 2, config.hold_time)
     holds_s[0] = _FIRST_HOLD_S
     yaw_rates = rng.uniform(-config.max_yaw_rate, config.max_yaw_rate, len(holds_s))
     starts_s = np.cumsum(holds_s) - holds_s
     headings = np.cumsum(yaw_rates * holds_s) - yaw_rates * holds_s
     arcs = _arc(config.speed, headings, yaw_rates, holds_s)
+    # First position of each arc.
     corners = _START * config.terrain_scale + (np.cumsum(arcs, axis=0) - arcs)
+    # Index of the arc at each time.
     arc = np.searchsorted(starts_s, times_s, side="right") - 1
     elapsed_s = times_s - starts_s[arc]
     positions = corners[arc] + _arc(config.speed, headings[arc], yaw_rates[arc], elapsed_s)
@@ -171,7 +176,10 @@ def _ground_track(
 def _arc(
     speed: float, heading: FloatArray, yaw_rate: FloatArray, duration_s: FloatArray
 ) -> FloatArray:
-    """Return displacements (N, 2) along arcs. A chord has the mean heading of both ends."""
+    """Return the displacements (N, 2), m, along arcs that begin with these headings (N,), rad.
+
+    The chord of an arc has the mean heading of both ends.
+    """
     half_turn = 0.5 * yaw_rate * duration_s
     chord = speed * duration_s * np.sinc(half_turn / np.pi)
     direction = heading + half_turn
@@ -202,13 +210,13 @@ def _poses_on_terrain(
 
 
 def surface(config: options.DriveConfig, x: FloatArray, y: FloatArray) -> tuple[FloatArray, ...]:
-    """Return height (N,) of the ground, m, and its slopes (N,) along x and y.
+    """Return the height (N,) of the ground, m, and its slopes (N,) along x and y.
 
     Parameters
     ----------
     config : DriveConfig
-        ``terrain_height`` is the height (m) of one unit of :func:`_peaks`; ``terrain_scale`` is the
-        length (m) of one unit of its arguments. Arguments beyond +/- ``terrain_limit`` are
+        The ground is ``terrain_height * peaks(x / terrain_scale, y / terrain_scale)``, with the
+        function :func:`_peaks` and lengths in m. Its arguments beyond +/- ``terrain_limit`` are
         mirrored, so that a long drive stays on the hills.
     x, y : (N,) arrays
         Positions, m.
@@ -226,7 +234,8 @@ def surface(config: options.DriveConfig, x: FloatArray, y: FloatArray) -> tuple[
 def _peaks(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the height of three hills and three hollows, and its derivatives along x and y.
 
-    The arrays have the same shape and no unit. The ground is flat more than 3.5 from the origin.
+    This is the function ``peaks`` of MATLAB. All arrays have the same shape and no unit. The ground
+    is flat at distances of more than 3.5 from the origin.
     """
     hill = 3.0 * np.exp(-(x**2) - (y + 1.0) ** 2)
     middle = 10.0 * np.exp(-(x**2) - y**2)
@@ -241,7 +250,7 @@ def _peaks(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatA
 
 
 def _mirrored(values: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:
-    """Return a triangle wave, equal to ``values`` within +/- ``limit``, and its slope."""
+    """Return values (N,) mirrored at +/- ``limit``, which is a triangle wave, and its slope."""
     phase = np.mod(values + limit, 4.0 * limit)
     is_falling = phase > 2.0 * limit
     wave = np.where(is_falling, 3.0 * limit - phase, phase - limit)
@@ -253,12 +262,13 @@ def add_noise(
 ) -> tuple[FloatArray, FloatArray]:
     """Add Gaussian noise to both sensors, then drift to the child, then jumps to both sensors.
 
-    Each kind of noise has its own random numbers, so a change of one kind does not change the
+    Each kind of noise has its own random numbers, so that the level of one kind does not change the
     others.
 
     Parameters
     ----------
     Ts_pw_p, Ts_cw_c : (N, 4, 4), (M, 4, 4) arrays
+        Poses of the parent sensor and of the child sensor, each in its world.
     noise : NoiseConfig
     rng : numpy.random.Generator
 
@@ -269,7 +279,7 @@ def add_noise(
     gaussian_rng, drift_rng, jump_rng = rng.spawn(3)
     Ts_pw_p = _with_gaussian(Ts_pw_p, noise, gaussian_rng)
     Ts_cw_c = _with_gaussian(Ts_cw_c, noise, gaussian_rng)
-    # Each step grows by a share of its length along one axis of the sensor.
+    # Drift: each step is extended along one axis of the sensor, by a share of its length.
     axis = drift_rng.integers(3)
     lengths_m = np.linalg.norm(np.diff(se3.translation_of(Ts_cw_c), axis=0), axis=1)
     steps = noise.drift * lengths_m[:, None] * Ts_cw_c[:-1, :3, axis]
@@ -291,9 +301,9 @@ def _with_gaussian(
 
 
 def _with_jumps(Ts_world_sensor: FloatArray, share: float, rng: np.random.Generator) -> FloatArray:
-    """Shift the rest of a trajectory (N, 4, 4) along the axes of the world at random poses.
+    """Return a trajectory (N, 4, 4) with jumps: each shifts all later poses along the world's axes.
 
-    ``round(share * N)`` poses are drawn with replacement.
+    ``round(share * N)`` poses at which it jumps are drawn with replacement.
     """
     count = len(Ts_world_sensor)
     indices = rng.integers(count, size=round(share * count))

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class DriveConfig:
-    """Vehicle, terrain and sensors.
+    """Vehicle, terrain and sensors of a simulated drive.
 
-    All defaults but the attitude are those of the published trajectories.
+    The defaults are those of the published trajectories, except the attitude.
 
     Attributes
     ----------
@@ -20,16 +20,16 @@ class DriveConfig:
     start_time : float
         Stamp of the first pose of the parent, s.
     speed : float
-        Horizontal, m/s.
+        Horizontal speed, m/s.
     max_yaw_rate, hold_time : float
         Yaw rates are drawn within +/- ``max_yaw_rate`` (rad/s), and are constant for ``hold_time``
         (s).
     terrain_height, terrain_scale, terrain_limit : float
         See :func:`~hand_eye_calib.extras.simulation.drive.surface`.
     attitude : {"vehicle", "published"}
-        "vehicle": x ahead and z along the normal of the surface. "published": the orientations of
-        the published trajectories. No vehicle has these, because they are transposed, and slopes
-        are not rotated with the heading.
+        "vehicle": x ahead and z along the normal of the ground. "published": the orientations of
+        the published trajectories. These are not possible for a vehicle: they are transposed, and
+        slopes are not rotated with the heading.
     """
 
     poses: int = 100
@@ -51,8 +51,8 @@ class DriveConfig:
 # The published drives of the article.
 PUBLISHED_DRIVE = DriveConfig(attitude="published")
 
-# Two minutes of a robot or forklift outdoors. The hills are steep enough to determine all six axes.
-# The sensors have different rates and no common stamps.
+# Two minutes of a robot or forklift outdoors. The slopes determine all six axes. The sensors have
+# different rates and no common stamps.
 HILLY_DRIVE = DriveConfig(
     poses=1200,
     child_rate=20.0,
@@ -69,14 +69,15 @@ HILLY_DRIVE = DriveConfig(
 
 @dataclass(frozen=True)
 class NoiseConfig:
-    """Level of each kind of noise. By default, there is no noise.
+    """Level of each kind of noise in a simulated drive. By default, there is no noise.
 
     Attributes
     ----------
     gaussian : float
         Standard deviation of each pose's translation error per axis, m (published: 0 to 0.010).
     rotation_per_metre : float
-        Standard deviation of each pose's Euler angles (rad) divided by that of its translation (m).
+        Standard deviation of each pose's Euler angles (rad), divided by that of its translation
+        (m).
     outliers : float
         Share of the poses of each sensor at which the trajectory jumps (published: 0 to 0.10).
     drift : float
@@ -89,9 +90,9 @@ class NoiseConfig:
     drift: float = 0.0
 
 
-# Good odometry: 2 mm and 0.06 deg per pose, 2 mm of drift per metre, and a few corrections of SLAM
-# of some decimetres.
+# Good odometry: 2 mm and 0.06 deg per pose, 2 mm of drift per metre, and a few jumps of some
+# decimetres, as from corrections by SLAM.
 REALISTIC = NoiseConfig(gaussian=0.002, rotation_per_metre=0.5, outliers=0.005, drift=0.002)
 
-# Mixture of the article: the middle of each range.
+# Mixture of the article: the middle of each published range.
 MIXTURE = NoiseConfig(gaussian=0.005, outliers=0.05, drift=0.025)

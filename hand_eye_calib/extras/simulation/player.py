@@ -24,11 +24,11 @@ from hand_eye_calib.formats.bags.messages import transform_of
 from hand_eye_calib.formats.bags.pose_table import PoseTable
 from hand_eye_calib.online.ros.conversions import LATCHED, to_time
 
-# A reliable subscription receives every message.
+# Quality of service with which no message is lost.
 _LOSSLESS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
-# Longest wait for one callback (s).
+# Largest time to wait for one callback (s).
 _SPIN_S = 0.02
-# Longest wait for the node (s).
+# Largest time to wait for the node (s).
 _PATIENCE_S = 120.0
 
 
@@ -39,7 +39,7 @@ def play(
     until_ns: int,
     check: Callable[[], None],
 ) -> FloatArray:
-    """Publish poses on the topics of their streams; return ``T_parent_child`` (4, 4) of the node.
+    """Publish poses to the node, and return the node's result ``T_parent_child`` (4, 4).
 
     Parameters
     ----------
@@ -47,11 +47,11 @@ def play(
     topics : mapping of str to str
         Topic of each stream.
     speed : float
-        Factor by which the playback is faster than the recording.
+        Ratio of the speed of the playback to that of the recording.
     until_ns : int
-        The result must use the poses up to this stamp.
+        Stamp up to which the result must use the poses.
     check : callable
-        ``check()`` is called while waiting. It raises an error if the node has ended.
+        ``check()`` raises an error if the node has ended. It is called while waiting.
 
     Raises
     ------
@@ -68,15 +68,18 @@ def play(
         wait = partial(_wait, executor, check)
 
         def are_subscribed() -> bool:
+            """Whether the node has subscribed to all topics."""
             return all(publisher.get_subscription_count() for publisher in publishers.values())
 
-        def is_covered() -> bool:
-            # A call of ~/solve may overtake poses, so it is repeated until the result has them all.
+        def has_all_poses() -> bool:
+            """Whether the newest result uses all poses; call ~/solve again if it does not."""
+            # A call of ~/solve may arrive before the last poses.
             if requests[-1].done():
                 requests.append(solve.call_async(Trigger.Request()))
             return transform_of(results[-1]).stamp_ns >= until_ns
 
         wait(are_subscribed, "listen")
+        # Time at which the stamp 0 would be played.
         start_s = time.monotonic() - int(poses.stamps_ns[0]) * 1e-9 / speed
         for row, stamp_ns in enumerate(poses.stamps_ns.tolist()):
             while (remaining_s := start_s + stamp_ns * 1e-9 / speed - time.monotonic()) > 0:
@@ -84,7 +87,7 @@ def play(
             publishers[poses.streams[row]].publish(_odometry(poses, row))
         wait(solve.service_is_ready, "serve ~/solve")
         requests = [solve.call_async(Trigger.Request())]
-        wait(is_covered, "give a result with all poses")
+        wait(has_all_poses, "give a result with all poses")
     result = transform_of(results[-1])
     return se3.from_quat_xyzw(result.position, result.quat_xyzw)
 
@@ -95,7 +98,11 @@ def _wait(
     condition: Callable[[], object],
     purpose: str,
 ) -> None:
-    """Run callbacks until a condition is true; ``purpose`` completes the message of the error."""
+    """Run callbacks until a condition is true.
+
+    Raises a HandEyeCalibError if this takes too long. ``purpose`` states in its message what the
+    node should have done.
+    """
     end_s = time.monotonic() + _PATIENCE_S
     while not condition():
         check()
@@ -106,7 +113,7 @@ def _wait(
 
 @contextmanager
 def _player_node() -> Iterator[tuple[Node, SingleThreadedExecutor]]:
-    """Start a node with its own context; yield the node and its executor."""
+    """Context with a new ROS node and its executor; both are closed at its end."""
     context = rclpy.Context()
     try:
         rclpy.init(args=[], context=context)
@@ -124,6 +131,7 @@ def _player_node() -> Iterator[tuple[Node, SingleThreadedExecutor]]:
 
 
 def _odometry(poses: PoseTable, row: int) -> Odometry:
+    """Return the message of a row of the table."""
     message = Odometry()
     message.header.stamp = to_time(int(poses.stamps_ns[row]))
     message.header.frame_id = poses.world_frames[row]

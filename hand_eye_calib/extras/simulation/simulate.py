@@ -19,7 +19,7 @@ from hand_eye_calib.offline.cli.options import (
     with_progress,
 )
 
-# The layout of the published simulations: sensor 1 is the parent.
+# Names of the files in the published simulations, in which sensor 1 is the parent.
 PARENT_FILE = "T_S1_W1.txt"
 CHILD_FILE = "T_S2_W2.txt"
 TRUTH_FILE = "T_S2_S1.txt"
@@ -120,6 +120,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _make_empty(folder: Path) -> None:
+    """Make a folder; raise an InputError if it exists and is not empty."""
     folder.mkdir(parents=True, exist_ok=True)
     if any(folder.iterdir()):
         raise InputError(
