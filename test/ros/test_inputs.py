@@ -203,8 +203,8 @@ class TestRefusedInput:
                 ["child_measures:=positions", "monitor:=true", "installed:=1 0 0 0 0 0"],
                 "monitor needs poses of both sensors; the parent measures auto, the child positio",
             ),
-            (["monitor:=true"], "monitor needs installed, the transform to compare with"),
-            (["journal:=resume"], "journal resume needs output_directory, which contains the"),
+            (["monitor:=true"], "monitor needs installed: set it to the transform to compare with"),
+            (["journal:=resume"], "journal resume needs output_directory: set the session"),
             (["output_directory:=~nosuchuser/x"], "output_directory '~nosuchuser/x'"),
         ],
     )

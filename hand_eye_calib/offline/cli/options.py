@@ -351,7 +351,8 @@ def _read_config(path: Path) -> Options:
     if settings.other_nodes and not (options or ignored):
         nodes = ", ".join(settings.other_nodes)
         raise ConfigError(
-            f"{path}: no parameters of a node named calibrator; the file has those of {nodes}"
+            f"{path}: no parameters of a node named calibrator; the file has those of {nodes}: "
+            "name the section calibrator or /**"
         )
     if ignored:
         note(f"{path}: only the node uses {', '.join(ignored)}; ignored here")

@@ -355,10 +355,13 @@ class CalibratorNode(ManagedNode):
         return response
 
     def _save_digest(self) -> Outcome:
-        """Write the digest of a monitored session; return the success and a line of text."""
+        """Write the digest of a monitored session; return the success and a line of text.
+
+        The digest is a small file for the history of the mount.
+        """
         directory = self._options.node.output_directory
         if self._mount is None or not directory:
-            return False, "the digest is not saved: output_directory is not set"
+            return False, "the digest is not saved: set output_directory"
         saved: Outcome = self._mount.save(output_path(directory))
         return saved
 
@@ -392,7 +395,7 @@ class CalibratorNode(ManagedNode):
         if options.publish_tf:
             message_type()
         if options.monitor and not options.installed:
-            raise ConfigError("monitor needs installed, the transform to compare with")
+            raise ConfigError("monitor needs installed: set it to the transform to compare with")
         if options.monitor and options.other_children:
             raise ConfigError("monitor watches one child sensor: leave other_children at 0")
         if self._output_base is not None and options.output_directory:

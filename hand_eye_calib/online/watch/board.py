@@ -91,7 +91,8 @@ class Board:
         ``now_s`` is the time (s) at which the state was received, on a steady clock.
         """
         is_silent = not self._newest or now_s - self._newest[1] > _SILENT_AFTER_S
-        if state.node == (self._wanted or self.node) or (is_silent and not self._wanted):
+        is_displayed = state.node == (self._wanted or self.node)
+        if is_displayed or (is_silent and not self._wanted):
             self._newest = state, now_s
 
     def answer(self, request: str, good: bool | None, text: str, now_s: float) -> None:
