@@ -9,7 +9,6 @@ With ``--headline TEXT``, the picture is the last page whose headline begins so.
 
 import argparse
 import base64
-import contextlib
 import http.server
 import io
 import itertools
@@ -34,8 +33,10 @@ PAGE_FILES = Path(web.__file__).parent / "page"
 MEDIA_TYPES = {".css": "text/css", ".js": "text/javascript", ".html": "text/html"}
 
 # Height of the picture (pixels), and time for which a page is displayed (ms).
-HEIGHT = 700
+HEIGHT = 800
 FRAME_MS = 2000
+# Colours of a single picture.
+N_COLOURS = 128
 
 # Number of letters by which sentences are recognised as the same.
 SAME_START = 25
@@ -64,11 +65,6 @@ class Player(http.server.BaseHTTPRequestHandler):
         self.wfile.write(file.read_bytes())
 
     def _send_events(self):
-        # The browser may close the page at any time.
-        with contextlib.suppress(BrokenPipeError):
-            self._send_changes()
-
-    def _send_changes(self):
         sent = None
         while self.server.html is not None:
             if self.server.html != sent:
@@ -94,6 +90,7 @@ def photographs(pages, width):
     """Yield a picture of each page."""
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Player)
     server.html = ""
+    server.handle_error = lambda *_: None  # the browser closes connections at any time
     threading.Thread(target=server.serve_forever, daemon=True).start()
     with tempfile.TemporaryDirectory() as folder:
         browser = Browser(folder)
@@ -121,12 +118,14 @@ def main():
     pages = chosen_pages(arguments.pages)
     if arguments.headline:
         pages = [page for page in pages if page.headline.startswith(arguments.headline)][-1:]
+    if not pages:
+        parser.error(f"no headline begins with {arguments.headline!r}")
     first, *others = photographs(pages, arguments.width)
     if others:
         moving = {"save_all": True, "append_images": others, "duration": FRAME_MS, "loop": 0}
         first.save(arguments.target, quality=60, **moving)
     else:
-        first.save(arguments.target)
+        first.quantize(N_COLOURS).save(arguments.target, optimize=True)
     size_kb = arguments.target.stat().st_size / 1000
     print(f"{arguments.target}: {1 + len(others)} pages, {size_kb:.0f} kB")
 
