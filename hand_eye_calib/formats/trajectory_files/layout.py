@@ -2,22 +2,18 @@
 
 A layout contains the line where the rows begin, the separator of their cells, and the quantity of
 each column (x, qw, ...). The quantities are recognised by the names above the rows. Without names,
-they are recognised by the values: a quaternion has unit length, a rotation matrix is orthogonal.
+they are recognised by the values (``recognition.py``).
 """
 
 import re
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
-from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import InputError
-from hand_eye_calib.core.geometry.trajectory import QUATERNION_NORM_TOLERANCE, ROTATION_TOLERANCE
 from hand_eye_calib.formats.files import LONGEST_LINE
 from hand_eye_calib.formats.trajectory_files.cells import (
     CellsOf,
@@ -25,24 +21,23 @@ from hand_eye_calib.formats.trajectory_files.cells import (
     is_number,
     is_value,
     names_in,
-    number,
     separator_of,
     splitter,
 )
 from hand_eye_calib.formats.trajectory_files.columns import (
-    LAST_ROW,
     MATRIX,
     POSITION,
-    ROTATION,
-    ROTATION_VECTOR,
     SCALAR_FIRST,
-    TRANSLATION,
     TUM_COLUMNS,
-    UNNAMED,
     is_pose,
     named_columns,
 )
 from hand_eye_calib.formats.trajectory_files.dates import is_date, is_date_or_time
+from hand_eye_calib.formats.trajectory_files.recognition import (
+    STAMPED_POSE,
+    TRANSPOSABLE,
+    columns_of_rows,
+)
 
 #: Stamps since 1970 are in ns from 10**17, in us from 10**14, in ms from 10**11, and in seconds
 #: below. These are times in March 1973, so the unit of later stamps is clear.
@@ -57,22 +52,12 @@ _MOST_LINES = 300
 _MOST_CHARACTERS = 1 << 19
 # Largest number of comments, the last ones above the first row, in which column names are searched.
 _MOST_COMMENTS = 100
-# Largest number of rows from whose values the quantities of the columns are recognised.
-_MOST_ROWS = 100
 # A line is a row of numbers if at least this share of its cells are values. The other cells may be
 # names of frames.
 _MIN_SHARE_OF_VALUES = 0.5
 
 #: Quantities of the columns in the format tum.
 TUM = ("t", *POSITION, "qx", "qy", "qz", "qw")
-#: Columns of a stamp and a pose whose quaternion may have its scalar first or last.
-STAMPED_POSE = ("t", *POSITION, *UNNAMED)
-# Columns of the state that FAST-LIO and related programs write: a stamp, a rotation vector, a
-# position, and six more vectors (18 columns). The last vector is gravity.
-_FAST_LIO = ("t", *ROTATION_VECTOR, *POSITION, *[""] * 18)
-# Smallest and largest norm of gravity (m/s^2) in the state of FAST-LIO: 9.81, with room for errors
-# of its estimate.
-_GRAVITY_M_S2 = (9.6, 10.0)
 # A stamp since 1970 in any unit: seconds have ten digits.
 _SINCE_1970 = re.compile(r"\d{10,}(\.\d*)?", re.ASCII)
 
@@ -244,13 +229,12 @@ def _joining(widths: Sequence[int]) -> _Merge:
     ``widths`` is the number of cells of each column; columns with 0 cells are skipped. The function
     returns rows with another total number of cells unchanged.
     """
-    ends = np.cumsum([width for width in widths if width]).tolist()
-    spans = list(zip([0, *ends[:-1]], ends, strict=True))
+    ends = [0, *accumulate(filter(None, widths))]
 
     def merge(cells: Sequence[str]) -> list[str]:
         if len(cells) != ends[-1]:
             return [*cells]
-        return [" ".join(cells[start:end]) for start, end in spans]
+        return [" ".join(cells[start:end]) for start, end in pairwise(ends)]
 
     return merge
 
@@ -439,22 +423,6 @@ def _with_named_columns(layout: Layout, names: tuple[str, ...], is_separated: bo
 
 # ---- numbers without names
 
-# Possible columns of a pose without a stamp, in the order in which they are tried.
-_POSES: tuple[tuple[str, ...], ...] = (
-    (*MATRIX, *LAST_ROW),
-    tuple(f"m{row}{column}" for column in "1234" for row in "1234"),
-    MATRIX,
-    (*ROTATION, *TRANSLATION),
-    (*TRANSLATION, *ROTATION),
-    (*POSITION, *UNNAMED),
-    (*UNNAMED, *POSITION),
-)
-# Poses whose rotation matrix is separate from the translation. Programs write the elements of such
-# a matrix in the order of its rows or of its columns.
-_TRANSPOSABLE = _POSES[3:5]
-# Possible numbers of columns of a covariance (6, 6) after a pose: the diagonal, one triangle, or
-# all elements.
-_COVARIANCES = (6, 21, 36)
 # Numbers of columns that several kinds of data have: x y z with a stamp or a quaternion alone; a
 # pose without a stamp, or a stamp with position and angles.
 _AMBIGUOUS_COUNTS = (4, 7)
@@ -465,7 +433,7 @@ def _with_fitting_columns(
 ) -> Layout:
     """Set the format and the columns of a layout without names from the values in its rows."""
     n_columns = len(layout.row)
-    columns = _columns_of_rows(layout.row, rows)
+    columns = columns_of_rows(layout.row, rows)
     may_be_stamped_pose = columns is None or columns[: len(TUM)] == STAMPED_POSE
     is_long_enough = is_separated and n_columns >= len(TUM)
     if may_be_stamped_pose and is_long_enough and _is_in_ns(layout.row[0]):
@@ -478,7 +446,7 @@ def _with_fitting_columns(
             layout,
             format="kitti" if columns == MATRIX else "csv",
             columns=columns,
-            is_transposable=pose in _TRANSPOSABLE,
+            is_transposable=pose in TRANSPOSABLE,
         )
     return _with_assumed_format(layout, is_separated)
 
@@ -495,126 +463,6 @@ def _with_assumed_format(layout: Layout, is_separated: bool) -> Layout:
     if n_columns == len(MATRIX):
         return replace(layout, format="kitti", columns=MATRIX)
     return replace(layout, format="tum", columns=STAMPED_POSE)
-
-
-def _columns_of_rows(row: Sequence[str], rows: Sequence[Sequence[str]]) -> tuple[str, ...] | None:
-    """Return the quantities of the columns from the values in the first rows; None if none fit.
-
-    Columns that contain text have an empty name. ``row`` is a row with the usual number of cells.
-    """
-    places = [place for place, cell in enumerate(row) if is_value(cell)]
-    if not places:
-        return None
-    values = _values_in(rows, places, len(row))
-    # Squares of very large numbers overflow to infinity, which fits nothing.
-    with np.errstate(all="ignore"):
-        columns = _columns_of_values(values) if len(values) else None
-    if columns is None:
-        return None
-    named = [""] * len(row)
-    for place, name in zip(places, columns, strict=True):
-        named[place] = name
-    return tuple(named)
-
-
-def _columns_of_values(values: FloatArray) -> tuple[str, ...] | None:
-    """Return the quantities of columns with these values (N, n); None if no quantities fit.
-
-    Possible are a pose with or without a stamp, and a stamped pose with further columns.
-    """
-    if values.shape[1] == len(_FAST_LIO) and _is_gravity(values[:, -3:]):
-        return _FAST_LIO
-    return _pose_alone(values) or _pose_with_more(values)
-
-
-def _pose_alone(values: FloatArray) -> tuple[str, ...] | None:
-    """Return the columns of a pose with or without a stamp; None if values (N, n) do not fit."""
-    stamps: list[tuple[str, ...]] = [(), ("t",)]
-    if _are_seconds_and_ns(values):
-        stamps.append(("secs", "nsecs"))
-    for pose in _POSES:
-        for stamp in stamps:
-            columns = (*stamp, *pose)
-            if len(columns) == values.shape[1] and _fits(pose, values[:, len(stamp) :]):
-                return columns
-    return None
-
-
-def _pose_with_more(values: FloatArray) -> tuple[str, ...] | None:
-    """Return the columns of a stamped pose and more columns; None if values (N, n) do not fit.
-
-    The columns after the pose have empty names.
-    """
-    for pose in _POSES:
-        n_more = values.shape[1] - 1 - len(pose)
-        # Any number of columns may follow a position and a quaternion; only those of a covariance
-        # may follow other poses.
-        may_have_more = pose == STAMPED_POSE[1:] or n_more in _COVARIANCES
-        if n_more > 0 and may_have_more and _fits(pose, values[:, 1 : 1 + len(pose)]):
-            return ("t", *pose, *[""] * n_more)
-    return None
-
-
-def _values_in(rows: Sequence[Sequence[str]], places: Sequence[int], n_columns: int) -> FloatArray:
-    """Return the values (N, n) in the columns ``places`` of the first rows that have numbers there.
-
-    Rows with another number of columns than ``n_columns`` are skipped. A first cell that is not a
-    number, such as a date, becomes 0.
-    """
-    values: list[list[float]] = []
-    for cells in islice((cells for cells in rows if len(cells) == n_columns), _MOST_ROWS):
-        first, *others = (cells[place] for place in places)
-        try:
-            stamp = number(first) if is_number(first) else 0.0
-            values.append([stamp, *map(number, others)])
-        except ValueError:
-            continue
-    table = np.array(values, dtype=float).reshape(len(values), len(places))
-    return table[np.isfinite(table).all(axis=1)]
-
-
-def _fits(pose: Sequence[str], values: FloatArray) -> bool:
-    """Whether values (N, n) can be those of a pose with these columns.
-
-    Quaternions must have unit length, and rotation matrices must be orthogonal. Rows with zeros
-    only have no pose and are ignored, but at least one row must have a pose.
-    """
-    if UNNAMED[0] in pose:
-        norms = np.linalg.norm(_values_of(UNNAMED, pose, values), axis=1)
-        is_unit = np.abs(norms - 1.0) <= QUATERNION_NORM_TOLERANCE
-        return bool(is_unit[norms > 0.0].all() and norms.any())
-    Rs = _values_of(ROTATION, pose, values).reshape(-1, 3, 3)
-    Rs = Rs[Rs.any(axis=(1, 2))]
-    errors = np.abs(Rs @ np.swapaxes(Rs, 1, 2) - np.eye(3))
-    if not len(Rs) or not (errors <= ROTATION_TOLERANCE).all():
-        return False
-    if LAST_ROW[0] not in pose:
-        return True
-    last_rows = _values_of(LAST_ROW, pose, values)
-    return bool(np.allclose(last_rows, [0.0, 0.0, 0.0, 1.0], atol=ROTATION_TOLERANCE))
-
-
-def _values_of(names: Sequence[str], pose: Sequence[str], values: FloatArray) -> FloatArray:
-    """Return the values (N, k) of k quantities; column i of ``values`` is the quantity pose[i]."""
-    return values[:, [pose.index(name) for name in names]]
-
-
-def _are_seconds_and_ns(values: FloatArray) -> bool:
-    """Whether the first two columns are whole seconds since 1970 and whole nanoseconds."""
-    stamps = values[:, :2]
-    is_whole = (stamps == np.round(stamps)).all()
-    # Seconds since 1970 have ten digits.
-    is_since_1970 = (stamps[:, 0] >= 1e9).all()
-    nanoseconds = stamps[:, -1]
-    is_below_second = ((nanoseconds >= 0) & (nanoseconds < 1e9)).all()
-    return bool(is_whole and is_since_1970 and is_below_second)
-
-
-def _is_gravity(values: FloatArray) -> bool:
-    """Whether all vectors (N, 3) have the norm of gravity."""
-    lengths = np.linalg.norm(values, axis=1)
-    shortest, longest = _GRAVITY_M_S2
-    return bool(((lengths >= shortest) & (lengths <= longest)).all())
 
 
 def _is_in_ns(cell: str) -> bool:

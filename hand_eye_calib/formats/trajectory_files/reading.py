@@ -32,13 +32,13 @@ from hand_eye_calib.formats.trajectory_files.columns import (
 )
 from hand_eye_calib.formats.trajectory_files.dates import notes_on_stamps
 from hand_eye_calib.formats.trajectory_files.layout import (
-    STAMPED_POSE,
     TUM,
     Layout,
     layout_of,
     lines_of,
 )
 from hand_eye_calib.formats.trajectory_files.poses import poses_of
+from hand_eye_calib.formats.trajectory_files.recognition import STAMPED_POSE
 from hand_eye_calib.formats.trajectory_files.stamps import (
     in_order,
     refuse_coarse,
