@@ -12,6 +12,12 @@ from hand_eye_calib.core.results.verdict import Reason as Reason
 from hand_eye_calib.core.results.verdict import Verdict as Verdict
 from hand_eye_calib.extras.fleet.together import calibrate_many as calibrate_many
 from hand_eye_calib.extras.fleet.together import calibrate_together as calibrate_together
+from hand_eye_calib.extras.ground.calibrate import calibrate_on_ground as calibrate_on_ground
+from hand_eye_calib.extras.ground.tracks import (
+    gravity_from_accelerations as gravity_from_accelerations,
+)
+from hand_eye_calib.extras.ground.tracks import gravity_from_attitude as gravity_from_attitude
+from hand_eye_calib.extras.ground.tracks import ground_from_clouds as ground_from_clouds
 from hand_eye_calib.extras.rig.rig import RigCalibration as RigCalibration
 from hand_eye_calib.extras.rig.rig import calibrate_rig as calibrate_rig
 from hand_eye_calib.extras.simulation.drive import simulate as simulate

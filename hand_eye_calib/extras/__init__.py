@@ -9,6 +9,7 @@ EXTRAS = (
     "stops",  # poses that are stops, such as the samples of an arm
     "rig",  # three sensors or more
     "sensors",  # lidar scans, images of a target, files of other programs
+    "ground",  # z, roll and pitch of machines on a flat floor
     "vehicle",  # a sensor in the frame of its vehicle, and the wheels
     "simulation",  # drives with known truth, and the demo
 )

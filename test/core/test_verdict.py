@@ -17,6 +17,7 @@ from hand_eye_calib.core.results.calibration import Calibration, SolveStatus, Ve
 from hand_eye_calib.core.results.records import AxisScatter, Severity
 from hand_eye_calib.core.results.verdict import RULES
 from hand_eye_calib.extras.fleet.records import Together
+from hand_eye_calib.extras.ground.part import GroundAxis, GroundResult
 
 PAGE = ROOT / "docs" / "verdict.md"
 TABLE = re.compile(r"(?<=<!-- rules: begin -->\n)(.*\n)*(?=<!-- rules: end -->)")
@@ -55,6 +56,8 @@ def several(kind):
     return Together(kind=kind, sentence=kind, scatter={}, recordings=())
 
 
+GROUND_AXIS = GroundAxis("roll", 0.0, 0.002, 0.02, 0.001, 9.0, False)
+
 # Rule to a result in which it alone applies.
 CASES = {
     "prior": dict(status=SolveStatus.CONTRADICTED, contradictions={"x": 5.5}),
@@ -64,6 +67,7 @@ CASES = {
     "recordings_differ": dict(parts={"together": several("differ")}),
     "unobservable": dict(observability_measured=observed(z=np.inf)),
     "warning_finding": dict(findings=(dataclasses.replace(FINDING, severity=Severity.WARNING),)),
+    "ground": dict(parts={"ground": GroundResult("ground", "ground", False, (GROUND_AXIS,))}),
     "recordings": dict(parts={"together": several("one off")}),
     "halves": dict(cross_check=checked("x", 0.02, 3.5, "halves")),
     "methods": dict(cross_check=checked("yaw", 0.01, 3.5, "methods")),

@@ -45,6 +45,7 @@ if sys.argv[3:]:
 SAMPLE = ["sample:lidar.tum", "sample:camera.tum"]
 NEEDING = {
     "fleet": (["compare", "out"], "invalid choice: 'compare'"),
+    "ground": (["calibrate", *SAMPLE, "--ground", "off"], "unknown '--ground'"),
     "mount": ([], ""),
     "partial": (
         ["calibrate", *SAMPLE, "--child-measures", "rotations"],

@@ -71,6 +71,21 @@ class Route(NamedTuple):
     run: Callable[[Any, Callable[[Any], Any]], int]
 
 
+class BesideMotion(NamedTuple):
+    """A source of measurements of the extrinsic beside motion, for bags.
+
+    Attributes
+    ----------
+    add_arguments : callable
+        ``add_arguments(parser)`` declares the arguments of the source.
+    find : callable
+        ``find(arguments, snapshot)`` returns measurements for ``Snapshot.beside_motion``.
+    """
+
+    add_arguments: Callable[[Any], None]
+    find: Callable[[Any, Any], tuple[Any, ...]]
+
+
 class Measure(NamedTuple):
     """Quantity that a stream may measure.
 
@@ -128,6 +143,9 @@ COMMANDS: Registry[Command] = Registry("command")
 #: Routes of ``calibrate`` for other data than two streams. The first route that takes the arguments
 #: is run.
 ROUTES: Registry[Route] = Registry("way to calibrate")
+
+#: Sources of measurements of the extrinsic beside motion.
+BESIDE_MOTION: Registry[BesideMotion] = Registry("source of measurements beside motion")
 
 #: Functions ``run(arguments, bags_of_recordings)`` that join several recordings of a rig into one
 #: result. They return the exit code.

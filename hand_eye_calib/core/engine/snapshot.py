@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -59,6 +60,9 @@ class Snapshot:
         Warnings that become part of the result.
     time_offset : TimeOffset or None
         Time offset of the kept pairs, if it was estimated.
+    beside_motion : tuple
+        Measurements of the extrinsic beside motion. Each has a method ``joined(calibration,
+        snapshot)``, which returns the calibration joined with the measurement.
     """
 
     config: CalibratorConfig
@@ -70,6 +74,7 @@ class Snapshot:
     child_names: StreamFrames = field(default_factory=StreamFrames)
     warnings: tuple[str, ...] = ()
     time_offset: TimeOffset | None = None
+    beside_motion: tuple[Any, ...] = ()
 
     @property
     def parent_frame(self) -> str:
@@ -220,6 +225,8 @@ class Snapshot:
         if len(pairs) < resolved.config.min_pairs:
             raise NotEnoughDataError(resolved._missing_data(len(pairs)))
         result = kind.solve(resolved, cross_check)
+        for measurement in self.beside_motion:
+            result = measurement.joined(result, resolved)
         return replace(
             result,
             parent_frame=self.parent_frame,

@@ -28,12 +28,11 @@ from hand_eye_calib.core.base.errors import InputError, printable, required
 from hand_eye_calib.core.base.text import frame_name
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.formats.bags.messages import Run, ns_of
+from hand_eye_calib.formats.bags.points import rows_of_points
 from hand_eye_calib.formats.bags.pose_table import PoseTable
 from hand_eye_calib.formats.bags.sources import Reading
 from hand_eye_calib.formats.npz import read_arrays
 
-# numpy's name of each datatype of a PointField.
-_DATATYPES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 # Names that drivers use for the time of a point.
 _TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time", "timeOffset", "ts")
 
@@ -135,7 +134,7 @@ def scan_of(message: Any) -> Scan:
     InputError
         If the message has no x, y and z, or is damaged.
     """
-    rows = _rows_of(message)
+    rows = rows_of_points(message)
     points = np.stack([rows[axis] for axis in "xyz"], axis=-1)
     ranges = np.linalg.norm(points.astype(float), axis=1)
     nearest_m, farthest_m = TUNING.ranges_m
@@ -159,23 +158,6 @@ def scan_of(message: Any) -> Scan:
     times_s = (times - middle) * unit_ns * 1e-9
     frame = printable(frame_name(message.header.frame_id))
     return Scan(points, rings, times_s, stamp_ns, frame)
-
-
-def _rows_of(message: Any) -> Any:
-    """Return the points of a PointCloud2 message as a structured array (N,)."""
-    names = [field.name for field in message.fields]
-    if not {*"xyz"} <= {*names}:
-        raise InputError(f"points have no x, y, z, but {', '.join(names)}")
-    size = message.point_step
-    n_bytes = message.height * message.width * size
-    byte_order = ">" if message.is_bigendian else "<"
-    try:
-        formats = [byte_order + _DATATYPES[field.datatype] for field in message.fields]
-        offsets = [field.offset for field in message.fields]
-        dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size})
-        return np.asarray(message.data, dtype=np.uint8)[:n_bytes].view(dtype)
-    except (ValueError, IndexError, TypeError) as error:
-        raise InputError(f"a scan of points is damaged ({error}); record it again") from error
 
 
 class ScanReading(Reading):

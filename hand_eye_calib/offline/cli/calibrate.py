@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hand_eye_calib.core.base.errors import ConfigError
-from hand_eye_calib.core.base.registry import ROUTES, SEVERAL_RECORDINGS
+from hand_eye_calib.core.base.registry import BESIDE_MOTION, ROUTES, SEVERAL_RECORDINGS
 from hand_eye_calib.offline.cli import options
 from hand_eye_calib.offline.cli.options import note, print_result, waiting_for
 
 if TYPE_CHECKING:
     from hand_eye_calib.core.base.plain import Document
+    from hand_eye_calib.core.engine.snapshot import Snapshot
     from hand_eye_calib.formats.remote import RestoreUrls
 
 EXAMPLES = """\
@@ -98,6 +99,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_json_argument(group, or_verbose=True)
     for route in ROUTES.values():
         route.add_arguments(parser)
+    for source in BESIDE_MOTION.values():
+        source.add_arguments(parser)
     _add_installed(parser)
 
 
@@ -179,10 +182,20 @@ def _run_locally(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int
         except bags.SeveralRecordingsError as several:
             note(f"{several.reason}; they give one result, as recordings of one rig")
             return SEVERAL_RECORDINGS["one rig"](arguments, several.groups)
+        if "bag" in recording.inputs:
+            recording.snapshot = _with_measurements(arguments, recording.snapshot)
     calibration = recording.solved(with_fingerprints=bool(arguments.out))
     calibration = dataclasses.replace(calibration, warnings=tuple(with_urls(calibration.warnings)))
     bag = paths[0] if are_bags else None
     return deliver(calibration, with_urls(recording.inputs), arguments, recording.snapshot, bag)
+
+
+def _with_measurements(arguments: argparse.Namespace, snapshot: "Snapshot") -> "Snapshot":
+    """Return the snapshot of a bag with measurements of the extrinsic beside motion."""
+    measurements: list[object] = []
+    for source in BESIDE_MOTION.values():
+        measurements += source.find(arguments, snapshot)
+    return dataclasses.replace(snapshot, beside_motion=tuple(measurements))
 
 
 def _list_topics(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int:

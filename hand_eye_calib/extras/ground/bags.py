@@ -1,0 +1,113 @@
+"""The ground and gravity in a bag: clouds or IMU data in the frame of a sensor."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.errors import NotEnoughDataError
+from hand_eye_calib.core.base.text import frame_name, listing
+from hand_eye_calib.core.geometry.frames import StreamFrames
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.extras.ground.joining import VerticalPair
+from hand_eye_calib.extras.ground.tracks import (
+    Source,
+    VerticalTrack,
+    gravity_from_accelerations,
+    ground_from_clouds,
+)
+from hand_eye_calib.formats.bags.messages import POINTS_TYPE, ns_of
+from hand_eye_calib.formats.bags.points import rows_of_points
+from hand_eye_calib.formats.bags.reader import PoseBag
+from hand_eye_calib.offline.cli.options import note, waiting_for
+
+_IMU = "sensor_msgs/msg/Imu"
+
+# Number of scans that suffices, evenly drawn.
+_MOST_SCANS = 300
+
+
+def verticals_of_bag(paths: Sequence[Path], snapshot: Any) -> tuple[VerticalPair, ...]:
+    """Return the verticals of both sensors of a bag; nothing if a sensor has none.
+
+    The clouds or IMU data of a sensor are those whose ``frame_id`` is the frame of its poses. The
+    ground is preferred, because it also has the height.
+    """
+    if snapshot.config.measured != "poses":
+        return ()
+    with PoseBag(*paths) as bag:
+        topics_of = _topics_by_frame(bag)
+        parent = _topic_of(snapshot.parent_names, topics_of)
+        child = _topic_of(snapshot.child_names, topics_of)
+        if not (parent and child):
+            return ()
+        topics = (parent, child)
+        are_imus = [bag.topics[topic].type == _IMU for topic in topics]
+        beside: Source = "gravity" if any(are_imus) else "ground"
+        tracks = []
+        for topic, stream in zip(topics, snapshot.unpaired, strict=True):
+            try:
+                with waiting_for(f"reading {topic}"):
+                    tracks.append(_track(bag, topic, stream, beside))
+            except NotEnoughDataError as error:
+                note(f"ground and gravity are not used: {topic}: {error}")
+                return ()
+    sources = []
+    for track, topic in zip(tracks, topics, strict=True):
+        sources.append(f"{track.source} from {topic}")
+    note(f"{listing(sources)} are used; to use the motion alone, set --ground off")
+    return (VerticalPair(*tracks),)
+
+
+def _topics_by_frame(bag: PoseBag) -> Mapping[str, str]:
+    """Return the topic of clouds or IMU data of each frame."""
+    topics_of: dict[str, str] = {}
+    for wanted in (POINTS_TYPE, _IMU):
+        topics = [topic for topic in bag.topics.values() if topic.type == wanted]
+        for topic in sorted(topics, key=lambda topic: -topic.count):
+            run = next(bag.runs([topic.name]), None)
+            if run is not None:
+                message = next(run._replace(messages=run.messages[:1]).decoded())
+                topics_of.setdefault(frame_name(message.header.frame_id), topic.name)
+    return topics_of
+
+
+def _topic_of(names: StreamFrames, topics_of: Mapping[str, str]) -> str:
+    """Return the topic for the frame of a sensor; empty without one."""
+    return topics_of.get(names.sensor) or topics_of.get(names.option) or ""
+
+
+def _track(bag: PoseBag, topic: str, stream: Trajectory, beside: Source) -> VerticalTrack:
+    """Return the vertical from the messages of a topic."""
+    if bag.topics[topic].type == POINTS_TYPE:
+        return ground_from_clouds(_clouds(bag, topic), stream, beside)
+    stamps_ns = []
+    forces = []
+    for message in _messages(bag, topic, 0):
+        force = message.linear_acceleration
+        stamps_ns.append(ns_of(message.header.stamp))
+        forces.append([force.x, force.y, force.z])
+    return gravity_from_accelerations(np.array(stamps_ns, dtype=np.int64), np.array(forces), stream)
+
+
+def _clouds(bag: PoseBag, topic: str) -> Iterator[tuple[int, FloatArray]]:
+    """Yield stamps (ns) and points (N, 3) of some scans."""
+    for message in _messages(bag, topic, bag.duration_s / _MOST_SCANS * 1e9):
+        rows = rows_of_points(message)
+        points = np.stack([rows[axis] for axis in "xyz"], axis=-1).astype(float)
+        yield ns_of(message.header.stamp) or 0, points[np.isfinite(points).all(axis=1)]
+
+
+def _messages(bag: PoseBag, topic: str, every_ns: float) -> Iterator[Any]:
+    """Yield messages of a topic that are at least ``every_ns`` apart."""
+    next_ns = 0.0
+    for run in bag.runs([topic]):
+        used = []
+        for row, bag_ns in enumerate(run.bag_ns.tolist()):
+            if bag_ns >= next_ns:
+                used.append(row)
+                next_ns = bag_ns + every_ns
+        messages = [run.messages[row] for row in used]
+        yield from run._replace(messages=messages, bag_ns=run.bag_ns[used]).decoded()

@@ -1,0 +1,280 @@
+"""The ground and gravity beside the motion, on simulated machines."""
+
+from dataclasses import replace
+from functools import cache, partial
+
+import numpy as np
+import pytest
+from bag_making import ODOMETRY, header, pose_message, write_messages
+from ground_making import START_NS, Machine
+
+import hand_eye_calib as hec
+from hand_eye_calib.core.base.errors import InputError, NotEnoughDataError
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.extras.ground.planes import ground_of
+from hand_eye_calib.extras.ground.tracks import driving_direction, turning_axis
+from hand_eye_calib.offline.cli.main import main
+
+POINTS = "sensor_msgs/msg/PointCloud2"
+IMU = "sensor_msgs/msg/Imu"
+# Targets of the ground: z (m), roll and pitch (rad).
+Z_M = 0.02
+TILT = np.radians(0.15)
+
+
+@cache
+def machine(place="yard", noise=1.0):
+    """A machine, and the scans of both lidars, one a second."""
+    drive = Machine(3, place, 70.0, noise=noise)
+    mounts = (drive.T_base_parent, drive.T_base_child)
+    return drive, [list(drive.clouds(mount, 10)) for mount in mounts]
+
+
+def tracks_of_lidars(drive, clouds):
+    streams = (drive.parent, drive.child)
+    return [hec.ground_from_clouds(*both) for both in zip(clouds, streams, strict=True)]
+
+
+def tracks_of_lidar_and_imu(drive, clouds):
+    ground = hec.ground_from_clouds(clouds[0], drive.parent, "gravity")
+    accelerations = drive.accelerations(drive.T_base_child)
+    return [ground, hec.gravity_from_accelerations(*accelerations, drive.child)]
+
+
+def errors_of(result, drive):
+    """Errors along (m) and about (rad) the axes of the parent."""
+    return np.abs(se3.deviation(result.T_parent_child, drive.T_parent_child))
+
+
+def test_two_lidars_on_a_flat_yard_get_all_six_axes():
+    drive, clouds = machine()
+    alone = hec.calibrate(drive.parent, drive.child)
+    assert alone.hidden == ["z"]
+    result = hec.calibrate_on_ground(drive.parent, drive.child, *tracks_of_lidars(drive, clouds))
+    errors = errors_of(result, drive)
+    assert result.hidden == []
+    assert result.verdict.value == "USE"
+    assert errors[2] < Z_M
+    assert errors[3:5].max() < TILT
+    assert (errors < 3.3 * result.sigmas).all()
+    assert result.headline.endswith("roll, pitch and z are mostly from the ground")
+    assert [axis.name for axis in result.ground.axes] == ["roll", "pitch", "z"]
+    assert not np.isfinite(result.ground.axes[2].motion_sigma)
+
+
+def test_without_noise_the_ground_is_exact():
+    drive, clouds = machine(noise=0.0)
+    result = hec.calibrate_on_ground(drive.parent, drive.child, *tracks_of_lidars(drive, clouds))
+    assert errors_of(result, drive)[2:5].max() < 2e-3
+
+
+@pytest.mark.parametrize("place", ["yard", "slope"])
+def test_a_slope_does_not_turn_the_mount_of_a_lidar_and_an_imu(place):
+    drive, clouds = machine(place)
+    tracks = tracks_of_lidar_and_imu(drive, clouds)
+    result = hec.calibrate_on_ground(drive.parent, drive.child, *tracks)
+    assert result.hidden == ["z"]
+    assert errors_of(result, drive)[3:5].max() < TILT
+    assert (result.ground.parent, result.ground.child) == ("ground", "gravity")
+    tilts = [axis.ground - axis.motion for axis in result.ground.axes]
+    assert np.abs(tilts).max() < np.radians(0.5)
+
+
+def test_on_a_ramp_the_ground_agrees_with_the_motion():
+    drive, clouds = machine("ramp")
+    result = hec.calibrate_on_ground(drive.parent, drive.child, *tracks_of_lidars(drive, clouds))
+    assert result.ground.is_joined
+    z = result.ground.axes[2]
+    assert z.motion_sigma < 0.05
+    assert z.ground == pytest.approx(z.motion, abs=0.05)
+    assert errors_of(result, drive)[2] < Z_M
+
+
+def test_attitudes_of_two_ins_give_roll_and_pitch():
+    drive, _ = machine()
+    streams = []
+    for T_base_sensor, frame in ((drive.T_base_parent, "a"), (drive.T_base_child, "b")):
+        Ts = drive.Ts_world_base[::10] @ T_base_sensor
+        streams.append(hec.Trajectory(drive.parent.stamps_ns, Ts, frame))
+    verticals = [hec.gravity_from_attitude(stream) for stream in streams]
+    result = hec.calibrate_on_ground(*streams, *verticals)
+    assert errors_of(result, drive)[3:5].max() < 1e-4
+
+
+# ------------------------------------------------------------------- wrong ground
+
+
+def test_a_tilted_plane_is_not_joined_and_named():
+    drive, clouds = machine()
+    parent, child = tracks_of_lidars(drive, clouds)
+    turn = se3.rotation_from_rpy([np.radians(4.0), 0.0, 0.0])
+    wrong = replace(child, ups=child.ups @ turn.T)
+    result = hec.calibrate_on_ground(drive.parent, drive.child, parent, wrong)
+    assert result.hidden == ["z"]
+    assert not result.ground.is_joined
+    (reason,) = [reason for reason in result.reasons if reason.rule == "ground"]
+    assert {*reason.axes} <= {"roll", "pitch"}
+    assert "by the motion" in reason.sentence
+    assert "--ground off" in reason.what_to_do
+
+
+def test_a_loading_edge_beside_a_ramp_is_not_joined():
+    drive, clouds = machine("ramp")
+    parent, child = tracks_of_lidars(drive, clouds)
+    on_edge = replace(child, heights_m=child.heights_m - 1.2)
+    result = hec.calibrate_on_ground(drive.parent, drive.child, parent, on_edge)
+    assert not result.ground.is_joined
+    assert [reason.axes for reason in result.reasons if reason.rule == "ground"] == [("z",)]
+
+
+def test_scans_of_a_loading_edge_are_outliers():
+    drive, clouds = machine()
+    scans = []
+    for number, (stamp_ns, points) in enumerate(clouds[1]):
+        # A quarter of the scans see a platform, 0.6 m high.
+        scans.append((stamp_ns, np.add(points, [0.0, 0.0, 0.6 * (number % 4 == 0)])))
+    tracks = tracks_of_lidars(drive, (clouds[0], scans))
+    result = hec.calibrate_on_ground(drive.parent, drive.child, *tracks)
+    assert np.ptp(tracks[1].heights_m) > 0.5
+    assert errors_of(result, drive)[2] < Z_M
+
+
+def test_walls_and_ceilings_are_no_ground():
+    drive, clouds = machine()
+    up, ahead = turning_axis(drive.parent), driving_direction(drive.parent)
+    plane = ground_of(clouds[0][0][1], up, ahead, 4.0)
+    assert plane.height_m == pytest.approx(drive.T_base_parent[2, 3], abs=0.05)
+    grid = np.stack(np.meshgrid(np.linspace(-8, 8, 60), np.linspace(-8, 8, 60)), -1).reshape(-1, 2)
+    ceiling = np.column_stack([grid, np.full(len(grid), 3.0)])
+    wall = np.column_stack([np.full(len(grid), 3.0), grid])
+    assert ground_of(ceiling, up, ahead, 4.0) is None
+    assert ground_of(wall, up, ahead, 4.0) is None
+    assert ground_of(np.empty((0, 3)), up, ahead, 4.0) is None
+
+
+def test_too_few_scans_with_ground_are_an_error():
+    drive, clouds = machine()
+    high = [(stamp_ns, np.add(points, [0.0, 0.0, 30.0])) for stamp_ns, points in clouds[0]]
+    with pytest.raises(NotEnoughDataError, match="0 of 70 scans contain the ground"):
+        hec.ground_from_clouds(high, drive.parent)
+
+
+def test_accelerations_without_gravity_are_an_error():
+    drive, _ = machine()
+    stamps_ns, forces = drive.accelerations(drive.T_base_child)
+    with pytest.raises(NotEnoughDataError, match="not that of gravity"):
+        hec.gravity_from_accelerations(stamps_ns, forces - [0, 0, 9.81], drive.child)
+    with pytest.raises(NotEnoughDataError, match="less than 15 s"):
+        hec.gravity_from_accelerations(stamps_ns[:100], forces[:100], drive.child)
+
+
+def test_a_straight_drive_has_no_vertical():
+    stamps_ns = START_NS + np.arange(200) * 10**8
+    straight = hec.Trajectory.from_quat_xyzw(
+        stamps_ns, np.column_stack([np.arange(200), np.zeros((200, 2))]), [[0, 0, 0, 1.0]] * 200
+    )
+    with pytest.raises(NotEnoughDataError, match="does not turn"):
+        hec.ground_from_clouds([], straight)
+
+
+def test_arguments_of_a_wrong_type_are_an_error():
+    drive, _ = machine()
+    with pytest.raises(InputError, match="parent_ground"):
+        hec.calibrate_on_ground(drive.parent, drive.child, 1.8, 1.1)
+
+
+# ------------------------------------------------------------------- bags
+
+
+def cloud_message(typestore, stamp_ns, points, frame):
+    field = typestore.types["sensor_msgs/msg/PointField"]
+    fields = [field(name=name, offset=4 * at, datatype=7, count=1) for at, name in enumerate("xyz")]
+    rows = np.ascontiguousarray(points, dtype="<f4")
+    return typestore.types[POINTS](
+        header=header(typestore, stamp_ns, frame),
+        height=1,
+        width=len(rows),
+        fields=fields,
+        is_bigendian=False,
+        point_step=12,
+        row_step=12 * len(rows),
+        data=rows.view(np.uint8).ravel(),
+        is_dense=True,
+    )
+
+
+def imu_message(typestore, stamp_ns, force, frame):
+    types = typestore.types
+    vector = partial(types["geometry_msgs/msg/Vector3"])
+    nothing = np.zeros(9)
+    return types[IMU](
+        header(typestore, stamp_ns, frame),
+        types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+        nothing,
+        vector(0.0, 0.0, 0.0),
+        nothing,
+        vector(*force.tolist()),
+        nothing,
+    )
+
+
+def odometry_messages(trajectory, topic):
+    rows = se3.to_rows(trajectory.poses)
+    for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), rows, strict=True):
+        message = pose_message(ODOMETRY, stamp_ns, row, "odom", trajectory.sensor_frame)
+        yield stamp_ns, topic, ODOMETRY, message
+
+
+def write_drive(path, child_frame="rear", with_imu=False):
+    """Write a bag of two lidars, or of a lidar and an IMU, with their odometry."""
+    drive, clouds = machine()
+    messages = [*odometry_messages(drive.parent, "/a"), *odometry_messages(drive.child, "/b")]
+    for topic, frame, scans in (
+        ("/a/points", "lidar", clouds[0]),
+        ("/b/points", "rear", clouds[1]),
+    ):
+        if topic == "/b/points" and with_imu:
+            stamps_ns, forces = drive.accelerations(drive.T_base_child)
+            for stamp_ns, force in zip(stamps_ns[::4].tolist(), forces[::4], strict=True):
+                make = partial(imu_message, stamp_ns=stamp_ns, force=force, frame=child_frame)
+                messages.append((stamp_ns, "/b/imu", IMU, make))
+            continue
+        frame = child_frame if frame == "rear" else frame
+        for stamp_ns, points in scans:
+            make = partial(cloud_message, stamp_ns=stamp_ns, points=points, frame=frame)
+            messages.append((stamp_ns, topic, POINTS, make))
+    write_messages(path, messages)
+    return drive
+
+
+def calibrated(folder, bag, capsys, *options):
+    topics = ["--parent-topic", "/a", "--child-topic", "/b"]
+    code = main(["calibrate", str(bag), *topics, "--out", str(folder / "out"), *options])
+    return code, hec.load(folder / "out"), capsys.readouterr()
+
+
+@pytest.mark.parametrize("with_imu", [False, True])
+def test_a_bag_uses_the_ground_by_itself(tmp_path, capsys, no_figures, with_imu):
+    drive = write_drive(tmp_path / "bag", with_imu=with_imu)
+    _, result, printed = calibrated(tmp_path, tmp_path / "bag", capsys)
+    second = "gravity from /b/imu" if with_imu else "ground from /b/points"
+    assert f"ground from /a/points and {second} are used" in printed.err
+    assert result.ground.is_joined
+    assert result.hidden == (["z"] if with_imu else [])
+    assert "roll by the ground" in printed.out
+    assert errors_of(result, drive)[3:5].max() < TILT
+    assert hec.load(tmp_path / "out").ground == result.ground
+
+
+def test_ground_off_uses_the_motion_alone(tmp_path, capsys, no_figures):
+    write_drive(tmp_path / "bag")
+    code, result, printed = calibrated(tmp_path, tmp_path / "bag", capsys, "--ground", "off")
+    assert (code, result.ground, result.hidden) == (3, None, ["z"])
+    assert "are used" not in printed.err
+
+
+def test_clouds_in_another_frame_are_not_used(tmp_path, capsys, no_figures):
+    write_drive(tmp_path / "bag", child_frame="base_link")
+    _, result, printed = calibrated(tmp_path, tmp_path / "bag", capsys)
+    assert result.ground is None
+    assert "are used" not in printed.err
