@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hand_eye_calib.online.live.input import NEAR_NS, WITNESSES, StampGuard
+from hand_eye_calib.online.live.input import MIN_HELD, NEAR_NS, StampGuard
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 100_000_000
@@ -121,7 +121,7 @@ def test_a_bag_that_loops_starts_over_with_every_message_of_the_new_lap():
     run(guard, stamps(50))
     jumps, taken, _ = run(guard, stamps(50))
     assert jumps.count(True) == 1
-    assert jumps.index(True) == WITNESSES - 1
+    assert jumps.index(True) == MIN_HELD - 1
     assert taken == stamps(50)
 
 

@@ -166,7 +166,7 @@ class SolveCycle:
 
     @property
     def published(self) -> Calibration | None:
-        """Result to publish; None without a result, or if it is refuted."""
+        """Result to publish; None if there is none, or if the result is refuted."""
         return None if self.result is None or is_refuted(self.result) else self.result
 
     @property

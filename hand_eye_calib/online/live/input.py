@@ -34,9 +34,9 @@ _MIN_MESSAGES = 20
 # reported for as many seconds.
 _REPORTS = 10
 
-# Number of messages, held in sequence, from which on the change of their stamps is real. Corrupt
-# stamps come in shorter sequences.
-WITNESSES = 6
+# Fewest messages, held in sequence, whose stamps are taken for a real change. Corrupt stamps come
+# in shorter sequences.
+MIN_HELD = 6
 # Largest difference (ns) of stamps that are near each other. A larger jump back begins a new
 # session.
 NEAR_NS = 1_000_000_000
@@ -99,9 +99,9 @@ class StampGuard:
         # Until this time (steady, s), messages are older than the session.
         self._outdated_until_s = -math.inf
         self.last_ns: int | None = None
-        # The last accepted stamps. At most WITNESSES - 1 corrupt stamps come in sequence, so the
+        # The last accepted stamps. At most MIN_HELD - 1 corrupt stamps come in sequence, so the
         # median of these stamps is a correct one.
-        self._recent_ns: deque[int] = deque(maxlen=2 * WITNESSES - 1)
+        self._recent_ns: deque[int] = deque(maxlen=2 * MIN_HELD - 1)
         self._held: list[Stamped] = []
 
     def check(self, stamp_ns: int, message: Any, now_s: float) -> Judgement:
@@ -118,7 +118,7 @@ class StampGuard:
             if step_ns > _MAX_PAUSE_NS:
                 dropped = self._drop_held()
         self._held.append((stamp_ns, message))
-        judgement = self._accept_held(now_s) if len(self._held) >= WITNESSES else Judgement()
+        judgement = self._accept_held(now_s) if len(self._held) >= MIN_HELD else Judgement()
         return judgement._replace(dropped=dropped)
 
     def restart(self, now_s: float | None = None) -> None:
@@ -134,7 +134,7 @@ class StampGuard:
             self._reset()
         elif self.last_ns is not None:
             self._outdated_until_s = now_s + SILENT_AFTER_S
-            self._outdated_until_s += 2 * WITNESSES * self.period_ns() * 1e-9
+            self._outdated_until_s += 2 * MIN_HELD * self.period_ns() * 1e-9
 
     def resume(self, last_ns: int | None) -> None:
         """Continue a session whose newest stamp is ``last_ns``."""

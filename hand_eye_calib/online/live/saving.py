@@ -73,13 +73,13 @@ class Saver:
             raise NotEnoughDataError("there is no result yet")
         result = result.with_part("goal", self._cycle.goal.progress)
         inputs = self._session.calibrator.inputs(self._session.topics)
-        # A check may have set other options than the user.
+        # The options of the result, which contain those that a check has set.
         inputs["options"] = snapshot.config.to_options()
         path = output_path(directory)
         if self._earlier_kept_in != directory:
             keep_earlier_results(path)
         self._earlier_kept_in = directory
-        # The process of an earlier save writes files of an older result.
+        # End the process of an earlier save, which writes files of an older result.
         if self._process is not None:
             self._process.kill()
             self._process.wait()

@@ -391,7 +391,7 @@ class CalibratorNode(ManagedNode):
     # ------------------------------------------------------------ parameters
 
     def _check_options(self, options: NodeConfig) -> None:
-        """Raise ConfigError if options exclude each other, or cannot work on this machine."""
+        """Raise a ConfigError if options exclude each other, or need a package that is missing."""
         if options.publish_tf:
             message_type()
         if options.monitor and not options.installed:

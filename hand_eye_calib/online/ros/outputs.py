@@ -101,9 +101,10 @@ class StateTopics:
 
 
 def diagnostics(state: NodeState, clock_ns: int) -> DiagnosticArray:
-    """Return the message for ``/diagnostics``: one status for each part of the node.
+    """Return the message for ``/diagnostics``, with one status for each part of the node.
 
-    The fully qualified name of the node distinguishes two nodes.
+    The name of a status begins with the fully qualified name of the node, so that two nodes have
+    different names.
     """
     message = DiagnosticArray()
     message.header.stamp = to_time(clock_ns)

@@ -133,7 +133,7 @@ def _descriptor(field: OptionField) -> ParameterDescriptor:
     """Return description, type and range of a parameter for ``ros2 param describe``."""
     meta = field.metadata
     words = meta["choices"]
-    # A parameter that takes a word as well as a number has no single type.
+    # A parameter whose value is a number or a word, such as "estimate", has no fixed type.
     is_dynamic = bool(meta["words"])
     if is_dynamic and not words:
         words = (f"{' or '.join(meta['words'])}, or a number",)
@@ -146,11 +146,11 @@ def _descriptor(field: OptionField) -> ParameterDescriptor:
         description=description, read_only=meta["read_only"], dynamic_typing=is_dynamic
     )
     if meta["within"] is not None:
-        least, most = meta["within"]
+        low, high = meta["within"]
         if isinstance(field.default, int):
-            descriptor.integer_range = [IntegerRange(from_value=int(least), to_value=int(most))]
+            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
         else:
             descriptor.floating_point_range = [
-                FloatingPointRange(from_value=float(least), to_value=float(most))
+                FloatingPointRange(from_value=float(low), to_value=float(high))
             ]
     return descriptor
