@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from sigmas import assert_errors_over_sigmas
 
+from hand_eye_calib.core.alignment.rate_correlation import correlate_rates
 from hand_eye_calib.core.alignment.similarity import estimate_scale
-from hand_eye_calib.core.alignment.time_offset import correlate_rates, estimate_time_offset
+from hand_eye_calib.core.alignment.time_offset import estimate_time_offset
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.engine.calibrator import BufferLimits, Calibrator

@@ -82,7 +82,7 @@ _MIN_SIGMAS = 5.0
 # scale.
 _MAX_UNEXPLAINED_OF_OTHER_UNIT = 0.1
 
-# Number of unknowns: rho (3), phi (3), log s, d.
+# Number of unknowns: rho (3), phi (3), log s and d.
 _N_UNKNOWNS = 8
 
 # Index of log s in the unknowns.
@@ -113,11 +113,12 @@ class SimilarityFit:
     sensitivity : (6, 2) array
         Derivatives of (rho, phi) with respect to log s and to d.
     offsets_of_blocks : (2, B) array
-        Change of d (s) that each of B blocks of time asks for at this X and s, and the weight of
-        this change. Zero if no velocities were given.
-    held : float
-        Ratio of these changes to the changes that a block really asks for, at most 1. They are too
-        small, because they are computed with constant robust weights.
+        Estimate of a further change of d (s) from each of B blocks of time, at this X and s, and
+        the weight of this estimate. Zero if no velocities were given.
+    curvature_share : float
+        Curvature of the cost with respect to d, over the curvature for constant robust weights; at
+        most 1. The estimates of a block are too small by this factor, because they assume constant
+        weights.
     sigma_translation, sigma_rotation : float
         Robust standard deviations per axis of the residuals, m and rad.
     unexplained_translation, unexplained : float
@@ -144,7 +145,7 @@ class SimilarityFit:
     offset_sigma_s: float
     sensitivity: FloatArray
     offsets_of_blocks: FloatArray
-    held: float
+    curvature_share: float
     sigma_translation: float
     sigma_rotation: float
     unexplained_translation: float
@@ -160,7 +161,7 @@ def fit_similarity(
     twists: tuple[FloatArray, FloatArray] | None = None,
     start: SimilarityFit | FloatArray | None = None,
     same_unit: bool = False,
-    most: float | None = None,
+    max_unexplained: float | None = None,
 ) -> SimilarityFit:
     """Fit X, the scale and, if velocities are given, the time offset.
 
@@ -176,13 +177,13 @@ def fit_similarity(
     same_unit : bool
         Fix the scale at 1. If the body only rotates about one of the sensors, this sensor hardly
         moves, and any small scale would fit.
-    most : float, optional
+    max_unexplained : float, optional
         Starts that leave more than this share of the motion unexplained are not refined.
 
     Returns
     -------
     SimilarityFit
-        The best fit. If no start is good enough for ``most``, the last start, not refined.
+        The best fit; the last start, not refined, if no start is good enough.
     """
     problem = _Problem(pairs, twists, same_unit)
     if isinstance(start, SimilarityFit):
@@ -192,10 +193,10 @@ def fit_similarity(
     fits: list[SimilarityFit] = []
     for T, scale in starts:
         scale = 1.0 if same_unit else scale
-        if most is not None:
+        if max_unexplained is not None:
             _, sigmas, _ = problem.rows(T, scale)
             _, unexplained = problem.shares(sigmas, scale)
-            if unexplained >= most:
+            if unexplained >= max_unexplained:
                 continue
         fits.append(problem.describe(*problem.refine(T, scale)))
         if fits[-1].unexplained < EXPLAINED:
@@ -205,7 +206,9 @@ def fit_similarity(
     return min(fits, key=lambda fit: fit.sigma_translation * fit.sigma_rotation / min(fit.scale, 1))
 
 
-def estimate_scale(pose_pairs: PosePairs, known: Sequence[SimilarityFit] = ()) -> SimilarityFit:
+def estimate_scale(
+    pose_pairs: PosePairs, first_fits: Sequence[SimilarityFit] = ()
+) -> SimilarityFit:
     """Estimate the factor from the child's unit of length to the parent's.
 
     Noise of the child makes the factor too small, because the child's lengths are the regressor.
@@ -215,7 +218,7 @@ def estimate_scale(pose_pairs: PosePairs, known: Sequence[SimilarityFit] = ()) -
     Parameters
     ----------
     pose_pairs : PosePairs
-    known : sequence of SimilarityFit, optional
+    first_fits : sequence of SimilarityFit, optional
         Fits of the same streams that exist already, over the first durations in _SCALE_LAGS_S. By
         default, all fits are computed.
 
@@ -229,7 +232,7 @@ def estimate_scale(pose_pairs: PosePairs, known: Sequence[SimilarityFit] = ()) -
     NotEnoughDataError
         If there are too few poses.
     """
-    best = _best_scale(pose_pairs, known)
+    best = _best_scale(pose_pairs, first_fits)
     if not best.has_own_unit:
         return best
     exchanged = replace(pose_pairs, Ts_pw_p=pose_pairs.Ts_cw_c, Ts_cw_c=pose_pairs.Ts_pw_p)
@@ -245,14 +248,14 @@ def estimate_scale(pose_pairs: PosePairs, known: Sequence[SimilarityFit] = ()) -
 
 
 def _best_scale(
-    pose_pairs: PosePairs, known: Sequence[SimilarityFit], start: SimilarityFit | None = None
+    pose_pairs: PosePairs, first_fits: Sequence[SimilarityFit], start: SimilarityFit | None = None
 ) -> SimilarityFit:
     """Return the fit whose scale has the smallest relative standard deviation.
 
     The unexplained share of the translations is added to the standard deviation of fits that do not
     explain them. ``start`` is the initial value of the first fit.
     """
-    fits = [*known]
+    fits = [*first_fits]
     for lag_s in _SCALE_LAGS_S[len(fits) :]:
         pairs = pairs_over(pose_pairs, lag_s)
         if len(pairs) >= MIN_PAIRS:
@@ -514,7 +517,7 @@ class _Problem:
         # change as d changes. Geman-McClure weights reduce the curvature of the cost by this share.
         pulls = (rows[:, :, _OFFSET] * rows[:, :, -1]).sum(axis=1) ** 2 / root
         fall = pulls.sum() / (1.5 * _QUARTER_WEIGHT_SIGMAS**2) / max(weights.sum(), 1e-300)
-        held = float(np.clip(1.0 - fall, 0.5, 1.0))
+        curvature_share = float(np.clip(1.0 - fall, 0.5, 1.0))
         offsets = -blocks.sums[:, _OFFSET, -1] / np.where(weights > 0.0, weights, 1.0)
         of_translation, unexplained = self.shares(sigmas_of_residuals, scale)
         scale_sigma = scale * float(sigmas[_SCALE])
@@ -526,10 +529,10 @@ class _Problem:
             offset_s=offset_s,
             sigmas=sigmas,
             scale_sigma=scale_sigma,
-            offset_sigma_s=float(sigmas[_OFFSET]) / held,
+            offset_sigma_s=float(sigmas[_OFFSET]) / curvature_share,
             sensitivity=np.column_stack([by_scale, by_offset]),
             offsets_of_blocks=np.stack([offsets, weights]),
-            held=held,
+            curvature_share=curvature_share,
             sigma_translation=sigmas_of_residuals[0],
             sigma_rotation=sigmas_of_residuals[1],
             unexplained_translation=of_translation,

@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hand_eye_calib.core.alignment import similarity, time_offset
+from hand_eye_calib.core.alignment.rate_correlation import MIN_VARIATION, Correlation
 from hand_eye_calib.core.alignment.similarity import SimilarityFit
-from hand_eye_calib.core.alignment.time_offset import Correlation, TimeOffset
+from hand_eye_calib.core.alignment.time_offset import TimeOffset
 from hand_eye_calib.core.assessment.covariance import hidden_axes, lever_arm_products
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
@@ -418,7 +419,7 @@ def _explained(
     # The angular rates of a frozen stream are no evidence.
     if is_frozen:
         return None, []
-    if correlation.variation < time_offset.MIN_VARIATION:
+    if correlation.variation < MIN_VARIATION:
         return None, [finding("no_turning")]
     return None, [finding("unrelated", doubt=correlation.doubt())]
 

@@ -391,7 +391,7 @@ def _below(
         child = rival.corrected("child", few.Ts_cw_c)
         motions = motion_pairs.pairs_between(parent, child, first, first + len(pairs))
         # A fit is stopped early if its start leaves far more than ``most`` unexplained.
-        fit = fit_similarity(motions, most=_DECISIVE * most)
+        fit = fit_similarity(motions, max_unexplained=_DECISIVE * most)
         tried.append(Explanation(rival, fit))
         most = min(most, _ABOUT_EQUAL * fit.unexplained)
     return [explanation for explanation in tried if explanation.fit.unexplained <= most]

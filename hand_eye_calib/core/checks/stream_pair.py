@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from hand_eye_calib.core.alignment.time_offset import Correlation, correlate_rates
+from hand_eye_calib.core.alignment.rate_correlation import Correlation, correlate_rates
 from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing import motion_pairs

@@ -136,7 +136,8 @@ class _PoseBuffer:
     def drop(self, until_ns: int, unpaired: bool) -> None:
         """Drop the poses up to a stamp, except the last few, which interpolation needs.
 
-        If ``unpaired``, the statistics count these poses as dropped.
+        Poses up to this stamp are refused from now on. If ``unpaired``, the statistics count the
+        poses as dropped.
         """
         split = max(bisect_right(self.stamps_ns, until_ns) - REACH, 0)
         if unpaired:

@@ -1,4 +1,4 @@
-"""Snapshots: poses and options for an estimate, which poses that arrive later do not change."""
+"""Snapshots of poses and options for an estimate. Poses that arrive later do not change them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -7,12 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.core.alignment.time_offset import (
-    Correlation,
-    TimeOffset,
-    correlate_rates,
-    estimate_time_offset,
-)
+from hand_eye_calib.core.alignment.rate_correlation import Correlation, correlate_rates
+from hand_eye_calib.core.alignment.time_offset import TimeOffset, estimate_time_offset
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.core.base.text import frame_name

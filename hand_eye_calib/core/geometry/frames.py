@@ -166,13 +166,14 @@ def _rigid(Ts: FloatArray, label: str = "") -> FloatArray:
         there is a ``label``, the message contains it and the row.
     """
     rotations = se3.nearest_rotation(se3.rotation_of(Ts))
-    deviations = np.abs(rotations - se3.rotation_of(Ts)).max(axis=(1, 2), initial=0.0)
-    if (deviations > _ROTATION_WITHIN).any():
-        row = int(np.argmax(deviations > _ROTATION_WITHIN))
+    differences = np.abs(rotations - se3.rotation_of(Ts))
+    is_wrong = (differences > _ROTATION_WITHIN).any(axis=(1, 2))
+    if is_wrong.any():
+        row = int(np.argmax(is_wrong))
         raise InputError(_place(label, row) + "the 3x3 part is not a rotation matrix")
-    deviations = np.abs(Ts[:, 3] - _LAST_ROW).max(axis=1, initial=0.0)
-    if (deviations > LAST_ROW_WITHIN).any():
-        row = int(np.argmax(deviations > LAST_ROW_WITHIN))
+    is_wrong = (np.abs(Ts[:, 3] - _LAST_ROW) > LAST_ROW_WITHIN).any(axis=1)
+    if is_wrong.any():
+        row = int(np.argmax(is_wrong))
         raise InputError(_place(label, row) + wrong_last_row(Ts[row]))
     return se3.from_rotation_translation(rotations, se3.translation_of(Ts))
 
@@ -197,10 +198,10 @@ def _pair_of_stacks(values: Any) -> tuple[FloatArray, FloatArray] | None:
     rotations, translations = map(_numbers, values)
     if rotations is None or translations is None:
         return None
-    vectors = ((3,), (3, 1), (1, 3))
-    if rotations.shape[1:] not in ((3, 3), *vectors) or translations.shape[1:] not in vectors:
-        return None
-    return rotations, translations
+    vector_shapes = ((3,), (3, 1), (1, 3))
+    are_rotations = rotations.shape[1:] in ((3, 3), *vector_shapes)
+    are_translations = translations.shape[1:] in vector_shapes
+    return (rotations, translations) if are_rotations and are_translations else None
 
 
 def _joined(rotations: FloatArray, translations: FloatArray, label: str) -> FloatArray:

@@ -186,9 +186,9 @@ class AdaptiveSolution(ModelSolution):
         return np.stack([self.parameters[RATE], self.parameter_sigmas[RATE]])
 
     def rotation_variance(self, n_intervals: IntArray | int) -> FloatArray:
-        """Return the variance (rad^2) per axis of the measured rotation over some intervals.
+        """Return the error variance (rad^2) per axis of the measured rotation between two poses.
 
-        It is the variance of the error, for a number of typical intervals between poses.
+        The poses are ``n_intervals`` typical intervals apart.
         """
         white, walk = np.exp(self.levels[[ROTATION, WALK_ROTATION]])
         variance = 2 * white + n_intervals * walk
@@ -410,6 +410,7 @@ def _expand_to_all_poses(
     jumps = np.zeros(len(spikes) - 1, dtype=bool)
     spikes = spikes.copy()
     weights = np.ones(len(spikes))
+    # A jump between two kept poses is marked at the last increment before the second one.
     jumps[kept[1:][fewer.jumps] - 1] = True
     spikes[kept[fewer.spikes]] = True
     weights[kept] = fewer.weights

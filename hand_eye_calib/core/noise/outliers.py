@@ -67,11 +67,12 @@ class Outliers:
         An increment between two kept poses is a jump if a jump is between them, or if they are
         farther apart than ``longest_gap`` poses.
         """
+        # Whether there is a jump from each kept pose to the next one.
         jumps = np.logical_or.reduceat(self.jumps[: kept[-1]], kept[:-1])
         return Outliers(jumps | (np.diff(kept) > longest_gap), self.spikes[kept])
 
     def differs_by(self, other: Outliers) -> float:
-        """Return the number of jumps and spikes in only one of two sets, over that of poses."""
+        """Return the share of poses at which only one of both sets has a jump or a spike."""
         differing = np.sum(self.jumps != other.jumps) + np.sum(self.spikes != other.spikes)
         return float(differing) / len(self.spikes)
 

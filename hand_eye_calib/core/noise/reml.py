@@ -154,30 +154,41 @@ def _newton_step(
 def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
     """Return the gradient (m,) of the loss and the average information (m, m) of the levels.
 
-    Let S be the prior covariance of errors v, and E[v v'] their posterior second moments. The
-    derivative of the loss with respect to the level of a basis of S is
-    ``1/2 exp(level) tr((S^-1 - S^-1 E[v v'] S^-1) basis)``, summed over all poses. The walk has a
-    derivative of the same form.
+    Let S be the prior covariance of white errors v, and E[v v'] their posterior second moments. The
+    derivative of the loss with respect to the level of a basis of S is ``1/2 exp(level) tr(D
+    basis)`` with ``D = S^-1 - S^-1 E[v v'] S^-1``, summed over all poses. The walk has a derivative
+    of the same form.
     """
-    space = posterior.space
     states, walk = posterior.smoothed()
-    white = states[:, :WHITE]
-    moments = white @ transposed(white)
-    moments += posterior.factor.selected_inverse[0][:, :WHITE, :WHITE]
-    moments *= space.weights[:, None, None]
-    precision = posterior.white_precision
-    excess = precision - precision @ moments @ precision
-    excess[space.weights == 0.0] = 0.0
-    traces = [float((excess * basis).sum()) for basis in space.white_bases]
-    moments = posterior.walk_covariances() + walk @ transposed(walk)
-    total = np.tensordot(posterior.walk_weights, moments, axes=1)
-    walk_precision = posterior.walk_precision
-    excess = (~space.cut).sum() * walk_precision - walk_precision @ total @ walk_precision
-    traces += [float((excess * basis).sum()) for basis in space.walk_bases]
+    white_D = _white_difference(posterior, states[:, :WHITE])
+    traces = [float((white_D * basis).sum()) for basis in posterior.space.white_bases]
+    walk_D = _walk_difference(posterior, walk)
+    traces += [float((walk_D * basis).sum()) for basis in posterior.space.walk_bases]
     gradient = [0.5 * np.exp(posterior.levels[: len(traces)]) * traces]
     gradient += [_group_gradient(posterior, group, states) for group in posterior.groups]
     information = _average_information(posterior, states[:, :, 0], walk[:, :, 0])
     return np.concatenate(gradient), information
+
+
+def _white_difference(posterior: Posterior, white: FloatArray) -> FloatArray:
+    """Return D (N, 6, 6) of :func:`derivatives` for the smoothed white errors (N, 6, 1 + p)."""
+    weights = posterior.space.weights
+    moments = white @ transposed(white)
+    moments += posterior.factor.selected_inverse[0][:, :WHITE, :WHITE]
+    moments *= weights[:, None, None]
+    precision = posterior.white_precision
+    difference = precision - precision @ moments @ precision
+    difference[weights == 0.0] = 0.0
+    return difference
+
+
+def _walk_difference(posterior: Posterior, walk: FloatArray) -> FloatArray:
+    """Return D (6, 6) of :func:`derivatives`, summed, for the smoothed walk (n, 6, 1 + p)."""
+    moments = posterior.walk_covariances() + walk @ transposed(walk)
+    total = np.tensordot(posterior.walk_weights, moments, axes=1)
+    precision = posterior.walk_precision
+    n_used = (~posterior.space.cut).sum()
+    return np.asarray(n_used * precision - precision @ total @ precision)
 
 
 def _group_gradient(posterior: Posterior, group: Markov, states: FloatArray) -> FloatArray:

@@ -381,7 +381,7 @@ def _detect_in_rounds(workspace: Workspace, fit: Fit, rounds: int, with_spikes: 
     tuning = problem.tuning
     for _ in range(rounds):
         if problem.is_noisy(fit):
-            fit = fit.corrected(problem.streams, _states_of(workspace, fit))
+            fit = fit.corrected(problem.streams, _expected_states(workspace, fit))
         of_walk, of_white = innovation_chi_squares(workspace.posterior(fit), fit.outliers.spikes)
         detected = detect_outliers(fit.outliers, of_walk, of_white, tuning, with_spikes)
         change = detected.differs_by(fit.outliers)
@@ -397,7 +397,7 @@ def _detect_in_rounds(workspace: Workspace, fit: Fit, rounds: int, with_spikes: 
     return fit
 
 
-def _states_of(workspace: Workspace, fit: Fit) -> FloatArray:
+def _expected_states(workspace: Workspace, fit: Fit) -> FloatArray:
     """Return the expected states (N, d) after the next step of the parameters.
 
     A function of its own, so that the caller has no reference to the posterior: two posteriors of a
@@ -430,11 +430,11 @@ def time_correlated(workspace: Workspace, fit: Fit) -> Fit:
     problem = workspace.problem
     tuning = problem.tuning
     kept = sample(len(problem.streams), tuning)
-    # The prior allows large biases here. Otherwise a process would explain a constant bias.
+    # Allow large biases. Otherwise a process would explain a constant bias.
     free = replace(fit, sigmas=np.array(tuning.sizes))
     loss_before = Posterior(problem.space(free, kept), fit.levels).loss
-    # White noise and walk begin with a share of the variance of an increment at least, so that
-    # their levels have a gradient.
+    # At the start, white noise and walk have at least a share of the variance of an increment, so
+    # that the loss depends on their levels.
     lowest = increment_levels(fit.levels) + np.log(tuning.start_share)
     levels = fit.levels.copy()
     levels[WHITES] = np.maximum(levels[WHITES], lowest)

@@ -321,6 +321,8 @@ def gauss_newton_step(Q: FloatArray, Ts_parent_child: FloatArray) -> FloatArray:
 def _derivatives(forms: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the values of forms of (vec R, 1) at ``R Exp(phi)``, and derivatives at phi = 0.
 
+    With r = vec R, a form is ``r' S r + 2 linear' r`` plus a constant.
+
     Returns
     -------
     (B,) array
@@ -337,6 +339,7 @@ def _derivatives(forms: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArr
     value = ((S_r + 2 * linear) * r).sum(axis=1)
     product = R.swapaxes(1, 2) @ (S_r + linear).reshape(-1, 3, 3)
     gradient = 2 * se3.vee(product)
+    # Derivatives of r with respect to phi.
     tangents = (R[:, None] @ _GENERATORS).reshape(-1, 3, 9)
     trace = np.trace(product, axis1=1, axis2=2)
     symmetric = 0.5 * (product + product.swapaxes(1, 2))

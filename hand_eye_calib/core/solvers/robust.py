@@ -353,10 +353,10 @@ def _weighted_translation(
     weights : (K,) array
         Factors of the equations of each pair.
     """
-    weighted_slopes = (weights[:, None, None] * slopes).reshape(-1, 3)
-    weighted_targets = (weights[:, None] * targets).ravel()
-    translation = np.linalg.lstsq(weighted_slopes, weighted_targets, rcond=1e-9)[0]
-    return np.asarray(translation, dtype=float)
+    weighted_slopes = weights[:, None, None] * slopes
+    weighted_targets = weights[:, None] * targets
+    solution = np.linalg.lstsq(weighted_slopes.reshape(-1, 3), weighted_targets.ravel(), rcond=1e-9)
+    return np.asarray(solution[0], dtype=float)
 
 
 def _median_length(vectors: FloatArray) -> float:

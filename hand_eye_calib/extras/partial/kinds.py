@@ -9,7 +9,8 @@ from functools import partial
 
 import numpy as np
 
-from hand_eye_calib.core.alignment.time_offset import TimeOffset, correlate_rates
+from hand_eye_calib.core.alignment.rate_correlation import correlate_rates
+from hand_eye_calib.core.alignment.time_offset import TimeOffset
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.checks import check as checking
 from hand_eye_calib.core.checks.check import CheckResult

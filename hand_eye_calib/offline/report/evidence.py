@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hand_eye_calib.core.alignment.time_offset import angular_rates
+from hand_eye_calib.core.alignment.rate_correlation import angular_rates
 from hand_eye_calib.core.assessment.excitation import Excitation, excitation
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.stats import median
