@@ -1,4 +1,4 @@
-"""Sums over blocks are those of plain loops, and answers those of least squares of the rows."""
+"""Compare sums over blocks with plain loops, and solutions with least squares of the rows."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ N_BLOCKS = 5
 
 @pytest.fixture
 def rows():
-    """Rows (37, 3, 5) of four columns and the values that they explain but for noise."""
+    """Return rows (37, 3, 5): four columns, and a linear combination of them with noise."""
     random = np.random.default_rng(3)
     columns = random.normal(size=(N_ROWS, 3, 4)) * [1.0, 1e3, 1e-3, 1.0]
     values = columns @ [0.5, -2e-3, 3e2, 0.0] + 0.1 * random.normal(size=(N_ROWS, 3))

@@ -16,7 +16,7 @@ from hand_eye_calib.core.solvers.registry import Method
 
 
 def brute_force_objective(costs, threshold, floor):
-    """Eq. (5) minimised over the weights by a linear programme."""
+    """Return the minimum of eq. (5) over the weights, by linear programming."""
     from scipy.optimize import linprog
 
     answer = linprog(
@@ -38,7 +38,7 @@ def test_truncation_is_the_optimum_over_the_weights(fraction):
 
 @pytest.fixture
 def jumpy_pairs():
-    """30 % of the child's poses thrown far off."""
+    """Return motion pairs in which 30 % of the child's poses are outliers."""
     parent = wandering_poses(80)
     child = disturbed(child_of(parent), 1, 0.002, 0.002)
     thrown = np.random.default_rng(5).choice(80, 24, replace=False)
@@ -135,7 +135,7 @@ def form_of(pairs, solution):
 
 
 def false_minimum(Q, T_parent_child):
-    """The highest local minimum from rotations by pi beside the global one, and how much higher."""
+    """Return the highest local minimum near rotations by pi, and its cost over the global one."""
     Ts, values, _ = quadratic_form.minimise(Q, T_parent_child[:3, :3] @ HALF_TURNS)
     T = Ts[np.argmax(values)]
     return T, float(quadratic_form.decrease(Q, T, T_parent_child))

@@ -1,4 +1,4 @@
-"""Both streams inverse, or neither: noise and shape of the motion choose, or nobody does."""
+"""Choose by noise and shape of the motion whether both streams are inverse, or neither."""
 
 import re
 from dataclasses import replace
@@ -30,19 +30,19 @@ INVERSE = Hypothesis(("inverse",), ("inverse",))
 
 
 def thinned(drive):
-    """Every second pose."""
+    """Return every second pose."""
     return replace(drive, parent=drive.parent[::2], child=drive.child[::2])
 
 
 @pytest.fixture(scope="module")
 def hand():
-    """A hand-held rig in a small room."""
+    """Return the motion of a hand-held rig in a small room."""
     return thinned(make("hand_mixture_30s", 912))
 
 
 @pytest.fixture(scope="module")
 def arm():
-    """A slow arm with white noise alone: it is the same in both readings."""
+    """Return a slow arm with only white noise, which is the same in both readings."""
     return thinned(mixed.make("mixed_arm", 812))
 
 
@@ -221,7 +221,7 @@ def test_a_lever_arm_of_nearly_zero_is_no_evidence_about_inverse_poses(lever_m, 
 
 
 def test_noise_that_contradicts_a_clear_shape_does_not_choose_alone():
-    """One exact stream and one of hardly any noise: the noise called the exact one inverse."""
+    """For an exact stream and one with little noise, the noise alone would choose the inversion."""
     readings = Readings(
         hypotheses=(Hypothesis((), ("inverse",)), Hypothesis(("inverse",), ())),
         shape=-2.9,

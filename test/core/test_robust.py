@@ -26,7 +26,7 @@ SIGMA_RAD = 0.002
 
 
 def noisy_poses(seed):
-    """Poses (N_POSES, 4, 4) of both sensors with white noise."""
+    """Return poses (N_POSES, 4, 4) of both sensors with white noise."""
     parent = wandering_poses(N_POSES, seed)
     child = child_of(parent)
     noisy_parent = disturbed(parent, [seed, 1], SIGMA_M, SIGMA_RAD)
@@ -142,14 +142,14 @@ class TestSecondOpinions:
 
 
 def answer_and_opinions(seed):
-    """An assessed answer, and second opinions from the same poses."""
+    """Return an assessed result, and second opinions from the same poses."""
     parent, child = noisy_poses(seed)
     opinions = second_opinions(parent, child, T_PARENT_CHILD)
     return min(opinions, key=lambda opinion: opinion.sigmas.sum()), opinions
 
 
 def shifted_in_parent(T, step):
-    """Transform after a translation and a rotation (6,) along and about the parent's axes."""
+    """Return a transform after a shift (6,) along and about the parent's axes."""
     shifted = T.copy()
     shifted[:3, 3] += step[:3]
     shifted[:3, :3] = se3.rotation_exp(step[3:]) @ T[:3, :3]
@@ -157,6 +157,6 @@ def shifted_in_parent(T, step):
 
 
 def added_sigmas(answer, opinions):
-    """Standard deviations (6,) along and about the parent's axes that opinions add."""
+    """Return the standard deviations (6,) that opinions add, along and about the parent's axes."""
     excess = excess_covariance(answer, opinions)
     return se3.sigmas_in_parent(answer.T_parent_child[:3, :3], excess)

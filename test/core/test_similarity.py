@@ -22,7 +22,7 @@ from hand_eye_calib.offline.calibrate import calibrate
 
 
 def streams(n_poses=400, seed=0, scale=1.0, noise=0.0, poses=motions.wandering_poses):
-    """Both at 10 Hz; the child's lengths must be multiplied by ``scale``."""
+    """Return two streams at 10 Hz. The child's lengths must be multiplied by ``scale``."""
     parent, child = motions.noisy_pair(poses(n_poses, seed), seed + 1, noise, noise)
     return parent, child.scaled(1 / scale)
 
@@ -120,7 +120,7 @@ def test_any_offset_is_found_also_without_common_time(shift_s):
 
 
 def test_a_body_that_rotates_about_one_of_its_sensors():
-    """No scale shows, and the offset does all the same."""
+    """The scale cannot be estimated then, but the offset can."""
 
     def rotating(n_poses, seed):
         poses = motions.wandering_poses(n_poses, seed)

@@ -1,4 +1,4 @@
-"""The likelihood of the noise model, against its definition with dense matrices."""
+"""Compare the likelihood of the noise model with its definition by dense matrices."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ SIZES = (3, 3, 3, 1)
 
 
 def space_of(seed=1, cut=(4,)):
-    """A state space of random numbers: two groups of three, one of three that lasts, a scale."""
+    """Return a state space of random numbers: three groups of three processes, and a scale."""
     random = np.random.default_rng(seed)
     n = N_POSES - 1
     intervals_s = random.uniform(0.05, 0.3, n)
@@ -53,7 +53,7 @@ def space_of(seed=1, cut=(4,)):
 
 
 def parameters_and_residuals(space, rows=slice(None)):
-    """J and e of some rows."""
+    """Return J and e, of all rows or of some."""
     columns = space.columns.reshape(-1, N_PARAMETERS + 1)[rows]
     return columns[:, :-1], columns[:, -1]
 
@@ -62,7 +62,7 @@ LEVELS = np.random.default_rng(2).uniform(-1.0, 1.0, N_LEVELS)
 
 
 def dense_covariance(space, levels):
-    """V (6 n, 6 n) by its definition, increments that are no evidence included."""
+    """Return V (6 n, 6 n) by its definition, also for increments without information."""
     variances = np.exp(levels)
     n, _, d = space.h0.shape
     prior = np.zeros((N_POSES, d, N_POSES, d))
@@ -86,7 +86,7 @@ def dense_covariance(space, levels):
 
 
 def dense_loss(space, levels):
-    """Restricted loss, step and its covariance by their textbook formulas."""
+    """Return the restricted loss, the step and the covariance by textbook formulas."""
     rows = np.repeat(~space.cut, 6)
     V = dense_covariance(space, levels)[np.ix_(rows, rows)]
     J, r = parameters_and_residuals(space, rows)

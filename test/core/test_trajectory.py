@@ -80,7 +80,7 @@ HZ = 10
 
 
 def shaking(hz, times_s):
-    """Poses that shake about all axes and along them."""
+    """Return poses that vibrate along and about all axes."""
     phases = 2 * np.pi * hz * times_s[:, None] + np.arange(6)
     return se3.exp(0.05 * np.sin(phases))
 

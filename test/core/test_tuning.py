@@ -1,4 +1,4 @@
-"""Every number of Tuning is obeyed: to change it changes a solution."""
+"""Change each number of Tuning, and require that a solution changes."""
 
 import ast
 from dataclasses import fields, replace
@@ -25,7 +25,7 @@ def stamps(n_poses):
 
 
 def lasting_errors(seed, n_poses, sigma, tau_poses):
-    """Gauss-Markov errors (N, 6)."""
+    """Return Gauss-Markov errors (N, 6)."""
     random = np.random.default_rng(seed)
     phi = np.exp(-1.0 / tau_poses)
     errors = sigma * random.normal(size=(n_poses, 6))
@@ -35,7 +35,7 @@ def lasting_errors(seed, n_poses, sigma, tau_poses):
 
 
 def drive():
-    """Time-correlated errors, heavy tails, outlier poses and a jump, a scale and a late child."""
+    """Return poses with time-correlated errors, heavy tails, outliers, a jump, scale and delay."""
     random = np.random.default_rng(3)
     parent = wandering_poses(N_POSES, 3)
     child = child_of(parent) @ se3.exp(lasting_errors(4, N_POSES, 0.01, 15))
@@ -49,7 +49,7 @@ def drive():
 
 
 def bursts():
-    """White noise that is ten times as large for a while."""
+    """Return poses whose white noise is ten times as large during a part of the recording."""
     random = np.random.default_rng(5)
     parent = wandering_poses(N_POSES, 5)
     sigmas = np.where(np.arange(N_POSES) % 60 < 20, 0.01, 0.001)[:, None]
@@ -58,7 +58,7 @@ def bursts():
 
 
 def target():
-    """A camera that observes a target: rotation noise exceeds the rotation from pose to pose."""
+    """Return poses of a camera at a target, whose rotation noise exceeds the rotation per pose."""
     parent = wandering_poses(N_POSES, 7, step_m=0.02, step_rad=0.01)
     T_cw_pw = se3.exp(np.array([1.0, -1.0, 0.5, 0.5, 0.2, -2.0]))
     child = child_of(parent, T_cw_pw=T_cw_pw)
@@ -67,7 +67,7 @@ def target():
 
 
 def sideways():
-    """A child that slips sideways on flat ground."""
+    """Return poses of a child that slips sideways on flat ground."""
     parent = planar_poses(N_POSES)
     child = child_of(parent)
     steps = se3.inverse(child[:-1]) @ child[1:]
@@ -77,7 +77,7 @@ def sideways():
 
 
 def heavy_walk():
-    """Odometry whose steps have heavy tails."""
+    """Return poses of an odometry whose steps have heavy tails."""
     random = np.random.default_rng(13)
     parent = wandering_poses(N_POSES, 13)
     child = child_of(parent)
@@ -88,7 +88,7 @@ def heavy_walk():
 
 
 def antenna():
-    """Positions of an antenna: a jump, noisy stretches and errors that last."""
+    """Return positions of an antenna with a jump, noisy periods and time-correlated errors."""
     random = np.random.default_rng(11)
     poses = wandering_poses(N_POSES, 11)
     drift = np.zeros((N_POSES - 1, 6))
@@ -113,7 +113,7 @@ POSES = {
 
 @cache
 def numbers_of(case, tuning):
-    """Numbers of the solution of a case."""
+    """Return the numbers of the solution of a case."""
     if case in POSES:
         parent, child = POSES[case]()
         solution = estimator.solve(stamps(N_POSES), parent, child, tuning=tuning)
@@ -193,7 +193,7 @@ def test_the_same_numbers_give_the_same_solution():
 
 
 def names_of_the_default(tree):
-    """Nodes that read TUNING, without those that make it the default of an argument or a field."""
+    """Return syntax nodes that read TUNING, except defaults of arguments and fields."""
     is_default = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.arguments):

@@ -386,11 +386,9 @@ def _strided_poses(problem: Problem, fit: Fit) -> IntArray:
     """
     tuning = problem.tuning
     sound_poses = np.flatnonzero(~fit.outliers.spikes)
-    longest_stride = 1
-    for stride in tuning.strides:
-        # A solution needs about 50 poses.
-        if len(sound_poses) >= stride * 50:
-            longest_stride = max(stride, longest_stride)
+    # A solution needs about 50 poses.
+    possible_strides = [stride for stride in tuning.strides if len(sound_poses) >= stride * 50]
+    longest_stride = max(possible_strides, default=1)
     noise_rad = np.exp(0.5 * fit.levels[ROTATION])
     rotations = problem.streams.Ts_pw_p[sound_poses, :3, :3]
     for stride in tuning.strides:

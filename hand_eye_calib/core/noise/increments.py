@@ -266,7 +266,7 @@ def _child_motions(
     (n, 4, 4) array
         Corrected motions.
     (n, 3, 3) array
-        Derivatives of the measured rotations (rad) with respect to the bias of rates (rad/s).
+        Derivatives (s) of the measured rotations with respect to the bias of rates.
     """
     Ts_cw_c = streams.Ts_cw_c
     if parameters[TIME]:

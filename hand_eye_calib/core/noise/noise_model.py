@@ -72,7 +72,7 @@ _WALK_FACTOR_LIMITS = (0.1, 100.0)
 
 
 class FastSigmas(NamedTuple):
-    """Standard deviations per axis of white noise, jitter of stamps and walk."""
+    """Standard deviations per axis of white noise, jitter of stamps, and walk per increment."""
 
     translation_m: float
     rotation_rad: float
@@ -181,9 +181,10 @@ class NoiseModel:
         )
 
     def _rotations_about_origin(self, streams: Streams, to_child: FloatArray) -> FloatArray:
-        """Return the covariances (N, 6, 6) of c for rotations of 1 rad about a world's origin.
+        """Return the covariances (N, 6, 6) of c for rotation errors about the origin of a world.
 
-        The world is that of the sensor in ``centre``.
+        The errors have a standard deviation of 1 rad per axis. The world is that of ``centre``,
+        which is "child" or "parent".
         """
         poses = streams.Ts_cw_c if self.centre == "child" else streams.Ts_pw_p
         by_rotation = np.zeros((len(poses), 6, 3))

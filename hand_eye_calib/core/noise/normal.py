@@ -227,6 +227,7 @@ class NormalEquations:
         rounding = np.finfo(float).eps * diagonal.max(axis=-1, keepdims=True)
         scale = 1.0 / np.sqrt(np.maximum(diagonal, rounding + np.finfo(float).tiny))
         values, vectors = np.linalg.eigh(scale[..., :, None] * information * scale[..., None, :])
+        # Eigenvalue 1 in place of rounding, which the mask excludes from root and log determinant.
         self._is_observed = values > _MIN_INFORMATION
         values = np.where(self._is_observed, values, 1.0)
         self._axes = scale[..., :, None] * vectors

@@ -85,7 +85,8 @@ def loss_difference(
 def _smallest_loss(workspace: stages.Workspace, start: stages.Fit, outliers: Outliers) -> float:
     """Return the smallest loss of a reading over all centres of rotation noise.
 
-    ``start`` is a fit of this reading. The search ignores ``outliers`` and has no robust weights.
+    ``start`` is a fit of this reading. The search does not use the poses and increments in
+    ``outliers``, and has no robust weights.
     """
     streams = workspace.problem.streams
     n_poses = len(streams)

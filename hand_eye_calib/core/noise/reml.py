@@ -65,7 +65,7 @@ def fit(
     settled_loss: float,
     n_steps: int = MAX_STEPS,
 ) -> tuple[Posterior, FloatArray]:
-    """Minimise the loss plus that of the prior over the levels, by damped Newton steps.
+    """Minimise the restricted loss plus the loss of the prior, by damped Newton steps.
 
     Parameters
     ----------
@@ -73,6 +73,7 @@ def fit(
     start : (m,) array
         Levels at the start.
     prior : Prior
+        Prior and bounds of the levels.
     settled_loss : float
         The search ends if a step is predicted to lower the loss by less than this.
     n_steps : int
@@ -220,12 +221,26 @@ def _group_gradient(posterior: Posterior, group: Markov, states: FloatArray) -> 
 def _average_information(posterior: Posterior, states: FloatArray, walk: FloatArray) -> FloatArray:
     """Return the average information (m, m) for the posterior means of states and walk.
 
+    It is ``1/2 f' P f = 1/2 (f' V^-1 f - f' V^-1 J (J' V^-1 J)^-1 J' V^-1 f)``.
+
     Parameters
     ----------
     posterior : Posterior
     states : (N, d) array
     walk : (n, 6) array
     """
+    space = posterior.space
+    f = _working_columns(posterior, states, walk)
+    weighted, whitened = posterior.forward_half(f)
+    f_V_f = multiplied(f, weighted) - multiplied(whitened, whitened)
+    J_V_f = multiplied(space.columns, weighted) - multiplied(posterior.whitened, whitened)
+    J_V_f = J_V_f[:-1]
+    information = 0.5 * (f_V_f - J_V_f.T @ posterior.normal.covariance @ J_V_f)
+    return 0.5 * (information + information.T)
+
+
+def _working_columns(posterior: Posterior, states: FloatArray, walk: FloatArray) -> FloatArray:
+    """Return the columns f_k (n, 6, m) of the average information, one for each level."""
     space = posterior.space
     variances = np.exp(posterior.levels)
     n_white = len(space.white_bases)
@@ -242,15 +257,10 @@ def _average_information(posterior: Posterior, states: FloatArray, walk: FloatAr
         values = states[:, group.states]
         moved[:, group.states, level] = values
         moved[:, group.states, level + 1] = group.derivative_by_log_tau(values)
-    columns = space.apply_u(moved)
+    f = space.apply_u(moved)
     # Levels of the walk: f_k = (d W^-1 / d theta_k) W w.
     forces = walk @ posterior.walk_precision
     for level, basis in enumerate(space.walk_bases, start=n_white):
-        columns[:, :, level] = variances[level] * forces @ basis
-    columns[space.cut] = 0.0
-    weighted, whitened = posterior.forward_half(columns)
-    own = multiplied(columns, weighted) - multiplied(whitened, whitened)
-    shared = multiplied(space.columns, weighted) - multiplied(posterior.whitened, whitened)
-    shared = shared[:-1]
-    information = 0.5 * (own - shared.T @ posterior.normal.covariance @ shared)
-    return 0.5 * (information + information.T)
+        f[:, :, level] = variances[level] * forces @ basis
+    f[space.cut] = 0.0
+    return f

@@ -246,6 +246,7 @@ class Fit:
         of_parent = white_of_parent + 0.5 * other_error
         of_child = white_of_parent - white_error - 0.5 * other_error
         measured = bridge_outliers(streams, T, spikes)
+        # The adjoint converts the error of the parent to the parent's frame.
         poses = Streams(
             streams.stamps_s,
             measured.Ts_pw_p @ se3.exp(-of_parent @ se3.adjoint(T).T),

@@ -66,7 +66,7 @@ class StateSpace:
     h1_processes : (n, 6, d - 6) array
         Columns of H1 for the processes. The first six columns of H1 are the identity.
     h0 : (n, 6, d) array
-        H0.
+        Matrices H0.
     white_bases : tuple of (1 or N, 6, 6) arrays
         The covariance of a white error is ``sum exp(level) basis``, a basis for each level.
     walk_bases : tuple of (6, 6) arrays

@@ -55,8 +55,9 @@ class Tuning:
     # White errors have heavy tails if the mean square of their chi-squares exceeds the squared mean
     # by this factor. The factor is 4/3 for normal errors.
     heavy_kurtosis: float = 1.7
-    # The walk has heavy tails if its chi-squares below the threshold of false alarms exceed this
-    # factor. If both limits are equal, errors on KITTI are 9 % larger.
+    # The walk has heavy tails if, of its chi-squares below the threshold of false alarms, the mean
+    # square exceeds the squared mean by this factor. With 1.7 as for white errors, errors on KITTI
+    # would be 9 % larger.
     walk_kurtosis: float = 1.5
     # Before noise levels are known, an increment is a jump beyond this number of robust standard
     # deviations. The limit is wide because the residuals contain all errors.
@@ -136,8 +137,8 @@ class Tuning:
     # Time (s) between the two positions of a velocity; an acceleration is the difference of two
     # velocities.
     accelerating_s: float = 0.2
-    # An acceleration is not used if a gap makes its time longer than this multiple of the usual
-    # one.
+    # An acceleration is not used if gaps between poses make its time span longer than the usual
+    # span by this factor.
     near: float = 2.5
     # At a jump, the variance of the walk is this multiple of the variance that explains the step.
     jump_factor: float = 10.0
