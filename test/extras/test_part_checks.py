@@ -117,7 +117,8 @@ OF_ROTATIONS = [
     ("rotations", "inverse", "inverse_orientation", ["car"]),
     ("rotations", "order w x y z", "inverse_orientation", ["drone"]),
     ("rotations", "yaw only", "flat", ["drone"]),
-    ("rotations", "yaw gain 1.05", "rotation_gain", ["hand"]),
+    ("rotations", "yaw gain 1.05", "rotation_gain", ["hand", "car"]),
+    ("rotations", "steps of 1 deg", "coarse_orientations", ["drone"]),
 ]
 
 

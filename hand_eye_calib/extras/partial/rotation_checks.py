@@ -72,7 +72,7 @@ _TURNING = 0.75
 
 # Standard deviations from which on smoothing is clear. They are those of a jackknife of at most 16
 # blocks, whose distribution has heavy tails.
-_CLEAR_SIGMAS = 6.0
+_CLEAR_SIGMAS = 4.0
 # Smallest smoothing (s^2): that of a filter of 63 ms. EuRoC, KITTI and machines simulated with
 # seeds 77 and 78 have up to 0.0012 without a filter.
 _SMOOTHING_S2 = 0.004
@@ -85,6 +85,11 @@ _LEAST_LEVELS = 5
 _ROUNDING_RAD_S = 1e-9
 # Smallest step of coarse rates (rad/s). Those of a gyroscope with 16 bits are 0.001.
 _STEP_RAD_S = 0.005
+
+# Rounding of angles that are computed from rotation matrices, and smallest step of coarse
+# orientations (deg).
+_ROUNDING_DEG = 1e-6
+_STEP_DEG = 0.2
 
 # Fewest clipped rates, which are equal to the largest rate.
 _LEAST_CLIPPED = 20
@@ -330,9 +335,9 @@ def _check_handedness(streams: _Streams) -> list[Finding]:
 
 
 def _check_levels(streams: _Streams) -> list[Finding]:
-    """Detect rates in coarse steps, or clipped at the limit of a gyroscope."""
+    """Detect coarse orientations, and rates in coarse steps or clipped at a gyroscope's limit."""
     if not streams.has_rates:
-        return []
+        return _check_coarse_orientations(streams)
     rates = _rates(streams.measured)
     for axis, column in zip("xyz", rates.T, strict=True):
         levels = np.unique(np.round(column / _ROUNDING_RAD_S)) * _ROUNDING_RAD_S
@@ -353,6 +358,22 @@ def _check_levels(streams: _Streams) -> list[Finding]:
                     "clipped_rates", streams.name, axis=axis, share=share, limit_deg_s=limit_deg_s
                 )
             ]
+    return []
+
+
+def _check_coarse_orientations(streams: _Streams) -> list[Finding]:
+    """Detect orientations whose roll, pitch or yaw is in coarse steps."""
+    for name, stream in (("parent", streams.parent), ("child", streams.child)):
+        angles_deg = np.degrees(se3.rotation_to_rpy(se3.rotation_of(stream.poses)))
+        for column in angles_deg.T:
+            levels = np.unique(np.round(column / _ROUNDING_DEG)) * _ROUNDING_DEG
+            if not _LEAST_LEVELS <= len(levels) < _FEW_LEVELS * len(column):
+                continue
+            steps_deg = np.diff(levels)
+            step_deg = median(steps_deg)
+            are_equal = np.abs(steps_deg - step_deg) < 10.0 * _ROUNDING_DEG
+            if step_deg > _STEP_DEG and are_equal.mean() > 0.5:
+                return [finding("coarse_orientations", name, step_deg=step_deg)]
     return []
 
 
@@ -387,8 +408,9 @@ def _check_response(streams: _Streams, rotation: FloatArray) -> list[Finding]:
         evidence = "The rates agree with the orientations of the other sensor"
         return copied(evidence, residual_rad=fitted.remaining)
     suspects = [_smoothing(fitted, streams), _gain(fitted, streams)]
-    if streams.has_rates:
-        suspects.append(_shear(fitted, streams))
+    # A gyroscope errs about its own axes. An attitude sensor errs about the vertical, too.
+    of_kind = _shear if streams.has_rates else _main_gain
+    suspects.append(of_kind(fitted, streams))
     ranked = sorted(suspects, key=lambda suspect: suspect.sigmas, reverse=True)
     findings = [suspect.found for suspect in ranked if suspect.found][:1]
     if findings or not streams.has_rates or fitted.bias_drift < _BIAS_DRIFT_RAD_S:
@@ -444,6 +466,15 @@ def _gain(fitted: RotationFit, streams: _Streams) -> _Suspect:
         "gain_of_axis", streams.name, gain, sigma, axis="xyz"[place], gain=1.0 + gain, sigma=sigma
     )
     return _Suspect(abs(gain) / sigma, found)
+
+
+def _main_gain(fitted: RotationFit, streams: _Streams) -> _Suspect:
+    """Return how clear it is that rotations about the main axis are too large or too small."""
+    gain, sigma, bias = fitted.main_gain()
+    if abs(gain) <= agreement.BIASES * bias:
+        return _Suspect(0.0, None)
+    values = {"axis": "main", "gain": 1.0 + gain, "sigma": sigma}
+    return _Suspect(abs(gain) / sigma, graded("gain_of_axis", streams.name, gain, sigma, **values))
 
 
 def _shear(fitted: RotationFit, streams: _Streams) -> _Suspect:

@@ -103,7 +103,15 @@ _COLUMNS = {
 
 @dataclass(frozen=True)
 class RotationFit(Fit):
-    """Regression of rotations on the columns of all faults."""
+    """Regression of rotations on the columns of all faults.
+
+    Attributes
+    ----------
+    main_axis : (3,) array
+        Unit vector of the axis of most rotation, in the axes of the measured sensor.
+    """
+
+    main_axis: FloatArray
 
     @property
     def axes_covariance(self) -> FloatArray:
@@ -135,6 +143,26 @@ class RotationFit(Fit):
         effects = np.linalg.solve(total[np.ix_(known, known)], total[np.ix_(known, weak)])[:3]
         of_weak = effects * np.array(prior_sigmas)
         return self.open_to(known) + of_weak @ of_weak.T
+
+    def main_gain(self) -> tuple[float, float, float]:
+        """Estimate the gain about the main axis u, less 1: u' S u.
+
+        If a machine turns about one axis only, this gain is certain, while those about the axes of
+        the sensor are not.
+
+        Returns
+        -------
+        float, float, float
+            The gain, its standard deviation, and its largest bias, see :meth:`biases`.
+        """
+        u = self.main_axis
+        row = np.zeros(len(self._every_column))
+        row[self.places["gains"]] = u**2
+        row[self.places["shears"]] = [2.0 * u[k] * u[m] for k, m in PLANES]
+        variance = row @ self.blocks.jackknife(self._every_column) @ row
+        spread = row @ np.linalg.solve(self.blocks.total[:-1, :-1], row)
+        bias = self.n_samples * abs(float(spread))
+        return float(row @ self.joint.values), float(np.sqrt(variance)), bias
 
     @property
     def bias_drift(self) -> float:
@@ -212,7 +240,10 @@ def fit_rotations(
     windows = _Windows(orientations, *motions)
     nuisances = np.concatenate([moving, in_windows(drifting)], axis=3)
     fitted = fit_columns(_COLUMNS, windows, is_used, errors, nuisances)
-    return RotationFit(**vars(fitted))
+    turns = se3.rotations_between(reference[:-1], reference[1:])
+    # The eigenvalues are ascending.
+    _, axes = np.linalg.eigh(turns.T @ turns)
+    return RotationFit(**vars(fitted), main_axis=axes[:, -1])
 
 
 def _integral(stamps_s: FloatArray, values: FloatArray) -> FloatArray:

@@ -83,6 +83,12 @@ WORDS = {
         "let the gyroscope warm up, or use a better one",
         severity=Severity.WARNING,
     ),
+    "coarse_orientations": FindingWords(
+        "{whose} orientations are in steps of {step_deg:.2g} deg",
+        "write orientations with all digits",
+        "rounding in a file",
+        severity=Severity.WARNING,
+    ),
     "inverse_rotations": FindingWords(
         "the orientations of {name} are inverted, or their quaternions are in the order w x y z",
         "correct that stream by its option (such as child_invert orientations, or child_quaternion "
