@@ -4,6 +4,7 @@ from importlib import import_module
 
 EXTRAS = (
     "fleet",  # several recordings: compared, together, in batches
+    "detectability",  # smallest errors that a recording contradicts
     "mount",  # the monitor of the mount
     "partial",  # streams of positions, rotations or angular rates alone
     "stops",  # poses that are stops, such as the samples of an arm

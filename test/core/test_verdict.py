@@ -16,6 +16,7 @@ from hand_eye_calib.core.results import verdict as rules
 from hand_eye_calib.core.results.calibration import Calibration, SolveStatus, Verdict
 from hand_eye_calib.core.results.records import AxisScatter, Severity
 from hand_eye_calib.core.results.verdict import RULES
+from hand_eye_calib.extras.detectability.record import Detectability
 from hand_eye_calib.extras.fleet.records import Together
 from hand_eye_calib.extras.ground.part import GroundAxis, GroundResult
 
@@ -58,6 +59,12 @@ def several(kind):
 
 GROUND_AXIS = GroundAxis("roll", 0.0, 0.002, 0.02, 0.001, 9.0, False)
 
+# An error of 1 m or 1 rad would not have shown.
+NOTHING_SHOWS = Detectability(
+    errors=dict.fromkeys(NAMES, 1.0), shifts={}, time_offset_s=np.inf, scale=np.inf
+)
+
+
 # Rule to a result in which it alone applies.
 CASES = {
     "prior": dict(status=SolveStatus.CONTRADICTED, contradictions={"x": 5.5}),
@@ -75,6 +82,7 @@ CASES = {
         cross_check=dict.fromkeys(NAMES, AxisScatter(sigma=0.003, of_methods=None, of_halves=None))
         | {"z": AxisScatter(sigma=0.01, of_methods=None, of_halves=None, is_confirmed=False)}
     ),
+    "undetectable": dict(parts={"detectability": NOTHING_SHOWS}),
     "outliers": dict(n_pairs=100, n_inliers=65),
     "target": dict(observability_measured=observed(x=0.04, yaw=0.02)),
     "floor": dict(T_parent_child=np.eye(4), covariance_allowance=FLOOR),

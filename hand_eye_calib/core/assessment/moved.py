@@ -24,6 +24,7 @@ than their covariances, because constant errors do not show within a recording. 
 to C (docs/session.md has the measurements).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,7 +103,8 @@ def shift_covariance(metres: float = _SHIFT_M, radians: float = _SHIFT_RAD) -> F
 
 
 _EXPECTED_SHIFTS = shift_covariance()
-_SHIFT_INFORMATION = inverse(_EXPECTED_SHIFTS)
+#: Information of the expected shifts, the inverse of their covariance.
+SHIFT_INFORMATION = inverse(_EXPECTED_SHIFTS)
 
 
 def log_ratio(tables: FloatArray, L: FloatArray = _EXPECTED_SHIFTS) -> FloatArray:
@@ -139,7 +141,7 @@ def most_likely(tables: FloatArray, ridge: float) -> FloatArray:
 
     ``ridge`` is the share of the information of the expected shifts that is added.
     """
-    return _solve(information(tables) + ridge * _SHIFT_INFORMATION, score(tables))
+    return _solve(information(tables) + ridge * SHIFT_INFORMATION, score(tables))
 
 
 def squares_about(tables: FloatArray, shifts: FloatArray, ridge: float) -> FloatArray:
@@ -149,7 +151,7 @@ def squares_about(tables: FloatArray, shifts: FloatArray, ridge: float) -> Float
     """
     H = information(tables)
     scores = score(tables) - se3.times(H, shifts)
-    return np.asarray((scores * _solve(H + ridge * _SHIFT_INFORMATION, scores)).sum(axis=-1))
+    return np.asarray((scores * _solve(H + ridge * SHIFT_INFORMATION, scores)).sum(axis=-1))
 
 
 # ---------------------------------------------------------------- within a recording
@@ -239,25 +241,50 @@ def find_change(pose_pairs: PosePairs, T_parent_child: FloatArray) -> MountChang
     T_parent_child : (4, 4) array
         X0, near the extrinsic.
     """
-    starts_ns, blocks = _evidence_by_second(pose_pairs, T_parent_child)
+    starts_ns, blocks = evidence_by_second(pose_pairs, T_parent_child)
     n_blocks = len(starts_ns)
-    counts = [count for count in _WINDOWS if n_blocks >= count * _LEAST_WINDOW_S]
-    if not counts:
+    long_run = _long_run_variance_of(blocks)
+    if long_run is None:
         return None
-    long_run = max(1.0, *(_long_run_variance(blocks.merged(count)) for count in counts))
-    shifts = blocks.shift_since(np.arange(1, n_blocks), _RIDGE * _SHIFT_INFORMATION)
+    shifts = blocks.shift_since(np.arange(1, n_blocks), _RIDGE * SHIFT_INFORMATION)
     ratios = log_ratio(shifts / long_run)
     n_edge = max(int(n_blocks * _LEAST_WINDOWS / max(_WINDOWS)), 1)
     ratios[: n_edge - 1] = -np.inf
     ratios[len(ratios) - n_edge + 1 :] = -np.inf
     best = int(np.argmax(ratios))
-    damped = information(shifts[best]) + _RIDGE * _SHIFT_INFORMATION
+    damped = information(shifts[best]) + _RIDGE * SHIFT_INFORMATION
     return MountChange(
         at_ns=int(starts_ns[best + 1]),
         xi=most_likely(shifts[best], _RIDGE),
         covariance=long_run * inverse(damped),
         log_ratio=float(ratios[best]),
     )
+
+
+def shifts_at(blocks: Blocks, cuts: IntArray) -> FloatArray | None:
+    """Return the evidence (C, 6, 7) of a shift at each cut (C,), for :func:`log_ratio`.
+
+    It is divided by the long-run variance. None if the recording is too short.
+
+    Parameters
+    ----------
+    blocks : Blocks
+        Evidence by second.
+    cuts : (C,) int array
+        Indices of the first second after a shift.
+    """
+    long_run = _long_run_variance_of(blocks)
+    if long_run is None:
+        return None
+    return blocks.shift_since(cuts, _RIDGE * SHIFT_INFORMATION) / long_run
+
+
+def _long_run_variance_of(blocks: Blocks) -> float | None:
+    """Return the long-run variance of evidence by second; None if there are too few seconds."""
+    counts = [count for count in _WINDOWS if len(blocks.sums) >= count * _LEAST_WINDOW_S]
+    if not counts:
+        return None
+    return max(1.0, *(_long_run_variance(blocks.merged(count)) for count in counts))
 
 
 def _long_run_variance(windows: Blocks) -> float:
@@ -278,10 +305,15 @@ def _long_run_variance(windows: Blocks) -> float:
     return float(squares.sum(axis=1).min()) / dof
 
 
-def _evidence_by_second(
-    pose_pairs: PosePairs, T_parent_child: FloatArray
+def evidence_by_second(
+    pose_pairs: PosePairs,
+    T_parent_child: FloatArray,
+    further_columns: Callable[[MotionPairs], FloatArray] | None = None,
 ) -> tuple[IntArray, Blocks]:
-    """Return the starts (N,) of the seconds of a recording, and their evidence ``[H S]``."""
+    """Return the starts (N,) of the seconds of a recording, and their evidence ``[H S]``.
+
+    ``further_columns`` returns columns (K, 6, q) of J for q unknowns beside xi.
+    """
     stamps_ns = pose_pairs.stamps_ns
     duration_ns = int(stamps_ns[-1] - stamps_ns[0])
     lag_s = max(_BLOCK_NS, stats.median(np.diff(stamps_ns))) * 1e-9
@@ -289,6 +321,8 @@ def _evidence_by_second(
     pairs = pairs_over(pose_pairs, lag_s, most_motions)
     residuals, jacobians = residuals_and_jacobians(pairs, T_parent_child)
     covariance, weights = noise_covariance(residuals)
+    if further_columns:
+        jacobians = np.concatenate([jacobians, further_columns(pairs)], axis=2)
     tables = evidence(residuals, jacobians, covariance, weights)
     middles_ns = (stamps_ns[pairs.i] + stamps_ns[pairs.j]) // 2
     block_of_pair = (middles_ns - stamps_ns[0]) // _BLOCK_NS

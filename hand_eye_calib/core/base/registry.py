@@ -134,6 +134,9 @@ EXTRA_RULES: Registry[ExtraRule] = Registry("rule")
 #: Parts of results that layers above the core add: functions that return a ``Part``.
 RESULT_PARTS: Registry[Callable[[], Any]] = Registry("part of a result")
 
+#: Functions ``examine(result, snapshot)`` that return the result of a solve with a further part.
+RESULT_EXAMINATIONS: Registry[Callable[[Any, Any], Any]] = Registry("examination of results")
+
 #: Modules of the public names of the extras.
 PUBLIC_NAMES: Registry[str] = Registry("public name")
 

@@ -11,6 +11,7 @@ from hand_eye_calib.core.alignment.rate_correlation import Correlation, correlat
 from hand_eye_calib.core.alignment.time_offset import TimeOffset, estimate_time_offset
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError, InputError, NotEnoughDataError
+from hand_eye_calib.core.base.registry import RESULT_EXAMINATIONS
 from hand_eye_calib.core.base.text import frame_name
 from hand_eye_calib.core.engine.kinds import kind_of
 from hand_eye_calib.core.geometry import se3
@@ -201,7 +202,8 @@ class Snapshot:
         ----------
         cross_check : bool, optional
             Whether to compare the result with those of other strides and of both halves. By
-            default, the result is compared unless the user has set a reference.
+            default, the result is compared unless the user has set a reference. If False, the
+            examinations of extras are skipped, too.
 
         Raises
         ------
@@ -223,6 +225,9 @@ class Snapshot:
         result = kind.solve(resolved, cross_check)
         for measurement in self.beside_motion:
             result = measurement.joined(result, resolved)
+        if cross_check is not False:
+            for examine in RESULT_EXAMINATIONS.values():
+                result = examine(result, resolved)
         return replace(
             result,
             parent_frame=self.parent_frame,
