@@ -497,6 +497,17 @@ def test_outliers_have_no_weight(random):
     assert np.linalg.norm(off(fit.T_parent_child, X)[:3]) < 0.01
 
 
+@pytest.mark.parametrize(("error_m", "codes"), [(0.003, []), (0.1, ["outliers"])])
+def test_only_clear_outliers_are_reported(random, error_m, codes):
+    robot, tracking, *_ = arm(random, n=40)
+    tracking[[5, 20], :3, 3] += error_m
+
+    result = calibrate_arm(robot, tracking)
+
+    assert [row.number for row in result.stops.rows if not row.is_used] == [6, 21]
+    assert [finding.code for finding in result.findings] == codes
+
+
 def test_two_stops_are_too_few(random):
     for n in (0, 1, 2):
         with pytest.raises(NotEnoughDataError, match="at least 3"):
