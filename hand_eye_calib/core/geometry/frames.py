@@ -116,6 +116,7 @@ def pose_of(*values: Any) -> FloatArray:
     elif sizes == (7,):
         T = checked_pose(flat[:3], flat[3:])
     elif sizes == (3, 4):
+        # From w, x, y, z to x, y, z, w.
         T = checked_pose(flat[:3], np.roll(flat[3:], -1))
     elif sizes == (3, 9):
         T[:3, 3] = flat[:3]
@@ -253,21 +254,26 @@ def numbers_of(value: Any) -> list[float]:
         position = value.get("translation", value.get("position"))
         quaternion = value.get("rotation", value.get("orientation"))
         if isinstance(position, Mapping) and isinstance(quaternion, Mapping):
+            # A message of ROS.
             value = [position.get(axis) for axis in "xyz"]
             value += [quaternion.get(axis) for axis in "xyzw"]
         else:
+            # A matrix of OpenCV.
             value = value.get("data", ())
     if isinstance(value, str):
         value = value.split()
     try:
-        return [float(x) for x in np.array(value, dtype=float).ravel()]
+        numbers: list[float] = np.array(value, dtype=float).ravel().tolist()
     except (TypeError, ValueError):
         return []
+    return numbers
 
 
 def words_of(name: str) -> set[str]:
     """Return the words in the name of a frame or topic, in lower case."""
-    return {*re.findall("[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower())}
+    # Capital letters after small ones begin a word, as in baseLink.
+    separated = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)
+    return set(re.findall("[a-z]+", separated.lower()))
 
 
 @dataclass(frozen=True)
@@ -398,7 +404,7 @@ class FrameTree:
         ----------
         frame, of : str
         moving : mapping, optional
-            Frame to its poses (..., 4, 4) in its parent, for edges that move.
+            For edges that move: name of the frame to its poses (..., 4, 4) in its parent.
 
         Raises
         ------
@@ -413,7 +419,9 @@ class FrameTree:
             T_above_step = moving.get(step, edge.pose)
             if T_above_step is None or not (edge.is_static or moving):
                 raise InputError(f"{frame} and {of} are not fixed to each other: {step} moves")
-            T_frame_of = T_frame_of @ (se3.inverse(T_above_step) if step in up else T_above_step)
+            if step in up:
+                T_above_step = se3.inverse(T_above_step)
+            T_frame_of = T_frame_of @ T_above_step
         return T_frame_of
 
     def route(self, frame: str, of: str) -> tuple[list[str], list[str]]:
