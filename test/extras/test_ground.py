@@ -186,9 +186,9 @@ def test_arguments_of_a_wrong_type_are_an_error():
 # ------------------------------------------------------------------- bags
 
 
-def cloud_message(typestore, stamp_ns, points, frame):
+def cloud_message(typestore, stamp_ns, points, frame, names="xyz"):
     field = typestore.types["sensor_msgs/msg/PointField"]
-    fields = [field(name=name, offset=4 * at, datatype=7, count=1) for at, name in enumerate("xyz")]
+    fields = [field(name=name, offset=4 * at, datatype=7, count=1) for at, name in enumerate(names)]
     rows = np.ascontiguousarray(points, dtype="<f4")
     return typestore.types[POINTS](
         header=header(typestore, stamp_ns, frame),
@@ -225,7 +225,7 @@ def odometry_messages(trajectory, topic):
         yield stamp_ns, topic, ODOMETRY, message
 
 
-def write_drive(path, child_frame="rear", with_imu=False):
+def write_drive(path, child_frame="rear", with_imu=False, names="xyz"):
     """Write a bag of two lidars, or of a lidar and an IMU, with their odometry."""
     drive, clouds = machine()
     messages = [*odometry_messages(drive.parent, "/a"), *odometry_messages(drive.child, "/b")]
@@ -242,6 +242,7 @@ def write_drive(path, child_frame="rear", with_imu=False):
         frame = child_frame if frame == "rear" else frame
         for stamp_ns, points in scans:
             make = partial(cloud_message, stamp_ns=stamp_ns, points=points, frame=frame)
+            make = partial(make, names=names)
             messages.append((stamp_ns, topic, POINTS, make))
     write_messages(path, messages)
     return drive
@@ -278,3 +279,10 @@ def test_clouds_in_another_frame_are_not_used(tmp_path, capsys, no_figures):
     _, result, printed = calibrated(tmp_path, tmp_path / "bag", capsys)
     assert result.ground is None
     assert "are used" not in printed.err
+
+
+def test_clouds_that_cannot_be_read_are_a_note(tmp_path, capsys, no_figures):
+    write_drive(tmp_path / "bag", names="abc")
+    code, result, printed = calibrated(tmp_path, tmp_path / "bag", capsys)
+    assert (code, result.ground) == (3, None)
+    assert "not used: /a/points: points have no x, y, z, but a, b, c" in printed.err

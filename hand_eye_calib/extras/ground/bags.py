@@ -1,13 +1,14 @@
 """The ground and gravity in a bag: clouds or IMU data in the frame of a sensor."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray
-from hand_eye_calib.core.base.errors import NotEnoughDataError
+from hand_eye_calib.core.base.errors import InputError, NotEnoughDataError
 from hand_eye_calib.core.base.text import frame_name, listing
 from hand_eye_calib.core.geometry.frames import StreamFrames
 from hand_eye_calib.core.geometry.trajectory import Trajectory
@@ -35,7 +36,8 @@ def verticals_of_bag(paths: Sequence[Path], snapshot: Any) -> tuple[VerticalPair
     The clouds or IMU data of a sensor are those whose ``frame_id`` is the frame of its poses. The
     ground is preferred, because it also has the height.
     """
-    if snapshot.config.measured != "poses":
+    config = snapshot.config
+    if config.measured != "poses" or min(map(len, snapshot.streams)) < config.min_pairs:
         return ()
     with PoseBag(*paths) as bag:
         topics_of = _topics_by_frame(bag)
@@ -47,11 +49,11 @@ def verticals_of_bag(paths: Sequence[Path], snapshot: Any) -> tuple[VerticalPair
         are_imus = [bag.topics[topic].type == _IMU for topic in topics]
         beside: Source = "gravity" if any(are_imus) else "ground"
         tracks = []
-        for topic, stream in zip(topics, snapshot.unpaired, strict=True):
+        for topic, stream in zip(topics, snapshot.streams, strict=True):
             try:
                 with waiting_for(f"reading {topic}"):
                     tracks.append(_track(bag, topic, stream, beside))
-            except NotEnoughDataError as error:
+            except (InputError, NotEnoughDataError) as error:
                 note(f"ground and gravity are not used: {topic}: {error}")
                 return ()
     sources = []
@@ -68,7 +70,9 @@ def _topics_by_frame(bag: PoseBag) -> Mapping[str, str]:
         topics = [topic for topic in bag.topics.values() if topic.type == wanted]
         for topic in sorted(topics, key=lambda topic: -topic.count):
             run = next(bag.runs([topic.name]), None)
-            if run is not None:
+            if run is None:
+                continue
+            with suppress(InputError):  # a damaged message
                 message = next(run._replace(messages=run.messages[:1]).decoded())
                 topics_of.setdefault(frame_name(message.header.frame_id), topic.name)
     return topics_of
@@ -89,7 +93,8 @@ def _track(bag: PoseBag, topic: str, stream: Trajectory, beside: Source) -> Vert
         force = message.linear_acceleration
         stamps_ns.append(ns_of(message.header.stamp))
         forces.append([force.x, force.y, force.z])
-    return gravity_from_accelerations(np.array(stamps_ns, dtype=np.int64), np.array(forces), stream)
+    stamps = np.array(stamps_ns, dtype=np.int64)
+    return gravity_from_accelerations(stamps, np.array(forces), stream)
 
 
 def _clouds(bag: PoseBag, topic: str) -> Iterator[tuple[int, FloatArray]]:

@@ -108,7 +108,7 @@ class VerticalPair:
         if not len(tracks[0]):
             return None
         basis, axes = _axes_of(tracks[0].ups)
-        streams = snapshot.unpaired
+        streams = snapshot.streams
         differences = _differences(*tracks, T, basis)
         slopes = _slopes(*tracks, streams, R, basis)
         is_good = _are_inliers(differences)
@@ -140,6 +140,7 @@ def _at_same_times(
 
     ``offset_s`` is added to the stamps of the child.
     """
+    child = child[np.argsort(child.stamps_ns, kind="stable")]
     stamps_ns = child.stamps_ns + round(offset_s * 1e9)
     after = np.clip(np.searchsorted(stamps_ns, parent.stamps_ns), 1, len(stamps_ns) - 1)
     differences = np.abs(stamps_ns[[after - 1, after]] - parent.stamps_ns)

@@ -145,8 +145,9 @@ def gravity_from_accelerations(
     margin_ns = int(_WINDOW_S / 10 * 1e9)
     first_ns = trajectory.stamps_ns[0] + margin_ns
     last_ns = trajectory.stamps_ns[-1] - margin_ns
-    inside = (stamps_ns > first_ns) & (stamps_ns < last_ns)
-    stamps_ns, forces = stamps_ns[inside], forces[inside]
+    is_used = (stamps_ns > first_ns) & (stamps_ns < last_ns) & np.isfinite(forces).all(axis=1)
+    stamps_ns = stamps_ns[is_used]
+    forces = forces[is_used]
     n_windows = 0
     if len(stamps_ns):
         n_windows = int((stamps_ns[-1] - stamps_ns[0]) * 1e-9 / _WINDOW_S)
