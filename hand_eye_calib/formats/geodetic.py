@@ -46,8 +46,8 @@ class LocalOrigin:
             self.geodetic = float(lat_rad[0]), float(lon_rad[0]), float(height_m[0])
         origin = np.array(self.geodetic)[:, None]
         from_origin = _earth_centred(lat_rad, lon_rad, height_m) - _earth_centred(*origin)
-        # These sums give the same bits for one position, as in live use, and for many positions. A
-        # matrix product does not.
+        # Product of vectors (N, 3) and axes (1, 3, 3). Sums give the same bits for one position, as in
+        # live use, and for many positions. A matrix product does not.
         terms = from_origin[:, :, None] * _axes(*origin[:2])
         return np.asarray(terms[:, 0] + terms[:, 1] + terms[:, 2])
 

@@ -579,10 +579,11 @@ class MountWatch:
             text = f"learning the noise: {monitor.seconds} of {TUNING.learning_s} s of motion"
         else:
             text = "the mount has not moved"
-            is_hidden = visible > SEEN_TARGETS * np.array(self._session.calibrator.config.targets)
-            if is_hidden.any():
-                hidden = axes_in_words([AXES[index] for index in np.flatnonzero(is_hidden)])
-                text += f"; {hidden} cannot be monitored with this motion"
+            # Axes along which only large shifts would be detected.
+            limits = SEEN_TARGETS * np.array(self._session.calibrator.config.targets)
+            axes = [AXES[index] for index in np.flatnonzero(visible > limits)]
+            if axes:
+                text += f"; {axes_in_words(axes)} cannot be monitored with this motion"
         visible = np.where(visible < change.UNKNOWN_FROM, visible, np.nan)
         shift = alarm.shift.axes if alarm else {}
         return MountState(

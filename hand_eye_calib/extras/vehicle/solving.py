@@ -118,6 +118,8 @@ class Drive:
         T. ``others`` are the unknowns except the pose.
         """
         clock_s, slip = others[:2]
+        # Over a length l with the speed v and the turn a, the slip angle is slip * v a / t with the
+        # duration t = l / v. So the axle slips to the side by l * slip * v a / t = slip * v^2 a.
         predicted = np.zeros(self.xi.shape)
         if self.model is None:
             axle = self.measured(T)

@@ -176,6 +176,7 @@ class RosbagsFile(Storage):
             self._repair = "the library for damaged mcap files, 'pip install mcap'"
         reader.open()
         opened.callback(reader.close)
+        # rosbags reads only the messages in the index of an mcap file, so it must be complete.
         if suffix == ".mcap":
             n_indexed = sum(sum(chunk.channel_count.values()) for chunk in reader.storage.chunks)
             if n_indexed != reader.message_count:

@@ -116,7 +116,7 @@ _ORIENTED = re.compile(
 # Parts of names that indicate a position.
 _PLACED = re.compile(r"(^|[^a-z])(pos(?!e)|loc|trans|coord|north|east|utm)")
 
-# Names of units, with a slash between words.
+# Names of each unit, with a slash between words.
 _UNIT_NAMES = {
     "m": "m metre metres meter meters",
     "mm": "mm",

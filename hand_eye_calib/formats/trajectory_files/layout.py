@@ -423,8 +423,8 @@ def _with_named_columns(layout: Layout, names: tuple[str, ...], is_separated: bo
 
 # ---- numbers without names
 
-# Numbers of columns that several kinds of data have: x y z with a stamp or a quaternion alone; a
-# pose without a stamp, or a stamp with position and angles.
+# Numbers of columns for which several kinds of data are possible. 4: a position with a stamp, or a
+# quaternion. 7: a pose without a stamp, or a stamp with a position and three angles.
 _AMBIGUOUS_COUNTS = (4, 7)
 
 

@@ -256,6 +256,7 @@ def _in_si(table: Table, names: Sequence[str], kind: str) -> FloatArray:
         )
     if units:
         return values * factors[units.pop()]
+    # The first two units are those of columns without a unit.
     first, second, *_ = factors
     largest = float(magnitudes.max())
     unit = second if largest > largest_of_first else first
