@@ -46,8 +46,8 @@ class LocalOrigin:
             self.geodetic = float(lat_rad[0]), float(lon_rad[0]), float(height_m[0])
         origin = np.array(self.geodetic)[:, None]
         from_origin = _earth_centred(lat_rad, lon_rad, height_m) - _earth_centred(*origin)
-        # Product of vectors (N, 3) and axes (1, 3, 3). Sums give the same bits for one position, as in
-        # live use, and for many positions. A matrix product does not.
+        # Product of vectors (N, 3) and axes (1, 3, 3). Sums give the same bits for one position (in
+        # live use) and for many positions. A matrix product does not.
         terms = from_origin[:, :, None] * _axes(*origin[:2])
         return np.asarray(terms[:, 0] + terms[:, 1] + terms[:, 2])
 
@@ -77,7 +77,7 @@ def axes_of_places(positions: FloatArray) -> FloatArray:
 
 
 def rotations_to_first(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:
-    """Return the rotations (N, 3, 3) from the axes at each position to those at the first position.
+    """Return the rotations (N, 3, 3) from the axes at each position to the axes at the first one.
 
     The axes are east, north and up.
     """
