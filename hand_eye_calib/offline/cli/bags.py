@@ -268,8 +268,8 @@ def read_journal_of(directory: Path, options: Options) -> Recording:
     with waiting_for(f"reading {directory}"):
         journal = read_journal(directory)
         session = journal.about["parent"]
-        # The session may be of an earlier version. Skip options that no longer exist, unless they
-        # were set.
+        # The session may be of an earlier version. Skip an option that no longer exists if its
+        # value is empty; any other value is an error.
         before = {
             name: value
             for name, value in session.get("options", {}).items()

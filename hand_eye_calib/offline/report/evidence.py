@@ -141,6 +141,7 @@ def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
     settled = replace(config, time_offset=calibration.time_offset_s)
     pose_pairs = replace(snapshot, config=settled).pose_pairs.child_scaled(calibration.scale)
     parent_is_positions = config.parent_measures == "positions"
+    # Pairs for the excitation, which is computed from the first sensor's orientations.
     oriented = pose_pairs
     if parent_is_positions:
         oriented = PosePairs(pose_pairs.stamps_ns, pose_pairs.Ts_cw_c, pose_pairs.Ts_pw_p)

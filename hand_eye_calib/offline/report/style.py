@@ -51,7 +51,8 @@ class Look(NamedTuple):
     axis_share : float
         Length of a sensor's axes as a share of the distance between the sensors.
     min_distance_m : float
-        Distance between the sensors (m) that is used for a smaller one in the length of the axes.
+        Smallest distance (m) in the length of the axes: sensors that are nearer have axes as if
+        they had this distance.
     object_m : float
         Distance of the object for which the error of its position is stated (m).
     near_object_m : float

@@ -406,10 +406,10 @@ class Goal:
 
 
 def _own_faults(calibration: Calibration) -> list[str]:
-    """Return the findings of a result that make it unusable.
+    """Return the findings that make a result unusable, one sentence each.
 
-    Only results from positions, rotations or rates contain findings. For poses, the stream checks
-    have them.
+    They are needed for positions, rotations and rates. For poses, the caller of :meth:`Goal.add`
+    passes the findings of the stream checks.
     """
     return [
         reason.sentence
