@@ -7,7 +7,7 @@ from typing import Any
 
 from hand_eye_calib.core.base.text import ABOUT, amount, axes_in_words, listing, two_digits
 from hand_eye_calib.core.results.parts import Part
-from hand_eye_calib.core.results.records import AXES
+from hand_eye_calib.core.results.records import AXES, DofVerdict
 from hand_eye_calib.core.results.verdict import Ground, target_of
 
 #: An injected error is contradicted above this many standard deviations: textbook, 1 of 370.
@@ -103,6 +103,9 @@ def find_undetectable(result: Any) -> Iterator[Ground]:
     """Yield a ground if a control error on some axes is not found in the recording."""
     detectability = result.parts.get("detectability")
     if detectability is None:
+        return
+    if any(dof.verdict is DofVerdict.PRIOR for dof in result.observability_measured):
+        # A prior or the ground determines more than the motion can contradict.
         return
     sizes = {}
     promises = {}
