@@ -285,16 +285,16 @@ def _updated(calibration: Calibration, measurement: Measurement, gain: FloatArra
     sigmas = sigmas_in_parent(se3.rotation_of(T), covariance)
     totals = np.hypot(sigmas, sigmas_in_parent(se3.rotation_of(T), allowance))
     dofs = []
-    for before, before_total, sigma, total in zip(
+    for of_motion, motion_total, sigma, total in zip(
         calibration.observability_measured, calibration.sigmas, sigmas.tolist(), totals, strict=True
     ):
-        dof = judged(before.name, sigma)
-        if dof.verdict is DofVerdict.UNOBSERVABLE and np.isfinite(before.sigma):
-            dof = before  # an unknown direction that has turned slightly with the child
-        if dof.verdict is not DofVerdict.UNOBSERVABLE and 2 * total**2 < before_total**2:
+        dof = judged(of_motion.name, sigma)
+        if dof.verdict is DofVerdict.UNOBSERVABLE and np.isfinite(of_motion.sigma):
+            dof = of_motion  # an unknown direction that has turned slightly with the child
+        if dof.verdict is not DofVerdict.UNOBSERVABLE and 2 * total**2 < motion_total**2:
             dof = replace(dof, verdict=DofVerdict.PRIOR)
-        elif before.verdict is DofVerdict.PRIOR:
-            dof = replace(dof, verdict=before.verdict)
+        elif of_motion.verdict is DofVerdict.PRIOR:
+            dof = replace(dof, verdict=of_motion.verdict)
         dofs.append(dof)
     updated = replace(
         calibration,

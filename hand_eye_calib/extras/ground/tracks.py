@@ -153,28 +153,37 @@ def gravity_from_accelerations(
         n_windows = int((stamps_ns[-1] - stamps_ns[0]) * 1e-9 / _WINDOW_S)
     if n_windows < 3:
         raise NotEnoughDataError("accelerations and poses overlap for less than 15 s")
-    rotations = se3.rotation_of(trajectory.at(stamps_ns, extrapolate=True))
-    in_world = np.einsum("nij,nj->ni", rotations, forces)
-    verticals = []
-    middles_ns = []
-    for rows in np.array_split(np.arange(len(stamps_ns)), n_windows):
-        ends_ns = stamps_ns[rows[[0, -1]]]
-        duration_s = (ends_ns[1] - ends_ns[0]) * 1e-9
-        gain = np.diff(_velocities(trajectory, ends_ns), axis=0)[0]
-        verticals.append(in_world[rows].mean(axis=0) - gain / duration_s)
-        middles_ns.append(ends_ns.sum() // 2)
-    lengths = np.linalg.norm(verticals, axis=1)
-    if abs(median(lengths) - g) > g / 20:
+    middles_ns, verticals = _verticals_of_windows(stamps_ns, forces, trajectory, n_windows)
+    length = median(np.linalg.norm(verticals, axis=1))
+    if abs(length - g) > g / 20:
         raise NotEnoughDataError(
-            f"the mean acceleration is {median(lengths):.2f} m/s^2, not that of gravity"
+            f"the mean acceleration is {length:.2f} m/s^2, not that of gravity"
         )
     # The vertical of the world drifts slowly: it is interpolated between the windows.
     stamps = trajectory.stamps_ns
     stamps = stamps[(stamps >= middles_ns[0]) & (stamps <= middles_ns[-1])]
     since_s = (stamps - middles_ns[0]) * 1e-9
-    middles_s = (np.array(middles_ns) - middles_ns[0]) * 1e-9
-    columns = [np.interp(since_s, middles_s, column) for column in np.transpose(verticals)]
+    middles_s = (middles_ns - middles_ns[0]) * 1e-9
+    columns = [np.interp(since_s, middles_s, column) for column in verticals.T]
     return _in_sensor(trajectory, stamps, np.column_stack(columns))
+
+
+def _verticals_of_windows(
+    stamps_ns: IntArray, forces: FloatArray, trajectory: Trajectory, n_windows: int
+) -> tuple[IntArray, FloatArray]:
+    """Return the middles (W,) of windows, and mean forces (W, 3) of gravity in the world."""
+    rotations = se3.rotation_of(trajectory.at(stamps_ns, extrapolate=True))
+    in_world = np.einsum("nij,nj->ni", rotations, forces)
+    middles_ns = []
+    verticals = []
+    for rows in np.array_split(np.arange(len(stamps_ns)), n_windows):
+        ends_ns = stamps_ns[rows[[0, -1]]]
+        duration_s = (ends_ns[1] - ends_ns[0]) * 1e-9
+        velocities = _velocities(trajectory, ends_ns)
+        acceleration = (velocities[1] - velocities[0]) / duration_s
+        verticals.append(in_world[rows].mean(axis=0) - acceleration)
+        middles_ns.append(ends_ns.sum() // 2)
+    return np.array(middles_ns, dtype=np.int64), np.array(verticals)
 
 
 def gravity_from_attitude(trajectory: Trajectory) -> VerticalTrack:

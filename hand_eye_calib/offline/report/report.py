@@ -51,7 +51,7 @@ _WORDS = {
     "observed": "determined by the motion",
     "weak": "determined, but not well",
     "unobservable": "do not use this value",
-    "prior": "mostly from the prior",
+    "prior": "mostly from a prior or the ground",
 }
 _AXIS_NAMES = {
     "x": "along x",
