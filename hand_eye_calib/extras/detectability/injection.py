@@ -51,6 +51,11 @@ _LEAST_SECONDS = 2 * _JACKKNIFE_BLOCKS[0]
 # Times of a shift of the mount, as shares of the recording.
 _MIDDLE = (0.35, 0.65)
 
+# Factor of the smallest shifts. The stream check estimates its noise anew, so a shift has less
+# weight than in the linear evidence. Of shifts of the stated size, this share is found in fresh
+# draws of 30 simulated drives: 68 % with a factor of 1.5, 91 % with 2, 93 % with 2.5.
+_LOSS_OF_WEIGHT = 2.0
+
 # Time (s) between a pose and those that its velocity is the difference of.
 _VELOCITY_STEP_S = 0.1
 
@@ -179,9 +184,8 @@ def _smallest_errors(
             sigmas = np.maximum(sigmas, np.sqrt(np.diag(turn @ covariance @ turn.T)))
     differences = _differences_of_halves(blocks, columns) @ turn.T
     thresholds = SIGMAS * np.hypot(2.0 * sigmas, allowance[columns])
-    # An error of either sign.
-    both_signs = np.concatenate([differences, -differences])
-    found_from = np.quantile(thresholds + both_signs, FOUND_SHARE, axis=0)
+    # A trial finds an error of either sign.
+    found_from = np.quantile(thresholds + np.abs(differences), FOUND_SHARE, axis=0)
     return np.asarray(found_from)
 
 
@@ -233,4 +237,4 @@ def _smallest_shifts(blocks: Blocks, R: FloatArray) -> FloatArray:
     # squares a^2 +- 2 mixed a = threshold
     roots = np.sqrt(np.maximum(mixed**2 + squares * threshold[:, None], 0.0))
     sizes = np.concatenate([roots - mixed, roots + mixed]) / np.concatenate([squares, squares])
-    return np.asarray(np.quantile(np.maximum(sizes, 0.0), FOUND_SHARE, axis=0))
+    return _LOSS_OF_WEIGHT * np.asarray(np.quantile(np.maximum(sizes, 0.0), FOUND_SHARE, axis=0))

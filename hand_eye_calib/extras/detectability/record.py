@@ -15,8 +15,9 @@ SIGMAS = 3.0
 
 #: Share of the trials in which an error must be found.
 FOUND_SHARE = 0.9
-# Number of standard deviations above which a normal variable is in 1 - FOUND_SHARE of all cases.
-_SIGMAS_OF_SHARE = 1.2816
+# Number of standard deviations that the size of a normal variable exceeds in 1 - FOUND_SHARE of all
+# cases.
+_SIGMAS_OF_SHARE = 1.645
 
 # Size of the control error, as a multiple of the error that the standard deviation makes
 # detectable. The largest ratio of 60 simulated recordings without faults is 2.4.
