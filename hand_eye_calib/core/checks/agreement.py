@@ -1,11 +1,16 @@
 """Checks of two streams that agree, on one clock and in one unit of length.
 
-They detect faults that explain little of the motion and yet bias the extrinsic.
+They detect faults that explain little of the motion and yet bias the extrinsic X. The sizes of
+faults are coefficients of the regressions in :mod:`~hand_eye_calib.core.checks.fault_regression`,
+which also explains regressor, group and bias by noise. Two regressions are used:
+
+- ``slow``, over motions of some seconds: scales, gains, worlds that are turned or drift;
+- ``fast``, over motions of one second: delays and smoothing.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,18 +19,16 @@ from hand_eye_calib.core.assessment.moved import SIGNIFICANT, MountChange, find_
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.stats import median, quantile
 from hand_eye_calib.core.base.text import angle, length, listing
+from hand_eye_calib.core.checks.fault_regression import (
+    Regression,
+    delay_regression,
+    motion_regression,
+)
 from hand_eye_calib.core.checks.findings import LIMITS, Finding, Severity, finding, graded
-from hand_eye_calib.core.checks.response import Regression, delays, response
 from hand_eye_calib.core.checks.stream_pair import MAX_ROTATION_RAD, MIN_PAIRS
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
 from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
-
-#: X (4, 4) and its standard deviations (6,), (rho, phi).
-Known: TypeAlias = tuple[FloatArray, FloatArray]
-
-# Share of the squared residuals that a fault explains, and its finding if it is significant.
-Suspect: TypeAlias = tuple[float, Finding | None]
 
 _STREAMS = ("child", "parent")
 
@@ -35,77 +38,100 @@ BIASES = 2.0
 
 # Drift of an odometry along one axis, as a share of the distance. On a flat floor this drift is
 # the whole motion along z, and the other stream does not contain it.
-_DRIFT = 0.02
+_DRIFT_SHARE = 0.02
 
-# Two frames are one frame if their distance is below this (m) or within its noise.
+# Two frames are called one frame if their distance is below this (m), or within its noise.
 _SAME_M = 0.005
-# Largest angle (rad) of axes that are parallel, unless its noise is larger.
+# Largest angle (rad) between axes that are called parallel, unless its noise is larger.
 SAME_RAD = float(np.radians(0.3))
-# Largest standard deviation of the rotation (rad) with which frames are compared.
+# Frames are compared only if the standard deviation of their rotation (rad) is at most this.
 MAX_SIGMA_RAD = float(np.radians(0.5))
-# Standard deviations within which a distance or an angle may be zero.
-_WITHIN = 3.0
+# A distance or an angle may be zero if it is below this number of standard deviations.
+_ZERO_SIGMAS = 3.0
 
-# Upper bounds of a lever arm (m), two standard deviations above its length. No two sensors with
-# different orientations are closer than this:
+# Upper bounds of a lever arm (m), two standard deviations above its length. Below the first one,
+# two sensors with different orientations are called one place: no two sensors are closer.
 _SAME_POSITION_M = 0.002
-# Hardly two sensors are mounted closer than this:
+# Below this bound the finding is a warning: hardly two sensors are mounted closer.
 _NEARLY_M = 0.012
-# The same if their axes are parallel, which is no accident:
+# The same bound for sensors with parallel axes, which are no accident.
 _PARALLEL_M = 0.03
 
-# A recording is split at these shares of its poses.
+# Shares of the poses before the time at which a recording is split in two.
 _SPLITS = (0.5, 0.25, 0.75)
-# A part of it is sound if its own rotation leaves less than this share of its rotations.
+# Largest share of its rotations that the extrinsic rotation of a sound part leaves unexplained.
 _SOUND_PART = 0.25
-# The part has other axes if the rotation of the other part leaves more than this share.
+# A part has other axes than the other part if the other part's extrinsic rotation leaves more than
+# this share of its rotations unexplained.
 _OTHER_PART = 0.5
 
-# Fewest rotation about an axis, root mean square, relative to the main axis, for which a gain is
-# estimated.
-_LITTLE = 0.1
+# Gains are estimated about axes with at least this share of the rotation (root mean square) about
+# the main axis.
+_MIN_ROTATION_SHARE = 0.1
 
-# Smallest factor of a coordinate whose inverse is stated. Smaller ones are noise.
-_LEAST_FACTOR = 1e-3
+# A coordinate explains why streams disagree if it removes more than this share of the squared
+# residuals.
+_EXPLAINING_SHARE = 0.3
+# A fault that explains at most this share is no error: jumps of a clean recording may cause it.
+_ERROR_SHARE = 0.1
 
-# A coordinate explains why streams disagree if it removes this share of the squared residuals.
-_MOST = 0.3
-# Below this share jumps of a clean recording may be the cause, and the finding is no error.
-_SOME = 0.1
-
-# Duration (s) and largest number of motions in which delays and smoothing are estimated.
+# Duration (s) and largest number of the motions in which delays and smoothing are estimated.
 SHORT_S = 1.0
-MOST_SHORT = 6000
-# Smallest delay (s): streams of vehicles without faults differ by some milliseconds.
-_DELAY_S = 2.5 * FLOOR_TRAVEL_S
-# A delay is an error from this multiple of the smallest one on.
-_GRAVE = 2.0
-# Share of the significance that a delay needs if it equals the clock offset.
-_EXPECTED = 2.0 / 3.0
-# A delay is an error, whatever explains it, above this time (s) and this many standard deviations,
-# if its shift is an error or exceeds this distance (m) and this share of the evidence. The largest
+_MAX_SHORT_MOTIONS = 6000
+# Smallest delay (s) that is reported: streams of vehicles without faults differ by some
+# milliseconds.
+_MIN_DELAY_S = 2.5 * FLOOR_TRAVEL_S
+# Smallest delay (s) that is an error.
+_ERROR_DELAY_S = 2.0 * _MIN_DELAY_S
+# Factor of the standard deviation of a delay that equals the clock offset: such a delay is
+# expected, so that less evidence suffices.
+_EXPECTED_SIGMA_SHARE = 2.0 / 3.0
+# A delay is always an error if it exceeds this time (s), this number of standard deviations, and
+# either the error limit of the shift, or the shift (m) and the explained share below. The largest
 # delays in 81 clean recordings are 33 ms, 38 mm and a share of 0.06 (EuRoC).
-_PLAIN_S = 0.04
-_PLAIN_SIGMAS = 8.0
-_PLAIN_SHIFT_M = 0.02
-_PLAIN_SHARE = 0.35
-# Factor that lifts a size just above the limit of an error.
-_ERROR = 1.001
+_ALWAYS_ERROR_S = 0.04
+_ALWAYS_ERROR_SIGMAS = 8.0
+_ALWAYS_ERROR_SHIFT_M = 0.02
+_ALWAYS_ERROR_SHARE = 0.35
+# Factor that lifts a size just above the limit of errors.
+_JUST_ABOVE = 1.001
 
-# Smallest smoothing (s^2) of each part of the poses.
-_SMOOTHING_S2 = {"positions": 0.003, "orientations": 0.002}
-# Smoothing by interpolation, as a share of the squared interval between poses.
-_OF_INTERVAL = 0.25
+# Smallest smoothing (s^2) that is reported, of positions and of orientations.
+_MIN_SMOOTHING_S2 = {"positions": 0.003, "orientations": 0.002}
+# Smoothing that interpolation of poses causes, as a share of the squared interval between poses.
+_INTERPOLATION_SHARE = 0.25
+
+
+class ExtrinsicEstimate(NamedTuple):
+    """Extrinsic X (4, 4), and its standard deviations (6,): translation in m, rotation in rad."""
+
+    T_parent_child: FloatArray
+    sigmas: FloatArray
+
+
+class Suspect(NamedTuple):
+    """A possible fault: the share of the squared residuals that it explains, and its finding.
+
+    The finding is None if the fault is not significant.
+    """
+
+    explained_share: float
+    finding: Finding | None
 
 
 def check_agreement(
-    pose_pairs: PosePairs, motions: MotionPairs, X: FloatArray, known: Known, offset_s: float
+    pose_pairs: PosePairs,
+    motions: MotionPairs,
+    X: FloatArray,
+    best: ExtrinsicEstimate,
+    offset_s: float,
 ) -> list[Finding]:
-    """Return the finding about two streams that agree, or none.
+    """Return the finding about a fault of two streams that agree, or none.
 
-    One fault affects several groups of columns. The group that explains most names the fault, if
-    it is significant. Odometries drift against each other, and a drift resembles a shift of the
-    mount, worlds that are turned, or a scale of one axis.
+    One fault changes the residuals of several groups. The group that explains most names the
+    fault, and the fault is reported if it is significant. If a drift between the odometries
+    explains most, a shift of the mount, turned worlds or a scale of one axis are not reported:
+    they resemble a drift.
 
     Parameters
     ----------
@@ -115,116 +141,123 @@ def check_agreement(
         Motions over some seconds.
     X : (4, 4) array
         Extrinsic fitted to these motions.
-    known : ((4, 4) array, (6,) array)
-        Best estimate of X, and its standard deviations.
+    best : ExtrinsicEstimate
+        Most certain estimate of X, from any source.
     offset_s : float
-        Clock offset that the orientations have shown, s.
+        Clock offset of the orientations, s.
     """
-    if same := check_same(*known):
+    if same := check_same(best):
         return same
+    speed_m_s = usual_speed(pose_pairs.stamps_ns, se3.translation_of(pose_pairs.Ts_pw_p))
+    suspects = _slow_suspects(pose_pairs, motions, X, speed_m_s)
+    short_motions = pairs_over(pose_pairs, SHORT_S, _MAX_SHORT_MOTIONS)
+    if fast := delay_regression(pose_pairs, short_motions, X):
+        suspects += delay_suspects(fast, pose_pairs, speed_m_s, offset_s)
+        interval_s = median(np.diff(pose_pairs.stamps_ns)) * 1e-9
+        suspects += smoothing_suspects(fast, interval_s, speed_m_s)
+    largest_share = 0.0
+    findings: list[Finding] = []
+    for suspect in suspects:
+        if suspect.finding and suspect.explained_share > largest_share:
+            largest_share = suspect.explained_share
+            findings = [suspect.finding]
+    return findings
+
+
+def _slow_suspects(
+    pose_pairs: PosePairs, motions: MotionPairs, X: FloatArray, speed_m_s: float
+) -> list[Suspect]:
+    """Return the fault that explains most of the motions over some seconds.
+
+    If it is a rotation between positions and orientations, all three such faults are returned:
+    they explain about the same, and any of them may be significant.
+    """
     change = find_change(pose_pairs, X)
-    slow, axes = response(pose_pairs, motions, X, change.at_ns if change else None)
-    speed = usual_speed(pose_pairs.stamps_ns, se3.translation_of(pose_pairs.Ts_pw_p))
-    tried: dict[str, Callable[[], Finding | None]] = {
-        "drift": lambda: _world_drift(slow, pose_pairs, speed),
+    slow, axes = motion_regression(pose_pairs, motions, X, change.at_ns if change else None)
+    checks: dict[str, Callable[[], Finding | None]] = {
+        "drift": lambda: _world_drift(slow, pose_pairs, speed_m_s),
         "gain": lambda: rotation_gain(slow, axes),
-        "turned_child": lambda: _turned(slow, "child"),
-        "turned_parent": lambda: _turned(slow, "parent"),
-        "turned_both": lambda: _turned(slow, "both"),
+        "turned_child": lambda: _turned_world(slow, "child"),
+        "turned_parent": lambda: _turned_world(slow, "parent"),
+        "turned_both": lambda: _turned_world(slow, "both"),
         "axes_child": lambda: axis_gain(slow, "child"),
         "axes_parent": lambda: axis_gain(slow, "parent"),
     }
     if change:
-        tried["moved"] = lambda: moved_mount(change, int(pose_pairs.stamps_ns[0]))
-    groups = [max(tried, key=slow.share)]
+        checks["moved"] = lambda: moved_mount(change, int(pose_pairs.stamps_ns[0]))
+    groups = [max(checks, key=slow.explained_share)]
     if groups[0].startswith("turned"):
-        # Streams that are turned explain about the same: any of them may be significant.
         groups = ["turned_child", "turned_parent", "turned_both"]
-    suspects: list[Suspect] = [(slow.share(group), tried[group]()) for group in groups]
-    motions = pairs_over(pose_pairs, SHORT_S, MOST_SHORT)
-    if fast := delays(pose_pairs, motions, X):
-        suspects += delay_suspects(fast, pose_pairs, speed, offset_s)
-        interval_s = median(np.diff(pose_pairs.stamps_ns)) * 1e-9
-        suspects += smoothing_suspects(fast, interval_s, speed)
-    largest_share = 0.0
-    findings: list[Finding] = []
-    for share, suspect in suspects:
-        if suspect and share > largest_share:
-            largest_share = share
-            findings = [suspect]
-    return findings
+    return [Suspect(slow.explained_share(group), checks[group]()) for group in groups]
 
 
 def check_coordinates(pose_pairs: PosePairs, motions: MotionPairs) -> list[Finding]:
     """Return the finding about a coordinate that explains why two streams disagree, or none.
 
-    Both streams have the same rotations.
+    The rotations of both streams must agree.
     """
     X = se3.from_rotation_translation(align_rotation_vectors(motions), np.zeros(3))
-    slow, _ = response(pose_pairs, motions, X)
-    stream = max(_STREAMS, key=lambda name: slow.share(f"axes_{name}"))
-    if slow.share(f"axes_{stream}") <= _MOST:
+    slow, _ = motion_regression(pose_pairs, motions, X)
+    stream = max(_STREAMS, key=lambda name: slow.explained_share(f"axes_{name}"))
+    if slow.explained_share(f"axes_{stream}") <= _EXPLAINING_SHARE:
         return []
     gain = axis_gain(slow, stream)
     return [gain] if gain else []
 
 
-def check_parts(pose_pairs: PosePairs) -> list[Finding]:
-    """Return the finding about parts of a recording whose extrinsic rotations differ, or none.
+def check_turned_parts(pose_pairs: PosePairs) -> list[Finding]:
+    """Return the finding that the extrinsic rotation differs between two parts, or none.
 
-    A stream that starts anew with other axes leaves two sound parts. The noise model follows one
-    of them and rejects the other as outliers.
+    A stream that starts anew with other axes leaves two sound parts of a recording. The noise model
+    follows one part and rejects the other as outliers.
     """
-    motions = pairs_over(pose_pairs, SHORT_S, MOST_SHORT)
+    motions = pairs_over(pose_pairs, SHORT_S, _MAX_SHORT_MOTIONS)
     angles = se3.rotation_angle(se3.rotation_of(motions.Ts_parenti_parentj))
     motions = motions[angles < MAX_ROTATION_RAD]
     for share in _SPLITS:
         split = int(share * len(pose_pairs))
-        parts = [motions[motions.j < split], motions[motions.i >= split]]
+        parts = (motions[motions.j < split], motions[motions.i >= split])
         if min(map(len, parts)) < MIN_PAIRS:
             continue
-        own = [
+        first, second = (
             se3.from_rotation_translation(align_rotation_vectors(part), np.zeros(3))
             for part in parts
-        ]
-        shares = np.array([[_unexplained(part, X) for X in own] for part in parts])
-        of_own = shares.diagonal().max()
-        of_other = min(shares[0, 1], shares[1, 0])
-        if of_own < _SOUND_PART and of_other > max(_OTHER_PART, 3.0 * of_own):
-            turned_rad = float(
-                se3.rotation_angle(se3.rotation_of(own[0]).T @ se3.rotation_of(own[1]))
-            )
-            at_s = float(pose_pairs.stamps_ns[split] - pose_pairs.stamps_ns[0]) * 1e-9
-            size = angle(turned_rad)
-            return [finding("parts_turned", size=size, at_s=at_s, turned_rad=turned_rad)]
+        )
+        by_own = max(_unexplained(parts[0], first), _unexplained(parts[1], second))
+        by_other = min(_unexplained(parts[0], second), _unexplained(parts[1], first))
+        if by_own >= _SOUND_PART or by_other <= max(_OTHER_PART, 3.0 * by_own):
+            continue
+        between = se3.rotation_of(first).T @ se3.rotation_of(second)
+        turned_rad = float(se3.rotation_angle(between))
+        at_s = float(pose_pairs.stamps_ns[split] - pose_pairs.stamps_ns[0]) * 1e-9
+        size = angle(turned_rad)
+        return [finding("parts_turned", size=size, at_s=at_s, turned_rad=turned_rad)]
     return []
 
 
 def _unexplained(motions: MotionPairs, X: FloatArray) -> float:
-    """Return the share that an extrinsic X (4, 4) does not explain of the largest rotations.
+    """Return the share of the rotations that an extrinsic X (4, 4) leaves unexplained.
 
-    The largest rotations are the upper quarter.
+    It is the median residual of the largest quarter of the rotations, divided by their median.
     """
     angles = se3.rotation_angle(se3.rotation_of(motions.Ts_parenti_parentj))
     are_large = angles >= quantile(angles, 0.75)
     _, residuals = motions.residuals(X)
-    remaining = np.linalg.norm(residuals[are_large], axis=1)
-    return median(remaining) / max(median(angles[are_large]), 1e-12)
+    residual_lengths = np.linalg.norm(residuals[are_large], axis=1)
+    return median(residual_lengths) / max(median(angles[are_large]), 1e-12)
 
 
-def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
-    """Return the finding about an extrinsic (4, 4), or its translation, of zero, or none.
-
-    ``sigmas`` (6,) are its standard deviations, m and rad.
-    """
-    distance_m = float(np.linalg.norm(se3.translation_of(T_parent_child)))
-    sigma_m = float(sigmas[:3].max())
+def check_same(extrinsic: ExtrinsicEstimate) -> list[Finding]:
+    """Return the finding about an extrinsic, or its translation, of zero, or none."""
+    sigma_m = float(extrinsic.sigmas[:3].max())
+    sigma_rad = float(extrinsic.sigmas[3:].max())
+    distance_m = float(np.linalg.norm(se3.translation_of(extrinsic.T_parent_child)))
     upper_m = distance_m + 2 * sigma_m
-    angle_rad = float(se3.rotation_angle(se3.rotation_of(T_parent_child)))
-    is_parallel = angle_rad < max(SAME_RAD, _WITHIN * sigmas[3:].max())
-    may_be_zero = distance_m < _WITHIN * sigma_m
+    angle_rad = float(se3.rotation_angle(se3.rotation_of(extrinsic.T_parent_child)))
+    is_parallel = angle_rad < max(SAME_RAD, _ZERO_SIGMAS * sigma_rad)
+    may_be_zero = distance_m < _ZERO_SIGMAS * sigma_m
     near_m = _PARALLEL_M if is_parallel or may_be_zero else _NEARLY_M
-    if upper_m > near_m or sigmas[3:].max() > MAX_SIGMA_RAD:
+    if upper_m > near_m or sigma_rad > MAX_SIGMA_RAD:
         return []
     if is_parallel:
         key = "same_frame"
@@ -238,50 +271,44 @@ def check_same(T_parent_child: FloatArray, sigmas: FloatArray) -> list[Finding]:
     return [finding(key, "both", severity, size=size, translation_m=distance_m)]
 
 
-def rotation_gain(slow: Regression, axes: FloatArray, inverse: bool = False) -> Finding | None:
+def rotation_gain(slow: Regression, axes: FloatArray) -> Finding | None:
     """Return the finding about a gain of the child's rotations about an axis, or None.
 
-    Parameters
-    ----------
-    slow : Regression
-        Regression with the columns "gain".
-    axes : (3, 3) array
-        Principal axes of rotation in the parent sensor's frame, one a column, the main axis first.
-    inverse : bool
-        Whether the gains are those of the parent's rotations.
+    ``axes`` (3, 3) has the principal axes of rotation in its columns, in the parent sensor's frame,
+    the main axis first.
     """
     gains, sigmas = slow.fit("gain")
     biases = slow.biases("gain")
     limits = LIMITS["rotation_gain"]
     noise = np.maximum(limits.sigmas * sigmas, BIASES * biases)
     ratios = np.abs(gains) / np.maximum(noise, limits.note)
-    # A bias is in inverse proportion to the squared rotation about its axis. Axes with less than
-    # _LITTLE of the rotation about the main axis (the first) are skipped.
-    ratios = np.where(biases < biases[0] / _LITTLE**2, ratios, 0.0)
+    # A bias is in inverse proportion to the squared rotation about its axis. Axes with too little
+    # rotation, compared with the main axis (the first), are skipped.
+    ratios = np.where(biases < biases[0] / _MIN_ROTATION_SHARE**2, ratios, 0.0)
     k = int(np.argmax(ratios))
     if ratios[k] < 1.0:
         return None
     axis = ", ".join(f"{component:.2f}" for component in axes[:, k])
-    gain = 1.0 / (1.0 + gains[k]) - 1.0 if inverse else gains[k]
-    values = {"axis": axis, "gain": 1.0 + gain, "sigma": sigmas[k]}
-    return graded("rotation_gain", "child", gain, **values)
+    values = {"axis": axis, "gain": 1.0 + gains[k], "sigma": sigmas[k]}
+    return graded("rotation_gain", "child", gains[k], **values)
 
 
-def _turned(slow: Regression, stream: str) -> Finding | None:
+def _turned_world(slow: Regression, stream: str) -> Finding | None:
     """Return the finding about positions turned against the orientations of a stream, or None."""
-    turns, sigmas = slow.fit(f"turned_{stream}")
-    sizes = np.abs(turns)
+    rotation_vector, sigmas = slow.fit(f"turned_{stream}")
+    angles_rad = np.abs(rotation_vector)
     limits = LIMITS["worlds_turned"]
     noise = np.hypot(limits.sigmas * sigmas, BIASES * slow.biases(f"turned_{stream}"))
-    if (sizes < noise).all() or sizes.max() < limits.note:
+    if (angles_rad < noise).all() or angles_rad.max() < limits.note:
         return None
-    turned_rad = float(np.linalg.norm(sizes))
-    values = {"axis": "xyz"[int(np.argmax(sizes))], "turned_deg": float(np.degrees(turned_rad))}
-    return graded("worlds_turned", stream, turned_rad, **values)
+    turned_rad = float(np.linalg.norm(angles_rad))
+    axis = "xyz"[int(np.argmax(angles_rad))]
+    turned_deg = float(np.degrees(turned_rad))
+    return graded("worlds_turned", stream, turned_rad, axis=axis, turned_deg=turned_deg)
 
 
 class _Deviation(NamedTuple):
-    """Deviation of the value on one of three axes from the mean of the others."""
+    """Deviation of the value on one of three axes from the mean on the other two axes."""
 
     axis: int
     size: float
@@ -289,7 +316,10 @@ class _Deviation(NamedTuple):
 
 
 def largest_deviation(values: FloatArray, sigmas: FloatArray) -> _Deviation:
-    """Return the most significant deviation among three values (3,) that should be equal."""
+    """Return the most significant deviation among values (3,) that should be equal on all axes.
+
+    ``sigmas`` (3,) are the standard deviations of the values.
+    """
     largest = _Deviation(0, 0.0, 1.0)
     weights = 1.0 / np.maximum(sigmas, 1e-9) ** 2
     for axis in range(3):
@@ -303,31 +333,22 @@ def largest_deviation(values: FloatArray, sigmas: FloatArray) -> _Deviation:
     return largest
 
 
-def axis_gain(slow: Regression, columns_of: str, stream: str = "") -> Finding | None:
+def axis_gain(slow: Regression, stream: str) -> Finding | None:
     """Return the finding about a coordinate with another scale than the others, or None.
 
-    Parameters
-    ----------
-    slow : Regression
-    columns_of : str
-        The stream ("parent" or "child") whose coordinates the columns scale.
-    stream : str
-        The stream that the finding names, if it is the other one. Its factor is the inverse.
+    ``stream`` is "parent" or "child": the stream with this coordinate.
     """
-    group = f"axes_{columns_of}"
+    group = f"axes_{stream}"
     gain = largest_deviation(*slow.fit(group))
     of_noise = slow.biases(group)[gain.axis]
-    of_drift = _DRIFT**2 * of_noise / slow.biases("scale")[0]
+    of_drift = _DRIFT_SHARE**2 * of_noise / slow.biases("scale")[0]
     if abs(gain.size) < BIASES * (of_noise + of_drift):
         return None
     size = gain.size
-    if slow.share(group) <= _SOME:
+    if slow.explained_share(group) <= _ERROR_SHARE:
         size = min(abs(size), LIMITS["axis_scale"].error)
-    factor = 1.0 + gain.size
-    if stream not in ("", columns_of):
-        factor = 1.0 / max(factor, _LEAST_FACTOR)
-    values = {"axis": "xyz"[gain.axis], "factor": factor, "sigma": gain.sigma}
-    return graded("axis_scale", stream or columns_of, size, gain.sigma, **values)
+    values = {"axis": "xyz"[gain.axis], "factor": 1.0 + gain.size, "sigma": gain.sigma}
+    return graded("axis_scale", stream, size, gain.sigma, **values)
 
 
 def moved_mount(change: MountChange, start_ns: int) -> Finding | None:
@@ -341,8 +362,10 @@ def moved_mount(change: MountChange, start_ns: int) -> Finding | None:
     significant = np.where(np.abs(change.xi) > 2.0 * sigmas, change.xi, 0.0)
     moved_m = float(np.linalg.norm(significant[:3]))
     moved_rad = float(np.linalg.norm(significant[3:]))
+    # A rotation (rad) moves a place 1 m from the sensor by as many metres.
     size = max(moved_m, moved_rad)
     if change.log_ratio < 2.0 * SIGNIFICANT:
+        # Too little evidence for an error.
         size = min(size, LIMITS["mount_moved"].error)
     sizes = []
     if moved_m > 0:
@@ -354,17 +377,17 @@ def moved_mount(change: MountChange, start_ns: int) -> Finding | None:
 
 
 def _world_drift(slow: Regression, pose_pairs: PosePairs, speed_m_s: float) -> Finding | None:
-    """Return the finding about a world that moves against the other, or None.
+    """Return the finding about a child's world that moves in the parent's world, or None.
 
-    ``speed_m_s`` is the usual speed of the sensors.
+    The drift is graded as a share of the usual speed of the sensors, ``speed_m_s``.
     """
     drift, sigmas = slow.fit("drift")
     if (np.abs(drift) < LIMITS["world_drift"].sigmas * sigmas).all():
         return None
     positions = se3.translation_of(pose_pairs.Ts_cw_c)
-    turning = np.cross(drift[3:], positions - positions.mean(axis=0))
-    moving = np.sqrt(((drift[:3] + turning) ** 2).sum(axis=1).mean())
-    share = float(moving) / max(speed_m_s, 1e-9)
+    by_rotation = np.cross(drift[3:], positions - positions.mean(axis=0))
+    drift_m_s = np.sqrt(((drift[:3] + by_rotation) ** 2).sum(axis=1).mean())
+    share = float(drift_m_s) / max(speed_m_s, 1e-9)
     rad_per_minute = 60 * float(np.linalg.norm(drift[3:]))
     values = {
         "deg_per_minute": float(np.degrees(rad_per_minute)),
@@ -376,29 +399,29 @@ def _world_drift(slow: Regression, pose_pairs: PosePairs, speed_m_s: float) -> F
 
 @dataclass(frozen=True)
 class _Delay:
-    """Delay of some coordinates of a stream against the others.
+    """Delay of some quantities of a stream after its other quantities.
 
     Attributes
     ----------
     code : str
         Code of the finding.
-    part, others : str
-        The coordinates that are late, and those that are not, in words.
+    late, punctual : str
+        The quantities that are late, and the others, in words: "positions", "z coordinates".
     size_s, sigma_s : float
         Delay and its standard deviation, s.
     speed_m_s : float
-        Usual speed along these coordinates.
-    share : float
+        Usual speed of the sensor; of one coordinate, along its axis.
+    explained_share : float
         Share of the squared residuals that the delay explains.
     """
 
     code: str
-    part: str
-    others: str
+    late: str
+    punctual: str
     size_s: float
     sigma_s: float
     speed_m_s: float
-    share: float
+    explained_share: float
 
     def finding(self, stream: str, offset_s: float) -> Finding | None:
         """Return the finding, or None if the delay is too small.
@@ -408,14 +431,16 @@ class _Delay:
         shift_m = self.size_s * self.speed_m_s
         size_m = shift_m
         sigma_m = self.sigma_s * self.speed_m_s
-        is_expected = abs(self.size_s / abs(offset_s or 1.0) - 1.0) < 1.0 - _EXPECTED
+        ratio = self.size_s / abs(offset_s or 1.0)
+        is_expected = abs(ratio - 1.0) < 1.0 - _EXPECTED_SIGMA_SHARE
         if is_expected:
-            sigma_m *= _EXPECTED
+            sigma_m *= _EXPECTED_SIGMA_SHARE
         error_m = LIMITS["late"].error
-        if self._is_clear(shift_m):
-            size_m = max(shift_m, _ERROR * error_m)
-        elif is_expected or self.size_s < _GRAVE * _DELAY_S or self.share < _SOME:
-            # No error: the shift and its noise are scaled to the limit of errors.
+        is_minor = self.size_s < _ERROR_DELAY_S or self.explained_share < _ERROR_SHARE
+        if self._is_always_error(shift_m):
+            size_m = max(shift_m, _JUST_ABOVE * error_m)
+        elif is_expected or is_minor:
+            # No error: shift and noise are scaled down, so that the shift is at most at the limit.
             factor = min(1.0, error_m / max(shift_m, 1e-9))
             size_m = factor * shift_m
             sigma_m = factor * sigma_m
@@ -424,31 +449,31 @@ class _Delay:
             "sigma_s": self.sigma_s,
             "shift_m": shift_m,
             "code": self.code,
-            "part": self.part,
-            "others": self.others,
+            "part": self.late,
+            "others": self.punctual,
         }
         return graded("late", stream, size_m, sigma_m, **values)
 
-    def _is_clear(self, shift_m: float) -> bool:
-        """Return whether the delay is an error whatever may explain it."""
-        if self.size_s <= max(_PLAIN_S, _PLAIN_SIGMAS * self.sigma_s):
+    def _is_always_error(self, shift_m: float) -> bool:
+        """Return whether the delay is an error even if it is expected or explains little."""
+        if self.size_s <= max(_ALWAYS_ERROR_S, _ALWAYS_ERROR_SIGMAS * self.sigma_s):
             return False
-        return shift_m > LIMITS["late"].error or (
-            shift_m > _PLAIN_SHIFT_M and self.share > _PLAIN_SHARE
-        )
+        if shift_m > LIMITS["late"].error:
+            return True
+        return shift_m > _ALWAYS_ERROR_SHIFT_M and self.explained_share > _ALWAYS_ERROR_SHARE
 
 
 def delay_suspects(
     fast: Regression, pairs: PosePairs, speed_m_s: float, offset_s: float
 ) -> Iterator[Suspect]:
-    """Yield suspects for positions with a delay against the orientations of their stream.
+    """Yield suspects for positions with a delay after the orientations of their stream.
 
-    The delay is that of all positions, or of those along one axis of the stream's world.
+    The delay is that of all positions, or of the positions along one axis of the stream's world.
 
     Parameters
     ----------
     fast : Regression
-        Regression with the columns of delays.
+        Regression with the groups of delays.
     pairs : PosePairs
     speed_m_s : float
         Usual speed of the sensors.
@@ -456,38 +481,38 @@ def delay_suspects(
         Clock offset between the streams.
     """
     for stream, poses in (("child", pairs.Ts_cw_c), ("parent", pairs.Ts_pw_p)):
-        smoothing = [f"{part}_{stream}" for part in _SMOOTHING_S2]
-        of_all = f"late_{stream}"
-        of_axes = f"late_axes_{stream}"
-        delays_s, sigmas_s = fast.fit(of_all, *smoothing)
+        smoothing = [f"{quantity}_{stream}" for quantity in _MIN_SMOOTHING_S2]
+        all_group = f"late_{stream}"
+        axis_group = f"late_axes_{stream}"
+        delays_s, sigmas_s = fast.fit(all_group, *smoothing)
         delay_s = float(delays_s[0])
         late = _Delay(
             code="position_clock",
-            part="positions" if delay_s > 0 else "orientations",
-            others="orientations" if delay_s > 0 else "positions",
+            late="positions" if delay_s > 0 else "orientations",
+            punctual="orientations" if delay_s > 0 else "positions",
             size_s=abs(delay_s),
             sigma_s=sigmas_s[0],
             speed_m_s=speed_m_s,
-            share=fast.share(of_all, *smoothing),
+            explained_share=fast.explained_share(all_group, *smoothing),
         )
-        # The other stream's coordinate cannot be early: negative delays are skipped.
-        deviation = largest_deviation(*fast.fit(of_axes, *smoothing))
+        # An early coordinate is not reported: negative delays are skipped below.
+        deviation = largest_deviation(*fast.fit(axis_group, *smoothing))
         late_axis = _Delay(
             code="axis_lag",
-            part=f"{'xyz'[deviation.axis]} coordinates",
-            others="others",
+            late=f"{'xyz'[deviation.axis]} coordinates",
+            punctual="others",
             size_s=deviation.size,
             sigma_s=deviation.sigma,
             speed_m_s=usual_speed(pairs.stamps_ns, poses[:, [deviation.axis], 3]),
-            share=fast.share(of_axes, *smoothing),
+            explained_share=fast.explained_share(axis_group, *smoothing),
         )
         for delay in (late, late_axis):
-            if delay.size_s > _DELAY_S:
-                yield delay.share, delay.finding(stream, offset_s)
+            if delay.size_s > _MIN_DELAY_S:
+                yield Suspect(delay.explained_share, delay.finding(stream, offset_s))
 
 
 def smoothing_suspects(fast: Regression, interval_s: float, speed_m_s: float) -> Iterator[Suspect]:
-    """Yield suspects for one part of the poses that is smoothed.
+    """Yield suspects for positions or orientations that are smoothed, while the other are not.
 
     A smoothing is an error by the distance that it displaces poses, and a warning by its time at
     the usual speed.
@@ -495,32 +520,32 @@ def smoothing_suspects(fast: Regression, interval_s: float, speed_m_s: float) ->
     Parameters
     ----------
     fast : Regression
-        Regression with the columns of smoothing.
+        Regression with the groups of smoothing.
     interval_s : float
         Interval between poses.
     speed_m_s : float
         Usual speed of the sensors.
     """
-    of_interpolation_s2 = _OF_INTERVAL * interval_s**2
+    interpolation_s2 = _INTERPOLATION_SHARE * interval_s**2
     limits = LIMITS["smoothed"]
-    for part, smallest_s2 in _SMOOTHING_S2.items():
+    for quantity, min_smoothing_s2 in _MIN_SMOOTHING_S2.items():
         for stream in _STREAMS:
-            group = f"{part}_{stream}"
+            group = f"{quantity}_{stream}"
             delay = f"late_{stream}"
-            values, sigmas = fast.fit(group, delay)
-            smoothing_s2 = float(values[0])
+            coefficients, sigmas = fast.fit(group, delay)
+            smoothing_s2 = float(coefficients[0])
             noise_s2 = limits.sigmas * float(sigmas[0])
-            if smoothing_s2 < max(smallest_s2 + of_interpolation_s2, noise_s2):
+            if smoothing_s2 < max(min_smoothing_s2 + interpolation_s2, noise_s2):
                 continue
             smoothing_s = smoothing_s2**0.5
-            displaced_m = smoothing_s2 * float(fast.displaced(group)[0])
+            displaced_m = smoothing_s2 * float(fast.displacements_m(group)[0])
             shift_m = max(displaced_m, min(smoothing_s * speed_m_s, limits.error))
             smoothed = graded(
                 "smoothed",
                 stream,
                 shift_m,
-                part=part,
+                part=quantity,
                 smoothing_s=smoothing_s,
                 shift_m=displaced_m,
             )
-            yield fast.share(group, delay), smoothed
+            yield Suspect(fast.explained_share(group, delay), smoothed)

@@ -3,10 +3,15 @@
 1. Check each stream alone (:mod:`~hand_eye_calib.core.checks.streams`).
 2. Correlate the angular rates (:mod:`~hand_eye_calib.core.alignment.time_offset`): do they agree at
    any clock offset? Reordered or inverted quaternions, units and axes do not change angular rates.
-3. Fit the whole motion (:mod:`~hand_eye_calib.core.checks.hypotheses`): without which usual mistake
-   do the streams agree?
-4. Under the hypothesis that holds, check the clock offset, the scale, and the directions that the
-   motion does not excite.
+3. Fit the whole motion (:mod:`~hand_eye_calib.core.checks.hypotheses`): which hypothesis about
+   usual mistakes makes the streams agree, once the mistakes are undone?
+4. With these mistakes undone, check the clock offset, the scale, and the directions that the motion
+   does not excite.
+5. Search for copied streams and for small faults that bias the extrinsic
+   (:mod:`~hand_eye_calib.core.checks.independence`, :mod:`~hand_eye_calib.core.checks.agreement`).
+
+Both streams may hold poses (of the sensor in its world) or inverse poses. An interpretation of both
+streams is called a *reading*.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,7 +31,7 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.base.text import axes_in_words, with_sigma
 from hand_eye_calib.core.checks import agreement, hypotheses, independence, misread
-from hand_eye_calib.core.checks.agreement import Known
+from hand_eye_calib.core.checks.agreement import ExtrinsicEstimate
 from hand_eye_calib.core.checks.findings import LIMITS, Finding, finding, graded, gravest_first
 from hand_eye_calib.core.checks.hypotheses import Explanation, Readings
 from hand_eye_calib.core.checks.stream_pair import LAGS_S, MAX_PAIRS, MIN_PAIRS, StreamPair
@@ -43,22 +48,22 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
 
 # Accuracy of the coarse clock offset of slow streams, in intervals between poses.
-_COARSE = 0.5
+_COARSE_INTERVALS = 0.5
 # Longest gap to interpolate across if the clocks of slow streams differ by more, in intervals.
-_SLOW_GAP = 1.5
+_SLOW_GAP_INTERVALS = 1.5
 
-# Standard deviations to subtract from a lever arm for its least length.
+# Standard deviations that are subtracted from a lever arm, for its smallest possible length.
 _LEVER_ARM_SIGMAS = 3.0
 
 # Code of rounded positions, whose severity depends on the unit of length.
 _ROUNDED = "coarse_positions"
 
-# Most motions for the checks of the response.
+# Largest number of motions over some seconds, for the regression on small faults.
 _MAX_MOTIONS = 1500
 
-# Shortest duration of a live session before its streams are checked.
+# Shortest duration of both streams of a live session before they are checked.
 MIN_DURATION_S = 20.0
-# Smallest rotation before that.
+# Smallest rotation of a sensor from its first pose before that.
 MIN_ROTATION_RAD = float(np.radians(30.0))
 
 
@@ -71,11 +76,12 @@ class CheckResult:
     findings : tuple of Finding
         The gravest first.
     fit : SimilarityFit or None
-        The fit under the hypothesis that holds; None if no hypothesis holds.
+        The fit with the mistakes of both streams undone; None if no hypothesis about mistakes
+        explains the streams.
     offset : TimeOffset or None
-        Clock offset beyond the known one; None if no hypothesis holds.
+        Clock offset in addition to the ``time_offset_s`` of the check; None without a fit.
     readings : Readings or None
-        Two readings of the streams that fit alike, if the reading of the findings may be wrong. The
+        Two readings that fit about equally well, if the reading of the findings may be wrong. The
         other reading also inverts both streams.
     """
 
@@ -92,63 +98,66 @@ def check_streams(
     scale: float = 1.0,
     max_gap_s: float = CalibratorConfig.max_gap,
     correlate: Callable[[], Correlation] | None = None,
-    known: Known | None = None,
+    earlier: ExtrinsicEstimate | None = None,
     are_exact: bool = False,
 ) -> CheckResult:
-    """Check two streams.
+    """Check two streams of poses.
 
     Parameters
     ----------
     parent, child : Trajectory
     time_offset_s, scale : float
-        Known seconds to add to the child's stamps, and known factor of its lengths.
+        Seconds to add to the child's stamps, and factor of its lengths, before the check.
     max_gap_s : float
         Longest time between two poses that interpolation may bridge, in seconds.
     correlate : callable, optional
-        Correlates the angular rates of the streams as they are. Called only if needed.
-    known : ((4, 4) array, (6,) array), optional
-        An extrinsic of these streams, and its standard deviations.
+        Correlate the angular rates of the original streams. Called only if needed.
+    earlier : ExtrinsicEstimate, optional
+        Extrinsic from an earlier solve of these streams.
     are_exact : bool
         Whether the user called both streams exact. Exact streams need not drift apart.
     """
-    given = StreamPair(parent, child.scaled(scale), max_gap_s)
-    findings = check_stream(given.parent, "parent", max_gap_s)
-    findings += check_stream(given.child, "child", max_gap_s)
+    original = StreamPair(parent, child.scaled(scale), max_gap_s)
+    findings = check_stream(original.parent, "parent", max_gap_s)
+    findings += check_stream(original.child, "child", max_gap_s)
     # Rounded positions are judged later, when the unit of length is known.
     if _are_unusable([found for found in findings if found.code != _ROUNDED]):
         return CheckResult(gravest_first(findings))
-    streams = given.shifted(time_offset_s)
+    streams = original.shifted(time_offset_s)
     explanation = None
     offset = TimeOffset()
-    if known and not streams.is_slow:
-        explanation, offset = _as_they_are(streams, known[0])
+    if earlier and not streams.is_slow:
+        explanation, offset = _explain_by_extrinsic(streams, earlier.T_parent_child)
     if not explanation:
-        correlation = (correlate or given.correlate)()
+        correlation = (correlate or original.correlate)()
         if factor := _factor_of_angles(correlation):
             return CheckResult(gravest_first([*findings, factor]))
-        streams, offset = _coarse_offset(given, streams, time_offset_s, correlation)
+        streams, offset = _coarse_offset(original, streams, time_offset_s, correlation)
     aligned = streams.shifted(offset.seconds)
     frozen = check_frozen(aligned.parent, aligned.child)
     findings += frozen
     incomplete = check_flat(aligned.parent, aligned.child)
-    incomplete = incomplete or agreement.check_parts(aligned.synchronised)
+    incomplete = incomplete or agreement.check_turned_parts(aligned.synchronised)
     if incomplete:
         return CheckResult(gravest_first([*findings, *incomplete]))
     if not explanation:
         is_frozen = _are_unusable(frozen)
-        explanation, mistakes = _explained_or_misread(streams, aligned, offset, known, is_frozen)
+        explanation, mistakes = _explain_or_misread(streams, aligned, offset, earlier, is_frozen)
         findings += mistakes
     if not explanation:
         return CheckResult(gravest_first(findings))
-    arguments = _Arguments(given, known, scale, time_offset_s, are_exact)
+    arguments = _Arguments(original, earlier, scale, time_offset_s, are_exact)
     return _check_explained(streams, explanation, offset, findings, arguments)
 
 
 class _Arguments(NamedTuple):
-    """Arguments of :func:`check_streams`: the streams in ``given``, the child with its scale."""
+    """Arguments of :func:`check_streams`.
 
-    given: StreamPair
-    known: Known | None
+    ``original`` is both streams without the time offset; the child is multiplied by ``scale``.
+    """
+
+    original: StreamPair
+    earlier: ExtrinsicEstimate | None
     scale: float
     time_offset_s: float
     are_exact: bool
@@ -160,62 +169,63 @@ def _are_unusable(findings: Sequence[Finding]) -> bool:
 
 
 def _factor_of_angles(correlation: Correlation) -> Finding | None:
-    """Return the finding that all rotations of the child have another size, or None."""
-    times = correlation.ratio
-    factor = graded("turns", "child", float(np.log(times)), times=times)
-    return factor if 1.0 - correlation.correlation < hypotheses.HOLDS else None
+    """Return the finding that one factor is wrong in all rotations of the child, or None."""
+    if 1.0 - correlation.correlation >= hypotheses.HOLDS:
+        return None
+    ratio = correlation.ratio
+    return graded("turns", "child", float(np.log(ratio)), times=ratio)
 
 
 def _coarse_offset(
-    given: StreamPair, streams: StreamPair, known_s: float, correlation: Correlation
+    original: StreamPair, streams: StreamPair, added_s: float, correlation: Correlation
 ) -> tuple[StreamPair, TimeOffset]:
-    """Return streams to compare, and the clock offset between them by their angular rates.
+    """Return the streams to compare, and the remaining clock offset by their angular rates.
 
     Parameters
     ----------
-    given, streams : StreamPair
-        The streams as they are, and with the known offset.
-    known_s : float
-        Known offset of the child's clock, s.
+    original, streams : StreamPair
+        The streams before and after ``added_s`` was added to the child's stamps.
+    added_s : float
+        Time offset, s.
     correlation : Correlation
-        Correlation of the angular rates of the streams as they are.
+        Correlation of the angular rates of the original streams.
     """
     if streams.is_slow:
-        streams, from_known = _of_slow(given, streams, known_s, correlation)
+        streams, remaining = _align_slow(original, streams, added_s, correlation)
     else:
-        from_known = replace(correlation, offset_s=correlation.offset_s - known_s)
+        remaining = replace(correlation, offset_s=correlation.offset_s - added_s)
     if not correlation.is_clear:
-        # Short recordings may not show the offset, and yet the streams agree at the known one.
-        from_known = replace(from_known, offset_s=0.0)
-    return streams, TimeOffset(from_known.offset_s, correlation=from_known)
+        # A short recording may not reveal the offset. The streams may still agree with added_s.
+        remaining = replace(remaining, offset_s=0.0)
+    return streams, TimeOffset(remaining.offset_s, correlation=remaining)
 
 
 def _check_explained(
     streams: StreamPair,
     explanation: Explanation,
-    at: TimeOffset,
+    coarse_offset: TimeOffset,
     findings: list[Finding],
     arguments: _Arguments,
 ) -> CheckResult:
-    """Check streams that a hypothesis explains.
+    """Check the remaining faults of streams that a hypothesis explains.
 
     Parameters
     ----------
     streams : StreamPair
-        Streams with the known clock offset.
+        Streams with the time offset of the arguments.
     explanation : Explanation
-    at : TimeOffset
-        Coarse clock offset beyond the known one.
+    coarse_offset : TimeOffset
+        Remaining clock offset.
     findings : list of Finding
-        Findings of the checks before.
+        Findings of earlier checks.
     arguments : _Arguments
     """
-    right = explanation.hypothesis.undo(streams)
-    offset = _fine_offset(right, at, explanation.fit)
-    right = right.shifted(offset.seconds)
-    sizes, fit = _check_sizes(right, explanation, offset.fit, arguments.scale)
-    lengths = _lengths_of_explained(streams, right, fit, explanation)
-    # Findings of an unclear reading: both streams may be inverse, or neither may be.
+    corrected = explanation.hypothesis.undo(streams)
+    offset = _fine_offset(corrected, coarse_offset, explanation.fit)
+    corrected = corrected.shifted(offset.seconds)
+    sizes, fit = _check_sizes(corrected, explanation, offset.fit, arguments.scale)
+    lengths = _lengths_of_explained(streams, corrected, fit, explanation)
+    # Findings of an unclear reading: either both streams hold inverse poses, or none does.
     of_reading = explanation.findings if explanation.may_be_uninverted else ()
     readings = explanation.readings
     if readings and lengths:
@@ -226,51 +236,53 @@ def _check_explained(
     is_sound = not _are_unusable([found for found in findings if found not in of_reading])
     findings += [*lengths, *check_offset(offset, arguments.time_offset_s), *sizes]
     if is_sound and not lengths:
-        right, fit = _preferred_reading(streams, right, explanation, fit, offset, arguments.known)
+        earlier = arguments.earlier
+        corrected, fit = _preferred_reading(streams, corrected, explanation, fit, offset, earlier)
         is_one_axis = any(found.code == "one_axis" for found in sizes)
-        findings += _check_agreeing(right, fit, offset, is_one_axis, arguments)
+        findings += _check_agreeing(corrected, fit, offset, is_one_axis, arguments)
     return CheckResult(gravest_first(findings), explanation.fit, offset, readings)
 
 
 def _lengths_of_explained(
-    streams: StreamPair, right: StreamPair, fit: SimilarityFit, explanation: Explanation
+    streams: StreamPair, corrected: StreamPair, fit: SimilarityFit, explanation: Explanation
 ) -> list[Finding]:
-    """Return the finding about lengths that no vehicle has, or none.
+    """Return the finding about lengths or speeds that no vehicle has, or none.
 
-    ``right`` are the corrected streams, ``fit`` is their fit.
+    ``fit`` is that of the corrected streams.
     """
     lever_arm_m = least_lever_arm(fit.T_parent_child, fit.sigmas[:3])
-    lengths = check_lengths(right.parent, right.child, lever_arm_m)
+    lengths = check_lengths(corrected.parent, corrected.child, lever_arm_m)
     if lengths and explanation.may_be_uninverted and explanation.findings:
-        # If both streams are inverse, the lever arm is the distance of the worlds. The streams as
-        # they are are judged without it.
+        # If both streams hold inverse poses, the lever arm is the distance between the worlds. So
+        # the uncorrected streams are judged without a lever arm.
         return check_lengths(streams.parent, streams.child)
     return lengths
 
 
 def _preferred_reading(
     streams: StreamPair,
-    right: StreamPair,
+    corrected: StreamPair,
     explanation: Explanation,
     fit: SimilarityFit,
     offset: TimeOffset,
-    known: Known | None,
+    earlier: ExtrinsicEstimate | None,
 ) -> tuple[StreamPair, SimilarityFit]:
-    """Return the streams in the reading of a known extrinsic, and their fit.
+    """Return the streams in the reading of an earlier extrinsic, and their fit.
 
-    The streams ``right`` and ``fit`` are returned if only one reading is possible, or if the
-    explanation has the reading of the known extrinsic: the streams as they are.
+    The earlier extrinsic was solved from streams that were not inverted. If the explanation inverts
+    both streams, although they may also be right without inversion, the uninverted streams are
+    fitted. Otherwise ``corrected`` and ``fit`` are returned.
     """
     has_other_reading = explanation.may_be_uninverted and not explanation.hypothesis.is_uninverted
-    if not known or not has_other_reading:
-        return right, fit
+    if not earlier or not has_other_reading:
+        return corrected, fit
     uninverted = streams.shifted(offset.seconds)
     motions = _motions(uninverted.synchronised, MAX_PAIRS)
-    return uninverted, similarity.fit_similarity(motions, start=known[0])
+    return uninverted, similarity.fit_similarity(motions, start=earlier.T_parent_child)
 
 
 def least_lever_arm(T_parent_child: FloatArray, sigmas: FloatArray) -> float:
-    """Return the length (m) that a lever arm has at least, within its uncertainty.
+    """Return the smallest length (m) of a lever arm within its uncertainty.
 
     Parameters
     ----------
@@ -285,16 +297,15 @@ def least_lever_arm(T_parent_child: FloatArray, sigmas: FloatArray) -> float:
 def _in_metres(
     findings: Sequence[Finding], units: Sequence[Finding], scale: float
 ) -> list[Finding]:
-    """Return the findings with steps of positions in metres.
+    """Return the findings, with those about rounded positions graded in metres.
 
     Parameters
     ----------
     findings : sequence of Finding
         Findings about streams with the child's lengths multiplied by ``scale``.
     units : sequence of Finding
-        Findings about the unit of a stream's lengths.
+        Findings about the unit of a stream's lengths; their options convert it to metres.
     scale : float
-        Known factor of the child's lengths.
     """
     options: dict[str, Any] = {}
     for unit in units:
@@ -305,24 +316,26 @@ def _in_metres(
         "child": float(options.get("scale", scale)) / scale,
     }
     in_metres: list[Finding] = []
-    for former in findings:
-        if former.code != _ROUNDED:
-            in_metres.append(former)
+    for found in findings:
+        if found.code != _ROUNDED:
+            in_metres.append(found)
             continue
-        step_m = former.evidence["step_m"] * factors[former.stream]
-        if coarse := graded(_ROUNDED, former.stream, step_m, step_m=step_m):
-            in_metres.append(coarse)
+        step_m = found.evidence["step_m"] * factors[found.stream]
+        if rounded := graded(_ROUNDED, found.stream, step_m, step_m=step_m):
+            in_metres.append(rounded)
     return in_metres
 
 
-def _as_they_are(streams: StreamPair, X: FloatArray) -> tuple[Explanation | None, TimeOffset]:
-    """Return the fit from a known extrinsic X, and the clock offset with it.
+def _explain_by_extrinsic(
+    streams: StreamPair, X: FloatArray
+) -> tuple[Explanation | None, TimeOffset]:
+    """Return the explanation that the streams agree without a mistake, and their clock offset.
 
-    The explanation is None unless the streams clearly agree as they are, in one unit and on about
-    one clock.
+    The fit starts at an earlier extrinsic X (4, 4). The explanation is None unless the streams
+    clearly agree, in one unit of length and on about one clock.
     """
-    least_s = LIMITS["time_offset"].note
-    grave_s = LIMITS["time_offset"].error
+    note_s = LIMITS["time_offset"].note
+    error_s = LIMITS["time_offset"].error
     lag_s = LAGS_S[1]
     offset = time_offset.offset_over(
         lag_s,
@@ -330,15 +343,15 @@ def _as_they_are(streams: StreamPair, X: FloatArray) -> tuple[Explanation | None
         streams.child,
         TimeOffset(),
         streams.max_gap_s,
-        # One step of refinement suffices if the offset is below half of the size that is reported.
-        2.0 * least_s,
+        # One step of refinement suffices if the offset is below half of the reported size.
+        2.0 * note_s,
         X,
         hypotheses.HOLDS,
     )
     fit = offset.fit
     if fit is None or not fit.is_in_one_unit or fit.unexplained >= similarity.EXPLAINED:
         return None, TimeOffset()
-    if offset.largest_s(streams.child.duration_s) >= grave_s:
+    if offset.largest_s(streams.child.duration_s) >= error_s:
         return None, TimeOffset()
     shifted = streams.shifted(offset.seconds)
     explanation = hypotheses.attributed(Explanation(hypotheses.PLAIN, fit), shifted, lag_s)
@@ -347,63 +360,79 @@ def _as_they_are(streams: StreamPair, X: FloatArray) -> tuple[Explanation | None
     return explanation, offset
 
 
-def _fine_offset(right: StreamPair, at: TimeOffset, fit: SimilarityFit) -> TimeOffset:
-    """Return the remaining clock offset of streams that agree by a fit."""
-    least_s = LIMITS["time_offset"].note
-    if at.fit and at.largest_s(right.child.duration_s) < least_s:
-        return at
-    if right.is_slow:
-        return TimeOffset(at.seconds, right.interval_s, at.correlation)
-    at = replace(at, fit=at.fit or fit)
-    return time_offset.refine_time_offset(right.parent, right.child, at, right.max_gap_s, least_s)
+def _fine_offset(
+    corrected: StreamPair, coarse_offset: TimeOffset, fit: SimilarityFit
+) -> TimeOffset:
+    """Return the refined clock offset of corrected streams.
 
-
-def _of_slow(
-    streams: StreamPair, moved: StreamPair, known_s: float, correlation: Correlation
-) -> tuple[StreamPair, Correlation]:
-    """Return slow streams on one clock, and the correlation of their angular rates.
-
-    Poses of slow streams are too far apart to interpolate. The streams as they are, or ``moved`` by
-    the known offset, are used if they have common stamps and the coarse offset agrees with that.
+    ``fit`` is used if the coarse offset has no fit. A coarse offset with a fit, clearly below the
+    size that is reported, is not refined. Slow streams cannot be interpolated, so their offset is
+    good to one interval between poses.
     """
-    for offset_s, candidate in ((known_s, moved), (0.0, streams)):
+    note_s = LIMITS["time_offset"].note
+    if coarse_offset.fit and coarse_offset.largest_s(corrected.child.duration_s) < note_s:
+        return coarse_offset
+    if corrected.is_slow:
+        return TimeOffset(coarse_offset.seconds, corrected.interval_s, coarse_offset.correlation)
+    return time_offset.refine_time_offset(
+        corrected.parent,
+        corrected.child,
+        replace(coarse_offset, fit=coarse_offset.fit or fit),
+        corrected.max_gap_s,
+        note_s,
+    )
+
+
+def _align_slow(
+    original: StreamPair, shifted: StreamPair, added_s: float, correlation: Correlation
+) -> tuple[StreamPair, Correlation]:
+    """Return slow streams on one clock, and the correlation with the remaining clock offset.
+
+    Poses of slow streams are too far apart to interpolate. So the streams shifted by ``added_s`` or
+    the original streams are used, if they have common stamps and the coarse offset agrees.
+    """
+    for offset_s, candidate in ((added_s, shifted), (0.0, original)):
         if len(candidate.synchronised) <= MIN_PAIRS:
             continue
-        is_near = abs(correlation.offset_s - offset_s) < _COARSE * streams.interval_s
-        if is_near or not correlation.is_clear:
+        error_s = abs(correlation.offset_s - offset_s)
+        if error_s < _COARSE_INTERVALS * original.interval_s or not correlation.is_clear:
             return candidate, replace(correlation, offset_s=0.0)
-    from_known = replace(correlation, offset_s=correlation.offset_s - known_s)
-    return replace(moved, max_gap_s=_SLOW_GAP * streams.interval_s), from_known
+    remaining = replace(correlation, offset_s=correlation.offset_s - added_s)
+    max_gap_s = _SLOW_GAP_INTERVALS * original.interval_s
+    return replace(shifted, max_gap_s=max_gap_s), remaining
 
 
-def _explained_or_misread(
+def _explain_or_misread(
     streams: StreamPair,
     aligned: StreamPair,
-    at: TimeOffset,
-    known: Known | None,
+    coarse_offset: TimeOffset,
+    earlier: ExtrinsicEstimate | None,
     is_frozen: bool,
 ) -> tuple[Explanation | None, list[Finding]]:
-    """Return the explanation that holds, or None, and the findings about misread streams.
+    """Return the explanation of both streams, or None, and the findings about misread streams.
 
-    ``streams`` have the known clock offset, ``aligned`` the whole one.
+    ``aligned`` are ``streams``, shifted by the coarse offset.
     """
-    start = known[0] if known else None
-    misread_positions = misread.earth_centred(aligned)
+    start = earlier.T_parent_child if earlier else None
+    misread_positions = misread.check_earth_centred(aligned)
     if misread_positions:
         return None, misread_positions
-    explanation, findings = _explained(aligned, at.correlation, start, is_frozen)
+    explanation, findings = _explain(aligned, coarse_offset.correlation, start, is_frozen)
     if not explanation:
-        findings = misread.misreadings(streams, aligned) or findings
+        findings = misread.check_misread(streams, aligned) or findings
     return explanation, findings
 
 
-def _explained(
+def _explain(
     streams: StreamPair,
     correlation: Correlation,
     start: FloatArray | None,
     is_frozen: bool,
 ) -> tuple[Explanation | None, list[Finding]]:
-    """Return the explanation that holds, or None, and the findings about the streams."""
+    """Return the explanation of both streams, or None, and the findings about the streams.
+
+    ``start`` (4, 4) is an earlier extrinsic, if any: the first guess of the fits.
+    """
     try:
         explanation = hypotheses.explain(streams, correlation.is_clear, start)
     except NotEnoughDataError as error:
@@ -425,19 +454,20 @@ def _explained(
 
 
 def _check_sizes(
-    streams: StreamPair, explanation: Explanation, timed: SimilarityFit | None, known_scale: float
+    streams: StreamPair, explanation: Explanation, timed: SimilarityFit | None, used_scale: float
 ) -> tuple[list[Finding], SimilarityFit]:
-    """Return findings about scale and hidden axes of streams that agree, and the fit with scale.
+    """Return findings about scale and unobservable axes of streams that agree, and the fit.
 
-    ``timed`` is the fit with the time offset. The child's lengths in ``streams`` are those of its
-    source times ``known_scale``.
+    The fit includes the scale if the unit of length is unclear. ``timed`` is the fit with the
+    refined time offset, if any. The child's lengths in ``streams`` are the original lengths times
+    ``used_scale``.
     """
     pose_pairs = streams.synchronised
     motions = _motions(pose_pairs, MAX_PAIRS)
     fit = explanation.fit
     chords = se3.rotation_of(motions.Ts_parenti_parentj) - np.eye(3)
     hidden = hidden_axes(lever_arm_products(chords), fit.sigma_rotation**2 * np.eye(3))
-    findings = [unseen(hidden)] if hidden else []
+    findings = [unobservable_axes(hidden)] if hidden else []
     if explanation.same_unit or fit.is_in_one_unit:
         return findings, fit
     fits_of_scale = [fit]
@@ -446,32 +476,35 @@ def _check_sizes(
     fits_of_scale = [candidate for candidate in fits_of_scale if candidate.scale_sigma > 0.0]
     with suppress(NotEnoughDataError):
         fit = similarity.estimate_scale(pose_pairs, fits_of_scale)
-        own_unit = _own_unit(streams, fit, known_scale) if fit.has_own_unit else None
+        own_unit = _own_unit(streams, fit, used_scale) if fit.has_own_unit else None
         if own_unit:
             findings.append(own_unit)
     return findings, fit
 
 
-def _own_unit(streams: StreamPair, fit: SimilarityFit, known_scale: float) -> Finding | None:
-    """Return the finding about a child in another unit of length, or else of another scale."""
-    child_as_given = streams.child.scaled(1.0 / known_scale)
+def _own_unit(streams: StreamPair, fit: SimilarityFit, used_scale: float) -> Finding | None:
+    """Return the finding that the child has another unit of length, or else another scale.
+
+    None if the scale is near 1. The child's lengths are the original lengths times ``used_scale``.
+    """
+    original_child = streams.child.scaled(1.0 / used_scale)
     sigma_and_bias = float(np.hypot(fit.scale_sigma, fit.scale_bias))
-    unit = in_other_units(fit.scale, sigma_and_bias, streams.parent, child_as_given, known_scale)
+    unit = in_other_units(fit.scale, sigma_and_bias, streams.parent, original_child, used_scale)
     if unit:
         return unit
-    total_scale = known_scale * fit.scale
+    total_scale = used_scale * fit.scale
     return graded(
         "scale",
         "child",
         fit.scale - 1.0,
         scale=total_scale,
-        sigma=known_scale * fit.scale_sigma,
+        sigma=used_scale * fit.scale_sigma,
         options={"scale": float(f"{total_scale:.4g}")},
     )
 
 
 def _check_agreeing(
-    right: StreamPair,
+    corrected: StreamPair,
     fit: SimilarityFit,
     offset: TimeOffset,
     is_one_axis: bool,
@@ -479,31 +512,32 @@ def _check_agreeing(
 ) -> list[Finding]:
     """Return the findings about streams that agree: copies, faults that bias X, and fusion.
 
-    ``right`` are the corrected streams on one clock. ``is_one_axis`` says that all rotation is
-    about one axis.
+    ``corrected`` are the streams on one clock, with all mistakes undone. ``is_one_axis`` is true if
+    all rotation is about one axis.
     """
-    fitted = fit.T_parent_child, fit.sigmas[:6]
-    extrinsics = [fitted, arguments.known] if arguments.known else [fitted]
-    best = min(extrinsics, key=lambda extrinsic: extrinsic[1][:3].max())
-    copied = independence.check_copies(arguments.given, right, arguments.are_exact)
+    best = ExtrinsicEstimate(fit.T_parent_child, fit.sigmas[:6])
+    earlier = arguments.earlier
+    if earlier and earlier.sigmas[:3].max() < best.sigmas[:3].max():
+        best = earlier
+    copied = independence.check_copies(arguments.original, corrected, arguments.are_exact)
     if copied:
-        return [*copied, *agreement.check_same(*best)]
-    pose_pairs = right.synchronised.child_scaled(fit.scale)
+        return [*copied, *agreement.check_same(best)]
+    pose_pairs = corrected.synchronised.child_scaled(fit.scale)
     motions = _motions(pose_pairs, _MAX_MOTIONS)
     offset_s = arguments.time_offset_s + offset.seconds
     findings = agreement.check_agreement(pose_pairs, motions, fit.T_parent_child, best, offset_s)
     if findings or arguments.are_exact:
         return findings
-    return independence.check_fusion(pose_pairs, best[0], is_one_axis)
+    return independence.check_fusion(pose_pairs, best.T_parent_child, is_one_axis)
 
 
 def check_parts(
     parent: Trajectory, child: Trajectory, max_gap_s: float, lever_arm_m: float = 0.0
 ) -> list[Finding]:
-    """Check two streams on one clock of which at least one has no full poses.
+    """Check two streams on one clock, if at least one stream has no full poses.
 
-    The findings need no solve. ``lever_arm_m`` is the smallest distance of the sensors (m) by a
-    solve; 0 without one.
+    The checks need no solve: rounding, lengths, frozen poses. ``lever_arm_m`` is the smallest
+    possible distance of the sensors (m) by an earlier solve; 0 without a solve.
     """
     if not (parent.has_positions and child.has_positions):
         parent = parent.scaled(0.0)
@@ -519,28 +553,36 @@ def check_parts(
 
 
 def can_check(parent: Trajectory, child: Trajectory) -> bool:
-    """Return whether two streams of a live session are long enough and rotate enough to check."""
-    return min(stream.duration_s for stream in (parent, child)) >= MIN_DURATION_S and any(
-        se3.rotation_angle(stream.poses[0, :3, :3].T @ se3.rotation_of(stream.poses)).max()
-        >= MIN_ROTATION_RAD
-        for stream in (parent, child)
-    )
+    """Return whether two streams of a live session are long enough to be checked.
+
+    At least one stream must have rotated enough.
+    """
+    if min(parent.duration_s, child.duration_s) < MIN_DURATION_S:
+        return False
+    for stream in (parent, child):
+        rotations = se3.rotation_of(stream.poses)
+        if se3.rotation_angle(rotations[0].T @ rotations).max() >= MIN_ROTATION_RAD:
+            return True
+    return False
 
 
-def check_offset(offset: TimeOffset, known_s: float) -> list[Finding]:
-    """Return the finding about a clock offset beyond ``known_s`` (added before), or none."""
-    values = offset_values(offset.seconds, known_s) | {"sigma_s": offset.sigma_s}
-    values["beyond"] = f" beyond the {known_s:.4f} s that were added" if known_s else ""
+def check_offset(offset: TimeOffset, added_s: float) -> list[Finding]:
+    """Return the finding about a clock offset, or none.
+
+    ``added_s`` was added to the child's stamps before, s.
+    """
+    values = offset_values(offset.seconds, added_s) | {"sigma_s": offset.sigma_s}
+    values["beyond"] = f" beyond the {added_s:.4f} s that were added" if added_s else ""
     values["options"] = {"time_offset": values["total_s"]}
     clocks_differ = graded("time_offset", "child", offset.seconds, offset.sigma_s, **values)
     return [clocks_differ] if clocks_differ else []
 
 
-def offset_values(offset_s: float, known_s: float = 0.0) -> dict[str, Any]:
-    """Return the values of the finding about a clock offset ``offset_s`` beyond ``known_s``."""
+def offset_values(offset_s: float, added_s: float = 0.0) -> dict[str, Any]:
+    """Return the values of the finding about a clock offset ``offset_s`` beyond ``added_s``."""
     values: dict[str, Any] = {"offset_s": offset_s, "size_s": abs(offset_s)}
     values["direction"] = "behind" if offset_s > 0 else "ahead of"
-    return values | {"total_s": round(known_s + offset_s, 4)}
+    return values | {"total_s": round(added_s + offset_s, 4)}
 
 
 def check_model_scale(scale: float, sigma: float) -> list[Finding]:
@@ -549,8 +591,8 @@ def check_model_scale(scale: float, sigma: float) -> list[Finding]:
     Parameters
     ----------
     scale, sigma : float
-        Factor of the child's lengths, and its standard deviation. A standard deviation of 0 means
-        that the scale was not estimated.
+        Factor of the child's lengths, and its standard deviation; 0 if the scale was not
+        estimated.
     """
     if sigma <= 0.0:
         return []
@@ -569,15 +611,15 @@ def check_model_scale(scale: float, sigma: float) -> list[Finding]:
     return [other_scale] if other_scale else []
 
 
-def _motions(pose_pairs: PosePairs, most: int) -> MotionPairs:
-    """Return at most ``most`` motions over the first lag with enough motions."""
-    motions = (pairs_over(pose_pairs, lag_s, most) for lag_s in LAGS_S)
+def _motions(pose_pairs: PosePairs, max_motions: int) -> MotionPairs:
+    """Return motions over the first lag of ``LAGS_S`` with enough motions."""
+    motions = (pairs_over(pose_pairs, lag_s, max_motions) for lag_s in LAGS_S)
     # Streams that agree were fitted over the first lag with enough motions, so it exists.
     return next(pairs for pairs in motions if len(pairs) >= MIN_PAIRS)
 
 
-def unseen(axes: Sequence[str]) -> Finding:
-    """Return the note that a motion does not determine some axes."""
+def unobservable_axes(axes: Sequence[str]) -> Finding:
+    """Return the note that the motion does not determine some axes of X."""
     options = {f"prior.{axis}": "VALUE+/-SIGMA" for axis in axes}
     pronoun = "it" if len(axes) == 1 else "them"
     return finding("one_axis", options=options, axes=axes_in_words(axes), it=pronoun)

@@ -47,7 +47,7 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
         scale=calibration.scale if calibration else config.given_scale,
         max_gap_s=snapshot.max_gap_s,
         correlate=lambda: snapshot.correlation,
-        known=_known_extrinsic(calibration),
+        earlier=_extrinsic_estimate(calibration),
         are_exact=config.parent_kind == config.child_kind == "exact",
     )
     obsolete = _obsolete_codes(snapshot, calibration)
@@ -64,7 +64,7 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
     return replace(result, findings=gravest_first(findings))
 
 
-def _known_extrinsic(calibration: Calibration | None) -> checking.Known | None:
+def _extrinsic_estimate(calibration: Calibration | None) -> checking.ExtrinsicEstimate | None:
     """Return the extrinsic of a result, and its standard deviations (6,); None without a result.
 
     All standard deviations are infinite if the result does not determine every axis.
@@ -72,8 +72,9 @@ def _known_extrinsic(calibration: Calibration | None) -> checking.Known | None:
     if calibration is None:
         return None
     sigmas = np.sqrt(np.diag(calibration.covariance_measured))
-    is_known = not calibration.unobservable()
-    return calibration.T_parent_child, np.where(is_known, sigmas, np.inf)
+    if calibration.unobservable():
+        sigmas = np.full(6, np.inf)
+    return checking.ExtrinsicEstimate(calibration.T_parent_child, sigmas)
 
 
 def _obsolete_codes(snapshot: Snapshot, calibration: Calibration | None) -> set[str]:

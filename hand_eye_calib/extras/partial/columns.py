@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.base.blocks import Blocks, inverse
 from hand_eye_calib.core.base.stats import median, robust_weights
 from hand_eye_calib.core.geometry import se3
@@ -61,33 +61,6 @@ class Column(NamedTuple):
 def by_axis(vectors: FloatArray) -> FloatArray:
     """Return one column (..., 3, 3) for each coordinate of vectors (..., 3)."""
     return np.asarray(vectors[..., None] * np.eye(3))
-
-
-class Stencil(NamedTuple):
-    """Rows (N,) of the samples one and two steps before and after each sample.
-
-    ``spans_s`` (N,) is the duration of the four steps.
-    """
-
-    before_2: IntArray
-    before: IntArray
-    after: IntArray
-    after_2: IntArray
-    spans_s: FloatArray
-
-    @property
-    def step_s(self) -> FloatArray:
-        """Duration (N, 1) of a step."""
-        return np.maximum(self.spans_s / 4.0, 1e-9)[:, None]
-
-
-def stencil(stamps_s: FloatArray, step: int) -> Stencil:
-    """Return the rows around each of the stamps (N,), in steps of so many samples."""
-    rows = np.arange(len(stamps_s))
-    last = len(stamps_s) - 1
-    before_2, before, after, after_2 = (np.clip(rows + k * step, 0, last) for k in (-2, -1, 1, 2))
-    spans_s = stamps_s[after_2] - stamps_s[before_2]
-    return Stencil(before_2, before, after, after_2, spans_s)
 
 
 class Split(NamedTuple):

@@ -127,7 +127,7 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
             findings = [found for found in findings if found.code != "unrelated"]
         findings += of_solve
     if hidden and not any(found.makes_unusable for found in findings):
-        findings.append(checking.unseen(hidden))
+        findings.append(checking.unobservable_axes(hidden))
     # Lengths in another unit come first: they cause the findings of the solve.
     findings.sort(key=lambda found: found.code != "lengths")
     return CheckResult(gravest_first(_without_repetitions(findings)))

@@ -22,15 +22,8 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.extras.partial.columns import (
-    Column,
-    Fit,
-    Stencil,
-    by_axis,
-    fit_columns,
-    split,
-    stencil,
-)
+from hand_eye_calib.core.geometry.differences import path_derivatives, stencil
+from hand_eye_calib.extras.partial.columns import Column, Fit, by_axis, fit_columns, split
 
 # Duration of a window (s): an odometry drifts little in it, and a machine turns.
 _WINDOW_S = 10.0
@@ -166,8 +159,8 @@ def _windows(
     rotations = se3.rotation_of(poses)
     predicted = se3.times(rotations, lever_arm) + se3.translation_of(poses)
     around = stencil(stamps_s, step)
-    velocities, accelerations = _derivatives(predicted, around)
-    measured_accelerations = _derivatives(positions, around)[1]
+    velocities, accelerations = path_derivatives(predicted, around, around.step_s)
+    _, measured_accelerations = path_derivatives(positions, around, around.step_s)
     in_windows = split(stamps_s, around.spans_s, step, _WINDOW_S)
     if in_windows is None:
         return None
@@ -193,14 +186,3 @@ def _centred(vectors: FloatArray, used: BoolArray) -> FloatArray:
     counts = used.sum(axis=1)[:, None]
     means = (vectors * used[..., None]).sum(axis=1) / counts
     return np.asarray(vectors - means[:, None])
-
-
-def _derivatives(path: FloatArray, around: Stencil) -> tuple[FloatArray, FloatArray]:
-    """Return velocities and accelerations (N, 3) of a path (N, 3).
-
-    Accelerations do not contain the noise of the position itself.
-    """
-    before_2, before, after, after_2, _ = around
-    velocities = (path[after] - path[before]) / (2.0 * around.step_s)
-    bends = path[after_2] - path[after] - path[before] + path[before_2]
-    return velocities, bends / (3.0 * around.step_s**2)

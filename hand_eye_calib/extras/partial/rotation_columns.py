@@ -27,8 +27,9 @@ from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.checks.agreement import BIASES
 from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.differences import Stencil, rotations_around, stencil
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
-from hand_eye_calib.extras.partial.columns import Column, Fit, Stencil, fit_columns, split, stencil
+from hand_eye_calib.extras.partial.columns import Column, Fit, fit_columns, split
 
 # Duration of a window (s): a bias is constant in it, and a machine turns.
 _WINDOW_S = 20.0
@@ -270,10 +271,8 @@ def _motion(
     has_rates : bool
         Whether the measured stream has rates.
     """
-    before_2, before, after, after_2, _ = around
-    rates = se3.rotations_between(stream[before], stream[after]) / (2.0 * around.step_s)
-    turn_after = se3.rotations_between(stream[after], stream[after_2])
-    turn_before = se3.rotations_between(stream[before_2], stream[before])
+    turn, turn_before, turn_after = rotations_around(stream, around)
+    rates = turn / (2.0 * around.step_s)
     accelerations = (turn_after - turn_before) / (3.0 * around.step_s**2)
     bends = se3.times(orientations, accelerations)
     turns = se3.rotations_between(stream[:-1], stream[1:])

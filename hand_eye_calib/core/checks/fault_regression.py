@@ -1,0 +1,419 @@
+"""Regression of the motion between two streams on possible faults.
+
+Two sensors move together on one rigid body. A and B are the motions of parent and child over a
+span of time, both in the parent's axes (the child's rotated by R_X); a and b are their
+displacements, t is the lever arm. A fault k of size f_k changes the motion by ``c_k f_k``:
+
+    b - a = (R_A - I) t + sum_k c_k f_k + noise,        Log(R_B R_A') = sum_k c_k f_k + noise.
+
+Words of this module:
+
+- A *regressor* c_k is the displacement (m) and the rotation (rad) that a fault of size 1 causes.
+- The *coefficient* of a regressor is the estimated size of the fault.
+- A *group* is the regressors of one fault, such as its three axes.
+- The *base* is the groups that every fit contains: the lever arm, a small rotation of X, the scale.
+
+Motions over some seconds reveal gains, scales by axis, and worlds that are turned or moving.
+Motions over a second reveal delays d and smoothing c. They change a motion of angular frequency f
+by the factor ``1 - i f d - f^2 c``: by -d times the velocity and c times the acceleration at both
+ends. Velocities and accelerations are differences of the poses around the ends, without the poses
+at the ends. Otherwise residuals and regressors would contain the same white noise.
+
+Regressors are computed from measured poses, so they have noise. This noise biases coefficients
+towards zero (W. Greene, *Econometric Analysis*, 2012, chapter 8). Lever arms and delays have
+*instruments* (instrumental variables) without this bias: the same regressors, computed from the
+other stream. Noise that accumulates makes a stream look less smooth, never smoother. So regressors
+of the child alone can reveal that the child is smoothed.
+
+The jackknife over blocks of time estimates the standard deviations.
+"""
+
+from collections.abc import Mapping
+from typing import TypeAlias
+
+import numpy as np
+
+from hand_eye_calib.core.assessment.covariance import BLOCKS
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.blocks import Blocks, solve
+from hand_eye_calib.core.base.stats import median, robust_sigma, robust_weights
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.differences import (
+    Stencil,
+    path_derivatives,
+    rotations_around,
+    stencil,
+)
+from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs
+
+# Shortest step (s) of the differences for velocities and accelerations; at least one interval.
+_MIN_STEP_S = 0.05
+# Stamps are regular if they deviate from multiples of a step by less than this share of a step.
+_MAX_STAMP_ERROR = 0.3
+
+# Residual length at which the robust weight of a motion is a quarter, in standard deviations.
+_QUARTER_WEIGHT_SIGMAS = 3.0
+# Rounds of robust weights.
+_ROUNDS = 4
+
+# Smallest units of displacements (m) and rotations (rad), for streams without noise.
+_MIN_UNIT_M = 1e-7
+_MIN_UNIT_RAD = 1e-8
+
+# Group of the base that another group replaces: scales by axis contain the scale.
+_REPLACED = {"axes_child": "scale", "axes_parent": "scale"}
+
+# Regressors (K, 6, m) of K motions, by the name of their group.
+_Groups: TypeAlias = Mapping[str, FloatArray]
+
+
+class Regression:
+    """Robust linear regression of motions on groups of regressors.
+
+    Parameters
+    ----------
+    rows : (K, 6, p + 1) array
+        The p regressors of K motions in order of time, displacements (m) before rotations (rad).
+        The last column is the observed difference between both streams.
+    instruments : (K, 6, p + 1) array
+        Instruments of the columns. Regressors without an instrument are their own.
+    units : (6, 1) array
+        Standard deviations of the noise, m and rad. Rows are divided by them.
+    columns : mapping
+        Columns of the regressors of each group.
+    base : sequence of str
+        Groups that are part of every fit.
+    """
+
+    def __init__(
+        self,
+        rows: FloatArray,
+        instruments: FloatArray,
+        units: FloatArray,
+        columns: Mapping[str, list[int]],
+        base: list[str],
+    ) -> None:
+        self._columns = columns
+        self._base = base
+        self._displacements_m = np.sqrt((rows[:, :3] ** 2).sum(axis=1).mean(axis=0))
+        rows = rows / units
+        n_motions, size, n_columns = rows.shape
+        flat = rows.reshape(-1, n_columns)
+        of_base = flat[:, [*self._columns_of(base), n_columns - 1]]
+        weights = np.ones(n_motions)
+        for _ in range(_ROUNDS):
+            products = (of_base * np.repeat(weights, size)[:, None]).T @ of_base
+            coefficients = solve(products, range(len(products) - 1))
+            residuals = of_base[:, -1] - of_base[:, :-1] @ coefficients
+            lengths = np.sqrt((residuals.reshape(n_motions, size) ** 2).sum(axis=1))
+            self._sigma = max(median(lengths) / np.sqrt(size), 1e-12)
+            squared = (lengths / self._sigma) ** 2 / (size * _QUARTER_WEIGHT_SIGMAS**2)
+            weights = robust_weights("geman_mcclure", squared)
+        self._total_weight = float(weights.sum())
+        weighted = rows * weights[:, None, None]
+        # Weighted products of all columns (p + 1, p + 1).
+        self._products = flat.T @ weighted.reshape(flat.shape)
+        self._blocks = Blocks.of_rows(weighted, BLOCKS, instruments / units)
+
+    def _columns_of(self, groups: list[str]) -> list[int]:
+        """Return the columns of groups, in the order of the groups."""
+        return [column for name in groups for column in self._columns[name]]
+
+    def _columns_beside(self, group: str, nuisances: tuple[str, ...]) -> list[int]:
+        """Return the columns that are fitted together with a group: its base and nuisances."""
+        base = [name for name in self._base if name != _REPLACED.get(group)]
+        return self._columns_of([*base, *nuisances])
+
+    def biases(self, group: str) -> FloatArray:
+        """Return the bias (m,) that noise of the regressors can cause in coefficients of a group.
+
+        The noise of the regressors is assumed to be as large as the noise of the residuals.
+        """
+        columns = self._columns[group]
+        squares = np.maximum(self._products[columns, columns], 1e-300)
+        return np.asarray(self._sigma**2 * self._total_weight / squares)
+
+    def displacements_m(self, group: str) -> FloatArray:
+        """Return the root mean square displacement (m,) that each fault of size 1 causes."""
+        return np.asarray(self._displacements_m[self._columns[group]])
+
+    def explained_share(self, group: str, *nuisances: str) -> float:
+        """Return the share (0 to 1) of the squared residuals that a group explains.
+
+        The base and the groups ``nuisances`` are fitted before and together with the group.
+        """
+        beside = self._columns_beside(group, nuisances)
+        costs = []
+        for columns in (beside, [*beside, *self._columns[group]]):
+            x = np.append(-self._blocks.solve(columns), 1.0)
+            used = [*columns, -1]
+            costs.append(float(x @ self._products[np.ix_(used, used)] @ x))
+        return 1.0 - costs[1] / max(costs[0], 1e-300)
+
+    def fit(self, group: str, *nuisances: str) -> tuple[FloatArray, FloatArray]:
+        """Return the coefficients (m,) of a group of m regressors, and their sigmas (m,).
+
+        The base and the groups ``nuisances`` are fitted together with the group.
+        """
+        beside = self._columns_beside(group, nuisances)
+        columns = [*beside, *self._columns[group]]
+        # The larger jackknife variance with long and with short blocks: errors may be correlated
+        # for longer than a short block.
+        variances = np.maximum(
+            np.diag(self._blocks.jackknife(columns)),
+            np.diag(self._blocks.merged(BLOCKS // 2).jackknife(columns)),
+        )
+        coefficients = self._blocks.solve(columns)
+        return coefficients[len(beside) :], np.sqrt(variances[len(beside) :])
+
+
+class _Stream:
+    """Motions of a stream over a span, in the parent's axes.
+
+    Parameters
+    ----------
+    poses : (N, 4, 4) array
+    pairs : MotionPairs
+        First and last row of each of K motions.
+    R_parent_sensor : (3, 3) array
+        Rotation from the stream's sensor to the parent.
+
+    Attributes
+    ----------
+    rows : tuple of three (K,) arrays
+        Rows of the start, the middle and the end of each motion.
+    from_world : (K, 3, 3) array
+        Rotation from the stream's world to the parent's axes at the middle. Errors of the middle
+        pose are independent of the errors at both ends.
+    R_start, R_end, chords : (K, 3, 3) arrays
+        Orientations at both ends in the axes at the middle, and their difference.
+    rotations : (K, 3, 3) array
+        Rotations from start to end, in the axes at the start.
+    displacements_in_world, displacements : (K, 3) arrays
+        Displacements from start to end (m), in the stream's world and in the axes at the middle.
+    """
+
+    def __init__(self, poses: FloatArray, pairs: MotionPairs, R_parent_sensor: FloatArray) -> None:
+        self._poses = poses
+        self._R_parent_sensor = R_parent_sensor
+        self.rows = pairs.i, (pairs.i + pairs.j) // 2, pairs.j
+        start, middle, end = (poses[rows] for rows in self.rows)
+        self.from_world = R_parent_sensor @ np.swapaxes(se3.rotation_of(middle), 1, 2)
+        self.R_start = self.from_world @ se3.rotation_of(start)
+        self.R_end = self.from_world @ se3.rotation_of(end)
+        self.chords = self.R_end - self.R_start
+        to_start = R_parent_sensor @ np.swapaxes(se3.rotation_of(start), 1, 2)
+        self.rotations = to_start @ se3.rotation_of(end) @ R_parent_sensor.T
+        self.displacements_in_world = se3.translation_of(end) - se3.translation_of(start)
+        self.displacements = se3.times(self.from_world, self.displacements_in_world)
+
+    def start_minus_end(self, vectors: FloatArray) -> FloatArray:
+        """Return vectors (N, 3) at the start minus those at the end, in the axes at the start.
+
+        The vectors are in the parent's axes at their pose.
+        """
+        start, _, end = self.rows
+        return vectors[start] - se3.times(self.rotations, vectors[end])
+
+    def angular_derivatives(self, around: Stencil, step_s: float) -> tuple[FloatArray, FloatArray]:
+        """Return angular rates and angular accelerations (N, 3) of all poses, in parent's axes."""
+        turns = rotations_around(se3.rotation_of(self._poses), around)
+        turn, turn_before, turn_after = (vectors @ self._R_parent_sensor.T for vectors in turns)
+        return turn / (2 * step_s), (turn_after - turn_before) / (3 * step_s**2)
+
+    def derivatives(self, around: Stencil, step_s: float) -> tuple[FloatArray, FloatArray]:
+        """Return velocities and accelerations (N, 3) of all poses, in the stream's world."""
+        return path_derivatives(se3.translation_of(self._poses), around, step_s)
+
+
+def motion_regression(
+    pose_pairs: PosePairs,
+    motions: MotionPairs,
+    T_parent_child: FloatArray,
+    moved_at_ns: int | None = None,
+) -> tuple[Regression, FloatArray]:
+    """Return the regression of motions over some seconds, and the principal axes of rotation.
+
+    The axes are the columns of a (3, 3) array in the parent sensor's frame, the axis with the most
+    rotation first.
+
+    Notes
+    -----
+    Groups of regressors:
+
+    - ``turned_child``, ``turned_parent``, ``turned_both``: rotation vector (rad) between positions
+      and orientations, in the stream's world; for both streams in the parent's world.
+    - ``axes_child``, ``axes_parent``: scale, less 1, of each coordinate of the positions.
+    - ``drift``: velocity (m/s) and angular rate (rad/s) of the child's world.
+    - ``gain``: factors, less 1, of the child's rotations about the principal axes.
+    - ``moved``: change of lever arm and rotation of X after ``moved_at_ns``, if given.
+    """
+    parent = _Stream(pose_pairs.Ts_pw_p, motions, np.eye(3))
+    child = _Stream(pose_pairs.Ts_cw_c, motions, se3.rotation_of(T_parent_child))
+    # Displacements of each stream in its own world, predicted from the other stream.
+    arm = se3.times(parent.chords, se3.translation_of(T_parent_child))
+    parent_to_world = np.swapaxes(parent.from_world, 1, 2)
+    child_to_world = np.swapaxes(child.from_world, 1, 2)
+    parent_predicted = se3.times(parent_to_world, child.displacements - arm)
+    child_predicted = se3.times(child_to_world, parent.displacements + arm)
+    stamps_ns = pose_pairs.stamps_ns
+    durations_s = (stamps_ns[motions.j] - stamps_ns[motions.i]) * 1e-9
+    drifted = child.from_world * durations_s[:, None, None]
+    middle = pose_pairs.Ts_cw_c[motions.i, :3, 3] + 0.5 * child.displacements_in_world
+    middle = middle - middle.mean(axis=0)
+    rotations = se3.rotation_log(parent.rotations)
+    axes = np.linalg.eigh(rotations.T @ rotations)[1][:, ::-1]
+    turned_child = -child.from_world @ se3.skew(child.displacements_in_world)
+    turned_parent = parent.from_world @ se3.skew(parent.displacements_in_world)
+    R_cw_pw = se3.nearest_rotation((child_to_world @ parent.from_world).mean(axis=0))
+    translating = _regressors(drifted)
+    rotating = _regressors(-drifted @ se3.skew(middle), drifted)
+    groups = {
+        "turned_child": _regressors(turned_child),
+        "turned_parent": _regressors(turned_parent),
+        "turned_both": _regressors(turned_parent + turned_child @ R_cw_pw),
+        "axes_child": _regressors(child.from_world * child_predicted[:, None, :]),
+        "axes_parent": _regressors(-parent.from_world * parent_predicted[:, None, :]),
+        "drift": np.concatenate([translating, rotating], axis=2),
+        "gain": _regressors(np.zeros_like(drifted), (rotations @ axes)[:, None, :] * axes[None]),
+    }
+    if moved_at_ns is not None:
+        is_after = (stamps_ns[motions.i] + stamps_ns[motions.j]) // 2 >= moved_at_ns
+        base = _base_groups(parent, child)
+        of_extrinsic = np.concatenate([base["lever"], base["rotation"]], axis=2)
+        groups["moved"] = is_after[:, None, None] * of_extrinsic
+    return _regression(parent, child, T_parent_child, groups, {}), axes
+
+
+def delay_regression(
+    pose_pairs: PosePairs, motions: MotionPairs, T_parent_child: FloatArray
+) -> Regression | None:
+    """Return the regression of motions over about a second; None if too few stamps are regular.
+
+    Notes
+    -----
+    Groups of regressors:
+
+    - ``late_child``, ``late_parent``: delay (s) of the positions after the orientations of the
+      stream. Their instruments are velocities of the other stream.
+    - ``late_axes_child``, ``late_axes_parent``: the same delay by coordinate.
+    - ``positions_child``, ``positions_parent``, ``orientations_child``, ``orientations_parent``:
+      smoothing c (s^2).
+    """
+    stamps_ns = pose_pairs.stamps_ns
+    interval_s = median(np.diff(stamps_ns)) * 1e-9
+    step = max(round(_MIN_STEP_S / interval_s), 1)
+    step_s = step * interval_s
+    is_regular = np.zeros(len(stamps_ns), dtype=bool)
+    inner = np.arange(2 * step, len(stamps_ns) - 2 * step)
+    multiples = np.array([-2, -1, 1, 2])
+    elapsed_s = (stamps_ns[inner[:, None] + step * multiples] - stamps_ns[inner, None]) * 1e-9
+    errors_s = np.abs(elapsed_s - step_s * multiples)
+    is_regular[inner] = (errors_s < _MAX_STAMP_ERROR * step_s).all(axis=1)
+    middles = (motions.i + motions.j) // 2
+    motions = motions[is_regular[motions.i] & is_regular[motions.j] & is_regular[middles]]
+    if len(motions) < BLOCKS**2:
+        return None
+    X = T_parent_child
+    R_X = se3.rotation_of(X)
+    lever_arm = se3.translation_of(X)
+    around = stencil(np.asarray(stamps_ns * 1e-9, dtype=float), step)
+    Ts_parent = pose_pairs.Ts_pw_p
+    Ts_child = pose_pairs.Ts_cw_c
+    parent = _Stream(Ts_parent, motions, np.eye(3))
+    child = _Stream(Ts_child, motions, R_X)
+    groups = _filter_groups(parent, child, lever_arm, around, step_s)
+    # The same regressors from poses of each sensor that are computed from the other stream.
+    parent_of_child = _Stream(Ts_child @ se3.inverse(X), motions, np.eye(3))
+    child_of_parent = _Stream(Ts_parent @ X, motions, R_X)
+    from_other = _filter_groups(parent_of_child, child_of_parent, lever_arm, around, step_s)
+    instruments = {name: from_other[name] for name in ("late_child", "late_parent")}
+    return _regression(parent, child, X, groups, instruments, "late")
+
+
+def _filter_groups(
+    parent: _Stream, child: _Stream, lever_arm: FloatArray, around: Stencil, step_s: float
+) -> dict[str, FloatArray]:
+    """Return the groups of delays and smoothing, and "late": a delay of whole poses of the child.
+
+    ``lever_arm`` (3,) is that of X, m. ``around`` and ``step_s`` (s) define the differences.
+    """
+    groups = {}
+    for name, sign, stream in (("child", -1.0, child), ("parent", 1.0, parent)):
+        velocity, acceleration = stream.derivatives(around, step_s)
+        rate, angular_acceleration = stream.angular_derivatives(around, step_s)
+        start, middle, end = stream.rows
+        velocity_change = sign * (velocity[end] - velocity[start])
+        acceleration_change = sign * (acceleration[start] - acceleration[end])
+        late = se3.times(stream.from_world, velocity_change)
+        positions = se3.times(stream.from_world, acceleration_change)
+        # The orientation of the middle pose rotates the displacement.
+        orientations = sign * se3.cross(angular_acceleration[middle], stream.displacements)
+        if name == "child":
+            displaced = late + se3.cross(rate[middle], stream.displacements)
+            groups["late"] = _regressors(displaced, stream.start_minus_end(rate))
+        else:
+            # The parent's orientations at both ends rotate the lever arm.
+            at_start = se3.cross(angular_acceleration[start], lever_arm)
+            at_end = se3.cross(angular_acceleration[end], lever_arm)
+            orientations += se3.times(stream.R_start, at_start) - se3.times(stream.R_end, at_end)
+        turned = sign * stream.start_minus_end(angular_acceleration)
+        groups[f"late_{name}"] = _regressors(late)
+        groups[f"late_axes_{name}"] = _regressors(stream.from_world * velocity_change[:, None, :])
+        groups[f"positions_{name}"] = _regressors(positions)
+        groups[f"orientations_{name}"] = _regressors(orientations, turned)
+    return groups
+
+
+def _base_groups(parent: _Stream, child: _Stream) -> dict[str, FloatArray]:
+    """Return the groups of the base: lever arm (m), small rotation of X (rad), and scale."""
+    return {
+        "lever": _regressors(parent.chords),
+        "rotation": _regressors(se3.skew(child.displacements), child.rotations - np.eye(3)),
+        "scale": _regressors(child.displacements),
+    }
+
+
+def _regressors(of_displacement: FloatArray, of_rotation: FloatArray | None = None) -> FloatArray:
+    """Join regressors of displacements and of rotations to (K, 6, m).
+
+    Each part is (K, 3, m), or (K, 3) for one regressor. A fault without rotations has only the
+    first part.
+    """
+    if of_rotation is None:
+        of_rotation = np.zeros_like(of_displacement)
+    joined = np.concatenate([of_displacement, of_rotation], axis=1)
+    return joined.reshape(len(of_displacement), 6, -1)
+
+
+def _regression(
+    parent: _Stream,
+    child: _Stream,
+    X: FloatArray,
+    groups: _Groups,
+    instruments: _Groups,
+    *also_in_base: str,
+) -> Regression:
+    """Return the regression on groups of faults and on the base.
+
+    The lever arm has instruments from the child's orientations; ``instruments`` are those of
+    other groups. ``also_in_base`` names groups that join the base.
+    """
+    displaced = child.displacements - parent.displacements
+    turned = se3.rotation_log(child.rotations @ np.swapaxes(parent.rotations, 1, 2))
+    residuals_m = displaced - se3.times(parent.chords, se3.translation_of(X))
+    unit_m = max(float(robust_sigma(residuals_m)), _MIN_UNIT_M)
+    unit_rad = max(float(robust_sigma(turned)), _MIN_UNIT_RAD)
+    units = np.repeat([unit_m, unit_rad], 3)[:, None]
+    base = _base_groups(parent, child)
+    columns: dict[str, list[int]] = {}
+    n_columns = 0
+    all_groups = base | dict(groups)
+    for name, regressors in all_groups.items():
+        columns[name] = list(range(n_columns, n_columns + regressors.shape[2]))
+        n_columns += regressors.shape[2]
+    rows = np.concatenate([*all_groups.values(), _regressors(displaced, turned)], axis=2)
+    instrument_rows = rows.copy()
+    for name, regressors in (_base_groups(child, child) | dict(instruments)).items():
+        instrument_rows[:, :, columns[name]] = regressors
+    return Regression(rows, instrument_rows, units, columns, [*base, *also_in_base])
