@@ -112,9 +112,9 @@ def local_path(source: str | Path) -> Path:
     InputError
         If the package has no sample of this name.
     """
-    scheme, _, name = str(source).partition(":")
-    if scheme != "sample":
+    if not str(source).startswith("sample:"):
         return Path(source)
+    name = str(source).removeprefix("sample:")
     samples = sorted(path.name for path in _SAMPLES.iterdir())
     if name not in samples:
         wanted = printable(str(source))

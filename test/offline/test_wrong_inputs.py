@@ -2,6 +2,7 @@
 
 import shlex
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -194,3 +195,8 @@ def test_an_option_of_dnlo_has_a_note_with_another_method(run):
     assert "Note: the option threshold has no effect with method adaptive: only dnlo uses" in words
     _, out, _ = run("calibrate", *paths, "--threshold", "0.5", "--method", "dnlo")
     assert "has no effect" not in out
+
+
+def test_a_folder_may_be_called_sample():
+    assert local_path("sample") == Path("sample")
+    assert local_path("sample/lidar.tum") == Path("sample/lidar.tum")
