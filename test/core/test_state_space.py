@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from hand_eye_calib.core.base.blocks import Blocks
+from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.noise import reml
 from hand_eye_calib.core.noise.normal import Factor, NormalEquations
 from hand_eye_calib.core.noise.outliers import chi_squares, innovation_chi_squares
@@ -114,6 +115,43 @@ def test_the_likelihood_stays_exact_where_there_is_hardly_any_walk_or_white_nois
         space = space_of()
         expected = dense_loss(space, levels)[0]
         assert Posterior(space, levels).loss == pytest.approx(expected, rel=1e-7)
+
+
+def test_a_parameter_without_information_changes_no_derivative():
+    """As z in planar motion: two columns of J that are proportional, and a column of zeros."""
+    space = space_of()
+    space.columns[:, :, 1] = 3.0 * space.columns[:, :, 0]
+    space.columns[:, :, 2] = 0.0
+    space.prior[:] = 0.0
+    step = 1e-5
+    gradient, _ = reml.derivatives(Posterior(space, LEVELS))
+    numerical = [
+        (Posterior(space, LEVELS + change).loss - Posterior(space, LEVELS - change).loss)
+        / (2 * step)
+        for change in step * np.eye(N_LEVELS)
+    ]
+    np.testing.assert_allclose(gradient, numerical, atol=1e-6)
+
+
+@pytest.mark.parametrize("units", [np.ones(3), np.array([1.0, 0.1, 10.0])])
+def test_the_log_determinant_is_that_of_the_directions_with_information(units):
+    information = np.diag([4.0, 9.0, 0.0])
+    turned = se3.rotation_exp(np.array([0.3, -0.2, 0.5]))
+    information = turned @ information @ turned.T
+    products = np.zeros((4, 4))
+    products[:3, :3] = information / np.outer(units, units)
+    # Without one direction, the product of the eigenvalues that are not zero.
+    values = np.linalg.eigvalsh(products[:3, :3])[1:]
+    result = NormalEquations(products)
+    assert len(result.unseen.T) == 1
+    assert result.log_determinant == pytest.approx(np.log(values).sum(), rel=1e-9)
+
+
+def test_no_information_at_all_is_no_error():
+    result = NormalEquations(np.zeros((4, 4)))
+    assert result.log_determinant == 0.0
+    assert result.unseen.shape == (3, 3)
+    assert not result.covariance.any()
 
 
 def test_derivatives_of_the_likelihood_are_the_numerical_ones():

@@ -216,17 +216,23 @@ class NormalEquations:
     cost : (...) array
         Weighted squared residual after the step.
     log_determinant : (...) array
-        Log determinant of the information ``J' V^-1 J``, without directions that have none.
+        Logarithm of the product of all eigenvalues of the information ``J' V^-1 J`` that are not
+        zero.
     """
 
     def __init__(self, products: FloatArray) -> None:
         information = products[..., :-1, :-1]
         gradient = products[..., :-1, -1]
         diagonal = np.einsum("...ii->...i", information)
-        # Scale the information to ones on the diagonal, because the units of parameters differ.
-        rounding = np.finfo(float).eps * diagonal.max(axis=-1, keepdims=True)
-        scale = 1.0 / np.sqrt(np.maximum(diagonal, rounding + np.finfo(float).tiny))
-        values, vectors = np.linalg.eigh(scale[..., :, None] * information * scale[..., None, :])
+        # Scale the information to ones on the diagonal, because the units of parameters differ. A
+        # parameter below rounding has no information; its scale is arbitrary.
+        largest = diagonal.max(axis=-1, keepdims=True)
+        has_information = diagonal > np.finfo(float).eps * largest
+        any_scale = np.where(largest > 0.0, largest, 1.0)
+        scale = 1.0 / np.sqrt(np.where(has_information, diagonal, any_scale))
+        both_have = has_information[..., :, None] & has_information[..., None, :]
+        scaled = np.where(both_have, information, 0.0)
+        values, vectors = np.linalg.eigh(scale[..., :, None] * scaled * scale[..., None, :])
         # Eigenvalue 1 in place of rounding, which the mask excludes from root and log determinant.
         self._is_observed = values > _MIN_INFORMATION
         values = np.where(self._is_observed, values, 1.0)
@@ -237,6 +243,21 @@ class NormalEquations:
         self.step = -(self.covariance @ gradient[..., None])[..., 0]
         self.cost = products[..., -1, -1] + (gradient * self.step).sum(axis=-1)
         self.log_determinant = np.log(values).sum(axis=-1) - 2.0 * np.log(scale).sum(axis=-1)
+        self.log_determinant += self._log_unseen_scale()
+
+    def _log_unseen_scale(self) -> FloatArray:
+        """Return (...) the share of directions without information in the scale, as a log.
+
+        The scaled information S I S has ones on its diagonal, so that S depends on the levels. Let
+        N be the vectors S v of directions v without information. Then ``pdet(I) = pdet(S I S) /
+        det(S)^2 det(N' N)``, with the pseudo-determinants pdet.
+        """
+        is_unseen = ~self._is_observed
+        both_unseen = is_unseen[..., :, None] & is_unseen[..., None, :]
+        products = np.where(
+            both_unseen, transposed(self._axes) @ self._axes, np.eye(is_unseen.shape[-1])
+        )
+        return np.asarray(np.linalg.slogdet(products)[1])
 
     @property
     def unseen(self) -> FloatArray:
