@@ -12,10 +12,10 @@ def register() -> None:
 
 
 def _save(result: Any, directory: Any) -> Any:
-    """Call :func:`.results.save_result`, which is imported only when it is needed."""
-    from hand_eye_calib.formats.results import save_result
+    """Call :func:`.results.save`, which is imported only when it is needed."""
+    from hand_eye_calib.formats.results import save
 
-    return save_result(result, directory)
+    return save(result, directory)
 
 
 def _export(result: Any, format: str) -> str:

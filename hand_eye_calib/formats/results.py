@@ -31,6 +31,7 @@ from hand_eye_calib.formats.yaml_files import read_yaml, yaml_text
 
 FILE_NAME = "extrinsic.yaml"
 RIG_NAME = "rig.yaml"
+REPORT_NAME = "report.html"
 XACRO_NAME = "extrinsic.urdf.xacro"
 LAUNCH_NAME = "static_transform.launch.py"
 _NAMES = (XACRO_NAME, LAUNCH_NAME, FILE_NAME)
@@ -65,11 +66,6 @@ def save_result(
     ------
     InputError
         If the files cannot be written.
-
-    Examples
-    --------
-    >>> hec.save(result, "saved")
-    PosixPath('saved/extrinsic.yaml')
     """
     require_type("the result", calibration, Calibration)
     directory = path_of("directory", directory)
@@ -80,6 +76,32 @@ def save_result(
         FILE_NAME: _yaml_text(calibration.to_dict(), inputs),
     }
     return _written(directory, texts)
+
+
+def save(
+    calibration: Calibration, directory: str | Path, inputs: Mapping[str, Any] | None = None
+) -> Path:
+    """Save a result, and keep the earlier result of the directory in its folder ``previous``.
+
+    Files, parameters and errors are those of :func:`save_result`. The report of the earlier result
+    is kept in ``previous``, too, because it does not belong to the new result.
+
+    Examples
+    --------
+    >>> hec.save(result, "saved")
+    PosixPath('saved/extrinsic.yaml')
+    """
+    require_type("the result", calibration, Calibration)
+    directory = path_of("directory", directory)
+    # A report that was written before the first save belongs to this result.
+    has_earlier = Path(directory, FILE_NAME).exists()
+    if has_earlier:
+        keep_earlier_results(directory)
+    path = save_result(calibration, directory, inputs)
+    if has_earlier:
+        with writing(directory):
+            Path(directory, REPORT_NAME).unlink(missing_ok=True)
+    return path
 
 
 def save_rig(
@@ -94,7 +116,7 @@ def save_rig(
     contains all usable transforms. Each sensor has a directory with the files of
     :func:`save_result`.
     """
-    folders = {RIG_NAME, LAUNCH_NAME, "report.html"}
+    folders = {RIG_NAME, LAUNCH_NAME, REPORT_NAME}
     for calibration in calibrations:
         # Replace characters of the frame's name that the name of a folder should not contain.
         name = re.sub(r"[^\w.-]", "_", calibration.child_frame.strip("/")).lstrip(".") or "sensor"
@@ -191,7 +213,7 @@ def keep_earlier_results(directory: str | Path) -> str:
         If a file cannot be copied.
     """
     previous = Path(directory, "previous")
-    paths = [Path(directory, name) for name in (*_NAMES, RIG_NAME, "report.html")]
+    paths = [Path(directory, name) for name in (*_NAMES, RIG_NAME, REPORT_NAME)]
     copies = {previous / path.name: read_bytes(path) for path in paths if path.exists()}
     if not copies:
         return ""
@@ -291,4 +313,3 @@ def _remarks(calibration: Judged) -> list[str]:
 
 # Names in the public interface of the package.
 load = load_result
-save = save_result

@@ -15,6 +15,7 @@ import yaml
 from result_making import calibration, dofs, good_calibration
 from source_code import ROOT
 
+import hand_eye_calib as hec
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.plain import json_text, plain
 from hand_eye_calib.core.checks import findings as wording
@@ -285,6 +286,30 @@ def test_saving_again_replaces_the_file_and_leaves_nothing_else(tmp_path):
     path = save_result(calibration(objective=2.0), tmp_path)
     assert load_result(path).objective == 2.0
     assert sorted(os.listdir(tmp_path)) == FILES
+
+
+@pytest.mark.parametrize("save", [hec.save, Calibration.save])
+def test_the_public_save_keeps_an_earlier_result_with_its_report(save, tmp_path):
+    earlier = hec.save(good_calibration(), tmp_path).read_bytes()
+    report = tmp_path / "report.html"
+    report.write_text("report of the first result, by hand_eye_calib")
+
+    save(calibration(objective=2.0), tmp_path)
+
+    assert not report.exists()
+    assert (tmp_path / "previous/report.html").is_file()
+    assert (tmp_path / "previous/extrinsic.yaml").read_bytes() == earlier
+    assert hec.load(tmp_path).objective == 2.0
+
+
+def test_the_public_save_keeps_a_report_that_was_written_before_it(tmp_path):
+    report = tmp_path / "report.html"
+    report.write_text("report of this result, by hand_eye_calib")
+
+    hec.save(calibration(), tmp_path)
+
+    assert report.exists()
+    assert not (tmp_path / "previous").exists()
 
 
 def test_a_write_that_fails_keeps_the_old_file(tmp_path, monkeypatch):
