@@ -2,7 +2,7 @@
 
 Model, for poses i = 0 ... N - 1 and the increments from pose i to pose i + 1:
 
-    e_i + J_i beta = c_{i+1} - Ad(B_i^-1) c_i + w_i
+    e_i + J_i beta = c_{i+1} - Ad(B_i^-1) c_i + D_i d_i + w_i
     c_i = v_i + sum_k M_ik g_ik
     g_{i+1,k} = phi_ik g_ik + q_ik
 
@@ -15,20 +15,27 @@ Model, for poses i = 0 ... N - 1 and the increments from pose i to pose i + 1:
   part.
 - g_ik: time-correlated errors, which are first-order Gauss-Markov processes; q_ik: their white
   driving noise. M_ik is the matrix from process k to c_i.
+- d_i: errors of the path, a drifting scale and direction, which are processes like g_ik; D_i is the
+  derivative of e_i with respect to them.
 - w_i (6,): step of a random walk, the drift of odometry.
-- x_i (d,): state of pose i, which is v_i followed by all g_ik.
+- x_i (d,): state of pose i, which is v_i followed by all processes.
 
 v, g and w are Gaussian. Their variances and the time constants of g are unknown: a *level* is the
 logarithm of one of them. The estimate has three parts:
 
 1. The states x and the walk w are marginalised exactly, by linear algebra in time linear in N.
-2. The levels maximise the restricted likelihood (REML), in which beta is marginalised, too.
+2. The levels maximise their posterior density: the restricted likelihood (REML), in which beta is
+   marginalised, too, times weak priors. They are fitted to a sample of the poses if there are many.
 3. beta is estimated by generalised least squares at these levels, and e is linearised again.
 
 Jumps, outlier poses and the choice of processes and systematic errors are decided between these
 parts, in the order of the stages.
 
-Reading order: :mod:`~hand_eye_calib.core.noise.increments` (e and J),
+A *process* is one scalar; the processes of one error share variance and time constant, and form a
+*group*.
+
+Reading order: :mod:`~hand_eye_calib.core.noise.tuning` (limits, in the order of their
+use), :mod:`~hand_eye_calib.core.noise.increments` (e and J),
 :mod:`~hand_eye_calib.core.noise.noise_model` (errors that are in the model),
 :mod:`~hand_eye_calib.core.noise.state_space` (likelihood and posterior of the states),
 :mod:`~hand_eye_calib.core.noise.normal` (linear algebra), :mod:`~hand_eye_calib.core.noise.reml`

@@ -157,10 +157,10 @@ class AdaptiveSolution(ModelSolution):
     weights : (n + 1,) array
         Weights of the white errors of poses; other than 1 only if the errors have heavy tails.
     metres_per_pose : float
-        Mean distance (m) that the parent travels from pose to pose.
+        Length of the parent's path (m), divided by the number of poses.
     is_noise_dominated : bool
-        Whether the noise of single poses exceeds the rotation between them, so that only every k-th
-        pose was used.
+        Whether the noise of single poses exceeds a share of the rotation between them
+        (``Tuning.noisy_share``), so that only every k-th pose was used.
     """
 
     T_parent_child: FloatArray
@@ -318,7 +318,8 @@ def solve(
     quick : bool
         Skip the stages for heavy tails and time-correlated errors.
     is_clock_free : bool
-        Whether the clock offset was estimated from these poses. If so, it has no prior.
+        Whether the clock offset was estimated from these poses. If so, it is certainly among the
+        systematic errors.
     without : collection of str
         Names of :data:`~hand_eye_calib.core.noise.stages.STAGES` that are skipped.
     tuning : Tuning
@@ -352,7 +353,8 @@ def solve(
 def _search(problem: Problem) -> AdaptiveSolution:
     """Run all stages, and return the solution.
 
-    Single poses of a camera that observes a target may be noisier than the rotation between them.
+    Single poses of a camera that observes a target may be as noisy as the rotation between them is
+    large.
     Then the search is repeated with every k-th pose. If X does not settle, the last stages are
     repeated without time-correlated errors.
     """

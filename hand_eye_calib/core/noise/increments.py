@@ -12,13 +12,14 @@ pose i + 1, w_i is the error of the motions themselves, and X is the present est
 The factor of xi is the derivative of e_i. Systematic errors have derivatives, too: a scale, a bias
 per metre of path, a time offset, a bias of angular rates.
 
-Derivatives are computed at poses from which the errors estimated so far were removed; the residuals
-contain these errors. Derivatives at noisy poses are noisy, too, and would bias X if the noise is
-not much smaller than the motion from pose to pose (errors in variables).
+Derivatives are computed at poses from which the errors estimated so far were removed. The residuals
+are those of the measured poses: these errors are added back. Derivatives at noisy poses are noisy,
+too, and would bias X if the noise is not much smaller than the motion from pose to pose (errors in
+variables).
 
 For the same reason, the derivatives with respect to scale and bias use smoothed steps of the child,
-which do not contain the noise of the increment's own residual. Otherwise the scale would be
-underestimated if steps are smaller than their noise.
+which contain at most a share of the noise of the increment's own residual. Otherwise the scale
+would be underestimated if steps are smaller than their noise.
 """
 
 from __future__ import annotations
@@ -141,8 +142,9 @@ def course_of(streams: Streams, T_parent_child: FloatArray, noise_m2: float = np
     T_parent_child : (4, 4) array
         X.
     noise_m2 : float
-        Noise variance of a step per axis. Differences between a step and its neighbours are
-        smoothed out if their variance is not larger. The larger it is, the less is smoothed.
+        Noise variance of a step per axis. The differences between steps and their neighbours are
+        removed if their median square is at most this variance, and hardly changed if it is far
+        larger. ``inf`` removes them.
     """
     R = se3.rotation_of(T_parent_child)
     lever_arm = se3.translation_of(T_parent_child)
@@ -162,9 +164,9 @@ def course_of(streams: Streams, T_parent_child: FloatArray, noise_m2: float = np
 
 
 def _smooth_steps(steps: FloatArray, intervals_s: FloatArray, noise_m2: float) -> FloatArray:
-    """Move steps (n, 3) towards the mean velocity of the steps two before and two after.
+    """Move each step i of (n, 3) towards the mean velocity of steps i - 2 and i + 2.
 
-    The difference from this mean is multiplied by the share of its variance that is not noise.
+    The difference from this mean is multiplied by the share of its median square that is not noise.
     """
     velocities = steps / intervals_s[:, None]
     padded = np.concatenate(
@@ -194,7 +196,8 @@ class Linearisation:
         Ad(B_i^-1).
     by_path : dict of str to array
         Derivatives of e with respect to drifting errors of the path: "scale" (n, 6, 1), and
-        "direction" (n, 6, 3), a rotation (rad) of the steps in the child's frame.
+        "direction" (n, 6, 3), for steps that are rotated by minus this vector (rad) in the child's
+        frame.
     """
 
     columns: FloatArray

@@ -5,13 +5,14 @@ errors:
 
 - white errors v of poses: translation, rotation, and a shift along the velocity, which is due to
   jitter of stamps;
-- a random walk w of the motions: translation and rotation;
+- a random walk of the motions with the steps w: translation and rotation;
 - first-order Gauss-Markov processes g of poses, with ``c = M g``. For translations fixed to the
   child's body, M is constant. For translations and rotations fixed to the parent's world,
   ``M = Ad(X^-1) blkdiag(R_p', R_p')`` with the orientation R_p of the parent;
 - Gauss-Markov processes of increments: a drifting scale, or a drifting direction of travel.
 
-Each error has one variance for all axes. A level is the logarithm of a variance or of a time
+Each error has one variance for all axes; white rotations also shift the child, by its lever arm,
+and jitter acts along the velocity alone. A level is the logarithm of a variance or of a time
 constant. Derivation: docs/adaptive.md.
 """
 
@@ -35,9 +36,9 @@ from hand_eye_calib.core.noise.tuning import Tuning
 # is the origin of its world.
 CENTRES = ("sensors", "child", "parent")
 
-# Indices of the levels of white errors and of the walk. The variances are those of white
-# translation (m^2), white rotation (rad^2), jitter of stamps (s^2), and of the walk of translation
-# (m^2) and of rotation (rad^2) over a typical increment.
+# Indices of the levels of fast errors, which are not time-correlated: white errors and the walk.
+# The variances are those of white translation (m^2), white rotation (rad^2), jitter of stamps
+# (s^2), and of the walk of translation (m^2) and of rotation (rad^2) over a typical increment.
 N_FAST = 5
 TRANSLATION, ROTATION, JITTER, WALK_TRANSLATION, WALK_ROTATION = range(N_FAST)
 WHITES = slice(TRANSLATION, ROTATION + 1)
@@ -148,8 +149,8 @@ class NoiseModel:
         """
         to_child = se3.adjoint(se3.inverse(T_parent_child))
         intervals_s = np.diff(streams.stamps_s)
-        # Half of the rotation noise is that of the parent. It also shifts the child, by the
-        # rotation times the lever arm.
+        # Half of the rotation noise R is that of the parent, which also shifts the child by its
+        # lever arm: 1/2 (R + Ad(X^-1) R Ad(X^-1)').
         rotations = 0.5 * (ROTATIONS + to_child @ ROTATIONS @ to_child.T)
         white_rotations = rotations[None]
         if self.centre != "sensors":
@@ -197,12 +198,12 @@ class NoiseModel:
     def shares(
         self, levels: FloatArray, streams: Streams, T_parent_child: FloatArray
     ) -> FloatArray:
-        """Return the matrices (1 or N, 6, 6) from white errors c to the parent's share of c.
+        """Return the matrices (1 or N, 6, 6) from white errors v to the parent's part of v.
 
-        The white covariances of parent and child, S_p and S_c, are in the child's frame. The
-        expected errors a of the parent and b of the child are
+        S_p and S_c are the white covariances of parent and child without jitter, in the child's
+        frame. The expected white errors a of the parent and b of the child are
 
-            Ad(X^-1) a = S_p (S_p + S_c)^-1 c,      b = -S_c (S_p + S_c)^-1 c
+            Ad(X^-1) a = S_p (S_p + S_c)^-1 v,      b = -S_c (S_p + S_c)^-1 v
 
         Each sensor has half of the noise. Exception: rotation noise about the origin of a world is
         that of the sensor in this world.
@@ -243,7 +244,10 @@ class NoiseModel:
 
     @property
     def _usual_log_tau(self) -> float:
-        """Logarithm of the time constant (s) at the start of a search; also its prior mean."""
+        """Logarithm of the time constant (s) at the start of a search; also its prior mean.
+
+        Both are clipped to the bounds of the time constants.
+        """
         shortest_s = self.tuning.start_tau_intervals * self.interval_s
         longest_s = max(self.tuning.start_tau_share * self.duration_s, shortest_s)
         return 0.5 * float(np.log(shortest_s * longest_s))

@@ -4,9 +4,9 @@ A symmetric positive definite matrix has blocks D_k on its diagonal; the block E
 and column k. Cyclic reduction (Golub; Heller, SIAM J. Numer. Anal. 13, 1976) factorises the matrix
 in rounds. A round eliminates every second row of blocks, k = 1, 3, 5, ...:
 
-    D_k = L_k L_k',    before_k = L_k^-1 E_{k-1},    behind_k = L_k^-1 E_k'
-    D_{k-1} -= before_k' before_k,    D_{k+1} -= behind_k' behind_k
-    new block of row k + 1 and column k - 1: -behind_k' before_k
+    D_k = L_k L_k',    before_k = L_k^-1 E_{k-1},    after_k = L_k^-1 E_k'
+    D_{k-1} -= before_k' before_k,    D_{k+1} -= after_k' after_k
+    new block of row k + 1 and column k - 1: -after_k' before_k
 
 The remaining matrix is block tridiagonal again, and half as long. The result is a Cholesky
 factorisation of the matrix with its rows and columns in another order. Time and memory are linear
@@ -73,13 +73,13 @@ def inverse_roots(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
 class _Round(NamedTuple):
     """Blocks of the factor that one round of cyclic reduction eliminates.
 
-    ``inverse`` (m, d, d) is L_k^-1. ``before`` (m, d, d) and ``behind`` (m or m - 1, d, d) couple
-    block k with its neighbours. The last eliminated block may have no neighbour behind it.
+    ``inverse`` (m, d, d) is L_k^-1. ``before`` (m, d, d) and ``after`` (m or m - 1, d, d) couple
+    block k with its neighbours. The last eliminated block may have no neighbour after it.
     """
 
     inverse: FloatArray
     before: FloatArray
-    behind: FloatArray
+    after: FloatArray
 
 
 class Factor:
@@ -108,15 +108,15 @@ class Factor:
         self.log_determinant = 0.0
         while len(diagonal) > 1 and diagonal.shape[0] * diagonal.shape[1] > _FEW:
             inverse, log_determinants = inverse_roots(diagonal[1::2])
-            n_behind = (len(diagonal) - 1) // 2
+            n_after = (len(diagonal) - 1) // 2
             before = inverse @ below[::2]
-            behind = inverse[:n_behind] @ transposed(below[1::2])
-            self._rounds.append(_Round(inverse, before, behind))
+            after = inverse[:n_after] @ transposed(below[1::2])
+            self._rounds.append(_Round(inverse, before, after))
             self.log_determinant += float(log_determinants.sum())
             diagonal = diagonal[::2].copy()
             diagonal[: len(before)] -= transposed(before) @ before
-            diagonal[1 : 1 + n_behind] -= transposed(behind) @ behind
-            below = -transposed(behind) @ before[:n_behind]
+            diagonal[1 : 1 + n_after] -= transposed(after) @ after
+            below = -transposed(after) @ before[:n_after]
         # The blocks that remain become one dense matrix.
         self._n_last, self._size, _ = diagonal.shape
         dense = np.zeros((self._n_last, self._size) * 2)
@@ -131,11 +131,11 @@ class Factor:
         """Return ``L^-1`` times columns (n, d, k), with the blocks in order of elimination."""
         whitened = np.empty(right.shape)
         start = 0
-        for inverse, before, behind in self._rounds:
+        for inverse, before, after in self._rounds:
             eliminated = inverse @ right[1::2]
             right = right[::2].copy()
             right[: len(eliminated)] -= transposed(before) @ eliminated
-            right[1 : 1 + len(behind)] -= transposed(behind) @ eliminated[: len(behind)]
+            right[1 : 1 + len(after)] -= transposed(after) @ eliminated[: len(after)]
             whitened[start : start + len(eliminated)] = eliminated
             start += len(eliminated)
         last = right.reshape(len(self._last), -1)
@@ -151,12 +151,12 @@ class Factor:
         start = len(whitened) - self._n_last
         last = whitened[start:].reshape(len(self._last), -1)
         solved = (self._last.T @ last).reshape(whitened[start:].shape)
-        for inverse, before, behind in reversed(self._rounds):
+        for inverse, before, after in reversed(self._rounds):
             neighbours = solved
             end = start
             start -= len(inverse)
             eliminated = whitened[start:end] - before @ neighbours[: len(inverse)]
-            eliminated[: len(behind)] -= behind @ neighbours[1 : 1 + len(behind)]
+            eliminated[: len(after)] -= after @ neighbours[1 : 1 + len(after)]
             solved = np.empty((len(inverse) + len(neighbours), *neighbours.shape[1:]))
             solved[::2] = neighbours
             np.matmul(transposed(inverse), eliminated, out=solved[1::2])
@@ -170,28 +170,28 @@ class Factor:
         blocks = np.arange(self._n_last)
         diagonal = dense[blocks, blocks]
         below = dense[blocks[1:], blocks[:-1]]
-        for inverse, before, behind in reversed(self._rounds):
+        for inverse, before, after in reversed(self._rounds):
             n_eliminated = len(inverse)
-            n_behind = len(behind)
+            n_after = len(after)
             root = transposed(inverse)
             # If the inverse is a covariance, an eliminated state is these matrices times its
             # neighbours, plus independent noise of covariance root root'.
             to_before = -root @ before
-            to_behind = -root[:n_behind] @ behind
+            to_after = -root[:n_after] @ after
             with_before = to_before @ diagonal[:n_eliminated]
-            with_before[:n_behind] += to_behind @ below[:n_behind]
-            with_behind = diagonal[1 : 1 + n_behind] @ transposed(to_behind)
-            with_behind += below[:n_behind] @ transposed(to_before[:n_behind])
+            with_before[:n_after] += to_after @ below[:n_after]
+            with_after = diagonal[1 : 1 + n_after] @ transposed(to_after)
+            with_after += below[:n_after] @ transposed(to_before[:n_after])
             eliminated = root @ inverse
             eliminated += with_before @ transposed(to_before)
-            eliminated[:n_behind] += transposed(to_behind @ with_behind)
+            eliminated[:n_after] += transposed(to_after @ with_after)
             neighbours = diagonal
             diagonal = np.empty((len(neighbours) + n_eliminated, *neighbours.shape[1:]))
             below = np.empty((len(diagonal) - 1, *neighbours.shape[1:]))
             diagonal[::2] = neighbours
             diagonal[1::2] = eliminated
             below[::2] = with_before
-            below[1::2] = with_behind
+            below[1::2] = with_after
         return diagonal, below
 
 

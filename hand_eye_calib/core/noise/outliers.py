@@ -39,7 +39,7 @@ _MIN_JUMP = 1e-6
 # The diagonal of S - S_post is increased by this share of the diagonal of S, so that rounding does
 # not make it indefinite ...
 _INCREASE_SHARE = 1e-9
-# ... and by this variance (m^2, rad^2), because S may be singular.
+# ... and by this variance (m^2, rad^2), because S of positions or rotations alone may be singular.
 _INCREASE_VARIANCE = 1e-18
 
 # Number of poses whose chi-squares are computed at once. It limits the memory.
@@ -89,7 +89,8 @@ def first_outliers(
     A residual is large beyond a multiple of its robust standard deviation. A large residual is a
     jump, but a pose between two large residuals is an outlier, and they are no jumps. If the
     trajectory also jumped there, the residual is still large after the pose was replaced: then the
-    increment behind the pose is a jump, too.
+    increment after the pose is a jump, too. If too many poses would be outliers, all large
+    residuals are jumps.
     """
     lengths = _lengths(residuals)
     usual_lengths = np.array([median(column) for column in lengths.T])
@@ -189,7 +190,7 @@ def detect_outliers(
     with_spikes : bool
         Whether to detect new outlier poses.
     """
-    # False alarms are expected in this share of all poses.
+    # Tail probability of one test, so that all poses together have the expected false alarms.
     threshold = chi_square_quantile(tuning.false_alarms / len(of_white))
     jump_threshold = _jump_factor(of_walk[~outliers.jumps], threshold, tuning) * threshold
     at_either_end = np.maximum(of_white[1:], of_white[:-1])

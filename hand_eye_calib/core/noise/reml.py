@@ -8,10 +8,11 @@ negative log likelihood (Patterson, Thompson, Biometrika 58, 1971):
     P = V^-1 - V^-1 J (J' V^-1 J)^-1 J' V^-1
     d loss / d theta_k = 1/2 (tr(P V_k) - e' P V_k P e),      V_k = dV / d theta_k
 
-The gradient is exact. It needs only those blocks of the states' covariance that are on the diagonal
-and next to it. The curvature is the average information, the mean of observed and expected
-information (Gilmour, Thompson, Cullis, Biometrics 51, 1995): ``1/2 f_k' P f_l`` with
-``f_k = V_k P e``.
+The prior of beta is part of the information ``J' V^-1 J``. The gradient is exact but for the prior
+of the processes, whose derivative is numerical. It needs only those blocks of the states'
+covariance that are on the diagonal and next to it. The curvature is the average information, the
+mean of observed and expected information (Gilmour, Thompson, Cullis, Biometrics 51, 1995): ``1/2
+f_k' P f_l`` with ``f_k = V_k P e``.
 """
 
 from __future__ import annotations

@@ -4,7 +4,8 @@
 :class:`Workspace` stores the factorisation of the last fit. :func:`start` returns the first fit;
 each stage is a function that takes a workspace and a fit and returns the next fit:
 
-1. :func:`noise`: levels of white noise and walk;
+1. :func:`noise`: all levels of the model, which has only white noise and a walk at first; and a
+   step of X;
 2. :func:`outliers`: jumps and outlier poses, which need noise levels;
 3. :func:`tails`: weights of white errors that have heavy tails;
 4. :func:`time_correlated`: Gauss-Markov processes, which must not explain outliers;
@@ -85,7 +86,8 @@ class Problem:
         Indices of the systematic errors in the model, see
         :data:`~hand_eye_calib.core.noise.increments.PARAMETERS`.
     is_clock_free : bool
-        Whether the time offset was estimated from the same poses. It has no prior then.
+        Whether the time offset was estimated from the same poses. It is certainly among the
+        systematic errors then.
     without : frozenset of str
         Names of the stages that are skipped.
     tuning : Tuning
@@ -363,11 +365,13 @@ def outliers(workspace: Workspace, fit: Fit) -> Fit:
         detected = _detect_in_rounds(workspace, noise(workspace, detected), 1)
     spikes = detected.outliers.spikes
     if np.mean(spikes) > tuning.max_outlier_share:
-        # Not single poses, but long stretches are noisy. Weights of heavy tails replace outliers.
+        # Not single poses, but long stretches are noisy. Weights of heavy tails replace outliers,
+        # unless the stage `tails` is skipped.
         detected = replace(
             detected,
             outliers=Outliers(detected.outliers.jumps, np.zeros_like(spikes)),
             poses=problem.streams,
+            error=np.zeros_like(fit.error),
             has_heavy_tails=True,
         )
     return detected

@@ -7,6 +7,9 @@ white error v_i and of all processes g_ik, with ``phi_ik = exp(-dt_i / tau_k)``.
 
     H1_i = [I, M_{i+1}],      H0_i = Ad(B_i^-1) [I, M_i]
 
+A process that is an error of the path (a drifting scale or direction) acts on the increment itself:
+its columns are 0 in H1_i, and minus the derivative of e_i in H0_i.
+
 Pi is the prior precision of all states, W is the precision of w, and V is the covariance of
 ``e + J beta``. The posterior precision Lambda of the states is block tridiagonal. For any matrix Z
 with the rows of e,
@@ -16,9 +19,9 @@ with the rows of e,
     V^-1 Z = W (Z - U Lambda^-1 U' W Z)
 
 One factorisation ``Lambda = L L'`` yields the likelihood in time linear in the number of poses.
-Products need only the forward half of the solution: ``Z' V^-1 Z = Z' W Z - Y' Y`` with
-``Y = L^-1 U' W Z``. This is the information form of the Kalman smoother (Rauch, Tung, Striebel,
-AIAA J. 3, 1965).
+Products need only the first triangular solution: ``Z' V^-1 Z = Z' W Z - Y' Y`` with
+``Y = L^-1 U' W Z``. The posterior is that of the Kalman smoother (Rauch, Tung, Striebel, AIAA J. 3,
+1965).
 """
 
 from __future__ import annotations
@@ -75,9 +78,11 @@ class StateSpace:
         Number of processes in each group. The processes of a group are independent and share a
         variance and a time constant. In a state, the groups follow the white error in this order.
     weights : (N,) array
-        Factor of the precision of each white error; zero for an outlier pose.
+        Factor of the precision of each white error. For zero, an outlier pose, the precision is
+        the identity instead (a prior of 1 m and 1 rad, in effect none).
     cut : (n,) bool array
-        Increments without information: jumps, and long gaps between poses.
+        Increments without information: jumps; in a sample of the poses, also increments over too
+        many left-out poses.
     prior : (p + 1, p + 1) array
         Prior of the parameters, as products that are added to ``[J e]' V^-1 [J e]``.
     """

@@ -47,7 +47,7 @@ class Tuning:
     settled_loss: float = 0.05
 
     # -- Outliers and heavy tails --
-    # Expected number of false alarms in a whole recording.
+    # Expected number of false alarms among all poses of a recording, and among all increments.
     false_alarms: float = 0.01
     # If the walk has heavy tails, a step is a jump only if its chi-square exceeds the threshold of
     # false alarms by this factor.
@@ -62,10 +62,12 @@ class Tuning:
     # Before noise levels are known, an increment is a jump beyond this number of robust standard
     # deviations. The limit is wide because the residuals contain all errors.
     first_jump_sigmas: float = 5.0
-    # Largest share of poses that may be outliers. If more are, no pose is an outlier and all poses
-    # get Student weights.
+    # Largest share of poses that may be outliers. If more are, no pose is an outlier, and all poses
+    # get Student weights in the stage `tails`. At the first detection, before noise levels are
+    # known, all large residuals are jumps then.
     max_outlier_share: float = 0.2
-    # The noise levels are fitted again if more than this share of poses became outliers or jumps.
+    # The noise levels are fitted again if more than this share of poses and increments became
+    # outliers or jumps, or ceased to be.
     negligible_share: float = 0.005
 
     # -- Rotation noise that is large relative to the rotation between poses --
@@ -76,13 +78,15 @@ class Tuning:
     strides: tuple[int, ...] = (3, 10, 30)
 
     # -- Time-correlated errors --
-    # Time-correlated errors are added if they lower the loss by at least this. Akaike's criterion
-    # for the two levels of one process would be 2.
+    # Time-correlated errors are added if all of them together, with white noise and walk fitted
+    # again, lower the loss by at least this. Akaike's criterion for two levels would be 2.
     least_gain: float = 4.0
-    # A process is dropped if the data have less information than this on its log variance.
+    # A process is dropped if the data have less information than this on its log variance, unless
+    # the first steps of the search have increased its variance.
     min_information: float = 0.3
     # At the start of the search, the variance of each process is this share of the variance of an
-    # increment; white noise and walk have at least this share.
+    # increment; white noise and walk have at least this share. Errors of the path (scale,
+    # direction) start at 0.03 squared.
     start_share: float = 0.1
     # At the start, a time constant is the geometric mean of this number of intervals ...
     start_tau_intervals: float = 10.0
@@ -112,8 +116,8 @@ class Tuning:
     # or more for a child that slips sideways on a road, and at most 2 in simulations.
     max_sigma_growth: float = 3.0
 
-    # -- The end --
-    # Largest number of rounds in which outliers are detected; also that of final steps of X.
+    # -- The end -- Largest number of rounds in which outliers are detected; also that of the last
+    # steps of X, with the step of the solution.
     max_rounds: int = 6
     # X is settled if its next step is shorter than this share of its standard deviation.
     settled_sigmas: float = 0.1
