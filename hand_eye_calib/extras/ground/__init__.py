@@ -13,7 +13,7 @@ from hand_eye_calib.core.base.registry import (
 
 
 def register() -> None:
-    """Register the measurements of the ground, their part of results and their rule."""
+    """Register the measurements of the ground: options, results, verdict and public names."""
     RESULT_PARTS["ground"] = _part
     EXTRA_RULES["ground"] = ExtraRule(
         after="warning_finding",

@@ -1,4 +1,4 @@
-"""The ground and gravity in a bag: clouds or IMU data in the frame of a sensor."""
+"""Read the verticals of both sensors from a bag: from clouds of a lidar or IMU data."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -26,15 +26,21 @@ from hand_eye_calib.offline.cli.options import note, waiting_for
 
 _IMU = "sensor_msgs/msg/Imu"
 
-# Number of scans that suffices, evenly drawn.
-_MOST_SCANS = 300
+# Largest number of scans that are used, evenly spaced in time.
+_MAX_SCANS = 300
 
 
 def verticals_of_bag(paths: Sequence[Path], snapshot: Any) -> tuple[VerticalPair, ...]:
-    """Return the verticals of both sensors of a bag; nothing if a sensor has none.
+    """Return the verticals of both sensors of a bag; an empty tuple if a sensor has none.
 
-    The clouds or IMU data of a sensor are those whose ``frame_id`` is the frame of its poses. The
-    ground is preferred, because it also has the height.
+    A topic belongs to a sensor if its ``frame_id`` is the frame of the poses of this sensor. Clouds
+    are preferred to IMU data, because the ground also determines the height.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+    snapshot : Snapshot
+        Streams and options of the calibration.
     """
     config = snapshot.config
     if config.measured != "poses" or min(map(len, snapshot.streams)) < config.min_pairs:
@@ -46,8 +52,9 @@ def verticals_of_bag(paths: Sequence[Path], snapshot: Any) -> tuple[VerticalPair
         if not (parent and child):
             return ()
         topics = (parent, child)
-        are_imus = [bag.topics[topic].type == _IMU for topic in topics]
-        beside: Source = "gravity" if any(are_imus) else "ground"
+        has_imu = any(bag.topics[topic].type == _IMU for topic in topics)
+        # A lidar needs a wider lane if the other sensor is an IMU.
+        beside: Source = "gravity" if has_imu else "ground"
         tracks = []
         for topic, stream in zip(topics, snapshot.streams, strict=True):
             try:
@@ -64,7 +71,10 @@ def verticals_of_bag(paths: Sequence[Path], snapshot: Any) -> tuple[VerticalPair
 
 
 def _topics_by_frame(bag: PoseBag) -> Mapping[str, str]:
-    """Return the topic of clouds or IMU data of each frame."""
+    """Return one topic for each frame: clouds if there are any, otherwise IMU data.
+
+    If a frame has several topics of a type, the topic with most messages is returned.
+    """
     topics_of: dict[str, str] = {}
     for wanted in (POINTS_TYPE, _IMU):
         topics = [topic for topic in bag.topics.values() if topic.type == wanted]
@@ -79,12 +89,15 @@ def _topics_by_frame(bag: PoseBag) -> Mapping[str, str]:
 
 
 def _topic_of(names: StreamFrames, topics_of: Mapping[str, str]) -> str:
-    """Return the topic for the frame of a sensor; empty without one."""
+    """Return the topic in the frame of a sensor; an empty text if there is none."""
     return topics_of.get(names.sensor) or topics_of.get(names.option) or ""
 
 
 def _track(bag: PoseBag, topic: str, stream: Trajectory, beside: Source) -> VerticalTrack:
-    """Return the vertical from the messages of a topic."""
+    """Return the vertical from the clouds or IMU data of a topic.
+
+    ``stream`` has the poses of the sensor, and ``beside`` is what the other sensor measures.
+    """
     if bag.topics[topic].type == POINTS_TYPE:
         return ground_from_clouds(_clouds(bag, topic), stream, beside)
     stamps_ns = []
@@ -98,15 +111,15 @@ def _track(bag: PoseBag, topic: str, stream: Trajectory, beside: Source) -> Vert
 
 
 def _clouds(bag: PoseBag, topic: str) -> Iterator[tuple[int, FloatArray]]:
-    """Yield stamps (ns) and points (N, 3) of some scans."""
-    for message in _messages(bag, topic, bag.duration_s / _MOST_SCANS * 1e9):
+    """Yield the stamp (ns) and the finite points (N, 3), m, of at most ``_MAX_SCANS`` scans."""
+    for message in _messages(bag, topic, bag.duration_s / _MAX_SCANS * 1e9):
         rows = rows_of_points(message)
         points = np.stack([rows[axis] for axis in "xyz"], axis=-1).astype(float)
         yield ns_of(message.header.stamp) or 0, points[np.isfinite(points).all(axis=1)]
 
 
 def _messages(bag: PoseBag, topic: str, every_ns: float) -> Iterator[Any]:
-    """Yield messages of a topic that are at least ``every_ns`` apart."""
+    """Yield the decoded messages of a topic that are at least ``every_ns`` apart."""
     next_ns = 0.0
     for run in bag.runs([topic]):
         used = []

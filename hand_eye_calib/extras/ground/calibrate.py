@@ -1,4 +1,4 @@
-"""Calibrate sensors on a flat floor with the ground or gravity that both measure."""
+"""Calibration on a flat floor, from the motion and from the ground or gravity."""
 
 from dataclasses import replace
 from typing import Any
@@ -21,8 +21,8 @@ def calibrate_on_ground(
 ) -> Calibration:
     """Estimate the pose of the child sensor from the motion, and from the ground or gravity.
 
-    Two lidars that see the ground determine z, roll and pitch on a flat floor. Gravity determines
-    roll and pitch.
+    On a flat floor, motion alone does not determine z, roll and pitch. Two lidars that measure the
+    ground determine them. Gravity determines roll and pitch.
 
     Parameters
     ----------
@@ -37,8 +37,8 @@ def calibrate_on_ground(
     Returns
     -------
     Calibration
-        ``result.ground`` has the measured axes. They are not part of the result if they disagree
-        with the motion.
+        ``result.ground`` has the measurements by the ground or gravity. If they disagree with the
+        motion, the result is that of the motion alone.
 
     Raises
     ------

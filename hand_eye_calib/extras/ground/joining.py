@@ -1,14 +1,15 @@
-"""Join the vertical that both sensors measure with the motion.
+"""Update a result of the motion with the vertical that both sensors measure.
 
-The extrinsic has the rotation R and the translation t. Both sensors measure the vertical (n_p, n_c)
-and the height over the ground (h_p, h_c) at the same time:
+The extrinsic X has the rotation R and the translation t, from the child to the parent. Both sensors
+measure the vertical (unit vectors n_p, n_c) and their height over the ground (h_p, h_c):
 
     n_p = R n_c,    n_p . t = h_c - h_p.
 
 If one sensor measures the ground and the other gravity, n_p and R n_c differ by the slope s of the
-road. It turns with the heading, and the mount does not, so that both are estimated. The measurement
-of X is joined by one step of a Kalman filter. Reference: Y. Bar-Shalom, X. R. Li, T. Kirubarajan,
-*Estimation with applications to tracking and navigation*, 2001, section 5.2.
+road. The slope turns with the heading, and an error of R does not. So s and the error of R are
+estimated together. One update of a Kalman filter joins this measurement with X. Reference:
+Y. Bar-Shalom, X. R. Li, T. Kirubarajan, *Estimation with applications to tracking and navigation*,
+2001, section 5.2.
 """
 
 from dataclasses import dataclass, replace
@@ -29,32 +30,37 @@ from hand_eye_calib.core.results.verdict import CONTRADICTED_SIGMAS
 from hand_eye_calib.extras.ground.part import GroundAxis, GroundResult
 from hand_eye_calib.extras.ground.tracks import VerticalTrack
 
-# Parts of the drive, equally long on the road. A third of them must have data.
-_PARTS = 24
+# Number of sections of the drive, equally long on the road. A third of them must have data.
+_N_SECTIONS = 24
 
-# Standard deviation of the slope of a road (rad): steep roads have 10 %.
-_SLOPE = 0.05
+# Prior standard deviation of the slope of a road (rad): half the slope of steep roads (10 %).
+_SLOPE_SIGMA_RAD = 0.05
 
-# Constant errors that no drive reveals, as standard deviations of one sensor. They were measured on
-# simulated drives with the errors that data sheets of rotating lidars state: 1 cm for ranges,
-# 0.05 deg for elevations of beams.
-_HEIGHT_M = 0.009
-# Tilt (rad): of the ground by the same errors 0.035 deg. Data sheets of industrial IMUs state a
-# bias of 2 mg, half of which averages out in curves.
-_TILTS = {"ground": float(np.radians(0.035)), "gravity": 0.001}
-# Tilt (rad) of a road that turns with the vehicle: the rest of a crown of 2 %, 0.15 deg.
-_ROAD = float(np.radians(0.15))
+# The following standard deviations are of constant errors of one sensor, which no drive reveals.
+# Error of the height (m), measured on simulated drives with the errors that data sheets of rotating
+# lidars state: 1 cm for ranges, 0.05 deg for elevations of beams.
+_HEIGHT_SIGMA_M = 0.009
+# Error of the vertical (rad), by what the sensor measures. Ground: 0.035 deg, from the same drives.
+# Gravity: data sheets of industrial IMUs state a bias of 2 mg, and half of it averages out in
+# curves.
+_TILT_SIGMAS_RAD = {"ground": float(np.radians(0.035)), "gravity": 0.001}
+# Tilt (rad) of a road across the drive, which turns with the vehicle and so looks like the mount. A
+# road has a crown of 2 %; 0.15 deg of it remain.
+_CROWN_SIGMA_RAD = float(np.radians(0.15))
 
 
 class Measurement(NamedTuple):
-    """Measurement of the extrinsic: ``jacobian @ xi = values``, xi = (rho, phi) of the child.
+    """Measurement of a correction xi of the extrinsic X: ``values = jacobian @ xi + noise``.
+
+    The corrected extrinsic is ``X exp(xi)``, with xi = (rho, phi) in the axes of the child.
 
     Attributes
     ----------
     axes : tuple of str
-        Axes of the parent that are nearest to the rows.
+        Axis of the parent that is nearest to each row: two rotations, and one translation if both
+        sensors measure heights.
     values : (M,) array
-        Differences (m, rad) from the extrinsic that the measurement is linearised at.
+        Measured minus predicted values (rad, m), at the extrinsic of the linearisation.
     jacobian : (M, 6) array
     covariance : (M, M) array
     """
@@ -67,13 +73,13 @@ class Measurement(NamedTuple):
 
 @dataclass(frozen=True)
 class VerticalPair:
-    """Verticals of both sensors: a measurement of the extrinsic beside motion."""
+    """Verticals that both sensors measured, from which the extrinsic is measured."""
 
     parent: VerticalTrack
     child: VerticalTrack
 
     def joined(self, calibration: Calibration, snapshot: Any) -> Calibration:
-        """Return a result joined with the verticals if they agree with the motion.
+        """Update a result with the verticals if they agree with the motion.
 
         Parameters
         ----------
@@ -81,6 +87,11 @@ class VerticalPair:
             Result of the motion alone.
         snapshot : Snapshot
             The streams of the result.
+
+        Returns
+        -------
+        Calibration
+            With a :class:`GroundResult`, or unchanged if there are too few data.
         """
         measurement = self.measurement(calibration, snapshot)
         if measurement is None:
@@ -95,36 +106,40 @@ class VerticalPair:
         if agrees:
             gain = np.asarray(np.linalg.solve(S, H @ C).T, dtype=float)
             updated = _updated(calibration, measurement, gain)
-        axes = _axes_of_part(calibration, updated, measurement, distances)
+        axes = _ground_axes(calibration, updated, measurement, distances)
         part = GroundResult(self.parent.source, self.child.source, agrees, axes)
         return updated.with_part("ground", part)
 
     def measurement(self, calibration: Calibration, snapshot: Any) -> Measurement | None:
-        """Return the measurement, linearised at a result; None with too few data."""
+        """Return the measurement, linearised at a result.
+
+        Return None if no instants are common, or if too few sections of the drive have data.
+        """
         T = calibration.T_parent_child
         R = se3.rotation_of(T)
-        offset_s = calibration.time_offset_s
-        tracks = _at_same_times(self.parent, self.child, offset_s)
-        if not len(tracks[0]):
+        parent, child = _at_same_times(self.parent, self.child, calibration.time_offset_s)
+        if not len(parent):
             return None
-        basis, axes = _axes_of(tracks[0].ups)
+        basis, axes = _measured_axes(parent.ups)
         streams = snapshot.streams
-        differences = _differences(*tracks, T, basis)
-        slopes = _slopes(*tracks, streams, R, basis)
-        is_good = _are_inliers(differences)
-        parts = _parts_of(streams[0], tracks[0].stamps_ns[is_good])
-        if len(np.unique(parts)) < _PARTS / 3:
+        differences = _differences(parent, child, T, basis)
+        slope_derivatives = _slope_derivatives(parent, child, streams, R, basis)
+        is_inlier = _are_inliers(differences)
+        sections = _sections_of(streams[0], parent.stamps_ns[is_inlier])
+        if len(np.unique(sections)) < _N_SECTIONS / 3:
             return None
-        means = _means(differences[is_good], parts)
-        has_slope = self.parent.source != self.child.source
-        if has_slope:
-            values, covariance = _fit_beside_slope(means, _means(slopes[is_good], parts))
+        means = _means(differences[is_inlier], sections)
+        tilt_variance = 0.0
+        if parent.source != child.source:
+            derivatives = _means(slope_derivatives[is_inlier], sections)
+            values, covariance = _fit_with_slope(means, derivatives)
+            tilt_variance = _CROWN_SIGMA_RAD**2
         else:
             values, covariance = _fit(means)
-        variance_of_tilt = has_slope * _ROAD**2
-        for track in tracks:
-            variance_of_tilt += _TILTS[track.source] ** 2
-        variances = [variance_of_tilt, variance_of_tilt, 2 * _HEIGHT_M**2]
+        for track in (parent, child):
+            tilt_variance += _TILT_SIGMAS_RAD[track.source] ** 2
+        variances = [tilt_variance, tilt_variance, 2 * _HEIGHT_SIGMA_M**2]
+        # Rows: rotation about two horizontal axes, translation along the vertical.
         jacobian = np.zeros((3, 6))
         jacobian[:2, 3:] = basis[:, :2].T @ R
         jacobian[2, :3] = basis[:, 2] @ R
@@ -136,9 +151,10 @@ class VerticalPair:
 def _at_same_times(
     parent: VerticalTrack, child: VerticalTrack, offset_s: float
 ) -> tuple[VerticalTrack, VerticalTrack]:
-    """Return the rows of both tracks at common instants, at most an interval of the child apart.
+    """Return the rows of parent and child at common instants, as two tracks of K rows.
 
-    ``offset_s`` is added to the stamps of the child.
+    The instants of a row differ by less than the usual interval of the child. ``offset_s`` is added
+    to the stamps of the child.
     """
     child = child[np.argsort(child.stamps_ns, kind="stable")]
     stamps_ns = child.stamps_ns + round(offset_s * 1e9)
@@ -149,16 +165,16 @@ def _at_same_times(
     return parent[is_near], child[nearest[is_near]]
 
 
-def _axes_of(ups: FloatArray) -> tuple[FloatArray, tuple[str, str, str]]:
-    """Return axes of the measurement, from verticals (N, 3) in the frame of the parent.
+def _measured_axes(ups: FloatArray) -> tuple[FloatArray, tuple[str, str, str]]:
+    """Return the axes of the measurement, from verticals (N, 3) in the frame of the parent.
 
     Returns
     -------
     basis : (3, 3) array
-        Columns: two horizontal directions and the vertical, along three axes of the parent as
-        closely as possible, right-handed.
+        Right-handed unit vectors as columns: two horizontal directions, then the vertical. Each is
+        near to an axis of the parent.
     axes : tuple of str
-        These axes: two rotations and one translation.
+        Names of these axes of the parent: two rotations and one translation.
     """
     up = ups.mean(axis=0)
     up /= np.linalg.norm(up)
@@ -174,100 +190,133 @@ def _axes_of(ups: FloatArray) -> tuple[FloatArray, tuple[str, str, str]]:
 def _differences(
     parent: VerticalTrack, child: VerticalTrack, T: FloatArray, basis: FloatArray
 ) -> FloatArray:
-    """Return differences (K, 2 or 3) of the verticals: tilts (rad), and heights (m) of the ground.
+    """Return differences (K, 2 or 3) between the parent and the child at each instant.
 
-    A tilt is the rotation that turns the vertical of the child into that of the parent.
+    The first two columns are tilts (rad) about the horizontal axes of the basis: the rotation from
+    the vertical of the child, in the frame of the parent, to the vertical of the parent. The third
+    column is the error (m) of the translation along the vertical, if both sensors measure heights.
     """
-    of_child = child.ups @ se3.rotation_of(T).T
-    crosses = np.cross(of_child, parent.ups)
+    child_ups = child.ups @ se3.rotation_of(T).T
+    # The cross product of unit vectors has the direction of the rotation axis, and the length of
+    # the sine of the angle. A rotation vector has the length of the angle.
+    crosses = np.cross(child_ups, parent.ups)
     sines = np.linalg.norm(crosses, axis=1)
-    angles = np.arctan2(sines, np.einsum("ki,ki->k", of_child, parent.ups))
-    ratios = np.divide(angles, sines, out=np.ones_like(sines), where=sines > 0.0)
-    columns = ratios[:, None] * crosses @ basis[:, :2]
+    cosines = np.einsum("ki,ki->k", child_ups, parent.ups)
+    angles = np.arctan2(sines, cosines)
+    angle_per_sine = np.divide(angles, sines, out=np.ones_like(sines), where=sines > 0.0)
+    rotation_vectors = angle_per_sine[:, None] * crosses
+    tilts = rotation_vectors @ basis[:, :2]
     if parent.heights_m is None or child.heights_m is None:
-        return columns
-    heights = child.heights_m - parent.heights_m - parent.ups @ se3.translation_of(T)
+        return tilts
+    errors_m = child.heights_m - parent.heights_m - parent.ups @ se3.translation_of(T)
+    # The vertical of the basis points down if the nearest axis of the parent does.
     sign = np.sign(basis[:, 2] @ parent.ups[0])
-    return np.column_stack([columns, sign * heights])
+    return np.column_stack([tilts, sign * errors_m])
 
 
-def _slopes(
+def _slope_derivatives(
     parent: VerticalTrack,
     child: VerticalTrack,
     streams: tuple[Trajectory, Trajectory],
     R: FloatArray,
     basis: FloatArray,
 ) -> FloatArray:
-    """Return derivatives (K, 2, 2) of the tilts with respect to the slope of the road.
+    """Return derivatives (K, 2, 2) of the two tilts with respect to the slope of the road.
 
-    The slope is fixed in the world of the sensor that measures the ground.
+    The slope has two components (rad), constant in the world of the sensor that measures the
+    ground: changes of the normal of the ground along two horizontal directions.
     """
     if parent.source == "ground":
         track, stream = parent, streams[0]
-        turned = np.eye(3)
+        to_parent = np.eye(3)
     else:
         track, stream = child, streams[1]
-        turned = -R
+        # Tilts are parent minus child, so the normal of the child has a negative sign.
+        to_parent = -R
     rotations = se3.rotation_of(stream.at(track.stamps_ns, extrapolate=True))
-    in_world = np.einsum("kij,kj->ki", rotations, track.ups)
-    horizontal = _axes_of(in_world)[0][:, :2]
-    in_parent = turned @ np.swapaxes(rotations, 1, 2) @ horizontal
+    ups_in_world = np.einsum("kij,kj->ki", rotations, track.ups)
+    horizontal = _measured_axes(ups_in_world)[0][:, :2]
+    in_parent = to_parent @ np.swapaxes(rotations, 1, 2) @ horizontal
     return np.asarray(basis[:, :2].T @ se3.skew(parent.ups) @ in_parent)
 
 
 def _are_inliers(differences: FloatArray) -> BoolArray:
-    """Return which instants (K,) are no outliers."""
+    """Return a mask (K,) of the instants whose differences (K, M) are no outliers.
+
+    The gate about the median is ``CONTRADICTED_SIGMAS`` standard deviations, estimated from the
+    median deviation.
+    """
     deviations = np.abs(differences - medians(differences.T))
     sigmas = medians(deviations.T) / MEDIAN_NORMAL
     return np.asarray((deviations <= CONTRADICTED_SIGMAS * sigmas).all(axis=1))
 
 
-def _parts_of(stream: Trajectory, stamps_ns: IntArray) -> IntArray:
-    """Return the part of the drive (K,) of each stamp; parts are equally long on the road."""
+def _sections_of(stream: Trajectory, stamps_ns: IntArray) -> IntArray:
+    """Return the number of the section of the drive (K,) in which each stamp (K,) is."""
     steps_m = np.linalg.norm(np.diff(se3.translation_of(stream.poses), axis=0), axis=1)
-    way_m = np.append(0.0, np.cumsum(steps_m))
-    shares = np.interp(stamps_ns, stream.stamps_ns, way_m) / way_m[-1]
-    return np.minimum((_PARTS * shares).astype(int), _PARTS - 1)
+    driven_m = np.append(0.0, np.cumsum(steps_m))
+    shares = np.interp(stamps_ns, stream.stamps_ns, driven_m) / driven_m[-1]
+    return np.minimum((_N_SECTIONS * shares).astype(int), _N_SECTIONS - 1)
 
 
-def _means(values: FloatArray, parts: IntArray) -> FloatArray:
-    """Return means (B, ...) of values (K, ...) in each part that has any."""
-    numbers, part_of_value = np.unique(parts, return_inverse=True)
-    counts = np.bincount(part_of_value)
-    sums = Blocks.gathered(values, part_of_value, len(numbers)).sums
+def _means(values: FloatArray, sections: IntArray) -> FloatArray:
+    """Return the mean (B, ...) of values (K, ...) in each of the B sections that have values."""
+    numbers, row_of_value = np.unique(sections, return_inverse=True)
+    counts = np.bincount(row_of_value)
+    sums = Blocks.gathered(values, row_of_value, len(numbers)).sums
     return np.asarray(sums / counts.reshape(-1, *[1] * (values.ndim - 1)))
 
 
 def _fit(means: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the mean (M,) of parts (B, M), and its covariance from their scatter."""
+    """Return the mean (M,) over sections (B, M), and the covariance (M, M) of this mean.
+
+    The covariance follows from the scatter of the sections.
+    """
     center = means.mean(axis=0)
     residuals = means - center
     count = len(means)
     covariance = residuals.T @ residuals / (count * (count - 1))
-    return center, covariance * _inflation(residuals)
+    return center, covariance * _correlation_factor(residuals)
 
 
-def _fit_beside_slope(means: FloatArray, slopes: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the mean tilt (2,) of parts (B, 2) beside the slope of the road, and its covariance.
+def _fit_with_slope(
+    means: FloatArray, slope_derivatives: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Estimate the tilt of the mount together with the slope of the road.
 
-    A prior limits the slope: in a drive of one heading, it cannot be distinguished from the mount.
+    If the heading is constant, the slope cannot be distinguished from the mount. A prior limits the
+    slope then.
+
+    Parameters
+    ----------
+    means : (B, 2) array
+        Mean tilts of the sections, rad.
+    slope_derivatives : (B, 2, 2) array
+
+    Returns
+    -------
+    tilt : (2,) array
+    covariance : (2, 2) array
     """
     count = len(means)
-    rows = np.concatenate([np.tile(np.eye(2), (count, 1, 1)), slopes], axis=2).reshape(-1, 4)
-    prior = np.diag([0.0, 0.0, _SLOPE**-2, _SLOPE**-2])
+    # Unknowns: two tilts of the mount, which are the same in all sections, then two slopes.
+    of_mount = np.tile(np.eye(2), (count, 1, 1))
+    rows = np.concatenate([of_mount, slope_derivatives], axis=2).reshape(-1, 4)
+    prior = np.diag([0.0, 0.0, _SLOPE_SIGMA_RAD**-2, _SLOPE_SIGMA_RAD**-2])
+    # The first solve has no prior. Its residuals determine the variance, which weights the prior.
     variance = 0.0
     for _ in range(2):
         information = rows.T @ rows + variance * prior
         solution = np.linalg.lstsq(information, rows.T @ means.ravel(), rcond=None)[0]
         residuals = means - (rows @ solution).reshape(-1, 2)
         scatter = (residuals**2).sum() / (2 * count - 4)
-        variance = scatter * _inflation(residuals)
+        variance = scatter * _correlation_factor(residuals)
     covariance = np.linalg.inv(rows.T @ rows / variance + prior)
     return solution[:2], covariance[:2, :2]
 
 
-def _inflation(residuals: FloatArray) -> float:
-    """Return the factor of the variance of a mean, because neighbouring parts are correlated.
+def _correlation_factor(residuals: FloatArray) -> float:
+    """Return the factor by which correlation of adjacent sections enlarges a variance.
 
     W. K. Newey, K. D. West, Econometrica 55, 1987, with one lag.
     """
@@ -276,7 +325,10 @@ def _inflation(residuals: FloatArray) -> float:
 
 
 def _updated(calibration: Calibration, measurement: Measurement, gain: FloatArray) -> Calibration:
-    """Return the result with a measurement that is weighted by a gain (6, M)."""
+    """Update a result by a Kalman gain (6, M).
+
+    Its covariance is the Joseph form ``(I - K H) C (I - K H)' + K V K'``.
+    """
     T = se3.retracted(calibration.T_parent_child, gain @ measurement.values)
     from_motion = np.eye(6) - gain @ measurement.jacobian
     allowance = from_motion @ calibration.covariance_allowance @ from_motion.T
@@ -284,17 +336,18 @@ def _updated(calibration: Calibration, measurement: Measurement, gain: FloatArra
     covariance += gain @ measurement.covariance @ gain.T
     sigmas = sigmas_in_parent(se3.rotation_of(T), covariance)
     totals = np.hypot(sigmas, sigmas_in_parent(se3.rotation_of(T), allowance))
+    is_from_ground = _halves_variance(totals, calibration.sigmas)
     dofs = []
-    for of_motion, motion_total, sigma, total in zip(
-        calibration.observability_measured, calibration.sigmas, sigmas.tolist(), totals, strict=True
+    for of_motion, sigma, has_prior in zip(
+        calibration.observability_measured, sigmas.tolist(), is_from_ground, strict=True
     ):
         dof = judged(of_motion.name, sigma)
         if dof.verdict is DofVerdict.UNOBSERVABLE and np.isfinite(of_motion.sigma):
-            dof = of_motion  # an unknown direction that has turned slightly with the child
-        if dof.verdict is not DofVerdict.UNOBSERVABLE and 2 * total**2 < motion_total**2:
+            # The rotation of the child has turned an unobservable direction slightly.
+            dof = of_motion
+        is_by_ground = has_prior and dof.verdict is not DofVerdict.UNOBSERVABLE
+        if is_by_ground or of_motion.verdict is DofVerdict.PRIOR:
             dof = replace(dof, verdict=DofVerdict.PRIOR)
-        elif of_motion.verdict is DofVerdict.PRIOR:
-            dof = replace(dof, verdict=of_motion.verdict)
         dofs.append(dof)
     updated = replace(
         calibration,
@@ -308,24 +361,32 @@ def _updated(calibration: Calibration, measurement: Measurement, gain: FloatArra
     return updated
 
 
-def _axes_of_part(
+def _halves_variance(sigmas: FloatArray, motion_sigmas: FloatArray) -> BoolArray:
+    """Return a mask (6,) of the axes whose variance an update has at least halved."""
+    return np.asarray(2 * sigmas**2 < motion_sigmas**2)
+
+
+def _ground_axes(
     calibration: Calibration, updated: Calibration, measurement: Measurement, distances: FloatArray
 ) -> tuple[GroundAxis, ...]:
-    """Return the axes of the measurement beside those of the motion."""
-    motion = dict(zip(AXES, se3.xyz_rpy(calibration.T_parent_child).tolist(), strict=True))
-    sigmas = dict(zip(AXES, calibration.sigmas.tolist(), strict=True))
-    totals = dict(zip(AXES, updated.sigmas.tolist(), strict=True))
-    own_sigmas = np.sqrt(np.diag(measurement.covariance))
+    """Return each measured axis by the motion alone and by the ground alone.
+
+    ``distances`` (M,) are the differences of both values in joint standard deviations.
+    """
+    values = se3.xyz_rpy(calibration.T_parent_child).tolist()
+    is_from_ground = _halves_variance(updated.sigmas, calibration.sigmas)
+    ground_sigmas = np.sqrt(np.diag(measurement.covariance))
     axes = []
     for row, name in enumerate(measurement.axes):
+        column = AXES.index(name)
         axis = GroundAxis(
             name=name,
-            motion=motion[name],
-            motion_sigma=sigmas[name],
-            ground=motion[name] + float(measurement.values[row]),
-            ground_sigma=float(own_sigmas[row]),
+            motion=values[column],
+            motion_sigma=float(calibration.sigmas[column]),
+            ground=values[column] + float(measurement.values[row]),
+            ground_sigma=float(ground_sigmas[row]),
             distance=float(distances[row]),
-            is_from_ground=2 * totals[name] ** 2 < sigmas[name] ** 2,
+            is_from_ground=bool(is_from_ground[column]),
         )
         axes.append(axis)
     return tuple(axes)

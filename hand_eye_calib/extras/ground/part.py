@@ -1,4 +1,4 @@
-"""What the ground and gravity measured, as a part of results, and its rule of the verdict."""
+"""Measurements by the ground and gravity in a result, and the verdict if the motion disagrees."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,20 +14,21 @@ from hand_eye_calib.core.results.verdict import CONTRADICTED_SIGMAS, Ground
 
 @dataclass(frozen=True)
 class GroundAxis:
-    """An axis of the extrinsic by the motion alone, and by the ground or gravity alone (m, rad).
+    """Two estimates of one axis of the extrinsic (m, rad): by motion, and by ground or gravity.
 
     Attributes
     ----------
     name : str
         Axis of the parent.
     motion, motion_sigma : float
-        Value and standard deviation; the latter is infinite if the motion does not determine it.
+        Value and standard deviation by the motion alone. The standard deviation is infinite if the
+        motion does not determine the axis.
     ground, ground_sigma : float
-        Value and standard deviation.
+        Value and standard deviation by the ground or gravity alone.
     distance : float
-        Difference in joint standard deviations.
+        Difference of both values in joint standard deviations.
     is_from_ground : bool
-        Whether the ground at least halves the variance of the result.
+        Whether the ground or gravity at least halves the variance that the motion alone has.
     """
 
     name: str
@@ -41,15 +42,15 @@ class GroundAxis:
 
 @dataclass(frozen=True)
 class GroundResult:
-    """Measurements by the ground and gravity.
+    """Measurements of the extrinsic by the ground and gravity.
 
     Attributes
     ----------
     parent, child : {"ground", "gravity"}
-        What each sensor measured.
+        Quantity that each sensor measured.
     is_joined : bool
-        Whether the result contains the measurements. They are left out if they disagree with the
-        motion.
+        Whether the result uses the measurements. Measurements that disagree with the motion are
+        not used.
     axes : tuple of GroundAxis
     """
 
@@ -66,11 +67,11 @@ class GroundPart(Part):
         super().__init__("ground", lambda: GroundResult)
 
     def details(self, value: GroundResult, result: Any) -> list[str]:
-        """Return a line for each axis."""
+        """Return a line of the report for each axis."""
         return [_line(value, axis) for axis in value.axes]
 
     def headline(self, value: GroundResult) -> str:
-        """Return which axes are not from the motion."""
+        """Return which axes are mostly from the ground or gravity; an empty text if none is."""
         names = [axis.name for axis in value.axes if axis.is_from_ground]
         if not names:
             return ""
@@ -79,11 +80,14 @@ class GroundPart(Part):
 
 
 def _source(value: GroundResult) -> str:
-    names = [name if name == "gravity" else "the ground" for name in (value.parent, value.child)]
-    return listing([*dict.fromkeys(names)])
+    """Return the measured quantities of both sensors, such as "the ground and gravity"."""
+    names = {"ground": "the ground", "gravity": "gravity"}
+    # A dict has equal names once, in their order.
+    return listing([*dict.fromkeys([names[value.parent], names[value.child]])])
 
 
 def _line(value: GroundResult, axis: GroundAxis) -> str:
+    """Return the line of an axis: its value by the ground or gravity, and by the motion."""
     by_ground = _number(axis.name, axis.ground, axis.ground_sigma)
     if not np.isfinite(axis.motion_sigma):
         by_motion = "the motion does not determine it"
@@ -94,19 +98,23 @@ def _line(value: GroundResult, axis: GroundAxis) -> str:
 
 
 def _number(name: str, value: float, sigma: float) -> str:
-    """Return a value (m or rad) and its standard deviation in m or deg."""
+    """Return a value and its standard deviation (m or rad) as a text in m or deg.
+
+    ``name`` is the axis of the value.
+    """
     if name in ROTATIONS:
         return f"{with_sigma(np.degrees(value), np.degrees(sigma), 2)} deg"
     return f"{with_sigma(value, sigma, 3)} m"
 
 
 def disagreements(result: Any) -> Iterator[Ground]:
-    """Yield the ground of the verdict that ground or gravity disagree with the motion."""
+    """Yield the reason of a verdict: the floor or gravity disagrees with the motion."""
     value = result.parts.get("ground")
     if value is None or value.is_joined:
         return
     farthest = max(axis.distance for axis in value.axes)
-    # Chi-square may be too large although no axis alone is far.
+    # All axes together may contradict the motion (chi-square) although no single axis does. The
+    # axis with the largest distance is named then.
     limit = min(CONTRADICTED_SIGMAS, farthest)
     far = [axis for axis in value.axes if axis.distance >= limit]
     texts = []

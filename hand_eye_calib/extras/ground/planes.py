@@ -1,7 +1,8 @@
 """The plane of the ground in a scan of a lidar.
 
-The points are turned so that z is roughly up, and thinned to one point a cell. The ground is the
-plane z = a x + b y + c that most cells are near to (RANSAC), fitted to them by least squares.
+The points are rotated so that z is roughly up, and averaged in cells of 0.5 m. The ground is the
+plane z = a x + b y + c with the most cells as inliers (RANSAC). Least squares of these cells
+refines the plane. x is the direction of the drive, y points left, the sensor is the origin.
 Reference: M. A. Fischler, R. C. Bolles, *Random sample consensus*, Comm. ACM 24, 1981.
 """
 
@@ -9,25 +10,31 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
+from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.blocks import Blocks
 
-# Distances of used points (m): nearer ones are of the machine, farther on the road may bend.
-_RANGE_M = (1.5, 12.0)
-# Side of a cell (m). Near rings have many points in a cell, far rings one.
+# Smallest horizontal distance (m) of a point that is used: nearer points may be on the machine.
+_MIN_RANGE_M = 1.5
+# Largest horizontal distance (m) of a point that is used: farther away, the road may bend.
+_MAX_RANGE_M = 12.0
+# Side of a cell (m). Near rings of a lidar are dense; cells weight them as far rings.
 _CELL_M = 0.5
-# Number of planes that are tried.
-_TRIALS = 200
-# Steepest plane against the expected vertical (tangent of 15 deg).
-_STEEPEST = 0.27
-# Cells within this distance of a plane (m) are of it: grass and the noise of ranges.
-_NEAR_M = 0.08
-# A plane is no ground if this share of the cells is clearly lower: it may be a loading edge.
-_SHARE_BELOW = 0.08
+# Number of random planes of RANSAC.
+_N_TRIALS = 200
+# Largest slope of the ground against the expected vertical: the tangent of 15 deg.
+_MAX_SLOPE = 0.27
+# Largest vertical distance (m) of an inlier from the plane, for grass and the noise of ranges.
+_MAX_INLIER_HEIGHT_M = 0.08
+# Largest share of the cells that may be clearly lower than the ground, by three times the height of
+# an inlier. A loading edge, for example, has more cells below it.
+_MAX_SHARE_BELOW = 0.08
 
 
 class Plane(NamedTuple):
-    """Plane of the ground: its unit normal (3,), up, and the height (m) of the sensor over it."""
+    """Plane of the ground in the frame of a sensor.
+
+    ``normal`` (3,) is a unit vector that points up. ``height_m`` is the height of the sensor.
+    """
 
     normal: FloatArray
     height_m: float
@@ -36,7 +43,7 @@ class Plane(NamedTuple):
 def ground_of(
     points: FloatArray, up: FloatArray, ahead: FloatArray, width_m: float
 ) -> Plane | None:
-    """Return the ground in a scan, or None if no plane is the ground.
+    """Detect the ground in a scan; return None if no plane can be the ground.
 
     Parameters
     ----------
@@ -44,81 +51,109 @@ def ground_of(
         In the frame of the sensor, m.
     up : (3,) array
         Expected vertical in the frame of the sensor, a unit vector. The normal of the ground
-        differs by 15 deg at most.
+        differs from this vector by 15 deg at most.
     ahead : (3,) array
         Direction of the drive in the frame of the sensor.
     width_m : float
-        Width of the ground that is used, with the sensor above its middle.
+        Width of the lane whose points are used. The sensor is above the middle of the lane.
     """
-    turn = _level(up, ahead)
-    cells = _cells(points @ turn.T, width_m)
+    rotation = _rotation_to_level(up, ahead)
+    cells = _cell_means(points @ rotation.T, width_m)
     if not len(cells):
         return None
-    plane = _most_supported(cells)
+    plane = _plane_by_ransac(cells)
     if plane is None:
         return None
-    for _ in range(2):  # of the tried plane, and of the fit
-        near = np.abs(cells[:, 2] - _heights(cells, plane)) < _NEAR_M
-        plane = np.linalg.lstsq(_columns(cells[near]), cells[near, 2], rcond=None)[0]
-    if not _is_ground(cells, near, plane):
+    # The first fit uses the inliers of RANSAC, the second fit those of the first fit.
+    for _ in range(2):
+        is_inlier = np.abs(cells[:, 2] - _heights(cells, plane)) < _MAX_INLIER_HEIGHT_M
+        inliers = cells[is_inlier]
+        plane = np.linalg.lstsq(_rows(inliers), inliers[:, 2], rcond=None)[0]
+    if not _is_ground(cells, inliers, plane):
         return None
     a, b, c = plane
     length = np.sqrt(1.0 + a * a + b * b)
-    return Plane(turn.T @ np.array([-a, -b, 1.0]) / length, float(-c / length))
+    return Plane(rotation.T @ np.array([-a, -b, 1.0]) / length, float(-c / length))
 
 
-def _level(up: FloatArray, ahead: FloatArray) -> FloatArray:
-    """Return a rotation (3, 3) that turns ``up`` into z, and ``ahead`` into the x-z plane."""
+def _rotation_to_level(up: FloatArray, ahead: FloatArray) -> FloatArray:
+    """Return the rotation (3, 3) that turns ``up`` into z, and ``ahead`` into the x-z plane."""
     left = np.cross(up, ahead)
     left /= np.linalg.norm(left)
     return np.array([np.cross(left, up), left, up])
 
 
-def _cells(points: FloatArray, width_m: float) -> FloatArray:
-    """Return means (C, 3) of the points of a lane below the sensor, in cells."""
-    ranges = np.hypot(points[:, 0], points[:, 1])
-    nearest_m, farthest_m = _RANGE_M
-    in_range = (ranges > nearest_m) & (ranges < farthest_m)
-    in_lane = np.abs(points[:, 1]) < width_m / 2
-    used = points[in_range & in_lane & (points[:, 2] < 0.0)]
-    # Cells have three dimensions, so that a wall does not lift the ground at its foot.
-    numbers = np.floor(used / _CELL_M).astype(int)
-    _, cell_of_point, counts = np.unique(numbers, axis=0, return_inverse=True, return_counts=True)
+def _cell_means(points: FloatArray, width_m: float) -> FloatArray:
+    """Return the mean point (C, 3) of each cell that has points of the lane, in m.
+
+    Parameters
+    ----------
+    points : (N, 3) array
+        Levelled points. Those above the sensor, too near or too far are skipped.
+    width_m : float
+        Width of the lane.
+    """
+    x, y, z = points.T
+    ranges = np.hypot(x, y)
+    in_range = (ranges > _MIN_RANGE_M) & (ranges < _MAX_RANGE_M)
+    in_lane = np.abs(y) < width_m / 2
+    used = points[in_range & in_lane & (z < 0.0)]
+    # Cells are cubes: a wall fills cubes of its own, and does not raise the ground at its foot.
+    cubes = np.floor(used / _CELL_M).astype(int)
+    _, cell_of_point, counts = np.unique(cubes, axis=0, return_inverse=True, return_counts=True)
     sums = Blocks.gathered(used, cell_of_point.ravel(), len(counts)).sums
     return np.asarray(sums / counts[:, None])
 
 
-def _columns(cells: FloatArray) -> FloatArray:
+def _rows(cells: FloatArray) -> FloatArray:
+    """Return rows (C, 3) of (x, y, 1); multiplied by a plane (a, b, c), they are its heights."""
     return np.column_stack([cells[:, :2], np.ones(len(cells))])
 
 
 def _heights(cells: FloatArray, planes: FloatArray) -> FloatArray:
-    """Heights (..., C) of planes (..., 3) at the cells."""
-    return np.asarray(planes @ _columns(cells).T)
+    """Return the heights z (..., C) of planes (..., 3) at the x and y of cells (C, 3)."""
+    return np.asarray(planes @ _rows(cells).T)
 
 
-def _most_supported(cells: FloatArray) -> FloatArray | None:
-    """Return the plane (3,) through three cells that most cells are near to."""
+def _plane_by_ransac(cells: FloatArray) -> FloatArray | None:
+    """Return the plane (3,) with most inliers, of random planes through three cells.
+
+    Return None if all random planes are too steep, or their cells nearly on a line.
+    """
     rng = np.random.default_rng(0)
-    samples = cells[rng.integers(len(cells), size=(_TRIALS, 3))]
-    columns = np.dstack([samples[..., :2], np.ones((_TRIALS, 3))])
-    # Twice the area of the triangle of the cells (m^2).
-    is_regular = np.abs(np.linalg.det(columns)) > 1.0
-    heights = samples[is_regular][..., 2:]
-    planes = np.linalg.solve(columns[is_regular], heights)[..., 0]
-    planes = planes[np.hypot(planes[:, 0], planes[:, 1]) < _STEEPEST]
+    triangles = cells[rng.integers(len(cells), size=(_N_TRIALS, 3))]
+    rows = np.dstack([triangles[..., :2], np.ones((_N_TRIALS, 3))])
+    # The determinant is twice the area of the triangle (m^2). A thin one determines no plane.
+    is_regular = np.abs(np.linalg.det(rows)) > 1.0
+    heights = triangles[is_regular][..., 2:]
+    planes = np.linalg.solve(rows[is_regular], heights)[..., 0]
+    planes = planes[_slopes(planes) < _MAX_SLOPE]
     if not len(planes):
         return None
     distances = np.abs(cells[:, 2] - _heights(cells, planes))
-    supports = (distances < _NEAR_M).sum(axis=1)
-    return np.asarray(planes[supports.argmax()])
+    n_inliers = (distances < _MAX_INLIER_HEIGHT_M).sum(axis=1)
+    return np.asarray(planes[n_inliers.argmax()])
 
 
-def _is_ground(cells: FloatArray, near: BoolArray, plane: FloatArray) -> bool:
-    """Whether a plane is wide, not too steep, and lower than nearly everything else."""
-    # A single ring of beams is a line, which determines no plane.
-    horizontal = cells[near, :2] - cells[near, :2].mean(axis=0)
-    is_wide = np.linalg.eigvalsh(horizontal.T @ horizontal / near.sum())[0] > _CELL_M**2
-    is_lower = cells[:, 2] < _heights(cells, plane) - 3 * _NEAR_M
-    is_lowest = is_lower.mean() < _SHARE_BELOW
-    return bool(is_wide and is_lowest and np.hypot(*plane[:2]) < _STEEPEST)
+def _slopes(planes: FloatArray) -> FloatArray:
+    """Return the slopes (...) of planes (..., 3): tangents of their angles to the horizontal."""
+    return np.asarray(np.hypot(planes[..., 0], planes[..., 1]))
+
+
+def _is_ground(cells: FloatArray, inliers: FloatArray, plane: FloatArray) -> bool:
+    """Return whether a plane is wide, not too steep, and below nearly all cells.
+
+    Parameters
+    ----------
+    cells : (C, 3) array
+    inliers : (I, 3) array
+        The cells in the plane.
+    plane : (3,) array
+    """
+    horizontal = inliers[:, :2] - inliers[:, :2].mean(axis=0)
+    covariance = horizontal.T @ horizontal / len(inliers)
+    # A single ring of a lidar is nearly a line, which determines no plane.
+    is_wide = np.linalg.eigvalsh(covariance)[0] > _CELL_M**2
+    is_below = cells[:, 2] < _heights(cells, plane) - 3 * _MAX_INLIER_HEIGHT_M
+    is_lowest = is_below.mean() < _MAX_SHARE_BELOW
+    return bool(is_wide and is_lowest and _slopes(plane) < _MAX_SLOPE)

@@ -1,10 +1,12 @@
 """The vertical in the frame of a sensor over time: from clouds, accelerations or an attitude.
 
-The normal n of the ground follows from the clouds of a lidar. The vertical u follows from the
-specific force f of an accelerometer, the velocity v of the poses of its sensor and gravity g, in
-the world of these poses, over a window from t0 to t1:
+From clouds of a lidar, the vertical is the normal of the ground. From an accelerometer, the
+vertical u (a unit vector in the world of the poses) follows over a window from t0 to t1:
 
-    mean(R f) - (v(t1) - v(t0)) / (t1 - t0) = g u.
+    mean(R f) - (v(t1) - v(t0)) / (t1 - t0) = g u
+
+with the specific force f, the rotation R from the sensor to the world, the velocity v of the poses
+and the standard gravity g.
 """
 
 from collections.abc import Iterable
@@ -21,17 +23,18 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Columns, Trajectory
 from hand_eye_calib.extras.ground.planes import ground_of
 
-#: Quantity that a vertical is from.
+#: Quantity that a vertical was measured by.
 Source: TypeAlias = Literal["ground", "gravity"]
 
-# The vertical is the axis of curves: rotation about all other axes is below this share.
-_LARGEST_OTHER_SHARE = 0.3
+# Largest rotation about any other axis, as a share of the rotation about the main axis. A machine
+# that turns in curves only stays below; then its main axis is the vertical.
+_MAX_OTHER_SHARE = 0.3
 
-# Width of the ground (m) that is used, by what the other sensor measures.
-_WIDTHS_M = {"ground": 4.0, "gravity": 24.0}
+# Width of the lane (m) in which points are used, by what the other sensor measures.
+_LANE_WIDTHS_M = {"ground": 4.0, "gravity": 24.0}
 
-# Window (s) over which accelerations are averaged: errors of velocities count less in long windows,
-# drift of the attitude more.
+# Window (s) over which accelerations are averaged. In a longer window, errors of the velocities
+# matter less, and drift of the attitude matters more.
 _WINDOW_S = 5.0
 
 
@@ -44,7 +47,8 @@ class VerticalTrack(Columns):
     stamps_ns : (N,) int64 array
         On the clock of the sensor.
     ups : (N, 3) array
-        Unit vectors, up, in the frame of the sensor: normals of the ground, or against gravity.
+        Unit vectors that point up, in the frame of the sensor: normals of the ground, or the
+        opposite of gravity.
     heights_m : (N,) array or None
         Heights of the sensor over the ground; None for gravity.
     """
@@ -75,9 +79,9 @@ def ground_from_clouds(
         Poses of the lidar. The ground is perpendicular to the axis about which the lidar turns in
         curves.
     beside : {"ground", "gravity"}
-        Quantity that the other sensor measures. For two lidars, the lane of the machine is used,
-        because a crown bends the road beside it. For gravity, the whole road is used: both sides of
-        a crown together are level.
+        Quantity that the other sensor measures. "ground": only points in the lane of the machine
+        are used, because a crown bends the road beside the lane. "gravity": points of the whole
+        road are used, because both sides of a crown together are level.
 
     Returns
     -------
@@ -95,7 +99,7 @@ def ground_from_clouds(
     """
     up = turning_axis(trajectory)
     ahead = driving_direction(trajectory)
-    width_m = _WIDTHS_M[beside]
+    width_m = _LANE_WIDTHS_M[beside]
     stamps_ns = []
     planes = []
     n_scans = 0
@@ -105,8 +109,8 @@ def ground_from_clouds(
         if plane is not None:
             stamps_ns.append(stamp_ns)
             planes.append(plane)
-    # On a ramp and beside walls, a third of the scans has no ground. A plane that is found in fewer
-    # than half is not what the machine drives on.
+    # On a ramp or beside walls, a third of the scans may have no ground. If fewer than half of the
+    # scans have a plane, the machine does not drive on this plane.
     if 2 * len(planes) <= n_scans:
         raise NotEnoughDataError(f"{len(planes)} of {n_scans} scans contain the ground")
     normals, heights = zip(*planes, strict=True)
@@ -159,7 +163,7 @@ def gravity_from_accelerations(
         raise NotEnoughDataError(
             f"the mean acceleration is {length:.2f} m/s^2, not that of gravity"
         )
-    # The vertical of the world drifts slowly: it is interpolated between the windows.
+    # The world of the poses tilts slowly, so its vertical is interpolated between the windows.
     stamps = trajectory.stamps_ns
     stamps = stamps[(stamps >= middles_ns[0]) & (stamps <= middles_ns[-1])]
     since_s = (stamps - middles_ns[0]) * 1e-9
@@ -171,7 +175,15 @@ def gravity_from_accelerations(
 def _verticals_of_windows(
     stamps_ns: IntArray, forces: FloatArray, trajectory: Trajectory, n_windows: int
 ) -> tuple[IntArray, FloatArray]:
-    """Return the middles (W,) of windows, and mean forces (W, 3) of gravity in the world."""
+    """Return the vertical times gravity in each of W windows, in the world of the poses.
+
+    Returns
+    -------
+    middles_ns : (W,) int64 array
+        Stamps of the middles of the windows.
+    verticals : (W, 3) array
+        ``g u`` of the module, m/s^2.
+    """
     rotations = se3.rotation_of(trajectory.at(stamps_ns, extrapolate=True))
     in_world = np.einsum("nij,nj->ni", rotations, forces)
     middles_ns = []
@@ -207,47 +219,51 @@ def gravity_from_attitude(trajectory: Trajectory) -> VerticalTrack:
 
 
 def _in_sensor(trajectory: Trajectory, stamps_ns: IntArray, ups: FloatArray) -> VerticalTrack:
-    """Return the track of verticals (N, 3) that are in the world of the poses."""
+    """Return the track of a sensor from verticals (N, 3) in the world of its poses."""
     rotations = se3.rotation_of(trajectory.at(stamps_ns, extrapolate=True))
+    # Transposed rotations: from the world to the sensor.
     ups = np.einsum("nji,nj->ni", rotations, ups)
     return VerticalTrack(stamps_ns, ups / np.linalg.norm(ups, axis=1, keepdims=True))
 
 
 def _velocities(trajectory: Trajectory, stamps_ns: IntArray) -> FloatArray:
-    """Return velocities (N, 3), m/s, in the world of the poses."""
+    """Return velocities (N, 3) at stamps (N,), in m/s and the world of the poses."""
     half_ns = int(_WINDOW_S / 20 * 1e9)
-    before, after = (
-        se3.translation_of(trajectory.at(stamps_ns + shift, extrapolate=True))
-        for shift in (-half_ns, half_ns)
-    )
-    return np.asarray((after - before) * 1e9 / (2 * half_ns))
+    before = trajectory.at(stamps_ns - half_ns, extrapolate=True)
+    after = trajectory.at(stamps_ns + half_ns, extrapolate=True)
+    moved_m = se3.translation_of(after) - se3.translation_of(before)
+    return np.asarray(moved_m * 1e9 / (2 * half_ns))
 
 
 def turning_axis(trajectory: Trajectory) -> FloatArray:
-    """Return the main axis of rotation (3,) in the frame of the sensor: the vertical.
+    """Estimate the vertical (3,) in the frame of the sensor: the main axis of its rotation.
 
-    The z axis of the sensor points upwards, so that it tells up from down.
+    The sign assumes that the z axis of the sensor points up and not down.
 
     Raises
     ------
     NotEnoughDataError
         If the sensor turns about several axes, or not at all.
     """
-    # Rotations within a second: noise of single poses counts little.
+    # Rotations over a second are larger than the noise of single poses.
     step = max(1, round(1.0 / trajectory.interval_s))
     rotations = se3.rotation_of(trajectory.poses[::step])
     turns = se3.rotation_log(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:])
     squares, axes = np.linalg.eigh(turns.T @ turns)
-    if squares[1] >= _LARGEST_OTHER_SHARE**2 * squares[2]:
+    # The eigenvalues are ascending.
+    if squares[1] >= _MAX_OTHER_SHARE**2 * squares[2]:
         raise NotEnoughDataError("the sensor does not turn about the vertical alone")
     axis = axes[:, 2]
     return np.asarray(axis * np.sign(axis[2]))
 
 
 def driving_direction(trajectory: Trajectory) -> FloatArray:
-    """Return the main direction of the motion (3,) in the frame of the sensor."""
+    """Estimate the main direction of the motion (3,) in the frame of the sensor.
+
+    The direction may be forwards or backwards.
+    """
     step = max(1, round(1.0 / trajectory.interval_s))
-    steps = se3.translation_of(
-        se3.inverse(trajectory.poses[:-step:step]) @ trajectory.poses[step::step]
-    )
-    return np.asarray(np.linalg.eigh(steps.T @ steps)[1][:, 2])
+    before = trajectory.poses[:-step:step]
+    motions = se3.translation_of(se3.inverse(before) @ trajectory.poses[step::step])
+    _, axes = np.linalg.eigh(motions.T @ motions)
+    return np.asarray(axes[:, 2])
