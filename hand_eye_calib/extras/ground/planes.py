@@ -68,7 +68,8 @@ def ground_of(
     for _ in range(2):
         is_inlier = np.abs(cells[:, 2] - _heights(cells, plane)) < _MAX_INLIER_HEIGHT_M
         inliers = cells[is_inlier]
-        plane = np.linalg.lstsq(_rows(inliers), inliers[:, 2], rcond=None)[0]
+        solution, *_ = np.linalg.lstsq(_rows(inliers), inliers[:, 2], rcond=None)
+        plane = np.asarray(solution, dtype=float)
     if not _is_ground(cells, inliers, plane):
         return None
     a, b, c = plane

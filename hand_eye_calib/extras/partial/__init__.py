@@ -1,4 +1,4 @@
-"""Streams of positions, rotations or angular rates alone."""
+"""Calibration from streams that have positions, rotations or angular rates only."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ from hand_eye_calib.core.base.registry import FINDING_WORDS, KINDS, RESULT_PARTS
 
 
 def register() -> None:
-    """Register both kinds of streams, and the bias of angular rates."""
+    """Register positions, rotations and rates as kinds of data, with their results and findings."""
     RESULT_PARTS["rate_bias"] = _rate_bias
     FINDING_WORDS["partial"] = _words
     KINDS["positions"] = _positions

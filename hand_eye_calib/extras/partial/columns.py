@@ -1,13 +1,15 @@
-"""Regression of windows of a recording on columns of possible faults.
+"""Linear regression of residuals on the extrinsic and on possible faults of a stream.
 
-In a window of some seconds, the residuals of a measured stream are
+In a window of some seconds, the residual of sample i of a measured stream is
 
     e_i = sum_k c_ki f_k + nuisances + noise.
 
-The first columns belong to the extrinsic, the others to faults. Each window has nuisances of its
-own, such as the pose of its world: they are projected out. Instruments replace columns with noise:
-the same columns, computed from the other stream (W. Greene, *Econometric Analysis*, 2012, chapter
-8). Weights of windows are robust. A jackknife over blocks of windows estimates the covariance.
+The column c_k is the derivative of the residuals with respect to the unknown f_k. The first
+unknowns correct the extrinsic, the others are sizes of faults, such as a delay. The nuisances are
+unknowns that each window has for itself, such as the pose of its world: they are projected out. A
+column with noise has an instrument, which is the same column computed from the other stream
+(W. Greene, *Econometric Analysis*, 2012, chapter 8). The windows have robust weights. A jackknife
+over blocks of windows estimates the covariance.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,35 +24,40 @@ from hand_eye_calib.core.base.blocks import Blocks, inverse
 from hand_eye_calib.core.base.stats import median, robust_weights
 from hand_eye_calib.core.geometry import se3
 
-# Shortest window (s), for short recordings, and fewest samples of a window.
-_SHORTEST_WINDOW_S = 4.0
-_LEAST_SAMPLES = 12
-# Windows of a recording that has enough of them, and fewest windows.
+# Shortest window (s), for short recordings.
+_MIN_WINDOW_S = 4.0
+# Fewest samples of a window. At least half of them must be used.
+_MIN_SAMPLES = 12
+# Number of windows below which the windows of a short recording become shorter.
 _ENOUGH_WINDOWS = 16
-_LEAST_WINDOWS = 6
+# Fewest windows of a regression.
+_MIN_WINDOWS = 6
 
-# Stamps of four steps may be off by this share of their duration: others are beside a gap.
-_TOLERANCE = 0.3
+# Largest deviation of the duration of four steps from the usual, as a share. A larger deviation
+# means that a gap is nearby.
+_MAX_DEVIATION = 0.3
 
-# Rounds of the robust weights of windows, and the residual with half the weight, in usual ones.
-_ROUNDS = 4
+# Number of iterations of the robust weights.
+_N_ITERATIONS = 4
+# Residual of a window that has half the weight, in median residuals.
 _HALF_WEIGHT = 2.0
 
 # Largest number of blocks of the jackknife.
-_MOST_BLOCKS = 16
+_MAX_BLOCKS = 16
 
 
 class Column(NamedTuple):
-    """Columns of one fault.
+    """Columns of the m unknowns of one fault.
 
     Attributes
     ----------
     sigma : float
-        Prior standard deviation of the values. Larger faults are not usual.
+        Prior standard deviation of the unknowns, in their unit: the usual size of the fault.
     rows : callable
-        Columns (W, K, 3, m) of windows.
+        Function that computes the columns (W, K, 3, m) from the windows.
     instrument : callable, optional
-        The same columns from the measured stream.
+        Function that computes the same columns from the other stream. Without it, the columns are
+        their own instrument.
     """
 
     sigma: float
@@ -59,7 +66,7 @@ class Column(NamedTuple):
 
 
 def by_axis(vectors: FloatArray) -> FloatArray:
-    """Return one column (..., 3, 3) for each coordinate of vectors (..., 3)."""
+    """Return vectors (..., 3) as diagonal matrices (..., 3, 3): one column for each coordinate."""
     return np.asarray(vectors[..., None] * np.eye(3))
 
 
@@ -69,9 +76,9 @@ class Split(NamedTuple):
     Attributes
     ----------
     size : int
-        K.
-    is_enough : (W', ) bool array
-        Windows with enough used samples, of all windows W'.
+        Number K of samples of a window.
+    is_enough : (W',) bool array
+        Which of all W' windows of the recording have enough used samples; W of them have.
     is_used : (W, K) bool array
         Samples without a gap nearby.
     """
@@ -81,44 +88,44 @@ class Split(NamedTuple):
     is_used: BoolArray
 
     def __call__(self, values: FloatArray) -> FloatArray:
-        """Return values (W, K, ...) of windows from values (N, ...)."""
+        """Return the values (N, ...) of all samples in windows, (W, K, ...)."""
         n_windows = len(self.is_enough)
         whole = values[: n_windows * self.size]
         return whole.reshape(n_windows, self.size, *values.shape[1:])[self.is_enough]
 
 
 def split(stamps_s: FloatArray, spans_s: FloatArray, step: int, longest_s: float) -> Split | None:
-    """Divide a recording into windows; return None if it is too short.
+    """Divide a recording into windows; return None if the recording is too short.
 
     Parameters
     ----------
     stamps_s : (N,) array
     spans_s : (N,) array
-        Duration of the four steps around each sample.
+        Duration of the four steps around each sample, from which derivatives are computed.
     step : int
-        Samples of a step.
+        Number of sample intervals of a step.
     longest_s : float
-        Duration of a window of a recording that is long enough.
+        Duration of a window if the recording is long enough.
     """
     interval_s = median(np.diff(stamps_s))
     duration_s = interval_s * len(stamps_s)
-    window_s = min(longest_s, max(duration_s / _ENOUGH_WINDOWS, _SHORTEST_WINDOW_S))
-    size = max(round(window_s / interval_s), _LEAST_SAMPLES)
+    window_s = min(longest_s, max(duration_s / _ENOUGH_WINDOWS, _MIN_WINDOW_S))
+    size = max(round(window_s / interval_s), _MIN_SAMPLES)
     n_windows = len(stamps_s) // size
-    if n_windows < _LEAST_WINDOWS:
+    if n_windows < _MIN_WINDOWS:
         return None
     usual_s = 4 * step * interval_s
-    is_regular = np.abs(spans_s - usual_s) < _TOLERANCE * usual_s
+    is_regular = np.abs(spans_s - usual_s) < _MAX_DEVIATION * usual_s
     is_used = is_regular[: n_windows * size].reshape(n_windows, size)
-    # Windows with few samples beside gaps do not reveal anything.
-    is_enough = is_used.sum(axis=1) >= _LEAST_SAMPLES // 2
-    if is_enough.sum() < _LEAST_WINDOWS:
+    # A window with many gaps has too few samples to determine its nuisances.
+    is_enough = is_used.sum(axis=1) >= _MIN_SAMPLES // 2
+    if is_enough.sum() < _MIN_WINDOWS:
         return None
     return Split(size, is_enough, is_used[is_enough])
 
 
 class Estimate(NamedTuple):
-    """Values (m,) of a fault and their standard deviations (m,)."""
+    """Estimated unknowns (m,) of a fault and their standard deviations (m,)."""
 
     values: FloatArray
     sigmas: FloatArray
@@ -126,24 +133,25 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True)
 class Fit:
-    """Regression of a stream on the columns of all faults.
+    """Result of the regression of a stream on the extrinsic and all faults.
 
     Attributes
     ----------
     blocks : Blocks
-        Products of the columns in blocks of time, in units of the noise.
+        Normal equations in blocks of time: products of the columns and of the residuals, which are
+        last, divided by the variance of the noise.
     places : dict
-        Places of the columns of each fault. The first are those of the extrinsic.
+        Indices of the columns of each fault. The first entry is the extrinsic.
     weights : (W,) array
-        Weights of the windows.
+        Weights of the windows, divided by the variance of the noise.
     residual : float
-        Usual residual with the extrinsic and without a fault.
+        Root of the median squared residual of a window, if only the extrinsic is estimated.
     remaining : float
-        Usual residual if all faults are possible.
+        The same root if all faults are estimated, too.
     n_samples : float
-        Number of samples, those of windows with less weight counted less.
+        Number of samples; a window with less weight counts less.
     nuisances : (W, n) array
-        Nuisances of each window, if all faults are possible.
+        Estimated nuisances of each window, if all faults are estimated, too.
     """
 
     blocks: Blocks
@@ -155,7 +163,7 @@ class Fit:
     nuisances: FloatArray
 
     @property
-    def _of_extrinsic(self) -> list[int]:
+    def _extrinsic_columns(self) -> list[int]:
         return next(iter(self.places.values()))
 
     @property
@@ -172,45 +180,52 @@ class Fit:
         return Estimate(self.blocks.solve(columns), sigmas)
 
     def estimate(self, name: str) -> Estimate:
-        """Return the values of a fault, if all other faults are possible too."""
+        """Return the estimate of a fault from the regression on all faults together."""
         places = self.places[name]
         return Estimate(self.joint.values[places], self.joint.sigmas[places])
 
     def biases(self, name: str) -> FloatArray:
-        """Return the bias (m,) that noise of the columns can cause in the values of a fault.
+        """Return the bias (m,) of the values of a fault that noise in the columns can cause.
 
-        The noise is assumed to be as large as the noise of the residuals.
+        Noise in a column reduces its estimate (errors in variables). The noise is assumed to be as
+        large as that of the residuals.
         """
         covariance = np.linalg.inv(self.blocks.total[:-1, :-1])
         return np.asarray(self.n_samples * np.abs(np.diag(covariance)[self.places[name]]))
 
     @property
     def explained_share(self) -> float:
-        """Share of the squared residuals with the extrinsic alone that the faults explain."""
-        costs = []
-        for columns in (self._of_extrinsic, self._every_column):
-            x = np.append(-self.blocks.solve(columns), 1.0)
-            used = [*columns, -1]
-            costs.append(float(x @ self.blocks.total[np.ix_(used, used)] @ x))
-        return 1.0 - costs[1] / max(costs[0], 1e-300)
+        """Share of the sum of squared residuals by which the faults reduce it."""
+        without_faults = self._cost(self._extrinsic_columns)
+        return 1.0 - self._cost(self._every_column) / max(without_faults, 1e-300)
+
+    def _cost(self, columns: list[int]) -> float:
+        """Return the sum of squared residuals after a fit of some columns."""
+        # The products x' P x of columns and residuals, with x = (-estimate, 1), are this sum.
+        x = np.append(-self.blocks.solve(columns), 1.0)
+        used = [*columns, -1]
+        return float(x @ self.blocks.total[np.ix_(used, used)] @ x)
 
     @property
     def open_covariance(self) -> FloatArray:
-        """Covariance (3, 3) of the extrinsic that possible faults leave open."""
+        """Covariance (3, 3) that all possible faults add to the extrinsic."""
         return self.open_to(self._every_column)
 
     def open_to(self, columns: list[int]) -> FloatArray:
-        """Return the covariance (3, 3) of the extrinsic that the faults of some columns leave open.
+        """Return the covariance (3, 3) that the faults of some columns add to the extrinsic.
 
-        The extrinsic moves if these faults are possible, and it is less certain then. Both may have
-        one direction, such as the axis that a machine turns about.
+        If these faults are estimated too, the extrinsic moves, and its covariance grows. The square
+        of the shift and the growth are added. They may concern one direction only, such as the axis
+        about which a machine turns.
         """
-        n_values = len(self._of_extrinsic)
-        values = self.blocks.solve(columns)[:n_values]
+        n_values = len(self._extrinsic_columns)
+        shift = self.blocks.solve(columns)[:n_values]
         with_faults = self.blocks.jackknife(columns)[:n_values, :n_values]
-        variances, axes = np.linalg.eigh(with_faults - self.blocks.jackknife(self._of_extrinsic))
-        added = (axes * np.maximum(variances, 0.0)) @ axes.T
-        return np.asarray(np.outer(values, values) + added)
+        without_faults = self.blocks.jackknife(self._extrinsic_columns)
+        variances, axes = np.linalg.eigh(with_faults - without_faults)
+        # Chance makes some variances smaller. They do not grow then, and add nothing.
+        growth = (axes * np.maximum(variances, 0.0)) @ axes.T
+        return np.asarray(np.outer(shift, shift) + growth)
 
 
 def fit_columns(
@@ -220,50 +235,60 @@ def fit_columns(
     residuals: FloatArray,
     nuisances: FloatArray,
 ) -> Fit:
-    """Fit windows with columns of the extrinsic and of all faults.
+    """Estimate the extrinsic and all faults from the residuals of all windows.
 
     Parameters
     ----------
     columns : mapping of str to Column
-        The first columns are those of the extrinsic.
+        The first entry is the extrinsic.
     windows : object
-        What the columns are computed from.
+        Argument of the functions of the columns.
     is_used : (W, K) bool array
+        Samples without a gap nearby.
     residuals : (W, K, 3) array
     nuisances : (W, K, 3, n) array
-        Columns that each window has for itself.
+        Columns of the unknowns that each window has for itself.
     """
-    rows = [column.rows(windows) for column in columns.values()]
-    instruments = [(column.instrument or column.rows)(windows) for column in columns.values()]
+    tables = []
+    instruments = []
     places: dict[str, list[int]] = {}
     information: list[float] = []
-    for name, row in zip(columns, rows, strict=True):
+    for name, column in columns.items():
+        table = column.rows(windows)
+        tables.append(table)
+        instruments.append(column.instrument(windows) if column.instrument else table)
         start = len(information)
-        information += [columns[name].sigma ** -2] * row.shape[3]
+        information += [column.sigma**-2] * table.shape[3]
         places[name] = list(range(start, len(information)))
     prior = np.diag([*information, 0.0])
+    # Project the nuisances out, by an orthonormal basis of them (W, 3 K, n).
     basis, triangle = np.linalg.qr(_flat([nuisances], is_used))
+    to_basis = np.swapaxes(basis, 1, 2)
     target = residuals[..., None]
-    joined = [_flat([*table, target], is_used) for table in (rows, instruments)]
-    absorbed = [np.swapaxes(basis, 1, 2) @ table for table in joined]
-    projected, probes = (table - basis @ part for table, part in zip(joined, absorbed, strict=True))
-    products = np.einsum("wkp,wkq->wpq", probes, projected)
+    data = _flat([*tables, target], is_used)
+    in_basis = to_basis @ data
+    data = data - basis @ in_basis
+    probes = _flat([*instruments, target], is_used)
+    probes = probes - basis @ (to_basis @ probes)
+    products = np.einsum("wkp,wkq->wpq", probes, data)
     counts = 3.0 * is_used.sum(axis=1)
-    known = [*next(iter(places.values())), -1]
+    # Weight the windows by their residuals after a fit of the extrinsic alone.
+    extrinsic = next(iter(places.values()))
+    used = [*extrinsic, -1]
+    of_extrinsic = products[:, used][:, :, used]
     weights = np.ones(len(products))
-    for _ in range(_ROUNDS):
+    for _ in range(_N_ITERATIONS):
         total = Blocks(weights[:, None, None] * products)
-        x = np.append(-total.solve(known[:-1]), 1.0)
-        squares = np.einsum("i,wij,j->w", x, products[:, known][:, :, known], x) / counts
+        x = np.append(-total.solve(extrinsic), 1.0)
+        squares = np.einsum("i,wij,j->w", x, of_extrinsic, x) / counts
         usual = max(median(squares), 1e-18)
         weights = robust_weights("cauchy", squares / usual / _HALF_WEIGHT**2) / usual
     blocks = Blocks(weights[:, None, None] * products)
-    blocks = blocks.merged(min(len(products), _MOST_BLOCKS))
+    blocks = blocks.merged(min(len(products), _MAX_BLOCKS))
     with_prior = Blocks(blocks.sums + prior / len(blocks.sums))
     values = with_prior.solve(range(len(information)))
     x = np.append(-values, 1.0)
-    remaining = ((projected @ x) ** 2).sum(axis=1) / counts
-    of_windows = absorbed[0] @ x
+    remaining = ((data @ x) ** 2).sum(axis=1) / counts
     return Fit(
         blocks=with_prior,
         places=places,
@@ -271,11 +296,14 @@ def fit_columns(
         residual=float(np.sqrt(usual)),
         remaining=float(np.sqrt(median(remaining))),
         n_samples=float(usual * weights @ counts / 3.0),
-        nuisances=se3.times(inverse(triangle), of_windows),
+        nuisances=se3.times(inverse(triangle), in_basis @ x),
     )
 
 
 def _flat(tables: list[FloatArray], is_used: BoolArray) -> FloatArray:
-    """Join tables (W, K, 3, m) of columns to one table (W, 3 K, p), zero where not used."""
+    """Join tables (W, K, 3, m) of columns to one table (W, 3 K, p).
+
+    Rows of samples that are not used are zero.
+    """
     joined = is_used[..., None, None] * np.concatenate(tables, axis=3)
     return np.reshape(joined, (len(joined), -1, joined.shape[3]))

@@ -8,7 +8,10 @@ from hand_eye_calib.core.checks.findings import Finding, Severity, finding
 
 
 def copied(evidence: str, **residual: Any) -> list[Finding]:
-    """Return the finding that one stream was computed from the other."""
+    """Return the finding that one stream was computed from the other.
+
+    ``residual`` is the remaining difference of both streams, with its unit in its name.
+    """
     return [finding("not_independent", "both", Severity.ERROR, evidence=evidence, **residual)]
 
 

@@ -1,17 +1,17 @@
-"""Regression of positions beside poses on columns of possible faults.
+"""Regression of measured positions on possible faults, with the poses of another sensor.
 
 In a window of some seconds, the measured positions are
 
     q_i = A (R_i l + t_i) + a + sum_k f_k c_ki + noise
 
-with the poses (R_i, t_i) of the odometry, the lever arm l, and the pose (A, a) of its world in the
-world of the positions. Errors of (A, a) are projected out of each window. The column c_k is what a
-fault f_k adds: the coordinates for a wrong scale of an axis, the velocities for a delay, the
-accelerations for smoothing. Any low-pass filter has the response ``1 - i w d - w^2 c`` at low
-angular frequencies w, with a delay d and a smoothing c.
+with the poses (R_i, t_i) of the odometry, the lever arm l, and the pose (A, a) of the world of the
+odometry in the world of the positions. Errors of (A, a) are projected out of each window. The
+column c_k is what a fault of size f_k = 1 adds: the coordinate for a wrong scale of an axis, minus
+the velocity for a delay d, the acceleration for smoothing c. The last two follow from the frequency
+response of any low-pass filter at low angular frequencies w, ``1 - i w d - w^2 c``.
 
-Accelerations come from the poses, and those of the measured positions are their instrument: the
-noise of both is independent, so that neither noise nor drift looks like smoothing.
+Accelerations are computed from the poses. The accelerations of the measured positions are their
+instrument: the noise of both is independent, so that neither noise nor drift looks like smoothing.
 """
 
 from dataclasses import dataclass
@@ -25,33 +25,37 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.differences import path_derivatives, stencil
 from hand_eye_calib.extras.partial.columns import Column, Fit, by_axis, fit_columns, split
 
-# Duration of a window (s): an odometry drifts little in it, and a machine turns.
+# Duration of a window (s): long enough for a turn, short enough for little drift of an odometry.
 _WINDOW_S = 10.0
 
-# Step (s) of the differences that accelerations come from; one interval if that is longer.
+# Step (s) of the finite differences for velocities and accelerations. If the interval between
+# positions is longer, the interval is the step.
 _STEP_S = 0.2
 
-# Range below which a coordinate is constant (m).
-_CONSTANT_M = 1e-6
+# Largest range (m) of a coordinate that is constant, for rounding.
+_MAX_CONSTANT_M = 1e-6
 
 
 class _Windows(NamedTuple):
-    """Aligned windows (W, K) of positions, in the world of the positions.
+    """W windows of K predicted and measured positions, in axes of the world of the positions.
+
+    The predicted positions are those of the lever arm's end along the poses. Each window of them is
+    rotated to fit the measured positions best.
 
     Attributes
     ----------
     is_used : (W, K) bool array
         Positions without a gap nearby.
     rotations : (W, K, 3, 3) array
-        Of the sensor with poses.
+        Rotations of the sensor with poses.
     path : (W, K, 3) array
-        Predicted positions less their mean.
+        Predicted positions minus their mean in the window, m.
     residuals : (W, K, 3) array
-        Measured less predicted positions.
+        Measured minus predicted positions, m.
     velocities, accelerations : (W, K, 3) array
-        Of the predicted positions.
+        Derivatives of the predicted positions, m/s and m/s^2.
     measured_accelerations : (W, K, 3) array
-        Of the measured positions.
+        Second derivatives of the measured positions, m/s^2.
     """
 
     is_used: BoolArray
@@ -63,15 +67,15 @@ class _Windows(NamedTuple):
     measured_accelerations: FloatArray
 
 
-# Columns by the names of the faults.
+# Columns by the name of the fault, with prior standard deviations. A comment states the unknowns.
 _COLUMNS = {
-    # Metres.
+    # Correction of the lever arm, m.
     "lever_arm": Column(100.0, lambda windows: windows.rotations),
-    # Factor of each coordinate, less 1.
+    # Scale of each coordinate, minus 1.
     "scales": Column(1.0, lambda windows: by_axis(windows.path)),
     # Delay of each coordinate, s.
     "delays": Column(1.0, lambda windows: by_axis(-windows.velocities)),
-    # Smoothing, s^2.
+    # Smoothing c, s^2.
     "smoothing": Column(
         0.1,
         lambda windows: windows.accelerations[..., None],
@@ -82,20 +86,21 @@ _COLUMNS = {
 
 @dataclass(frozen=True)
 class PositionFit(Fit):
-    """Regression of positions on the columns of all faults.
+    """Result of the regression of positions on all faults.
 
     Attributes
     ----------
     is_constant : (3,) bool array
         Coordinates that are the same in all measured positions.
     path_m : float
-        Root mean square distance from the mean of a window.
+        Root mean square distance of the predicted positions from the mean of their window.
     spreads_m : (3,) array
-        The same along each coordinate, without what the other columns explain.
+        Root mean square distance along each coordinate, without the motion that other columns
+        explain.
     speeds_m_s : (3,) array
-        Root mean square speed along each coordinate.
+        Root mean square of the predicted velocity along each coordinate.
     acceleration_m_s2 : float
-        Root mean square acceleration.
+        Root mean square of the predicted acceleration.
     """
 
     is_constant: BoolArray
@@ -108,7 +113,7 @@ class PositionFit(Fit):
 def fit_positions(
     stamps_ns: IntArray, poses: FloatArray, positions: FloatArray, lever_arm: FloatArray
 ) -> PositionFit | None:
-    """Fit positions with a lever arm and all faults.
+    """Estimate a correction of the lever arm, and all faults, from measured positions.
 
     Parameters
     ----------
@@ -130,31 +135,32 @@ def fit_positions(
     if windows is None:
         return None
     is_used = windows.is_used
-    moving = np.broadcast_to(np.eye(3), windows.rotations.shape)
-    world = np.concatenate([moving, se3.skew(windows.path)], axis=3)
+    # Errors of the pose (A, a): translation and rotation of the world of the odometry.
+    translation = np.broadcast_to(np.eye(3), windows.rotations.shape)
+    world = np.concatenate([translation, se3.skew(windows.path)], axis=3)
     fitted = fit_columns(_COLUMNS, windows, is_used, windows.residuals, world)
-    information = fitted.blocks.total[:-1, :-1]
-    own = 1.0 / np.abs(np.diag(np.linalg.inv(information)))
+    # Information of each column that no other column explains.
+    information = 1.0 / np.abs(np.diag(np.linalg.inv(fitted.blocks.total[:-1, :-1])))
     weight = fitted.weights @ is_used.sum(axis=1)
     return PositionFit(
         **vars(fitted),
-        is_constant=np.ptp(positions, axis=0) < _CONSTANT_M,
+        is_constant=np.ptp(positions, axis=0) < _MAX_CONSTANT_M,
         path_m=float(np.linalg.norm(_root_mean_square(windows.path, is_used))),
-        spreads_m=np.sqrt(own[fitted.places["scales"]] / weight),
+        spreads_m=np.sqrt(information[fitted.places["scales"]] / weight),
         speeds_m_s=_root_mean_square(windows.velocities, is_used),
         acceleration_m_s2=float(np.linalg.norm(_root_mean_square(windows.accelerations, is_used))),
     )
 
 
 def _root_mean_square(vectors: FloatArray, is_used: BoolArray) -> FloatArray:
-    """Return the root mean square (3,) of used vectors (W, K, 3)."""
+    """Return the root mean square (3,) of each coordinate of the used vectors (W, K, 3)."""
     return np.asarray(np.sqrt((vectors[is_used] ** 2).mean(axis=0)))
 
 
 def _windows(
     stamps_s: FloatArray, poses: FloatArray, positions: FloatArray, lever_arm: FloatArray
 ) -> _Windows | None:
-    """Return aligned windows, or None if the recording is too short."""
+    """Return windows of predicted and measured positions, or None for a short recording."""
     step = max(round(_STEP_S / median(np.diff(stamps_s))), 1)
     rotations = se3.rotation_of(poses)
     predicted = se3.times(rotations, lever_arm) + se3.translation_of(poses)
@@ -167,6 +173,7 @@ def _windows(
     is_used = in_windows.is_used
     path = _centred(in_windows(predicted), is_used)
     measured = _centred(in_windows(positions), is_used)
+    # Rotation of each window that fits the predicted to the measured positions best (Kabsch).
     products = np.einsum("wki,wkj,wk->wij", measured, path, is_used)
     to_world = se3.nearest_rotation(products)[:, None]
     path = se3.times(to_world, path)
@@ -181,8 +188,8 @@ def _windows(
     )
 
 
-def _centred(vectors: FloatArray, used: BoolArray) -> FloatArray:
-    """Return vectors (W, K, 3) less the mean of the used ones of each window."""
-    counts = used.sum(axis=1)[:, None]
-    means = (vectors * used[..., None]).sum(axis=1) / counts
+def _centred(vectors: FloatArray, is_used: BoolArray) -> FloatArray:
+    """Return vectors (W, K, 3) minus the mean of the used vectors of their window."""
+    counts = is_used.sum(axis=1)[:, None]
+    means = (vectors * is_used[..., None]).sum(axis=1) / counts
     return np.asarray(vectors - means[:, None])

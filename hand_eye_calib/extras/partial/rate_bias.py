@@ -1,11 +1,20 @@
-"""Bias of angular rates, as a part of results."""
+"""Bias of angular rates, stored in a result."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True, kw_only=True)
 class RateBias:
-    """Bias of angular rates and its standard deviation, rad/s, in the axes of the sensor ``of``."""
+    """Bias of angular rates.
+
+    Attributes
+    ----------
+    of : str
+        Sensor that has the bias, whose axes are used: "parent", "child", or a sentence about the
+        difference of two gyroscopes.
+    rad_per_s, sigma : tuple of float
+        Bias about x, y, z and its standard deviations, rad/s.
+    """
 
     of: str
     rad_per_s: tuple[float, ...]
