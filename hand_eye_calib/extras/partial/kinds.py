@@ -1,6 +1,6 @@
-"""Kinds of data in which one stream measures only a part of its poses.
+"""Kinds of data without full poses of both sensors.
 
-The streams are positions beside poses, or rotations or angular rates of both sensors.
+Either one sensor has poses and the other positions, or both have rotations or angular rates.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.extras.partial import position_checks, rotation_checks
 from hand_eye_calib.extras.partial.partial import estimate_lever_arm, estimate_rotation
 
-# Allowed values of options that only affect full poses.
+# Allowed values of options that only matter for full poses of both sensors.
 _OF_POSES: dict[str, tuple[object, ...]] = {
     "method": ("auto", "adaptive"),
     "reference": ("auto",),
@@ -38,22 +38,22 @@ _OF_ROTATIONS: dict[str, tuple[object, ...]] = {
     "parent_scale": (1.0,),
 }
 
-# Change of the time offset (s) from which on positions are paired anew. Their model estimates the
-# offset better than speeds do.
+# Change of the time offset (s) above which positions are paired anew. A smaller change is left to
+# the model of the positions, which estimates the offset better than speeds do.
 _LEAST_CHANGE_OF_POSITIONS_S = 0.05
 
-# Every solve estimates time offsets below this (s).
+# Largest time offset (s) that the solve itself is sure to estimate.
 _FOUND_BY_SOLVE_S = 0.25
 
-# Accuracy of a coarse time offset, in intervals between poses.
+# Standard deviation of a time offset from correlated rates, in intervals between poses.
 _COARSE_INTERVALS = 0.2
 
 
 def _solve_positions(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
-    """Estimate the lever arm; positions have no cross-check.
+    """Estimate the lever arm. ``cross_check`` has no effect: positions have no cross-check.
 
-    A delay or a low-pass filter may make positions look unrelated to the poses. Speeds determine
-    the delay then, and the solve is repeated.
+    A delay may make positions look unrelated to the poses. The correlation of speeds then estimates
+    the delay, and the solve is repeated.
     """
     result = _solve(snapshot, estimate_lever_arm)
     config = snapshot.config
@@ -70,7 +70,7 @@ def _solve_positions(snapshot: Snapshot, cross_check: bool | None) -> Calibratio
 
 
 def _is_unrelated(calibration: Calibration) -> bool:
-    """Return whether the solve did not explain the positions."""
+    """Return whether a result has the finding that the streams are unrelated."""
     return any(found.code == "unrelated" for found in calibration.findings)
 
 
@@ -80,7 +80,10 @@ def _solve_rotations(snapshot: Snapshot, cross_check: bool | None) -> Calibratio
 
 
 def _solve(snapshot: Snapshot, estimate: Callable[..., Calibration]) -> Calibration:
-    """Estimate the observable part of the extrinsic, and pair anew if the time offset is large."""
+    """Estimate the extrinsic; pair the streams anew and repeat if the time offset is large.
+
+    An estimated time offset that changes by more than ``UNASKED_S`` is rejected.
+    """
     config = snapshot.config
     result = estimate(snapshot.pose_pairs, config)
     before_s = float(config.time_offset)
@@ -89,16 +92,17 @@ def _solve(snapshot: Snapshot, estimate: Callable[..., Calibration]) -> Calibrat
         return replace(result, time_offset_s=before_s)
     if len(snapshot.kept) or not change_s > MOST_MOVED_S:
         return result
-    # Interpolate at the stamps of the other stream, instead of moving poses along the velocity.
+    # Pairing interpolates the poses. The solve only moved them along their velocity, which is exact
+    # for small offsets only.
     config = replace(config, time_offset=result.time_offset_s)
     pose_pairs = replace(snapshot, config=config).pose_pairs
     return estimate(pose_pairs, config) if len(pose_pairs) >= config.min_pairs else result
 
 
 def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckResult:
-    """Check two streams of which one measures only a part of its poses.
+    """Check two streams without full poses of both sensors.
 
-    The result includes the findings of the solve.
+    The returned findings include those of the calibration.
 
     Parameters
     ----------
@@ -109,7 +113,7 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
     findings = [*calibration.findings] if calibration else []
     known_s = float(snapshot.resolved.config.time_offset)
     parent, child = snapshot.streams
-    # Stored pairs may have gaps that the streams do not have.
+    # Pairs of a stored session may have gaps that its streams did not have: they are not checked.
     if not len(snapshot.kept):
         findings += _check_aligned(snapshot, calibration, known_s)
     hidden = calibration.hidden if calibration else []
@@ -136,7 +140,7 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
 def _check_solved(
     snapshot: Snapshot, calibration: Calibration, is_unrelated: bool
 ) -> list[Finding]:
-    """Check both streams against their result."""
+    """Check both streams with the extrinsic of their calibration."""
     parent, child = snapshot.streams
     config = snapshot.config
     if calibration.measured == "rotations":
@@ -149,7 +153,7 @@ def _check_solved(
 def _check_aligned(
     snapshot: Snapshot, calibration: Calibration | None, known_s: float
 ) -> list[Finding]:
-    """Check both streams in one unit and on one clock."""
+    """Check both streams with the scale and the time offset of their calibration."""
     parent, child = snapshot.streams
     scale = calibration.scale if calibration else snapshot.config.given_scale
     aligned = child.scaled(scale).shifted(known_s)
@@ -158,7 +162,7 @@ def _check_aligned(
 
 
 def _without_repetitions(findings: Sequence[Finding]) -> list[Finding]:
-    """Return the findings without those that are equal to one before."""
+    """Return the findings in their order, equal findings once."""
     different: list[Finding] = []
     for found in findings:
         if found not in different:
@@ -167,7 +171,7 @@ def _without_repetitions(findings: Sequence[Finding]) -> list[Finding]:
 
 
 def _least_lever_arm(calibration: Calibration) -> float:
-    """Return the least length (m) of the lever arm of a result, within its uncertainty."""
+    """Return the smallest length (m) of the lever arm that its uncertainty allows."""
     sigmas = np.sqrt(np.diag(calibration.covariance_measured))[:3]
     is_hidden = [axis in calibration.hidden for axis in "xyz"]
     return checking.least_lever_arm(calibration.T_parent_child, np.where(is_hidden, np.inf, sigmas))

@@ -1,10 +1,11 @@
-"""Calibration from streams of which one measures only a part of its poses.
+"""Calibration from streams without full poses of both sensors.
 
-- Positions beside poses: the lever arm l and the time offset are estimated. By convention the
-  sensor that measures positions has the axes of the other one. The rotation is unobservable.
+- Positions of one sensor and poses of the other: the lever arm l and the time offset are estimated.
+  By convention, the sensor with positions has the axes of the sensor with poses. The rotation is
+  unobservable.
 - Rotations or angular rates: the rotation R, the time offset and the bias b of a gyroscope are
-  estimated, from ``w_p(t) = R (w_c(t + d) - b)``. The adaptive estimator gets trajectories that
-  never leave their origins, because its rotation does not depend on the positions.
+  estimated, from ``w_p(t) = R (w_c(t + d) - b)``. The adaptive estimator is used with poses whose
+  positions are all zero, because its rotation does not depend on them.
 """
 
 import contextlib
@@ -36,31 +37,31 @@ from hand_eye_calib.extras.partial.rate_bias import RateBias
 from hand_eye_calib.extras.partial.rotation_checks import measured_stream
 from hand_eye_calib.extras.partial.rotation_columns import fit_pairs
 
-# Share of the path of positions above which it is suspect that the poses do not explain it: at most
-# 0.05 if both are of one body.
+# Share of the path of the positions that the poses do not explain: above this, a fault is searched.
+# Two sensors on one body have at most 0.05.
 _SUSPECT_PATH = 0.1
-# Share of the path above which both streams are unrelated: 0.5 and more if they are of two bodies.
+# The same share above which both streams are unrelated. Sensors on two bodies have 0.5 and more.
 _UNRELATED_PATH = 0.3
-# The same share of the rotation, for rotations and rates.
+# Unexplained share of the rotation above which rotations or rates are unrelated.
 _UNRELATED_ROTATION = 0.5
 
-# Poses between the ends of the motions that show how much of the rotation is explained.
+# Number of poses that a motion spans in the comparison of the rotations of both streams.
 _SPAN = 10
-# Quantile of the rotation angles above which motions count: a sensor may stand still for long.
+# Quantile of the rotation angles above which motions are compared: a sensor may rest for long.
 _TURNING = 0.75
 
-# A scale explains a path if it reduces the unexplained share below this factor.
+# A scale explains a path if it reduces the unexplained share at least by this factor.
 _MENDED_PATH = 0.5
 
-# A scale between the streams is reported above this many standard deviations.
+# Number of standard deviations above which a scale between the streams is reported.
 _SCALE_SIGMAS = 5.0
-# Least share of the information on the scale that comes from the data, not from the prior.
-_SHOWN_SCALE = 0.5
+# Smallest share of the information on a reported scale that is from the data, not from the prior.
+_MIN_DATA_SHARE = 0.5
 # Smallest scale to divide by.
 _LEAST_SCALE = 1e-3
 
-# Standard deviation (m) along each axis of the point that a sensor measures: the frame of an
-# odometry, the centre of an antenna or a prism.
+# Standard deviation (m) along each axis of the point that a sensor refers to: the origin of an
+# odometry, or the centre of an antenna or a prism.
 _POINT_M = 0.005
 
 
@@ -87,7 +88,7 @@ class _Paths:
         )
 
     def open_covariance(self, solution: of_positions.LeverArmSolution) -> FloatArray:
-        """Return the covariance (3, 3) of the lever arm that possible faults leave open."""
+        """Return the covariance (3, 3), m^2, that possible faults add to the lever arm."""
         scaled = solution.scale * self.positions
         fitted = fit_positions(self.stamps_ns, self.poses, scaled, solution.lever_arm)
         return fitted.open_covariance if fitted else np.zeros((3, 3))
@@ -162,10 +163,10 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
 
 
 def _allowance(paths: _Paths, kind_of_poses: str, kind_of_positions: str) -> FloatArray:
-    """Return the covariance (6, 6) of errors that no recording shows.
+    """Return the covariance (6, 6) of constant errors that no recording reveals.
 
-    The point that each sensor measures is uncertain, unless the positions are exact. An odometry
-    adds its travel in ``FLOOR_TRAVEL_S``, as for poses.
+    The reference point of a sensor is uncertain, unless its stream is exact. Poses that are not
+    exact also add the distance that the sensor travels in ``FLOOR_TRAVEL_S``, as for full poses.
     """
     variance = _POINT_M**2
     if kind_of_positions != "exact":
@@ -177,7 +178,11 @@ def _allowance(paths: _Paths, kind_of_poses: str, kind_of_positions: str) -> Flo
 
 
 def _step_residuals(solution: of_positions.LeverArmSolution, paths: _Paths) -> Residuals:
-    """Residuals of the distances between positions, along the steps of the sensor with poses."""
+    """Return the residuals of the distances between consecutive positions.
+
+    A residual is the predicted minus the measured distance (m), as a vector along the predicted
+    step, in the axes of the sensor with poses. The rotation of the world does not matter.
+    """
     rotations = se3.rotation_of(paths.poses)
     steps = np.diff(rotations @ solution.lever_arm + se3.translation_of(paths.poses), axis=0)
     lengths = np.linalg.norm(steps, axis=1)
@@ -238,13 +243,13 @@ def _check_scale(
 ) -> tuple[Finding, ...]:
     """Detect a scale between the streams that is larger than the error of an odometry.
 
-    The model has a prior of 1 with ``prior_sigma`` for the scale. It is removed here.
+    The estimated scale has a prior of 1 with ``prior_sigma``. Its effect is removed here.
     """
-    shown = 1.0 - (solution.scale_sigma / prior_sigma) ** 2
-    if shown < _SHOWN_SCALE:
+    data_share = 1.0 - (solution.scale_sigma / prior_sigma) ** 2
+    if data_share < _MIN_DATA_SHARE:
         return ()
-    excess = (solution.scale - 1.0) / shown
-    sigma = solution.scale_sigma / shown**0.5
+    excess = (solution.scale - 1.0) / data_share
+    sigma = solution.scale_sigma / data_share**0.5
     if abs(excess) < _SCALE_SIGMAS * sigma:
         return ()
     scale = 1.0 + excess
@@ -309,7 +314,10 @@ def estimate_rotation(
 def _open_covariance(
     pairs: PosePairs, T_parent_child: FloatArray, config: CalibratorConfig
 ) -> FloatArray:
-    """Return the covariance (6, 6) of the rotation that possible faults leave open."""
+    """Return the covariance (6, 6) that possible faults add to the rotation, rad^2.
+
+    It refers to a perturbation in the axes of the child. The translation has zeros.
+    """
     whole = np.zeros((6, 6))
     rotation = se3.rotation_of(T_parent_child)
     name = measured_stream(config.parent_measures, config.child_measures)
@@ -365,7 +373,7 @@ def _rate_bias(solution: adaptive_estimator.AdaptiveSolution, config: Calibrator
 def _check_rotation(
     Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, T_parent_child: FloatArray
 ) -> tuple[Finding, ...]:
-    """Detect rotations of one stream that do not explain those of the other."""
+    """Detect streams whose rotations differ too much after the extrinsic is applied."""
     span = min(_SPAN, max(len(Ts_pw_p) // 10, 1))
     pairs = motion_pairs(Ts_pw_p, Ts_cw_c, f"B{span}")
     residuals = np.linalg.norm(pairs.residuals(T_parent_child)[1], axis=1)

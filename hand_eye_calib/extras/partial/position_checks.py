@@ -1,4 +1,4 @@
-"""Checks of positions of one sensor beside poses of another.
+"""Checks of streams with positions of one sensor and poses of the other.
 
 The regression of :mod:`~hand_eye_calib.extras.partial.position_columns` detects a wrong scale of a
 coordinate, a delay of a coordinate, and smoothing.
@@ -26,17 +26,16 @@ from hand_eye_calib.extras.partial.copies import as_errors, copied
 from hand_eye_calib.extras.partial.position_columns import PositionFit, fit_positions
 from hand_eye_calib.extras.partial.positions import solve, unexplained_share
 
-# A lever arm is zero if each axis is below this distance (m) or below ``_ZERO_SIGMAS``.
+# A coordinate of a lever arm is zero if it is below this distance (m).
 _ZERO_M = 0.005
-# Standard deviations below which a lever arm is zero.
+# A coordinate is also zero if it is below this number of standard deviations.
 _ZERO_SIGMAS = 3.0
 
-# A zero lever arm is an error if the upper bounds of two axes are below _HOUSING_M and that of the
-# third is below _UNCERTAIN_M. An upper bound is the value plus two standard deviations.
-# Distance (m) below which two housings hardly fit.
+# The upper bound of a coordinate is its size plus two standard deviations.
+# Two housings hardly fit if the upper bounds of two coordinates are below this distance (m).
 _HOUSING_M = 0.03
-# Largest upper bound (m) of a zero lever arm. If fewer than two upper bounds are at most this, the
-# lever arm is too uncertain to be called zero: there is no finding.
+# Largest upper bound (m) of a zero coordinate. With fewer than two coordinates below, the lever arm
+# is too uncertain to be zero, and there is no finding. With all three, the finding can be an error.
 _UNCERTAIN_M = 0.06
 
 # Median residual (m) below which positions were computed from the poses: no receiver or total
@@ -45,24 +44,25 @@ _COPIED_M = 5e-5
 # The same limit as a share of the median motion, for slow streams.
 _COPIED_SHARE = 0.01
 
-# Standard deviations from which on smoothing or a late coordinate is an error, or is clear. They
-# are those of a jackknife of at most 16 blocks, whose distribution has heavy tails.
+# Number of standard deviations above which smoothing is an error, and a late coordinate is
+# reported. A jackknife of at most 16 blocks estimates them, so their ratio has heavy tails.
 _CLEAR_SIGMAS = 6.0
-# Standard deviations from which on smoothing is a warning. A drone tilts as it accelerates, so that
-# a vertical lever arm acts nearly like smoothing, and smoothing is less certain.
+# Number of standard deviations above which smoothing is a warning. The limit is lower, because
+# smoothing is less certain on a drone: it tilts as it accelerates, so that a vertical lever arm
+# acts nearly like smoothing.
 _LIKELY_SIGMAS = 3.3
 # Smallest smoothing of positions that is an error (s^2): that of a filter of 0.13 s. Streams
 # without a filter have up to 0.006 (simulated machines with seeds 77 and 78, and NTU VIRAL).
 _SMOOTHING_S2 = 0.008
-# Drift of an odometry along a coordinate, as a share of the distance.
+# Drift of an odometry along a coordinate, as a share of the distance from the mean position.
 _DRIFT = 0.02
-# Smallest delay of a coordinate against the others (s).
+# Smallest delay (s) of a coordinate against the others that is reported.
 _LAG_S = 0.02
-# Share of the squared residuals that faults must explain, to be reported for positions on another
-# path than the poses.
+# Smallest share of the squared residuals that the faults must explain, if the positions are on
+# another path than the poses. Otherwise no fault is reported as the reason.
 _NAMES_UNRELATED = 0.6
 
-# Share of a mirrored path below which a lever arm explains the path.
+# Largest unexplained share of a path that a lever arm explains after the sign of z is changed.
 _MIRRORED_PATH = 0.1
 
 
@@ -109,7 +109,10 @@ def _check_moving(
     is_unrelated: bool,
     interpolated: list[Finding],
 ) -> list[Finding]:
-    """Check positions; return the findings of the first check that has any."""
+    """Check positions against the lever arm; return the findings of the first check that fails.
+
+    ``interpolated`` are the findings of the check for interpolated positions.
+    """
     lever_arm = se3.translation_of(calibration.T_parent_child)
     sigmas = calibration.sigmas_measured[:3]
     if stream == "child":
@@ -134,7 +137,10 @@ def _check_moving(
 
 
 def _is_mirrored(stamps_ns: IntArray, poses: FloatArray, positions: FloatArray) -> bool:
-    """Return whether a lever arm explains positions only if one coordinate has the other sign."""
+    """Return whether a lever arm explains the positions after the sign of z is changed.
+
+    The sign of any coordinate gives the same path up to a rotation, so z stands for all three.
+    """
     mirrored = positions * [1.0, 1.0, -1.0]
     try:
         solution = solve(stamps_ns, poses, mirrored)
@@ -145,7 +151,7 @@ def _is_mirrored(stamps_ns: IntArray, poses: FloatArray, positions: FloatArray) 
 
 
 def _is_copied(fitted: PositionFit, positions: FloatArray) -> bool:
-    """Return whether positions were computed from the poses: only rounding differs."""
+    """Return whether the residuals are so small that positions were computed from the poses."""
     moved_m = median(np.linalg.norm(np.diff(positions, axis=0), axis=1))
     return fitted.residual < min(_COPIED_M, _COPIED_SHARE * moved_m)
 
@@ -210,17 +216,16 @@ def check_positions(fitted: PositionFit, stream: str, is_unrelated: bool) -> lis
 
 
 class _Suspect(NamedTuple):
-    """A fault that is possible: its size in standard deviations, and its finding if it is clear."""
+    """A possible fault: its size in standard deviations, and its finding if it is significant."""
 
     sigmas: float
     found: Finding | None
 
 
 def _smoothing(fitted: PositionFit, stream: str) -> _Suspect:
-    """Return how clear it is that positions are smoothed.
+    """Test whether positions are smoothed.
 
-    Smoothed positions are an error if they are clear, because the lever arm follows from the
-    positions in turns.
+    Significant smoothing is an error, because the lever arm follows from the positions in turns.
     """
     values, sigmas = fitted.estimate("smoothing")
     smoothing_s2 = float(values[0])
@@ -239,16 +244,17 @@ def _smoothing(fitted: PositionFit, stream: str) -> _Suspect:
 
 
 def _scale_of_axis(fitted: PositionFit, stream: str) -> _Suspect:
-    """Return how clear it is that a coordinate has another scale than the others.
+    """Test whether a coordinate has another scale than the others.
 
-    Drift and noise of the odometry along a coordinate that hardly changes shrink its factor, and do
-    not enlarge it. A coordinate that does not change at all was not measured.
+    Drift and noise of the odometry reduce the estimated scale of a coordinate that hardly changes.
+    A scale that is too small by no more than this bias is not reported. The exception is a
+    coordinate that does not change at all: it was not measured.
     """
     axis, size, sigma = largest_deviation(*fitted.estimate("scales"))
     noise = 3.0 * fitted.residual**2 * (1.0 - fitted.explained_share)
     spurious = (_DRIFT * fitted.path_m) ** 2 + noise
-    shrinks = agreement.BIASES * spurious / fitted.spreads_m[axis] ** 2
-    if -shrinks < size < 0.0 and not fitted.is_constant[axis]:
+    max_bias = agreement.BIASES * spurious / fitted.spreads_m[axis] ** 2
+    if -max_bias < size < 0.0 and not fitted.is_constant[axis]:
         return _Suspect(0.0, None)
     factor = 1.0 + size
     values = {"axis": "xyz"[axis], "factor": factor, "sigma": sigma}
@@ -256,7 +262,7 @@ def _scale_of_axis(fitted: PositionFit, stream: str) -> _Suspect:
 
 
 def _lag_of_axis(fitted: PositionFit, stream: str) -> _Suspect:
-    """Return how clear it is that a coordinate is late against the others."""
+    """Test whether a coordinate is late against the others."""
     axis, lag_s, sigma_s = largest_deviation(*fitted.estimate("delays"))
     n_sigmas = lag_s / sigma_s
     if lag_s < _LAG_S or n_sigmas < _CLEAR_SIGMAS:

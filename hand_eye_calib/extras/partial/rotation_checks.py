@@ -35,7 +35,7 @@ from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
 from hand_eye_calib.extras.partial.copies import as_errors, copied
 from hand_eye_calib.extras.partial.rotation_columns import PLANES, RotationFit, fit_pairs
 
-# Standard deviations below which a rotation is zero.
+# Number of standard deviations below which a rotation is zero.
 _ZERO_SIGMAS = 3.0
 
 # Median residual (rad) below which rotations were computed from those of the other stream. It
@@ -48,7 +48,7 @@ _COPIED_SHARE = 0.01
 # 7e-5, the most accurate odometries and gyroscopes of the study of faults 5e-4.
 _COPIED_RATES_RAD = 1e-4
 
-# Largest number of motions.
+# Largest number of motions that are compared, for speed.
 _MOST_MOTIONS = 3000
 
 # Rates have left-handed axes if the residual of the best reflection is below this share of the
@@ -60,14 +60,16 @@ _UNMIRRORED = 0.06
 # Duration (s) of these rotation vectors: those of a second are too long to be mirrored by a matrix.
 _MIRRORED_S = 0.5
 
-# Orientations in another convention leave less than this share of the rotation unexplained.
+# Largest share of the rotation that stays unexplained after orientations are inverted, if they are
+# reported as inverted.
 _EXPLAINED = 0.1
-# Orientations as they were read leave at least so many times as much.
+# Smallest ratio of the unexplained shares without and with the inversion.
 _DECISIVE = 3.0
 
-# Rates in degrees instead of radians have a ratio within this share of 57.3.
+# Largest relative deviation of a ratio of rates from 57.3, if one unit is degrees and the other
+# radians.
 _UNIT_WITHIN = 0.2
-# Quantile of the rates that are compared: a sensor may stand still for long.
+# Quantile of the rates that are compared: a sensor may rest for long.
 _TURNING = 0.75
 
 # Standard deviations from which on smoothing is clear. They are those of a jackknife of at most 16
@@ -186,7 +188,7 @@ def check_solved(
 
 
 def _check_reading(streams: _Streams) -> list[Finding]:
-    """Detect streams that were read in another convention or unit, or that have only yaw."""
+    """Detect streams in another convention or unit than assumed, or with yaw only."""
     flat = check_flat(streams.parent.scaled(0.0), streams.child.scaled(0.0))
     return flat or _check_unit(streams) or _check_conventions(streams)
 
@@ -393,7 +395,7 @@ def _check_mount(pairs: PosePairs, rotation: FloatArray) -> list[Finding]:
 
 
 class _Suspect(NamedTuple):
-    """A fault that is possible: its size in standard deviations, and its finding if it is clear."""
+    """A possible fault: its size in standard deviations, and its finding if it is significant."""
 
     sigmas: float
     found: Finding | None
@@ -419,7 +421,7 @@ def _check_response(streams: _Streams, rotation: FloatArray) -> list[Finding]:
 
 
 def _smoothing(fitted: RotationFit, streams: _Streams) -> _Suspect:
-    """Return how clear it is that one stream is smoothed against the other."""
+    """Test whether one stream is smoothed more than the other."""
     values, sigmas = fitted.estimate("smoothing")
     smoothing_s2 = float(values[0])
     n_sigmas = abs(smoothing_s2) / max(float(sigmas[0]), 1e-12)
@@ -457,7 +459,7 @@ def _largest(fitted: RotationFit, name: str) -> _Largest | None:
 
 
 def _gain(fitted: RotationFit, streams: _Streams) -> _Suspect:
-    """Return how clear it is that rates about an axis are too large or too small."""
+    """Test whether the rates about an axis of the sensor are too large or too small."""
     largest = _largest(fitted, "gains")
     if not largest:
         return _Suspect(0.0, None)
@@ -469,7 +471,7 @@ def _gain(fitted: RotationFit, streams: _Streams) -> _Suspect:
 
 
 def _main_gain(fitted: RotationFit, streams: _Streams) -> _Suspect:
-    """Return how clear it is that rotations about the main axis are too large or too small."""
+    """Test whether the rotations about the main axis are too large or too small."""
     gain, sigma, bias = fitted.main_gain()
     if abs(gain) <= agreement.BIASES * bias:
         return _Suspect(0.0, None)
@@ -478,7 +480,7 @@ def _main_gain(fitted: RotationFit, streams: _Streams) -> _Suspect:
 
 
 def _shear(fitted: RotationFit, streams: _Streams) -> _Suspect:
-    """Return how clear it is that two axes of a gyroscope are not perpendicular."""
+    """Test whether two axes of a gyroscope are not perpendicular."""
     largest = _largest(fitted, "shears")
     if not largest:
         return _Suspect(0.0, None)

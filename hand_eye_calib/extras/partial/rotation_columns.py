@@ -1,7 +1,7 @@
-"""Regression of rotations of two sensors on columns of possible faults.
+"""Regression of the rotations of one sensor on possible faults, with another as the reference.
 
-G_i are the orientations of the reference in the axes of the measured sensor, by the extrinsic
-rotation, and Q_i those of the measured stream. In a window, their errors in the world are
+The reference has the orientations G_i, rotated by the extrinsic to the axes of the measured sensor.
+The measured sensor has the orientations Q_i. In a window, their errors in the world are
 
     e_i = Log(W' Q_i G_i') = G_i phi + int G S w dt - G_i w_i d + c (...) + nuisances + noise
 
@@ -31,13 +31,14 @@ from hand_eye_calib.core.geometry.differences import Stencil, rotations_around, 
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.extras.partial.columns import Column, Fit, fit_columns, split
 
-# Duration of a window (s): a bias is constant in it, and a machine turns.
+# Duration of a window (s): long enough for turns, short enough for a constant bias.
 _WINDOW_S = 20.0
 
-# Step (s) of the differences that rates come from; one interval if that is longer.
+# Step (s) of the finite differences for rates. If the interval between stamps is longer, the
+# interval is the step.
 _STEP_S = 0.1
 
-# Parts of a recording whose biases are compared.
+# Number of equal sections of a recording whose biases are compared.
 _PARTS = 4
 
 # Planes of two axes that may be misaligned, in the order of the third axis.
@@ -52,7 +53,7 @@ class _Motion(NamedTuple):
     rates : (W, K, 3) array
         Angular rates.
     bends : (W, K, 3) array
-        What smoothing adds.
+        Rotation vectors that smoothing of 1 s^2 adds.
     gains, shears : (W, K, 3, 3) array
         Integrals of the rate about each axis, and of the rates of each plane, exchanged.
     """
@@ -71,11 +72,11 @@ class _Windows(NamedTuple):
     measured: _Motion
 
 
-# Columns by the names of the faults.
+# Columns by the name of the fault, with prior standard deviations. A comment states the unknowns.
 _COLUMNS = {
-    # Radians.
+    # Correction of the extrinsic rotation, rad.
     "rotation": Column(1.0, lambda windows: windows.orientations),
-    # Factor of the rate about each axis, less 1.
+    # Scale of the rate about each axis, minus 1.
     "gains": Column(
         0.03,
         lambda windows: windows.reference.gains,
@@ -87,7 +88,7 @@ _COLUMNS = {
         lambda windows: windows.reference.shears,
         lambda windows: windows.measured.shears,
     ),
-    # Seconds.
+    # Delay, s.
     "delay": Column(
         1.0,
         lambda windows: -windows.reference.rates[..., None],
@@ -104,7 +105,7 @@ _COLUMNS = {
 
 @dataclass(frozen=True)
 class RotationFit(Fit):
-    """Regression of rotations on the columns of all faults.
+    """Result of the regression of rotations on all faults.
 
     Attributes
     ----------
@@ -116,10 +117,10 @@ class RotationFit(Fit):
 
     @property
     def axes_covariance(self) -> FloatArray:
-        """Covariance (3, 3) of the extrinsic rotation that possible faults leave open, rad^2.
+        """Covariance (3, 3), rad^2, that possible faults add to the extrinsic rotation.
 
-        If two axes of a sensor are not perpendicular, its frame is uncertain by the same angle.
-        Faults without evidence are at most as large as usual.
+        If two axes of a sensor are not perpendicular, the frame of this sensor is uncertain by the
+        same angle. The covariance is at most that of faults of usual size.
         """
         shears, sigmas = self.estimate("shears")
         estimated = self.open_covariance + np.diag(np.maximum(shears**2 - sigmas**2, 0.0))
@@ -127,10 +128,11 @@ class RotationFit(Fit):
 
     @property
     def _usual_covariance(self) -> FloatArray:
-        """Covariance (3, 3) of the extrinsic rotation if faults without evidence are usual, rad^2.
+        """Covariance (3, 3), rad^2, with usual sizes of gains and shears that are not significant.
 
-        About an axis without turns, the rates are noise, which is a weak instrument: its estimates
-        of gains and misalignments are arbitrary.
+        About an axis without turns, the rates are only noise, and their instrument is weak.
+        Estimates of gains and shears are arbitrary then. Their prior standard deviations replace
+        them.
         """
         weak: list[int] = []
         prior_sigmas: list[float] = []
