@@ -272,17 +272,7 @@ def fit_columns(
     probes = probes - basis @ (to_basis @ probes)
     products = np.einsum("wkp,wkq->wpq", probes, data)
     counts = 3.0 * is_used.sum(axis=1)
-    # Weight the windows by their residuals after a fit of the extrinsic alone.
-    extrinsic = next(iter(places.values()))
-    used = [*extrinsic, -1]
-    of_extrinsic = products[:, used][:, :, used]
-    weights = np.ones(len(products))
-    for _ in range(_N_ITERATIONS):
-        total = Blocks(weights[:, None, None] * products)
-        x = np.append(-total.solve(extrinsic), 1.0)
-        squares = np.einsum("i,wij,j->w", x, of_extrinsic, x) / counts
-        usual = max(median(squares), 1e-18)
-        weights = robust_weights("cauchy", squares / usual / _HALF_WEIGHT**2) / usual
+    weights, usual = _window_weights(products, next(iter(places.values())), counts)
     blocks = Blocks(weights[:, None, None] * products)
     blocks = blocks.merged(min(len(products), _MAX_BLOCKS))
     with_prior = Blocks(blocks.sums + prior / len(blocks.sums))
@@ -298,6 +288,39 @@ def fit_columns(
         n_samples=float(usual * weights @ counts / 3.0),
         nuisances=se3.times(inverse(triangle), in_basis @ x),
     )
+
+
+def _window_weights(
+    products: FloatArray, extrinsic: list[int], counts: FloatArray
+) -> tuple[FloatArray, float]:
+    """Return robust weights (W,) of windows from their residuals after a fit of the extrinsic.
+
+    Parameters
+    ----------
+    products : (W, p, p) array
+        Products of the columns and, last, the residuals.
+    extrinsic : list of int
+        Columns of the extrinsic.
+    counts : (W,) array
+        Number of residuals of each window.
+
+    Returns
+    -------
+    weights : (W,) array
+        Divided by the median squared residual.
+    usual : float
+        Median squared residual.
+    """
+    used = [*extrinsic, -1]
+    of_extrinsic = products[:, used][:, :, used]
+    weights = np.ones(len(products))
+    for _ in range(_N_ITERATIONS):
+        total = Blocks(weights[:, None, None] * products)
+        x = np.append(-total.solve(extrinsic), 1.0)
+        squares = np.einsum("i,wij,j->w", x, of_extrinsic, x) / counts
+        usual = max(median(squares), 1e-18)
+        weights = robust_weights("cauchy", squares / usual / _HALF_WEIGHT**2) / usual
+    return weights, usual
 
 
 def _flat(tables: list[FloatArray], is_used: BoolArray) -> FloatArray:
