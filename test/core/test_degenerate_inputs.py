@@ -179,7 +179,7 @@ def singular(monkeypatch):
     def fail(problem):
         raise np.linalg.LinAlgError("Singular matrix")
 
-    monkeypatch.setattr(estimator, "_solved", fail)
+    monkeypatch.setattr(estimator, "_search", fail)
 
 
 def test_dnlo_stands_in_if_no_noise_model_fits(singular):
