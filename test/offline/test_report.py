@@ -35,7 +35,7 @@ from hand_eye_calib.offline.cli import main as cli
 from hand_eye_calib.offline.cli.reporting import write_report
 from hand_eye_calib.offline.report import evidence
 from hand_eye_calib.offline.report.report import render
-from hand_eye_calib.offline.report.views import VIEWS
+from hand_eye_calib.offline.report.views import VIEWS, VIEWS_OF_VEHICLE
 
 FIGURES = ("views", "trajectories", "coordinates", "residuals", "streams")
 VOID = {"meta", "br", "hr", "img", "link", "input"}
@@ -408,9 +408,46 @@ def test_no_sentence_speaks_against_a_green_verdict():
 
 def test_views_are_named_by_where_one_looks_from():
     from_where = {"from above": [0, 0, 1], "from the side": [0, -1, 0], "from the front": [1, 0, 0]}
-    for (across, up), name in VIEWS.items():
+    for (across, up), name in VIEWS_OF_VEHICLE.items():
         axes = np.eye(3)[["xyz".index(across), "xyz".index(up)]]
         assert np.cross(*axes).tolist() == from_where[name]
+        (other,) = set("xyz") - {across, up}
+        assert VIEWS[across + up] == f"along {other}"
+
+
+def with_optical_parent(snapshot):
+    """Snapshot and calibration of the same drive whose parent has z forward and y down."""
+    parent, child = snapshot.streams
+    optical = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    poses = parent.poses.copy()
+    poses[:, :3, :3] = poses[:, :3, :3] @ optical
+    turned = whole_snapshot(dataclasses.replace(parent, poses=poses), child, {})
+    return turned, turned.estimate()
+
+
+@pytest.mark.parametrize("drive", ["hilly", "planar"])
+def test_only_a_parent_with_a_vertical_z_is_seen_from_above(drive, request):
+    snapshot, calibration, text, _ = request.getfixturevalue(drive)
+    assert "from above" in text
+    assert "from the side" in text
+    turned, optical = with_optical_parent(snapshot)
+    _, page = page_of(turned, optical)
+    assert "from above" not in page.text
+    assert "along z" in page.text
+    assert "along z" in hec.plot(calibration).axes[0].get_title()
+
+
+def test_both_streams_coincide_at_every_pitch():
+    # The drive turns by more than 90 deg about y of a parent with optical axes.
+    snapshot, calibration = simulated(poses=400, max_yaw_rate=2.0)
+    turned, optical = with_optical_parent(snapshot)
+    for case, result in ((snapshot, calibration), (turned, optical)):
+        measured, computed = evidence.gather(result, case).angles
+        assert np.degrees(np.abs(computed - measured).max()) < 5.0
+    # Curves of the road are about the vertical axis of the parent.
+    about_y = evidence.gather(optical, turned).angles[0][:, 1]
+    about_z = evidence.gather(calibration, snapshot).angles[0][:, 2]
+    assert about_y == pytest.approx(-about_z, abs=1e-6)
 
 
 @pytest.mark.parametrize("unknown", ["x", "y", "z"])

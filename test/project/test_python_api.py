@@ -359,7 +359,7 @@ def test_a_notebook_gets_six_numbers_in_degrees_and_three_views(solved):
         assert number in html
     assert solved.headline in html
     assert html.count("<svg") == 1
-    for view in ("from above", "from the side", "from the front"):
+    for view in ("along z", "along y", "along x"):
         assert view in html
     assert "measured, " in html
 

@@ -19,6 +19,11 @@ from hand_eye_calib.core.results.document import UNKNOWN_M
 # Shortest step (s) of which the length of a path is summed. Shorter steps would sum the noise.
 _MIN_PATH_STEP_S = 0.2
 
+# Largest ratio of the variance of positions across the plane of motion to the smaller variance in
+# it, and least cosine between an axis and the normal of this plane (30 deg). Both are choices.
+_MAX_FLAT = 0.25
+_MIN_UPRIGHT = 0.87
+
 # Largest number of samples of the rates of a stream.
 _MAX_RATES = 1500
 # Shortest window (s) over which a rate is computed.
@@ -115,14 +120,17 @@ class Evidence:
         sensor is the parent, or the sensor that has positions without orientations. The paths are
         in this sensor's world and begin at its first position.
     angles : 2 x (N, 3) arrays, or None
-        Roll, pitch and yaw (rad) of the parent relative to its first pose: as measured, and as
-        computed from the child's stream. None if a stream does not measure poses.
+        Angles (rad) by which the parent has turned about its own x, y and z since its first pose:
+        as measured, and as computed from the child's stream. The difference of both is the rotation
+        vector between the measured and the computed pose. None if a stream does not measure poses.
     excitation : Excitation
         Motion of the sensors.
     streams : StreamView
         Rates of both streams.
     has_positions_of_parent : bool
         Whether the parent has positions without orientations.
+    is_upright : bool
+        Whether z of the sensor is near the normal of the plane in which it moves.
     """
 
     times_s: FloatArray
@@ -132,6 +140,7 @@ class Evidence:
     excitation: Excitation
     streams: StreamView
     has_positions_of_parent: bool
+    is_upright: bool
 
 
 def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
@@ -159,6 +168,7 @@ def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
         excitation=excitation(oriented),
         streams=view_streams(parent, shifted, config.max_gap),
         has_positions_of_parent=parent_is_positions,
+        is_upright=_is_upright(oriented.Ts_pw_p),
     )
 
 
@@ -233,20 +243,31 @@ def _between_worlds(pose_pairs: PosePairs, Ts_cw_p: FloatArray) -> FloatArray:
 
 
 def _angles(calibration: Calibration, pose_pairs: PosePairs) -> tuple[FloatArray, FloatArray]:
-    """Return roll, pitch and yaw (N, 3) of the parent as measured, and as computed.
+    """Return the angles (N, 3) turned about the parent's axes as measured, and as computed.
 
-    The computed angles (rad) are from the child's stream and the result. All angles are relative to
-    the first measured pose.
+    The measured angles (rad) are the sum of the rotation vectors from pose to pose. They have no
+    singularity, unlike roll, pitch and yaw at a pitch of 90 deg. The computed angles add the
+    rotation vector from the measured pose to the pose from the child's stream and the result.
     """
     Ts_cw_p = pose_pairs.Ts_cw_c @ calibration.T_child_parent
     measured = se3.rotation_of(pose_pairs.Ts_pw_p)
     computed = _between_worlds(pose_pairs, Ts_cw_p) @ se3.rotation_of(Ts_cw_p)
-    first = measured[0].T
-    measured_rad = np.unwrap(se3.rotation_to_rpy(first @ measured), axis=0)
-    computed_rad = np.unwrap(se3.rotation_to_rpy(first @ computed), axis=0)
-    # Unwrapped angles may differ by whole turns: remove them.
-    computed_rad -= 2 * np.pi * np.round((computed_rad[0] - measured_rad[0]) / (2 * np.pi))
-    return measured_rad, computed_rad
+    steps_rad = se3.rotation_log(np.swapaxes(measured[:-1], 1, 2) @ measured[1:])
+    measured_rad = np.vstack([np.zeros(3), np.cumsum(steps_rad, axis=0)])
+    return measured_rad, measured_rad + se3.rotation_log(np.swapaxes(measured, 1, 2) @ computed)
+
+
+def _is_upright(poses: FloatArray) -> bool:
+    """Return whether z of a sensor is near the normal of the plane in which it moves.
+
+    ``poses`` (N, 4, 4) are those of the sensor in its world. The result is False if the sensor
+    moves in all directions.
+    """
+    variances, axes = np.linalg.eigh(np.cov(se3.translation_of(poses).T))
+    is_flat = variances[0] <= _MAX_FLAT * variances[1]
+    # Cosine between the normal of the plane and z of the sensor.
+    cosine = float(np.mean(poses[:, :3, 2] @ axes[:, 0]))
+    return bool(is_flat and abs(cosine) > _MIN_UPRIGHT)
 
 
 def spread_of_position(calibration: Calibration) -> tuple[FloatArray, FloatArray]:

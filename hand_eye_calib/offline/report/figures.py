@@ -25,7 +25,7 @@ from hand_eye_calib.offline.report.style import (
     page_style,
     plain_label,
 )
-from hand_eye_calib.offline.report.views import VIEWS, figure_of_views
+from hand_eye_calib.offline.report.views import VIEWS, VIEWS_OF_VEHICLE, figure_of_views
 
 # Factor from SI units to the unit of a figure, and label of its axis, for translations ("x") and
 # rotations ("yaw").
@@ -44,7 +44,7 @@ def figures_of(calibration: Calibration, evidence: Evidence | None) -> list[Draw
     """Draw all figures of a result; ``evidence`` is None for the stops of an arm."""
     figures = []
     if calibration.measured != "rotations":
-        figures.append(figure_of_views([calibration]))
+        figures.append(figure_of_views([calibration], _titles_of_views(evidence)))
         if evidence:
             figures.append(_figure_of_paths(calibration, evidence))
         if "stops" in calibration.parts:
@@ -57,6 +57,15 @@ def figures_of(calibration: Calibration, evidence: Evidence | None) -> list[Draw
         names = (calibration.parent_frame, calibration.child_frame)
         figures.append(figure_of_streams(evidence.streams, names))
     return figures
+
+
+def _titles_of_views(evidence: Evidence | None) -> dict[str, str]:
+    """Return the titles of the three views: directions of a vehicle only where they are true."""
+    if evidence is None or not evidence.is_upright:
+        return VIEWS
+    if evidence.excitation.has_vehicle_axes:
+        return VIEWS_OF_VEHICLE
+    return VIEWS | {"xy": VIEWS_OF_VEHICLE["xy"]}
 
 
 @page_style()
@@ -180,7 +189,7 @@ def _figure_of_paths(calibration: Calibration, evidence: Evidence) -> Drawn:
 
 @page_style()
 def _figure_of_coordinates(calibration: Calibration, evidence: Evidence) -> Drawn:
-    """Draw position and angles of the parent over time, from both streams."""
+    """Draw position and turned angles of the parent over time, from both streams."""
     assert evidence.angles is not None
     rows = _downsample(len(evidence.times_s), LOOK.max_coordinate_points)
     factor, unit = _time_axis(evidence.times_s[-1])
@@ -188,7 +197,7 @@ def _figure_of_coordinates(calibration: Calibration, evidence: Evidence) -> Draw
     measured = np.hstack([evidence.parent, np.degrees(evidence.angles[0])])
     computed = np.hstack([evidence.child, np.degrees(evidence.angles[1])])
     figure, panels = make_panels(5.4, 3, 2, bottom=0.8, sharex=True)
-    labels = ("x (m)", "y (m)", "z (m)", "roll (deg)", "pitch (deg)", "yaw (deg)")
+    labels = ("x (m)", "y (m)", "z (m)", "about x (deg)", "about y (deg)", "about z (deg)")
     parent = calibration.parent_frame
     child = calibration.child_frame
     for column, label in enumerate(labels):
@@ -206,12 +215,13 @@ def _figure_of_coordinates(calibration: Calibration, evidence: Evidence) -> Draw
     for panel in panels[-2:]:
         panel.set_xlabel(f"time ({unit})")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="lower center", ncols=2)
-    differences = np.median(np.abs(measured - computed), axis=0)
+    distances_m = np.linalg.norm(evidence.child - evidence.parent, axis=1)
+    angles_rad = np.linalg.norm(evidence.angles[1] - evidence.angles[0], axis=1)
     caption = (
-        f"Position of {parent}, and its angles against the first pose: as measured, and computed "
-        f"from the poses of {child} and the result. Half of the time, the worst axis differs by "
-        f"less than {length(float(differences[:3].max()))} and "
-        f"{angle(float(np.radians(differences[3:].max())))}. That includes drift."
+        f"Position of {parent}, and the angles by which it has turned about its own axes since the "
+        f"first pose: as measured, and computed from the poses of {child} and the result. Half of "
+        f"the time, both poses differ by less than {length(float(np.median(distances_m)))} and "
+        f"{angle(float(np.median(angles_rad)))}. That includes drift."
     )
     return as_drawn(figure, "coordinates", "Both streams over time, aligned", caption)
 

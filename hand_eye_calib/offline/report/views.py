@@ -5,7 +5,7 @@
 
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,9 +34,11 @@ from hand_eye_calib.offline.report.style import (
     plain_label,
 )
 
-# The three views. The key has the parent's axes that are drawn to the right and upwards. The title
-# fits a vehicle, with x forward and z up.
-VIEWS = {"xy": "from above", "xz": "from the side", "yz": "from the front"}
+# The three views and their titles. The key has the parent's axes that are drawn to the right and
+# upwards. The title has the axis that points at the reader or away.
+VIEWS = {"xy": "along z", "xz": "along y", "yz": "along x"}
+# Titles for a vehicle, with x forward and z up.
+VIEWS_OF_VEHICLE = {"xy": "from above", "xz": "from the side", "yz": "from the front"}
 
 
 class NotebookFigure(Figure):
@@ -103,14 +105,16 @@ def caption_of_views(*calibrations: Calibration) -> str:
     return text
 
 
-def draw_views(panels: Sequence[Axes], *calibrations: Calibration) -> None:
+def draw_views(
+    panels: Sequence[Axes], *calibrations: Calibration, titles: Mapping[str, str] = VIEWS
+) -> None:
     """Draw the parent sensor and all child sensors in its frame, one view in each of three panels.
 
-    Several calibrations have the same parent sensor.
+    Several calibrations have the same parent sensor. ``titles`` has the keys of :data:`VIEWS`.
     """
     distances = [float(np.linalg.norm(calibration.translation)) for calibration in calibrations]
     axis_m = LOOK.axis_share * max(*distances, LOOK.min_distance_m)
-    for panel, (axes, title) in zip(panels, VIEWS.items(), strict=True):
+    for panel, (axes, title) in zip(panels, titles.items(), strict=True):
         rows = ["xyz".index(axis) for axis in axes]
         _draw_sensor(panel, np.eye(4)[rows], calibrations[0].parent_frame, PARENT, axis_m, 6)
         for calibration in calibrations:
@@ -170,8 +174,10 @@ def _draw_sensor(
 
 
 @page_style()
-def figure_of_views(calibrations: Sequence[Calibration]) -> Drawn:
+def figure_of_views(
+    calibrations: Sequence[Calibration], titles: Mapping[str, str] = VIEWS
+) -> Drawn:
     """Draw the child sensors of one or several results in their parent's frame."""
     figure, panels = make_panels(3.1, 1, 3, gap=0.36)
-    draw_views(panels, *calibrations)
+    draw_views(panels, *calibrations, titles=titles)
     return as_drawn(figure, "views", "The sensors in space", caption_of_views(*calibrations))
