@@ -22,7 +22,8 @@ from hand_eye_calib.core.results.verdict import target_of
 
 _Named = tuple[str, Calibration | Extrinsic]
 
-# Largest change of an axis, in targets, that may stay undetected if the axis counts as the same.
+# Largest change, as a multiple of the target of an axis, that may stay undetected on an axis that
+# is reported as unchanged.
 SEEN_TARGETS = 5.0
 
 
@@ -45,12 +46,13 @@ def compare(
     Returns
     -------
     Comparison
-        Its ``moved`` names the results that differ, or without which the others agree.
+        ``moved`` has the names of the results that differ from the installed extrinsic. Without
+        an installed extrinsic, it has the results without which the others agree.
 
     Raises
     ------
     InputError
-        If there is nothing to compare, or the results are of different frames.
+        If there is nothing to compare, or if the results are for different pairs of frames.
 
     Examples
     --------
@@ -63,7 +65,9 @@ def compare(
     if installed is not None:
         require_type("installed", installed, Calibration, Extrinsic)
     by_name = _by_name(results, names)
-    require_same_frames(each for each in (*results, installed) if isinstance(each, Calibration))
+    require_same_frames(
+        extrinsic for extrinsic in (*results, installed) if isinstance(extrinsic, Calibration)
+    )
     couples: list[tuple[_Named, tuple[str, Calibration]]] = [*combinations(by_name.items(), 2)]
     if installed is not None:
         couples = [(("installed", installed), named) for named in by_name.items()]
@@ -79,7 +83,7 @@ def compare(
     if installed is not None and len(differences) == 1:
         sentence = differences[0].sentence
     elif moved_names and installed is None:
-        moved_names, sentence = _who_moved([*by_name], results, differences)
+        moved_names, sentence = _moved_results([*by_name], results, differences)
     elif moved_names:
         sentence = f"moved: {listing(moved_names)} of {len(results)}"
     return Comparison(
@@ -88,7 +92,7 @@ def compare(
 
 
 def _by_name(results: Sequence[Calibration], names: Sequence[str] | None) -> dict[str, Calibration]:
-    """Return results by their names, or by their numbers without names."""
+    """Return results by name: ``result 1``, ``result 2`` and so on if no names are provided."""
     if not names:
         names = [f"result {number}" for number in range(1, len(results) + 1)]
     by_name = dict(zip(names, results, strict=False))
@@ -97,15 +101,15 @@ def _by_name(results: Sequence[Calibration], names: Sequence[str] | None) -> dic
     return by_name
 
 
-def _who_moved(
+def _moved_results(
     names: Sequence[str], results: Sequence[Calibration], differences: Sequence[Difference]
 ) -> tuple[tuple[str, ...], str]:
     """Return the names of the results that the others contradict, and a sentence about them."""
-    # Two results differ for sure: weaker evidence is enough to name one of them.
+    # At least two results differ significantly. A weaker level is enough to find which one moved.
     agreement = agreement_of_results(results, level=0.05)
     if agreement.kind in ("one off", "moved"):
-        apart = tuple(names[index] for index in agreement.apart)
-        return apart, f"moved: {agreement.sentence(names)}"
+        moved_names = tuple(names[index] for index in agreement.apart)
+        return moved_names, f"moved: {agreement.sentence(names)}"
     couples = [
         f"{difference.first} and {difference.second}"
         for difference in differences
@@ -115,7 +119,7 @@ def _who_moved(
 
 
 def with_comparison(result: Calibration, installed: Calibration | Extrinsic) -> Calibration:
-    """Return a result with its comparison with the installed extrinsic."""
+    """Return a copy of a result that contains its comparison with the installed extrinsic."""
     origin = "a result" if isinstance(installed, Calibration) else installed.origin
     values = by_axis(xyz_rpy(installed.T_parent_child))
     comparison = compare([result], installed, ["result"])
@@ -123,13 +127,13 @@ def with_comparison(result: Calibration, installed: Calibration | Extrinsic) -> 
 
 
 def _difference(first: _Named, second: tuple[str, Calibration]) -> Difference:
-    """Test the difference of two named extrinsics by axis."""
+    """Test on each axis whether two named extrinsics differ."""
     first_name, before = first
     second_name, after = second
-    covariance, scatter, allowance = _spread(before) + _spread(after)
+    covariance, scatter, allowance = _covariances(before) + _covariances(after)
     if not (_is_from_motion(before) and _is_from_motion(after)):
-        # Only one of both has the errors that all recordings share: the larger of scatter and
-        # allowance holds, by axis.
+        # Constant sensor errors cancel between two estimates from motion, but not here. The
+        # allowance covers them; on axes where the scatter is larger, the scatter is used instead.
         scatter = allowance + np.diag(np.maximum(np.diag(scatter - allowance), 0.0))
     values = deviation(after.T_parent_child, before.T_parent_child)
     limits = SEEN_TARGETS * np.array([target_of(axis, after) for axis in AXES])
@@ -145,14 +149,15 @@ def _difference(first: _Named, second: tuple[str, Calibration]) -> Difference:
 
 
 def _is_from_motion(extrinsic: Calibration | Extrinsic) -> bool:
-    """Whether an extrinsic was estimated from motion, with the same sensors."""
+    """Return whether an extrinsic was estimated from the motion of the same sensors."""
     return isinstance(extrinsic, Calibration) or extrinsic.is_calibration
 
 
-def _spread(extrinsic: Calibration | Extrinsic) -> FloatArray:
-    """Covariances (3, 6, 6) of an extrinsic along and about the parent's axes.
+def _covariances(extrinsic: Calibration | Extrinsic) -> FloatArray:
+    """Return three covariances of an extrinsic, as an array (3, 6, 6) in the parent's axes.
 
-    They are the measured covariance, the scatter between recordings of the rig, and the allowance.
+    The first is the measured covariance. The second is the scatter between recordings of the rig.
+    The third is the allowance for constant sensor errors.
     """
     rotation = se3.rotation_of(extrinsic.T_parent_child)
     covariance = np.diag(UNKNOWN**2)
@@ -174,9 +179,10 @@ def _spread(extrinsic: Calibration | Extrinsic) -> FloatArray:
 
 
 def agreement_of_results(results: Sequence[Calibration], level: float = 0.01) -> Agreement:
-    """Compare the results of several recordings of one rig, in the order of time.
+    """Test whether the results of several recordings of one rig agree.
 
-    ``level`` is that of :func:`~hand_eye_calib.core.assessment.agreement.agreement_of`.
+    ``results`` are in the order of time. ``level`` is the significance level of
+    :func:`~hand_eye_calib.core.assessment.agreement.agreement_of`.
     """
     Ts = np.array([result.T_parent_child for result in results])
     measured = np.array([result.covariance_measured for result in results])
@@ -186,7 +192,7 @@ def agreement_of_results(results: Sequence[Calibration], level: float = 0.01) ->
 
 
 def require_same_frames(results: Iterable[Calibration]) -> None:
-    """Raise InputError unless all results are of one pair of frames."""
+    """Raise InputError if results are for different pairs of frames."""
     frames = {f"{result.child_frame} in {result.parent_frame}" for result in results}
     if len(frames) > 1:
         raise InputError(
@@ -195,5 +201,5 @@ def require_same_frames(results: Iterable[Calibration]) -> None:
 
 
 def by_axis(values: FloatArray) -> dict[str, float]:
-    """Return values (6,) by the name of their axis."""
+    """Return six values as a mapping from the name of the axis to the value."""
     return dict(zip(AXES, values.tolist(), strict=True))

@@ -1,27 +1,27 @@
-"""Test for a shift of the mount: the kernel of comparisons, parts of a recording and the monitor.
+"""Test for a shift of the mount, within a recording or between recordings.
 
-A shift d of the extrinsic, ``X exp(d)``, has an estimate with covariance C: information ``H =
-C^-1``, score ``S = H d``. With shifts of covariance L expected, the log likelihood ratio of a shift
-against none is (a Gaussian form of the generalised likelihood ratio: M. Basseville, I. Nikiforov,
-*Detection of abrupt changes*, 1993)
+Model: a mount that shifts by d changes the extrinsic from X to ``X exp(d)``. An estimate of d with
+covariance C has the information ``H = C^-1`` and the score ``S = H d``. If shifts are expected to
+have covariance L, the log likelihood ratio of a shift against no shift is
 
-    1/2 S' (H + L^-1)^-1 S - 1/2 log|I + L H|.
+    1/2 S' (H + L^-1)^-1 S - 1/2 log|I + L H|
 
-H and S are divided before by the long-run variance: how much more S scatters than H predicts. This
-ratio serves tests at many times. :mod:`~hand_eye_calib.core.assessment.change` tests each axis,
-where a person asks what has moved.
+(Gaussian form of the generalised likelihood ratio: M. Basseville, I. Nikiforov, *Detection of
+abrupt changes*, 1993). H and S are first divided by the long-run variance: the factor by which S
+scatters more than H predicts. The ratio tests many possible times of a shift.
+:mod:`~hand_eye_calib.core.assessment.change` tests single axes, to report which axis has moved.
 
 A motion pair within a recording has the residual ``e = Log(B^-1 X0^-1 A X0)`` (6,) at an extrinsic
 X0. If the mount has moved by xi, to ``X0 exp(xi)``, then ``e = -J xi + noise`` with ``J = I -
 Ad(B^-1)``. With the noise covariance C each second has ``H = sum J' C^-1 J`` and ``S = -sum J' C^-1
-e``; both add over time. Large residuals have less weight, so a large shift comes out too small:
-compute the information again at the extrinsic that the shift leads to.
+e``; H and S are sums over time. Large residuals have less weight, so a large shift is
+underestimated: compute H and S again at the shifted extrinsic.
 
-Successive motions have correlated noise, which the long-run variance measures. Errors that wander
-over minutes, such as a bias or a map that bends, also give a large ratio. The stream checks compare
-how well a moving world explains the motion. Answers of one rig scatter between recordings by more
-than their covariances, because constant errors do not show within a recording. This scatter belongs
-to C (docs/session.md has the measurements).
+Successive motions have correlated noise, which the long-run variance measures. Errors that drift
+over minutes, such as a bias or a bent map, also cause a large ratio. The stream checks therefore
+test whether a moving world explains the motion as well. Results of one rig scatter between
+recordings by more than their covariances, because constant errors cannot be detected within a
+recording. C must include this scatter (docs/session.md has the measurements).
 """
 
 from collections.abc import Callable
@@ -43,67 +43,69 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.noise.normal import NormalEquations
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
 
-# Expected shifts: one standard deviation per axis (m, rad).
+# Prior standard deviation of a shift, per axis of translation (m) and of rotation (rad).
 _SHIFT_M = 0.03
 _SHIFT_RAD = float(np.radians(1.0))
 
-# Scatter between recordings of one rig per axis (m, rad): of flights and hand-held recordings.
+# Standard deviation between the results of several recordings of one rig, per axis (m, rad).
+# Measured on flights and hand-held recordings.
 _SCATTER_IN_HAND = np.repeat([0.008, np.radians(0.12)], 3)
-# The same of vehicles.
+# The same standard deviation, measured on vehicles.
 _SCATTER_OF_VEHICLES = np.repeat([0.020, np.radians(0.10)], 3)
-# A vehicle turns about one axis: the standard deviation of the translation along this axis is
-# larger than the others by this factor.
-_VEHICLE = 4.0
+# A rig counts as a vehicle if the standard deviation of the translation along one axis is larger
+# than along the other two by this factor: a vehicle turns about this axis only.
+_VEHICLE_SIGMA_RATIO = 4.0
 
-# Time over which motions are compared, and in which their evidence is added (ns).
+# Duration of a motion pair, and of the blocks of time in which H and S are summed (ns).
 _BLOCK_NS = 1_000_000_000
-# Largest number of motions in this time.
-_MOTIONS_PER_BLOCK = 20
+# Largest number of motion pairs per block, on average over the recording.
+_MAX_PAIRS_PER_BLOCK = 20
 
-# Rounds of the estimate of the noise.
-_ROUNDS = 4
+# Iterations of the noise covariance.
+_NOISE_ITERATIONS = 4
 # Smallest standard deviations of residuals (m, rad).
-_LEAST_SIGMA = np.repeat([1e-6, 1e-7], 3)
+_MIN_SIGMAS = np.repeat([1e-6, 1e-7], 3)
 
 # Number of windows of equal duration in a recording for the long-run variance.
-_WINDOWS = (8, 16)
-# Fewest windows on either side of a shift.
-_LEAST_WINDOWS = 2
+_WINDOW_COUNTS = (8, 16)
+# Fewest windows before a possible shift, and fewest after it.
+_MIN_WINDOWS_PER_SIDE = 2
 # Shortest window (s).
-_LEAST_WINDOW_S = 3.0
+_MIN_WINDOW_S = 3.0
 
-# Log likelihood ratio from which on a shift is significant.
+# Smallest log likelihood ratio of a significant shift.
 SIGNIFICANT = 12.0
 
 # Prior probability that a mount moves within a recording.
-_MOVES = 0.02
-# Fewest parts of a recording before and after a shift.
-_LEAST_PARTS = 4
-# A smaller probability of a shift is zero.
-_LEAST_PROBABILITY = 1e-3
+_PRIOR_PROBABILITY = 0.02
+# Fewest parts of a recording before a possible shift, and fewest after it.
+_MIN_PARTS_PER_SIDE = 4
+# A shift with a smaller probability is ignored.
+_MIN_PROBABILITY = 1e-3
 
-# Information of the expected shifts within a recording, as a share of the full one: without it,
-# shifts of many metres are possible.
-_RIDGE = 1e-6
+# Weight of the prior of a shift within a recording, as a share of SHIFT_INFORMATION. It only keeps
+# the estimate finite: without it, shifts of many metres are possible along unobservable directions.
+_PRIOR_SHARE = 1e-6
 
 
 def scatter_of_recordings(covariance: FloatArray) -> FloatArray:
-    """Return the covariance (6, 6) between recordings of one rig, to be added to that of one.
+    """Return the covariance (6, 6) of the scatter between recordings of one rig.
 
-    The covariance (6, 6) of one recording reveals whether the rig is a vehicle.
+    Add it to ``covariance``, the covariance (6, 6) of the result of one recording. The translation
+    part of ``covariance`` decides whether the rig counts as a vehicle.
     """
     variances = np.linalg.eigvalsh(covariance[:3, :3])
-    is_vehicle = variances[2] > _VEHICLE**2 * variances[1]
+    is_vehicle = variances[2] > _VEHICLE_SIGMA_RATIO**2 * variances[1]
     return np.diag((_SCATTER_OF_VEHICLES if is_vehicle else _SCATTER_IN_HAND) ** 2)
 
 
 def shift_covariance(metres: float = _SHIFT_M, radians: float = _SHIFT_RAD) -> FloatArray:
-    """Return the covariance L (6, 6) of expected shifts from standard deviations per axis."""
+    """Return the prior covariance L (6, 6) of shifts, from standard deviations per axis."""
     return np.diag(np.repeat([metres**2, radians**2], 3))
 
 
 _EXPECTED_SHIFTS = shift_covariance()
-#: Information of the expected shifts, the inverse of their covariance.
+#: Prior information (6, 6) of a shift: the inverse of the prior covariance L.
 SHIFT_INFORMATION = inverse(_EXPECTED_SHIFTS)
 
 
@@ -113,9 +115,9 @@ def log_ratio(tables: FloatArray, L: FloatArray = _EXPECTED_SHIFTS) -> FloatArra
     Parameters
     ----------
     tables : (..., 6, 7) array
-        Evidence ``[H S]`` since the possible shift.
+        Information and score ``[H S]`` of the shift.
     L : (..., 6, 6) array
-        Covariance of the expected shifts.
+        Prior covariance of the shift.
     """
     H = information(tables)
     S = score(tables)
@@ -126,28 +128,29 @@ def log_ratio(tables: FloatArray, L: FloatArray = _EXPECTED_SHIFTS) -> FloatArra
 
 def _solve(H: FloatArray, S: FloatArray) -> FloatArray:
     """Return ``H^-1 S`` (..., n) of matrices (..., n, n) and vectors (..., n)."""
-    # NumPy 1 takes the columns for vectors unless both arrays have as many dimensions.
+    # NumPy 1 reads S as vectors, not as columns, if H and S differ in their number of dimensions.
     columns = np.broadcast_to(S, np.broadcast_shapes(S.shape, H.shape[:-1]))[..., None]
     try:
         solved = np.linalg.solve(H, columns)
     except np.linalg.LinAlgError:
-        # Exact poses have so much evidence along some directions that the others are rounding.
+        # Exact poses determine some directions so well that H is singular within rounding errors.
         solved = np.linalg.pinv(H) @ columns
     return np.asarray(solved[..., 0])
 
 
 def most_likely(tables: FloatArray, ridge: float) -> FloatArray:
-    """Return the most likely shifts (..., 6) by evidence ``[H S]`` (..., 6, 7).
+    """Return the most likely shifts (..., 6) from ``[H S]`` (..., 6, 7).
 
-    ``ridge`` is the share of the information of the expected shifts that is added.
+    ``ridge`` is the weight of the prior: SHIFT_INFORMATION times ``ridge`` is added to H.
     """
     return _solve(information(tables) + ridge * SHIFT_INFORMATION, score(tables))
 
 
 def squares_about(tables: FloatArray, shifts: FloatArray, ridge: float) -> FloatArray:
-    """Return the squared distances (...) of evidence ``[H S]`` (..., 6, 7) from shifts (..., 6).
+    """Return squared Mahalanobis distances (...) of estimated shifts from ``shifts`` (..., 6).
 
-    The unit is the covariance of the evidence. ``ridge`` is as in :func:`most_likely`.
+    ``tables`` (..., 6, 7) are ``[H S]`` of the estimates. ``ridge`` is the weight of the prior, as
+    in :func:`most_likely`.
     """
     H = information(tables)
     scores = score(tables) - se3.times(H, shifts)
@@ -169,7 +172,7 @@ class MountChange:
         The shift (rho, phi) in the child sensor's frame, m and rad: the extrinsic is ``X`` before
         and ``X exp(xi)`` afterwards.
     covariance : (6, 6) array
-        Of xi, with the long-run variance.
+        Covariance of xi, multiplied by the long-run variance.
     log_ratio : float
         Log likelihood ratio of this shift against none.
     """
@@ -196,16 +199,18 @@ def residuals_and_jacobians(
 def evidence(
     residuals: FloatArray, jacobians: FloatArray, noise: FloatArray, weights: FloatArray
 ) -> FloatArray:
-    """Return the evidence ``[H S]`` (K, p, p + 1) of motion pairs on p parameters.
+    """Return information and score ``[H S]`` (K, p, p + 1) of each motion pair on p parameters.
 
     Parameters
     ----------
     residuals : (K, 6) array
+        Residuals e of the motion pairs, in m and rad.
     jacobians : (K, 6, p) array
         J of ``residuals = -J parameters + noise``.
     noise : (6, 6) array
         Covariance of the residuals.
     weights : (K,) array
+        Robust weights of the motion pairs.
     """
     whitened = np.swapaxes(jacobians, 1, 2) @ np.linalg.inv(noise)
     columns = np.concatenate([jacobians, -residuals[..., None]], axis=2)
@@ -213,94 +218,98 @@ def evidence(
 
 
 def noise_covariance(residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Estimate the covariance (6, 6) of residuals (K, 6) with Student's t noise.
+    """Estimate the covariance (6, 6) of residuals (K, 6), with noise of Student's t distribution.
 
-    The second value are the weights (K,) of the residuals: 1 on average, small for jumps.
+    The second result are the robust weights (K,) of the residuals: 1 on average, small for jumps.
     """
     sigmas = np.repeat([stats.robust_sigma(part) for part in np.split(residuals, 2, axis=1)], 3)
-    covariance = np.diag(np.maximum(sigmas, _LEAST_SIGMA) ** 2)
-    for _ in range(_ROUNDS):
+    covariance = np.diag(np.maximum(sigmas, _MIN_SIGMAS) ** 2)
+    for _ in range(_NOISE_ITERATIONS):
         squared = np.einsum("ki,ki->k", residuals @ np.linalg.inv(covariance), residuals)
         weights = stats.robust_weights("student", squared)
         scatter = (weights[:, None] * residuals).T @ residuals / len(residuals)
-        covariance = scatter + np.diag(_LEAST_SIGMA**2)
+        covariance = scatter + np.diag(_MIN_SIGMAS**2)
     return covariance, weights
 
 
 def find_change(pose_pairs: PosePairs, T_parent_child: FloatArray) -> MountChange | None:
-    """Return the most likely shift of the mount within a recording; None if it is too short.
+    """Return the most likely shift of the mount within a recording.
 
-    The answers before and after every possible time are compared. The scatter of windows about the
-    answer of their side, in windows of a sixteenth and of an eighth of the recording, is the
-    long-run variance: noise that wanders is no shift.
+    The shift is tested at the start of every second, except near both ends. A ratio below
+    :data:`SIGNIFICANT` is no evidence of a shift. The long-run variance keeps noise that drifts
+    from being reported as a shift. Returns None if the recording is too short.
 
     Parameters
     ----------
     pose_pairs : PosePairs
-        On one clock and in one unit of length.
+        Poses of both sensors, on one clock and in one unit of length.
     T_parent_child : (4, 4) array
-        X0, near the extrinsic.
+        Linearisation point X0, near the extrinsic.
     """
     starts_ns, blocks = evidence_by_second(pose_pairs, T_parent_child)
     n_blocks = len(starts_ns)
-    long_run = _long_run_variance_of(blocks)
+    long_run = _worst_long_run_variance(blocks)
     if long_run is None:
         return None
-    shifts = blocks.shift_since(np.arange(1, n_blocks), _RIDGE * SHIFT_INFORMATION)
+    shifts = blocks.shift_since(np.arange(1, n_blocks), _PRIOR_SHARE * SHIFT_INFORMATION)
     ratios = log_ratio(shifts / long_run)
-    n_edge = max(int(n_blocks * _LEAST_WINDOWS / max(_WINDOWS)), 1)
+    n_edge = max(int(n_blocks * _MIN_WINDOWS_PER_SIDE / max(_WINDOW_COUNTS)), 1)
     ratios[: n_edge - 1] = -np.inf
     ratios[len(ratios) - n_edge + 1 :] = -np.inf
     best = int(np.argmax(ratios))
-    damped = information(shifts[best]) + _RIDGE * SHIFT_INFORMATION
+    damped = information(shifts[best]) + _PRIOR_SHARE * SHIFT_INFORMATION
     return MountChange(
         at_ns=int(starts_ns[best + 1]),
-        xi=most_likely(shifts[best], _RIDGE),
+        xi=most_likely(shifts[best], _PRIOR_SHARE),
         covariance=long_run * inverse(damped),
         log_ratio=float(ratios[best]),
     )
 
 
 def shifts_at(blocks: Blocks, cuts: IntArray) -> FloatArray | None:
-    """Return the evidence (C, 6, 7) of a shift at each cut (C,), for :func:`log_ratio`.
+    """Return ``[H S]`` (C, 6, 7) of a shift at each of C times, for :func:`log_ratio`.
 
-    It is divided by the long-run variance. None if the recording is too short.
+    H and S are divided by the long-run variance. Returns None if the recording is too short.
 
     Parameters
     ----------
     blocks : Blocks
-        Evidence by second.
+        ``[H S]`` of each second.
     cuts : (C,) int array
-        Indices of the first second after a shift.
+        Index of the first second after each possible shift.
     """
-    long_run = _long_run_variance_of(blocks)
+    long_run = _worst_long_run_variance(blocks)
     if long_run is None:
         return None
-    return blocks.shift_since(cuts, _RIDGE * SHIFT_INFORMATION) / long_run
+    return blocks.shift_since(cuts, _PRIOR_SHARE * SHIFT_INFORMATION) / long_run
 
 
-def _long_run_variance_of(blocks: Blocks) -> float | None:
-    """Return the long-run variance of evidence by second; None if there are too few seconds."""
-    counts = [count for count in _WINDOWS if len(blocks.sums) >= count * _LEAST_WINDOW_S]
+def _worst_long_run_variance(blocks: Blocks) -> float | None:
+    """Return the long-run variance of the scores: a factor of at least 1.
+
+    ``blocks`` has ``[H S]`` of each second. Returns None if there are too few seconds.
+    """
+    counts = [count for count in _WINDOW_COUNTS if len(blocks.sums) >= count * _MIN_WINDOW_S]
     if not counts:
         return None
     return max(1.0, *(_long_run_variance(blocks.merged(count)) for count in counts))
 
 
 def _long_run_variance(windows: Blocks) -> float:
-    """Return the long-run variance of the scores of windows, in units of their information.
+    """Return the variance of the scores of windows, divided by the variance that H predicts.
 
-    The scores are taken about the answers before and since a time. The time with the smallest
-    variance counts.
+    A shift must not increase this variance. So each possible time of a shift has two estimates,
+    one before and one after it, and scores are relative to the estimate of their side. The smallest
+    variance over all times is returned.
     """
     n_windows = len(windows.sums)
-    cuts = np.arange(_LEAST_WINDOWS, n_windows - _LEAST_WINDOWS + 1)
+    cuts = np.arange(_MIN_WINDOWS_PER_SIDE, n_windows - _MIN_WINDOWS_PER_SIDE + 1)
     sides = np.stack([windows.before(cuts), windows.since(cuts)], axis=1)
     side_of_window = (np.arange(n_windows) >= cuts[:, None]).astype(int)
-    answers = most_likely(sides, _RIDGE)[np.arange(len(cuts))[:, None], side_of_window]
+    answers = most_likely(sides, _PRIOR_SHARE)[np.arange(len(cuts))[:, None], side_of_window]
     has_evidence = np.trace(information(windows.sums), axis1=1, axis2=2) > 0
-    squares = squares_about(windows.sums[has_evidence], answers[:, has_evidence], _RIDGE)
-    # Six values a window, less six of each answer.
+    squares = squares_about(windows.sums[has_evidence], answers[:, has_evidence], _PRIOR_SHARE)
+    # Each window has six values; the two estimates use up twelve.
     dof = max(6 * int(has_evidence.sum()) - 12, 1)
     return float(squares.sum(axis=1).min()) / dof
 
@@ -310,15 +319,15 @@ def evidence_by_second(
     T_parent_child: FloatArray,
     further_columns: Callable[[MotionPairs], FloatArray] | None = None,
 ) -> tuple[IntArray, Blocks]:
-    """Return the starts (N,) of the seconds of a recording, and their evidence ``[H S]``.
+    """Return the start (ns) of each second of a recording, and ``[H S]`` of each second.
 
-    ``further_columns`` returns columns (K, 6, q) of J for q unknowns beside xi.
+    ``further_columns`` returns columns (K, 6, q) of J, for q parameters in addition to xi.
     """
     stamps_ns = pose_pairs.stamps_ns
     duration_ns = int(stamps_ns[-1] - stamps_ns[0])
     lag_s = max(_BLOCK_NS, stats.median(np.diff(stamps_ns))) * 1e-9
-    most_motions = max(duration_ns * _MOTIONS_PER_BLOCK // _BLOCK_NS, 2)
-    pairs = pairs_over(pose_pairs, lag_s, most_motions)
+    max_pairs = max(duration_ns * _MAX_PAIRS_PER_BLOCK // _BLOCK_NS, 2)
+    pairs = pairs_over(pose_pairs, lag_s, max_pairs)
     residuals, jacobians = residuals_and_jacobians(pairs, T_parent_child)
     covariance, weights = noise_covariance(residuals)
     if further_columns:
@@ -332,27 +341,30 @@ def evidence_by_second(
 
 
 def possible_shift(products: FloatArray, misfit: float) -> tuple[FloatArray, tuple[str, ...]]:
-    """Return the covariance because of a possible shift of the mount, and a warning.
+    """Return the covariance that a possible shift of the mount adds, and a warning.
 
-    The answers before and after each time are compared under the noise model of the estimate. The
-    likelihood ratio of a shift, averaged over the times, gives its probability. An answer between
-    both mounts is half of the shift away from either.
+    The estimates before and after each possible time are compared under the noise model. The
+    likelihood ratio of a shift, averaged over these times, leads to the probability of a shift. A
+    result between both mounts is half of the shift away from either mount.
 
     Parameters
     ----------
     products : (K, p + 1, p + 1) array
-        Of :func:`~hand_eye_calib.core.noise.state_space.part_products`.
+        Products ``[J e]' W [J e]`` of K parts of the recording, from
+        :func:`~hand_eye_calib.core.noise.state_space.part_products`.
     misfit : float
-        Factor of the covariances.
+        Factor of the covariances: squared residuals divided by their expected value. Factors below
+        1 count as 1.
 
     Returns
     -------
     covariance : (6, 6) array
-        Of xi in ``X exp(xi)``; zero if a shift is improbable.
+        Covariance of xi in ``X exp(xi)``, in m and rad; zero if a shift is improbable.
     warnings : tuple of str
-        One if a shift larger than the scatter of recordings is more likely than not.
+        One warning if a shift is more likely than not, even after the scatter between recordings is
+        added to the covariances; else empty.
     """
-    cuts = np.arange(_LEAST_PARTS, len(products) - _LEAST_PARTS + 1)
+    cuts = np.arange(_MIN_PARTS_PER_SIDE, len(products) - _MIN_PARTS_PER_SIDE + 1)
     before = NormalEquations(Blocks(products).before(cuts))
     after = NormalEquations(Blocks(products).since(cuts))
     is_complete = before.is_complete & after.is_complete
@@ -363,7 +375,7 @@ def possible_shift(products: FloatArray, misfit: float) -> tuple[FloatArray, tup
     tables = answer_evidence(steps, covariances)
     ratios = log_ratio(tables)
     probability = _probability(ratios)
-    if probability < _LEAST_PROBABILITY:
+    if probability < _MIN_PROBABILITY:
         return np.zeros((6, 6)), ()
     shifts = most_likely(tables, 1.0)
     weights = np.exp(ratios - ratios.max())
@@ -374,11 +386,11 @@ def possible_shift(products: FloatArray, misfit: float) -> tuple[FloatArray, tup
         return spread, ()
     best = int(np.argmax(ratios))
     share = int(cuts[is_complete][best]) / len(products)
-    return spread, (_parts_differ(share, shifts[best]),)
+    return spread, (_shift_warning(share, shifts[best]),)
 
 
-def _parts_differ(share: float, xi: FloatArray) -> str:
-    """Return the warning about a shift xi (6,) after a share of the recording."""
+def _shift_warning(share: float, xi: FloatArray) -> str:
+    """Return the warning about a shift xi (6,) after the fraction ``share`` of the recording."""
     metres = length(float(np.linalg.norm(xi[:3])))
     turn = angle(float(np.linalg.norm(xi[3:])))
     return (
@@ -389,7 +401,9 @@ def _parts_differ(share: float, xi: FloatArray) -> str:
 
 
 def _probability(log_ratios: FloatArray) -> float:
-    """Return the probability of a shift at one of several times, by the log likelihood ratios."""
+    """Return the probability of a shift at any of several times with these likelihood ratios."""
     most = log_ratios.max()
-    log_odds = most + np.log(np.exp(log_ratios - most).mean() * _MOVES / (1.0 - _MOVES))
+    log_odds = most + np.log(
+        np.exp(log_ratios - most).mean() * _PRIOR_PROBABILITY / (1.0 - _PRIOR_PROBABILITY)
+    )
     return float(np.exp(-np.logaddexp(0.0, -log_odds)))

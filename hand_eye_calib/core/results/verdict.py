@@ -1,8 +1,8 @@
 """The verdict on a result, and the rules that lead to it.
 
-Each rule of :data:`RULES` examines a result and yields grounds against its use. The rules are
-sorted by gravity; the first rule that yields a ground decides the verdict. docs/verdict.md has the
-same table; a test compares both.
+Each rule of :data:`RULES` examines a result and yields grounds: reasons not to use the result. The
+rules are sorted, the most serious first. The first rule that yields a ground decides the verdict.
+docs/verdict.md has the same table; a test compares the two tables.
 """
 
 import math
@@ -50,18 +50,18 @@ class Verdict(str, Enum):
     DO_NOT_USE = "DO NOT USE"
 
 
-# Options of a reason that no option repairs.
+# Value of ``options`` if no option repairs the problem.
 NO_OPTIONS: Mapping[str, float | str] = {}
 
 
 @dataclass(frozen=True)
 class Reason:
-    """Why a result may not be used as it is.
+    """A reason why a result should not be used without further steps.
 
     Attributes
     ----------
     rule : str
-        Name of the rule in :data:`RULES`, stable over versions.
+        Name of the rule in :data:`RULES`. It does not change between versions.
     verdict : Verdict
         The verdict on the result if this were the only reason.
     sentence : str
@@ -98,7 +98,7 @@ class Reason:
 
 
 class Ground(NamedTuple):
-    """The fields of a reason that differ from result to result; a rule yields grounds."""
+    """What a rule reports about one result: a :class:`Reason` without its rule and verdict."""
 
     sentence: str
     what_to_do: str
@@ -107,7 +107,10 @@ class Ground(NamedTuple):
 
 
 class Rule(NamedTuple):
-    """A row of the table of rules: its verdict, its condition in words, and ``find(result)``."""
+    """A row of the table of rules.
+
+    ``when`` is the condition in words. ``find(result)`` yields a ground if the condition is met.
+    """
 
     name: str
     verdict: Verdict
@@ -115,34 +118,35 @@ class Rule(NamedTuple):
     find: Callable[[Result], Iterator[Ground]]
 
 
-# Other estimates contradict a result on an axis if their scatter about it exceeds this number of
-# joint standard deviations, and CONTRADICTED_SHARE. They never lead to DO NOT USE, because their
-# methods have no model of time-correlated errors.
+# Other estimates contradict a result on an axis if two limits are exceeded. This one is in joint
+# standard deviations of the scatter of the estimates about the result. A contradiction never leads
+# to DO NOT USE, because the other methods do not model time-correlated errors.
 CONTRADICTED_SIGMAS = 3.0
-# Share of the target that the scatter must exceed, too.
+# The second limit of the scatter, as a share of the target of the axis.
 CONTRADICTED_SHARE = 0.25
 
-# Estimates that are about as certain as the result also contradict it if their scatter exceeds
-# CONTRADICTED_SIGMAS of the result's own standard deviations, and this number of targets. Their own
-# uncertainty cannot explain such a scatter.
+# Estimates that are about as certain as the result have a second test. They contradict the result
+# if their scatter exceeds CONTRADICTED_SIGMAS standard deviations of the result, and this multiple
+# of the target. The uncertainty of the estimates cannot explain such a scatter.
 CONTRADICTED_TARGETS = 2.0
 
-# Smallest share of inliers among the motion pairs without a reason against the result.
+# Smallest share of inliers among the motion pairs. Below it, the rule "outliers" yields a ground.
 FEWEST_INLIERS = 0.7
 
-# The same share for the adaptive method, whose noise model rejects only outliers.
+# The same share for the adaptive method. It is larger, because the noise model of this method
+# rejects only outliers.
 FEWEST_OF_MODEL = 0.9
 
-# Rules about a limit of the recording. Reasons of all other rules are suspicions.
+# Kinds of the rules that report a limit of the recording. All other rules report a suspicion.
 _KINDS = dict.fromkeys(
     ("nothing_known", "unobservable", "unconfirmed", "target", "floor"),
     "physics",
 )
 _NO_FAULT = " (a limit of the recording; no fault was found)"
 
-# Words of the rules "halves" and "methods": what disagrees, the claim that it contradicts, and what
-# the user should do.
-_OTHERS = {
+# Words of the rules "halves" and "methods": which estimates disagree, words before the standard
+# deviations of the result, and what the user should do.
+_CONTRADICTION_TEXTS = {
     "halves": (
         "the two halves of the recording disagree",
         "this result claims",
@@ -161,7 +165,7 @@ class Judged(Result):
 
     @cached_property
     def reasons(self) -> tuple[Reason, ...]:
-        """Why the result may not be used as it is, the gravest reason first.
+        """Reasons why the result should not be used without further steps, most serious first.
 
         The tuple is empty if the result may be used. The rules are
         :data:`hand_eye_calib.core.results.verdict.RULES`.
@@ -229,23 +233,23 @@ class Judged(Result):
 
 
 def _is_notable(finding: Finding) -> bool:
-    """Whether the headline names a finding that does not lower the verdict.
+    """Return whether a finding that does not lower the verdict belongs in the headline.
 
-    Such a finding changes the meaning of the numbers.
+    It does if the finding changes the meaning of the numbers.
     """
     return finding.code in ("model_scale", "outliers") and finding.severity is Severity.NOTE
 
 
 def shown(reasons: Sequence[Reason]) -> tuple[Reason, ...]:
-    """Return the reasons that a person has to read: those with the gravest verdict.
+    """Return the reasons to be printed: those with the most serious verdict.
 
-    The other reasons may be consequences.
+    The other reasons may be consequences of the printed ones.
     """
     return tuple(reason for reason in reasons if reason.verdict is reasons[0].verdict)
 
 
 def what_is_known(result: Result) -> str:
-    """Return the largest standard deviation of translation and of rotation, in words."""
+    """Return the accuracy in words: the largest sigmas of translation and of rotation."""
     axes = _axes(result)
     texts = []
     for names in (TRANSLATIONS, ROTATIONS):
@@ -261,7 +265,7 @@ def what_is_known(result: Result) -> str:
 
 
 def target_of(axis: str, result: Result) -> float:
-    """Return the target of an axis: the standard deviation (m or rad) that is small enough."""
+    """Return the target of an axis: the largest acceptable standard deviation (m or rad)."""
     default = result.target_rotation if axis in ROTATIONS else result.target_translation
     return float(result.target_axes.get(axis, default))
 
@@ -336,7 +340,7 @@ def _contradiction(kind: str, result: Result) -> Iterator[Ground]:
                 claimed = row.sigma
             sigmas.append(f"+/- {amount(axis.name, claimed)}")
     if distances:
-        who, claims, advice = _OTHERS[kind]
+        who, claims, advice = _CONTRADICTION_TEXTS[kind]
         disagree = f"{who} {listing([*distances.values()])}"
         yield Ground(f"{disagree}; {claims} {listing(sigmas)}", advice, tuple(distances))
 
@@ -352,7 +356,7 @@ def _scatter_of(kind: str, row: AxisScatter, axis: "_Axis") -> tuple[float, bool
         excess = row.excess_of_methods
         over_own = row.excess_over_own
     if scatter is None and over_own is not None:
-        # There are too few estimates for `of_methods`, but they are about as certain as the result.
+        # The estimates are too few for `of_methods`, but about as certain as the result.
         scatter = over_own * (row.sigma or axis.total)
     if scatter is None:
         return 0.0, False
@@ -384,7 +388,10 @@ def _hidden(result: Result) -> Iterator[Ground]:
 
 
 def _hidden_ground(result: Result, source: str) -> Ground:
-    """Return the ground that ``source`` ("this motion") does not determine some axes."""
+    """Return the ground that some axes are unobservable.
+
+    ``source`` names what does not determine them, such as "this motion".
+    """
     axes = tuple(axis.name for axis in _axes(result) if axis.is_hidden)
     priors = listing([f"prior.{axis} VALUE+/-SIGMA" for axis in axes])
     them = "it" if len(axes) == 1 else "them"
@@ -456,7 +463,7 @@ def _floor(result: Result) -> Iterator[Ground]:
 
 
 def _targets(axes: Sequence["_Axis"]) -> str:
-    """List the different targets of axes in words."""
+    """Return the targets of axes in words, without repetitions."""
     return listing([*dict.fromkeys(amount(axis.name, axis.target) for axis in axes)])
 
 
