@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hand_eye_calib.core.checks.check import check_streams
-from hand_eye_calib.core.checks.sampling import check_sampling, step_excess
+from hand_eye_calib.core.checks.sampling import check_sampling, step_velocities
 from hand_eye_calib.core.checks.streams import check_stream
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from reproduction.part_faults import PLATFORMS
@@ -36,8 +36,8 @@ def test_whole_poses_that_were_interpolated_are_consistent():
     few = child[::10]
     stamps_ns = child.stamps_ns[: len(few) * 10 - 20]
     dense = Trajectory(stamps_ns, few.at(stamps_ns, straight=True))
-    excesses = [excess for excess, _ in step_excess(dense)]
-    codes = {finding.code for finding in check_sampling(dense, excesses, "child")}
+    velocities = step_velocities(dense)
+    codes = {finding.code for finding in check_sampling(dense, velocities, "child")}
     assert "interpolated" not in codes
 
 

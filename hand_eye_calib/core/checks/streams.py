@@ -9,7 +9,7 @@ from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.stats import median, quantile
 from hand_eye_calib.core.checks.findings import LIMITS, Finding, finding, graded
-from hand_eye_calib.core.checks.sampling import check_sampling, step_excess
+from hand_eye_calib.core.checks.sampling import check_sampling, step_velocities
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory, repetitions
 from hand_eye_calib.core.pairing.motion_pairs import find_leap
@@ -17,10 +17,11 @@ from hand_eye_calib.core.pairing.motion_pairs import find_leap
 # An interval is a gap if it is longer than the limit and than this many median intervals.
 _GAP_INTERVALS = 5.0
 
-# A step is a jump if its difference from the steps around it exceeds the median difference by the
-# first factor, and a fast step by the second factor.
-_JUMP_SIGMAS = 12.0
-_JUMP_STEPS = 3.0
+# A step is a jump if its excess over the steps around it exceeds two limits.
+# Limit as a multiple of the median excess.
+_JUMP_EXCESSES = 12.0
+# Limit as a multiple of the speed that nine tenths of the steps do not exceed.
+_JUMP_SPEEDS = 3.0
 
 # Largest difference (m, rad) of positions, heights and verticals that are equal to rounding.
 _SAME = 1e-6
@@ -124,13 +125,14 @@ def check_stream(
     if any(found.code != "gaps" for found in findings):
         return findings
     are_jumps = np.zeros(len(trajectory) - 1, dtype=bool)
-    excesses = step_excess(trajectory)
-    for excess, speed in excesses:
-        fast = _JUMP_STEPS * quantile(speed, USUAL)
-        are_jumps |= excess > max(_JUMP_SIGMAS * (median(excess) + 1e-12), fast)
+    velocities = step_velocities(trajectory)
+    for steps in velocities:
+        usual = _JUMP_EXCESSES * (median(steps.excess) + 1e-12)
+        fast = _JUMP_SPEEDS * quantile(steps.speeds, USUAL)
+        are_jumps |= steps.excess > max(usual, fast)
     share = float(are_jumps.mean())
     jumps = graded("jumps", stream, share, options={"method": "dnlo"}, share=share)
-    findings += check_sampling(trajectory, [excess for excess, _ in excesses], stream)
+    findings += check_sampling(trajectory, velocities, stream)
     return [*findings, jumps] if jumps else findings
 
 
