@@ -354,7 +354,7 @@ def _explain_by_extrinsic(
     if offset.largest_s(streams.child.duration_s) >= error_s:
         return None, TimeOffset()
     shifted = streams.shifted(offset.seconds)
-    explanation = hypotheses.attributed(Explanation(hypotheses.PLAIN, fit), shifted, lag_s)
+    explanation = hypotheses.choose_reading(Explanation(hypotheses.PLAIN, fit), shifted, lag_s)
     if explanation.findings:
         return None, TimeOffset()
     return explanation, offset

@@ -1,15 +1,15 @@
-"""Hypotheses about mistakes in two streams.
+"""Hypotheses about mistakes in two streams, such as inverse poses or quaternions in another order.
 
-Each hypothesis undoes one usual mistake, and a fit measures whether the streams agree without it.
+Model: a rigid mount X gives both sensors the same angle of rotation, and the same distance along
+the screw axis, in every motion pair (screw congruence). The robust fit of
+:mod:`~hand_eye_calib.core.alignment.similarity` measures the unexplained share: the share of the
+motion that breaks this rule. Each hypothesis corrects the streams for its mistakes, and the fit is
+repeated. The plain hypothesis (no mistake) is rejected only if another hypothesis leaves less than
+half of its unexplained share.
 
-Model: in every motion pair, whatever X is, both sensors rotate through the same angle and move by
-the same distance along the same screw axis. The robust fit of
-:mod:`~hand_eye_calib.core.alignment.similarity` measures the share of the motion that breaks this
-rule. The plain hypothesis (no mistake) is rejected only if another hypothesis leaves several times
-less of the motion unexplained.
-
-Two inverted streams agree as well as two correct ones. X is then the pose of one world in the
-other. Three properties of the motion decide between both readings:
+The fit is equally good if both streams are inverted. X is then the pose of the child's world in the
+parent's world. So there are two readings: the streams contain poses, or inverse poses. Three
+properties of the motion decide between the two readings:
 
 - Vehicles travel in a steady direction in their own frame.
 - On other bodies, some point of the body has a shorter path than any point of the world has in the
@@ -39,57 +39,59 @@ from hand_eye_calib.core.checks.stream_pair import LAGS_S, MAX_PAIRS, StreamPair
 from hand_eye_calib.core.geometry import se3, trajectory
 from hand_eye_calib.core.pairing import motion_pairs
 
-# Most motions in the rough fits that rank the hypotheses.
+# Largest number of motions in the rough fits that rank the hypotheses.
 _MAX_ROUGH = 120
-# A hypothesis holds if it leaves at most this share of the motion unexplained.
+# A hypothesis holds (the streams agree under it) below this unexplained share.
 HOLDS = 0.12
-# Another hypothesis replaces a plain one that does not hold if it leaves this many times less.
+# A rival replaces another hypothesis if its unexplained share is smaller by this factor.
 _DECISIVE = 2.0
 
 # Largest unexplained share that noise can cause, in streams whose angular rates clearly agree.
 _NOISY = 0.3
 
-# Two hypotheses are equally good if their unexplained shares differ by less than this factor. The
-# simpler hypothesis is then preferred, and a mistake of the child to a mistake of the parent.
+# Two hypotheses are equally good if their unexplained shares differ by less than this factor. Then
+# the hypothesis with fewer mistakes is chosen, and a mistake of the child before one of the parent.
 _ABOUT_EQUAL = 1.5
-# A scale farther from 1 than this (in the logarithm) counts as one more mistake.
+# A scale whose logarithm is farther from 0 than this counts as one more mistake.
 _ODD_SCALE = 0.05
 
 # Shape of the motion: the sum of the log ratios of the paths and of the lever arms. The shape of
 # 190 correct recordings (KinHEC, real, simulated) was -0.25 at most, and below -0.4 in all but six.
-# Inverse streams have the other sign.
-# The reading with both streams inverted is considered above this shape.
+# The shape of inverse streams has the other sign.
+# Above this shape the streams may be inverse, so that both readings are kept.
 _SUSPICIOUS = -0.2
-# The shape decides between two readings from this size on, if the noise does not decide.
+# A shape larger than this, or smaller than its negative, decides if the noise does not decide.
 CLEAR_SHAPE = 0.4
-# Shape if a steady direction of travel decides.
+# Value that is used as the shape if a steady direction of travel decides.
 STEADY_SHAPE = 1.0
 
-#: Codes of the conventions that a stream breaks.
-_Way: TypeAlias = tuple[str, ...]
-_EULER_ORDER: _Way = ("euler_order",)
+# Codes of the mistakes of one stream.
+_Codes: TypeAlias = tuple[str, ...]
+_EULER_ORDER: _Codes = ("euler_order",)
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """Mistakes of each stream, as codes of findings.
+    """Mistakes of each stream.
 
-    ``axes`` (3, 3) undoes wrong axes of positions; ``detail`` names what (x, y, z) should be.
+    Attributes
+    ----------
+    parent, child : tuple of str
+        Mistakes of each stream, as codes of findings.
+    axes : (3, 3) array or None
+        Matrix that corrects positions in wrong axes: corrected = axes @ position.
+    detail : str
+        Axes that (x, y, z) of the positions should be, such as "y -x z".
     """
 
-    parent: _Way = ()
-    child: _Way = ()
+    parent: _Codes = ()
+    child: _Codes = ()
     axes: FloatArray | None = None
     detail: str = ""
 
     @property
-    def ways(self) -> tuple[_Way, _Way]:
-        """Mistakes of the parent and of the child."""
-        return self.parent, self.child
-
-    @property
     def is_uninverted(self) -> bool:
-        """Whether neither stream holds inverse poses."""
+        """Whether both streams contain poses, not inverse poses."""
         return "inverse" not in self.parent and "inverse" not in self.child
 
     @property
@@ -101,27 +103,28 @@ class Hypothesis:
 
     @property
     def complexity(self) -> tuple[int, int]:
-        """Number of mistakes, and a number that prefers mistakes of the child among equals.
+        """Key that sorts hypotheses, the simplest first.
 
-        Each wrong axis counts as one mistake.
+        The first number is that of the mistakes; each wrong axis is one more. The second number
+        sorts equal numbers of mistakes: mistakes of the child come first.
         """
         n_axes = 0 if self.axes is None else int((self.axes != np.eye(3)).any(axis=1).sum())
         return len(self.mistakes) + n_axes, 2 * len(self.parent) + len(self.child)
 
     def corrected(self, stream: str, poses: FloatArray) -> FloatArray:
-        """Return the poses (N, 4, 4) of a stream without its mistakes."""
-        way = self.child if stream == "child" else self.parent
-        if way and self.axes is not None:
+        """Correct the poses (N, 4, 4) of the "parent" or the "child" stream for its mistakes."""
+        codes = self.child if stream == "child" else self.parent
+        if codes and self.axes is not None:
             return se3.from_rotation_translation(
                 se3.rotation_of(poses), se3.translation_of(poses) @ self.axes.T
             )
-        if way == _EULER_ORDER:
+        if codes == _EULER_ORDER:
             rotations = se3.in_other_order(se3.rotation_of(poses))
             return se3.from_rotation_translation(rotations, se3.translation_of(poses))
-        return se3.put_right(poses, **dict(map(CONVENTIONS.__getitem__, way)))
+        return se3.put_right(poses, **dict(CONVENTIONS[code] for code in codes))
 
     def undo(self, streams: StreamPair) -> StreamPair:
-        """Return both streams without the mistakes."""
+        """Correct both streams for their mistakes."""
         if self is PLAIN:
             return streams
         parent = self.corrected("parent", streams.parent.poses)
@@ -133,31 +136,35 @@ class Hypothesis:
         )
 
     def inverted(self) -> "Hypothesis":
-        """Return the hypothesis that also inverts both streams. It fits equally well."""
-        return Hypothesis(_inverted_way(self.parent), _inverted_way(self.child))
+        """Return the other reading: the hypothesis under which both streams are also inverted.
+
+        It fits equally well.
+        """
+        return Hypothesis(_toggle_inverse(self.parent), _toggle_inverse(self.child))
 
 
-def _inverted_way(way: _Way) -> _Way:
-    """Return the mistakes of a stream whose poses are inverted beside its other mistakes."""
-    return tuple([code for code in CONVENTIONS if (code in way) != (code == "inverse")])
+def _toggle_inverse(codes: _Codes) -> _Codes:
+    """Return the mistakes of one stream with "inverse" added, or removed if it is among them."""
+    return tuple([code for code in CONVENTIONS if (code in codes) != (code == "inverse")])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Readings:
-    """Two hypotheses that fit alike: the second one also inverts both streams.
+    """Two hypotheses that fit equally well: the streams contain poses, or inverse poses.
 
     Attributes
     ----------
     hypotheses : tuple of two Hypothesis
-        A hypothesis that inverts neither stream is the first.
+        The second hypothesis is the first one with both streams inverted. If one of them inverts
+        neither stream, :meth:`ordered` makes it the first.
     shape : float
         Evidence of the shape of the motion for the second hypothesis: the sum of the log ratios of
-        paths and lever arms.
+        paths and lever arms. A negative shape is evidence for the first hypothesis.
     paths : float
-        The part of ``shape`` from the paths.
+        Log ratio of the paths alone.
     is_small : bool
-        Whether all sensors stay within the reach of an arm. Inverse poses may be right for an arm
-        beside a fixed camera.
+        Whether all sensors stay within the reach of an arm. The data of an arm beside a fixed
+        camera look like inverse poses although they are right.
     """
 
     hypotheses: tuple["Hypothesis", "Hypothesis"]
@@ -172,12 +179,15 @@ class Readings:
 
     @property
     def is_clear(self) -> bool:
-        """Whether the shape decides. A fixed camera beside an arm may explain it as well."""
+        """Whether the shape decides between the hypotheses.
+
+        It does not if a fixed camera beside an arm is another cause of that shape.
+        """
         is_fixed_camera = self.is_small and self.hypotheses[0].is_uninverted and self.shape > 0.0
         return self.by_shape != 0 and not is_fixed_camera
 
     def ordered(self) -> "Readings":
-        """Return the readings with the uninverted one first."""
+        """Return the readings with the hypothesis first that inverts neither stream."""
         first, second = self.hypotheses
         if not second.is_uninverted:
             return self
@@ -195,11 +205,11 @@ class Explanation:
     findings : tuple of Finding
         Findings about the mistakes of the hypothesis.
     limit : float
-        The hypothesis holds below this unexplained share.
+        Unexplained share below which the hypothesis holds.
     same_unit : bool
         Whether the scale of the fit was fixed to 1.
     readings : Readings or None
-        Two readings of the streams, if another reading may be right.
+        Both readings, as poses and as inverse poses, if the other reading may be right.
     """
 
     hypothesis: Hypothesis
@@ -211,7 +221,7 @@ class Explanation:
 
     @property
     def may_be_uninverted(self) -> bool:
-        """Whether two readings are possible, and the first one inverts neither stream."""
+        """Whether both readings are possible, and in the first one both streams contain poses."""
         return self.readings is not None and self.readings.hypotheses[0].is_uninverted
 
     @property
@@ -221,14 +231,15 @@ class Explanation:
 
     @property
     def complexity(self) -> tuple[int, int]:
-        """Complexity of the hypothesis. An odd scale is one more mistake."""
+        """Key that sorts explanations, the simplest first. An odd scale is one more mistake."""
         n_mistakes, of_streams = self.hypothesis.complexity
         return n_mistakes + int(abs(np.log(self.fit.scale)) > _ODD_SCALE), of_streams
 
 
 _MIRROR = -np.eye(3)
-# Inverted orientations in the order w x y z are missing: they equal orientations of other axes.
-_WAYS: list[_Way] = [
+# Mistakes of one stream in the convention of its poses. Inverted orientations whose quaternions are
+# in the order w x y z are missing: they equal orientations in other axes.
+_CODES_OF_STREAM: list[_Codes] = [
     (),
     ("inverse",),
     ("inverse_orientation",),
@@ -236,15 +247,16 @@ _WAYS: list[_Way] = [
     ("quaternion_order", "inverse"),
     ("quaternion_names",),
 ]
-_ALL_WAYS = [
-    Hypothesis(way_of_parent, way_of_child) for way_of_parent in _WAYS for way_of_child in _WAYS
-]
-PLAIN = _ALL_WAYS[0]
+# All combinations for both streams.
+_CONVENTIONAL = list(itertools.starmap(Hypothesis, itertools.product(_CODES_OF_STREAM, repeat=2)))
+# The hypothesis without a mistake.
+PLAIN = _CONVENTIONAL[0]
 
 
-# Hypotheses that also invert both streams are missing: they fit equally well.
+# Usual mistakes. Hypotheses with both streams inverted are missing: they fit as well as those
+# with neither stream inverted.
 _USUAL = [
-    *(way for way in _ALL_WAYS[1:] if ("inverse", "both") not in way.mistakes),
+    *(usual for usual in _CONVENTIONAL[1:] if ("inverse", "both") not in usual.mistakes),
     Hypothesis(child=("left_handed",), axes=_MIRROR),
     Hypothesis(parent=("left_handed",), axes=_MIRROR),
     Hypothesis(child=_EULER_ORDER),
@@ -253,9 +265,10 @@ _USUAL = [
 
 
 def _axes() -> Iterator[Hypothesis]:
-    """Yield all permutations and flips of the axes of the positions, but not the mirror of all.
+    """Yield hypotheses with permuted and flipped axes of the positions, for either stream.
 
-    On flat ground some of them are the same as an inverted orientation.
+    The mirror of all three axes is missing, because it is the mistake "left_handed". On flat ground
+    some of these hypotheses fit as well as that of inverted orientations.
     """
     flips = itertools.product((1, -1), repeat=3)
     for order, signs in itertools.product(itertools.permutations(range(3)), flips):
@@ -272,15 +285,22 @@ def _axes() -> Iterator[Hypothesis]:
 
 
 def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None) -> Explanation:
-    """Find the mistake that explains the streams, if one does.
+    """Find the mistakes under which both streams agree.
 
     Parameters
     ----------
     streams : StreamPair
+        Streams on one clock.
     thorough : bool
-        Whether to try all wrong axes, too. That is useful only if the angular rates agree.
+        Whether to try all wrong axes, too. Set it only if the angular rates of the streams agree.
     start : (4, 4) array, optional
-        The extrinsic if the streams have no mistake.
+        Start of the fit without mistakes: an estimate of the extrinsic.
+
+    Returns
+    -------
+    Explanation
+        The plain hypothesis if it holds and no mistake explains far more. Otherwise the hypothesis
+        that holds, or the best one with the finding "unexplained".
 
     Raises
     ------
@@ -308,7 +328,7 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
 
 
 def _plain(streams: StreamPair, lag_s: float, start: FloatArray | None) -> Explanation:
-    """Return the fit of the streams as they are, from a start if it leads to a good fit."""
+    """Fit the streams without corrections, and once more without the start if it fails."""
     plain = _fitted(PLAIN, streams, lag_s, start)
     if start is not None and not plain.holds:
         plain = _fitted(PLAIN, streams, lag_s)
@@ -318,7 +338,7 @@ def _plain(streams: StreamPair, lag_s: float, start: FloatArray | None) -> Expla
 def _or_usual_mistake(
     plain: Explanation, streams: StreamPair, lag_s: float, thorough: bool
 ) -> Explanation:
-    """Return the explanation by a usual mistake, or ``plain`` if no mistake explains more."""
+    """Return the explanation by a usual mistake, or ``plain`` if no mistake is far better."""
     if plain.holds:
         # Streams of an arm, or on nearly flat ground, may agree in spite of one mistake.
         rivals = [hypothesis for hypothesis in _USUAL if len(hypothesis.mistakes) == 1]
@@ -333,23 +353,27 @@ def _or_usual_mistake(
 
 
 def _with_findings(chosen: Explanation, streams: StreamPair, lag_s: float) -> Explanation:
-    """Return an explanation that holds, in the likelier reading, with all its findings."""
+    """Add the findings to an explanation that holds.
+
+    The result has the likelier reading: that the streams contain poses, or inverse poses.
+    """
     doubts: list[Finding] = []
     codes = {code for code, _ in chosen.hypothesis.mistakes}
     if codes - {"inverse", "axes"}:
         chosen, doubts = _or_axes(chosen, streams, lag_s)
-    explanation = attributed(chosen, streams, lag_s)
+    explanation = choose_reading(chosen, streams, lag_s)
     return replace(explanation, findings=(*explanation.findings, *doubts))
 
 
 def _unexplained(best: Explanation, streams: StreamPair, thorough: bool) -> Explanation:
-    """Return the best explanation that does not hold, with the finding about the share it leaves.
+    """Add the finding "unexplained" to the best of the explanations that do not hold.
 
-    A small share may be noise if the search was thorough: the explanation then holds.
+    If the search was thorough and the unexplained share is small, noise may be its cause. The
+    explanation then holds, with the finding "noisy".
     """
     unexplained = best.fit.unexplained
     if thorough and unexplained < _NOISY:
-        noisy = attributed(best, streams, LAGS_S[0])
+        noisy = choose_reading(best, streams, LAGS_S[0])
         findings = (*noisy.findings, finding("noisy", share=unexplained))
         return replace(noisy, findings=findings, limit=_NOISY)
     share = min(unexplained, 1.0)
@@ -363,7 +387,7 @@ def _or_rival(
     lag_s: float,
     limit: float,
 ) -> Explanation:
-    """Return the simplest of the best rivals, or ``plain`` if no rival is decisively better."""
+    """Return the simplest of the best rivals, or ``plain`` if no rival is better by _DECISIVE."""
     if plain.fit.unexplained < EXPLAINED:
         return plain
     most = min(limit, plain.fit.unexplained / _DECISIVE)
@@ -381,7 +405,7 @@ def _simplest(explanations: Sequence[Explanation]) -> Explanation:
 def _below(
     most: float, rivals: Iterable[Hypothesis], streams: StreamPair, lag_s: float
 ) -> list[Explanation]:
-    """Return the best rivals: about equal, and with at most the share ``most`` unexplained."""
+    """Return the rivals whose unexplained share is at most ``most`` and about the smallest."""
     pairs = streams.pairs(lag_s, _MAX_ROUGH)
     few = streams.synchronised[np.concatenate([pairs.i, pairs.j])]
     first = np.arange(len(pairs))
@@ -390,7 +414,7 @@ def _below(
         parent = rival.corrected("parent", few.Ts_pw_p)
         child = rival.corrected("child", few.Ts_cw_c)
         motions = motion_pairs.pairs_between(parent, child, first, first + len(pairs))
-        # A fit is stopped early if its start leaves far more than ``most`` unexplained.
+        # To save time, a fit stops if its start leaves far more than ``most`` unexplained.
         fit = fit_similarity(motions, max_unexplained=_DECISIVE * most)
         tried.append(Explanation(rival, fit))
         most = min(most, _ABOUT_EQUAL * fit.unexplained)
@@ -404,7 +428,7 @@ def _fitted(
     start: FloatArray | None = None,
     same_unit: bool = False,
 ) -> Explanation:
-    """Return the fit of the streams without the mistakes of a hypothesis."""
+    """Fit the streams, corrected for the mistakes of a hypothesis."""
     pairs = hypothesis.undo(streams).pairs(lag_s, MAX_PAIRS)
     fit = fit_similarity(pairs, start=start, same_unit=same_unit)
     return Explanation(hypothesis, fit, same_unit=same_unit)
@@ -413,10 +437,10 @@ def _fitted(
 def _or_axes(
     chosen: Explanation, streams: StreamPair, lag_s: float
 ) -> tuple[Explanation, list[Finding]]:
-    """Compare an explanation by orientations with explanations by wrong axes.
+    """Compare an explanation by wrong orientations with explanations by wrong axes of positions.
 
-    An explanation by wrong axes is returned if it explains clearly more. If it explains about as
-    much, the finding "ambiguous" is returned as well.
+    If wrong axes explain clearly more, they are returned instead. If they explain about as much,
+    the finding "ambiguous" is returned with the chosen explanation.
     """
     unexplained = chosen.fit.unexplained
     rivals = _below(_ABOUT_EQUAL * unexplained, _axes(), streams, lag_s)
@@ -430,22 +454,29 @@ def _or_axes(
 
 
 def _steadier(chosen: Explanation, streams: StreamPair, lag_s: float) -> tuple[Explanation, bool]:
-    """Return an explanation in which both sensors travel in a steady direction, as on vehicles.
+    """Find the explanation under which both sensors travel in a steady direction, as on vehicles.
 
-    The chosen explanation is returned if no other one is steadier. The second value says whether
-    the direction is steady, or cannot be judged.
+    Returns
+    -------
+    Explanation
+        The steadiest explanation that holds, or ``chosen`` if no other one is clearly steadier.
+    bool
+        Whether the direction decides between poses and inverse poses. True also for mistakes that
+        are not compared (axes, Euler angles).
     """
-    if chosen.hypothesis.axes is not None or _EULER_ORDER in chosen.hypothesis.ways:
+    hypothesis = chosen.hypothesis
+    if hypothesis.axes is not None or _EULER_ORDER in (hypothesis.parent, hypothesis.child):
         return chosen, True
+    # Scatter of the direction under each hypothesis: that of the less steady of both sensors.
     scatters = np.maximum.outer(_scatters(streams.parent), _scatters(streams.child))
-    scatter = dict(zip(_ALL_WAYS, scatters.flat, strict=True))
-    scatter_of_chosen = scatter[chosen.hypothesis]
+    scatter = dict(zip(_CONVENTIONAL, scatters.flat, strict=True))
+    scatter_of_chosen = scatter[hypothesis]
     smallest = min(scatter.values())
     if smallest < min(trajectory.STEADY, scatter_of_chosen / trajectory.CLEARLY):
         # Rounding makes the scatter of exact motion negative.
         limit = max(_ABOUT_EQUAL * smallest, 0.0)
-        steadiest = [way for way in _ALL_WAYS if scatter[way] <= limit]
-        simplest = min(steadiest, key=lambda hypothesis: hypothesis.complexity)
+        steadiest = [rival for rival in _CONVENTIONAL if scatter[rival] <= limit]
+        simplest = min(steadiest, key=lambda rival: rival.complexity)
         steady = _fitted(simplest, streams, lag_s)
         if steady.holds:
             return steady, True
@@ -453,19 +484,21 @@ def _steadier(chosen: Explanation, streams: StreamPair, lag_s: float) -> tuple[E
 
 
 def _scatters(stream: trajectory.Trajectory) -> list[float]:
-    """Return the scatter of the direction of travel without the mistakes of each way."""
+    """Return the scatter of the direction of travel, corrected for each of _CODES_OF_STREAM."""
     poses = stream.poses[:: 1 + len(stream) // MAX_PAIRS]
-    return [
-        trajectory.scatter_of_direction(Hypothesis(way).corrected("parent", poses)) for way in _WAYS
-    ]
+    scatters = []
+    for codes in _CODES_OF_STREAM:
+        corrected = Hypothesis(codes).corrected("parent", poses)
+        scatters.append(trajectory.scatter_of_direction(corrected))
+    return scatters
 
 
-def attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> Explanation:
-    """Choose between two readings that fit alike, and add the findings of the choice.
+def choose_reading(explanation: Explanation, streams: StreamPair, lag_s: float) -> Explanation:
+    """Choose whether the streams contain poses or inverse poses, and add the findings.
 
-    The readings are the hypothesis, and the hypothesis with both streams inverted. The shape of the
-    motion decides. If the other reading is possible, the explanation has :class:`Readings`, so that
-    the noise of both readings can be compared later.
+    Both readings fit equally well: the hypothesis, and the hypothesis with both streams inverted. A
+    steady direction of travel decides, or otherwise the shape of the motion. If the other reading
+    may be right, the result has :class:`Readings`. The caller then compares the noise of both.
     """
     former = explanation.hypothesis
     explanation, is_settled = _steadier(explanation, streams, lag_s)
@@ -474,7 +507,7 @@ def attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> E
     if _has_one_reading(hypothesis) or (is_settled and is_uninverted_as_before):
         return replace(explanation, findings=findings_of(hypothesis))
     if is_settled:
-        # A steady direction of travel is as clear evidence as paths can be.
+        # A steady direction is clear evidence for this hypothesis, the second of the readings.
         readings = Readings(
             hypotheses=(hypothesis.inverted(), hypothesis),
             shape=STEADY_SHAPE,
@@ -491,14 +524,14 @@ def attributed(explanation: Explanation, streams: StreamPair, lag_s: float) -> E
 
 
 def _has_one_reading(hypothesis: Hypothesis) -> bool:
-    """Return whether the same hypothesis with both streams inverted is no rival."""
+    """Return whether the hypothesis with both streams also inverted need not be compared."""
     if hypothesis.axes is not None:
         return True
-    return any("inverse_orientation" in way for way in hypothesis.ways)
+    return any(code == "inverse_orientation" for code, _ in hypothesis.mistakes)
 
 
 def _readings(explanation: Explanation, streams: StreamPair) -> Readings:
-    """Return a hypothesis and its inverse, with the evidence of the shape of the motion."""
+    """Return a hypothesis and its inverted one, with the evidence of the shape of the motion."""
     hypothesis = explanation.hypothesis
     right = hypothesis.undo(streams)
     paths, arms = evidence_for_inverse(right, explanation.fit)
@@ -513,14 +546,14 @@ def _readings(explanation: Explanation, streams: StreamPair) -> Readings:
 def _in_likelier_reading(
     explanation: Explanation, readings: Readings, streams: StreamPair, lag_s: float
 ) -> Explanation:
-    """Return the explanation in the likelier of two readings, with its findings."""
+    """Return the explanation by the likelier hypothesis of two readings, with its findings."""
     hypothesis = explanation.hypothesis
     likelier = readings.hypotheses[int(readings.shape > 0.0)]
     if hypothesis.is_uninverted and not readings.is_clear:
         likelier = hypothesis
     if likelier is not hypothesis:
         explanation = _fitted(likelier, streams, lag_s)
-    # Options are set only if the choice is clear.
+    # Options that invert streams are set only if the choice is clear.
     findings = findings_of(likelier, has_options=readings.is_clear or likelier.is_uninverted)
     if likelier.is_uninverted:
         options = conventions("inverse", "both")
@@ -529,9 +562,9 @@ def _in_likelier_reading(
 
 
 def findings_of(hypothesis: Hypothesis, has_options: bool = True) -> tuple[Finding, ...]:
-    """Return the findings of the mistakes of a hypothesis.
+    """Return one finding per mistake of a hypothesis.
 
-    Inverse poses have the options that repair them only with ``has_options``.
+    Without ``has_options``, the findings about inverse poses lack the options that repair them.
     """
     findings = []
     for code, stream in hypothesis.mistakes:
