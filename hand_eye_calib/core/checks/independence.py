@@ -1,7 +1,11 @@
-"""Checks that two streams are independent.
+"""Checks that two streams are independent measurements.
 
 Streams are not independent if one stream was computed from the other, or fused with the other
-through an assumed transform. The result would then only return that transform.
+through an assumed transform. The extrinsic would then only be a copy of that transform.
+
+Model: errors of two sensors are independent. The variances of their noise add up in the difference
+of the aligned streams, and odometries drift against each other. A stream that was computed from the
+other has a difference with less noise, or without drift.
 """
 
 import numpy as np
@@ -24,38 +28,41 @@ from hand_eye_calib.core.pairing.motion_pairs import (
 )
 from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
 
-# Largest angle (rad) between orientations that are copies: rounding to five digits.
+# Orientations are copies if their residual is below this angle (rad): rounding to five digits.
 _ROUNDING_RAD = 0.01 * np.radians(0.08)
-# Largest such angle as a share of the rotation.
+# The residual must also be below this share of the rotation angle between the poses.
 _SMALL_SHARE = 0.005
 
-# Interpolation adds errors of its own. Therefore the instants are compared at which both streams
-# have nearly a pose: a hundredth of all instants, but at least and at most these numbers.
+# Interpolation adds errors. Therefore only poses nearest in time to a pose of the other stream are
+# compared: a hundredth of all poses, but at least the first and at most the second number.
 _NEAREST = (40, 300)
 
 # Noise that both streams share is measured in the upper half of their spectra.
 # Noise is white if both quarters of that half differ by less than this factor.
 _FLAT = 1.75
-# Accelerations of both streams above this number of medians are impulses, which are white as well.
+# Impulses have white spectra like noise, and are removed. An impulse is an acceleration of both
+# streams above this multiple of the median.
 _ABRUPT = 4.0
-# Largest noise of the orientations as a share of the squared rotation. Larger values may be motion
-# that is too fast for the interval.
+# Largest noise power of the orientations as a share of the power of the rotation. Larger values may
+# be motion that is too fast for the interval between poses.
 _LITTLE_NOISE = 1e-3
-# Largest ratio of the noise of a stream and of the difference of both streams: of positions and of
-# orientations. Sensors that shake together have 1.2 and 16.
+# Largest ratio of the noise of the quieter stream to the noise of the difference of both streams:
+# for positions and for orientations. Sensors that shake together have ratios of 1.2 and 16.
 _SHARED = np.array([3.0, 30.0])
 
 # A filter may correct one stream by the other through an assumed mount. Short motions then contain
-# the true mount, and long motions the assumed mount. Durations of both, s:
+# the true mount, and long motions the assumed mount.
+# Duration of short motions, s.
 _SHORT_S = 0.05
+# Duration of long motions, s.
 _LONG_S = 3.0
 # Largest number of motions of each duration.
 _MOST_MOTIONS = 6000
 
-# Both mounts differ from this angle (rad) on.
+# The mounts of short and of long motions differ if their angle exceeds two limits.
+# Limit in rad.
 _OTHER_MOUNT_RAD = float(np.radians(0.04))
-# Both mounts differ from this number of standard deviations on. 177 clean recordings have at most
-# 5.2.
+# Limit in standard deviations. 177 recordings without this fault have at most 5.2.
 _OTHER_MOUNT_SIGMAS = 6.5
 # Blocks of time of the jackknife for the standard deviations.
 _BLOCKS = 20
@@ -63,9 +70,9 @@ _BLOCKS = 20
 _ROUNDS = 4
 
 # Two odometries drift against each other. On a path of at least this length (m), the median
-# distance of aligned positions is at least the share below.
+# distance of aligned positions exceeds the share _LEAST_DRIFT of the path.
 _LONG_PATH_M = 400.0
-# Step of the path, s.
+# The length of the path is summed over steps of this duration, s.
 _STEP_S = 1.0
 # Share of the path. Recordings of two sensors have 5e-5 to 6e-3; two poses of one INS have 2e-8.
 _LEAST_DRIFT = 2.5e-5
@@ -103,20 +110,22 @@ _MOST_POSES = 2000
 
 
 def check_copies(given: StreamPair, aligned: StreamPair, are_exact: bool) -> list[Finding]:
-    """Return the finding that one stream was computed from the other, or none.
+    """Detect a stream that was computed from the other stream.
 
-    Two sensors differ by their noise, whatever the extrinsic is. Computed poses agree with their
-    source to the rounding of numbers. Computed poses with noise of their own share more white noise
-    with their source than two sensors do. Orientations suffice for both tests.
+    Two sensors differ by their noise, for any extrinsic. Computed poses agree with their source to
+    the rounding of numbers. Computed poses with added noise share more white noise with their
+    source than two sensors do. Both tests also work with orientations alone.
 
     Parameters
     ----------
     given, aligned : StreamPair
-        Sound streams with their stamps as they are, and on one clock.
+        The same streams twice: with their recorded stamps, and with the child's stamps on the
+        parent's clock. Other faults of the streams were excluded before.
     are_exact : bool
-        Whether the user called both streams exact, as for motion capture: only rounding counts.
+        Whether the user called both streams exact, as for motion capture. Agreement to rounding is
+        then a warning instead of an error, and noise is not compared.
     """
-    # Programs interpolate at the stamps of the new stream, which may be either.
+    # A program interpolates its source at the stamps of the new stream. Either stream may be new.
     pairs = [(streams.child, streams.parent) for streams in (given, aligned)]
     pairs += [(streams.parent, streams.child) for streams in (given, aligned)]
     residual_rad = min(_residual_at_nearest(slow, fast) for slow, fast in pairs)
@@ -133,7 +142,7 @@ def check_copies(given: StreamPair, aligned: StreamPair, are_exact: bool) -> lis
 
 
 def check_fusion(pose_pairs: PosePairs, X: FloatArray, is_one_axis: bool) -> list[Finding]:
-    """Return the finding that one odometry follows the other through an assumed mount, or none.
+    """Detect an odometry that was fused with the other stream through an assumed mount.
 
     Parameters
     ----------
@@ -151,18 +160,18 @@ def check_fusion(pose_pairs: PosePairs, X: FloatArray, is_one_axis: bool) -> lis
 
 
 def _doubt(text: str, severity: Severity | None = None, **evidence: float) -> Finding:
-    """Return the finding "not_independent" with its evidence in words and in numbers."""
+    """Return the finding "not_independent" with a text that names the evidence, and its values."""
     return finding("not_independent", "both", severity, None, evidence=text, **evidence)
 
 
 def _within(slow: Trajectory, fast: Trajectory) -> IntArray:
-    """Return the rows of one stream whose stamps lie within another stream."""
+    """Return the indices of poses of ``slow`` whose stamps are between both ends of ``fast``."""
     first_ns, last_ns = fast.stamps_ns[[0, -1]]
     return np.flatnonzero((slow.stamps_ns >= first_ns) & (slow.stamps_ns <= last_ns))
 
 
 def _second_half(slow: Trajectory, fast: Trajectory) -> Trajectory:
-    """Return poses of one stream from the middle of the common time on, a limited number."""
+    """Return the first _NEAREST[1] poses of ``slow`` after the middle of the common time."""
     rows = _within(slow, fast)
     return slow[rows[len(rows) // 2 :][: _NEAREST[1]]]
 
@@ -170,7 +179,7 @@ def _second_half(slow: Trajectory, fast: Trajectory) -> Trajectory:
 def _residual_at_nearest(slow: Trajectory, fast: Trajectory) -> float:
     """Return the residual angle (rad) between the rotations of both streams.
 
-    The rotations are those between stamps of ``slow`` at which a pose of ``fast`` is nearest.
+    Poses of ``slow`` are used for which a pose of ``fast`` is nearest in time.
     """
     rows = _within(slow, fast)
     after = np.clip(np.searchsorted(fast.stamps_ns, slow.stamps_ns[rows]), 1, len(fast) - 1)
@@ -184,7 +193,11 @@ def _residual_at_nearest(slow: Trajectory, fast: Trajectory) -> float:
 
 
 def _residual(motions: MotionPairs) -> float:
-    """Return the usual residual angle (rad) of rotations, or infinity if it is no small share."""
+    """Return the usual residual angle (rad) of motion pairs after the best rotation of X.
+
+    The result is infinite if there are too few pairs, or if the residual is not far smaller than
+    the usual angle of rotation.
+    """
     angles = se3.rotation_angle(se3.rotation_of(motions.Ts_parenti_parentj))
     is_clear = angles < MAX_ROTATION_RAD
     motions = motions[is_clear]
@@ -197,13 +210,11 @@ def _residual(motions: MotionPairs) -> float:
 
 
 def _shared_noise(slow: Trajectory, fast: Trajectory) -> float:
-    """Return the noise that both streams share, over the largest noise that two sensors share.
+    """Return the shared noise of both streams as a multiple of its limit for two sensors.
 
-    Model: the noise of two sensors is independent. The variance of the difference of both motions
-    is therefore the sum of both variances. If one stream was computed from the other, the
-    difference has far less noise than each stream.
-
-    The result is 0 if the shared noise may be motion, or if a pose is missing.
+    The shared noise is the ratio of the noise of the quieter stream to the noise of the difference.
+    It is large if one stream was computed from the other. The limits are _SHARED. The result is 0
+    if the noise may be motion, or if a pose is missing.
     """
     intervals_ns = np.diff(slow.stamps_ns)
     if len(slow) < _NEAREST[0] or intervals_ns.max() > 1.5 * median(intervals_ns):
@@ -234,16 +245,19 @@ def _shared_noise(slow: Trajectory, fast: Trajectory) -> float:
 
 
 def _second_differences(Ts: FloatArray) -> FloatArray:
-    """Return second differences (N - 3, 2, 3) of the steps of poses (N, 4, 4).
+    """Return second differences (N - 3, 2, 3) of the motions between neighbouring poses (N, 4, 4).
 
-    The second axis has positions and rotations.
+    Index 0 of the second axis is translation, index 1 is rotation.
     """
     steps = se3.log(se3.inverse(Ts[:-1]) @ Ts[1:])
     return np.diff(steps, 2, axis=0).reshape(-1, 2, 3)
 
 
 def _is_calm(of_slow: FloatArray, of_fast: FloatArray) -> BoolArray:
-    """Return whether (N,) at least one stream has no impulse, in positions and in rotations."""
+    """Return which samples (N,) have no impulse that both streams contain.
+
+    Arguments are second differences (N, 2, 3) of two streams.
+    """
     sizes = np.linalg.norm([of_slow, of_fast], axis=3)
     usual = _ABRUPT * np.median(sizes, axis=1, keepdims=True)
     return np.asarray((sizes <= usual).any(axis=0).all(axis=1))
@@ -263,7 +277,7 @@ def _upper_quarters(second_differences: FloatArray) -> FloatArray:
 
 
 def _other_mount(pose_pairs: PosePairs) -> Finding | None:
-    """Return the doubt about streams whose short motions show another mount than long ones."""
+    """Detect streams with different rotations of X in short and in long motions."""
     rotations = [
         _rotations_of_blocks(pairs_over(pose_pairs, lag_s, _MOST_MOTIONS), len(pose_pairs))
         for lag_s in (_SHORT_S, _LONG_S)
@@ -284,9 +298,9 @@ def _other_mount(pose_pairs: PosePairs) -> Finding | None:
 
 
 def _rotations_of_blocks(motions: MotionPairs, n_poses: int) -> FloatArray | None:
-    """Return rotations (1 + blocks, 3, 3) of X: by all motions, and without each block of time.
+    """Estimate the rotation of X by all motions, and by all but each block of time (jackknife).
 
-    None if there are too few motions.
+    Return (1 + _BLOCKS, 3, 3), the estimate by all motions first, or None for too few motions.
     """
     of_parent = se3.rotation_log(se3.rotation_of(motions.Ts_parenti_parentj))
     of_child = se3.rotation_log(se3.rotation_of(motions.Ts_childi_childj))
@@ -306,7 +320,7 @@ def _rotations_of_blocks(motions: MotionPairs, n_poses: int) -> FloatArray | Non
 
 
 def _no_drift(pose_pairs: PosePairs, X: FloatArray) -> Finding | None:
-    """Return the doubt about streams that hardly drift against each other."""
+    """Detect streams that drift less against each other than two odometries do."""
     path = coarse(Trajectory(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p), _STEP_S)
     path_m = float(np.linalg.norm(np.diff(se3.translation_of(path.poses), axis=0), axis=1).sum())
     few = pose_pairs[:: 1 + len(pose_pairs) // _MOST_POSES]
@@ -322,9 +336,10 @@ def _no_drift(pose_pairs: PosePairs, X: FloatArray) -> Finding | None:
 
 
 def _is_steady(pose_pairs: PosePairs, X: FloatArray) -> bool:
-    """Return whether positions differ over the whole recording as little as within seconds.
+    """Return whether positions differ over the whole recording about as little as within seconds.
 
-    Errors of X, scale and clock offset cause differences as well. Their columns are fitted first.
+    Errors of X, scale and clock offset cause differences as well. They are estimated by a robust
+    regression and removed first.
     """
     points = se3.translation_of(pose_pairs.Ts_pw_p @ X)
     others = se3.translation_of(pose_pairs.Ts_cw_c)
@@ -349,7 +364,7 @@ def _is_steady(pose_pairs: PosePairs, X: FloatArray) -> bool:
 
 
 def _apart_in_windows(stamps_ns: IntArray, points: FloatArray, others: FloatArray) -> float:
-    """Return the median distance (m) of points (N, 3) that were aligned in windows of time."""
+    """Align points (N, 3) in each window of time, and return the median distance (m) of all."""
     # A window needs enough points, also of a long recording with few of its poses.
     window_ns = max(round(_LONG_S * 1e9), round(2 * MIN_PAIRS * median(np.diff(stamps_ns))))
     windows = (stamps_ns - stamps_ns[0]) // window_ns
@@ -362,12 +377,16 @@ def _apart_in_windows(stamps_ns: IntArray, points: FloatArray, others: FloatArra
 
 
 def _after_alignment(points: FloatArray, others: FloatArray) -> float:
-    """Return the median distance (m) of points (N, 3) after a robust alignment."""
+    """Align points (N, 3) with others robustly, and return their median distance (m)."""
     return median(_alignment(points, others)[1])
 
 
 def _is_copy_with_noise(pose_pairs: PosePairs, X: FloatArray) -> bool:
-    """Return whether both streams differ by white noise that contains the noise of one of them."""
+    """Return whether one stream is a copy of the other with added noise.
+
+    The difference of both streams is then white, and the noise of one stream contains that of the
+    other.
+    """
     few = pose_pairs[:: 1 + len(pose_pairs) // _MOST_POSES]
     seconds = (few.stamps_ns - few.stamps_ns[0]) * 1e-9
     if len(seconds) < _GROWTH_POSES or seconds[-1] < _GROWTH_S:
@@ -442,7 +461,7 @@ def _upper_spectra(second_differences: FloatArray) -> NDArray[np.complex128]:
 
 
 def _size_of_changes(values: FloatArray, n_poses: int) -> FloatArray:
-    """Return the usual change (d,) of values (N, d) over a number of poses, at least one."""
+    """Return the _DIFFERENCE_SHARE quantile (d,) of changes of values (N, d) over some poses."""
     n_poses = max(n_poses, 1)
     changes = np.sort(np.abs(values[n_poses:] - values[:-n_poses]), axis=0)
     return np.maximum(changes[int(_DIFFERENCE_SHARE * len(changes))], 1e-12)
@@ -451,7 +470,8 @@ def _size_of_changes(values: FloatArray, n_poses: int) -> FloatArray:
 def _differences(seconds: FloatArray, pose_pairs: PosePairs, X: FloatArray) -> FloatArray:
     """Return the differences (N, 6) of child and parent poses: positions (m), orientations (rad).
 
-    Errors of X, scale and clock offset cause differences as well. Their columns are fitted first.
+    Errors of X, scale and clock offset cause differences as well. They are estimated by a robust
+    regression and removed.
     """
     Ts = pose_pairs.Ts_pw_p @ X
     points = se3.translation_of(Ts)
@@ -469,7 +489,7 @@ def _differences(seconds: FloatArray, pose_pairs: PosePairs, X: FloatArray) -> F
         velocities[:, :, None],
     ]
     distances = (others - others.mean(axis=0)) @ R.T - from_mean
-    # Rotations from the parent's world to the child's world are constant but for errors.
+    # Without errors, the rotations from the parent's world to the child's world are constant.
     between = se3.rotation_of(pose_pairs.Ts_cw_c) @ np.swapaxes(rotations, 1, 2)
     world = se3.nearest_rotation(between.sum(axis=0))
     turns = se3.rotation_log(world.T @ between)
@@ -484,7 +504,7 @@ def _differences(seconds: FloatArray, pose_pairs: PosePairs, X: FloatArray) -> F
 
 
 def _without_columns(columns: list[FloatArray], targets: FloatArray) -> FloatArray:
-    """Return targets (N, 3) less their robust fit by columns (N, 3, m)."""
+    """Return the residuals (N, 3) of targets after a robust regression on columns (N, 3, m)."""
     rows = np.concatenate(columns, axis=2)
     values, _ = robust_regression(
         "cauchy", rows, targets, _ROUNDS, lambda lengths: 2.0 * median(lengths)

@@ -1,4 +1,9 @@
-"""Shape of the motion: evidence for or against inverse poses in both streams."""
+"""Shape of the motion: evidence for poses or for inverse poses in both streams.
+
+The rigid mount fits both equally well. But some point of a moving body, such as an axle, has a
+short path. If the poses are inverse, a point with a short path is one of the world in the frame of
+the body. The log ratio of the shortest paths, under both interpretations, is the evidence.
+"""
 
 import numpy as np
 
@@ -9,48 +14,65 @@ from hand_eye_calib.core.checks.stream_pair import LAGS_S, StreamPair
 from hand_eye_calib.core.checks.streams import coarse
 from hand_eye_calib.core.geometry import se3
 
-# Log ratio of the paths of sensors that look at a point: 0.4 for a camera around its target.
-_OF_TARGET = 0.5
+# Log ratio of the paths that sensors around a target cause, although their poses are not inverse.
+# Measured: 0.4 for a camera around its target.
+_TARGET_LOG_RATIO = 0.5
 
 # Reweighted rounds of the search for the point with the shortest path.
 _ROUNDS = 5
 
-# Two frames may be one frame below this distance (m) and this angle (rad). If both streams have
-# one world, the lever arm between the worlds is no evidence.
+# Two frames may be the same frame up to this distance (m) and this angle (rad). If both streams
+# have the same world, the lever arm between the worlds is no evidence.
 _SAME_FRAME_M = 0.03
 _SAME_FRAME_RAD = 0.01
-# Shortest lever arm (m) that is compared.
-_SHORTEST_ARM_M = 0.01
+# Shorter lever arms (m) count as this length.
+_MIN_ARM_M = 0.01
 
-# Reach of a robot arm (m). The hand of an arm may move more than its base moves in the frame of the
-# hand. Poses within this distance may therefore be right although they look inverse.
+# Reach of a robot arm (m). The path of the hand may be longer than that of the base in the frame of
+# the hand. Poses within this distance may therefore be right although they look inverse.
 _REACH_M = 3.0
 
 
 def may_be_an_arm(streams: StreamPair) -> bool:
-    """Return whether the streams are stops, or stay within the reach of an arm."""
+    """Return whether the sensors may be those of a robot arm.
+
+    The streams then consist of single stops, or their poses and inverse poses stay within the reach
+    of an arm.
+    """
     if streams.is_slow:
         return True
     for poses in (streams.parent.poses, streams.child.poses):
-        for reading in (poses, se3.inverse(poses)):
-            positions = se3.translation_of(reading)
+        for candidates in (poses, se3.inverse(poses)):
+            positions = se3.translation_of(candidates)
             if np.linalg.norm(positions - medians(positions.T), axis=1).max() >= _REACH_M:
                 return False
     return True
 
 
 def evidence_for_inverse(right: StreamPair, fit: SimilarityFit) -> tuple[float, float]:
-    """Return evidence for inverse poses: the log ratio of the paths, and half that of lever arms.
+    """Compute the evidence for inverse poses in both streams.
 
-    A ratio compares the streams as they are with both streams inverted. Some point of a body, such
-    as an axle, has a short path. If poses are inverse, that point is a point of the world in the
-    frame of the body. Sensors that move around a point that they look at have such paths, too: the
-    path of that point is less than half of their own.
+    Sensors that move around a target have paths like those of inverse poses. Their shortest path,
+    that of the target, is less than half of the path of the sensor. The log ratio of the paths is
+    then reduced by that of a target.
+
+    Parameters
+    ----------
+    right : StreamPair
+        Streams without other mistakes.
+    fit : SimilarityFit
+        Fit of these streams.
+
+    Returns
+    -------
+    float, float
+        Log ratio of the paths, and half the log ratio of the lever arms: those of the streams as
+        they are over those of inverse streams. Positive values are evidence for inverse poses.
     """
     logs = []
     for stream in (right.parent, right.child):
         poses = coarse(stream, LAGS_S[-1]).poses
-        # Stops contain only places, and not the motion between them.
+        # Stops are poses without the motion between them, so that changes of velocity are unknown.
         order = 2 if stream.interval_s < LAGS_S[-1] else 1
         shortest, path_of_origin = _shortest_path(poses, order)
         shortest_of_inverse, _ = _shortest_path(se3.inverse(poses), order)
@@ -58,19 +80,19 @@ def evidence_for_inverse(right: StreamPair, fit: SimilarityFit) -> tuple[float, 
     paths, relative_to_origin = np.mean(logs, axis=0)
     looks_at_a_point = relative_to_origin < np.log(0.5)
     if looks_at_a_point and paths > 0.0:
-        paths = max(paths - _OF_TARGET, 0.0)
+        paths = max(paths - _TARGET_LOG_RATIO, 0.0)
     return float(paths), _evidence_of_lever_arms(right, fit)
 
 
 def _evidence_of_lever_arms(right: StreamPair, fit: SimilarityFit) -> float:
     """Return half the log ratio of the lever arms between the sensors and between the worlds.
 
-    The result is 0 if the streams have one frame in common.
+    The result is 0 if both sensors, or both worlds, may have the same frame.
     """
     pairs = right.synchronised.child_scaled(fit.scale)
     worlds = pairs.Ts_pw_p @ fit.T_parent_child @ se3.inverse(pairs.Ts_cw_c)
     Ts = np.array([fit.T_parent_child, medians(np.moveaxis(worlds, 0, 2))])
-    arms_m = np.maximum(np.linalg.norm(se3.translation_of(Ts), axis=1), _SHORTEST_ARM_M)
+    arms_m = np.maximum(np.linalg.norm(se3.translation_of(Ts), axis=1), _MIN_ARM_M)
     angles_rad = se3.rotation_angle(se3.rotation_of(Ts))
     are_same = (arms_m <= _SAME_FRAME_M) & (angles_rad <= _SAME_FRAME_RAD)
     if are_same.any():
@@ -79,9 +101,10 @@ def _evidence_of_lever_arms(right: StreamPair, fit: SimilarityFit) -> float:
 
 
 def _shortest_path(poses: FloatArray, order: int) -> tuple[float, float]:
-    """Return the path (m) of the point of a body with the shortest path, and that of its origin.
+    """Return the lengths (m) of the shortest path of a point of the body, and of its origin's path.
 
-    For ``order`` 2 the path is the sum of the changes of velocity instead of place.
+    A point p of the body is at R p + t. Its path is the sum of the sizes of the changes of R p + t:
+    the first differences for ``order`` 1, the second differences for ``order`` 2.
     """
     changes = np.diff(poses[:, :3], order, axis=0)
     steps = changes[:, :, 3]

@@ -1,4 +1,4 @@
-"""Two streams on about one clock, and the motions that they have in common."""
+"""Two streams whose clocks nearly agree, and the motion pairs that they have in common."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -8,20 +8,29 @@ from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing import motion_pairs
 
-# Durations of the compared motions, s. Shorter motions are used only if longer ones disagree.
+# Durations (s) of the motions that are compared. Shorter motions are used only if longer motions
+# disagree.
 LAGS_S = (3.0, 1.0, 0.4)
-# Most motions in a fit.
+# Largest number of motions in a fit.
 MAX_PAIRS = 400
-# Fewest motions in a fit.
+# Smallest number of motions in a fit.
 MIN_PAIRS = 12
 
-# Largest angle (rad) of a rotation vector: near half a turn its sign is ambiguous.
+# Largest angle (rad) of a rotation vector that is used: near pi its sign is ambiguous.
 MAX_ROTATION_RAD = 2.8
 
 
 @dataclass(frozen=True)
 class StreamPair:
-    """Two streams on about one clock, and the longest gap (s) to interpolate across."""
+    """Two streams whose clocks nearly agree.
+
+    Attributes
+    ----------
+    parent, child : Trajectory
+        Streams of both sensors.
+    max_gap_s : float
+        Longest interval between two poses that is interpolated, s.
+    """
 
     parent: Trajectory
     child: Trajectory
@@ -29,16 +38,16 @@ class StreamPair:
 
     @property
     def interval_s(self) -> float:
-        """Median time between poses of the faster stream, s."""
+        """Median interval between poses of the faster stream, s."""
         return min(self.parent.interval_s, self.child.interval_s)
 
     @property
     def is_slow(self) -> bool:
         """Whether most poses are too far apart to interpolate between them."""
-        return min(self.parent.interval_s, self.child.interval_s) > self.max_gap_s
+        return self.interval_s > self.max_gap_s
 
     def correlate(self) -> Correlation:
-        """Correlate the angular rates of both streams."""
+        """Correlate the angular rates of both streams, to compare their clocks."""
         return correlate_rates(self.parent, self.child, self.max_gap_s)
 
     def shifted(self, offset_s: float) -> "StreamPair":
@@ -47,16 +56,16 @@ class StreamPair:
 
     @cached_property
     def synchronised(self) -> motion_pairs.PosePairs:
-        """Poses of both streams at common stamps."""
+        """Poses of both streams, interpolated at common stamps."""
         return motion_pairs.synchronise(self.parent, self.child, self.max_gap_s)
 
     def pairs(self, lag_s: float, max_pairs: int) -> motion_pairs.MotionPairs:
-        """Motion pairs over ``lag_s`` seconds.
+        """Return at most ``max_pairs`` motion pairs, each over ``lag_s`` seconds.
 
         Raises
         ------
         NotEnoughDataError
-            If the streams have too few common motions.
+            If the streams have fewer than MIN_PAIRS of them.
         """
         pairs = motion_pairs.pairs_over(self.synchronised, lag_s, max_pairs)
         if len(pairs) < MIN_PAIRS:

@@ -1,4 +1,4 @@
-"""Checks of a single stream, and of one beside another."""
+"""Checks of the stamps and poses of one stream, and of its motion against the other stream."""
 
 import itertools
 
@@ -14,7 +14,7 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory, repetitions
 from hand_eye_calib.core.pairing.motion_pairs import find_leap
 
-# An interval is a gap if it is longer than the limit and than this many median intervals.
+# A gap is longer than the option max_gap, and longer than this multiple of the median interval.
 _GAP_INTERVALS = 5.0
 
 # A step is a jump if its excess over the steps around it exceeds two limits.
@@ -26,26 +26,26 @@ _JUMP_SPEEDS = 3.0
 # Largest difference (m, rad) of positions, heights and verticals that are equal to rounding.
 _SAME = 1e-6
 
-# Smallest tilt of a stream that is not flat (rad).
-_TILTS = 0.02
+# A stream is not flat if its tilt (root mean square, rad) exceeds this angle.
+_MIN_TILT_RAD = 0.02
 
 # Shortest time (s) for which a frozen stream repeats its pose.
-_FROZEN_S = 1.0
-# The motion of the other sensor is judged in parts of about this duration (s): a car may stand for
-# a minute and then drive.
+_MIN_FROZEN_S = 1.0
+# The motion of the other sensor is checked in parts of about this duration (s), because a car may
+# wait for a minute and then drive.
 _PART_S = 10.0
 
-# Smallest net motion of a sensor that does not stand. Odometry drifts by up to 6 cm and 0.05 rad
-# while a car waits 42 s at traffic lights.
-# Distance, m.
+# A sensor moves if its distance or its angle from the start of a part exceeds the limits below.
+# Measured: odometry drifts by up to 6 cm and 0.05 rad while a car waits 42 s at traffic lights.
+# Limit of the distance, m.
 _MOVES_M = 0.02
-# Angle, rad.
+# Limit of the angle, rad.
 _MOVES_RAD = 0.1
-# Distance as a share of the usual speed times the duration.
+# Limit of the distance, as a share of the usual speed times the duration of the part.
 _MOVES_SHARE = 0.1
 
-# Motion must also exceed the noise of positions and angles by this factor. Noise is the median
-# second difference. The largest distance of white noise was 2.2 times that in 6,000 draws.
+# The distance or angle must also exceed the noise by this factor. Noise is the median second
+# difference. Measured: the largest distance of white noise is 2.2 times that in 6,000 draws.
 _MOVES_NOISES = 2.5
 
 # Two sensors take turns on one topic if the roughness from pose to pose exceeds the roughness over
@@ -57,20 +57,21 @@ _MAX_PERIOD = 6
 _MIN_ROUGHNESS_M = 0.01
 # Largest share of repeated positions. Streams that repeat poses are rough for another reason.
 _MAX_REPEATS = 0.1
-# The levels of both sensors are steady over this number of turns.
+# The level of a sensor is the mean distance of its positions from the line between neighbours.
+# The mean is over this number of periods.
 _TURNS = 40
-# Smallest share of the roughness that the steady levels explain. A body that shakes or walks in
-# step with the poses soon falls out of step.
+# Smallest share of the mean squared distance that the levels explain. The levels of a body that
+# shakes or walks with nearly the same period change, so that they explain less.
 _STEADY_SHARE = 0.6
 
-# Positions are on a grid if most differences are multiples of the smallest difference.
-# Fewest differences.
+# Positions are on a grid if most differences are multiples of the smallest difference (the step).
+# Smallest number of differences.
 _MIN_GRID = 30
 # Smallest share of multiples among the differences.
 _ON_GRID = 0.98
 # Largest distance from a multiple, as a share of the step.
 _GRID_TOLERANCE = 0.06
-# Largest multiple that is judged.
+# Differences above this multiple of the step are skipped.
 _MAX_MULTIPLE = 200.0
 # Steady motion has equal differences as well. A stream that nearly always moves must therefore have
 # this number of different multiples.
@@ -98,20 +99,20 @@ _SLOWEST = 0.01
 
 # Time over which velocities are computed (s), so that noise contributes little.
 _STEP_S = 1.0
-# Quantile of usual sizes. A tenth of the velocities may be those of jumps.
+# A usual size is this quantile of all sizes: up to a tenth of the velocities may be jumps.
 USUAL = 0.9
 
 
 def coarse(trajectory: Trajectory, step_s: float) -> Trajectory:
-    """Return the first pose of every step of ``step_s`` seconds, where a step has a pose."""
+    """Return the first pose in each interval of ``step_s`` seconds; empty intervals are skipped."""
     steps = (trajectory.stamps_ns - trajectory.stamps_ns[0]) // round(step_s * 1e9)
     return trajectory[np.unique(steps, return_index=True)[1]]
 
 
 def are_gaps(intervals_s: FloatArray, max_gap_s: float) -> BoolArray:
-    """Return which intervals (N,) between poses, s, are gaps.
+    """Detect gaps among the intervals (N,) between poses, in seconds.
 
-    A gap is longer than interpolation may bridge, and longer than usual in the stream.
+    A gap is longer than ``max_gap_s``, and much longer than the median interval of the stream.
     """
     usual_s = median(intervals_s) if len(intervals_s) else 0.0
     return intervals_s > max(max_gap_s, _GAP_INTERVALS * usual_s)
@@ -120,7 +121,18 @@ def are_gaps(intervals_s: FloatArray, max_gap_s: float) -> BoolArray:
 def check_stream(
     trajectory: Trajectory, stream: str, max_gap_s: float = CalibratorConfig.max_gap
 ) -> list[Finding]:
-    """Return the findings about one stream of poses, "parent" or "child"."""
+    """Return the findings about one stream of poses.
+
+    Jumps and sampling are checked only if stamps and positions have no fault other than gaps.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+    stream : str
+        "parent" or "child".
+    max_gap_s : float
+        Longest interval that is interpolated, s.
+    """
     findings = check_positions(trajectory, stream, max_gap_s)
     if any(found.code != "gaps" for found in findings):
         return findings
@@ -152,17 +164,17 @@ def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> li
     if apart_m := _interleaved(trajectory):
         return [*findings, finding("interleaved", stream, distance_m=apart_m)]
     step_m = max(_grid_step(column) for column in se3.translation_of(trajectory.poses).T)
-    # Rounding of positions alone is noise like any other.
+    # In a stream without orientations, rounding is noise like any other: never an error.
     most = np.inf if trajectory.has_rotations else LIMITS["coarse_positions"].error
     coarse = graded("coarse_positions", stream, min(step_m, most), step_m=step_m)
     return [*findings, coarse] if coarse else findings
 
 
 def _interleaved(trajectory: Trajectory) -> float:
-    """Return the distance (m) of two levels between which the positions of a stream alternate.
+    """Return the roughness (m) of positions that alternate between sensors, or 0 for one sensor.
 
-    Two sensors on one topic take turns. Neighbouring poses then differ more than poses that are
-    one period apart. The result is 0 for a stream of one sensor.
+    Sensors that publish on one topic take turns. Neighbouring poses then differ more than poses
+    that are one period apart.
     """
     positions = se3.translation_of(trajectory.poses)
     stamps_ns = trajectory.stamps_ns
@@ -196,7 +208,7 @@ def _interleaved(trajectory: Trajectory) -> float:
 
 
 def _grid_step(values: FloatArray) -> float:
-    """Return the step (m) of which all differences of values (N,) are multiples, or 0."""
+    """Return the step (m) if nearly all differences of values (N,) are its multiples, else 0."""
     steps = np.abs(np.diff(values))
     differences = steps[steps > _SAME]
     if len(differences) < _MIN_GRID:
@@ -227,7 +239,7 @@ def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
         # sensor whose image in the world scatters least.
         mean = whole.poses[::10, :3, :3].mean(axis=0)
         tilt_rad = float(np.sqrt(max(np.linalg.eigvalsh(np.eye(3) - mean.T @ mean)[0], 0.0)))
-        if tilt_rad > _TILTS:
+        if tilt_rad > _MIN_TILT_RAD:
             return [finding("flat", name, other=other, tilt_deg=float(np.degrees(tilt_rad)))]
     return []
 
@@ -258,7 +270,7 @@ def frozen_share(trajectory: Trajectory, other: Trajectory) -> float:
     """
     usual_m_s = usual_speed(other.stamps_ns, se3.translation_of(other.poses))
     frozen_ns = 0
-    for from_ns, until_ns in repetitions(trajectory, _FROZEN_S):
+    for from_ns, until_ns in repetitions(trajectory, _MIN_FROZEN_S):
         n_parts = max(1, round((until_ns - from_ns) * 1e-9 / _PART_S))
         edges_ns = np.linspace(from_ns, until_ns, n_parts + 1).astype(np.int64)
         for first_ns, last_ns in itertools.pairwise(edges_ns.tolist()):
@@ -269,7 +281,7 @@ def frozen_share(trajectory: Trajectory, other: Trajectory) -> float:
 
 
 def _moves(part: Trajectory, usual_m_s: float) -> bool:
-    """Return whether a sensor moves in a part of its stream. Drift and noise are no motion."""
+    """Return whether a sensor moves by more than drift and noise in a part of its stream."""
     if len(part) < 2:
         return False
     positions = se3.translation_of(part.poses)
@@ -279,7 +291,7 @@ def _moves(part: Trajectory, usual_m_s: float) -> bool:
 
 
 def _exceeds(away: FloatArray, least: float) -> bool:
-    """Return whether vectors (N, 3) from the start become longer than ``least`` and their noise."""
+    """Return whether the longest of the vectors (N, 3) exceeds ``least`` and a limit of noise."""
     rough = np.linalg.norm(np.diff(away, 2, axis=0), axis=1)
     noise = median(rough) if len(rough) else 0.0
     largest = float(np.linalg.norm(away, axis=1).max())
@@ -287,16 +299,16 @@ def _exceeds(away: FloatArray, least: float) -> bool:
 
 
 def check_lengths(parent: Trajectory, child: Trajectory, lever_arm_m: float = 0.0) -> list[Finding]:
-    """Return the finding about motion that no vehicle has, or none.
+    """Detect lengths in another unit than metres, from a motion that no vehicle has in metres.
 
-    Two streams in millimetres agree with each other: only their motion reveals the unit.
+    Two streams in millimetres agree with each other, so that only their motion reveals the unit.
 
     Parameters
     ----------
     parent, child : Trajectory
-        Streams on one scale, if the scale is known.
+        Both streams, with the child's lengths multiplied by the scale if it is known.
     lever_arm_m : float
-        Smallest distance of the sensors; 0 if it is unknown.
+        Lower limit of the distance between the sensors, m; 0 if it is unknown.
     """
     if not is_too_fast(parent, lever_arm_m):
         return []
@@ -324,9 +336,10 @@ def check_lengths(parent: Trajectory, child: Trajectory, lever_arm_m: float = 0.
 
 
 def _unit_of_motion(speed: float, change: float) -> tuple[str, float]:
-    """Return the unit in which a speed and a change of velocity are usual: in words and in m.
+    """Return the name of the unit in which a motion is usual, and the size of that unit in metres.
 
-    The size is that of millimetres if both millimetres and centimetres are possible.
+    The size is that of millimetres if both millimetres and centimetres are possible. The arguments
+    are computed as if lengths were in metres: a speed (m/s) and a change of velocity in a second.
     """
     if speed * 0.01 >= _FASTEST or change * 0.01 > _MOST_USUAL:
         return "millimetres", 0.001
@@ -336,9 +349,10 @@ def _unit_of_motion(speed: float, change: float) -> tuple[str, float]:
 
 
 def is_too_fast(trajectory: Trajectory, lever_arm_m: float = 0.0) -> bool:
-    """Return whether no vehicle moves like this, so that the lengths are not in metres.
+    """Return whether a motion is too fast for any vehicle, so that lengths are not in metres.
 
-    The distance to the other sensor is the smallest size of the vehicle.
+    The limit is lower for large vehicles. The lever arm between the sensors is a lower limit of the
+    size of the vehicle.
     """
     speed, change = _usual_motion(trajectory)
     hardest = _HARDEST_OF_LARGE if lever_arm_m >= _LONG_LEVER_M else _HARDEST
@@ -346,7 +360,7 @@ def is_too_fast(trajectory: Trajectory, lever_arm_m: float = 0.0) -> bool:
 
 
 def is_too_slow(trajectory: Trajectory) -> bool:
-    """Return whether a sensor moves more slowly than sensors do while they are calibrated."""
+    """Return whether a sensor is slower than any sensor during a calibration in metres."""
     speed, _ = _usual_motion(trajectory)
     return speed < _SLOWEST
 
@@ -354,7 +368,8 @@ def is_too_slow(trajectory: Trajectory) -> bool:
 def _usual_motion(trajectory: Trajectory) -> tuple[float, float]:
     """Return the usual speed (m/s) and the usual change of velocity within a second (m/s^2).
 
-    Nine tenths of all seconds do not exceed them. They are zero for fewer than four seconds.
+    Both are quantiles that nine tenths of all seconds do not exceed. They are zero for a stream of
+    fewer than four seconds.
     """
     seconds = coarse(trajectory, _STEP_S)
     if len(seconds) < 4:

@@ -6,17 +6,20 @@ from hand_eye_calib.core.checks.findings import Finding, finding
 from hand_eye_calib.core.checks.streams import is_too_fast, is_too_slow
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 
+# Names of the units of length that are detected, by their size in metres.
 _UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches", 0.3048: "feet"}
 
-# Largest distance of a scale from a unit, in standard deviations of the scale.
+# A scale equals a unit if their difference is within the largest of two limits.
+# Limit in standard deviations of the scale.
 UNIT_SIGMAS = 3.0
-# Largest distance of a scale without noise from the child's unit, as a share of the unit.
+# Limit for a unit of the child, as a share of the unit: rounding of data without noise.
 _UNIT_ROUNDING = 1e-6
-# Largest distance of a scale from the parent's unit, as a share of the unit. Noise of the child
-# biases the scale: by 0.2 % for simulated arms, which is several standard deviations.
+# Limit for a unit of the parent, as a share of the unit. Noise of the child biases the scale: by
+# 0.2 % for simulated arms, which is several standard deviations.
 _PARENT_UNIT_SHARE = 0.005
-# A scale this close to a unit (share) may be that unit times a scale error of the odometry.
-_UNIT_NEAR = 0.05
+# A scale whose difference from a unit is within this share of the unit may be that unit times a
+# scale error of the odometry.
+_NEAR_UNIT_SHARE = 0.05
 
 
 def in_other_units(
@@ -25,25 +28,31 @@ def in_other_units(
     """Return the finding that a stream's lengths are in another unit, or None.
 
     A scale below 1 that is within three standard deviations of a unit means that the child is in
-    that unit. Any other scale below 1 is a scale of the child. A scale above 1 has two
-    explanations: the parent is in a unit, or the child has a scale of its own, as that of a single
-    camera. The ratio of lengths alone never changes the parent. The motion decides. A parent that
-    would be too fast in metres is in that unit. A child that would hardly move in metres has a
-    scale of its own. If both are plausible in metres, the finding names both explanations. It is an
-    error within three standard deviations or 0.5 % of a unit, and a warning within 5 %. Two streams
-    in one wrong unit have no ratio:
+    that unit. Any other scale below 1 is a scale error of the child.
+
+    A scale above 1 near the inverse of a unit has two explanations: the parent is in that unit, or
+    the child's lengths have an unknown scale, such as those of a single camera. The motion decides:
+
+    - A parent that would be too fast in metres is in that unit.
+    - A child that would hardly move in metres has an unknown scale.
+    - If both motions are plausible in metres, the finding names both explanations. It is an error
+      within three standard deviations or 0.5 % of a unit, and a warning within 5 %.
+
+    Two streams in the same wrong unit have the ratio 1:
     :func:`~hand_eye_calib.core.checks.streams.check_lengths` detects them.
 
     Parameters
     ----------
     scale, sigma : float
-        Factor of the child's lengths beside the known one, and its standard deviation.
+        Estimated factor of the child's lengths, after they were multiplied by ``known``, and the
+        standard deviation of the factor.
     parent, child : Trajectory
-        Streams as they are, without the known scale.
+        Streams as they were recorded, not multiplied by ``known``.
     known : float
-        Known factor of the child's lengths.
+        Factor of the child's lengths that the user stated.
     """
-    # The solve may have found a known factor near 1 itself: the unit is then in the product.
+    # A known factor near 1 may come from an earlier solve of the same streams. Then the product of
+    # both factors is compared first.
     totals = (scale * known, scale) if 0.5 < known < 2.0 else (scale,)
     for total in totals:
         values: dict[str, Any] = {"scale": total, "sigma": sigma * total / scale}
@@ -58,14 +67,14 @@ def in_other_units(
 
 
 class _Unit(NamedTuple):
-    """A unit of length (m), and whether a scale is that of the unit within its uncertainty."""
+    """A unit of length (m), and whether a scale equals the unit within its uncertainty."""
 
     size_m: float
     is_exact: bool
 
 
 def _unit_of(total: float, sigma: float) -> _Unit | None:
-    """Return the unit near a scale, or near its inverse if the scale is above 1; None if none."""
+    """Return the unit near a scale, or None. A scale above 1 is compared with inverse units."""
     for unit_m in _UNITS:
         if total < 1.0:
             factor = unit_m
@@ -75,7 +84,7 @@ def _unit_of(total: float, sigma: float) -> _Unit | None:
             share = _PARENT_UNIT_SHARE
         difference = abs(total - factor)
         is_exact = difference <= max(UNIT_SIGMAS * sigma, share * factor)
-        if is_exact or difference <= _UNIT_NEAR * factor:
+        if is_exact or difference <= _NEAR_UNIT_SHARE * factor:
             return _Unit(unit_m, is_exact)
     return None
 
@@ -83,9 +92,9 @@ def _unit_of(total: float, sigma: float) -> _Unit | None:
 def _parent_or_child(
     unit: _Unit, values: dict[str, Any], parent: Trajectory, child: Trajectory
 ) -> Finding | None:
-    """Return the finding about a child whose lengths are shorter than the parent's by a unit.
+    """Return the finding about a parent that may be in a unit, because the scale is its inverse.
 
-    None if the child has a scale of its own.
+    The result is None if the child is too slow for lengths in metres: its scale is unknown.
     """
     if is_too_fast(parent) and not is_too_fast(child):
         options = {"parent_scale": unit.size_m}
