@@ -1,4 +1,4 @@
-"""Make findings of the stream checks from a key and values, and grade them by their size."""
+"""Findings of the stream checks: their texts by a key, and their severity by size or options."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -28,14 +28,14 @@ _NEVER = float("inf")
 
 
 class Limits(NamedTuple):
-    """Limits of the size of a fault.
+    """Limits of the size of a fault, which determine its severity.
 
     Attributes
     ----------
     sigmas : float
-        Fewest standard deviations of its size.
+        Smallest size of the fault in standard deviations.
     note, warning, error : float
-        Sizes from which on the fault is a note, a warning, an error.
+        Smallest size of a note, of a warning and of an error.
     """
 
     sigmas: float
@@ -153,14 +153,14 @@ def finding(
 
 
 def _plain_value(value: Real | str) -> float | int | str:
-    """Return a value as files contain it: a number of Python, or a text."""
+    """Convert a number of numpy to one of Python, which files can contain. Texts are unchanged."""
     if isinstance(value, str):
         return value
     return int(value) if isinstance(value, Integral) else float(value)
 
 
-# Code of a finding to the option that corrects the convention of a stream, and its value, in the
-# order in which mistakes are undone.
+# Option (without the name of the stream) and its value that correct the convention of a stream, by
+# the code of the finding. Streams are corrected in this order.
 CONVENTIONS = {
     "quaternion_order": ("quaternion", "wxyz"),
     "quaternion_names": ("quaternion", "yzwx"),
@@ -182,15 +182,16 @@ def conventions(code: str, stream: str) -> dict[str, float | str]:
 
 
 def repair_message(findings: Sequence[Finding], options: Options, verdicts: str = "") -> str:
-    """Return what was repaired, the options that did it, and those that undo it.
+    """Return the message about repaired faults, the options that were set, and how to undo them.
 
     Parameters
     ----------
     findings : sequence of Finding
-        Findings that the options repair.
+        Findings about the faults.
     options : mapping
+        Options that repair the faults, and their values.
     verdicts : str
-        Verdicts with and without the repair, in words.
+        Text about the verdicts with and without the repair.
     """
     what = "; ".join([found.what for found in findings])
     undo = options_in_words(defaults_of(options))
@@ -198,17 +199,18 @@ def repair_message(findings: Sequence[Finding], options: Options, verdicts: str 
 
 
 def answered(findings: Sequence[Finding], config: CalibratorConfig) -> list[Finding]:
-    """Return findings, graded by the options of a configuration.
+    """Return findings with the severity that they have under a configuration.
 
-    A finding whose options are all set becomes a note, and so do a few jumps if the method rejects
-    outliers.
+    A finding becomes a note if the configuration has all options that repair the fault. A small
+    share of jumps becomes a note if the method rejects outliers.
     """
     current = config.to_options()
     graded_findings = []
     for found in findings:
         options = dict(found.options)
         if found.code in CONVENTIONS:
-            # A stream that was corrected already, and needs it again, was right before.
+            # If a corrected stream needs the same correction again, it was right at first: the
+            # finding then proposes the default values of these options.
             repeated = [name for name, value in options.items() if current[name] == value]
             options |= defaults_of(repeated)
         is_answered = options and all(current.get(name) == options[name] for name in options)
