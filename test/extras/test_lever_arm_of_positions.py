@@ -115,7 +115,7 @@ class TestLeverArm:
         )
         assert abs(smoothed.T_parent_child[2, 3] - LEVER_ARM[2]) > 0.02
         assert np.abs(distances(smoothed)).max() < 3.0
-        assert any("answer to acceleration" in text for text in smoothed.noise.in_words)
+        assert any("acceleration shifts the positions" in text for text in smoothed.noise.in_words)
 
     def test_the_expected_scale_of_a_tuning_is_taken_out_of_a_finding(self, monkeypatch):
         sigmas = list(TUNING.of_positions)

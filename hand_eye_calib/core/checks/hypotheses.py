@@ -319,8 +319,8 @@ def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None
             chosen = _or_rival(chosen, _axes(), streams, lag_s, HOLDS)
         if chosen.holds:
             return _with_findings(chosen, streams, lag_s)
-        # Jumps affect long motions more than short ones.
         failed.append(chosen)
+        # Try shorter motions: jumps affect fewer of them.
     if not failed:
         raise too_few
     best = min(failed, key=lambda explanation: explanation.fit.unexplained)

@@ -430,7 +430,7 @@ def _solve_pairs(
     if reference == "auto" and method.solve_best_stride:
         best = method.solve_best_stride(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c)
         reference = best.reference
-        reason = f"{reference}: of all numbers of poses, its covariance is the smallest"
+        reason = f"{reference}: motions over this number of poses have the smallest covariance"
     elif reference == "auto":
         from hand_eye_calib.core.assessment.reference_selection import select_reference
 

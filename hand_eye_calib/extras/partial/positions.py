@@ -112,8 +112,8 @@ class LeverArmSolution(ModelSolution):
         sigma_mm = 1e3 * self.parameter_sigmas[RESPONSE]
         if abs(response_mm) > MIN_REPORTED_SIGMAS * sigma_mm:
             sentences.append(
-                f"the positions answer to acceleration by {response_mm:.1f} +/- {sigma_mm:.1g} mm "
-                "per m/s^2 (one of the sensors smooths); what that may do is in the +/- values"
+                f"acceleration shifts the positions by {response_mm:.1f} +/- {sigma_mm:.1g} mm per "
+                "m/s^2 (one of the sensors smooths); the +/- values contain the effect of this"
             )
         sentences += self.events(stamps_ns)
         return Noise(

@@ -54,7 +54,8 @@ WORDS = {
         "a misaligned axis of a gyroscope",
     ),
     "gain_of_axis": FindingWords(
-        "{whose} rotations about its {axis} axis are {gain:.4f} +/- {sigma:.4f} times too large",
+        "{whose} rotations about its {axis} axis are {gain:.4f} +/- {sigma:.4f} times the true "
+        "ones",
         "calibrate that scale first",
         "a gyroscope with a wrong scale",
         code="rotation_gain",

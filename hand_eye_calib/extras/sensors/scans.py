@@ -279,7 +279,7 @@ class ScanReading(Reading):
             self._poses[-1] = self._poses[-2]
 
     def _register_finely(self, index: int) -> None:
-        """Estimate the pose of the scan at this index from the end, and add it to the maps."""
+        """Estimate the pose of a scan (index -1 is the newest), and add the scan to the maps."""
         still = self._still(index)
         points = self._thinned(still, _FINE)
         self._align(index, points, self._fine_map, _FINE)

@@ -180,7 +180,7 @@ def stamp_of(names: Sequence[str], cells: Sequence[str], unit: str = "") -> Deci
         Quantities of the cells, such as ("date", "t"); see columns.stamp_columns.
     cells : sequence of str
     unit : str, optional
-        Unit of the second of a GPS week, if the name of the column states it. By default, the
+        Unit of the time within a GPS week, if the name of the column states it. By default, the
         number is in seconds, or in milliseconds if it is more than the seconds of two weeks.
 
     Returns

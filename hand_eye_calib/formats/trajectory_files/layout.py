@@ -214,7 +214,7 @@ _Merge = Callable[[Sequence[str]], list[str]]
 
 
 def _merged(split: CellsOf, merge: _Merge) -> CellsOf:
-    """Return a function that splits a line and then joins cells."""
+    """Return a function that splits a line, and joins cells that belong to one column."""
     return lambda line: merge(split(line))
 
 
@@ -248,7 +248,10 @@ def _is_split_stamp(cells: Sequence[str]) -> bool:
 
 
 class _Header(NamedTuple):
-    """Names of the columns, if there are any, and a function that joins cells of one column."""
+    """Names of the columns, if there are any, and a function that joins cells of a row.
+
+    It joins cells that belong to one column, such as a date and a time.
+    """
 
     names: tuple[str, ...] | None
     merge: _Merge | None = None

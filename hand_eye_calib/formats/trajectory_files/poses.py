@@ -57,7 +57,7 @@ _MATHEMATICAL = "counterclockwise from x (east)"
 # The angles are those of the inverse rotation, as in the library pyboreas.
 _INVERSE = "that of the world in the sensor's frame"
 # The rotations about x, y and z are applied in the opposite order.
-_OTHER_ORDER = "counterclockwise from x, about axes that roll and pitch have turned"
+_OTHER_ORDER = "counterclockwise from x, about the axis that roll and pitch have turned"
 # A sensor remains level if the scatter of the vertical direction in its axes, 1 minus the length of
 # the mean direction, is at most this value: about 1 minus the cosine of 2.5 deg.
 _LEVEL = 1e-3

@@ -94,7 +94,7 @@ class Table:
     stamp_unit : str
         Unit of the stamps; if empty, it is inferred from their magnitude.
     second_unit : str
-        Unit of the second of a GPS week; empty if the name of the column does not state it.
+        Unit of the time within a GPS week; empty if the name of the column does not state it.
 
     Raises
     ------
@@ -160,7 +160,7 @@ class Table:
                 )
 
     def _set_stamp_units(self, units: Sequence[str]) -> None:
-        """Set the units of the stamps and of the second of a GPS week.
+        """Set the units of the stamps and of the time within a GPS week.
 
         ``units`` are the units that the names of all columns state.
         """

@@ -288,7 +288,8 @@ class Goal:
             total_s += _confirming_motion(motion_s + total_s)
         else:
             total_s = self._confirmation_s(newest)
-            # This time is known, so it may be shorter than the last estimate by several steps.
+            # Forget the last reported total: the new one is known, not estimated, so that it may be
+            # shorter by several steps.
             self._steps[-1] = len(_STEPS_S) - 1
         *axes_left_s, total_s = self._in_steps(np.append(left_s, total_s))
         axes = self._by_axis(newest.sigmas, axes_left_s)

@@ -32,10 +32,11 @@ class StreamChecks:
         """Begin a new session without findings."""
         self._result: CheckResult | None = None
         self._checked_at_s = 0.0
-        # A finding is identified by its code and its stream. These are the findings of the last
-        # check, the findings that count, and among those the errors in the received poses.
+        # Codes and streams of the findings of the last check.
         self._reported: set[tuple[str, str]] = set()
+        # Findings that count, by code and stream.
         self._faults: dict[tuple[str, str], Finding] = {}
+        # Those of them that are errors in the received poses.
         self._pose_errors: dict[tuple[str, str], Finding] = {}
 
     def follow(self, config: CalibratorConfig) -> None:
