@@ -157,6 +157,19 @@ def test_compare_prints_the_history_of_a_folder(session, tmp_path, capsys):
         compare_digests(arguments(tmp_path, installed="robot.urdf"))
 
 
+def test_an_alarm_within_a_session_is_printed_and_is_no_good_exit(session, tmp_path, capsys):
+    *others, last = weeks(session, 5, np.zeros(6), since=6, n_weeks=4)
+    for digest in (*others, dataclasses.replace(last, alarm="moved about z by 1.5 deg")):
+        write_digest(tmp_path, digest)
+    assert compare_digests(arguments(tmp_path)) == 4
+    lines = capsys.readouterr().out.splitlines()
+    assert f"alarm in the session of {last.day}: moved about z by 1.5 deg" in lines[0]
+    assert lines[-1] == "  -- alarm in this session: moved about z by 1.5 deg"
+    assert compare_digests(arguments(tmp_path, json=True)) == 4
+    alarms = json.loads(capsys.readouterr().out)["alarms"]
+    assert alarms == {last.day: "moved about z by 1.5 deg"}
+
+
 def test_other_files_are_left_to_compare_and_unusable_digests_are_named(session, tmp_path):
     other = tmp_path / "extrinsic.yaml"
     other.write_text("a: 1\n")

@@ -33,6 +33,9 @@ from hand_eye_calib.online.live.progress import AXIS_KEYS
 # Covariance (6, 6) of an offset about which nothing is known.
 _UNKNOWN = np.diag(change.UNKNOWN**2)
 
+# Width of the column of an axis on the terminal, in letters.
+_WIDTH = 26
+
 
 @dataclass(frozen=True)
 class Changepoint:
@@ -121,8 +124,9 @@ def _shift_of(table: FloatArray, to_parent: FloatArray) -> change.Moved:
 
 
 def compare_digests(arguments: argparse.Namespace) -> int | None:
-    """Print the history of a mount, and return the exit code of ``compare``: 4 after a change.
+    """Print the history of a mount, and return the exit code of ``compare``.
 
+    The code is 4 after a change between sessions, and after an alarm of the monitor within one.
     None is returned if the arguments are no digests.
 
     Raises
@@ -146,9 +150,14 @@ def compare_digests(arguments: argparse.Namespace) -> int | None:
             }
             for item in changes
         ]
-        document = {"sessions": [digest.day for digest in digests], "changes": plain(rows)}
+        document = {
+            "sessions": [digest.day for digest in digests],
+            "changes": plain(rows),
+            "alarms": {digest.day: digest.alarm for digest in digests if digest.alarm},
+        }
     print_result(_lines(digests, changes), document)
-    return 4 if changes else 0
+    has_alarm = any(digest.alarm for digest in digests)
+    return 4 if changes or has_alarm else 0
 
 
 def _lines(digests: Sequence[Digest], changes: Sequence[Changepoint]) -> Iterator[str]:
@@ -156,13 +165,18 @@ def _lines(digests: Sequence[Digest], changes: Sequence[Changepoint]) -> Iterato
     first = digests[0]
     mount = f"Mount of {first.child_frame} on {first.parent_frame}"
     sessions = counted(len(digests), "session")
+    alarms = [digest for digest in digests if digest.alarm]
     if changes:
         newest = changes[-1]
         day = digests[newest.index].day
         yield f"{mount}: moved before {day}: {newest.shift.what} ({sessions})"
+    elif alarms:
+        # The monitor compares within a session, where the sessions as a whole may agree.
+        alarm = alarms[-1]
+        yield f"{mount}: alarm in the session of {alarm.day}: {alarm.alarm} ({sessions})"
     else:
         yield f"{mount}: no change in {sessions}"
-    names = "".join(f"{key.replace('_', ' '):>24}" for key in AXIS_KEYS.values())
+    names = "".join(f"{key.replace('_', ' '):>{_WIDTH}}" for key in AXIS_KEYS.values())
     yield f"  {'session':<18}{'motion':>8}{names}"
     by_index = {changepoint.index: changepoint for changepoint in changes}
     offset = np.zeros((6, 7))
@@ -177,4 +191,8 @@ def _lines(digests: Sequence[Digest], changes: Sequence[Changepoint]) -> Iterato
             f"{amount(axis, row.difference)} +/- {amount(axis, row.sigma)}"
             for axis, row in shift.axes.items()
         ]
-        yield f"  {digest.day:<18}{digest.seconds:>6} s" + "".join(f"{cell:>24}" for cell in cells)
+        yield f"  {digest.day:<18}{digest.seconds:>6} s" + "".join(
+            f"{cell:>{_WIDTH}}" for cell in cells
+        )
+        if digest.alarm:
+            yield f"  -- alarm in this session: {digest.alarm}"
