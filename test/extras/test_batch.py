@@ -4,6 +4,7 @@ say together.
 
 import contextlib
 import csv
+import dataclasses
 import functools
 import json
 import os
@@ -266,6 +267,22 @@ def test_rows_and_page_have_every_recording_and_the_vehicle(run, fleet, tmp_path
     monkeypatch.setattr(batch_run, "together", lambda results: 1 / 0)  # is not called again
     assert run(*fleet, *more, "--out", tmp_path / "1")[0] == 1
     assert (tmp_path / "1" / "index.html").read_text(encoding="utf-8") == page
+
+
+@pytest.mark.usefixtures("no_processes")
+def test_a_vehicle_whose_recordings_differ_is_no_good_exit(run, tmp_path, monkeypatch):
+    for number in range(2):
+        write_drive(tmp_path / "bags" / f"drive{number}", 60, number)
+
+    def differing(results):
+        return dataclasses.replace(good_calibration(), status=SolveStatus.NOT_CONVERGED)
+
+    monkeypatch.setattr(batch_run, "together", differing)
+    bags = ["--batch", f"{tmp_path}/bags/drive*", *STREAMS, "--reference", "B5", "--no-report"]
+    code, out, _ = run(*bags, "--vehicle", "truck", "--jobs", "1")
+    assert code == exit_code(differing(None))
+    assert code != 0
+    assert "1 vehicle: 1 DO NOT USE" in out
 
 
 @pytest.mark.parametrize("name", [" =cmd()", "＝1+1", "a;=cmd()"])

@@ -31,7 +31,7 @@ from hand_eye_calib.offline.cli.options import (
     waiting_for,
     with_progress,
 )
-from hand_eye_calib.offline.cli.present import deliver, gravest_code, wrapped
+from hand_eye_calib.offline.cli.present import deliver, exit_code, gravest_code, wrapped
 from hand_eye_calib.offline.cli.reporting import REPORT
 
 # Largest number of results on the terminal. rows.csv contains all results.
@@ -67,7 +67,9 @@ def run_batch(arguments: argparse.Namespace) -> int:
             "--vehicle to the position of the vehicle in their paths, such "
             "as 'fleet/{vehicle}/*'"
         )
-    return gravest_code(outcome.code for outcome in done)
+    codes = [outcome.code for outcome in done]
+    codes += [exit_code(result) for result in vehicles.values()]
+    return gravest_code(codes)
 
 
 def _print_json(title: str, done: Sequence[Outcome], vehicles: Mapping[str, Calibration]) -> None:
@@ -244,6 +246,10 @@ def _print_results(done: Sequence[Outcome], vehicles: Mapping[str, Calibration])
     print(f"{len(done) - failed} of {counted(len(done), 'bag')} calibrated, {failed} failed")
     if counts:
         print(listing([f"{count} {verdict}" for verdict, count in counts.items()]))
+    if vehicles:
+        counts = Counter(result.verdict.value for result in vehicles.values())
+        verdicts = listing([f"{count} {verdict}" for verdict, count in counts.items()])
+        print(f"{counted(len(vehicles), 'vehicle')}: {verdicts}")
     for name, result in vehicles.items():
         text = result.headline
         together = result.parts.get("together")
