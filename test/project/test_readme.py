@@ -231,7 +231,7 @@ def test_python_of_the_readme_runs(tmp_path, monkeypatch):
     assert result.covariance.shape == (6, 6)
     truth = names["hec"].read_trajectory("sample:truth.tum").poses[0]
     np.testing.assert_allclose(result.T_parent_child, truth, atol=5e-3)
-    assert (tmp_path / "result" / "extrinsic.yaml").exists()
+    assert (tmp_path / "python_result" / "extrinsic.yaml").exists()
 
 
 def anchors(text):
