@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 import pandas as pd
 
-from hand_eye_calib.core.assessment.covariance import common_mode_floor, usual_speed
+from hand_eye_calib.core.assessment.common_mode import common_mode_floor, usual_speed
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry.se3 import deviation
 from reproduction.coverage.scores import answer

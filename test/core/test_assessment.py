@@ -10,6 +10,7 @@ import real_data
 from sigmas import assert_errors_over_sigmas
 
 import hand_eye_calib as hec
+from hand_eye_calib.core.assessment import common_mode
 from hand_eye_calib.core.assessment import covariance as uncertainty
 from hand_eye_calib.core.assessment.reference_selection import select_reference
 from hand_eye_calib.core.base.blocks import Blocks
@@ -131,9 +132,9 @@ class TestFloor:
             answers.append(Method("dnl").solve(pairs))
         pairs = motion_pairs(parent.poses, child.poses, "B5")
         T = answers[0].T_parent_child
-        floor = uncertainty.floor_of_pairs(pairs, answers[0].weights, T, 0.0)
+        floor = common_mode.floor_of_pairs(pairs, answers[0].weights, T, 0.0)
         by_scale = se3.log(se3.inverse(T) @ answers[1].T_parent_child)
-        of_scale = floor - uncertainty.common_mode_floor()
+        of_scale = floor - common_mode.common_mode_floor()
         direction = by_scale / np.linalg.norm(by_scale)
         assert direction @ of_scale @ direction > 0.99 * np.trace(of_scale)
         # These poses know the scale far better than one per cent.
@@ -141,26 +142,26 @@ class TestFloor:
 
     def test_the_scale_is_as_open_as_the_data_leave_it(self):
         by_scale = np.r_[2.0, np.zeros(5)]
-        fixed = uncertainty.common_mode_floor()
-        np.testing.assert_allclose(np.diag(fixed)[:3], uncertainty.FLOOR_TRANSLATION**2)
-        np.testing.assert_allclose(np.diag(fixed)[3:], uncertainty.FLOOR_ROTATION**2)
+        fixed = common_mode.common_mode_floor()
+        np.testing.assert_allclose(np.diag(fixed)[:3], common_mode.FLOOR_TRANSLATION**2)
+        np.testing.assert_allclose(np.diag(fixed)[3:], common_mode.FLOOR_ROTATION**2)
         for variance, expected in ((1e6, 0.02), (0.01**2, 0.02 / np.sqrt(2)), (0.0, 0.0)):
-            floor = uncertainty.open_scale_floor(by_scale, variance)
+            floor = common_mode.open_scale_floor(by_scale, variance)
             assert np.sqrt(floor[0, 0]) == pytest.approx(expected, rel=1e-3)
 
     def test_what_is_far_away_moves_the_centre_of_a_fast_odometry(self):
-        sigmas = np.sqrt(np.diag(uncertainty.common_mode_floor(speed_m_s=2.4)))
+        sigmas = np.sqrt(np.diag(common_mode.common_mode_floor(speed_m_s=2.4)))
         np.testing.assert_allclose(sigmas[:3], 0.013)
         fast = hec.calibrate(*(stream.scaled(20.0) for stream in streams()), checks=False)
-        assert fast.allowance[:3].min() > 2 * uncertainty.FLOOR_TRANSLATION
+        assert fast.allowance[:3].min() > 2 * common_mode.FLOOR_TRANSLATION
 
     def test_neither_stops_nor_jumps_count_for_the_usual_speed(self):
         stamps_ns = np.arange(600) * 100_000_000
         x = 0.2 * np.clip(np.arange(600) - 300, 0, None)  # half of the time at rest, then 2 m/s
         x[500:] += 40.0
         positions = np.column_stack([x, 0.0 * x, 0.0 * x])
-        assert uncertainty.usual_speed(stamps_ns, positions) == pytest.approx(2.0)
-        assert uncertainty.usual_speed(stamps_ns, 0.0 * positions) == 0.0
+        assert common_mode.usual_speed(stamps_ns, positions) == pytest.approx(2.0)
+        assert common_mode.usual_speed(stamps_ns, 0.0 * positions) == 0.0
 
     def test_exact_poses_have_none(self):
         both = hec.calibrate(*streams(), parent_kind="exact", child_kind="exact", checks=False)
@@ -173,9 +174,9 @@ class TestFloor:
     @pytest.mark.parametrize("method", ["auto", "adaptive", "dnlo", "park"])
     def test_every_result_has_it_beside_the_covariance(self, method):
         result = hec.calibrate(*streams(), method=method, checks=False)
-        np.testing.assert_allclose(result.allowance[3:], uncertainty.FLOOR_ROTATION, rtol=1e-3)
-        assert 0.999 * uncertainty.FLOOR_TRANSLATION < result.allowance[:3].max() < 0.01
-        assert result.sigmas_measured[3:].max() < uncertainty.FLOOR_ROTATION
+        np.testing.assert_allclose(result.allowance[3:], common_mode.FLOOR_ROTATION, rtol=1e-3)
+        assert 0.999 * common_mode.FLOOR_TRANSLATION < result.allowance[:3].max() < 0.01
+        assert result.sigmas_measured[3:].max() < common_mode.FLOOR_ROTATION
         np.testing.assert_allclose(
             result.sigmas**2, result.sigmas_measured**2 + result.allowance**2
         )

@@ -232,9 +232,8 @@ def angular_rates(
     if of_speed:
         moved = np.linalg.norm(se3.translation_of(after) - se3.translation_of(before), axis=1)
     else:
-        moved = se3.rotation_angle(
-            np.swapaxes(se3.rotation_of(before), 1, 2) @ se3.rotation_of(after)
-        )
+        rotations = se3.relative_rotations(se3.rotation_of(before), se3.rotation_of(after))
+        moved = se3.rotation_angle(rotations)
     rates = moved / window_s
     # Number of long gaps before each pose. A window overlaps a gap if it differs at both ends.
     gaps_before = np.r_[0, np.cumsum(np.diff(stamps_ns) > (max_gap_s + window_s) * 1e9)]

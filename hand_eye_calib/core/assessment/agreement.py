@@ -1,19 +1,19 @@
-"""Common extrinsic of several recordings of one rig, and detection of results that do not belong.
+"""Common extrinsic of several recordings of one rig, and detection of results that differ.
 
-Random effects: result i is ``X Exp(u_i) Exp(e_i)``. The error e_i has the covariance of the result,
-u_i is the scatter between recordings, which none of them reveals. The standard deviations of u_i
-per axis are usual ones (:func:`~hand_eye_calib.core.assessment.moved.scatter_of_recordings`) times
-one unknown factor for the translation and one for the rotation. Each factor has a half-Cauchy prior
-of scale 1. X is the mean over both factors, weighted by prior and restricted likelihood (C. Röver,
-*Bayesian random-effects meta-analysis using the bayesmeta R package*, 2020). Information is added,
-so an axis that one recording does not reveal comes from another.
+The model has random effects: result i is ``X Exp(u_i) Exp(e_i)``. The error e_i has the covariance
+of the result. The scatter u_i between recordings has a standard deviation per axis: the usual one
+(:func:`~hand_eye_calib.core.assessment.moved.scatter_of_recordings`) times an unknown factor, one
+factor for the translation and one for the rotation. Each factor has a half-Cauchy prior of scale 1.
+X is the mean over both factors, weighted by prior and restricted likelihood (C. Röver, *Bayesian
+random-effects meta-analysis using the bayesmeta R package*, 2020). Each axis of X comes from the
+recordings that reveal the axis.
 
-Before that, two explanations of a contradiction are tried: one recording is off, or the mount has
-moved at some time. The better one is accepted if chance rarely produces one as good, both with the
-usual scatter and, by an F test, with the scatter of the others.
+Two explanations of a contradiction are tried first: one recording is off, or the mount has moved at
+some time. The better explanation is accepted if its p-value is small, both for the usual scatter
+(chi-square test) and for the scatter of the other results (F test).
 
-All values are along and about the axes of the parent. Motion on a plane hides the same direction
-there in every recording.
+All values are along and about the axes of the parent: motion on a plane hides the same direction of
+the parent in every recording.
 """
 
 import itertools
@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.blocks import Blocks, information, score
 from hand_eye_calib.core.base.text import amount, axes_in_words, listing
 from hand_eye_calib.core.geometry import se3
@@ -33,13 +33,14 @@ from hand_eye_calib.core.results.records import AXES
 
 # A direction with a larger standard deviation (m, rad) is unknown.
 _UNKNOWN = 0.3
-# Variance of an unknown direction: many results together have no information on it.
+# Variance (m^2, rad^2) of an unknown direction: so large that even many results together have no
+# information on the direction.
 _UNKNOWN_VARIANCE = 1e4
-# Rounds of the estimate of the common extrinsic.
+# Gauss-Newton steps of the common extrinsic.
 _ROUNDS = 2
 # Probability of a false alarm.
 _LEVEL = 0.01
-# Factors of the usual scatter. Results that scatter by more are not of one mount.
+# Grid of the factors of the usual scatter. Results that scatter by more are not of one mount.
 _FACTORS = np.geomspace(1 / 16, 16, 9)
 
 # Sentence by the kind of agreement.
@@ -65,19 +66,20 @@ class Agreement:
         Indices of the results that differ from the others: the result that is off, or all
         results since the mount has moved.
     T_parent_child : (4, 4) array
-        Common extrinsic of the others.
+        Common extrinsic of the results that are not apart.
     covariance : (6, 6) array
         Covariance of the common extrinsic, along and about the parent's axes. Unknown directions
         have a standard deviation of many metres.
     scatter : (6,) array
-        Standard deviation of u_i along (m) and about (rad) the axes, root mean square.
+        Estimated standard deviation of u_i along (m) and about (rad) the axes.
     chi2, dof, p_value : float, int, float
-        Of the hypothesis that all results are of one extrinsic and scatter as usual.
+        Chi-square test of the hypothesis that all results are of one extrinsic and scatter as
+        usual.
     excess : float
         Ratio of the scatter without the results apart to the usual scatter.
     deviations : (N, 6) array
-        Of each result from the common extrinsic: x, y, z (m) along the parent's axes and the
-        rotation vector (rad) about them. NaN on unknown axes of the result.
+        Deviation of each result from the common extrinsic: x, y, z (m) along the parent's axes and
+        the rotation vector (rad) about them. NaN on unknown axes of the result.
     sigmas : (N, 6) array
         Standard deviations of each result, with the usual scatter.
     """
@@ -115,14 +117,15 @@ class Agreement:
         """
         apart = [*self.apart]
         values = self.deviations[apart].mean(axis=0)
-        variances = (self.sigmas[apart] ** 2).mean(axis=0) / len(apart) + np.diag(self.covariance)
-        ratios = np.nan_to_num(np.abs(values) / np.sqrt(variances))
+        mean_variances = (self.sigmas[apart] ** 2).mean(axis=0) / len(apart)
+        sigmas = np.sqrt(mean_variances + np.diag(self.covariance))
+        ratios = np.nan_to_num(np.abs(values) / sigmas)
         moves = []
         for axis in np.argsort(-ratios):
             if ratios[axis] >= min(2.0, ratios.max()):
                 name = AXES[axis]
                 size = amount(name, values[axis])
-                sigma = amount(name, float(np.sqrt(variances[axis])))
+                sigma = amount(name, float(sigmas[axis]))
                 moves.append(f"{axes_in_words([name])} by {size} +/- {sigma}")
         return listing(moves)
 
@@ -145,21 +148,21 @@ def agreement_of(
         Usual standard deviations of u_i along (m) and about (rad) the axes. By default there is no
         scatter besides the covariances.
     level : float
-        Probability to report results that belong together.
+        Probability of reporting a difference between results of one extrinsic.
     """
-    tau = np.zeros(6) if usual is None else usual
+    usual_scatter = np.zeros(6) if usual is None else usual
     stated = np.array([_without_unknown(covariance) for covariance in covariances])
-    scattered = stated + np.diag(tau**2)
+    scattered = stated + np.diag(usual_scatter**2)
     weights = np.linalg.inv(scattered)
     best = int(np.argmax(np.trace(weights, axis1=1, axis2=2)))
     no_scatter = np.zeros(6)
-    start = _common(
-        Ts_parent_child, np.linalg.inv(weights), no_scatter, Ts_parent_child[best]
-    ).T_parent_child
+    first_guess = Ts_parent_child[best]
+    of_all = _common(Ts_parent_child, np.linalg.inv(weights), no_scatter, first_guess)
+    start = of_all.T_parent_child
     errors = deviation(Ts_parent_child, start)
     explanation = _explain(errors, weights, level)
     belongs = ~explanation.apart
-    common = _common(Ts_parent_child[belongs], stated[belongs], tau, start)
+    common = _common(Ts_parent_child[belongs], stated[belongs], usual_scatter, start)
     rest = _explain(errors[belongs], weights[belongs], 0.0)
     sigmas = np.sqrt(np.diagonal(scattered, axis1=1, axis2=2))
     sigmas = np.where(sigmas < _UNKNOWN, sigmas, np.nan)
@@ -190,27 +193,39 @@ class _Common(NamedTuple):
 def _common(
     Ts: FloatArray, covariances: FloatArray, usual_scatter: FloatArray, start: FloatArray
 ) -> _Common:
-    """Estimate the common extrinsic of N results that belong together.
+    """Estimate the common extrinsic of N results of one mount.
 
-    ``start`` (4, 4) is a first guess.
+    The estimate is the posterior mean over a grid of G pairs of factors.
+
+    Parameters
+    ----------
+    Ts : (N, 4, 4) array
+    covariances : (N, 6, 6) array
+        Without the scatter between recordings.
+    usual_scatter : (6,) array
+    start : (4, 4) array
+        Linearisation point of the first step.
     """
     factors = np.ones((1, 2))
     if usual_scatter.any():
         factors = np.array(list(itertools.product(_FACTORS, repeat=2)))
     variances = (np.repeat(factors, 3, axis=1) * usual_scatter) ** 2
-    spread = covariances + (variances[:, :, None] * np.eye(6))[:, None]
+    scatter_covariances = variances[:, :, None] * np.eye(6)
+    spread = covariances + scatter_covariances[:, None]
     weights = np.linalg.inv(spread)
-    means_covariances = np.linalg.inv(weights.sum(axis=1))
-    log_volumes = np.linalg.slogdet(spread)[1].sum(axis=1)
-    log_volumes = log_volumes - np.linalg.slogdet(means_covariances)[1]
-    # Half-Cauchy prior of each factor, per unit of its logarithm: the grid is uniform in the
-    # logarithm.
+    mean_covariances = np.linalg.inv(weights.sum(axis=1))
+    _, log_determinants = np.linalg.slogdet(spread)
+    _, log_determinants_of_mean = np.linalg.slogdet(mean_covariances)
+    # Restricted likelihood: the determinant of the mean's covariance is divided out.
+    log_volumes = log_determinants.sum(axis=1) - log_determinants_of_mean
+    # Half-Cauchy density of each factor times the factor: a density over the factor's logarithm, in
+    # which the grid is uniform.
     log_prior = np.log(factors / (1.0 + factors**2)).sum(axis=1)
     T = start
     for _ in range(_ROUNDS):
         errors = deviation(Ts, T)
         scores = np.einsum("gnij,nj->gi", weights, errors)
-        means = se3.times(means_covariances, scores)
+        means = se3.times(mean_covariances, scores)
         residuals = errors - means[:, None]
         weighted = np.einsum("gnij,gnj->gni", weights, residuals)
         squares = (residuals * weighted).sum(axis=(1, 2))
@@ -218,11 +233,14 @@ def _common(
         shares = np.exp(log_posterior - log_posterior.max())
         shares /= shares.sum()
         step = shares @ means
-        covariance = np.einsum("g,gij->ij", shares, means_covariances)
+        # Law of total variance: mean of the covariances plus covariance of the means.
+        covariance = np.einsum("g,gij->ij", shares, mean_covariances)
         covariance += (shares * (means - step).T) @ (means - step)
         rotation = se3.rotation_exp(step[3:]) @ se3.rotation_of(T)
-        T = se3.from_rotation_translation(rotation, se3.translation_of(T) + step[:3])
-    return _Common(T, covariance, np.sqrt(shares @ variances))
+        translation = se3.translation_of(T) + step[:3]
+        T = se3.from_rotation_translation(rotation, translation)
+    scatter = np.sqrt(shares @ variances)
+    return _Common(T, covariance, scatter)
 
 
 def unknown_directions(covariance: FloatArray) -> FloatArray:
@@ -232,7 +250,7 @@ def unknown_directions(covariance: FloatArray) -> FloatArray:
 
 
 def _without_unknown(covariance: FloatArray) -> FloatArray:
-    """Return a covariance (6, 6) with so large variances of unknown directions that they vanish."""
+    """Return a covariance (6, 6) with the variance of unknown directions set very large."""
     if not np.isfinite(covariance).all():
         return _UNKNOWN_VARIANCE * np.eye(6)
     values, vectors = np.linalg.eigh(covariance)
@@ -253,10 +271,11 @@ class _Explanation(NamedTuple):
 def _explain(errors: FloatArray, weights: FloatArray, level: float) -> _Explanation:
     """Explain errors (N, 6) of results with weights (N, 6, 6).
 
-    Each result alone is tried, and all results since each time. If both explain the errors equally,
-    one result is off.
+    An explanation splits the results into two groups with a mean each. The first group is a single
+    result, or all results since the mount has moved. If two explanations have the same p-value, a
+    single result is preferred.
     """
-    from scipy.special import chdtrc, fdtrc
+    from scipy.special import chdtrc
 
     n_results = len(errors)
     number = np.arange(n_results)
@@ -271,19 +290,7 @@ def _explain(errors: FloatArray, weights: FloatArray, level: float) -> _Explanat
         kind = kind if n_results == 2 else "single"
         return _Explanation(kind, apart, total_chi2, int(total_dof), p_value)
     since = np.arange(2, n_results - 1)
-    group = np.concatenate([products.sums, products.since(since)])
-    group_ranks = np.concatenate([ranks.sums, ranks.since(since)])
-    group_chi2, group_dof = _chi2_and_dof(group, group_ranks)
-    other_chi2, other_dof = _chi2_and_dof(products.total - group, ranks.total - group_ranks)
-    chi2 = group_chi2 + other_chi2
-    dof = group_dof + other_dof
-    gained = total_chi2 - chi2
-    spent = total_dof - dof
-    p_values = chdtrc(spent, gained)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        by_scatter_of_others = fdtrc(spent, dof, gained / spent / (chi2 / dof))
-    p_values = np.where(dof > 0, np.fmax(p_values, by_scatter_of_others), p_values)
-    p_values[spent <= 0] = 1.0
+    p_values = _p_values_of_splits(products, ranks, since)
     best = int(np.argmin(p_values))
     if len(p_values) * p_values[best] < level:
         if best < n_results:
@@ -297,8 +304,41 @@ def _explain(errors: FloatArray, weights: FloatArray, level: float) -> _Explanat
     return _Explanation(kind, apart, total_chi2, int(total_dof), p_value)
 
 
+def _p_values_of_splits(products: Blocks, ranks: Blocks, since: IntArray) -> FloatArray:
+    """Return the p-values (N + S,) of splits of N results into two groups.
+
+    The p-value is the larger of two tests: the chi-square test of the reduction of chi-square, and
+    the F test of this reduction against the remaining chi-square.
+
+    Parameters
+    ----------
+    products, ranks : Blocks
+        Of the results, as for :func:`_chi2_and_dof`.
+    since : (S,) int array
+        First results of the second groups. The first N splits separate a single result.
+    """
+    from scipy.special import chdtrc, fdtrc
+
+    total_chi2, total_dof = map(float, _chi2_and_dof(products.total, ranks.total))
+    group = np.concatenate([products.sums, products.since(since)])
+    group_ranks = np.concatenate([ranks.sums, ranks.since(since)])
+    group_chi2, group_dof = _chi2_and_dof(group, group_ranks)
+    other_chi2, other_dof = _chi2_and_dof(products.total - group, ranks.total - group_ranks)
+    chi2 = group_chi2 + other_chi2
+    dof = group_dof + other_dof
+    gained = total_chi2 - chi2
+    spent = total_dof - dof
+    p_values = chdtrc(spent, gained)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = gained / spent / (chi2 / dof)
+        by_scatter_of_others = fdtrc(spent, dof, ratios)
+    p_values = np.where(dof > 0, np.fmax(p_values, by_scatter_of_others), p_values)
+    p_values[spent <= 0] = 1.0
+    return p_values
+
+
 def _chi2_and_dof(products: FloatArray, ranks: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return chi-square and degrees of freedom of groups of errors about their common mean.
+    """Return chi-square and degrees of freedom of groups of errors about the mean of each group.
 
     Parameters
     ----------
@@ -315,6 +355,6 @@ def _chi2_and_dof(products: FloatArray, ranks: FloatArray) -> tuple[FloatArray, 
 
 
 def _ranks(weights: FloatArray) -> FloatArray:
-    """Numbers (...) of known directions of weights (..., 6, 6)."""
+    """Return the numbers (...) of known directions of weights (..., 6, 6)."""
     is_known = np.linalg.eigvalsh(weights) > 1 / _UNKNOWN**2
     return np.asarray(is_known.sum(axis=-1), dtype=float)

@@ -1,10 +1,10 @@
 """Test by axis whether an extrinsic has moved.
 
-The difference d of two estimates has the covariance C. An axis has moved if ``|d_k| / sigma_k``
-exceeds the value that the largest of six normal variables exceeds once in 200 comparisons. Without
-such an axis, the extrinsic has moved if ``d' C^-1 d`` exceeds the 99.9 % quantile of chi-square
-with 6 degrees of freedom. An axis is the same only if the test would detect a change that matters
-in nine of ten cases.
+The difference d of two estimates has the covariance C. An axis k has moved if ``|d_k| / sigma_k``
+exceeds a limit. The largest of six normal variables exceeds this limit once in 200 comparisons. The
+extrinsic has also moved if ``d' C^-1 d`` exceeds the 99.9 % quantile of chi-square with 6 degrees
+of freedom. An axis is the same only if the test would detect a change of the size that matters in
+nine of ten cases.
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from hand_eye_calib.core.results.records import AXES
 
 # Standard deviations (m, rad) that represent "unknown".
 UNKNOWN = np.sqrt(np.repeat([100.0, 10.0], 3))
-# Standard deviations above which an axis is unknown.
+# Standard deviations (m, rad) above which an axis is unknown.
 UNKNOWN_FROM = 0.1 * UNKNOWN
 
 
@@ -35,9 +35,10 @@ class Change(str, Enum):
     @classmethod
     def of_all(cls, changes: Sequence["Change"]) -> "Change":
         """Return the gravest of several verdicts."""
-        if cls.MOVED in changes:
-            return cls.MOVED
-        return cls.CANNOT_TELL if cls.CANNOT_TELL in changes else cls.SAME
+        for change in (cls.MOVED, cls.CANNOT_TELL):
+            if change in changes:
+                return change
+        return cls.SAME
 
 
 @dataclass(frozen=True)
@@ -76,17 +77,22 @@ class Moved:
     @property
     def what(self) -> str:
         """The axes that have moved; the two that differ most if none has moved on its own."""
-        axes = self._axes_that(Change.MOVED)
-        if not axes:
-            ratios = {axis: abs(each.difference) / each.sigma for axis, each in self.axes.items()}
-            different = [axis for axis in AXES if ratios.get(axis)]
-            axes = sorted(different, key=lambda axis: -ratios[axis])[:2]
+        axes = self._axes_that(Change.MOVED) or self._most_different_axes()
         moves = []
         for axis in axes:
             difference = amount(axis, self.axes[axis].difference)
             sigma = amount(axis, self.axes[axis].sigma)
             moves.append(f"{axis} by {difference} +/- {sigma}")
         return listing(moves) or "by what the axes show together, none of them alone"
+
+    def _most_different_axes(self) -> list[str]:
+        """Return the two axes that differ most, in standard deviations."""
+        ratios = {}
+        for axis in AXES:
+            if axis in self.axes:
+                ratios[axis] = abs(self.axes[axis].difference) / self.axes[axis].sigma
+        different = [axis for axis, ratio in ratios.items() if ratio]
+        return sorted(different, key=lambda axis: -ratios[axis])[:2]
 
     def _power(self, axes: Sequence[str]) -> str:
         """Describe the changes of these axes that the test would detect."""
@@ -106,10 +112,12 @@ def moved(values: FloatArray, covariance: FloatArray, limits: FloatArray) -> Mov
     values : (6,) array
         Difference along (m) and about (rad) the axes of the parent sensor's frame.
     covariance : (6, 6) array
-        Of the difference, with the scatter between recordings if there are two.
+        Of the difference. It includes the scatter between recordings if the estimates come from two
+        recordings.
     limits : (6,) array
         Changes that the test must detect before an axis is called the same.
     """
+    # Keep the covariance of noise-free estimates invertible.
     covariance = covariance + 1e-18 * np.eye(6)
     sigmas = np.sqrt(np.diag(covariance))
     chi2 = float(values @ np.linalg.solve(covariance, values))

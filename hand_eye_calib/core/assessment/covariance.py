@@ -5,19 +5,21 @@ micro Lie theory for state estimation in robotics*, 2018):
 
     X_true = X exp(xi),    cov(xi) = max(C_model, C_jackknife) + U U' + C_floor
 
-- C_model is the covariance under the noise model. The adaptive estimator has its own. For other
-  methods, motion pairs have independent, equally large errors, propagated to first order.
-- C_jackknife is the scatter of the answers without each tenth of the recording (B. Efron, R. J.
-  Tibshirani, *An introduction to the bootstrap*, 1993). It needs no noise model and includes
-  time-correlated errors such as drift. The larger of both holds in each direction.
+- C_model is the covariance under the noise model. The adaptive estimator computes its own C_model.
+  The other methods assume motion pairs with independent, equally large errors, and propagate these
+  errors to first order.
+- C_jackknife is the scatter of ten answers, each computed without one tenth of the recording
+  (B. Efron, R. J. Tibshirani, *An introduction to the bootstrap*, 1993). It needs no noise model
+  and includes time-correlated errors such as drift. The maximum is taken in each direction.
 - U are the directions that the motion does not reveal, times a standard deviation for "unknown".
 - C_floor is the common-mode floor: errors that are equal in every part of a recording, such as
-  wrong intrinsics of a camera or a stretched lidar map. Neither residuals nor halves reveal them.
+  wrong intrinsics of a camera or a stretched lidar map. They change neither the residuals nor the
+  difference between both halves of a recording.
 
-A rotation R moves the end of a lever arm d by (R - I) d. The mean square over K motions is d' S d
-with S = mean (R - I)'(R - I). If all rotations are about one axis, a lever arm d along that axis
-does not move, and the translation along the axis stays unknown. The covariance, the stream checks
-and the hints to the driver all use this rule.
+A rotation R displaces the end of a lever arm d by the chord (R - I) d. The mean square of the
+chord over K motions is d' S d with S = mean (R - I)'(R - I). If all rotations are about one axis,
+a lever arm along that axis is not displaced, and the translation along the axis stays unknown. The
+covariance, the stream checks and the hints to the driver all use this rule.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -25,9 +27,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.base.blocks import Blocks, jackknife_covariance
-from hand_eye_calib.core.base.stats import CHI2, median
+from hand_eye_calib.core.base.stats import CHI2
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import sigmas_in_parent
 from hand_eye_calib.core.noise.estimator import AdaptiveSolution, ModelSolution
@@ -45,34 +47,34 @@ _LEAST_BLOCKS = 4
 # Fewest motion pairs or increments in a block.
 _LEAST_BLOCK_SIZE = 3
 
-# An unseen direction of xi is a rotation if its part phi is longer than this.
+# Smallest length of the part phi of a unit vector xi (rho, phi) that counts as a rotation.
 _SHARE_OF_ROTATION = 0.5
 
 # Standard deviations (m, rad) that represent "unknown" in the covariance: the distance between
 # sensors on a large machine, and half a turn. An unknown direction is never exactly an axis of the
-# parent sensor, so a part of its variance is added to the other axes. Larger values would hide what
-# is known of these axes. The verdicts name the unknown axes.
+# parent sensor, so a part of its variance is added to the other axes. Larger values would exceed
+# the variances of these other axes.
 UNKNOWN_SIGMAS = np.repeat([3.0, np.pi], 3)
 
-# Smallest variance (m^2 or rad^2) that is divided by: the variance of noise-free data is zero.
+# Smallest divisor among variances (m^2 or rad^2): the variance of noise-free data is zero.
 ROUNDING_VARIANCE = 1e-24
 
 # Information below this share of the largest is rounding.
 _RANK_TOLERANCE = 1e-12
 
-# The motion reveals a direction of the lever arm if the rotations displace it with this many times
-# the power of the rotation errors. Below, noise alone looks like such a displacement.
+# The motion reveals a direction of the lever arm if the mean square displacement is this many times
+# the mean square displacement by rotation errors. Noise alone causes smaller ratios.
 _MIN_SIGNAL_TO_NOISE = 3.0
 
-# A direction must also move by this share of the direction that moves most. Otherwise all rotation
-# is about this direction to within 2.3 deg. Systematic odometry errors of 1 or 2 % of the rotation
-# are common, and the residuals do not contain them.
+# The displacement along a direction must also be this share of the displacement along the direction
+# that moves most. With a smaller share, all rotation is about this direction to within 2.3 deg.
+# Systematic odometry errors of 1 or 2 % of the rotation are common and absent from the residuals.
 _MIN_SHARE = 0.04
 
-# Rotation errors are at least this large (rad): rounding, not motion.
+# Smallest rotation error (rad): rounding of poses in files.
 _ROUNDING_ANGLE = 1e-6
 
-# An axis is hidden if this share of it lies in directions that are not revealed.
+# An axis is hidden if more than this share of its squared length lies in hidden directions.
 _HIDDEN_SHARE = 0.1
 
 # Standard deviations (m, rad) above which an axis is weak.
@@ -95,10 +97,10 @@ class Assessment:
         x, y, z, roll, pitch, yaw in the parent sensor's frame.
     contradictions : mapping
         Axis name to the distance between prior and motion in standard deviations, for axes on which
-        both contradict each other. The prior of these axes is ignored.
+        prior and motion contradict each other. The prior of these axes is ignored.
     from_motion : (6, 6) array
-        Share of an error of the estimate from motion that remains in the result, by xi: the
-        identity without a prior, zero along directions that only a prior determines.
+        Derivative of the result with respect to the estimate from motion, both as xi. It is the
+        identity without a prior, and zero along directions that only a prior determines.
     """
 
     T_parent_child: FloatArray
@@ -113,7 +115,10 @@ class Assessment:
         return np.array([dof.sigma for dof in self.observability])
 
     def allowance(self, of_motion: FloatArray) -> FloatArray:
-        """Return the allowance (6, 6) of the result from that of the estimate from motion."""
+        """Return the allowance (6, 6) of the result.
+
+        ``of_motion`` (6, 6) is the allowance of the estimate from motion.
+        """
         return self.from_motion @ of_motion @ self.from_motion.T
 
 
@@ -149,8 +154,8 @@ def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assess
     covariance = widened_by_blocks(solution.cov_parent_child_in_child, solution, slice(0, 6))
     least_share = _MIN_SHARE
     if not solution.is_noise_dominated:
-        # Rotations exceed the noise of single poses: the tilt of the axis is estimated, and half
-        # the share is enough.
+        # Rotations exceed the noise of single poses. The solution then includes an estimate of the
+        # tilt of the axis, and half the share is enough.
         least_share = _MIN_SHARE / 2
     hidden = _hidden_by_noise(
         pose_pairs.Ts_pw_p,
@@ -167,7 +172,7 @@ def assess_rotation(Ts_pw_p: FloatArray, solution: AdaptiveSolution) -> Assessme
     """Assess a solution of the adaptive estimator from rotations alone.
 
     The translation is unknown. If the sensors rotate about only one axis, the rotation about this
-    axis is unknown, too: it is the axis along which a lever arm would be hidden.
+    axis is unknown, too. This axis is the hidden direction of a lever arm.
 
     Parameters
     ----------
@@ -183,8 +188,10 @@ def assess_rotation(Ts_pw_p: FloatArray, solution: AdaptiveSolution) -> Assessme
     lone_axes = _hidden_by_noise(
         Ts_pw_p, solution.T_parent_child, solution.jumps, solution.rotation_variance
     )
+    translations = np.eye(6)[:3]
     rotations = [np.r_[np.zeros(3), phi] for phi in (*unseen, *lone_axes)]
-    return combined(solution.T_parent_child, covariance, basis([*np.eye(6)[:3], *rotations]))
+    unknown = basis([*translations, *rotations])
+    return combined(solution.T_parent_child, covariance, unknown)
 
 
 def assess_lever_arm(
@@ -210,28 +217,44 @@ def assess_lever_arm(
     """
     whole = np.zeros((6, 6))
     whole[:3, :3] = widened_by_blocks(covariance, solution, slice(0, 3)) + of_faults
-    # Bound the white rotation noise per axis by the differences between steps about the two axes
-    # with the smoothest rotation. Positions do not reveal it otherwise: noise of the orientation
-    # would look like a small motion that does not move the lever arm.
-    rotations = se3.rotation_of(Ts)
-    steps = se3.rotations_between(rotations[:-1], rotations[1:])
-    # Differences of steps have six times the variance of white noise.
-    variances = np.median(np.diff(steps, axis=0) ** 2, axis=0) / CHI2[0.5][1] / 6.0
-    white = float(np.sort(variances)[:2].mean())
+    white = _white_rotation_variance(se3.rotation_of(Ts))
     walk = np.exp(solution.levels[WALK_ROTATION])
-    hidden = _hidden_by_noise(
-        Ts, np.eye(4), solution.jumps, lambda n: np.asarray(2.0 * white + n * walk)
-    )
-    return combined(T, whole, basis([*np.eye(6)[3:], *_translations(hidden)]))
+
+    def rotation_variance(n_increments: int) -> FloatArray:
+        return np.asarray(2.0 * white + n_increments * walk)
+
+    hidden = _hidden_by_noise(Ts, np.eye(4), solution.jumps, rotation_variance)
+    rotations = np.eye(6)[3:]
+    unknown = basis([*rotations, *_translations(hidden)])
+    return combined(T, whole, unknown)
+
+
+def _white_rotation_variance(rotations: FloatArray) -> float:
+    """Return an upper bound of the variance (rad^2) per axis of the white rotation noise.
+
+    The bound comes from the differences between steps about the two axes with the smoothest
+    rotation. The positions of a lever arm do not reveal this noise: it looks like a small motion
+    that does not displace the lever arm.
+
+    Parameters
+    ----------
+    rotations : (N, 3, 3) array
+    """
+    steps = se3.rotations_between(rotations[:-1], rotations[1:])
+    squares = np.diff(steps, axis=0) ** 2
+    # Differences of steps have six times the variance of white noise.
+    variances = np.median(squares, axis=0) / CHI2[0.5][1] / 6.0
+    return float(np.sort(variances)[:2].mean())
 
 
 def widened_by_blocks(covariance: FloatArray, solution: ModelSolution, part: slice) -> FloatArray:
     """Widen the model's covariance of a part of xi to the scatter of blocks.
 
-    One factor serves all directions, the mean of their variance ratios: the ratio of a single
-    direction scatters too much. Rotations use a factor of their own if it is larger, because the
-    noise model easily takes slow rotation errors fixed to a sensor for errors fixed to a world. The
-    latter average out while the sensor moves, so the model's covariance is then too small.
+    All directions share one factor, the mean of their variance ratios: the ratio of a single
+    direction scatters too much. Rotations have a factor of their own if it is larger. The reason is
+    that the noise model may confuse slow rotation errors fixed to a sensor with errors fixed to a
+    world. Errors fixed to a world average out while the sensor moves, so the model's covariance is
+    then too small.
     """
     if len(solution.jumps) < BLOCKS * _LEAST_BLOCK_SIZE:
         return covariance
@@ -240,8 +263,8 @@ def widened_by_blocks(covariance: FloatArray, solution: ModelSolution, part: sli
     spread = jackknife_covariance(answers[:, part])
     factors = np.full(len(covariance), max(_mean_ratio(spread, covariance), 1.0))
     if len(covariance) == 6:
-        of_rotation = _mean_ratio(spread[3:, 3:], covariance[3:, 3:])
-        factors[3:] = np.maximum(factors[3:], of_rotation)
+        rotation_ratio = _mean_ratio(spread[3:, 3:], covariance[3:, 3:])
+        factors[3:] = np.maximum(factors[3:], rotation_ratio)
     return covariance * np.sqrt(np.outer(factors, factors))
 
 
@@ -260,15 +283,15 @@ def _hidden_by_noise(
 ) -> FloatArray:
     """Return the directions (U, 3) of translation that the rotations do not reveal.
 
-    A single increment may be smaller than its noise; sums of increments decide. Long baselines are
-    best if the noise is white, short ones if it drifts.
+    A single increment may be smaller than its noise, so sums of increments are tested, too. Long
+    baselines are best against white noise, short baselines against drift.
 
     Parameters
     ----------
     Ts_pw_p : (N, 4, 4) array
     T_parent_child : (4, 4) array
     jumps : (N - 1,) bool array
-        Increments that are no evidence.
+        Increments with a jump, which are ignored.
     rotation_variance : callable
         Variance (rad^2) per axis of the rotation noise over a number of increments.
     least_share : float
@@ -280,20 +303,22 @@ def _hidden_by_noise(
     jumps_before = np.concatenate([[0], np.cumsum(jumps)])
     candidates: list[FloatArray] = []
     for baseline in baselines[::-1].tolist():
-        motions = np.swapaxes(rotations[:-baseline], 1, 2) @ rotations[baseline:]
-        # Motions across a jump do not count, unless all of them are.
-        weights = (jumps_before[baseline:] == jumps_before[:-baseline]).astype(float)
-        if not weights.any():
+        motions = se3.relative_rotations(rotations[:-baseline], rotations[baseline:])
+        # Motions across a jump have weight zero, unless every motion is across a jump.
+        is_without_jump = jumps_before[baseline:] == jumps_before[:-baseline]
+        weights = is_without_jump.astype(float)
+        if not is_without_jump.any():
             weights[:] = 1.0
         chords = (motions - np.eye(3)) @ se3.rotation_of(T_parent_child)
         noise = rotation_variance(baseline) * np.eye(3)
         products = lever_arm_products(chords, weights)
         candidates.append(_hidden_directions(products, noise, least_share).T)
+    # The baseline that reveals most directions decides.
     return min(candidates, key=len)
 
 
 def _translations(directions: FloatArray) -> FloatArray:
-    """Directions (U, 6) of xi from directions (U, 3) of its translation."""
+    """Return directions (U, 6) of xi = (rho, 0) from directions (U, 3) of rho."""
     return np.pad(directions, ((0, 0), (0, 3)))
 
 
@@ -325,15 +350,17 @@ def combined(T_parent_child: FloatArray, covariance: FloatArray, unknown: FloatA
     whole = known @ covariance @ known + scaled @ scaled.T
     rotation = se3.rotation_of(T_parent_child)
     sigmas = sigmas_in_parent(rotation, whole)
-    unknown_shares = ((se3.block_diagonal(rotation) @ unknown) ** 2).sum(axis=1)
+    unknown_in_parent = se3.block_diagonal(rotation) @ unknown
+    unknown_shares = (unknown_in_parent**2).sum(axis=1)
     sigmas = np.where(unknown_shares > _HIDDEN_SHARE, np.inf, sigmas)
-    return Assessment(T_parent_child, whole, tuple(map(judged, AXES, sigmas.tolist())))
+    observability = map(judged, AXES, sigmas.tolist())
+    return Assessment(T_parent_child, whole, tuple(observability))
 
 
 def without_axes(assessment: Assessment, axes: Collection[str]) -> Assessment:
     """Return an assessment in which these axes of the parent's frame are unobservable."""
-    # An unobservable axis keeps its unknown direction, which hardly ever is exactly the axis: a
-    # second direction would hide another axis.
+    # An axis that is unobservable already has an unknown direction near it. The axis itself as a
+    # second direction would make another axis unobservable.
     is_hidden = [
         dof.name in axes and dof.verdict is not DofVerdict.UNOBSERVABLE
         for dof in assessment.observability
@@ -346,8 +373,8 @@ def without_axes(assessment: Assessment, axes: Collection[str]) -> Assessment:
 
 def without_direction(assessment: Assessment, axis: FloatArray) -> Assessment:
     """Return an assessment in which a lever arm along an axis (3,) of the parent is unknown."""
-    # An unobservable translation has this axis as its direction already. The same direction, added
-    # again with other rounding, would make a second axis unobservable.
+    # The direction of an unobservable translation is this axis already. A second, slightly
+    # different direction would make another axis unobservable.
     if any(dof.verdict is DofVerdict.UNOBSERVABLE for dof in assessment.observability[:3]):
         return assessment
     in_child = se3.rotation_of(assessment.T_parent_child).T @ axis
@@ -379,11 +406,12 @@ def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray
     weights = solution.weights
     n_effective = max(float(weights.sum()) - 3.0, 1.0)
     residual_t, residual_r = pairs.residuals(solution.T_parent_child)
-    variance_t = (weights @ (residual_t**2).sum(axis=1)) / (3 * n_effective)
+    squares_t = (residual_t**2).sum(axis=1)
+    variance_t = (weights @ squares_t) / (3 * n_effective)
     cov_r = (weights[:, None] * residual_r).T @ residual_r / n_effective
     variance_r = np.trace(cov_r) / 3
 
-    jacobian_t, jacobian_r = _derivatives(pairs, se3.rotation_of(solution.T_parent_child))
+    jacobian_t, jacobian_r = derivatives(pairs, se3.rotation_of(solution.T_parent_child))
     weight_of_pair = weights[:, None, None]
     information_t = multiplied(weight_of_pair * jacobian_t, jacobian_t)
     information_r = np.zeros((6, 6))
@@ -395,13 +423,16 @@ def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray
     is_seen = values > rounding
     inverse_values = np.divide(1.0, values, out=np.zeros(6), where=is_seen)
     inverse = (vectors * inverse_values) @ vectors.T
-    covariance = inverse @ (variance_t * information_t + 4 * variance_r * information_r) @ inverse
+    score_covariance = variance_t * information_t + 4 * variance_r * information_r
+    covariance = inverse @ score_covariance @ inverse
 
-    hidden = _hidden_directions(lever_arm_products(jacobian_t[..., :3], weights), cov_r).T
-    return covariance, basis([*_translations(hidden), *vectors[:, ~is_seen].T])
+    products = lever_arm_products(jacobian_t[..., :3], weights)
+    hidden = _hidden_directions(products, cov_r).T
+    unseen = vectors[:, ~is_seen].T
+    return covariance, basis([*_translations(hidden), *unseen])
 
 
-def _derivatives(pairs: MotionPairs, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
+def derivatives(pairs: MotionPairs, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Derivatives of the residuals of motion pairs.
 
     Returns
@@ -412,25 +443,29 @@ def _derivatives(pairs: MotionPairs, rotation: FloatArray) -> tuple[FloatArray, 
         Derivatives with respect to phi, in axes that differ from pair to pair by a rotation. Such a
         rotation does not change products J' J.
     """
-    # A chord is R_A - I.
-    chords = se3.rotation_of(pairs.Ts_parenti_parentj) - np.eye(3)
+    parent_chords = se3.rotation_of(pairs.Ts_parenti_parentj) - np.eye(3)
+    child_chords = se3.rotation_of(pairs.Ts_childi_childj) - np.eye(3)
+    by_rho = parent_chords @ rotation
     by_phi = rotation @ se3.skew(se3.translation_of(pairs.Ts_childi_childj))
-    of_rotation = se3.rotation_of(pairs.Ts_childi_childj) - np.eye(3)
-    return np.concatenate([chords @ rotation, by_phi], axis=2), of_rotation
+    of_translation = np.concatenate([by_rho, by_phi], axis=2)
+    return of_translation, child_chords
 
 
 def lever_arm_products(chords: FloatArray, weights: FloatArray | None = None) -> FloatArray:
-    """Return S (3, 3), the mean product of the chords of motions.
+    """Return S (3, 3), the weighted mean product of the chords of motions.
 
     Parameters
     ----------
     chords : (K, 3, 3) array
-        R - I of each motion; (R - I) Q for lever arms in a frame that Q rotates from.
+        R - I of each motion. For lever arms in another frame: (R - I) Q, where Q rotates from that
+        frame to the frame of R.
     weights : (K,) array, optional
         1 by default.
     """
-    weights = np.ones(len(chords)) if weights is None else weights
-    total = multiplied(weights[:, None, None] * chords, chords)
+    if weights is None:
+        weights = np.ones(len(chords))
+    weighted = weights[:, None, None] * chords
+    total = multiplied(weighted, chords)
     return total / max(float(weights.sum()), 1.0)
 
 
@@ -444,15 +479,22 @@ def _hidden_directions(
     products : (3, 3) array
         :func:`lever_arm_products` of the motions.
     cov_rotation : (3, 3) array
-        Covariance C of the rotation errors, rad^2, in the frame of the lever arms. An error e moves
-        a lever arm d by ``e x d``, with the mean square ``d' (tr(C) I - C) d``.
+        Covariance C of the rotation errors, rad^2, in the frame of the lever arms. An error e
+        displaces a lever arm d by ``e x d``, with the mean square ``d' (tr(C) I - C) d``.
     least_share : float
-        Least displacement, as a share of that along the direction that moves most.
+        Smallest displacement of a revealed direction, as a share of the displacement along the
+        direction that moves most.
     """
     powers, directions = np.linalg.eigh(products)
-    noise = np.trace(cov_rotation) * np.eye(3) - cov_rotation + _ROUNDING_ANGLE**2 * np.eye(3)
-    noise_powers = _MIN_SIGNAL_TO_NOISE * np.diag(directions.T @ noise @ directions)
-    return directions[:, powers < np.maximum(noise_powers, least_share**2 * powers[-1])]
+    identity = np.eye(3)
+    noise = np.trace(cov_rotation) * identity - cov_rotation
+    noise = noise + _ROUNDING_ANGLE**2 * identity
+    noise_powers = np.diag(directions.T @ noise @ directions)
+    least_powers = np.maximum(
+        _MIN_SIGNAL_TO_NOISE * noise_powers,
+        least_share**2 * powers[-1],
+    )
+    return directions[:, powers < least_powers]
 
 
 def hidden_axes(products: FloatArray, cov_rotation: FloatArray | None = None) -> tuple[str, ...]:
@@ -465,9 +507,11 @@ def hidden_axes(products: FloatArray, cov_rotation: FloatArray | None = None) ->
     cov_rotation : (3, 3) array, optional
         Covariance of the rotation errors, rad^2; zero by default.
     """
-    cov_rotation = np.zeros((3, 3)) if cov_rotation is None else cov_rotation
-    shares = (_hidden_directions(products, cov_rotation) ** 2).sum(axis=1)
-    return tuple(axis for axis, share in zip("xyz", shares, strict=True) if share > _HIDDEN_SHARE)
+    if cov_rotation is None:
+        cov_rotation = np.zeros((3, 3))
+    directions = _hidden_directions(products, cov_rotation)
+    shares = (directions**2).sum(axis=1)
+    return tuple("xyz"[index] for index in np.flatnonzero(shares > _HIDDEN_SHARE))
 
 
 def basis(directions: list[FloatArray]) -> FloatArray:
@@ -485,114 +529,3 @@ def judged(axis: str, sigma: float) -> DofObservability:
     is_weak = sigma > WEAK[axis in ROTATIONS]
     verdict = DofVerdict.WEAK if is_weak else DofVerdict.OBSERVED
     return DofObservability(axis, verdict, sigma)
-
-
-# -------------------------------------------------------------------- the common-mode floor
-
-# Standard deviation along each axis (m): odometries on real recordings with a known extrinsic agree
-# to this on where the frame of a sensor is.
-FLOOR_TRANSLATION = 0.005
-# Standard deviation about each axis (rad), from the same recordings.
-FLOOR_ROTATION = float(np.radians(0.15))
-# Prior standard deviation of the scale of a path that is not part of the model.
-FLOOR_SCALE = 0.01
-# Standard deviation along each axis per speed (s). Rotations of an odometry are right to 0.25 %.
-# The odometry moves its own centre by this share of the distance of what it observes, about two
-# seconds of travel. Of ten real rigs, those on roads agree with 5 to 15 ms: centres are 6 to 14 cm
-# off there, and 1 cm in rooms.
-FLOOR_TRAVEL_S = 0.005
-
-# Speeds are means over this time (s), so that noise between neighbouring poses counts little.
-_SPEED_OVER_S = 1.0
-
-# Information below this share of the largest is noise: such directions are unknown anyway.
-_MIN_INFORMATION = 1e-6
-
-
-def common_mode_floor(speed_m_s: float = 0.0) -> FloatArray:
-    """Return the common-mode floor for a scale that is part of the model.
-
-    Parameters
-    ----------
-    speed_m_s : float
-        Usual speed of the recording.
-
-    Returns
-    -------
-    (6, 6) array
-        Covariance of xi = (rho, phi), in the child sensor's frame.
-    """
-    translation = FLOOR_TRANSLATION**2 + (FLOOR_TRAVEL_S * speed_m_s) ** 2
-    return np.diag(np.repeat([translation, FLOOR_ROTATION**2], 3))
-
-
-def usual_speed(stamps_ns: IntArray, positions: FloatArray) -> float:
-    """Return the speed (m/s) above which half of the path is driven.
-
-    Neither stops nor jumps change it.
-
-    Parameters
-    ----------
-    stamps_ns : (N,) int64 array
-    positions : (N, 3) array
-    """
-    step_s = median(np.diff(stamps_ns)) * 1e-9 if len(stamps_ns) > 1 else 1.0
-    stride = max(1, round(_SPEED_OVER_S / step_s))
-    durations_s = np.diff(stamps_ns[::stride]) * 1e-9
-    lengths_m = np.linalg.norm(np.diff(positions[::stride], axis=0), axis=1)
-    if not lengths_m.any():
-        return 0.0
-    speeds = lengths_m / durations_s
-    order = np.argsort(speeds)
-    driven_m = np.cumsum(lengths_m[order])
-    middle = np.searchsorted(driven_m, driven_m[-1] / 2)
-    return float(speeds[order[middle]])
-
-
-def open_scale_floor(by_scale: FloatArray, scale_variance: float) -> FloatArray:
-    """Return the part of the floor (6, 6) of a scale outside the model.
-
-    Parameters
-    ----------
-    by_scale : (6,) array
-        Derivative of the answer with respect to the logarithm of the scale of the child's path.
-    scale_variance : float
-        Variance of this scale, by the data alone.
-    """
-    open_variance = FLOOR_SCALE**2 * scale_variance / (FLOOR_SCALE**2 + scale_variance)
-    return open_variance * np.outer(by_scale, by_scale)
-
-
-def floor_of_pairs(
-    pairs: MotionPairs, weights: FloatArray, T_parent_child: FloatArray, speed_m_s: float
-) -> FloatArray:
-    """Return the floor (6, 6) of an answer that minimises the squared residuals of motion pairs.
-
-    With the child's translations times s, the residual ``(R_A - I) t + t_A - s R t_B`` changes by
-    ``-R t_B ds``. Overlapping pairs are as much evidence of the scale as separate ones.
-
-    Parameters
-    ----------
-    pairs : MotionPairs
-        K motion pairs.
-    weights : (K,) array
-    T_parent_child : (4, 4) array
-    speed_m_s : float
-        Usual speed of the recording.
-    """
-    rotation = se3.rotation_of(T_parent_child)
-    by_xi, of_rotation = _derivatives(pairs, rotation)
-    by_log_scale = (se3.translation_of(pairs.Ts_childi_childj) @ rotation.T)[:, :, None]
-    residuals = pairs.residuals(T_parent_child)[0][:, :, None]
-    columns = np.concatenate([by_xi, by_log_scale, residuals], axis=2)
-    weight_of_pair = weights[:, None, None]
-    products = multiplied(weight_of_pair * columns, columns)
-    information = products[:6, :6].copy()
-    information[3:, 3:] += 2 * multiplied(weight_of_pair * of_rotation, of_rotation)
-    coupling = products[:6, 6]
-    by_scale = np.linalg.pinv(information, rcond=_MIN_INFORMATION, hermitian=True) @ coupling
-    scale_information = max(float(products[6, 6] - coupling @ by_scale), 1e-30)
-    overlap = float(np.mean(pairs.j - pairs.i)) if len(pairs) else 1.0
-    variance = overlap * products[7, 7] / max(3.0 * float(weights.sum()) - 7.0, 1.0)
-    scale_variance = float(variance / scale_information)
-    return common_mode_floor(speed_m_s) + open_scale_floor(by_scale, scale_variance)

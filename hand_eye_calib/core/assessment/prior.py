@@ -1,18 +1,19 @@
 """Fusion of the estimate from motion with a prior.
 
-Both are measurements, weighted by their covariances: with the estimate X0 of covariance C and the
-residuals r(X) of the prior in its standard deviations, the result minimises (Gauss-Newton)
+The estimate from motion X0 has the covariance C. The residuals r(X) of the prior are divided by its
+standard deviations. The result X minimises, by Gauss-Newton steps ``X <- X exp(step)``,
 
-    Log(X0^-1 X)' C^-1 Log(X0^-1 X) + r(X)' r(X),    X <- X exp(step).
+    d(X)' C^-1 d(X) + r(X)' r(X),
 
-Only the prior determines a direction that the motion does not reveal. Without a prior, the
-translation along such a direction is set to zero, because the estimate is only noise, and the
-direction stays unknown. Reference: T. Barfoot, *State estimation for robotics*, 2017.
+where d(X) is the deviation (rho, phi) of X from X0 in the child's frame. Only the prior determines
+a direction that the motion does not reveal. Without a prior, the direction stays unknown, and the
+translation along it is set to zero, because the estimate is only noise. Reference: T. Barfoot,
+*State estimation for robotics*, 2017.
 """
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -31,22 +32,23 @@ from hand_eye_calib.core.results.records import AXES, ROTATIONS, TRANSLATIONS
 # Axis name to (value, standard deviation), in m and rad.
 Prior: TypeAlias = Mapping[str, tuple[float, float]]
 
-# A direction is unknown from this share of the variance that represents "unknown" on.
+# A direction is unknown if its variance exceeds this share of the variance for "unknown".
 _UNKNOWN_SHARE = 0.25
 
+# Largest number of Gauss-Newton steps.
 _MAX_STEPS = 20
 # The iteration ends below this step (m, rad).
 _STEP_TOLERANCE = 1e-12
 
-# Step of numerical derivatives (m or rad), and smallest standard deviation of a prior. Smaller ones
-# make the equations singular, and nobody measures better.
+# Step of numerical derivatives (m or rad), and smallest standard deviation of a prior: a smaller
+# one makes the equations singular.
 _SMALL = 1e-6
 
 # A prior contradicts the estimate from motion above this many standard deviations.
 _MAX_DISTANCE = 4.0
 
-# Largest lever arm (m) of any machine: a prior above it is in another unit. It serves unobservable
-# axes, where the motion cannot contradict a prior.
+# Largest lever arm (m) of any machine: a longer prior is in another unit. This limit replaces the
+# distance above on unobservable axes, where the motion cannot contradict a prior.
 _MAX_LEVER_ARM = 50.0
 
 
@@ -63,43 +65,91 @@ def fuse(assessment: Assessment, prior: Prior) -> Assessment:
     """
     start = assessment.T_parent_child
     covariance = assessment.cov_parent_child_in_child
-    shares, vectors = np.linalg.eigh(covariance / np.outer(UNKNOWN_SIGMAS, UNKNOWN_SIGMAS))
-    unknown = np.linalg.qr(UNKNOWN_SIGMAS[:, None] * vectors[:, shares > _UNKNOWN_SHARE])[0]
+    unknown = _unknown_directions(covariance)
     contradictions = _contradictions(assessment, prior) if prior else {}
     prior = {axis: prior[axis] for axis in prior if axis not in contradictions}
     without_prior = replace(assessment, contradictions=contradictions)
     if not prior and not unknown.shape[1]:
         return without_prior
-    root, inverse_root, targets = _whitened(start, covariance, unknown)
-    T = start
+    whitening = _whitened(start, covariance, unknown)
+    T, normal = _minimum(start, whitening, prior)
+    if not prior:
+        return replace(without_prior, T_parent_child=T)
+    whitened_covariance = np.linalg.inv(normal)
+    posterior = whitening.root @ whitened_covariance @ whitening.root.T
+    sigmas = sigmas_in_parent(se3.rotation_of(T), posterior)
+    motion_sigmas = sigmas_in_parent(se3.rotation_of(start), covariance)
+    verdicts = []
+    for axis, sigma, motion_sigma in zip(AXES, sigmas.tolist(), motion_sigmas, strict=True):
+        has_prior = axis in prior
+        verdicts.append(_verdict_on(axis, sigma, motion_sigma, has_prior))
+    from_motion = whitening.root @ whitened_covariance @ whitening.inverse_root
+    return Assessment(T, posterior, tuple(verdicts), contradictions, from_motion)
+
+
+def _unknown_directions(covariance: FloatArray) -> FloatArray:
+    """Return an orthonormal basis (6, U) of the unknown directions of a covariance (6, 6)."""
+    relative = covariance / np.outer(UNKNOWN_SIGMAS, UNKNOWN_SIGMAS)
+    shares, vectors = np.linalg.eigh(relative)
+    directions = UNKNOWN_SIGMAS[:, None] * vectors[:, shares > _UNKNOWN_SHARE]
+    orthonormal, _ = np.linalg.qr(directions)
+    return np.asarray(orthonormal)
+
+
+class _Whitening(NamedTuple):
+    """Coordinates in which deviations from the estimate have unit variance.
+
+    Attributes
+    ----------
+    root : (6, 6) array
+        From coordinates of unit variance to deviations (rho, phi).
+    inverse_root : (6, 6) array
+        From deviations to coordinates of unit variance.
+    targets : (6,) array
+        Deviation, in these coordinates, of the result without a prior. It is zero along known
+        directions. Along unknown directions, it makes the translation of X zero.
+    """
+
+    root: FloatArray
+    inverse_root: FloatArray
+    targets: FloatArray
+
+
+def _minimum(
+    start: FloatArray, whitening: _Whitening, prior: Prior
+) -> tuple[FloatArray, FloatArray]:
+    """Return the minimum (4, 4) of the cost, and the normal matrix (6, 6) there.
+
+    The normal matrix is in coordinates of unit variance.
+    """
+    root = whitening.root
     back = se3.rotation_of(start).T
+    T = start
     for _ in range(_MAX_STEPS):
         residuals, jacobian = _prior_residuals(T, prior)
         jacobian = jacobian @ root
         normal = np.eye(6) + jacobian.T @ jacobian
         translation = back @ (se3.translation_of(T) - se3.translation_of(start))
-        change = np.concatenate([translation, se3.rotation_log(back @ se3.rotation_of(T))])
-        step = -root @ np.linalg.solve(
-            normal, inverse_root @ change - targets + jacobian.T @ residuals
-        )
+        rotation = se3.rotation_log(back @ se3.rotation_of(T))
+        deviation = np.concatenate([translation, rotation])
+        from_targets = whitening.inverse_root @ deviation - whitening.targets
+        gradient = from_targets + jacobian.T @ residuals
+        step = -root @ np.linalg.solve(normal, gradient)
         T = se3.retracted(T, step)
         if np.abs(step).max() < _STEP_TOLERANCE:
             break
-    if not prior:
-        return replace(without_prior, T_parent_child=T)
-    posterior = root @ np.linalg.inv(normal) @ root.T
-    sigmas = sigmas_in_parent(se3.rotation_of(T), posterior)
-    motion_sigmas = sigmas_in_parent(se3.rotation_of(start), covariance)
-    verdicts = []
-    for axis, sigma, motion_sigma in zip(AXES, sigmas.tolist(), motion_sigmas, strict=True):
-        verdict = judged(axis, sigma)
-        is_observable = verdict.verdict is not DofVerdict.UNOBSERVABLE
-        # An axis is mostly from the prior if the prior at least halves its variance.
-        if is_observable and axis in prior and 2 * sigma**2 < motion_sigma**2:
-            verdict = DofObservability(axis, DofVerdict.PRIOR, sigma)
-        verdicts.append(verdict)
-    from_motion = root @ np.linalg.inv(normal) @ inverse_root
-    return Assessment(T, posterior, tuple(verdicts), contradictions, from_motion)
+    return T, normal
+
+
+def _verdict_on(axis: str, sigma: float, motion_sigma: float, has_prior: bool) -> DofObservability:
+    """Return the verdict on an axis from its standard deviations, fused and by motion alone."""
+    verdict = judged(axis, sigma)
+    is_observable = verdict.verdict is not DofVerdict.UNOBSERVABLE
+    # The value of an axis is mostly the prior's if the prior at least halves its variance.
+    is_halved = 2 * sigma**2 < motion_sigma**2
+    if is_observable and has_prior and is_halved:
+        return DofObservability(axis, DofVerdict.PRIOR, sigma)
+    return verdict
 
 
 def widened(assessment: Assessment, spread: FloatArray) -> Assessment:
@@ -119,39 +169,32 @@ def widened(assessment: Assessment, spread: FloatArray) -> Assessment:
 
 def _whitened(
     T_parent_child: FloatArray, covariance: FloatArray, unknown: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Whiten deviations from the estimate.
+) -> _Whitening:
+    """Return coordinates in which deviations from the estimate have unit variance.
 
-    The variances of known and unknown directions differ by many powers of ten.
-
-    Returns
-    -------
-    root : (6, 6) array
-        From coordinates of unit variance to deviations (rho, phi).
-    inverse_root : (6, 6) array
-        From deviations to coordinates of unit variance.
-    targets : (6,) array
-        Deviation, in these coordinates, of the result without a prior. It is zero along known
-        directions. Along unknown directions, it makes the translation of X zero.
+    The variances of known and unknown directions differ by many powers of ten, so known and unknown
+    directions are whitened separately.
     """
     values, vectors = np.linalg.eigh(unknown @ unknown.T)
     known = vectors[:, values < 0.5]
     variances, axes = np.linalg.eigh(known.T @ covariance @ known)
+    known_sigmas = np.sqrt(np.maximum(variances, ROUNDING_VARIANCE))
     is_translation = (unknown[:3] ** 2).sum(axis=0) > 0.5
     unknown_sigmas = np.where(is_translation, UNKNOWN_SIGMAS[0], UNKNOWN_SIGMAS[-1])
     directions = np.concatenate([known @ axes, unknown], axis=1)
-    sigmas = np.concatenate([np.sqrt(np.maximum(variances, ROUNDING_VARIANCE)), unknown_sigmas])
+    sigmas = np.concatenate([known_sigmas, unknown_sigmas])
     in_child = se3.rotation_of(T_parent_child).T @ se3.translation_of(T_parent_child)
-    targets = np.where(is_translation, -(unknown[:3].T @ in_child), 0.0) / unknown_sigmas
-    targets = np.concatenate([np.zeros(len(variances)), targets])
-    return directions * sigmas, (directions / sigmas).T, targets
+    to_zero = -(unknown[:3].T @ in_child)
+    unknown_targets = np.where(is_translation, to_zero, 0.0) / unknown_sigmas
+    return _Whitening(
+        root=directions * sigmas,
+        inverse_root=(directions / sigmas).T,
+        targets=np.concatenate([np.zeros(len(variances)), unknown_targets]),
+    )
 
 
 def _prior_residuals(T: FloatArray, prior: Prior) -> tuple[FloatArray, FloatArray]:
-    """Return weighted residuals (P,) of the prior, and derivatives (P, 6).
-
-    The derivatives are with respect to (rho, phi).
-    """
+    """Return weighted residuals (P,) of the prior, and their derivatives (P, 6) by (rho, phi)."""
     residuals = _weighted(T, prior)
     jacobian = np.zeros((len(prior), 6))
     for column, step in enumerate(_SMALL * np.eye(6)):
@@ -162,25 +205,31 @@ def _prior_residuals(T: FloatArray, prior: Prior) -> tuple[FloatArray, FloatArra
 
 
 def _weighted(T: FloatArray, prior: Prior) -> FloatArray:
-    """Values (P,) of the transform less those of the prior, in its standard deviations."""
-    errors = dict(zip(TRANSLATIONS, se3.translation_of(T), strict=True))
-    errors = {axis: errors[axis] - prior[axis][0] for axis in TRANSLATIONS if axis in prior}
+    """Return the errors (P,) of a transform from the prior, in the prior's standard deviations."""
+    errors = {}
+    for axis, value in zip(TRANSLATIONS, se3.translation_of(T), strict=True):
+        if axis in prior:
+            errors[axis] = value - prior[axis][0]
     angles = {axis: prior[axis][0] for axis in ROTATIONS if axis in prior}
+    rotation = se3.rotation_of(T)
     if len(angles) == 3:
-        # A full rotation: no angle is singular.
+        # The rotation vector from the prior to T has no gimbal lock.
         nominal = se3.rotation_from_rpy(list(angles.values()))
-        errors |= dict(
-            zip(ROTATIONS, se3.rotation_log(se3.rotation_of(T) @ nominal.T), strict=True)
-        )
+        rotation_vector = se3.rotation_log(rotation @ nominal.T)
+        errors |= dict(zip(ROTATIONS, rotation_vector, strict=True))
     elif angles:
-        rpy = dict(zip(ROTATIONS, se3.rotation_to_rpy(se3.rotation_of(T)), strict=True))
+        rpy = dict(zip(ROTATIONS, se3.rotation_to_rpy(rotation), strict=True))
         for axis, angle in angles.items():
+            # The phase of a complex number is between -pi and pi.
             errors[axis] = np.angle(np.exp(1j * (rpy[axis] - angle)))
     return np.array([errors[axis] / max(sigma, _SMALL) for axis, (_, sigma) in prior.items()])
 
 
 def _contradictions(assessment: Assessment, prior: Prior) -> dict[str, float]:
-    """Axis name to the distance of the prior in standard deviations, if it is too large."""
+    """Return the axes whose prior contradicts the motion.
+
+    The values are the distances between prior and motion, in standard deviations of both together.
+    """
     residuals, jacobian = _prior_residuals(assessment.T_parent_child, prior)
     covariance = assessment.cov_parent_child_in_child
     variances = 1.0 + np.einsum("pi,ij,pj->p", jacobian, covariance, jacobian)

@@ -1,4 +1,4 @@
-"""Option ``reference: auto``: the reference with the answer nearest to the adaptive estimator's."""
+"""Option ``reference: auto``: choose the reference with the answer nearest to ``adaptive``."""
 
 from dataclasses import dataclass
 
@@ -11,6 +11,7 @@ from hand_eye_calib.core.noise.estimator import AdaptiveSolution
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs, motion_pairs
 from hand_eye_calib.core.solvers.registry import Method
 
+# References that are compared.
 _CANDIDATES = ("B1", "B2", "B3", "B5", "B7", "B10", "B15", "B20", "C5", "C10")
 
 # Fewest poses for an estimate of the noise.
@@ -27,8 +28,8 @@ class ReferenceChoice:
     ----------
     reference : str
     distances : dict of str to float
-        Candidate to the distance of its answer from that of the adaptive estimator, in standard
-        deviations of the latter.
+        Distance of the answer of each candidate from the answer of the adaptive estimator, in
+        standard deviations of the adaptive estimator.
     model : AdaptiveSolution
         The answer of the adaptive estimator.
     """
@@ -53,9 +54,9 @@ def select_reference(
     """Choose the reference for a method.
 
     The residual does not indicate the best reference (Välimäki et al. 2023, section 4.2). The
-    adaptive estimator does: its error is smaller and, as the error of the best linear estimator,
-    uncorrelated with the distance of other answers from its own. So the nearest answer is probably
-    the best one.
+    answer X0 of the adaptive estimator does. Its error is smaller. As the error of the best linear
+    estimator, it is also uncorrelated with the distance between X0 and other answers. So the answer
+    nearest to X0 is probably the best answer.
 
     Parameters
     ----------
@@ -82,7 +83,9 @@ def select_reference(
     for reference in _CANDIDATES:
         pairs = motion_pairs(*poses, reference)
         if len(pairs) >= _MIN_PAIRS:
-            deviation = se3.log(back @ method.solve(pairs).T_parent_child)
-            distances[reference] = max(float(deviation @ information @ deviation), 0.0) ** 0.5
+            answer = method.solve(pairs).T_parent_child
+            deviation = se3.log(back @ answer)
+            square = float(deviation @ information @ deviation)
+            distances[reference] = max(square, 0.0) ** 0.5
     nearest = min(distances, key=distances.__getitem__)
     return ReferenceChoice(nearest, distances, solution)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.core.assessment.covariance import FLOOR_TRAVEL_S, usual_speed
+from hand_eye_calib.core.assessment.common_mode import FLOOR_TRAVEL_S, usual_speed
 from hand_eye_calib.core.assessment.moved import SIGNIFICANT, MountChange, find_change
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.stats import median, quantile

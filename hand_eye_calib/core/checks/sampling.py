@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.core.assessment.covariance import usual_speed
+from hand_eye_calib.core.assessment.common_mode import usual_speed
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.checks.findings import Finding, finding, graded

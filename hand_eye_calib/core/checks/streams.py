@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-from hand_eye_calib.core.assessment.covariance import usual_speed
+from hand_eye_calib.core.assessment.common_mode import usual_speed
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.stats import median, quantile

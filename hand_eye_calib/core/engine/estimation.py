@@ -12,7 +12,7 @@ import numpy as np
 
 from hand_eye_calib.core.alignment.similarity import SimilarityFit, settle_scale
 from hand_eye_calib.core.alignment.time_offset import TimeOffset
-from hand_eye_calib.core.assessment import covariance
+from hand_eye_calib.core.assessment import common_mode, covariance
 from hand_eye_calib.core.assessment.moved import possible_shift
 from hand_eye_calib.core.assessment.prior import fuse, widened
 from hand_eye_calib.core.assessment.rocking import rocking_axis
@@ -306,13 +306,15 @@ def solve_poses(
 
 def floor_of(solved: Solved, pose_pairs: PosePairs, config: CalibratorConfig) -> FloatArray:
     """Return the covariance (6, 6) of constant errors of the sensors that are odometries."""
-    # The functions in `covariance` return the covariance for two odometries.
+    # The functions in `common_mode` return the covariance for two odometries.
     share = [config.parent_kind, config.child_kind].count("odometry") / 2
-    speed_m_s = covariance.usual_speed(pose_pairs.stamps_ns, se3.translation_of(pose_pairs.Ts_pw_p))
+    speed_m_s = common_mode.usual_speed(
+        pose_pairs.stamps_ns, se3.translation_of(pose_pairs.Ts_pw_p)
+    )
     if isinstance(solved.solution, AdaptiveSolution):
-        return share * covariance.common_mode_floor(speed_m_s)
+        return share * common_mode.common_mode_floor(speed_m_s)
     T = solved.solution.T_parent_child
-    return share * covariance.floor_of_pairs(solved.pairs, solved.weights, T, speed_m_s)
+    return share * common_mode.floor_of_pairs(solved.pairs, solved.weights, T, speed_m_s)
 
 
 def _solve_stream(pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free: bool) -> Solved:

@@ -177,7 +177,12 @@ def rotations_between(start: FloatArray, end: FloatArray) -> FloatArray:
 
     A rotation vector has the same coordinates in the axes of its start and of its end.
     """
-    return rotation_log(np.swapaxes(start, 1, 2) @ end)
+    return rotation_log(relative_rotations(start, end))
+
+
+def relative_rotations(start: FloatArray, end: FloatArray) -> FloatArray:
+    """Return the rotations ``start' end`` (N, 3, 3), in the axes of ``start`` (N, 3, 3)."""
+    return np.asarray(np.swapaxes(start, 1, 2) @ end)
 
 
 def quat_log(quat_xyzw: FloatArray) -> FloatArray:

@@ -248,7 +248,7 @@ def turning_axis(trajectory: Trajectory) -> FloatArray:
     # Rotations over a second are larger than the noise of single poses.
     step = max(1, round(1.0 / trajectory.interval_s))
     rotations = se3.rotation_of(trajectory.poses[::step])
-    turns = se3.rotation_log(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:])
+    turns = se3.rotations_between(rotations[:-1], rotations[1:])
     squares, axes = np.linalg.eigh(turns.T @ turns)
     # The eigenvalues are ascending.
     if squares[1] >= _MAX_OTHER_SHARE**2 * squares[2]:

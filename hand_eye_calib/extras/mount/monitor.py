@@ -26,8 +26,8 @@ from pathlib import Path
 import numpy as np
 
 from hand_eye_calib.core.assessment import change, moved
+from hand_eye_calib.core.assessment.common_mode import floor_of_pairs
 from hand_eye_calib.core.assessment.comparison import SEEN_TARGETS
-from hand_eye_calib.core.assessment.covariance import floor_of_pairs
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.blocks import Blocks, information, inverse, score, shift_evidence
 from hand_eye_calib.core.base.stats import NINE_TIMES_OUT_OF_TEN, robust_weights

@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from hand_eye_calib.core.assessment import covariance
+from hand_eye_calib.core.assessment import common_mode, covariance
 from hand_eye_calib.core.assessment.prior import fuse, widened
 from hand_eye_calib.core.assessment.second_opinion import excess_covariance, second_opinions
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
@@ -172,8 +172,8 @@ def _allowance(paths: _Paths, kind_of_poses: str, kind_of_positions: str) -> Flo
     if kind_of_positions != "exact":
         variance += _POINT_M**2
     if kind_of_poses != "exact":
-        speed_m_s = covariance.usual_speed(paths.stamps_ns, se3.translation_of(paths.poses))
-        variance += (covariance.FLOOR_TRAVEL_S * speed_m_s) ** 2
+        speed_m_s = common_mode.usual_speed(paths.stamps_ns, se3.translation_of(paths.poses))
+        variance += (common_mode.FLOOR_TRAVEL_S * speed_m_s) ** 2
     return variance * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 
 

@@ -68,7 +68,7 @@ def check_frozen(poses: StopPoses) -> Iterator[Finding]:
         others = se3.rotation_of(getattr(poses, other))
         steps = se3.log(se3.inverse(own[:-1]) @ own[1:])
         is_repeated = np.abs(steps).max(axis=1) < _ROUNDING
-        turns_rad = se3.rotation_angle(np.swapaxes(others[:-1], 1, 2) @ others[1:])
+        turns_rad = se3.rotation_angle(se3.relative_rotations(others[:-1], others[1:]))
         share = float(np.mean(is_repeated & (turns_rad > MIN_TURN_RAD)))
         if share == 0.0:
             continue

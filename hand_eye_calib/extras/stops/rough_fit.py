@@ -210,7 +210,8 @@ def _fit_rotations(R_A: FloatArray, R_B: FloatArray) -> tuple[float, FloatArray]
     weights = np.ones(len(R_A))
     for _ in range(_MAX_ROUNDS):
         X, Z = closest_rotations(R_A, R_B, weights)
-        angles_rad = se3.rotation_angle(np.swapaxes(Z @ R_B, 1, 2) @ R_A @ X)
+        residuals = se3.relative_rotations(Z @ R_B, R_A) @ X
+        angles_rad = se3.rotation_angle(residuals)
         error_rad = median(angles_rad)
         weights = robust_weights("cauchy", (angles_rad / max(error_rad, _TINY)) ** 2)
     return error_rad, Z

@@ -5,7 +5,7 @@ A kind supplies the functions that solve and check its data, see :mod:`..core.en
 
 import numpy as np
 
-from hand_eye_calib.core.assessment import covariance
+from hand_eye_calib.core.assessment import common_mode, covariance
 from hand_eye_calib.core.assessment.prior import fuse
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import NotEnoughDataError
@@ -192,9 +192,9 @@ def _calibration(
     fused = fuse(assessment, config.prior())
     floor = np.zeros((6, 6))
     if config.child_kind == "odometry":
-        speed_m_s = covariance.usual_speed(pairs.stamps_ns, se3.translation_of(pairs.Ts_cw_c))
+        speed_m_s = common_mode.usual_speed(pairs.stamps_ns, se3.translation_of(pairs.Ts_cw_c))
         # Half of the floor, which is that of two odometries: only the sensor has one here.
-        floor = 0.5 * covariance.common_mode_floor(speed_m_s)
+        floor = 0.5 * common_mode.common_mode_floor(speed_m_s)
     # Residuals (K, 6), with zeros for the components that are not compared.
     all_residuals = np.zeros(drive.xi.shape)
     all_residuals[:, drive.components] = fit.residuals

@@ -63,7 +63,8 @@ def summarise(trajectory: Trajectory) -> StreamSummary:
     intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
     poses = coarse(trajectory, max(_MIN_PATH_STEP_S, median(intervals_s))).poses
     steps = np.linalg.norm(np.diff(se3.translation_of(poses), axis=0), axis=1)
-    angles = se3.rotation_angle(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
+    rotations = se3.rotation_of(poses)
+    angles = se3.rotation_angle(se3.relative_rotations(rotations[:-1], rotations[1:]))
     return StreamSummary(
         poses=len(trajectory),
         duration_s=trajectory.duration_s,
@@ -252,9 +253,10 @@ def _angles(calibration: Calibration, pose_pairs: PosePairs) -> tuple[FloatArray
     Ts_cw_p = pose_pairs.Ts_cw_c @ calibration.T_child_parent
     measured = se3.rotation_of(pose_pairs.Ts_pw_p)
     computed = _between_worlds(pose_pairs, Ts_cw_p) @ se3.rotation_of(Ts_cw_p)
-    steps_rad = se3.rotation_log(np.swapaxes(measured[:-1], 1, 2) @ measured[1:])
+    steps_rad = se3.rotations_between(measured[:-1], measured[1:])
     measured_rad = np.vstack([np.zeros(3), np.cumsum(steps_rad, axis=0)])
-    return measured_rad, measured_rad + se3.rotation_log(np.swapaxes(measured, 1, 2) @ computed)
+    errors_rad = se3.rotations_between(measured, computed)
+    return measured_rad, measured_rad + errors_rad
 
 
 def _is_upright(poses: FloatArray) -> bool:
