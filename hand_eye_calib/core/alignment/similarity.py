@@ -317,7 +317,9 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     Candidates are the solutions for random subsets of the pairs, and those for all pairs at the
     start rotations of dnl. One subset without outliers suffices.
     """
-    few = pairs[np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_RANKED_PAIRS)).astype(int)]
+    n_ranked = min(len(pairs), _MAX_RANKED_PAIRS)
+    ranked = np.linspace(0, len(pairs) - 1, n_ranked).astype(int)
+    few = pairs[ranked]
     # Lengths in units of the root mean square translation of each stream.
     parent = few.Ts_parenti_parentj.copy()
     child = few.Ts_childi_childj.copy()
@@ -326,23 +328,29 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     parent[:, :3, 3] /= unit_of_parent
     child[:, :3, 3] /= unit_of_child
     few = replace(few, Ts_parenti_parentj=parent, Ts_childi_childj=child)
-    forms = quadratic_form.expand(_random_subsets(len(few)) @ quadratic_form.condense(few))
-    rotations = [*_closed_form_rotations(forms), *all_pairs.start_rotations(few)]
+    sums = _random_subsets(len(few)) @ quadratic_form.condense(few)
+    subset_forms = quadratic_form.expand(sums)
+    more_rotations = all_pairs.start_rotations(few)
+    rotations = np.concatenate([_closed_form_rotations(subset_forms), more_rotations])
     # The further rotations belong to the form of all pairs.
-    forms = np.concatenate([forms, *[forms[:1]] * (len(rotations) - len(forms))])
+    forms_of_all = np.repeat(subset_forms[:1], len(more_rotations), axis=0)
+    forms = np.concatenate([subset_forms, forms_of_all])
     # Scale and translation that minimise the form of each rotation.
     reduced, to_translation = quadratic_form.without_translation(forms)
-    vectors = np.append(np.reshape(rotations, (-1, 9)), np.zeros((len(forms), 1)), axis=1)
+    vectors = np.append(rotations.reshape(-1, 9), np.zeros((len(forms), 1)), axis=1)
     products = se3.times(reduced, vectors)
-    scales = -products[:, 9] / np.maximum((vectors * products).sum(axis=1), 1e-300)
+    squares = (vectors * products).sum(axis=1)
+    scales = -products[:, 9] / np.maximum(squares, 1e-300)
     # Candidates without a sensible scale, of opposite or no motion, have large costs at scale 1.
     scales[(scales <= 1e-3) | (scales >= 1e9)] = 1.0
-    translations = -se3.times(to_translation, scales[:, None] * vectors + np.eye(10)[9])
-    Ts = se3.from_rotation_translation(np.array(rotations), translations)
+    scaled_vectors = scales[:, None] * vectors + np.eye(10)[9]
+    translations = -se3.times(to_translation, scaled_vectors)
+    Ts = se3.from_rotation_translation(rotations, translations)
     costs = quadratic_form.median_costs(quadratic_form.coefficients(few), Ts, scales)
     Ts[:, :3, 3] *= unit_of_parent
     scales *= unit_of_parent / unit_of_child
-    return [(Ts[k], float(scales[k])) for k in np.argsort(costs)[:_N_REFINED_STARTS]]
+    best = np.argsort(costs)[:_N_REFINED_STARTS]
+    return [(Ts[k], float(scales[k])) for k in best]
 
 
 def _rms_translation(motions: FloatArray) -> float:
@@ -377,10 +385,12 @@ def _closed_form_rotations(forms: FloatArray) -> FloatArray:
     (S, 3, 3) array
     """
     left = forms[:, :12, :12]
-    left = left + 1e-9 * np.trace(left, axis1=1, axis2=2)[:, None, None] * np.eye(12)
+    traces = np.trace(left, axis1=1, axis2=2)
+    left = left + 1e-9 * traces[:, None, None] * np.eye(12)
     # The forms of streams that never move are zero.
     left = left + np.finfo(float).tiny * np.eye(12)
-    matrices = -np.linalg.solve(left, forms[:, :12, 12:])[:, :9, 0].reshape(-1, 3, 3)
+    minima = -np.linalg.solve(left, forms[:, :12, 12:])
+    matrices = minima[:, :9, 0].reshape(-1, 3, 3)
     return se3.nearest_rotation(matrices)
 
 
@@ -439,15 +449,40 @@ class _Problem:
         root : (K,) array
             Square roots of the robust weights.
         """
+        translations = self._translation_rows(T, scale, offset_s)
+        rotations = self._rotation_rows(T, offset_s)
+        lengths_m = np.linalg.norm(translations[:, :, -1], axis=1)
+        lengths_rad = np.linalg.norm(rotations[:, :, -1], axis=1)
+        least_m = max(_MIN_SIGMA_TRANSLATION * self.rms_a, 1e-12)
+        sigma_m = max(median(lengths_m) / MEDIAN_LENGTH, least_m)
+        sigma_rad = max(median(lengths_rad) / MEDIAN_LENGTH, _MIN_SIGMA_ROTATION)
+        squared = (lengths_m / sigma_m) ** 2 + (lengths_rad / sigma_rad) ** 2
+        relative = squared / (6 * _QUARTER_WEIGHT_SIGMAS**2)
+        root = np.sqrt(robust_weights("geman_mcclure", relative))
+        translations *= (root / sigma_m)[:, None, None]
+        rotations *= (root / sigma_rad)[:, None, None]
+        return [translations, rotations], (sigma_m, sigma_rad), root
+
+    def _translation_rows(self, T: FloatArray, scale: float, offset_s: float) -> FloatArray:
+        """Return derivatives and residuals (K, 3, 9) of the translations, without weights."""
         rotation = se3.rotation_of(T)
+        back = rotation.T
+        rows = np.zeros((len(self.translation_a), 3, _N_UNKNOWNS + 1))
+        rows[:, :, :3] = _times(self.chord_a, rotation)
+        rows[:, :, 3:6] = -scale * np.swapaxes(_times(self.skew_b, back), 1, 2)
+        rows[:, :, _SCALE] = -scale * self.translation_b @ back
+        rows[:, :, _OFFSET] = -scale * self.translation_by_offset @ back
+        moved_b = self.translation_b + self.translation_by_offset * offset_s
+        rows[:, :, -1] = self.chord_a @ se3.translation_of(T) + self.translation_a
+        rows[:, :, -1] -= scale * moved_b @ back
+        return rows
+
+    def _rotation_rows(self, T: FloatArray, offset_s: float) -> FloatArray:
+        """Return derivatives and residuals (K, 3, 9) of the rotations, without weights."""
         back = se3.rotation_of(T).T
-        of_translation, of_rotation = np.zeros((2, len(self.translation_a), 3, _N_UNKNOWNS + 1))
-        of_translation[:, :, :3] = _times(self.chord_a, rotation)
-        of_translation[:, :, 3:6] = -scale * np.swapaxes(_times(self.skew_b, back), 1, 2)
-        of_translation[:, :, _SCALE] = -scale * self.translation_b @ back
-        of_translation[:, :, _OFFSET] = -scale * self.translation_by_offset @ back
-        of_rotation[:, :, 3:6] = np.swapaxes(_times(self.chord_b, back), 1, 2)
-        of_rotation[:, :, _OFFSET] = self.rotation_by_offset @ back
+        rows = np.zeros((len(self.translation_a), 3, _N_UNKNOWNS + 1))
+        rows[:, :, 3:6] = np.swapaxes(_times(self.chord_b, back), 1, 2)
+        rows[:, :, _OFFSET] = self.rotation_by_offset @ back
         # Vector and scalar part of the quaternion of R_A^T R R_B R^T.
         va = self.quats_a[:, :3]
         wa = self.quats_a[:, 3:]
@@ -455,22 +490,9 @@ class _Problem:
         wb = self.quats_b[:, 3:]
         vector = wa * vb - wb * va + se3.cross(vb, va)
         scalar = wa * wb + (va * vb).sum(axis=1, keepdims=True)
-        moved_b = self.translation_b + self.translation_by_offset * offset_s
-        of_translation[:, :, -1] = self.chord_a @ se3.translation_of(T) + self.translation_a
-        of_translation[:, :, -1] -= scale * moved_b @ back
-        of_rotation[:, :, -1] = se3.quat_log(np.concatenate([vector, scalar], axis=1))
-        of_rotation[:, :, -1] += offset_s * of_rotation[:, :, _OFFSET]
-        parts = [of_translation, of_rotation]
-        lengths = [np.linalg.norm(part[:, :, -1], axis=1) for part in parts]
-        sigmas = (
-            max(median(lengths[0]) / MEDIAN_LENGTH, _MIN_SIGMA_TRANSLATION * self.rms_a, 1e-12),
-            max(median(lengths[1]) / MEDIAN_LENGTH, _MIN_SIGMA_ROTATION),
-        )
-        squared = sum((length / sigma) ** 2 for length, sigma in zip(lengths, sigmas, strict=True))
-        root = np.sqrt(robust_weights("geman_mcclure", squared / (6 * _QUARTER_WEIGHT_SIGMAS**2)))
-        for part, sigma in zip(parts, sigmas, strict=True):
-            part *= (root / sigma)[:, None, None]
-        return parts, sigmas, root
+        rows[:, :, -1] = se3.quat_log(np.concatenate([vector, scalar], axis=1))
+        rows[:, :, -1] += offset_s * rows[:, :, _OFFSET]
+        return rows
 
     def refine(self, T: FloatArray, scale: float) -> tuple[FloatArray, float, float]:
         """Return X, scale and offset after Gauss-Newton steps with robust weights."""
@@ -483,7 +505,8 @@ class _Problem:
             step = np.zeros(_N_UNKNOWNS)
             step[self.free] = -solve(moments, self.free)
             # At most 1 rad of rotation, and a factor e of the scale.
-            step *= min(1.0, 1.0 / max(np.linalg.norm(step[3:6]), abs(step[_SCALE]), 1e-300))
+            size = max(np.linalg.norm(step[3:6]), abs(step[_SCALE]), 1e-300)
+            step *= min(1.0, 1.0 / size)
             T = se3.retracted(T, step[:6])
             scale = scale * float(np.exp(step[_SCALE]))
             offset_s = offset_s + step[_OFFSET]

@@ -113,8 +113,8 @@ def robust_weights(kind: str, squared: FloatArray) -> FloatArray:
     Parameters
     ----------
     kind : {"huber", "cauchy", "geman_mcclure", "student"}
-        Weight function. Weights are at most 1; those of ``student`` have the mean 1 for vectors of
-        six values.
+        Weight function. Weights are at most 1, except for ``student``: its weights have the mean 1
+        for vectors of six values.
     squared : (...) array
         Squared residuals. At 1, the weight is 1/2 for ``cauchy`` and 1/4 for ``geman_mcclure``; the
         weight of ``huber`` is 1 up to there. For ``student``, squared Mahalanobis distances.

@@ -353,10 +353,9 @@ def solve(
 def _search(problem: Problem) -> AdaptiveSolution:
     """Run all stages, and return the solution.
 
-    Single poses of a camera that observes a target may be as noisy as the rotation between them is
-    large.
-    Then the search is repeated with every k-th pose. If X does not settle, the last stages are
-    repeated without time-correlated errors.
+    The rotation noise of a camera that observes a target may be as large as the rotation between
+    two poses. Then the search is repeated with every k-th pose. If X does not settle, the last
+    stages are repeated without time-correlated errors.
     """
     workspace = Workspace(problem)
     first = _run_stages(_FIRST_STAGES, workspace, start(problem))
@@ -425,8 +424,8 @@ def _solution(workspace: Workspace, fit: Fit) -> AdaptiveSolution:
     normal = posterior.normal
     final = fit.moved(normal.step, columns)
     misfit = float(normal.cost) / _degrees_of_freedom(problem, fit)
-    # A misfit below 1 does not reduce the covariance: it is dominated by short distances between
-    # poses, and X by long ones.
+    # A misfit below 1 does not reduce the covariance: short distances between poses dominate the
+    # misfit, long distances dominate X.
     covariance = max(misfit, 1.0) * normal.covariance
     sigmas = np.zeros(N_SYSTEMATIC)
     sigmas[columns] = np.sqrt(np.diag(covariance)[6:])

@@ -169,13 +169,12 @@ def _smooth_steps(steps: FloatArray, intervals_s: FloatArray, noise_m2: float) -
     The difference from this mean is multiplied by the share of its median square that is not noise.
     """
     velocities = steps / intervals_s[:, None]
-    padded = np.concatenate(
-        [velocities[:1], velocities[:1], velocities, velocities[-1:], velocities[-1:]]
-    )
+    padded = np.pad(velocities, ((2, 2), (0, 0)), mode="edge")
     smooth = 0.5 * (padded[:-4] + padded[4:]) * intervals_s[:, None]
-    variance = max(median((steps - smooth) ** 2), _ROUNDING_M2)
+    differences = steps - smooth
+    variance = max(median(differences**2), _ROUNDING_M2)
     share = max(1.0 - noise_m2 / variance, 0.0)
-    return smooth + share * (steps - smooth)
+    return smooth + share * differences
 
 
 def cumulative_sum(steps: FloatArray) -> FloatArray:
@@ -235,19 +234,23 @@ def linearise(
         Errors c that were removed from the poses; they are added to the residuals.
     """
     R_c_transposed = transposed(streams.Ts_cw_c[:-1, :3, :3])
+    # Smoothed steps in the child's frame, and the factors of a bias per metre.
     steps = se3.times(R_c_transposed, np.diff(course.path, axis=0))
     metres = R_c_transposed @ np.diff(course.along, axis=0)
     B, by_rate = _child_motions(streams, course, parameters)
-    B[:, :3, 3] = (1.0 + parameters[SCALE]) * se3.translation_of(B) - metres @ parameters[BIAS]
+    scaled = (1.0 + parameters[SCALE]) * se3.translation_of(B)
+    B[:, :3, 3] = scaled - metres @ parameters[BIAS]
     B_inverse = se3.inverse(B)
     R_B_transposed = se3.rotation_of(B_inverse)
     adjoints = se3.adjoint(B_inverse)
-    by_steps = np.zeros((len(steps), 6, 4))
-    by_steps[:, :3] = -R_B_transposed @ np.dstack([steps, se3.skew(steps)])
     A_X = (streams.motions_p.reshape(-1, 4) @ T_parent_child).reshape(B.shape)
-    residuals = se3.log(B_inverse @ (se3.inverse(T_parent_child) @ A_X))
+    motions_by_parent = se3.inverse(T_parent_child) @ A_X
+    residuals = se3.log(B_inverse @ motions_by_parent)
     if error is not None:
         residuals += error[1:] - se3.times(adjoints, error[:-1])
+    scale_and_direction = np.dstack([steps, se3.skew(steps)])
+    by_steps = np.zeros((len(steps), 6, 4))
+    by_steps[:, :3] = -R_B_transposed @ scale_and_direction
     systematic = np.zeros((len(steps), 6, N_SYSTEMATIC))
     systematic[:, :, SCALE] = by_steps[:, :, 0]
     systematic[:, :3, BIAS] = R_B_transposed @ metres

@@ -246,7 +246,8 @@ class NoiseModel:
     def _usual_log_tau(self) -> float:
         """Logarithm of the time constant (s) at the start of a search; also its prior mean.
 
-        Both are clipped to the bounds of the time constants.
+        The search clips the start to the bounds of the time constants. The prior mean may be
+        outside the bounds for a short recording.
         """
         shortest_s = self.tuning.start_tau_intervals * self.interval_s
         longest_s = max(self.tuning.start_tau_share * self.duration_s, shortest_s)
@@ -274,13 +275,14 @@ class NoiseModel:
             Levels for the start of a search: the given levels, then those of the processes.
         """
         tuning = self.tuning
-        variances = dict(
-            zip(PARTS, increment_levels(levels) + np.log(tuning.start_share), strict=True)
-        )
-        variances |= dict.fromkeys(PATH_PARTS, 2.0 * np.log(tuning.sizes[SCALE]))
+        of_poses = increment_levels(levels) + np.log(tuning.start_share)
+        of_path = 2.0 * np.log(tuning.sizes[SCALE])
+        log_variances = dict(zip(PARTS, of_poses, strict=True))
+        log_variances |= dict.fromkeys(PATH_PARTS, of_path)
         log_tau = self._usual_log_tau
-        starts = [[variances[part], log_tau] for _, part in processes]
-        return replace(self, processes=processes), np.r_[levels, np.ravel(starts)]
+        starts = [[log_variances[part], log_tau] for _, part in processes]
+        all_levels = np.concatenate([levels, np.ravel(starts)])
+        return replace(self, processes=processes), all_levels
 
     def process_errors(
         self, states: FloatArray, streams: Streams, T_parent_child: FloatArray

@@ -195,6 +195,32 @@ class Factor:
         return diagonal, below
 
 
+def prior_products(values: FloatArray, sigmas: FloatArray, size: int) -> FloatArray:
+    """Return a prior with mean zero as products that are added to ``[J e]' V^-1 [J e]``.
+
+    Parameters
+    ----------
+    values : (k,) array
+        Present values of the last k parameters. The other parameters have no prior.
+    sigmas : (k,) array
+        Prior standard deviations of the last k parameters.
+    size : int
+        Number of rows of the products: that of all parameters, plus 1 for the residuals.
+
+    Returns
+    -------
+    (size, size) array
+    """
+    products = np.zeros((size, size))
+    indices = np.arange(size - 1 - len(values), size - 1)
+    weights = sigmas**-2.0
+    products[indices, indices] = weights
+    products[indices, -1] = weights * values
+    products[-1, indices] = weights * values
+    products[-1, -1] = weights @ values**2
+    return products
+
+
 class NormalEquations:
     """Generalised least squares solution of one system, or of a stack of systems.
 
@@ -228,16 +254,18 @@ class NormalEquations:
         # parameter below rounding has no information; its scale is arbitrary.
         largest = diagonal.max(axis=-1, keepdims=True)
         has_information = diagonal > np.finfo(float).eps * largest
-        any_scale = np.where(largest > 0.0, largest, 1.0)
-        scale = 1.0 / np.sqrt(np.where(has_information, diagonal, any_scale))
+        any_square = np.where(largest > 0.0, largest, 1.0)
+        scale = 1.0 / np.sqrt(np.where(has_information, diagonal, any_square))
         both_have = has_information[..., :, None] & has_information[..., None, :]
-        scaled = np.where(both_have, information, 0.0)
-        values, vectors = np.linalg.eigh(scale[..., :, None] * scaled * scale[..., None, :])
+        kept = np.where(both_have, information, 0.0)
+        scaled = scale[..., :, None] * kept * scale[..., None, :]
+        values, vectors = np.linalg.eigh(scaled)
         # Eigenvalue 1 in place of rounding, which the mask excludes from root and log determinant.
         self._is_observed = values > _MIN_INFORMATION
         values = np.where(self._is_observed, values, 1.0)
         self._axes = scale[..., :, None] * vectors
-        self.root = self._axes * (self._is_observed / np.sqrt(values))[..., None, :]
+        inverse_roots = self._is_observed / np.sqrt(values)
+        self.root = self._axes * inverse_roots[..., None, :]
         self.covariance = self.root @ transposed(self.root)
         self.is_complete = self._is_observed.all(axis=-1)
         self.step = -(self.covariance @ gradient[..., None])[..., 0]

@@ -211,7 +211,10 @@ def _jump_factor(of_walk: FloatArray, threshold: float, tuning: Tuning) -> float
     of the model, and at least 1. If the steps have heavy tails, the factor is larger.
     """
     ordinary = of_walk[of_walk < threshold]
-    if not len(ordinary) or np.mean(ordinary**2) > tuning.walk_kurtosis * np.mean(ordinary) ** 2:
+    if not len(ordinary):
+        return tuning.heavy_jump_factor
+    normal_square = tuning.walk_kurtosis * np.mean(ordinary) ** 2
+    if np.mean(ordinary**2) > normal_square:
         return tuning.heavy_jump_factor
     return float(max(median(ordinary) / CHI2[0.5][6], 1.0))
 
@@ -238,17 +241,19 @@ def bridge_outliers(streams: Streams, T_parent_child: FloatArray, spikes: BoolAr
 
 
 def tail_weights(posterior: Posterior) -> FloatArray:
-    """Return weights (N,) of the white errors v for Student's t distribution with nu degrees.
+    """Return weights (N,) of the white errors v for Student's t distribution.
 
-    ``weight = (nu + 6) / (nu + E[v' S^-1 v])`` with the white covariance S. The expectation is that
-    of the smoothed v, plus a share that smoothing removes. This share is assumed to be in inverse
-    proportion to the weights of the poses.
+    ``weight = (nu + 6) / (nu + E[v' S^-1 v])`` with nu = 4 degrees of freedom and the white
+    covariance S. The expectation is that of the smoothed v, plus a share that smoothing removes.
+    This share is assumed to be in inverse proportion to the weights of the poses.
     """
     v = posterior.states_after(posterior.normal.step)[:, :WHITE]
     squares = (v * se3.times(posterior.white_precision, v)).sum(axis=1)
     weights = posterior.space.weights
     is_outlier = weights == 0.0
+    weighted_squares = (weights * squares)[~is_outlier]
     # The mean square of a white error that is not smoothed is 6.
-    remaining_share = min(float(np.mean((weights * squares)[~is_outlier])) / WHITE, 1.0)
+    remaining_share = min(float(np.mean(weighted_squares)) / WHITE, 1.0)
     removed = WHITE * (1.0 - remaining_share) / np.where(is_outlier, 1.0, weights)
-    return robust_weights("student", np.where(is_outlier, 0.0, squares + removed))
+    expected_squares = np.where(is_outlier, 0.0, squares + removed)
+    return robust_weights("student", expected_squares)

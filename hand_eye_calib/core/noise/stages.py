@@ -50,7 +50,7 @@ from hand_eye_calib.core.noise.noise_model import (
     increment_levels,
     rough_levels,
 )
-from hand_eye_calib.core.noise.normal import NormalEquations
+from hand_eye_calib.core.noise.normal import NormalEquations, prior_products
 from hand_eye_calib.core.noise.outliers import (
     Outliers,
     bridge_outliers,
@@ -100,7 +100,7 @@ class Problem:
     tuning: Tuning = TUNING
 
     def prior(self, fit: Fit) -> FloatArray:
-        """Return the prior of the parameters (p + 1, p + 1), see :func:`prior_products`."""
+        """Return the prior of the parameters as products (p + 1, p + 1)."""
         values = fit.parameters[self.columns]
         return prior_products(values, fit.sigmas[self.columns], 7 + len(values))
 
@@ -257,32 +257,6 @@ class Fit:
         return replace(self, poses=poses, error=error)
 
 
-def prior_products(values: FloatArray, sigmas: FloatArray, size: int) -> FloatArray:
-    """Return a prior with mean zero as products that are added to ``[J e]' V^-1 [J e]``.
-
-    Parameters
-    ----------
-    values : (k,) array
-        Present values of the last k parameters. The other parameters have no prior.
-    sigmas : (k,) array
-        Prior standard deviations of the last k parameters.
-    size : int
-        Number of rows of the products: that of all parameters, plus 1 for the residuals.
-
-    Returns
-    -------
-    (size, size) array
-    """
-    products = np.zeros((size, size))
-    indices = np.arange(size - 1 - len(values), size - 1)
-    weights = sigmas**-2.0
-    products[indices, indices] = weights
-    products[indices, -1] = weights * values
-    products[-1, indices] = weights * values
-    products[-1, -1] = weights @ values**2
-    return products
-
-
 def sample(n_poses: int, tuning: Tuning) -> IntArray | None:
     """Return the indices of poses that noise levels are fitted to, or None for all poses.
 
@@ -332,11 +306,13 @@ def _centre_of_rotations(
     It is the origin of a world if the translations of residuals (n, 6) at this origin are smaller
     than ``max_ratio`` times those at the sensors.
     """
+    translations = residuals[:, :3]
+    rotations = residuals[:, 3:]
     poses_of_child = {"child": streams.Ts_cw_c[1:], "parent": streams.Ts_pw_p[1:] @ T}
-    sizes = {"sensors": median(np.linalg.norm(residuals[:, :3], axis=1))}
+    sizes = {"sensors": median(np.linalg.norm(translations, axis=1))}
     for world, poses in poses_of_child.items():
         to_origin = se3.translation_of(se3.inverse(poses))
-        at_origin = residuals[:, :3] + np.cross(residuals[:, 3:], to_origin)
+        at_origin = translations + np.cross(rotations, to_origin)
         sizes[world] = median(np.linalg.norm(at_origin, axis=1))
     best = min(CENTRES, key=lambda centre: sizes[centre])
     return best if sizes[best] < max_ratio * sizes["sensors"] else "sensors"
@@ -471,8 +447,10 @@ def _with_processes(fit: Fit, levels: FloatArray, is_kept: BoolArray) -> Fit:
         Levels of all K processes and of the other errors.
     is_kept : (K,) bool array
     """
-    model = replace(fit.model, processes=tuple(compress(fit.model.processes, is_kept)))
-    is_kept_level = np.r_[np.ones(N_FAST, dtype=bool), np.repeat(is_kept, 2)]
+    processes = tuple(compress(fit.model.processes, is_kept))
+    model = replace(fit.model, processes=processes)
+    is_kept_level = np.ones(len(levels), dtype=bool)
+    is_kept_level[N_FAST:] = np.repeat(is_kept, 2)
     return replace(fit, model=model, levels=levels[is_kept_level])
 
 
@@ -589,9 +567,11 @@ def is_settled(workspace: Workspace, fit: Fit) -> bool:
     """
     tuning = workspace.problem.tuning
     normal = workspace.posterior(fit).normal
-    principal_variances, axes = np.linalg.eigh(normal.covariance[:3, :3])
-    steps = np.r_[axes.T @ normal.step[:3], normal.step[3:]]
-    variances = np.r_[principal_variances, np.diag(normal.covariance)[3:]]
+    # The translation is compared along its principal axes.
+    steps = normal.step.copy()
+    variances = np.diag(normal.covariance).copy()
+    variances[:3], axes = np.linalg.eigh(normal.covariance[:3, :3])
+    steps[:3] = axes.T @ normal.step[:3]
     sigmas = np.sqrt(np.maximum(variances, 0.0))
     limits = np.maximum(tuning.settled_sigmas * sigmas, _ROUNDING_STEP)
     limits[:3][sigmas[:3] > tuning.unknown_m] = np.inf

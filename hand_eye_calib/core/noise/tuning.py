@@ -116,8 +116,9 @@ class Tuning:
     # or more for a child that slips sideways on a road, and at most 2 in simulations.
     max_sigma_growth: float = 3.0
 
-    # -- The end -- Largest number of rounds in which outliers are detected; also that of the last
-    # steps of X, with the step of the solution.
+    # -- The end --
+    # Largest number of rounds in which outliers are detected. Also the largest number of last steps
+    # of X, including the step that computes the solution.
     max_rounds: int = 6
     # X is settled if its next step is shorter than this share of its standard deviation.
     settled_sigmas: float = 0.1
@@ -131,7 +132,11 @@ class Tuning:
     # Numbers of the rounds before which noise levels are fitted.
     fits: tuple[int, ...] = (1, 3, 5)
     # Log variance (rad^2) of the walk of the orientations: lower bound, start and upper bound.
-    rotation_walk: tuple[float, float, float] = (math.log(1e-12), math.log(1e-6), math.log(0.1))
+    rotation_walk: tuple[float, float, float] = (
+        math.log(1e-12),
+        math.log(1e-6),
+        math.log(0.1),
+    )
     # Prior standard deviations: of the lever arm (m), of the scale of the odometry, of its
     # direction (rad: 0.15 deg), of the time offset (s), of the response of positions to
     # acceleration (s^2).

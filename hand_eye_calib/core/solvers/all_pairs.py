@@ -173,6 +173,9 @@ def start_rotations(pairs: MotionPairs) -> FloatArray:
     axes_parent = se3.vee(pairs.Ts_parenti_parentj)
     axes_child = se3.vee(pairs.Ts_childi_childj)
     U, _, V_transposed = np.linalg.svd(axes_parent.T @ axes_child)
-    aligned = U @ np.diag([1.0, 1.0, np.linalg.det(U @ V_transposed)]) @ V_transposed
-    half_turns = ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])
-    return aligned @ [np.diag(signs) for signs in half_turns]
+    sign = np.linalg.det(U @ V_transposed)
+    aligned = U @ np.diag([1.0, 1.0, sign]) @ V_transposed
+    # The identity, and the rotations by pi about x, y and z.
+    diagonals = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    half_turns = diagonals[:, :, None] * np.eye(3, dtype=int)
+    return np.asarray(aligned @ half_turns)

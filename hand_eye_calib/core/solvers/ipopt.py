@@ -100,7 +100,9 @@ def _cost_expressions(pairs: MotionPairs, pose: _Expression) -> _Expression:
 
 def _columns(transforms: FloatArray) -> FloatArray:
     """Return the top three rows of transforms as columns (12, K), column-major as in CasADi."""
-    return np.ascontiguousarray(np.swapaxes(transforms[:, :3], 1, 2).reshape(len(transforms), 12).T)
+    column_major = np.swapaxes(transforms[:, :3], 1, 2)
+    columns = column_major.reshape(len(transforms), 12).T
+    return np.ascontiguousarray(columns)
 
 
 def _rodrigues(rotation_vector: _Expression) -> _Expression:

@@ -64,11 +64,14 @@ def _residual_table() -> FloatArray:
     """
     flat = np.zeros((16, DIMENSION))
     flat[_X_IN_T, np.arange(DIMENSION)] = 1.0
-    entry = flat.reshape(4, 4, DIMENSION)  # X[i, j] = entry[i, j] @ x
-    # Element (i, k) of A - I multiplies X[k, j]; element (k, j) of B - I multiplies X[i, k].
-    of_parent = np.einsum("il,kjm->ikljm", np.eye(3), entry).reshape(12, 12, DIMENSION)
-    of_child = -np.einsum("jl,ikm->kjilm", np.eye(4), entry[:3, :3]).reshape(12, 12, DIMENSION)
-    return np.concatenate([of_parent, of_child])
+    # X[i, j] = entry[i, j] @ x.
+    entry = flat.reshape(4, 4, DIMENSION)
+    # Element (i, k) of A - I multiplies X[k, j].
+    of_parent = np.einsum("il,kjm->ikljm", np.eye(3), entry)
+    # Element (k, j) of B - I multiplies X[i, k].
+    of_child = -np.einsum("jl,ikm->kjilm", np.eye(4), entry[:3, :3])
+    shape = (12, 12, DIMENSION)
+    return np.concatenate([of_parent.reshape(shape), of_child.reshape(shape)])
 
 
 def _twist_table() -> FloatArray:
@@ -139,11 +142,16 @@ def median_costs(coefficients: FloatArray, Ts: FloatArray, scales: FloatArray) -
     scales : (S,) array
         Factors of the child's translations.
     """
+    xs = Ts.reshape(-1, 16)[:, _X_IN_T]
     # Factors (S, 24, 12) from coefficients to residuals.
-    by_u = np.tensordot(Ts.reshape(-1, 16)[:, _X_IN_T], _RESIDUAL, axes=(1, 2))
+    by_u = np.tensordot(xs, _RESIDUAL, axes=(1, 2))
     # The second half of u is B - I (3, 4). Its last column is the child's translation.
-    by_u.reshape(-1, 2, 3, 4, 12)[:, 1, :, 3] *= scales[:, None, None]
-    return medians(((coefficients @ by_u) ** 2).sum(axis=2)) / np.minimum(scales, 1.0) ** 2
+    by_element = by_u.reshape(-1, 2, 3, 4, 12)
+    by_element[:, 1, :, 3] *= scales[:, None, None]
+    residuals = coefficients @ by_u
+    costs_of_pairs = (residuals**2).sum(axis=2)
+    units = np.minimum(scales, 1.0)
+    return medians(costs_of_pairs) / units**2
 
 
 def weighted_sum(coefficients: FloatArray, weights: FloatArray) -> FloatArray:
@@ -231,7 +239,8 @@ def minimise(Q: FloatArray, rotation_start: FloatArray) -> tuple[FloatArray, Flo
         gradient[better] = gradient_new[better]
         value[better] = value_new[better]
     vectors = np.append(R.reshape(-1, 9), np.ones((len(R), 1)), axis=1)
-    Ts = se3.from_rotation_translation(R, -se3.times(to_translation, vectors))
+    translations = -se3.times(to_translation, vectors)
+    Ts = se3.from_rotation_translation(R, translations)
     return Ts, value + constant, converged
 
 
@@ -245,17 +254,20 @@ def without_translation(Q: FloatArray) -> tuple[FloatArray, FloatArray]:
     (B, 3, 10) array
         Factors that map ``(vec R, 1)`` to the negative best translation (m).
     """
-    # Indices of vec R and 1.
+    # Indices of t, and of vec R and 1, in x.
+    translation = slice(9, 12)
     others = np.append(np.arange(9), 12)
-    coupling = Q[:, 9:12][:, :, others]
+    of_translation = Q[:, translation, translation]
+    coupling = Q[:, translation][:, :, others]
+    of_others = Q[:, others[:, None], others]
     # The pseudo-inverse of the translation block is zero along unobservable directions.
-    values, vectors = np.linalg.eigh(Q[:, 9:12, 9:12])
+    values, vectors = np.linalg.eigh(of_translation)
     largest = np.maximum(values[:, -1:], np.finfo(float).tiny)
     is_observed = values > _RANK_TOLERANCE * largest
     inverse_values = np.divide(1.0, values, np.zeros_like(values), where=is_observed)
     inverse = (vectors * inverse_values[:, None]) @ vectors.swapaxes(1, 2)
     eliminated = coupling.swapaxes(1, 2) @ inverse @ coupling
-    return Q[:, others[:, None], others] - eliminated, inverse @ coupling
+    return of_others - eliminated, inverse @ coupling
 
 
 def _newton_step(
@@ -277,11 +289,15 @@ def _newton_step(
     curvatures = np.abs(values)
     largest = curvatures.max(axis=1)
     # A curvature below rounding would make an arbitrarily long step.
-    curvatures = np.maximum(curvatures, 1e-14 * np.maximum(largest, TINY)[:, None])
-    along = axes.swapaxes(1, 2) @ gradient[:, :, None]
-    step = -(axes @ (along / (curvatures + damping[:, None])[:, :, None]))[:, :, 0]
+    rounding = 1e-14 * np.maximum(largest, TINY)
+    curvatures = np.maximum(curvatures, rounding[:, None])
+    damped_curvatures = curvatures + damping[:, None]
+    gradient_along_axes = axes.swapaxes(1, 2) @ gradient[:, :, None]
+    step_along_axes = gradient_along_axes / damped_curvatures[:, :, None]
+    step = -(axes @ step_along_axes)[:, :, 0]
     length = np.linalg.norm(step, axis=1)
-    step *= np.minimum(1.0, 1.0 / np.maximum(length, TINY))[:, None]
+    shortening = np.minimum(1.0, 1.0 / np.maximum(length, TINY))
+    step *= shortening[:, None]
     return step, length, largest
 
 
@@ -304,8 +320,9 @@ def gauss_newton_step(Q: FloatArray, Ts_parent_child: FloatArray) -> FloatArray:
         Transforms after the step.
     """
     n_forms = len(Ts_parent_child)
+    entries = Ts_parent_child.reshape(n_forms, 16)
     # Derivatives of x along the six tangents, then x itself: seven vectors, linear in X.
-    tangents = (Ts_parent_child.reshape(n_forms, 16) @ _TANGENTS).reshape(n_forms, 7, DIMENSION)
+    tangents = (entries @ _TANGENTS).reshape(n_forms, 7, DIMENSION)
     normal = tangents @ Q @ tangents.transpose(0, 2, 1)
     # The damping keeps X along directions that the pairs do not determine, and is too small to slow
     # down the other directions. Every eighth of the 49 elements is on the diagonal.
@@ -314,8 +331,10 @@ def gauss_newton_step(Q: FloatArray, Ts_parent_child: FloatArray) -> FloatArray:
     step = np.linalg.solve(normal[:, :6, :6], -normal[:, :6, 6:])
     # Cayley's map equals the exponential up to second order, and takes less time.
     twist = (step[:, :, 0] @ _TWISTS).reshape(n_forms, 4, 4)
-    shrink = 1 / (1 + 0.25 * (step[:, 3:] ** 2).sum(axis=1, keepdims=True))
-    return Ts_parent_child @ (np.eye(4) + shrink * (twist + 0.5 * twist @ twist))
+    squared_angles = (step[:, 3:] ** 2).sum(axis=1, keepdims=True)
+    shrink = 1 / (1 + 0.25 * squared_angles)
+    second_order = twist + 0.5 * twist @ twist
+    return Ts_parent_child @ (np.eye(4) + shrink * second_order)
 
 
 def _derivatives(forms: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

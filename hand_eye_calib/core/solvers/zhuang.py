@@ -96,18 +96,23 @@ def _condense(pairs: MotionPairs) -> FloatArray:
     k_A = _axes(se3.rotation_of(A))
     k_B = _axes(se3.rotation_of(B))
     # Factors of (1, z) in f.
-    f = np.concatenate([(k_A - k_B)[:, :, None], se3.skew(k_A + k_B)], axis=2)
+    by_z = se3.skew(k_A + k_B)
+    f = np.concatenate([(k_A - k_B)[:, :, None], by_z], axis=2)
     # Coefficients (K, 3, i, j) of z_i t_j in g, with z_0 = t_0 = 1:
     # g = (R_A - I) t + t_A - t_B - [z] ((R_A - I) t + t_A + t_B).
     # The slices i = 1, 2, 3 first contain the bracket; the einsum multiplies it by -[z].
+    chords = se3.rotation_of(A) - np.eye(3)
     g = np.zeros((len(pairs), 3, 4, 4))
-    g[..., 1:] = (se3.rotation_of(A) - np.eye(3))[:, :, None]
+    g[..., 1:] = chords[:, :, None]
     g[:, :, 0, 0] = t_A - t_B
     g[:, :, 1:, 0] = (t_A + t_B)[:, :, None]
-    g[:, :, 1:] = -np.einsum("zij,njzt->nizt", se3.skew(np.eye(3)), g[:, :, 1:])
+    brackets = g[:, :, 1:]
+    g[:, :, 1:] = -np.einsum("zij,njzt->nizt", se3.skew(np.eye(3)), brackets)
     root_f = np.linalg.qr(f.reshape(-1, 4), mode="r")
     root_g = np.linalg.qr(g.reshape(-1, 16), mode="r")
-    return np.concatenate([np.kron(root_f, [1.0, 0.0, 0.0, 0.0]), root_g])
+    # f does not contain t: its coefficients are those of the products with t_0 = 1.
+    root_f_of_products = np.kron(root_f, [1.0, 0.0, 0.0, 0.0])
+    return np.concatenate([root_f_of_products, root_g])
 
 
 def _products(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:

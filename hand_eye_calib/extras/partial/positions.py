@@ -44,14 +44,14 @@ from hand_eye_calib.core.noise.noise_model import (
     fast_sigmas,
     rough_levels,
 )
-from hand_eye_calib.core.noise.normal import NormalEquations
+from hand_eye_calib.core.noise.normal import NormalEquations, prior_products
 from hand_eye_calib.core.noise.outliers import (
     Outliers,
     bridge_outliers,
     detect_outliers,
     innovation_chi_squares,
 )
-from hand_eye_calib.core.noise.stages import prior_products, sample
+from hand_eye_calib.core.noise.stages import sample
 from hand_eye_calib.core.noise.state_space import Posterior, StateSpace
 from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 from hand_eye_calib.core.results.records import Noise
