@@ -15,6 +15,7 @@ from hand_eye_calib.extras.rig import command
 from hand_eye_calib.extras.rig import rig as of_rig
 from hand_eye_calib.extras.rig.command import as_lines
 from hand_eye_calib.extras.rig.page import render_rig
+from hand_eye_calib.extras.rig.rig import RigCalibration
 from hand_eye_calib.formats.bags.writer import write_bag
 from hand_eye_calib.formats.results import save_rig
 from hand_eye_calib.offline.cli import present
@@ -91,6 +92,40 @@ def test_two_good_sensors_do_not_suffer_from_a_bad_first_one():
     assert (np.abs(apart) < 0.5 * sigmas).all()
     own, with_first = (calibrated.covariance_measured(name, "rear") for name in ("front", "lidar"))
     assert np.trace(own) < 0.5 * np.trace(with_first)
+
+
+@pytest.fixture
+def turned_neighbour(calibrated):
+    """Return the result for front and rear with an error of 20 standard deviations about x."""
+    (neighbour,) = calibrated.neighbours
+    error = np.zeros(6)
+    error[3] = 20.0 * np.sqrt(neighbour.covariance_measured[3, 3])
+    return dataclasses.replace(neighbour, T_parent_child=neighbour.T_parent_child @ se3.exp(error))
+
+
+def test_both_results_of_a_loop_that_does_not_close_are_used_with_care(
+    calibrated, turned_neighbour
+):
+    assert calibrated.verdict is hec.Verdict.USE
+    opened = RigCalibration.of(calibrated.sensors, calibrated.calibrations, [turned_neighbour])
+    assert not opened.closures[0].closes
+    assert opened.verdict is hec.Verdict.USE_WITH_CARE
+    for result in opened.calibrations:
+        assert [found.code for found in result.findings] == ["not_closed"]
+        assert result.verdict is hec.Verdict.USE_WITH_CARE
+    text = "\n".join(as_lines(opened))
+    assert text.count("lidar, front and rear, two at a time, differ around the loop") == 2
+
+
+def test_a_bad_result_of_a_loop_does_not_lower_the_verdict_of_the_other(
+    calibrated, turned_neighbour
+):
+    good, other = calibrated.calibrations
+    bad = dataclasses.replace(other, findings=(JUMPS,))
+    opened = RigCalibration.of(calibrated.sensors, [good, bad], [turned_neighbour])
+    assert not opened.closures[0].closes
+    verdicts = [result.verdict for result in opened.calibrations]
+    assert verdicts == [hec.Verdict.USE, hec.Verdict.DO_NOT_USE]
 
 
 def test_what_is_of_two_sensors_is_refused(rig):

@@ -6,6 +6,7 @@ from typing import Any
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.registry import (
     COMMANDS,
+    FINDING_WORDS,
     PUBLIC_NAMES,
     ROUTES,
     SESSION_PAGES,
@@ -15,9 +16,10 @@ from hand_eye_calib.core.base.registry import (
 
 
 def register() -> None:
-    """Register the command ``rig``, ``calibrate`` for three sensors, and the files of a session."""
+    """Register the command ``rig``, its findings, and the files of a session with a rig."""
     PUBLIC_NAMES["RigCalibration"] = "hand_eye_calib.extras.rig.rig"
     PUBLIC_NAMES["calibrate_rig"] = "hand_eye_calib.extras.rig.rig"
+    FINDING_WORDS["rig"] = _words
     COMMANDS["rig"] = Command("calibrate three sensors or more together", _rig)
     ROUTES["rig"] = Route(_add_arguments, _is_rig, _calibrate_rig)
     SESSION_PAGES["rig"] = _session_rig
@@ -28,6 +30,13 @@ def _rig() -> Any:
     from hand_eye_calib.extras.rig.job import RIG
 
     return RIG
+
+
+def _words() -> Any:
+    """Return the sentences of the findings about rigs."""
+    from hand_eye_calib.extras.rig.words import WORDS
+
+    return WORDS
 
 
 def _session_rig(directory: Path, session: Any) -> None:

@@ -21,6 +21,7 @@ from hand_eye_calib.core.base.errors import ConfigError, InputError, require_typ
 from hand_eye_calib.core.base.plain import Document, plain
 from hand_eye_calib.core.base.stats import CHI2
 from hand_eye_calib.core.base.text import angle, frame_name, length, listing
+from hand_eye_calib.core.checks.findings import finding
 from hand_eye_calib.core.engine.attempts import Attempt
 from hand_eye_calib.core.engine.estimation import solve_poses
 from hand_eye_calib.core.engine.run import run
@@ -29,6 +30,7 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import synchronise
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
+from hand_eye_calib.core.results.records import Finding
 
 # Beginnings of the names of options that a rig does not have, because they concern two sensors.
 _OF_ONE_PAIR = ("parent_", "child_", "base_frame", "prior")
@@ -189,6 +191,21 @@ class Closure:
             f"{self.dof} degrees of freedom"
         )
 
+    @property
+    def finding(self) -> Finding:
+        """The finding of a loop that does not close."""
+        first, second, third = self.sensors
+        return finding(
+            "not_closed",
+            first=first,
+            second=second,
+            third=third,
+            distance_mm=1e3 * self.translation_m,
+            rotation_deg=np.rad2deg(self.rotation_rad),
+            chi2=self.chi2,
+            dof=self.dof,
+        )
+
 
 @dataclass(frozen=True)
 class RigCalibration:
@@ -226,6 +243,8 @@ class RigCalibration:
     ) -> RigCalibration:
         """Return a rig, with the closure errors of these results distributed.
 
+        The results of a loop that does not close have a finding, ``not_closed``.
+
         Parameters
         ----------
         sensors : tuple of str
@@ -242,7 +261,24 @@ class RigCalibration:
             replace(calibration, T_parent_child=se3.exp(step) @ calibration.T_parent_child)
             for calibration, step in zip(star, rig._steps(), strict=True)
         )
-        return replace(rig, calibrations=calibrations)
+        return replace(rig, calibrations=calibrations)._with_findings()
+
+    def _with_findings(self) -> RigCalibration:
+        """Return the rig with a finding in both results of each loop that does not close.
+
+        A result that is DO NOT USE already explains why its loop does not close. The other result
+        of this loop may be good, and gets no finding.
+        """
+        calibrations = list(self.calibrations)
+        for loop, closure in enumerate(self.closures):
+            results = self.calibrations[loop : loop + 2]
+            has_bad_result = any(result.verdict is Verdict.DO_NOT_USE for result in results)
+            if closure.closes or has_bad_result:
+                continue
+            for k in (loop, loop + 1):
+                findings = (*calibrations[k].findings, closure.finding)
+                calibrations[k] = replace(calibrations[k], findings=findings)
+        return replace(self, calibrations=tuple(calibrations))
 
     def __repr__(self) -> str:
         return f"{self.verdict.value}: {listing(self.sensors)}"

@@ -1,0 +1,14 @@
+"""Sentences of the findings about rigs."""
+
+from hand_eye_calib.core.checks.words import FindingWords
+from hand_eye_calib.core.results.records import Severity
+
+WORDS = {
+    "not_closed": FindingWords(
+        "the results for {first}, {second} and {third}, two at a time, differ around the loop by "
+        "{distance_mm:.1f} mm and {rotation_deg:.2f} deg, more than their uncertainty allows",
+        "tighten the mounts of these sensors and record again; compare their scales",
+        "a sensor that moved on its mount, or a scale that changed during the recording",
+        severity=Severity.WARNING,
+    ),
+}
