@@ -233,7 +233,8 @@ def fused(parent, child, X, tau_s):
 class TestParentFusedFromTheChild:
     """Through a mount that is 3.5 deg and 8 cm wrong."""
 
-    WRONG = se3.exp(np.r_[0.05, -0.05, 0.04, np.radians([2.0, -2.0, 2.0])])
+    WRONG_ROTATION = np.radians([2.0, -2.0, 2.0])
+    WRONG = se3.exp(np.r_[0.05, -0.05, 0.04, WRONG_ROTATION])
 
     @pytest.mark.parametrize("tau_s", [0.1, 0.2, 0.5])
     @pytest.mark.parametrize("kind", ["hand_vio_walk", "hand_gm_1s"])
@@ -248,6 +249,33 @@ class TestParentFusedFromTheChild:
         assert codes & {"not_independent", "worlds_turned"}
         clean = hec.calibrate(truth.parent, truth.child)
         assert (clean.verdict, clean.findings) == (Verdict.USE, ())
+
+    @pytest.mark.parametrize("tau_s", [0.3, 2.0])
+    @pytest.mark.parametrize("filtered", ["parent", "child"])
+    def test_the_finding_names_the_error_of_the_assumed_mount(self, filtered, tau_s):
+        truth = make("hand_vio_walk", 902)
+        parent = truth.parent[2:-2]
+        child = truth.child
+        assumed = truth.T_parent_child @ self.WRONG
+        if filtered == "parent":
+            parent = fused(parent, child, assumed, tau_s)
+        else:
+            child = fused(child[2:-2], truth.parent, se3.inverse(assumed), tau_s)
+        findings = check_streams(parent, child).findings
+        (finding,) = [found for found in findings if found.code == "not_independent"]
+        assert finding.severity is Severity.ERROR
+        wrong_rad = np.linalg.norm(self.WRONG_ROTATION)
+        assert finding.evidence["turn_rad"] == pytest.approx(wrong_rad, rel=0.4)
+        # Only the nearest of four time constants is fitted.
+        assert finding.evidence["time_constant_s"] in (0.3, 1.0, 3.0)
+
+    def test_a_wrong_lever_arm_alone_is_questioned(self):
+        truth = make("hand_vio_walk", 902)
+        shift = se3.from_rotation_translation(np.eye(3), np.array([0.05, -0.05, 0.04]))
+        parent = fused(truth.parent[2:-2], truth.child, truth.T_parent_child @ shift, 0.1)
+        (finding,) = check_streams(parent, truth.child).findings
+        assert (finding.code, finding.severity) == ("not_independent", Severity.WARNING)
+        assert finding.evidence["shift_m"] == pytest.approx(0.081, rel=0.2)
 
     @pytest.mark.parametrize("seed", [61, 62])
     def test_rotations_about_one_axis_show_no_other_mount(self, seed):

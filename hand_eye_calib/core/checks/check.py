@@ -17,7 +17,7 @@ streams is called a *reading*.
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,9 +29,15 @@ from hand_eye_calib.core.assessment.covariance import hidden_axes, lever_arm_pro
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import NotEnoughDataError
-from hand_eye_calib.core.base.text import axes_in_words, with_sigma
-from hand_eye_calib.core.checks import agreement, hypotheses, independence, misread
+from hand_eye_calib.core.base.text import axes_in_words
+from hand_eye_calib.core.checks import agreement, fusion, hypotheses, independence, misread
 from hand_eye_calib.core.checks.agreement import ExtrinsicEstimate
+from hand_eye_calib.core.checks.clock_and_scale import (
+    ROUNDED,
+    check_offset,
+    in_metres,
+    own_unit,
+)
 from hand_eye_calib.core.checks.findings import LIMITS, Finding, finding, graded, gravest_first
 from hand_eye_calib.core.checks.hypotheses import Explanation, Readings
 from hand_eye_calib.core.checks.stream_pair import LAGS_S, MAX_PAIRS, MIN_PAIRS, StreamPair
@@ -42,7 +48,6 @@ from hand_eye_calib.core.checks.streams import (
     check_positions,
     check_stream,
 )
-from hand_eye_calib.core.checks.units import in_other_units
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
@@ -54,9 +59,6 @@ _SLOW_GAP_INTERVALS = 1.5
 
 # Standard deviations that are subtracted from a lever arm, for its smallest possible length.
 _LEVER_ARM_SIGMAS = 3.0
-
-# Code of rounded positions, whose severity depends on the unit of length.
-_ROUNDED = "coarse_positions"
 
 # Largest number of motions over some seconds, for the regression on small faults.
 _MAX_MOTIONS = 1500
@@ -121,7 +123,7 @@ def check_streams(
     findings = check_stream(original.parent, "parent", max_gap_s)
     findings += check_stream(original.child, "child", max_gap_s)
     # Rounded positions are judged later, when the unit of length is known.
-    if _are_unusable([found for found in findings if found.code != _ROUNDED]):
+    if _are_unusable([found for found in findings if found.code != ROUNDED]):
         return CheckResult(gravest_first(findings))
     streams = original.shifted(time_offset_s)
     explanation = None
@@ -232,14 +234,13 @@ def _check_explained(
         # Noise and shape decide between the readings only if the unit of length is known.
         readings = None
         findings = [found for found in findings if found not in of_reading]
-    findings = _in_metres(findings, [*lengths, *sizes], arguments.scale)
+    findings = in_metres(findings, [*lengths, *sizes], arguments.scale)
     is_sound = not _are_unusable([found for found in findings if found not in of_reading])
     findings += [*lengths, *check_offset(offset, arguments.time_offset_s), *sizes]
     if is_sound and not lengths:
         earlier = arguments.earlier
         corrected, fit = _preferred_reading(streams, corrected, explanation, fit, offset, earlier)
-        is_one_axis = any(found.code == "one_axis" for found in sizes)
-        findings += _check_agreeing(corrected, fit, offset, is_one_axis, arguments)
+        findings += _check_agreeing(corrected, fit, offset, arguments)
     return CheckResult(gravest_first(findings), explanation.fit, offset, readings)
 
 
@@ -292,38 +293,6 @@ def least_lever_arm(T_parent_child: FloatArray, sigmas: FloatArray) -> float:
     """
     sizes = np.abs(se3.translation_of(T_parent_child)) - _LEVER_ARM_SIGMAS * sigmas
     return float(np.linalg.norm(np.clip(np.nan_to_num(sizes, neginf=0.0), 0.0, None)))
-
-
-def _in_metres(
-    findings: Sequence[Finding], units: Sequence[Finding], scale: float
-) -> list[Finding]:
-    """Return the findings, with those about rounded positions graded in metres.
-
-    Parameters
-    ----------
-    findings : sequence of Finding
-        Findings about streams with the child's lengths multiplied by ``scale``.
-    units : sequence of Finding
-        Findings about the unit of a stream's lengths; their options convert it to metres.
-    scale : float
-    """
-    options: dict[str, Any] = {}
-    for unit in units:
-        if unit.code in ("units", "lengths"):
-            options.update(unit.options)
-    factors = {
-        "parent": float(options.get("parent_scale", 1.0)),
-        "child": float(options.get("scale", scale)) / scale,
-    }
-    in_metres: list[Finding] = []
-    for found in findings:
-        if found.code != _ROUNDED:
-            in_metres.append(found)
-            continue
-        step_m = found.evidence["step_m"] * factors[found.stream]
-        if rounded := graded(_ROUNDED, found.stream, step_m, step_m=step_m):
-            in_metres.append(rounded)
-    return in_metres
 
 
 def _explain_by_extrinsic(
@@ -476,44 +445,21 @@ def _check_sizes(
     fits_of_scale = [candidate for candidate in fits_of_scale if candidate.scale_sigma > 0.0]
     with suppress(NotEnoughDataError):
         fit = similarity.estimate_scale(pose_pairs, fits_of_scale)
-        own_unit = _own_unit(streams, fit, used_scale) if fit.has_own_unit else None
-        if own_unit:
-            findings.append(own_unit)
+        other_unit = own_unit(streams, fit, used_scale) if fit.has_own_unit else None
+        if other_unit:
+            findings.append(other_unit)
     return findings, fit
-
-
-def _own_unit(streams: StreamPair, fit: SimilarityFit, used_scale: float) -> Finding | None:
-    """Return the finding that the child has another unit of length, or else another scale.
-
-    None if the scale is near 1. The child's lengths are the original lengths times ``used_scale``.
-    """
-    original_child = streams.child.scaled(1.0 / used_scale)
-    sigma_and_bias = float(np.hypot(fit.scale_sigma, fit.scale_bias))
-    unit = in_other_units(fit.scale, sigma_and_bias, streams.parent, original_child, used_scale)
-    if unit:
-        return unit
-    total_scale = used_scale * fit.scale
-    return graded(
-        "scale",
-        "child",
-        fit.scale - 1.0,
-        scale=total_scale,
-        sigma=used_scale * fit.scale_sigma,
-        options={"scale": float(f"{total_scale:.4g}")},
-    )
 
 
 def _check_agreeing(
     corrected: StreamPair,
     fit: SimilarityFit,
     offset: TimeOffset,
-    is_one_axis: bool,
     arguments: _Arguments,
 ) -> list[Finding]:
     """Return the findings about streams that agree: copies, faults that bias X, and fusion.
 
-    ``corrected`` are the streams on one clock, with all mistakes undone. ``is_one_axis`` is true if
-    all rotation is about one axis.
+    ``corrected`` are the streams on one clock, with all mistakes undone.
     """
     best = ExtrinsicEstimate(fit.T_parent_child, fit.sigmas[:6])
     earlier = arguments.earlier
@@ -526,9 +472,12 @@ def _check_agreeing(
     motions = _motions(pose_pairs, _MAX_MOTIONS)
     offset_s = arguments.time_offset_s + offset.seconds
     findings = agreement.check_agreement(pose_pairs, motions, fit.T_parent_child, best, offset_s)
-    if findings or arguments.are_exact:
+    if arguments.are_exact:
         return findings
-    return independence.check_fusion(pose_pairs, best.T_parent_child, is_one_axis)
+    correction = fusion.check_correction(pose_pairs, best.T_parent_child)
+    if correction and (correction.makes_unusable or not findings):
+        return [correction]
+    return findings or independence.check_drift(pose_pairs, best.T_parent_child)
 
 
 def check_parts(
@@ -545,7 +494,7 @@ def check_parts(
     findings = check_positions(parent, "parent", max_gap_s)
     findings += check_positions(child, "child", max_gap_s)
     # Rounded positions stay the same while the sensor moves.
-    is_rounded = any(found.code == _ROUNDED for found in findings)
+    is_rounded = any(found.code == ROUNDED for found in findings)
     if is_rounded or _are_unusable(findings):
         return findings
     lengths = check_lengths(parent, child, lever_arm_m)
@@ -564,51 +513,6 @@ def can_check(parent: Trajectory, child: Trajectory) -> bool:
         if se3.rotation_angle(rotations[0].T @ rotations).max() >= MIN_ROTATION_RAD:
             return True
     return False
-
-
-def check_offset(offset: TimeOffset, added_s: float) -> list[Finding]:
-    """Return the finding about a clock offset, or none.
-
-    ``added_s`` was added to the child's stamps before, s.
-    """
-    values = offset_values(offset.seconds, added_s) | {"sigma_s": offset.sigma_s}
-    values["beyond"] = f" beyond the {added_s:.4f} s that were added" if added_s else ""
-    values["options"] = {"time_offset": values["total_s"]}
-    clocks_differ = graded("time_offset", "child", offset.seconds, offset.sigma_s, **values)
-    return [clocks_differ] if clocks_differ else []
-
-
-def offset_values(offset_s: float, added_s: float = 0.0) -> dict[str, Any]:
-    """Return the values of the finding about a clock offset ``offset_s`` beyond ``added_s``."""
-    values: dict[str, Any] = {"offset_s": offset_s, "size_s": abs(offset_s)}
-    values["direction"] = "behind" if offset_s > 0 else "ahead of"
-    return values | {"total_s": round(added_s + offset_s, 4)}
-
-
-def check_model_scale(scale: float, sigma: float) -> list[Finding]:
-    """Return the finding about a scale that the noise model added to the solution, or none.
-
-    Parameters
-    ----------
-    scale, sigma : float
-        Factor of the child's lengths, and its standard deviation; 0 if the scale was not
-        estimated.
-    """
-    if sigma <= 0.0:
-        return []
-    excess = 1.0 / scale - 1.0
-    sigma_excess = sigma / scale**2
-    other_scale = graded(
-        "model_scale",
-        "child",
-        excess,
-        sigma_excess,
-        scale=scale,
-        sigma=sigma,
-        size=with_sigma(100.0 * abs(excess), 100.0 * sigma_excess, 1),
-        than="longer" if excess > 0.0 else "shorter",
-    )
-    return [other_scale] if other_scale else []
 
 
 def _motions(pose_pairs: PosePairs, max_motions: int) -> MotionPairs:

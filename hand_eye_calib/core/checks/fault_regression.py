@@ -54,7 +54,7 @@ _MAX_STAMP_ERROR = 0.3
 # Residual length at which the robust weight of a motion is a quarter, in standard deviations.
 _QUARTER_WEIGHT_SIGMAS = 3.0
 # Rounds of robust weights.
-_ROUNDS = 4
+ROUNDS = 4
 
 # Smallest units of displacements (m) and rotations (rad), for streams without noise.
 _MIN_UNIT_M = 1e-7
@@ -101,7 +101,7 @@ class Regression:
         flat = rows.reshape(-1, n_columns)
         of_base = flat[:, [*self._columns_of(base), n_columns - 1]]
         weights = np.ones(n_motions)
-        for _ in range(_ROUNDS):
+        for _ in range(ROUNDS):
             products = (of_base * np.repeat(weights, size)[:, None]).T @ of_base
             coefficients = solve(products, range(len(products) - 1))
             residuals = of_base[:, -1] - of_base[:, :-1] @ coefficients
@@ -365,6 +365,13 @@ def _filter_groups(
     return groups
 
 
+def noise_units(displacements: FloatArray, rotations: FloatArray) -> FloatArray:
+    """Return the standard deviations (6,) of residuals: displacements (K, 3), rotations (K, 3)."""
+    unit_m = max(float(robust_sigma(displacements)), _MIN_UNIT_M)
+    unit_rad = max(float(robust_sigma(rotations)), _MIN_UNIT_RAD)
+    return np.repeat([unit_m, unit_rad], 3)
+
+
 def _base_groups(parent: _Stream, child: _Stream) -> dict[str, FloatArray]:
     """Return the groups of the base: lever arm (m), small rotation of X (rad), and scale."""
     return {
@@ -402,9 +409,7 @@ def _regression(
     displaced = child.displacements - parent.displacements
     turned = se3.rotation_log(child.rotations @ np.swapaxes(parent.rotations, 1, 2))
     residuals_m = displaced - se3.times(parent.chords, se3.translation_of(X))
-    unit_m = max(float(robust_sigma(residuals_m)), _MIN_UNIT_M)
-    unit_rad = max(float(robust_sigma(turned)), _MIN_UNIT_RAD)
-    units = np.repeat([unit_m, unit_rad], 3)[:, None]
+    units = noise_units(residuals_m, turned)[:, None]
     base = _base_groups(parent, child)
     columns: dict[str, list[int]] = {}
     n_columns = 0

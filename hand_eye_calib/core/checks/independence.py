@@ -1,31 +1,31 @@
 """Checks that two streams are independent measurements.
 
-Streams are not independent if one stream was computed from the other, or fused with the other
-through an assumed transform. The extrinsic would then only be a copy of that transform.
+Streams are not independent if one stream was computed from the other through an assumed transform.
+The extrinsic would then only be a copy of that transform.
+:mod:`~hand_eye_calib.core.checks.fusion` checks streams that a filter fuses.
 
 Model: errors of two sensors are independent. The variances of their noise add up in the difference
 of the aligned streams, and odometries drift against each other. A stream that was computed from the
 other has a difference with less noise, or without drift.
 """
 
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
 import numpy as np
 from numpy.typing import NDArray
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.core.base.blocks import Blocks, jackknife_covariance
 from hand_eye_calib.core.base.stats import median, quantile, robust_regression, robust_weights
 from hand_eye_calib.core.base.text import angle, length
+from hand_eye_calib.core.checks.fault_regression import ROUNDS
 from hand_eye_calib.core.checks.findings import Finding, Severity, finding
 from hand_eye_calib.core.checks.stream_pair import MAX_ROTATION_RAD, MIN_PAIRS, StreamPair
 from hand_eye_calib.core.checks.streams import USUAL, coarse
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
-from hand_eye_calib.core.pairing.motion_pairs import (
-    MotionPairs,
-    PosePairs,
-    pairs_between,
-    pairs_over,
-)
+from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_between
 from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
 
 # Orientations are copies if their residual is below this angle (rad): rounding to five digits.
@@ -50,25 +50,8 @@ _LITTLE_NOISE = 1e-3
 # for positions and for orientations. Sensors that shake together have ratios of 1.2 and 16.
 _SHARED = np.array([3.0, 30.0])
 
-# A filter may correct one stream by the other through an assumed mount. Short motions then contain
-# the true mount, and long motions the assumed mount.
-# Duration of short motions, s.
-_SHORT_S = 0.05
-# Duration of long motions, s.
-_LONG_S = 3.0
-# Largest number of motions of each duration.
-_MOST_MOTIONS = 6000
-
-# The mounts of short and of long motions differ if their angle exceeds two limits.
-# Limit in rad.
-_OTHER_MOUNT_RAD = float(np.radians(0.04))
-# Limit in standard deviations. 177 recordings without this fault have at most 5.2.
-_OTHER_MOUNT_SIGMAS = 6.5
-# Blocks of time of the jackknife for the standard deviations.
-_BLOCKS = 20
-# Rounds of robust weights.
-_ROUNDS = 4
-
+# Duration of the windows in which positions are aligned, s.
+_WINDOW_S = 3.0
 # Two odometries drift against each other. On a path of at least this length (m), the median
 # distance of aligned positions exceeds the share _LEAST_DRIFT of the path.
 _LONG_PATH_M = 400.0
@@ -90,7 +73,7 @@ _GROWN_S = (3.0, 8.0, 15.0, 30.0, 60.0)
 # with white noise.
 _WHITE_GROWTH = 1.25
 # Streams do not drift if positions differ over the whole recording by less than this factor times
-# their distance within windows of _LONG_S: 1.58 at least in simulated and real recordings of two
+# their distance within windows of _WINDOW_S: 1.58 at least in simulated and real recordings of two
 # odometries on paths above 200 m.
 _STEADY = 1.25
 # Shortest path (m) on which this is judged. Hand-held sensors in a motion capture room, which do
@@ -139,24 +122,6 @@ def check_copies(given: StreamPair, aligned: StreamPair, are_exact: bool) -> lis
     if more > 1.0:
         return [_doubt("the noise of both streams is unusually alike", more=more)]
     return []
-
-
-def check_fusion(pose_pairs: PosePairs, X: FloatArray, is_one_axis: bool) -> list[Finding]:
-    """Detect an odometry that was fused with the other stream through an assumed mount.
-
-    Parameters
-    ----------
-    pose_pairs : PosePairs
-        Pose pairs on one clock, in one unit of length.
-    X : (4, 4) array
-        The extrinsic.
-    is_one_axis : bool
-        Whether the sensors rotate about one axis only. Their rotations then do not determine the
-        mount.
-    """
-    other_mount = None if is_one_axis else _other_mount(pose_pairs)
-    doubt = other_mount or _no_drift(pose_pairs, X)
-    return [doubt] if doubt else []
 
 
 def _doubt(text: str, severity: Severity | None = None, **evidence: float) -> Finding:
@@ -276,128 +241,134 @@ def _upper_quarters(second_differences: FloatArray) -> FloatArray:
     return np.stack([quarter.mean(axis=1) for quarter in quarters[2:]])
 
 
-def _other_mount(pose_pairs: PosePairs) -> Finding | None:
-    """Detect streams with different rotations of X in short and in long motions."""
-    rotations = [
-        _rotations_of_blocks(pairs_over(pose_pairs, lag_s, _MOST_MOTIONS), len(pose_pairs))
-        for lag_s in (_SHORT_S, _LONG_S)
-    ]
-    if any(stack is None for stack in rotations):
-        return None
-    of_short, of_long = (stack for stack in rotations if stack is not None)
-    turns = se3.rotations_between(of_long, of_short)
-    covariance = jackknife_covariance(turns[1:]) + 1e-12 * np.eye(3)
-    sigmas = float(np.sqrt(turns[0] @ np.linalg.solve(covariance, turns[0])))
-    turn_rad = float(np.linalg.norm(turns[0]))
-    if turn_rad < _OTHER_MOUNT_RAD or sigmas < _OTHER_MOUNT_SIGMAS:
-        return None
-    text = (
-        f"short motions show a mount that is turned by {angle(turn_rad)} against that of long ones"
-    )
-    return _doubt(text, turn_rad=turn_rad, sigmas=sigmas)
+def check_drift(pose_pairs: PosePairs, X: FloatArray) -> list[Finding]:
+    """Detect streams that drift less against each other than two odometries do.
 
-
-def _rotations_of_blocks(motions: MotionPairs, n_poses: int) -> FloatArray | None:
-    """Estimate the rotation of X by all motions, and by all but each block of time (jackknife).
-
-    Return (1 + _BLOCKS, 3, 3), the estimate by all motions first, or None for too few motions.
+    Parameters
+    ----------
+    pose_pairs : PosePairs
+        Pose pairs on one clock, in one unit of length.
+    X : (4, 4) array
+        The extrinsic.
     """
-    of_parent = se3.rotation_log(se3.rotation_of(motions.Ts_parenti_parentj))
-    of_child = se3.rotation_log(se3.rotation_of(motions.Ts_childi_childj))
-    is_clear = np.linalg.norm(of_parent, axis=1) < MAX_ROTATION_RAD
-    blocks = motions.i * _BLOCKS // n_poses
-    if is_clear.sum() < MIN_PAIRS or len(np.unique(blocks[is_clear])) < _BLOCKS:
-        return None
-    weights = is_clear.astype(float)
-    for _ in range(_ROUNDS):
-        outer = weights[:, None, None] * of_parent[:, :, None] * of_child[:, None, :]
-        products = Blocks.gathered(outer, blocks, _BLOCKS)
-        R = se3.nearest_rotation(products.total)
-        residuals = np.linalg.norm(of_parent - of_child @ R.T, axis=1)
-        usual = 2.0 * median(residuals[is_clear]) + 1e-12
-        weights = is_clear * robust_weights("cauchy", (residuals / usual) ** 2)
-    return se3.nearest_rotation(np.concatenate([products.total[None], products.without()]))
-
-
-def _no_drift(pose_pairs: PosePairs, X: FloatArray) -> Finding | None:
-    """Detect streams that drift less against each other than two odometries do."""
     path = coarse(Trajectory(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p), _STEP_S)
     path_m = float(np.linalg.norm(np.diff(se3.translation_of(path.poses), axis=0), axis=1).sum())
-    few = pose_pairs[:: 1 + len(pose_pairs) // _MOST_POSES]
-    points = se3.translation_of(few.Ts_pw_p @ X)
-    others = se3.translation_of(few.Ts_cw_c)
-    apart_m = _after_alignment(points, others)
+    aligned = _AlignedPositions.of(pose_pairs[:: 1 + len(pose_pairs) // _MOST_POSES], X)
+    apart_m = median(aligned.distances_m)
     is_close = path_m >= _LONG_PATH_M and apart_m <= _LEAST_DRIFT * path_m
-    is_steady = path_m >= _STEADY_PATH_M and _is_steady(few, X)
-    if not (is_close or is_steady or _is_copy_with_noise(pose_pairs, X)):
-        return None
+    is_steady = path_m >= _STEADY_PATH_M and _is_steady(aligned)
+    is_copy = _is_difference_white(aligned) and _is_noise_shared(pose_pairs, X)
+    if not (is_close or is_steady or is_copy):
+        return []
     text = f"the streams drift apart by only {length(apart_m)} over {length(path_m)}"
-    return _doubt(text, drift_m=apart_m, path_m=path_m)
+    return [_doubt(text, drift_m=apart_m, path_m=path_m)]
 
 
-def _is_steady(pose_pairs: PosePairs, X: FloatArray) -> bool:
+@dataclass(frozen=True, eq=False)
+class _AlignedPositions:
+    """Positions of both streams, aligned robustly by a rotation and a translation.
+
+    Attributes
+    ----------
+    pose_pairs : PosePairs
+        N pose pairs.
+    Ts_pw_c : (N, 4, 4) array
+        Poses of the child in the parent's world, from the parent's poses and X.
+    points, others : (N, 3) arrays
+        Positions of the child in the parent's world and in its own world, m.
+    R : (3, 3) array
+        Rotation from the child's world to the parent's world.
+    distances_m : (N,) array
+        Distances of the aligned positions, m.
+    """
+
+    pose_pairs: PosePairs
+    Ts_pw_c: FloatArray
+    points: FloatArray
+    others: FloatArray
+    R: FloatArray
+    distances_m: FloatArray
+
+    @classmethod
+    def of(cls, pose_pairs: PosePairs, X: FloatArray) -> Self:
+        """Align the positions of pose pairs for the extrinsic X (4, 4)."""
+        Ts_pw_c = pose_pairs.Ts_pw_p @ X
+        points = se3.translation_of(Ts_pw_c)
+        others = se3.translation_of(pose_pairs.Ts_cw_c)
+        R, distances_m = _alignment(points, others)
+        return cls(pose_pairs, Ts_pw_c, points, others, R, distances_m)
+
+    @cached_property
+    def seconds(self) -> FloatArray:
+        """Times (N,) since the first pose pair, s."""
+        stamps_ns = self.pose_pairs.stamps_ns
+        return np.asarray((stamps_ns - stamps_ns[0]) * 1e-9)
+
+    @cached_property
+    def from_mean(self) -> FloatArray:
+        """Points (N, 3) relative to their mean, m."""
+        return np.asarray(self.points - self.points.mean(axis=0))
+
+    @cached_property
+    def differences(self) -> FloatArray:
+        """Differences (N, 3) of the aligned positions, in the parent's world, m."""
+        others_from_mean = self.others - self.others.mean(axis=0)
+        return np.asarray(others_from_mean @ self.R.T - self.from_mean)
+
+    def regressors(self, rotations: FloatArray) -> FloatArray:
+        """Return the regressors (N, 3, 11) of errors of both worlds, X, scale and clock offset.
+
+        ``rotations`` (N, 3, 3) rotate an error of the lever arm to the parent's world.
+        """
+        columns = [
+            np.broadcast_to(np.eye(3), rotations.shape),
+            se3.skew(self.from_mean),
+            rotations,
+            self.from_mean[:, :, None],
+            np.gradient(self.points, self.seconds, axis=0)[:, :, None],
+        ]
+        return np.concatenate(columns, axis=2)
+
+
+def _is_steady(aligned: _AlignedPositions) -> bool:
     """Return whether positions differ over the whole recording about as little as within seconds.
 
     Errors of X, scale and clock offset cause differences as well. They are estimated by a robust
     regression and removed first.
     """
-    points = se3.translation_of(pose_pairs.Ts_pw_p @ X)
-    others = se3.translation_of(pose_pairs.Ts_cw_c)
-    R = _alignment(points, others)[0]
-    residuals = (others - others.mean(axis=0)) @ R.T - (points - points.mean(axis=0))
-    seconds = (pose_pairs.stamps_ns - pose_pairs.stamps_ns[0]) * 1e-9
-    from_mean = points - points.mean(axis=0)
-    columns = [
-        np.broadcast_to(np.eye(3), (len(points), 3, 3)),
-        se3.skew(from_mean),
-        se3.rotation_of(pose_pairs.Ts_pw_p),
-        from_mean[:, :, None],
-        np.gradient(points, seconds, axis=0)[:, :, None],
-    ]
-    rows = np.concatenate(columns, axis=2)
+    rows = aligned.regressors(se3.rotation_of(aligned.pose_pairs.Ts_pw_p))
     values, distances_m = robust_regression(
-        "cauchy", rows, residuals, _ROUNDS, lambda lengths_m: 2.0 * median(lengths_m)
+        "cauchy", rows, aligned.differences, ROUNDS, lambda lengths_m: 2.0 * median(lengths_m)
     )
-    corrected = points + rows @ values
-    windows_m = _apart_in_windows(pose_pairs.stamps_ns, corrected, others)
+    corrected = aligned.points + rows @ values
+    windows_m = _apart_in_windows(aligned.pose_pairs.stamps_ns, corrected, aligned.others)
     return median(distances_m) < _STEADY * windows_m
 
 
 def _apart_in_windows(stamps_ns: IntArray, points: FloatArray, others: FloatArray) -> float:
     """Align points (N, 3) in each window of time, and return the median distance (m) of all."""
     # A window needs enough points, also of a long recording with few of its poses.
-    window_ns = max(round(_LONG_S * 1e9), round(2 * MIN_PAIRS * median(np.diff(stamps_ns))))
+    window_ns = max(round(_WINDOW_S * 1e9), round(2 * MIN_PAIRS * median(np.diff(stamps_ns))))
     windows = (stamps_ns - stamps_ns[0]) // window_ns
     distances_m = [
-        _after_alignment(points[windows == window], others[windows == window])
+        median(_alignment(points[windows == window], others[windows == window])[1])
         for window in np.unique(windows)
         if (windows == window).sum() >= MIN_PAIRS
     ]
     return median(distances_m) if distances_m else 0.0
 
 
-def _after_alignment(points: FloatArray, others: FloatArray) -> float:
-    """Align points (N, 3) with others robustly, and return their median distance (m)."""
-    return median(_alignment(points, others)[1])
-
-
-def _is_copy_with_noise(pose_pairs: PosePairs, X: FloatArray) -> bool:
-    """Return whether one stream is a copy of the other with added noise.
-
-    The difference of both streams is then white, and the noise of one stream contains that of the
-    other.
-    """
-    few = pose_pairs[:: 1 + len(pose_pairs) // _MOST_POSES]
-    seconds = (few.stamps_ns - few.stamps_ns[0]) * 1e-9
+def _is_difference_white(aligned: _AlignedPositions) -> bool:
+    """Return whether the difference of both streams does not grow with time."""
+    seconds = aligned.seconds
     if len(seconds) < _GROWTH_POSES or seconds[-1] < _GROWTH_S:
         return False
     interval_s = median(np.diff(seconds))
     times_s = [time_s for time_s in _GROWN_S if time_s <= seconds[-1] / 3.0]
-    differences = _differences(seconds, few, X)
+    differences = _pose_differences(aligned)
     first = _size_of_changes(differences, 1)
     sizes = [_size_of_changes(differences, round(time_s / interval_s)) for time_s in times_s]
-    is_white = (np.array(sizes) < _WHITE_GROWTH * first).all()
-    return bool(is_white and _is_noise_shared(pose_pairs, X))
+    return bool((np.array(sizes) < _WHITE_GROWTH * first).all())
 
 
 def _is_noise_shared(pose_pairs: PosePairs, X: FloatArray) -> bool:
@@ -467,47 +438,33 @@ def _size_of_changes(values: FloatArray, n_poses: int) -> FloatArray:
     return np.maximum(changes[int(_DIFFERENCE_SHARE * len(changes))], 1e-12)
 
 
-def _differences(seconds: FloatArray, pose_pairs: PosePairs, X: FloatArray) -> FloatArray:
+def _pose_differences(aligned: _AlignedPositions) -> FloatArray:
     """Return the differences (N, 6) of child and parent poses: positions (m), orientations (rad).
 
     Errors of X, scale and clock offset cause differences as well. They are estimated by a robust
     regression and removed.
     """
-    Ts = pose_pairs.Ts_pw_p @ X
-    points = se3.translation_of(Ts)
-    others = se3.translation_of(pose_pairs.Ts_cw_c)
-    rotations = se3.rotation_of(Ts)
-    constant = np.broadcast_to(np.eye(3), rotations.shape)
-    R = _alignment(points, others)[0]
-    from_mean = points - points.mean(axis=0)
-    velocities = np.gradient(points, seconds, axis=0)
-    of_positions = [
-        constant,
-        se3.skew(from_mean),
-        rotations,
-        from_mean[:, :, None],
-        velocities[:, :, None],
-    ]
-    distances = (others - others.mean(axis=0)) @ R.T - from_mean
+    rotations = se3.rotation_of(aligned.Ts_pw_c)
     # Without errors, the rotations from the parent's world to the child's world are constant.
-    between = se3.rotation_of(pose_pairs.Ts_cw_c) @ np.swapaxes(rotations, 1, 2)
+    between = se3.rotation_of(aligned.pose_pairs.Ts_cw_c) @ np.swapaxes(rotations, 1, 2)
     world = se3.nearest_rotation(between.sum(axis=0))
     turns = se3.rotation_log(world.T @ between)
     steps = se3.rotation_log(rotations[1:] @ np.swapaxes(rotations[:-1], 1, 2))
-    rates = np.gradient(np.cumsum(np.pad(steps, ((1, 0), (0, 0))), axis=0), seconds, axis=0)
-    of_orientations = [constant, rotations, rates[:, :, None]]
+    angles = np.cumsum(np.pad(steps, ((1, 0), (0, 0))), axis=0)
+    rates = np.gradient(angles, aligned.seconds, axis=0)
+    constant = np.broadcast_to(np.eye(3), rotations.shape)
+    of_orientations = np.concatenate([constant, rotations, rates[:, :, None]], axis=2)
     residuals = [
-        _without_columns(of_positions, distances),
-        _without_columns(of_orientations, turns),
+        _residuals(aligned.regressors(rotations), aligned.differences),
+        _residuals(of_orientations, turns),
     ]
     return np.concatenate(residuals, axis=1)
 
 
-def _without_columns(columns: list[FloatArray], targets: FloatArray) -> FloatArray:
-    """Return the residuals (N, 3) of targets after a robust regression on columns (N, 3, m)."""
-    rows = np.concatenate(columns, axis=2)
+def _residuals(rows: FloatArray, targets: FloatArray) -> FloatArray:
+    """Return the residuals (N, 3) of targets after a robust regression on rows (N, 3, m)."""
     values, _ = robust_regression(
-        "cauchy", rows, targets, _ROUNDS, lambda lengths: 2.0 * median(lengths)
+        "cauchy", rows, targets, ROUNDS, lambda lengths: 2.0 * median(lengths)
     )
     return np.asarray(targets - rows @ values)
 
@@ -521,7 +478,7 @@ def _alignment(points: FloatArray, others: FloatArray) -> tuple[FloatArray, Floa
         Rotation from the others to the points, and distances of the aligned points, m.
     """
     weights = np.ones(len(points))
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         from_mean = points - np.average(points, axis=0, weights=weights)
         others_from_mean = others - np.average(others, axis=0, weights=weights)
         R = se3.nearest_rotation((weights[:, None] * from_mean).T @ others_from_mean)

@@ -6,6 +6,7 @@ import numpy as np
 
 from hand_eye_calib.core.checks import check as checking
 from hand_eye_calib.core.checks.check import CheckResult
+from hand_eye_calib.core.checks.clock_and_scale import check_model_scale
 from hand_eye_calib.core.checks.findings import Severity, answered, gravest_first
 from hand_eye_calib.core.engine.cross_check import cross_checked
 from hand_eye_calib.core.engine.estimation import solve_poses
@@ -53,7 +54,7 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
     obsolete = _obsolete_codes(snapshot, calibration)
     findings = [finding for finding in result.findings if finding.code not in obsolete]
     if calibration and config.scale == "none":
-        findings += checking.check_model_scale(calibration.scale, calibration.scale_sigma)
+        findings += check_model_scale(calibration.scale, calibration.scale_sigma)
     findings = answered(findings, config)
     if INVERSIONS & config.given:
         # The user has decided whether both streams are inverse.

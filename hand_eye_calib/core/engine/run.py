@@ -22,9 +22,9 @@ from hand_eye_calib.core.alignment.time_offset import TimeOffset, refine_time_of
 from hand_eye_calib.core.base.config import METHODS, defaults_of
 from hand_eye_calib.core.base.errors import HandEyeCalibError, NotEnoughDataError
 from hand_eye_calib.core.base.option import Options
-from hand_eye_calib.core.checks import check as checking
 from hand_eye_calib.core.checks import units
 from hand_eye_calib.core.checks.check import CheckResult
+from hand_eye_calib.core.checks.clock_and_scale import offset_values
 from hand_eye_calib.core.checks.findings import Finding, Severity, repair_message
 from hand_eye_calib.core.checks.findings import finding as new_finding
 from hand_eye_calib.core.checks.hypotheses import HOLDS
@@ -389,7 +389,7 @@ def _with_estimate_warnings(
     offset_s = calibration.time_offset_s
     reasons["time_offset"] = (
         f"the child's clock is {abs(offset_s):.4f} +/- {calibration.time_offset_sigma_s:.4f} "
-        f"s {checking.offset_values(offset_s)['direction']} the parent's"
+        f"s {offset_values(offset_s)['direction']} the parent's"
     )
     rate = calibration.clock_rate
     if rate and rate.is_used:
@@ -408,7 +408,7 @@ def _with_offset_doubt(attempt: Attempt, doubts: Collection[Finding]) -> Attempt
     offset_s = attempt.calibration.time_offset_s
     doubts = [*doubts]
     if "time_offset" in attempt.options and abs(offset_s) > UNASKED_S:
-        large = new_finding("large_time_offset", "child", **checking.offset_values(offset_s))
+        large = new_finding("large_time_offset", "child", **offset_values(offset_s))
         if large not in attempt.calibration.findings:
             doubts.append(large)
     return attempt.with_doubts(doubts)

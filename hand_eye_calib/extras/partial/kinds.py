@@ -14,6 +14,7 @@ from hand_eye_calib.core.alignment.time_offset import TimeOffset
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.checks import check as checking
 from hand_eye_calib.core.checks.check import CheckResult
+from hand_eye_calib.core.checks.clock_and_scale import check_offset
 from hand_eye_calib.core.checks.findings import Finding, gravest_first
 from hand_eye_calib.core.engine.kinds import Kind, kind_of
 from hand_eye_calib.core.engine.snapshot import MOST_MOVED_S, UNASKED_S, Snapshot
@@ -188,7 +189,7 @@ def _check_clock(
         return []
     sigma_s = _COARSE_INTERVALS * max(parent.interval_s, child.interval_s)
     offset = TimeOffset(correlation.offset_s, sigma_s, correlation)
-    return checking.check_offset(offset, known_s)
+    return check_offset(offset, known_s)
 
 
 #: Poses of one sensor and positions of the other.

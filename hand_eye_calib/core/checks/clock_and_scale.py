@@ -1,0 +1,112 @@
+"""Findings about the clock offset, the scale and the unit of length between two streams."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from hand_eye_calib.core.alignment.similarity import SimilarityFit
+from hand_eye_calib.core.alignment.time_offset import TimeOffset
+from hand_eye_calib.core.base.text import with_sigma
+from hand_eye_calib.core.checks.findings import Finding, graded
+from hand_eye_calib.core.checks.stream_pair import StreamPair
+from hand_eye_calib.core.checks.units import in_other_units
+
+# Code of rounded positions, whose severity depends on the unit of length.
+ROUNDED = "coarse_positions"
+
+
+def check_offset(offset: TimeOffset, added_s: float) -> list[Finding]:
+    """Return the finding about a clock offset, or none.
+
+    ``added_s`` was added to the child's stamps before, s.
+    """
+    values = offset_values(offset.seconds, added_s) | {"sigma_s": offset.sigma_s}
+    values["beyond"] = f" beyond the {added_s:.4f} s that were added" if added_s else ""
+    values["options"] = {"time_offset": values["total_s"]}
+    clocks_differ = graded("time_offset", "child", offset.seconds, offset.sigma_s, **values)
+    return [clocks_differ] if clocks_differ else []
+
+
+def offset_values(offset_s: float, added_s: float = 0.0) -> dict[str, Any]:
+    """Return the values of the finding about a clock offset ``offset_s`` beyond ``added_s``."""
+    values: dict[str, Any] = {"offset_s": offset_s, "size_s": abs(offset_s)}
+    values["direction"] = "behind" if offset_s > 0 else "ahead of"
+    return values | {"total_s": round(added_s + offset_s, 4)}
+
+
+def check_model_scale(scale: float, sigma: float) -> list[Finding]:
+    """Return the finding about a scale that the noise model added to the solution, or none.
+
+    Parameters
+    ----------
+    scale, sigma : float
+        Factor of the child's lengths, and its standard deviation; 0 if the scale was not
+        estimated.
+    """
+    if sigma <= 0.0:
+        return []
+    excess = 1.0 / scale - 1.0
+    sigma_excess = sigma / scale**2
+    other_scale = graded(
+        "model_scale",
+        "child",
+        excess,
+        sigma_excess,
+        scale=scale,
+        sigma=sigma,
+        size=with_sigma(100.0 * abs(excess), 100.0 * sigma_excess, 1),
+        than="longer" if excess > 0.0 else "shorter",
+    )
+    return [other_scale] if other_scale else []
+
+
+def own_unit(streams: StreamPair, fit: SimilarityFit, used_scale: float) -> Finding | None:
+    """Return the finding that the child has another unit of length, or else another scale.
+
+    None if the scale is near 1. The child's lengths are the original lengths times ``used_scale``.
+    """
+    original_child = streams.child.scaled(1.0 / used_scale)
+    sigma_and_bias = float(np.hypot(fit.scale_sigma, fit.scale_bias))
+    unit = in_other_units(fit.scale, sigma_and_bias, streams.parent, original_child, used_scale)
+    if unit:
+        return unit
+    total_scale = used_scale * fit.scale
+    return graded(
+        "scale",
+        "child",
+        fit.scale - 1.0,
+        scale=total_scale,
+        sigma=used_scale * fit.scale_sigma,
+        options={"scale": float(f"{total_scale:.4g}")},
+    )
+
+
+def in_metres(findings: Sequence[Finding], units: Sequence[Finding], scale: float) -> list[Finding]:
+    """Return the findings, with those about rounded positions graded in metres.
+
+    Parameters
+    ----------
+    findings : sequence of Finding
+        Findings about streams with the child's lengths multiplied by ``scale``.
+    units : sequence of Finding
+        Findings about the unit of a stream's lengths; their options convert it to metres.
+    scale : float
+    """
+    options: dict[str, Any] = {}
+    for unit in units:
+        if unit.code in ("units", "lengths"):
+            options.update(unit.options)
+    factors = {
+        "parent": float(options.get("parent_scale", 1.0)),
+        "child": float(options.get("scale", scale)) / scale,
+    }
+    in_metres: list[Finding] = []
+    for found in findings:
+        if found.code != ROUNDED:
+            in_metres.append(found)
+            continue
+        step_m = found.evidence["step_m"] * factors[found.stream]
+        if rounded := graded(ROUNDED, found.stream, step_m, step_m=step_m):
+            in_metres.append(rounded)
+    return in_metres
