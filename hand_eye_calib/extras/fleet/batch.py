@@ -60,7 +60,8 @@ def run_batch(arguments: argparse.Namespace) -> int:
         _print_json(title, done, vehicles)
     else:
         _print_results(done, vehicles)
-    n_alone = sum(bool(outcome.row["verdict"] and not outcome.row["vehicle"]) for outcome in done)
+    alone = [outcome for outcome in done if outcome.row["verdict"] and not outcome.row["vehicle"]]
+    n_alone = len(alone)
     if n_alone > 1:
         note(
             f"{n_alone} recordings are not compared with each other: set "
@@ -245,17 +246,26 @@ def _print_results(done: Sequence[Outcome], vehicles: Mapping[str, Calibration])
     failed = counts.pop("failed", 0)
     print(f"{len(done) - failed} of {counted(len(done), 'bag')} calibrated, {failed} failed")
     if counts:
-        print(listing([f"{count} {verdict}" for verdict, count in counts.items()]))
+        print(_counts_in_words(counts))
     if vehicles:
-        counts = Counter(result.verdict.value for result in vehicles.values())
-        verdicts = listing([f"{count} {verdict}" for verdict, count in counts.items()])
-        print(f"{counted(len(vehicles), 'vehicle')}: {verdicts}")
+        _print_vehicles(vehicles)
+
+
+def _print_vehicles(vehicles: Mapping[str, Calibration]) -> None:
+    """Print the number of vehicles by verdict, and a line for each vehicle."""
+    counts = Counter(result.verdict.value for result in vehicles.values())
+    print(f"{counted(len(vehicles), 'vehicle')}: {_counts_in_words(counts)}")
     for name, result in vehicles.items():
         text = result.headline
         together = result.parts.get("together")
         if together and not is_in_headline(result):
             text = f"{text}. {together.sentence}"
         _print_line(name, text)
+
+
+def _counts_in_words(counts: Mapping[str, int]) -> str:
+    """Return the number of results by verdict as text, such as "3 USE and 1 DO NOT USE"."""
+    return listing([f"{count} {verdict}" for verdict, count in counts.items()])
 
 
 def _print_line(name: str, text: str) -> None:

@@ -7,7 +7,7 @@ for each recording with a link to its report.
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
@@ -32,6 +32,7 @@ from hand_eye_calib.offline.report.style import (
 )
 
 _AXES = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}
+# Tones of verdicts, the gravest first.
 _GRAVITY = ("bad", "warn", "good")
 # Height of the figure of a vehicle, inches.
 _HEIGHT = 3.9
@@ -63,8 +64,8 @@ def render_batch(
         Names of the recordings that have a report.
     """
     cells = [_cells(row, row["name"] in with_report) for row in rows]
-    cells.sort(key=lambda cell: _gravity(cell[2]))
-    counts = Counter(cell[2] for cell in cells)
+    cells.sort(key=lambda cells_of_row: _gravity(cells_of_row.verdict))
+    counts = Counter(cells_of_row.verdict for cells_of_row in cells)
     ordered = sorted(vehicles.items(), key=lambda item: _gravity(item[1].verdict.value))
     shown_vehicles = []
     for number, (name, result) in enumerate(ordered[: LOOK.max_vehicles], start=1):
@@ -72,7 +73,7 @@ def render_batch(
         shown_vehicles.append((name, result, values, _trend(result, number)))
     return page(
         Path(__file__).with_name("batch.html"),
-        TONES.get(cells[0][2], "bad"),
+        TONES.get(cells[0].verdict, "bad"),
         counted(len(rows), "recording"),
         listing([f"{count:,} {verdict}" for verdict, count in counts.most_common()]),
         batch=Path(title.rstrip("/*")).name or title,
@@ -113,7 +114,13 @@ def _draw_axis(panel: Any, axis: str, sigma: float, recordings: Sequence[Recorde
 
     ``sigma`` is the measured standard deviation of the common value.
     """
-    factor, unit = (100.0, "cm") if axis in "xyz" else (np.degrees(1.0), "deg")
+    factor = 100.0
+    unit = "cm"
+    title = axis
+    if axis in ABOUT:
+        factor = np.degrees(1.0)
+        unit = "deg"
+        title = f"about {ABOUT[axis]}"
     stamps_ns = np.array([recording.stamp_ns for recording in recordings], dtype="datetime64[ns]")
     days = date2num(stamps_ns)
     is_apart = np.array([bool(recording.left_out) for recording in recordings])
@@ -121,38 +128,64 @@ def _draw_axis(panel: Any, axis: str, sigma: float, recordings: Sequence[Recorde
     values, sigmas = factor * np.where(np.isfinite(points), points, np.nan).T
     band = factor * LOOK.sigmas * sigma
     is_determined = np.isfinite(band)
-    title = f"about {ABOUT[axis]}" if axis in ABOUT else axis
     title += f", {unit}" if is_determined else ": not determined"
     panel.set_title(title, loc="left")
     panel.axhline(0, color=GRID, lw=0.8)
     if is_determined:
         panel.axhspan(-band, band, color=PARENT, alpha=0.15, lw=0)
     # A dot is drawn as a line of length 0, because markers would make a large page.
+    gap = np.full(len(days), np.nan)
     for half, width in ((sigmas, 0.8), (0 * sigmas, 3.2)):
-        ends = np.stack([values - half, values + half, np.full(len(days), np.nan)], axis=1)
+        # The NaN after each line separates it from the next line.
+        ends = np.stack([values - half, values + half, gap], axis=1)
         for group, colour, cap in ((~is_apart, INK, "round"), (is_apart, BAD, "projecting")):
-            line = panel.plot(np.repeat(days[group], 3), ends[group].ravel(), color=colour)
-            line[0].set(lw=width, solid_capstyle=cap)
+            (line,) = panel.plot(np.repeat(days[group], 3), ends[group].ravel(), color=colour)
+            line.set(lw=width, solid_capstyle=cap)
 
 
 def _values(row: Document) -> list[str]:
-    return [
-        with_sigma(row[f"{name}_{unit}"], row[f"sigma_{name}_{unit}"], 3 if unit == "m" else 2)
-        for name, unit in _AXES.items()
-    ]
+    """Return the numbers of a row with their standard deviations as text, by axis."""
+    values = []
+    for name, unit in _AXES.items():
+        column = f"{name}_{unit}"
+        decimals = 3 if unit == "m" else 2
+        values.append(with_sigma(row[column], row[f"sigma_{column}"], decimals))
+    return values
 
 
-def _cells(row: Document, is_linked: bool) -> list[Any]:
-    """Return the cells of a recording in the table.
+class _Cells(NamedTuple):
+    """Cells of a recording in the table.
 
-    The cells are name, vehicle, verdict, start, whether the recording has a report, and the values.
-    A value is a text of the number and its standard deviation. Instead of values, a failed
-    recording has its error.
+    Attributes
+    ----------
+    name, vehicle, verdict, start : str
+    is_linked : int
+        1 if the recording has a report, else 0.
+    values : list of str or str
+        Numbers with their standard deviations by axis; the error of a failed recording.
     """
+
+    name: str
+    vehicle: str
+    verdict: str
+    start: str
+    is_linked: int
+    values: list[str] | str
+
+
+def _cells(row: Document, is_linked: bool) -> _Cells:
+    """Return the cells of the row of a recording."""
     values: list[str] | str = row["error"]
     if row["verdict"] is not None and not row["error"]:
         values = [text.replace(" +/- ", " ") for text in _values(row)]
-    # Cut the seconds.
+    # Date and time up to the minutes.
     start = (row["start"] or "")[:16].replace("T", " ")
     verdict = "failed" if row["error"] else row["verdict"]
-    return [printable(row["name"]), row["vehicle"], verdict, start, int(is_linked), values]
+    return _Cells(
+        name=printable(row["name"]),
+        vehicle=row["vehicle"],
+        verdict=verdict,
+        start=start,
+        is_linked=int(is_linked),
+        values=values,
+    )

@@ -197,12 +197,15 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
     for index in agreement.apart:
         left_out[names[index]] = "it does not belong to the others"
     used = {name: result for name, result in usable.items() if name not in left_out}
-    deviations = dict.fromkeys(results, np.full(6, np.nan))
+    # Unusable recordings are not compared.
+    unknown = np.full(6, np.nan)
+    deviations = dict.fromkeys(results, unknown)
     deviations |= dict(zip(names, agreement.deviations, strict=True))
-    sigmas = dict.fromkeys(results, np.full(6, np.nan))
+    sigmas = dict.fromkeys(results, unknown)
     sigmas |= dict(zip(names, agreement.sigmas, strict=True))
-    records = tuple(
-        Recorded(
+    records = []
+    for name, result in results.items():
+        recorded = Recorded(
             name=name,
             headline=result.headline,
             left_out=left_out.get(name, ""),
@@ -212,13 +215,12 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
             scale=result.scale,
             stamp_ns=result.stamp_ns,
         )
-        for name, result in results.items()
-    )
+        records.append(recorded)
     record = Together(
         kind=agreement.kind,
         sentence=agreement.sentence(names),
         scatter=by_axis(agreement.scatter),
-        recordings=records,
+        recordings=tuple(records),
     )
     return _joint(used, agreement, record)
 
@@ -250,6 +252,8 @@ def _joint(
     assessed = _assessed(used, agreement)
     is_open = any(math.isinf(dof.sigma) for dof in assessed.observability)
     newest = used[-1]
+    methods = Counter(result.method for result in used)
+    most_frequent_method, _ = methods.most_common(1)[0]
     clocks = {(result.time_offset_s, result.scale) for result in used}
     offset_s, scale = clocks.pop() if len(clocks) == 1 else (0.0, 1.0)
     return Calibration(
@@ -259,7 +263,7 @@ def _joint(
         observability_measured=assessed.observability,
         status=SolveStatus.UNOBSERVABLE if is_open else SolveStatus.OK,
         objective=agreement.chi2,
-        method=Counter(result.method for result in used).most_common(1)[0][0],
+        method=most_frequent_method,
         time_offset_s=offset_s,
         scale=scale,
         findings=_gravest_of_each(used),
@@ -273,8 +277,8 @@ def _joint(
 def _assessed(used: Sequence[Calibration], agreement: Agreement) -> Assessment:
     """Assess the common result of recordings.
 
-    If all recordings have an axis from a prior, its standard deviation is at least the smallest one
-    of the recordings: they share one measurement by hand.
+    If all recordings have an axis from a prior, they share one measurement by hand. Then the
+    standard deviation of the axis is at least the smallest one among the recordings.
     """
     T = agreement.T_parent_child
     covariance = agreement.covariance.copy()
@@ -297,7 +301,10 @@ def _assessed(used: Sequence[Calibration], agreement: Agreement) -> Assessment:
 
 def _gravest_of_each(used: Sequence[Calibration]) -> tuple[Finding, ...]:
     """Return the gravest finding of each code and stream."""
-    findings: dict[tuple[str, str], Finding] = {}
-    for finding in gravest_first([finding for result in used for finding in result.findings]):
-        findings.setdefault((finding.code, finding.stream), finding)
-    return tuple(findings.values())
+    all_findings: list[Finding] = []
+    for result in used:
+        all_findings += result.findings
+    gravest: dict[tuple[str, str], Finding] = {}
+    for finding in gravest_first(all_findings):
+        gravest.setdefault((finding.code, finding.stream), finding)
+    return tuple(gravest.values())

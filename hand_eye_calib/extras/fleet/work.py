@@ -31,11 +31,14 @@ from hand_eye_calib.offline.cli.bags import read_recording
 from hand_eye_calib.offline.cli.options import STREAMS
 from hand_eye_calib.offline.cli.present import exit_code
 
+# Names in the directory of a batch: the outcome of a task in its folder, the table, the page, and
+# the folder of the vehicles.
 STATE = "batch.jsonl"
 TABLE = "rows.csv"
 INDEX = "index.html"
 VEHICLES = "vehicles"
 
+# Row of the table of a batch.
 Row = Document
 
 
@@ -98,14 +101,8 @@ def tasks_of(groups: Sequence[Sequence[str]], vehicle: str = "", **common: Any) 
     **common
         Further fields of all tasks.
     """
-    pattern = re.escape(vehicle).replace(r"\*\*", ".*").replace(r"\*", "[^/]*")
-    pattern = pattern.replace(re.escape("{vehicle}"), "([^/]+)")
-    # Paths are resolved, because a path such as "." has no name.
-    paths = [
-        bag.partition("?")[0] if remote.is_url(bag) else str(Path(bag).resolve())
-        for bag, *_ in groups
-    ]
-    stems = distinct_names([str(_without_suffix(Path(path))) for path in paths])
+    paths = [_without_suffix(_full_path(first_bag)) for first_bag, *_ in groups]
+    stems = distinct_names([str(path) for path in paths])
     tasks: list[Task] = []
     names = {STATE, TABLE, INDEX, VEHICLES}
     for group, stem in zip(groups, stems, strict=True):
@@ -113,12 +110,33 @@ def tasks_of(groups: Sequence[Sequence[str]], vehicle: str = "", **common: Any) 
         numbered = chain([name], (f"{name}_{number}" for number in count(2)))
         name = next(candidate for candidate in numbered if candidate not in names)
         names.add(name)
-        vehicle_name = vehicle
-        if "{vehicle}" in vehicle:
-            match = re.search(pattern, group[0])
-            vehicle_name = match[1].strip(".") if match else ""
+        vehicle_name = _vehicle_of(group[0], vehicle)
         tasks.append(Task(name=name, bags=tuple(group), vehicle=vehicle_name, **common))
     return tasks
+
+
+def _vehicle_of(bag: str, vehicle: str) -> str:
+    """Return the name of the vehicle of a bag.
+
+    ``vehicle`` is the name, or a pattern of the path with ``{vehicle}`` in place of the name. The
+    name is empty if the path does not match the pattern.
+    """
+    if "{vehicle}" not in vehicle:
+        return vehicle
+    pattern = re.escape(vehicle).replace(r"\*\*", ".*").replace(r"\*", "[^/]*")
+    pattern = pattern.replace(re.escape("{vehicle}"), "([^/]+)")
+    match = re.search(pattern, bag)
+    return match[1].strip(".") if match else ""
+
+
+def _full_path(bag: str) -> Path:
+    """Return the path of a bag, or a URL without its query.
+
+    The path is resolved, because a path such as "." has no name.
+    """
+    if remote.is_url(bag):
+        return Path(bag.partition("?")[0])
+    return Path(bag).resolve()
 
 
 def _without_suffix(path: Path) -> Path:
@@ -202,7 +220,10 @@ class Outcome(NamedTuple):
 
 
 def _times_of(streams: Sequence[Mapping[str, Any]]) -> Row:
-    """Return start and duration of the time span common to all streams; None if unknown."""
+    """Return start and duration (s) of the time in which all streams have data.
+
+    Both are None if the stamps of a stream are unknown.
+    """
     starts_ns = [stream["first_stamp_ns"] for stream in streams]
     if not starts_ns or None in starts_ns:
         return {"start": None, "duration_s": None}
@@ -248,8 +269,8 @@ def outcomes(
 ) -> Iterator[tuple[Task, Outcome]]:
     """Perform tasks in worker processes; yield each task with its outcome when it is done.
 
-    If a worker dies, the tasks that may have killed it are repeated one at a time; then the other
-    unfinished tasks are repeated.
+    If a worker dies, the tasks that may have killed it are repeated separately. Then the other
+    unfinished tasks are repeated together.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Read trajectories of other programs whose files are not tables of numbers.
 
-The first bytes of a file select its format. A format is a function that returns a header and rows;
-these are read like a csv file. A format that cannot be read has a sentence instead of a function,
-which names the content of such files and what the user should do.
+The first bytes of a file select its format. A format is a function that returns a header and rows,
+like those of a csv file. A format that cannot be read is a sentence instead: it names the content
+of such files and what the user should do.
 """
 
 import csv
@@ -37,14 +37,18 @@ from hand_eye_calib.formats.trajectory_files.dates import DAY_S, GPS_EPOCH_S, GP
 from hand_eye_calib.formats.trajectory_files.reading import FileOptions
 from hand_eye_calib.formats.trajectory_files.table import Table, columns_of_array
 
+# Names of the columns of a pose.
 _POSE = (*POSITION, *QUATERNION)
+# Names of the columns of a stamp and a position on the earth.
 _PLACE = ("t [s]", "lat [deg]", "lon [deg]", "height [m]")
 # Rotation from the axes forward, right, down to forward, left, up. It is also the rotation from the
 # camera axes of OpenGL to those of OpenCV.
 _FLIP = np.diag([1.0, -1.0, -1.0])
 # Largest number of lines before the rows of a Motive file; 7 in format version 1.25.
 _MOTIVE_HEADER_LINES = 20
+# Units of length by their names in Motive files.
 _MOTIVE_UNITS = {"Meters": "m", "Centimeters": "cm", "Millimeters": "mm"}
+# Note on a file without times.
 _NUMBERED = "the file has no times: the numbers of its {} are used as seconds, to pair the poses"
 
 
@@ -139,20 +143,24 @@ def _of_nmea(data: bytes, _: str | None) -> _Rows:
     day_s = None
     n_damaged = 0
     for line in _lines(data):
-        sentence, _, checksum = line[line.find("$") + 1 :].partition("*")
+        # A sentence is between $ and *; its checksum follows.
+        start = line.find("$") + 1
+        sentence, _, checksum = line[start:].partition("*")
         if checksum and _checksum(sentence) != checksum[:2].upper():
             n_damaged += 1
             continue
         cells = sentence.strip().split(",")
+        # The first two letters are the talker, such as GP.
         kind = cells[0][-3:]
         if kind == "RMC":
             day_s = _day_of_rmc(cells) or day_s
-        elif kind == "GGA" and day_s is not None and _has_fix(cells):
-            row = _gga_row(cells, day_s)
-            # After midnight, the date is still the old one until the next RMC sentence.
-            if rows and row[0] < rows[-1][0] - DAY_S / 2:
-                row[0] += DAY_S
-            rows.append(row)
+        if kind != "GGA" or day_s is None or not _has_fix(cells):
+            continue
+        row = _gga_row(cells, day_s)
+        # After midnight, the date is that of the day before until the next RMC sentence.
+        if rows and row[0] < rows[-1][0] - DAY_S / 2:
+            row[0] += DAY_S
+        rows.append(row)
     if not rows:
         raise ValueError("NMEA: expected GGA sentences with a fix, and the date in RMC sentences")
     notes = [f"{n_damaged} sentences with a wrong checksum left out"] if n_damaged else []
@@ -177,15 +185,26 @@ def _has_fix(cells: Sequence[str]) -> bool:
 
 
 def _gga_row(cells: Sequence[str], day_s: float) -> list[float]:
-    """Return stamp (s), latitude, longitude (deg) and height (m) of a GGA sentence."""
+    """Return stamp (s), latitude, longitude (deg) and height (m) of a GGA sentence.
+
+    The height is above the ellipsoid: the height above the geoid plus the height of the geoid.
+    """
     clock, lat, north, lon, east = cells[1:6]
+    # hhmmss.ss, ddmm.mmmm and dddmm.mmmm.
     stamp_s = day_s + 3600 * int(clock[:2]) + 60 * int(clock[2:4]) + float(clock[4:])
-    lat_deg = (-1 if north in "SW" else 1) * (int(lat[:2]) + float(lat[2:]) / 60)
-    lon_deg = (-1 if east in "SW" else 1) * (int(lon[:3]) + float(lon[3:]) / 60)
-    return [stamp_s, lat_deg, lon_deg, float(cells[9]) + float(cells[11] or 0)]
+    lat_deg = int(lat[:2]) + float(lat[2:]) / 60
+    lon_deg = int(lon[:3]) + float(lon[3:]) / 60
+    if north in "SW":
+        lat_deg = -lat_deg
+    if east in "SW":
+        lon_deg = -lon_deg
+    above_geoid_m = float(cells[9])
+    geoid_m = float(cells[11] or 0)
+    return [stamp_s, lat_deg, lon_deg, above_geoid_m + geoid_m]
 
 
 def _of_gpx(data: bytes, _: str | None) -> _Rows:
+    """Read the points of a GPX track."""
     rows = []
     for point in ElementTree.fromstring(data).iterfind(".//{*}trkpt"):
         time = point.findtext("{*}time")
@@ -197,6 +216,7 @@ def _of_gpx(data: bytes, _: str | None) -> _Rows:
 
 
 def _of_rtklib(data: bytes, _: str | None) -> _Rows:
+    """Read a position file of RTKLIB or Emlid with latitude, longitude and height."""
     if b"latitude(deg)" not in data and data.startswith(b"%"):
         raise ValueError("RTKLIB without degrees: set out-solformat to llh, degrees")
     rows = []
@@ -243,6 +263,7 @@ def _of_week(week: str, second: str) -> str:
 
 
 def _of_g2o(data: bytes, _: str | None) -> _Rows:
+    """Read the vertices of a pose graph, in two or three dimensions."""
     vertices = [line.split()[1:9] for line in _lines(data) if line.startswith("VERTEX_SE")]
     if not vertices:
         raise ValueError("a g2o graph without vertices; save it with them, optimised")
@@ -294,8 +315,12 @@ def _of_images(names: Sequence[str], poses: FloatArray, notes: list[str]) -> _Ro
     a number.
     """
     images = [Path(name).stem for name in names]
-    rows = [(*row, image) for row, image in zip(_as_rows(poses).tolist(), images, strict=True)]
-    stamps = [number for image in images for number in re.findall(r"\d+\.\d+|\d+", image)[-1:]]
+    matrices = _as_rows(poses).tolist()
+    rows = [(*matrix, image) for matrix, image in zip(matrices, images, strict=True)]
+    stamps = []
+    for image in images:
+        numbers = re.findall(r"\d+\.\d+|\d+", image)
+        stamps += numbers[-1:]
     if len(stamps) < len(images):
         return _Rows((*MATRIX, "image"), rows, notes)
     # Seconds since 1970 have ten digits before the point; numbers of images have fewer.
@@ -322,12 +347,16 @@ def _of_motive(data: bytes, choice: str | None) -> _Rows:
     place_of = places_of_bodies[body]
     if not place_of.keys() >= {*_POSE}:
         raise ValueError("it contains Euler angles of Motive: export with rotation type Quaternion")
+    # The first line contains names and values in turn.
     properties = dict(zip(head[0][::2], head[0][1::2], strict=False))
     unit = _MOTIVE_UNITS[properties.get("Length Units", "Meters")]
-    places = [head[last].index("Time (Seconds)"), *(place_of[name] for name in _POSE)]
+    places = [head[last].index("Time (Seconds)")]
+    places += [place_of[name] for name in _POSE]
     table = chain(head[last + 1 :], lines)
-    rows = ([cells[place] for place in places] for cells in table if len(cells) > max(places))
-    header = ("t [s]", *(f"{axis} [{unit}]" for axis in POSITION), *QUATERNION)
+    complete = (cells for cells in table if len(cells) > max(places))
+    rows = ([cells[place] for place in places] for cells in complete)
+    positions = [f"{axis} [{unit}]" for axis in POSITION]
+    header = ("t [s]", *positions, *QUATERNION)
     return _Rows(header, rows, [f"poses of rigid body {body}"])
 
 

@@ -22,7 +22,8 @@ from hand_eye_calib.formats.bags.sources import Reading
 def read_images(bag: PoseBag, stream: str, topic: str, text: str) -> "ImageReading":
     """Return the reader of images of a target.
 
-    The intrinsics come from a file, or from the camera_info topic beside the images.
+    The intrinsics come from a file, or from a camera_info topic: that in the namespace of the
+    images, or in a namespace above it.
 
     Parameters
     ----------
@@ -45,8 +46,8 @@ def read_images(bag: PoseBag, stream: str, topic: str, text: str) -> "ImageReadi
         raise InputError(f"{topic} has type {type_}, which contains no images")
     if file:
         return ImageReading(stream, topic, target, read_camera(file))
-    candidates = [str(folder / "camera_info") for folder in PurePosixPath(topic).parents]
-    info = next((name for name in candidates if name in bag.topics), "")
+    candidates = [str(namespace / "camera_info") for namespace in PurePosixPath(topic).parents]
+    info = next((candidate for candidate in candidates if candidate in bag.topics), "")
     run = next(bag.runs([info]), None)
     if run is None:
         raise InputError(
@@ -58,7 +59,10 @@ def read_images(bag: PoseBag, stream: str, topic: str, text: str) -> "ImageReadi
 
 
 class ImageReading(Reading):
-    """Read images of a target as poses of the camera in the frame of the target."""
+    """Read images of a target as poses of the camera in the frame of the target.
+
+    Images without the target are skipped.
+    """
 
     def __init__(self, stream: str, topic: str, target: Target, camera: Camera) -> None:
         super().__init__(stream, topic)

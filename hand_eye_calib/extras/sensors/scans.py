@@ -1,17 +1,18 @@
 """Compute odometry from the scans of a lidar (``sensor_msgs/PointCloud2``) with small_gicp.
 
-Each scan is registered against a map of the previous scans by generalised ICP: points match local
-planes, and each voxel of the map holds the mean plane of its points. Matching points to points, as
-KISS-ICP does, drags along the rings of a lidar with 16 rings. On flat ground the rings look the
-same at any pitch, so pitch and roll would not be followed.
+Each scan is registered against a map of the previous scans by generalised ICP (A. Segal et al.,
+*Generalized-ICP*, RSS 2009): points match local planes, and each voxel of the map contains the mean
+plane of its points. Point-to-point matching, as in KISS-ICP, fails for a lidar with 16 rings: on
+flat ground the rings have the same shape at any pitch and roll, so these angles are lost.
 
-A pose is that of the middle of its scan. Each new scan is registered roughly, as if the motion
-continued. It is registered finely after the next scan, when the motion during it is known from both
-sides. A constant motion would double the errors.
+A pose is that of the lidar in the middle of its scan. A new scan is first registered roughly, from
+the pose that continues the last motion. It is registered finely after the next scan, when there are
+poses before and after it. The poses then determine the motion during the scan. A constant motion in
+its place would double the errors.
 
-The range error of each ring is learned from the planes of the map. With an error of 3 mm, walls
-seem to move as the lidar pitches, and the extrinsic is up to 2 cm off along the axis that turns
-least.
+The range error of each ring is estimated from the planes of the map. If it is ignored, an error of
+3 mm makes walls move as the lidar pitches, and the extrinsic is up to 2 cm off along the axis with
+the least rotation.
 """
 
 from collections.abc import Mapping, Sequence
@@ -45,11 +46,11 @@ class Step(NamedTuple):
     map_voxel : float
         Size of the voxels of the map.
     scan_voxel : float
-        The scan is thinned to one point in each voxel of this size.
+        The scan is reduced to one point in each voxel of this size.
     reach : float
         Longest distance of matched points.
     min_inlier_fraction : float
-        Registration fails if fewer points match.
+        Smallest share of matched points. Registration fails below it.
     """
 
     map_voxel: float
@@ -62,29 +63,31 @@ class Step(NamedTuple):
 class Tuning:
     """Constants of the registration."""
 
-    # Longest scan (ns). The unit of the times of points follows from this limit.
+    # Longest scan (ns). The unit of the times of points is the largest one that obeys this limit.
     longest_ns: float = 1e9
-    # Ranges that are used (m). The robot itself is nearer; beyond, a scan is too sparse.
+    # Smallest and largest range that is used (m). Nearer points are on the robot itself, farther
+    # points are too sparse.
     ranges_m: tuple[float, float] = (1.0, 80.0)
-    # Points of a scan that are used, evenly drawn. More take longer and change nothing.
+    # Largest number of points of a scan that are used, evenly drawn. More points take more time and
+    # change nothing.
     most_points: int = 7_000
     # Size of a voxel as a share of the median range.
     voxel_share: float = 0.03
     # Limits of the size of a voxel (m).
     voxel_limits_m: tuple[float, float] = (0.1, 0.4)
-    # Number of neighbours that a local plane is fitted to. Fewer may all be on one ring, which is a
-    # line.
+    # Number of neighbours that a local plane is fitted to. Fewer neighbours may all be on one ring,
+    # which is a line and not a plane.
     n_neighbours: int = 15
-    # Rings by elevation, in half degrees.
+    # Number of possible rings: elevations from 0 to 180 deg from straight down, in half degrees.
     n_rings: int = 361
-    # Scans between two estimates of the range errors of rings.
+    # Number of scans from one estimate of the range errors of rings to the next.
     learn_every: int = 10
     # Share of the sums of earlier scans that is kept at each new estimate (forgetting factor).
     kept_share: float = 0.95
-    # Weight of the prior that a ring has no range error: it counts like measurements with this sum
-    # of squared cosines.
+    # Weight of the prior that a ring has no range error: a sum of squared cosines, as that of
+    # measurements.
     prior_weight: float = 100.0
-    # A voxel is a plane if its variance across is this share of its variance along.
+    # A voxel is a plane if its variance along the normal is below this share of the next variance.
     flat: float = 0.01
     # Longest distance of a point from its plane (m).
     near_m: float = 0.1
@@ -140,20 +143,25 @@ def scan_of(message: Any) -> Scan:
     nearest_m, farthest_m = TUNING.ranges_m
     used = np.flatnonzero((ranges > nearest_m) & (ranges < farthest_m))
     if len(used) > TUNING.most_points:
-        used = used[np.linspace(0, len(used) - 1, TUNING.most_points).astype(int)]
+        evenly = np.linspace(0, len(used) - 1, TUNING.most_points).astype(int)
+        used = used[evenly]
     points = points[used].astype(float)
-    rings = np.round(np.degrees(2 * np.arccos(-points[:, 2] / ranges[used]))).astype(int)
+    elevations = np.arccos(-points[:, 2] / ranges[used])
+    half_degrees = np.degrees(2 * elevations)
+    rings = np.round(half_degrees).astype(int)
     times = np.zeros(len(used))
     time_field = next((name for name in _TIME_FIELDS if name in rows.dtype.names), "")
     if time_field:
         times = rows[time_field][used].astype(float)
     first = times.min() if len(times) else 0.0
     last = times.max() if len(times) else 0.0
-    fitting = [ns for ns in STAMP_UNITS.values() if 0 < (last - first) * ns <= TUNING.longest_ns]
-    unit_ns = max(fitting, default=0)
+    duration = last - first
+    units_ns = [ns for ns in STAMP_UNITS.values() if 0 < duration * ns <= TUNING.longest_ns]
+    unit_ns = max(units_ns, default=0)
     middle = (first + last) / 2
     stamp_ns = round(float(middle) * unit_ns)
-    if stamp_ns <= TUNING.longest_ns:  # the times are relative to the header
+    if stamp_ns <= TUNING.longest_ns:
+        # The times of the points are relative to the stamp in the header.
         stamp_ns += ns_of(message.header.stamp) or 0
     times_s = (times - middle) * unit_ns * 1e-9
     frame = printable(frame_name(message.header.frame_id))
@@ -179,7 +187,7 @@ class ScanReading(Reading):
         self._state = np.array([[file.stat().st_size, file.stat().st_mtime_ns] for file in files])
         self._path = bag.with_name(f"{bag.name}{topic.replace('/', '.')}.odometry.npz")
         self._stored: Mapping[str, Any] = {}
-        # The errors are of many kinds: the file is absent, cut off, or of an older version.
+        # Many kinds of errors are possible: the file is absent, cut off, or of an older version.
         with suppress(Exception):
             stored = read_arrays(self._path)
             if np.array_equal(stored["bag_files"], self._state):
@@ -191,16 +199,16 @@ class ScanReading(Reading):
         self._voxel_m = 0.0
         self._rough_map: Any = None
         self._fine_map: Any = None
-        # Of all scans.
+        # One entry for each scan so far.
         self._poses = [np.eye(4)]
         self._has_failed = [False]
         self._stamps_ns = list[int]()
         self._bag_ns = list[int]()
         # The newest three scans.
         self._scans = list[Scan]()
-        # Range error of each ring (m), the ratio of two sums over planes: cosine times distance,
-        # and squared cosine.
+        # Range error of each ring, m.
         self._too_far_m = np.zeros(TUNING.n_rings)
+        # Sums over points for the range errors: cosine times distance (m), and squared cosine.
         self._sums = np.zeros((2, TUNING.n_rings))
 
     def take(self, run: Run) -> None:
@@ -240,25 +248,30 @@ class ScanReading(Reading):
             "n_failed": n_failed,
             "too_far_m": self._too_far_m,
         }
-        with suppress(OSError):  # the folder may be read-only
+        # The folder may be read-only.
+        with suppress(OSError):
             np.savez(self._path, bag_files=self._state, **self._stored)
 
     def _add(self, scan: Scan) -> None:
         """Register the next scan roughly, and the scan before it finely."""
         ranges = np.linalg.norm(scan.points, axis=1)
         factors = 1.0 - self._too_far_m[scan.rings] / ranges
-        self._scans = [*self._scans[-2:], scan._replace(points=scan.points * factors[:, None])]
+        corrected = scan._replace(points=scan.points * factors[:, None])
+        self._scans = [*self._scans[-2:], corrected]
         self._stamps_ns.append(scan.stamp_ns)
         count = len(self._stamps_ns)
         if count == 1:
             size_m = TUNING.voxel_share * np.median(ranges)
             self._voxel_m = float(np.clip(size_m, *TUNING.voxel_limits_m))
         else:
+            # Predict the pose: the last motion continues. The second scan has the first pose.
             last = self._poses[-1]
-            self._poses.append(last @ se3.inverse(self._poses[-2:][0]) @ last)
+            before = self._poses[-2:][0]
+            self._poses.append(last @ se3.inverse(before) @ last)
             self._has_failed.append(True)
             self._register_roughly()
-        if count <= 3:  # the first scan needs the motion during it
+        if count <= 3:
+            # Begin again: more poses determine the motion during the first scan better.
             self._start_maps()
         if count >= 3:
             self._register_finely(-2)
@@ -275,7 +288,7 @@ class ScanReading(Reading):
         """Estimate the pose of the newest scan; the pose before it if that fails."""
         points = self._thinned(self._still(-1), _ROUGH)
         if not self._align(-1, points, self._rough_map, _ROUGH):
-            # The predicted pose would lead on and away from the map.
+            # Further predictions from the predicted pose would lead away from the map.
             self._poses[-1] = self._poses[-2]
 
     def _register_finely(self, index: int) -> None:
@@ -291,7 +304,10 @@ class ScanReading(Reading):
         self._fine_map.insert(points, self._poses[index])
 
     def _align(self, index: int, points: Any, voxel_map: Any, step: Step) -> bool:
-        """Register points; replace the pose at the index and return True unless too few match."""
+        """Register the points of a scan, and return whether enough of them match.
+
+        If enough match, the pose of the scan is replaced, and the scan counts as registered.
+        """
         result = self._gicp.align(
             voxel_map,
             points,
@@ -311,23 +327,23 @@ class ScanReading(Reading):
     def _still(self, index: int) -> FloatArray:
         """Return the points (N, 3) of a scan as if all were measured in its middle.
 
-        A polynomial through the poses of the newest scans is the motion during the scan.
+        The motion during the scan is a polynomial through the poses of the newest scans.
         """
         scan = self._scans[index]
         newest = slice(-len(self._scans), None)
         since_s = (np.array(self._stamps_ns[newest]) - scan.stamp_ns) * 1e-9
-        motions = se3.log(se3.inverse(self._poses[index]) @ np.array(self._poses[newest]))
+        relative_poses = se3.inverse(self._poses[index]) @ np.array(self._poses[newest])
+        motions = se3.log(relative_poses)
         polynomial = np.linalg.lstsq(np.vander(since_s), motions, rcond=None)[0]
         part_numbers = np.round(scan.times_s / TUNING.part_s)
         parts, part_of_point = np.unique(part_numbers, return_inverse=True)
         powers = np.vander(parts * TUNING.part_s, len(since_s))
         Ts = se3.exp(powers @ polynomial)[part_of_point]
-        return np.asarray(
-            np.einsum("nij,nj->ni", se3.rotation_of(Ts), scan.points) + se3.translation_of(Ts)
-        )
+        rotated = np.einsum("nij,nj->ni", se3.rotation_of(Ts), scan.points)
+        return np.asarray(rotated + se3.translation_of(Ts))
 
     def _thinned(self, points: FloatArray, step: Step) -> Any:
-        """Return one of the points (N, 3) in each voxel, with their local planes."""
+        """Return one point in each voxel, with its local plane, from points (N, 3)."""
         thinned = self._gicp.voxelgrid_sampling(points, step.scan_voxel * self._voxel_m)
         self._gicp.estimate_covariances(thinned, num_neighbors=TUNING.n_neighbours)
         return thinned
@@ -335,22 +351,34 @@ class ScanReading(Reading):
     def _learn_range_errors(self, scan: Scan, still: FloatArray, pose: FloatArray) -> None:
         """Estimate the range errors of rings from points near planes of the fine map.
 
-        A range that is too long by e moves the point by e times the cosine between ray and normal
-        away from its plane; e is the least-squares estimate with a prior of 0.
+        A range that is too long by e displaces the point from its plane by e times the cosine
+        between ray and normal. The estimate of e is by least squares with a prior of 0.
+
+        Parameters
+        ----------
+        scan : Scan
+        still : (N, 3) array
+            Points of the scan as if all were measured in its middle.
+        pose : (4, 4) array
+            Pose of the middle of the scan in the map.
         """
         means = np.array(self._fine_map.voxel_points())[:, :3]
         covariances = np.reshape(self._fine_map.voxel_covs(), (-1, 4, 4))[:, :3, :3]
-        points = still @ se3.rotation_of(pose).T + se3.translation_of(pose)
-        rays = scan.points @ se3.rotation_of(pose).T
-        nearest = self._gicp.KdTree(means).batch_nearest_neighbor_search(points)[0]
+        to_map = se3.rotation_of(pose).T
+        points = still @ to_map + se3.translation_of(pose)
+        rays = scan.points @ to_map
+        nearest, *_ = self._gicp.KdTree(means).batch_nearest_neighbor_search(points)
         voxels, voxel_of_point = np.unique(nearest, return_inverse=True)
         variances, axes = np.linalg.eigh(covariances[voxels])
         is_flat = variances[:, 0] < TUNING.flat * variances[:, 1]
         normals = axes[voxel_of_point, :, 0]
-        from_planes = points - means[voxels[voxel_of_point]]
-        distances = np.einsum("ni,ni->n", normals, from_planes)
-        cosines = np.einsum("ni,ni->n", normals, rays) / np.linalg.norm(rays, axis=1)
-        cosines *= is_flat[voxel_of_point] & (np.abs(distances) < TUNING.near_m)
+        from_means = points - means[voxels[voxel_of_point]]
+        distances = np.einsum("ni,ni->n", normals, from_means)
+        along_normals = np.einsum("ni,ni->n", normals, rays)
+        cosines = along_normals / np.linalg.norm(rays, axis=1)
+        is_near = np.abs(distances) < TUNING.near_m
+        # Points that are not near a plane have no weight.
+        cosines *= is_flat[voxel_of_point] & is_near
         # The points were corrected by the previous estimate.
         distances += cosines * self._too_far_m[scan.rings]
         products = np.bincount(scan.rings, cosines * distances, TUNING.n_rings)

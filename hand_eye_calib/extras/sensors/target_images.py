@@ -44,11 +44,11 @@ _TO_GREY = {
     "yuv422_yuy2": "YUV2GRAY_YUY2",
 }
 
-# A longer side of a square or tag (m) is a mistake of the unit.
+# Largest side of a square or tag (m). A longer side is in another unit.
 _LARGEST_SIZE_M = 100.0
 # An image with fewer corners of the target is skipped.
 _FEWEST_CORNERS = 8
-# An image with larger residuals (rms, pixels) is skipped.
+# An image with larger residuals of its corners (root mean square, pixels) is skipped.
 _LARGEST_RMS_PX = 5.0
 
 _EXPECTED_TARGET = (
@@ -132,7 +132,7 @@ class Camera:
     Attributes
     ----------
     matrix : (3, 3) array
-        Pixels.
+        Camera matrix: focal lengths and principal point, pixels.
     distortion : (n,) array
         Coefficients of OpenCV's models.
     is_fisheye : bool
@@ -144,12 +144,12 @@ class Camera:
 
     @classmethod
     def of(cls, where: object, matrix: Any, distortion: Any, model: str = "") -> Self:
-        """Make a camera from 9 numbers, coefficients and the name of their model.
+        """Return the camera of 9 numbers of its matrix, coefficients and the name of their model.
 
         Raises
         ------
         InputError
-            If they are not those of a camera; ``where`` names their place.
+            If these values are not those of a camera. ``where`` names their source in the message.
         """
         try:
             numbers = np.array(matrix, dtype=float).reshape(3, 3)
@@ -184,7 +184,10 @@ def _entries(matrix: Any) -> Any:
 
 
 def camera_of(info: Any, is_rectified: bool, where: str) -> Camera:
-    """Return the intrinsics of a CameraInfo message; of its projection for rectified images."""
+    """Return the intrinsics of a CameraInfo message.
+
+    Rectified images have the intrinsics of its projection matrix P, without distortion.
+    """
     is_ros1 = hasattr(info, "K")
     if is_rectified:
         projection = np.reshape(info.P if is_ros1 else info.p, (3, 4))
@@ -212,7 +215,7 @@ def read_image(path: Path) -> Any:
     Raises
     ------
     InputError
-        If it is no regular file, no image, or has too many pixels.
+        If the path is no regular file or no image, or the image has too many pixels.
     """
     return image_in(read_bytes(path), path)
 
@@ -263,9 +266,10 @@ class TargetPoses:
     images : list of int
         Indices of the N images.
     rms_px : (N,) array
-        Residuals of the corners (rms, pixels).
+        Residuals of the corners of each image (root mean square, pixels).
     sigmas : (N, 2) array
-        Standard deviations (m, rad) of each pose if the corners err by these residuals.
+        Standard deviations (m, rad) of each pose. The error of a corner is assumed to be as large
+        as ``rms_px``.
     n_images : int
         Number of all images.
     """
@@ -308,7 +312,7 @@ class TargetFinder:
         self._target = target
         self._camera = camera
         self._n_images = 0
-        # By the number of the image.
+        # Poses by the index of the image.
         self._poses: dict[int, _Pose] = {}
         aruco = self._cv2.aruco
         markers = getattr(aruco, f"DICT_{target.dictionary}", None)
@@ -317,7 +321,8 @@ class TargetFinder:
                 f"OpenCV has no markers {target.dictionary!r}; expected such as 4X4_50, 5X5_100"
             )
         dictionary = aruco.getPredefinedDictionary(markers)
-        # The corners (k, 3), m, of each number that is detected: k is 1 of a square, 4 of a tag.
+        # Corners (n, k, 3), m, by the number that is detected: k is 1 for the inner corners of a
+        # ChArUco board, and 4 for tags.
         if target.kind == "charuco":
             size = (target.columns, target.rows)
             board = aruco.CharucoBoard(size, target.size, target.marker, dictionary)
@@ -325,13 +330,14 @@ class TargetFinder:
             self._corners = np.asarray(board.getChessboardCorners(), dtype=float)[:, None]
         else:
             parameters = aruco.DetectorParameters()
-            parameters.markerBorderBits = 2  # Kalibr's tags have a border of two bits
+            # Kalibr's tags have a border of two bits.
+            parameters.markerBorderBits = 2
             parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
             self._detect = aruco.ArucoDetector(dictionary, parameters).detectMarkers
             self._corners = _aprilgrid_corners(target)
 
     def look(self, image: Any) -> bool:
-        """Take the next image; return whether it shows the target well enough."""
+        """Detect the target in the next image; return whether a pose was estimated."""
         number = self._n_images
         self._n_images += 1
         pixels, detected, *_ = self._detect(image)
@@ -348,7 +354,13 @@ class TargetFinder:
         return is_good
 
     def found(self) -> TargetPoses:
-        """Return all poses; raise InputError if no image shows the target."""
+        """Return all poses.
+
+        Raises
+        ------
+        InputError
+            If no image contains the target.
+        """
         if not self._poses:
             target = self._target
             raise InputError(
@@ -384,8 +396,10 @@ class TargetFinder:
         rms_px, vector, shift, derivatives = min(candidates, key=itemgetter(0))
         T = se3.from_rotation_translation(cv2.Rodrigues(vector)[0], shift.ravel())
         jacobian = derivatives * np.tile(focal, len(corners))[:, None]
-        # The two coordinates of a corner share its variance.
-        variances = rms_px**2 / 2 * np.diag(np.linalg.pinv(jacobian.T @ jacobian))
+        # Each of the two coordinates of a corner has half of the mean square.
+        variance_px2 = rms_px**2 / 2
+        unit_covariance = np.linalg.pinv(jacobian.T @ jacobian)
+        variances = variance_px2 * np.diag(unit_covariance)
         # OpenCV's parameters are rotations, then translations.
         turn_rad, shift_m = np.sqrt(variances.reshape(2, 3).mean(axis=1))
         return _Pose(T, rms_px, np.array([shift_m, turn_rad]))
@@ -394,8 +408,8 @@ class TargetFinder:
 def _aprilgrid_corners(target: Target) -> FloatArray:
     """Return the corners (tags, 4, 3) of an AprilGrid in OpenCV's order, m.
 
-    The tags begin at the lower left, row by row upward. OpenCV has the tags of this family upside
-    down: their corners begin at the lower right, clockwise.
+    The tags begin at the lower left, row by row upward. In OpenCV, the tags of this family are
+    upside down, so that the corners of a tag begin at its lower right, and follow clockwise.
     """
     square = target.size * np.array([[1, 0, 0], [0, 0, 0], [0, 1, 0], [1, 1, 0]])
     y, x = np.divmod(np.arange(target.columns * target.rows), target.columns)
