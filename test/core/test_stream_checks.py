@@ -212,7 +212,7 @@ class TestOneStream:
         keep[100:130] = False
         finding = check_stream(parent[keep], "parent")[0]
         assert (finding.code, finding.severity) == ("gaps", Severity.NOTE)
-        assert "1 gaps of up to 3.10 s" in finding.what
+        assert "gaps: 1, of up to 3.10 s" in finding.what
 
     def test_jumps(self):
         parent, _ = drive()
@@ -328,9 +328,7 @@ class TestCommand:
         out, err = capsys.readouterr()
         assert "--time-offset 2.0" in out
         assert "ERROR    time_offset" in out
-        assert out.startswith(
-            "DO NOT USE: the streams need a repair; calibrate with --time-offset 2.0.\n"
-        )
+        assert out.startswith("DO NOT USE as they are: calibrate with --time-offset 2.0.\n")
         assert len(err.splitlines()) == 1
         assert main(["check", *files(parent, child.shifted(-2.0)), "--time-offset", "2"]) == 0
 
@@ -410,3 +408,7 @@ def test_a_short_lever_arm_is_zero_only_if_it_cannot_be_longer_than_2_mm():
             {finding.severity for finding in findings if finding.code == "same_position"}
         )
     assert severities == [{Severity.ERROR}, {Severity.WARNING}, set(), set()]
+
+    def test_a_listing_of_files_is_refused_in_one_line(self, files, capsys):
+        assert main(["calibrate", *files(*drive()), "--list"]) == 1
+        assert "is a trajectory file, which has none" in capsys.readouterr().err

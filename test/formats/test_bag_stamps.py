@@ -117,6 +117,8 @@ def test_the_command_takes_the_recorders_times_if_asked(tmp_path, capsys, option
     error = capsys.readouterr().err
     assert "/b: 300 of 300 header stamps are 0" in error
     assert "--child-stamps receive" in error
+    assert main(["check", str(path), *TOPICS[:4]]) == 1
+    assert "--child-stamps receive" in capsys.readouterr().err
     main(["calibrate", str(path), *TOPICS, option, "receive", "--json"])
     document = json.loads(capsys.readouterr().out)
     np.testing.assert_allclose(document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6)

@@ -5,6 +5,7 @@ import pytest
 from report_inputs import calibrated, reports_folder
 
 from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.offline.cli.main import main
 
 # Translation (m) and roll, pitch, yaw (deg) of the child in the parent.
 ON_CAMERA = ([0.42, -0.11, 0.25], [-88.0, 3.0, -92.0])
@@ -82,3 +83,12 @@ def test_the_cause_is_one_line(run_files, parent, child, cause):
     *_, last = output.splitlines()
     assert cause in last
     assert child in last
+
+
+def test_check_reads_both_streams_as_calibrate_does(capsys):
+    folder = reports_folder("files")
+    assert main(["check", str(folder / "p.tum"), str(folder / "motive.csv")]) == 1
+    out = capsys.readouterr().out
+    # Before the choice between both readings, the check proposed to invert both streams.
+    assert out.startswith("DO NOT USE as they are: calibrate with --time-offset 1700000000.")
+    assert "inverse" not in out

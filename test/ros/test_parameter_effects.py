@@ -193,7 +193,7 @@ def report_is_used(start_node, peer, tmp_path):
     assert "/parent_odom" in page
     saved = yaml.safe_load((out / "extrinsic.yaml").read_text())
     assert saved["cross_check"]["x"]["of_halves"] is not None
-    gap = "1 gaps of up to 1.60 s"  # both say what the last check found
+    gap = "gaps: 1, of up to 1.60 s"  # both say what the last check found
     assert gap in page
     assert gap in str(saved["findings"])
     assert saved["provenance"]["inputs"]["child"]["topic"] == "/child_odom"

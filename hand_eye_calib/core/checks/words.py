@@ -48,7 +48,8 @@ WORDS = {
     "disorder": FindingWords("{text}", "repair the source of the stamps", severity=Severity.NOTE),
     "leap": FindingWords("{whose} {leap}", "{remedy}"),
     "gaps": FindingWords(
-        "the {stream} stream has {gaps} gaps of up to {longest_s:.2f} s ({share:.0%} of the time)",
+        "the {stream} stream has gaps: {gaps}, of up to {longest_s:.2f} s ({share:.0%} of the "
+        "time)",
         "nothing is paired across a gap; raise max_gap if the motion there is smooth",
         severity=Severity.NOTE,
     ),

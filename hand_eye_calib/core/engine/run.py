@@ -25,7 +25,7 @@ from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.checks import units
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.clock_and_scale import offset_values
-from hand_eye_calib.core.checks.findings import Finding, Severity, repair_message
+from hand_eye_calib.core.checks.findings import Finding, Severity, gravest_first, repair_message
 from hand_eye_calib.core.checks.findings import finding as new_finding
 from hand_eye_calib.core.checks.hypotheses import HOLDS
 from hand_eye_calib.core.engine import readings as choosing
@@ -420,6 +420,30 @@ def _with_offset_doubt(attempt: Attempt, doubts: Collection[Finding]) -> Attempt
 def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckResult:
     """Check the streams of a snapshot, with their result if there is one."""
     return kind_of(snapshot.config).check(snapshot, calibration)
+
+
+def examine(snapshot: Snapshot) -> tuple[Finding, ...]:
+    """Return the findings of :func:`run` about the streams as they are, the gravest first.
+
+    As in :func:`run`, the check starts from a solve, and one of two readings is chosen.
+
+    Raises
+    ------
+    NotEnoughDataError
+        If too few poses can be paired, and this kind of data cannot be checked without a result.
+    """
+    try:
+        calibration = snapshot.estimate(cross_check=False)
+    except NotEnoughDataError:
+        if not kind_of(snapshot.config).has_conventions:
+            raise
+        calibration = None
+    result = check(snapshot, calibration)
+    known_s = snapshot.config.given_time_offset_s
+    if calibration:
+        known_s = calibration.time_offset_s
+    reading = _reading_of(snapshot, result, (), known_s)
+    return gravest_first((*reading.findings, *reading.doubts))
 
 
 def _checked(calibration: Calibration, snapshot: Snapshot) -> Attempt:

@@ -266,9 +266,9 @@ class PoseBag:
         return choose(free, missing, self.sensor_frame, moving_edges)
 
     def sensor_frame(self, topic: str) -> str:
-        """Return the sensor's frame in the first message of a topic of poses; may be empty."""
+        """Return the sensor's frame in the first message of a topic; empty if it has none."""
         type_ = self.type_of(topic)
-        if type_ not in messages.POSE_TYPES:
+        if type_ not in (*messages.POSE_TYPES, *messages.SENSOR_TYPES):
             return ""
         run = next(self.runs([topic]), None)
         if run is None:
@@ -277,6 +277,8 @@ class PoseBag:
             table = messages.unpack_poses(run.messages[:1], type_, run.kind.is_ros1)
         except messages.MALFORMED as error:
             raise run.unreadable(error) from error
+        if type_ in messages.SENSOR_TYPES:
+            return table.world_frames[0]
         return table.sensor_frames[0] or ""
 
     def _parts_of(self, topic: str) -> list[str]:
@@ -319,9 +321,13 @@ class PoseBag:
         readings = [self._reading("parent", parent, measures or {}, max_gap_s)]
         if child:
             readings.append(self._reading("child", child, measures or {}, max_gap_s))
+        return self._poses_of(readings, stamps or {})
+
+    def _poses_of(self, readings: Sequence[Reading], stamps: Mapping[str, str]) -> PoseTable:
+        """Read the poses of streams in the order of bag time; ``stamps`` are those of `poses`."""
         topics: set[str] = set()
         for reading in readings:
-            reading.use_stamps((stamps or {}).get(reading.stream, "header"))
+            reading.use_stamps(stamps.get(reading.stream, "header"))
             topics.update(reading.topics)
         count = sum(self.topics[topic].count for topic in topics)
         runs = self.runs(topics)
@@ -366,7 +372,11 @@ class PoseBag:
         )
 
     def trajectory(
-        self, source: Source, measures: str = "auto", stamps: str = "header"
+        self,
+        source: Source,
+        measures: str = "auto",
+        stamps: str = "header",
+        stream: str = "parent",
     ) -> tuple[Trajectory, list[str]]:
         """Read the trajectory of one source, sorted by stamps.
 
@@ -379,6 +389,8 @@ class PoseBag:
             Quantity to read, see :meth:`measured`.
         stamps : {"header", "receive"}
             See :meth:`poses`.
+        stream : {"parent", "child"}
+            Stream whose options an error names.
 
         Returns
         -------
@@ -392,7 +404,8 @@ class PoseBag:
             If the bag or a pose cannot be read.
         """
         self.check(source)
-        poses = self.poses(source, measures={"parent": measures}, stamps={"parent": stamps})
+        reading = self._reading(stream, source, {stream: measures}, CalibratorConfig.max_gap)
+        poses = self._poses_of([reading], {stream: stamps})
         if not len(poses):
             raise InputError(f"no poses on {source} of {self}")
         kind: Any = self.measured(source, measures)

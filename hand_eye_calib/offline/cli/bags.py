@@ -1,7 +1,7 @@
 """Read a recording from a bag, from several bags that are its parts, or from a journal."""
 
 import dataclasses
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -116,14 +116,14 @@ def stamps_of(wanted: Mapping[str, str]) -> dict[str, str]:
 
 
 def read_sources(
-    bag: PoseBag, measures: Iterable[tuple[Source, str, str]]
+    bag: PoseBag, measures: Sequence[tuple[Source, str, str]]
 ) -> tuple[list[Trajectory], list[str]]:
     """Read the whole trajectories of sources of a bag.
 
     Parameters
     ----------
     bag : PoseBag
-    measures : iterable of (Source, str, str)
+    measures : sequence of (Source, str, str)
         Sources, what they measure, and the stamps to use: "header" or "receive".
 
     Returns
@@ -134,9 +134,11 @@ def read_sources(
     """
     trajectories = []
     repairs: list[str] = []
-    for source, kind, stamps in measures:
+    # Errors name the options of a stream. The sensors of a rig share those options.
+    streams = STREAMS if len(measures) == len(STREAMS) else [STREAMS[0]] * len(measures)
+    for stream, (source, kind, stamps) in zip(streams, measures, strict=True):
         with waiting_for(f"reading {source}"):
-            trajectory, notes = bag.trajectory(source, kind, stamps)
+            trajectory, notes = bag.trajectory(source, kind, stamps, stream)
         trajectories.append(trajectory)
         repairs += notes
     note(*bag.warnings)

@@ -206,7 +206,14 @@ def _list_topics(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int
     """
     from hand_eye_calib.formats.bags.messages import MESSAGE_TYPES
     from hand_eye_calib.formats.bags.reader import PoseBag
+    from hand_eye_calib.offline.cli import reading
 
+    files = [path for path in arguments.paths if reading.is_plain_file(path)]
+    if files:
+        raise ConfigError(
+            f"--list prints the topics of a bag; {files[0]} is a trajectory file, which has none. "
+            "Omit --list"
+        )
     with PoseBag(*arguments.paths) as bag, waiting_for(f"reading {bag}"):
         topics = []
         for topic in bag.topics.values():

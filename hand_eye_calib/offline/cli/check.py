@@ -10,6 +10,7 @@ from hand_eye_calib.offline.cli import options
 from hand_eye_calib.offline.cli.options import (
     STREAMS,
     fail,
+    note,
     print_result,
     typed_options,
     waiting_for,
@@ -41,6 +42,9 @@ most used options:
 
 {_EPILOG}"""
 
+# Codes of notes that the user can act on. All other notes are printed without advice.
+_NOTES_WITH_ADVICE = ("one_axis",)
+
 _HEADINGS = ("", "poses", "seconds", "per s", "longest gap", "path length", "rotation")
 
 
@@ -61,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     """
     from hand_eye_calib.core.base.plain import plain
     from hand_eye_calib.core.checks.findings import finding, gravest_first
-    from hand_eye_calib.core.engine.run import check
+    from hand_eye_calib.core.engine.run import examine
     from hand_eye_calib.core.engine.snapshot import whole_snapshot
     from hand_eye_calib.offline.report.evidence import summarise
 
@@ -71,11 +75,9 @@ def run(arguments: argparse.Namespace) -> int:
     parent, child = recording.trajectories
     snapshot = whole_snapshot(parent, child, settings)
     with waiting_for("checking the streams"):
-        # Without poses, the findings come from a solve.
-        has_poses = snapshot.config.measured == "poses"
-        checked = check(snapshot, None if has_poses else snapshot.estimate())
+        examined = examine(snapshot)
     repairs = [finding("disorder", text=text) for text in recording.repairs]
-    findings = gravest_first([*checked.findings, *repairs])
+    findings = gravest_first([*examined, *repairs])
     streams = {
         stream: summarise(poses)
         for stream, poses in zip(STREAMS, snapshot.unpaired, strict=True)
@@ -121,7 +123,8 @@ def _read_streams(arguments: argparse.Namespace, settings: Mapping[str, Any]) ->
         options.refuse_stamps(arguments)
         names = dict(zip(STREAMS, map(str, paths), strict=True))
         files = reading.read_files(arguments, paths, settings)
-        return _Streams(names, files.trajectories, [*files.repairs, *files.warnings])
+        note(*files.warnings)
+        return _Streams(names, files.trajectories, files.repairs)
     from hand_eye_calib.core.base.config import CalibratorConfig
     from hand_eye_calib.formats.bags.reader import PoseBag
     from hand_eye_calib.offline.cli import bags
@@ -162,7 +165,7 @@ def _verdict(findings: "Sequence[Finding]") -> str:
     verdict = Verdict.DO_NOT_USE if errors else Verdict.USE_WITH_CARE
     if all(finding.options for finding in serious):
         typed = " ".join(typed_options(finding.options.items()) for finding in serious)
-        return f"{verdict.value}: the streams need a repair; calibrate with {typed}."
+        return f"{verdict.value} as they are: calibrate with {typed}."
     codes = ", ".join(finding.code for finding in errors or serious)
     return f"{verdict.value}: check these findings first: {codes}."
 
@@ -178,6 +181,9 @@ def _finding_lines(findings: "Sequence[Finding]") -> Iterator[str]:
         if mark != "note":
             mark = mark.upper()
         yield f"{mark:<8} {finding.code:<17} {finding.stream}"
+        if mark == "note" and finding.code not in _NOTES_WITH_ADVICE:
+            yield from wrapped(f"{finding.what}; no action is needed", "    ", "    ")
+            continue
         advice = f"-> {finding.advice}"
         if finding.options:
             advice += f": {typed_options(finding.options.items())}"

@@ -139,6 +139,11 @@ def _looks_like_file_of_bag(path: Path) -> bool:
     return path.suffix in _BAG_SUFFIXES
 
 
+def is_plain_file(path: Path | str) -> bool:
+    """Return whether a path is an existing file that does not have the name of a bag."""
+    return isinstance(path, Path) and path.is_file() and not _looks_like_file_of_bag(path)
+
+
 def _looks_like_bag(path: Path) -> bool:
     """Whether a path is a folder or a bag's file, by its name."""
     return _looks_like_file_of_bag(path) or path.is_dir()
