@@ -95,7 +95,8 @@ def save(
     directory = path_of("directory", directory)
     # A report that was written before the first save belongs to this result.
     has_earlier = Path(directory, FILE_NAME).exists()
-    if has_earlier:
+    # The folder of a rig has a launch file of its own, which this result replaces.
+    if any(Path(directory, name).exists() for name in (*_NAMES, RIG_NAME)):
         keep_earlier_results(directory)
     path = save_result(calibration, directory, inputs)
     if has_earlier:
@@ -114,7 +115,7 @@ def save_rig(
 
     ``rig.yaml`` contains ``document``, the rig in plain values. ``static_transform.launch.py``
     contains all usable transforms. Each sensor has a directory with the files of
-    :func:`save_result`.
+    :func:`save_result`; its earlier files are kept in ``previous``.
     """
     folders = {RIG_NAME, LAUNCH_NAME, REPORT_NAME}
     for calibration in calibrations:
@@ -123,6 +124,7 @@ def save_rig(
         while name in folders:
             name += "_2"
         folders.add(name)
+        keep_earlier_results(Path(directory, name))
         save_result(calibration, Path(directory, name), inputs)
     usable = [
         calibration for calibration in calibrations if calibration.verdict is not Verdict.DO_NOT_USE
@@ -251,6 +253,8 @@ def load_result(path: str | Path) -> Calibration:
         if (path / RIG_NAME).exists() and not (path / FILE_NAME).exists():
             sensors = sorted(str(file.parent) for file in path.glob(f"*/{FILE_NAME}"))
             raise InputError(f"{path} is of a rig; name one of its sensors: {', '.join(sensors)}")
+        if not (path / FILE_NAME).exists():
+            raise InputError(f"{path} has no {FILE_NAME}: name the folder of a result (--out)")
         path = path / FILE_NAME
     document = read_yaml(path)
     with located(path):

@@ -23,7 +23,7 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.calibration import Calibration, SolveStatus, Verdict
 from hand_eye_calib.core.results.records import AxisScatter, CorrelatedError, Noise
 from hand_eye_calib.extras.partial.rate_bias import RateBias
-from hand_eye_calib.formats.results import load_result, save_result
+from hand_eye_calib.formats.results import load_result, save_result, save_rig
 from hand_eye_calib.formats.yaml_files import yaml_text
 from hand_eye_calib.offline.cli.main import main
 from hand_eye_calib.online.live.progress import AxisProgress, Progress
@@ -358,7 +358,7 @@ def test_what_is_no_calibration_is_refused_with_the_file(tmp_path, text, message
 def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(InputError, match=r"cannot read .*absent: No such file"):
         load_result(tmp_path / "absent")
-    with pytest.raises(InputError, match=r"cannot read .*extrinsic\.yaml: No such file"):
+    with pytest.raises(InputError, match=r"has no extrinsic\.yaml: name the folder"):
         load_result(tmp_path)
     (tmp_path / "extrinsic.yaml").write_bytes(b"\xff\xfe\x00\x01")
     with pytest.raises(InputError, match="not a text file; expected YAML"):
@@ -451,3 +451,22 @@ def test_a_result_without_a_part_has_its_attributes_empty_and_no_others():
     assert (result.parent_world_frame, result.child_world_frame) == ("", "")
     with pytest.raises(AttributeError, match="no attribute 'T_child_paren'"):
         _ = result.T_child_paren
+
+
+def test_a_result_saved_into_the_folder_of_a_rig_keeps_the_launch_file_of_the_rig(tmp_path):
+    save_rig({"format": "rig"}, [calibration()], tmp_path)
+    launch = tmp_path / "static_transform.launch.py"
+    of_rig = launch.read_text()
+    hec.save(dataclasses.replace(calibration(), child_frame="other"), tmp_path)
+    assert launch.read_text() != of_rig
+    assert (tmp_path / "previous" / launch.name).read_text() == of_rig
+
+
+def test_a_second_rig_keeps_the_files_of_each_sensor(tmp_path):
+    save_rig({"format": "rig"}, [calibration()], tmp_path)
+    [path] = tmp_path.glob("*/extrinsic.yaml")
+    before = path.read_text()
+    second = dataclasses.replace(calibration(), warnings=("of the second rig",))
+    save_rig({"format": "rig"}, [second], tmp_path)
+    assert path.read_text() != before
+    assert (path.parent / "previous" / path.name).read_text() == before

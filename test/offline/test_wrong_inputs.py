@@ -100,7 +100,7 @@ TABLE = """
 1 | info absent | cannot read absent: No such file or directory
 1 | info list.yaml | expected format hand_eye_calib/extrinsic
 2 | info folder --as nothing | invalid choice: 'nothing' (choose from 'urdf'
-1 | export folder urdf | cannot read folder/extrinsic.yaml
+1 | export folder urdf | folder has no extrinsic.yaml
 2 | compare | required: RESULT
 2 | simulate | required: --out
 2 | simulate --out new --drive rocky | choose from 'published', 'hilly'
