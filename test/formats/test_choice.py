@@ -118,3 +118,15 @@ def test_without_an_obvious_pair_the_error_names_cause_and_options(rows, edges, 
         chosen(rows, edges=edges)
     assert message in str(caught.value)
     assert caught.value.options == options
+
+
+def test_a_topic_of_the_same_sensor_is_not_the_other_stream():
+    rows = [("/odom", ODOMETRY, 900), ("/imu", IMU, 900)]
+    frames = {"/odom": "base_footprint", "/imu": "base_footprint"}
+    with pytest.raises(UnclearStreamsError) as caught:
+        chosen(rows, frames=frames)
+    assert not caught.value.options
+    assert "record the odometry of the other sensor" in str(caught.value)
+    with pytest.raises(UnclearStreamsError) as caught:
+        chosen(rows, frames={**frames, "/imu": "imu_link"})
+    assert {*caught.value.options.values()} == {"/odom", "/imu"}

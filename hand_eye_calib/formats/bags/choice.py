@@ -125,7 +125,12 @@ def choose(
             return [sensor.name for sensor in chosen]
     if len(sensors) < n_missing <= len(candidates):
         sensors = candidates
-    raise _unclear(topics, [sensor.topic for sensor in sensors], missing, edges)
+    partners = topics
+    if len(sensors) == 1 and sensors[0].frame:
+        # A topic of the same sensor cannot be the other stream.
+        frame = sensors[0].frame
+        partners = [topic for topic in topics if frame_of(topic.name) != frame]
+    raise _unclear(topics, [sensor.topic for sensor in sensors], missing, edges, partners)
 
 
 def _topic_of_each_sensor(candidates: Sequence[_Candidate]) -> list[_Candidate]:
@@ -144,15 +149,17 @@ def _unclear(
     sensors: Sequence[TopicInfo],
     missing: Sequence[str],
     edges: Collection[str],
+    partners: Sequence[TopicInfo],
 ) -> UnclearStreamsError:
     """Return the error for a bag without an obvious choice.
 
     The error contains the problem, and the options of the likeliest choice. If no choice is
-    possible, it contains what to record instead, and the topics of the bag.
+    possible, it contains what to record instead, and the topics of the bag. ``partners`` are the
+    topics that may belong to the other sensor if only one topic has poses.
     """
     if not any(topic.count for topic in topics) and len(missing) > 1:
         return UnclearStreamsError("the bag has no messages: record again", {})
-    problem, sources = _problem_and_sources(topics, sensors, edges, len(missing))
+    problem, sources = _problem_and_sources(partners, sensors, edges, len(missing))
     if len(sources) >= len(missing):
         return UnclearStreamsError(problem, _options(missing, sources))
     advice = "record the odometry of the other sensor"
@@ -190,6 +197,15 @@ def _problem_and_sources(
             f"no topic has poses; the odometry of lidars can be computed from {_listed(clouds)}"
         )
         return problem, [topic.name for topic in clouds]
+    frames = {edge.split(":")[-1] for edge in edges}
+    worlds = {edge.split(":")[0] for edge in edges}
+    if len(frames - worlds) >= n_missing and not sensors:
+        listed = shortened(listing(sorted(edges)), _LONGEST_LIST)
+        problem = (
+            f"no topic has poses, and the transforms share a frame ({listed}; if two sensors "
+            "measured them, name both)"
+        )
+        return problem, []
     return "no topic has poses", []
 
 

@@ -248,6 +248,8 @@ _ROWS.append(MessageType(POINTS_TYPE, _OF_POSES))
 MESSAGE_TYPES = {row.name: row for row in _ROWS}
 #: Types with a complete pose in each message, which is unpacked from the bytes.
 POSE_TYPES = tuple(row.name for row in _ROWS if row.unpack is _pose)
+#: Types whose header contains the sensor's frame, not a world frame.
+SENSOR_TYPES = tuple(row.name for row in _ROWS if row.unpack in (_imu, _fix))
 #: Types with a complete pose in each message, whose fields a library decodes.
 FIELD_POSE_TYPES = tuple(
     name for name, fields in _FIELDS.items() if "qw=" in fields or "roll" in fields
@@ -516,9 +518,8 @@ class MessageReader:
             measured = self._measured(columns.stamps_ns[is_usable], values[is_usable])
             poses[is_usable, target] = measured
         poses[~is_usable] = np.nan
-        if self._row.unpack not in (_imu, _fix):
+        if self._row.name not in SENSOR_TYPES:
             return replace(columns, poses=poses), is_usable
-        # The header of these types contains the sensor's frame, not a world frame.
         return PoseTable.of(columns.stamps_ns, poses, "", columns.world_frames), is_usable
 
     def _measured(self, stamps_ns: IntArray, values: FloatArray) -> FloatArray:
