@@ -287,6 +287,7 @@ def cross_check(
     config = config or snapshot.config
     config.require_poses("a cross-check")
     settled = replace(snapshot, config=replace(config, time_offset=calibration.time_offset_s))
+    settled.require_pairs()
     others = answers_of_whole(calibration, settled.pose_pairs)
     halves = answers_of_halves(calibration, settled.pose_pairs)
     return compare_answers(calibration, others, halves)

@@ -11,6 +11,7 @@ from result_making import good_calibration
 import hand_eye_calib as hec
 from hand_eye_calib import calibrate
 from hand_eye_calib.core.assessment.covariance import Assessment
+from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.engine.cross_check import compare_answers
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.calibration import (
@@ -275,3 +276,10 @@ def test_every_solve_is_checked_and_one_from_python_for_a_sound_and_a_loose_moun
         assert list(cross_check) == ["x", "y", "z", "roll", "pitch", "yaw"]
         assert apart or (column(cross_check, "of_methods") > 0).all()
         assert (column(cross_check, "excess_of_halves").max() > 3) == apart
+
+
+def test_streams_that_do_not_overlap_are_named_in_a_cross_check(mounts):
+    parent, child, _ = mounts
+    result = calibrate(parent, child, reference="B5")
+    with pytest.raises(NotEnoughDataError, match="do not overlap in time"):
+        hec.cross_check(result, parent, child.shifted(1e6))

@@ -372,7 +372,7 @@ def saved(tmp_path, monkeypatch):
         (["first", "--with", NUMBERS], 0, "Mount of camera on lidar: same: a change of "),
         (["third", "--with", "robot.urdf"], 4, "moved: y by "),
         (["flat", "--with", "first"], 3, "cannot tell about x, y and z; roll, pitch"),
-        (["first", "second"], 0, "same: none of 2 differs"),
+        (["first", "second"], 0, "same: both agree"),
         (["first", "second", "third"], 4, "moved: third differs from the others: y by "),
         (["first", "third", "--with", "second"], 4, "moved: third of 2"),
     ],

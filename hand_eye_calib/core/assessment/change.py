@@ -7,6 +7,7 @@ of freedom. An axis is the same only if the test would detect a change of the si
 nine of ten cases.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -17,12 +18,17 @@ from hand_eye_calib.core.base import stats
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.text import amount, listing
 from hand_eye_calib.core.results.context import AxisDifference
-from hand_eye_calib.core.results.records import AXES
+from hand_eye_calib.core.results.records import AXES, ROTATIONS, TRANSLATIONS
 
 # Standard deviations (m, rad) that represent "unknown".
 UNKNOWN = np.sqrt(np.repeat([100.0, 10.0], 3))
 # Standard deviations (m, rad) above which an axis is unknown.
 UNKNOWN_FROM = 0.1 * UNKNOWN
+
+# Largest number of axes whose differences are listed. More differences are stated in all.
+_MOST_LISTED = 3
+# Rotation (rad, 45 deg) above which a difference is a matter of conventions, not of a mount.
+_CONVENTION_RAD = 0.25 * math.pi
 
 
 class Change(str, Enum):
@@ -64,7 +70,13 @@ class Moved:
     def sentence(self) -> str:
         """The verdict in one line, with its evidence."""
         if self.verdict is Change.MOVED:
-            return f"moved: {self.what}"
+            advice = ""
+            if self._total(ROTATIONS) > _CONVENTION_RAD:
+                advice = (
+                    "; so large a rotation is usually another convention of axes, or the inverse "
+                    "transform"
+                )
+            return f"moved: {self.what}{advice}"
         same = self._axes_that(Change.SAME)
         unknown = self._axes_that(Change.CANNOT_TELL)
         if not unknown:
@@ -77,7 +89,10 @@ class Moved:
     @property
     def what(self) -> str:
         """The axes that have moved; the two that differ most if none has moved on its own."""
-        axes = self._axes_that(Change.MOVED) or self._most_different_axes()
+        axes = self._axes_that(Change.MOVED)
+        if len(axes) > _MOST_LISTED:
+            return f"{listing(axes)}, by {listing(self._totals())} in all"
+        axes = axes or self._most_different_axes()
         moves = []
         for axis in axes:
             difference = amount(axis, self.axes[axis].difference)
@@ -93,6 +108,21 @@ class Moved:
                 ratios[axis] = abs(self.axes[axis].difference) / self.axes[axis].sigma
         different = [axis for axis, ratio in ratios.items() if ratio]
         return sorted(different, key=lambda axis: -ratios[axis])[:2]
+
+    def _total(self, axes: Sequence[str]) -> float:
+        """Return the length of the difference (m, rad) over three axes."""
+        return math.hypot(*(row.difference for axis, row in self.axes.items() if axis in axes))
+
+    def _totals(self) -> list[str]:
+        """Return the differences over all axes, with the largest standard deviations, in words."""
+        totals = []
+        for axes in (TRANSLATIONS, ROTATIONS):
+            sigmas = [row.sigma for axis, row in self.axes.items() if axis in axes]
+            sigma = max(sigmas, default=math.inf)
+            if math.isfinite(sigma):
+                total = amount(axes[0], self._total(axes))
+                totals.append(f"{total} +/- {amount(axes[0], sigma)}")
+        return totals
 
     def _power(self, axes: Sequence[str]) -> str:
         """Describe the changes of these axes that the test would detect."""

@@ -80,6 +80,8 @@ def compare(
     )
     others = "another" if installed is None else "what is installed"
     sentence = f"{verdict}: none of {len(results)} differs from {others}"
+    if installed is None and len(results) == 2 and verdict == Change.SAME.value:
+        sentence = f"{verdict}: both agree"
     if installed is not None and len(differences) == 1:
         sentence = differences[0].sentence
     elif moved_names and installed is None:

@@ -219,9 +219,7 @@ class Snapshot:
         kind = kind_of(self.config)
         kind.require_allowed(self.config)
         resolved = self.resolved
-        pairs = self.pose_pairs
-        if len(pairs) < resolved.config.min_pairs:
-            raise NotEnoughDataError(resolved._missing_data(len(pairs)))
+        self.require_pairs()
         result = kind.solve(resolved, cross_check)
         for measurement in self.beside_motion:
             result = measurement.joined(result, resolved)
@@ -252,6 +250,13 @@ class Snapshot:
             _measuring(parent, self.config.parent_measures),
             _measuring(child, self.config.child_measures),
         )
+
+    def require_pairs(self) -> None:
+        """Raise NotEnoughDataError, with the reason, if too few poses can be paired."""
+        resolved = self.resolved
+        pairs = self.pose_pairs
+        if len(pairs) < resolved.config.min_pairs:
+            raise NotEnoughDataError(resolved._missing_data(len(pairs)))
 
     def _missing_data(self, n_pairs: int) -> str:
         """Return a message about the reason why only ``n_pairs`` poses could be paired."""

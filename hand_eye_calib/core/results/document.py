@@ -38,6 +38,8 @@ _READABLE = (1, 2)
 
 # Share of a standard deviation below which an allowance changes none of its two digits.
 _NEGLIGIBLE_SHARE = 0.01
+# Ratio between the standard deviation of an angle and that of the rotation that is explained.
+_EXPLAINED_RATIO = 1.2
 
 # Fields of a result that are matrices in a document.
 _TRANSFORMS = ("T_parent_child", "T_method", "T_base_parent")
@@ -297,6 +299,21 @@ def parts_of_sigmas(transform: Notation) -> dict[str, str]:
             recorded = amount(axis, sigma_measured)
             parts[axis] = f"{recorded} measured, {amount(axis, allowance)} allowance"
     return parts
+
+
+def angles_in_words(transform: Notation, result: Result) -> str:
+    """Explain roll and yaw that are less certain than the rotation; empty if none is.
+
+    Near a pitch of 90 deg, roll and yaw vary together: a small rotation changes both by much.
+    """
+    rotation_rad = float(result.sigmas[3:].max())
+    largest_rad = math.radians(float(np.max(transform.sigma_rpy_deg)))
+    if not largest_rad > _EXPLAINED_RATIO * rotation_rad:
+        return ""
+    return (
+        f"roll and yaw vary together at pitch {transform.rpy_deg[1]:.0f} deg; the rotation itself "
+        f"is good to {amount('roll', rotation_rad)}"
+    )
 
 
 def allowance_in_words(result: Result) -> str:

@@ -142,7 +142,7 @@ _KINDS = dict.fromkeys(
     ("nothing_known", "unobservable", "unconfirmed", "target", "floor"),
     "physics",
 )
-_NO_FAULT = " (a limit of the recording; no fault was found)"
+_NO_FAULT = "a limit of the recording, no fault was found"
 
 # Words of the rules "halves" and "methods": which estimates disagree, words before the standard
 # deviations of the result, and what the user should do.
@@ -210,8 +210,10 @@ class Judged(Result):
             text = first.sentence
             if others:
                 text += f" (and {counted(len(others), 'more reason')})"
-            if all(reason.kind == "physics" for reason in self.reasons):
-                text += _NO_FAULT
+            is_limit = all(reason.kind == "physics" for reason in self.reasons)
+            # A warning may be about a fault that was repaired, or about a possible one.
+            if is_limit and not self.warnings:
+                text += f"; {_NO_FAULT}"
             if self.verdict is Verdict.DO_NOT_USE:
                 notes = []
         return "; ".join([text, *notes])

@@ -213,6 +213,8 @@ def read_trajectory(
         if has_other_options or not path:
             raise ConfigError("topic is for bags and cannot be combined with options of text files")
         return _of_bag(path, topic, measures)
+    if path and path.is_dir():
+        raise ConfigError(f"{path} is a folder: name the topic of the bag, such as topic='/odom'")
     has_unusable_options = has_times_in_memory if path else has_file_options
     if has_unusable_options:
         raise ConfigError(

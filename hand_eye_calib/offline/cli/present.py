@@ -14,6 +14,7 @@ from hand_eye_calib.core.base.text import frame_name, listing
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, Verdict
 from hand_eye_calib.core.results.document import (
     allowance_in_words,
+    angles_in_words,
     extra_transforms,
     parts_of_sigmas,
     printed_numbers,
@@ -207,6 +208,8 @@ def _extrinsic_lines(calibration: Calibration, with_details: bool) -> list[str]:
             lines += transform_lines(transforms[name], out_of_reach, with_details)
         else:
             lines += compact_lines(transforms[name], out_of_reach)
+        if words := angles_in_words(transforms[name], calibration):
+            lines += wrapped(words, "  ", "  ")
         if name == "T_parent_child":
             lines += allowance_lines(calibration)
     return lines
