@@ -39,6 +39,7 @@ sys.path[:0] = [str(PROJECT), str(PROJECT / "benchmarks"), str(PROJECT / "test")
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from geometry_msgs.msg import TransformStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
+from node_load import others  # noqa: E402
 from ros_harness import (  # noqa: E402
     LATCHED,
     NodeProcess,
@@ -516,9 +517,7 @@ def run(name, session, folder, seed):
     arguments = [f"-p {key}:={value}" for key, value in parameters.items()]
     witness = Witness(peer, domain, folder)
     node = NodeProcess(domain, folder / "node.log", arguments, fresh=True)
-    busy = [
-        subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(session.load)
-    ]
+    end_load = others(session.load)
     try:
         peer.spin_until(lambda: witness.pages and witness.states, "the page and the node")
         start_s = time.time() + START_S
@@ -530,9 +529,7 @@ def run(name, session, folder, seed):
         code, _ = node.stop(signal.SIGINT)
         peer.spin_until(lambda: time.time() > end_s + 4.0, "the end of the page")
     finally:
-        for program in busy:
-            program.kill()
-            program.wait()
+        end_load()
         node.kill()
         watch_code = witness.close()
         peer.close()
@@ -616,9 +613,13 @@ HEADINGS = ["seconds", "result at", "DONE at", "verdicts", "headlines", "error m
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("sessions", nargs="*", metavar="SESSION", help=", ".join(SESSIONS))
+    names = ", ".join(SESSIONS)
+    parser.add_argument("sessions", nargs="*", metavar="SESSION", help=f"all by default: {names}")
     parser.add_argument("--out", type=Path, help="directory for logs, pages and headlines")
     arguments = parser.parse_args()
+    for name in arguments.sessions:
+        if name not in SESSIONS:
+            parser.error(f"no session {name!r}; the sessions are {names}")
     rows = []
     all_problems = []
     with tempfile.TemporaryDirectory() as scratch:
