@@ -81,6 +81,44 @@ def test_an_option_that_cannot_be_applied_leaves_the_node_unconfigured(start_nod
     assert "/calibrator/solve" not in service_names(peer)
 
 
+def managed(peer, transition, wanted):
+    """Change the state as nav2_lifecycle_manager does: request, then compare the state."""
+    assert change(peer, transition), wanted
+    assert label(peer) == wanted
+
+
+def test_nav2_lifecycle_manager_starts_pauses_resumes_resets_and_shuts_down(start_node, peer):
+    # The requests of nav2_lifecycle_manager with bond_timeout 0, in its order, for one node.
+    node = start_node("-p lifecycle:=true", *RELIABLE_INPUTS)
+
+    def start_up():
+        managed(peer, Transition.TRANSITION_CONFIGURE, "inactive")
+        managed(peer, Transition.TRANSITION_ACTIVATE, "active")
+
+    def reset():
+        managed(peer, Transition.TRANSITION_DEACTIVATE, "inactive")
+        managed(peer, Transition.TRANSITION_CLEANUP, "unconfigured")
+
+    start_up()
+    managed(peer, Transition.TRANSITION_DEACTIVATE, "inactive")  # pause
+    managed(peer, Transition.TRANSITION_ACTIVATE, "active")  # resume
+    publishers = peer.publishers()
+    peer.wait_matched(*publishers)
+    answer, _ = peer.solve(publishers, *drive())
+    assert answer.success
+    reset()
+    peer.wait_left(*publishers)
+    start_up()
+    peer.wait_matched(*publishers)
+    assert not change(peer, Transition.TRANSITION_ACTIVATE)
+    assert "transition 3 is refused: the node is active" in node.log
+    assert label(peer) == "active"
+    reset()  # the shutdown begins like a reset
+    managed(peer, Transition.TRANSITION_UNCONFIGURED_SHUTDOWN, "finalized")
+    code, seconds = node.stop()
+    assert (code, seconds < 2.0) == (0, True)
+
+
 def test_a_shutdown_ends_the_session_from_any_state(start_node, peer):
     node = start_node("-p lifecycle:=true", *RELIABLE_INPUTS)
     assert change(peer, Transition.TRANSITION_CONFIGURE)

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
+from rclpy._rclpy_pybind11 import RCLError
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleNodeMixin
 from rclpy.node import Node
@@ -49,6 +50,21 @@ class ManagedNode(LifecycleNodeMixin, Node):
     def manage(self) -> None:
         """Serve the transitions. From now on, only transitions configure the node."""
         LifecycleNodeMixin.__init__(self)
+        change_state = self._service_change_state.callback
+
+        def change_state_if_possible(request: Any, response: Any) -> Any:
+            # rclpy raises an error for a transition that the present state does not have, such as
+            # a second activation. The error would end the node.
+            try:
+                return change_state(request, response)
+            except RCLError:
+                _, state = self._state_machine.current_state
+                wanted = request.transition.label or request.transition.id
+                self._log.warning(f"transition {wanted} is refused: the node is {state}")
+                response.success = False
+                return response
+
+        self._service_change_state.callback = change_state_if_possible
 
     def configure(self) -> None:
         """Make topics, services and timers. Poses are not accepted yet.
