@@ -241,3 +241,40 @@ def test_what_the_halves_of_the_whole_drive_no_longer_say_is_taken_back(cycle, l
     taken_back = [(level, text) for level, text in lines if text.startswith("no longer found")]
     assert [level for level, _ in taken_back] == ["info"]
     assert sentence in taken_back[0][1]
+
+
+def test_a_solve_on_a_busy_computer_is_named_and_its_pause_is_short(cycle, lines, monkeypatch):
+    now_s = [100.0]
+    monkeypatch.setattr(module.time, "monotonic", lambda: now_s[0])
+    cycle.start_if_due()
+    answer = Answer(0, 60.0, seen(30.0), result(), processor_s=0.5)
+    cycle.conclude(answer)
+    state = cycle.extrinsic_state(True, (Broadcast.OFF, ""))
+    assert state.slow == "The computer is busy: a result takes 60 s."
+    assert ("warning", state.slow) in lines
+    assert cycle._rest_until_s == 100.5
+    cycle.conclude(dataclasses.replace(answer, seconds=15.0, processor_s=14.0))
+    slow = cycle.extrinsic_state(True, (Broadcast.OFF, "")).slow
+    assert slow == "The computer is slow: a result takes 10 s."
+    cycle.conclude(dataclasses.replace(answer, seconds=1.0, processor_s=0.5))
+    assert cycle.extrinsic_state(True, (Broadcast.OFF, "")).slow == ""
+
+
+def test_a_running_solve_that_takes_long_is_named_before_it_ends(cycle, monkeypatch):
+    now_s = [100.0]
+    monkeypatch.setattr(module.time, "monotonic", lambda: now_s[0])
+    cycle._start()
+    assert cycle.extrinsic_state(True, (Broadcast.OFF, "")).slow == ""
+    now_s[0] = 130.0
+    slow = cycle.extrinsic_state(True, (Broadcast.OFF, "")).slow
+    assert slow == "The computer is busy: a result takes 30 s."
+
+
+def test_checks_are_rare_if_a_solve_takes_long(cycle, monkeypatch):
+    now_s = [1000.0]
+    monkeypatch.setattr(module.time, "monotonic", lambda: now_s[0])
+    cycle.conclude(Answer(0, 60.0, seen(30.0), result(), processor_s=0.5))
+    cycle._is_unchecked = True
+    cycle._start()
+    assert cycle.jobs[-1].check
+    assert cycle._check_due_s == 1000.0 + 4 * 60.0

@@ -599,3 +599,14 @@ def test_the_address_is_drawn_as_a_code(monkeypatch):
 def test_a_port_in_use_is_said_in_one_line(server):
     with pytest.raises(ConfigError, match="choose another with --web PORT"):
         WebServer(Board(), print, ("127.0.0.1", server.server_port))
+
+
+def test_a_busy_computer_is_named_beside_the_advice_that_waits_for_its_result():
+    slow = "The computer is busy: a result takes 60 s."
+    busy = replace(EXTRINSIC, slow=slow)
+    view = view_of(state(extrinsic=busy))
+    assert (view.word, view.advice) == ("GO ON", slow)
+    start = view_of(state(extrinsic=replace(busy, result=None)))
+    assert (start.word, start.advice) == ("START", slow)
+    done = view_of(state(extrinsic=busy, at={"done": True, "precision": "good to 1 cm"}))
+    assert slow not in done.text

@@ -27,6 +27,7 @@ from hand_eye_calib.online.live.describing import (
     is_refuted,
     is_too_little,
     priors_of,
+    slow_in_words,
     state_of_result,
     too_little_in_words,
     with_axis_keys,
@@ -54,6 +55,10 @@ OnSolved: TypeAlias = Callable[[bool, str], None]
 
 # Shortest time between two stream checks (s). A check takes one or two seconds.
 _CHECK_PERIOD_S = 30.0
+
+# Shortest time between two stream checks in durations of a solve: a check prolongs a solve by a half,
+# so on a busy computer most solves are done without a check.
+_SOLVES_PER_CHECK = 4.0
 
 # Options that change the verdict on a result, but not the result.
 _TARGETS = ("target_translation", "target_rotation", "target_axes")
@@ -104,6 +109,10 @@ class SolveCycle:
         self._publish = publish
         # Earliest start of the next solve (steady time, s).
         self._rest_until_s = 0.0
+        # Start of the newest job (steady time, s), and durations of the last job that has ended (s).
+        self._started_s = 0.0
+        self._job_s = 0.0
+        self._job_processor_s = 0.0
         # Callbacks that wait for a solve, with the time of the request (steady time, s).
         self._waiting: dict[OnSolved, float] = {}
         # Callbacks that were waiting when the current job started; its answer goes to them.
@@ -268,6 +277,7 @@ class SolveCycle:
         """Submit a job to the solving process."""
         now_s = time.monotonic()
         self.is_solving = True
+        self._started_s = now_s
         self._is_unchecked |= self._session.has_new_poses
         self._in_job = tuple(self._waiting)
         # A requested result needs up-to-date findings, even if no check is due.
@@ -275,7 +285,7 @@ class SolveCycle:
         check = self._is_unchecked and is_due
         if check:
             self._is_unchecked = False
-            self._check_due_s = now_s + _CHECK_PERIOD_S
+            self._check_due_s = now_s + max(_CHECK_PERIOD_S, _SOLVES_PER_CHECK * self._job_s)
         self._submitted = self._session.copy_to_solve()
         self._process.submit(Job(self._session.number, self._submitted, check, self._check_options))
 
@@ -285,8 +295,13 @@ class SolveCycle:
         """Process an answer; return the success of the solve, and a line of text about it."""
         if answer.session != self._session.number:
             return False, "the session was reset during the solve: the result is dropped"
-        # Pause for the duration of the solve, so that half of the processor time stays free.
-        self._rest_until_s = time.monotonic() + answer.seconds
+        # Pause for the processor time of the solve, so that half of the processor time stays free.
+        # On a busy computer, the solve takes much longer than this, and no longer pause is needed.
+        self._rest_until_s = time.monotonic() + answer.processor_s
+        self._job_s = answer.seconds
+        self._job_processor_s = answer.processor_s
+        if slow := slow_in_words(self._job_s, self._job_s, self._job_processor_s):
+            self._log.warning(slow, key="slow")
         self._take_motion(answer)
         self._take_check(answer)
         calibration = answer.calibration
@@ -457,6 +472,7 @@ class SolveCycle:
             level=level,
             text=text,
             is_solving=self.is_solving,
+            slow=self._slow_in_words(),
             n_poses=motion.n_poses,
             path_m=motion.distance,
             motion_s=motion.motion_s,
@@ -470,6 +486,11 @@ class SolveCycle:
             contradicted=tuple(self.result.contradictions) if self.result else (),
             result=result,
         )
+
+    def _slow_in_words(self) -> str:
+        """Return a sentence about solves that take long, and the reason; empty if they do not."""
+        running_s = time.monotonic() - self._started_s if self.is_solving else 0.0
+        return slow_in_words(max(running_s, self._job_s), self._job_s, self._job_processor_s)
 
     def _condition(self, accepts_poses: bool, tf_static: BroadcastState) -> Condition:
         """Return level and text of the gravest condition that applies."""

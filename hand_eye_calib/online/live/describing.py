@@ -21,6 +21,12 @@ from hand_eye_calib.online.live.state import Condition, InputState, Level, Resul
 _MIN_MOTION_S = 20.0
 _MIN_ROTATION_RAD = float(np.radians(30.0))
 
+# Duration of a solve (s) from which on a person is told about it: advice and time left are then as
+# old as this.
+_SLOW_SOLVE_S = 10.0
+# Share of a processor that a solve gets, below which other programs keep the processor busy.
+_BUSY_SHARE = 0.5
+
 
 def pause_of(inputs: Mapping[str, InputState], accepts_poses: bool) -> Condition:
     """Return level and reason if no poses arrive; otherwise level OK and an empty text.
@@ -58,6 +64,24 @@ def too_little_in_words(motion: Excitation) -> str:
         f"{np.degrees(_MIN_ROTATION_RAD):.0f} deg, so far {motion.motion_s:.0f} s and "
         f"{rotation_deg:.0f} deg."
     )
+
+
+def slow_in_words(seconds: float, last_s: float, last_processor_s: float) -> str:
+    """Return a sentence about solves that take long, and the reason; empty if they do not.
+
+    Parameters
+    ----------
+    seconds : float
+        Longest duration of the last solve and of the running solve (s).
+    last_s, last_processor_s : float
+        Duration and processor time of the last solve (s).
+    """
+    if seconds < _SLOW_SOLVE_S:
+        return ""
+    is_busy = last_processor_s < _BUSY_SHARE * last_s or last_s < _SLOW_SOLVE_S
+    word = "busy" if is_busy else "slow"
+    # Whole tens: the sentence does not change with every second of a running solve.
+    return f"The computer is {word}: a result takes {duration(10.0 * (seconds // 10.0))}."
 
 
 def with_newest_halves(kept: Calibration, newest: Calibration) -> Calibration:

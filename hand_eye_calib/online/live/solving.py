@@ -42,10 +42,6 @@ from hand_eye_calib.online.live.stream_checks import merged
 # __main__, and the node could not unpickle them.
 _SOLVE = "from hand_eye_calib.online.live.solving import main; main()"
 
-# Nice value of the process: other programs get twice its share of a processor. With a higher value,
-# a solve takes minutes while other programs are busy. The callbacks are as fast with any value.
-_NICENESS = 3
-
 # Time (s) after which a job counts as hung: live sessions are solved in seconds.
 HANGS_AFTER_S = 600.0
 
@@ -130,6 +126,9 @@ class Answer:
         Sentences about these options.
     newest_motion : Excitation or None
         Motion of the last minute.
+    processor_s : float
+        Processor time of the job (s). It is much shorter than the duration if other programs keep
+        the processor busy.
     """
 
     session: int
@@ -143,6 +142,7 @@ class Answer:
     options: Options = field(default_factory=dict)
     messages: tuple[str, ...] = ()
     newest_motion: Excitation | None = None
+    processor_s: float = 0.0
 
 
 def answer(job: Job) -> Answer:
@@ -152,6 +152,7 @@ def answer(job: Job) -> Answer:
     failure in the answer, and what was computed before the error stays.
     """
     start_s = time.monotonic()
+    start_processor_s = time.process_time()
     result = Answer(job.session, 0.0, is_checked=job.check)
     try:
         received = job.calibrator.snapshot()
@@ -170,7 +171,11 @@ def answer(job: Job) -> Answer:
         result = replace(result, failure=result.failure or _failure(error))
     if result.check is not None:
         result = replace(result, check=with_raw_findings(result.check, received))
-    return replace(result, seconds=time.monotonic() - start_s)
+    return replace(
+        result,
+        seconds=time.monotonic() - start_s,
+        processor_s=time.process_time() - start_processor_s,
+    )
 
 
 def _newest(pairs: PosePairs) -> PosePairs:
@@ -233,9 +238,10 @@ def _failure(error: Exception) -> Failure:
 def main() -> None:
     """Answer jobs until standard input ends.
 
-    Standard input ends with the node, even if the node crashes.
+    Standard input ends with the node, even if the node crashes. The process has the priority of the
+    node: with a lower one, a solve takes minutes while other programs are busy. The callbacks of
+    the node are as fast with any priority.
     """
-    os.nice(_NICENESS)
     # Standard output is the pipe. What a library prints goes to standard error instead.
     outgoing = os.fdopen(os.dup(1), "wb")
     os.dup2(sys.stderr.fileno(), 1)

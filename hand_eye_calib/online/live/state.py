@@ -122,6 +122,8 @@ class ExtrinsicState(Part):
 
     Attributes
     ----------
+    slow : str
+        Sentence about solves that take long, and the reason; empty if they do not.
     path_m : float
         Length of the path (m).
     motion_s : float
@@ -143,6 +145,7 @@ class ExtrinsicState(Part):
     """
 
     is_solving: bool
+    slow: str = ""
     n_poses: int
     path_m: float
     motion_s: float = 0.0

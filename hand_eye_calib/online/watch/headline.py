@@ -115,11 +115,13 @@ def _activity(state: NodeState) -> Headline:
     tone = Tone.BUSY if session.level is Level.OK else Tone.ACT
     if session.is_paused:
         return Headline(tone, "PAUSED", sentence)
+    # Until the next result, neither bars nor advice change, whatever the person does.
+    slow = state.extrinsic.slow if state.extrinsic else ""
     if state.result is None:
-        return Headline(Tone.BUSY, "START", sentence)
+        return Headline(Tone.BUSY, "START", sentence, slow)
     if session.progress.target_is_too_small:
-        return Headline(tone, CHANGE_TARGET, sentence)
-    return Headline(tone, "GO ON" if tone is Tone.BUSY else CHANGE_MOTION, sentence)
+        return Headline(tone, CHANGE_TARGET, sentence, slow)
+    return Headline(tone, "GO ON" if tone is Tone.BUSY else CHANGE_MOTION, sentence, slow)
 
 
 def _at_goal(state: NodeState, session: ProgressState) -> Headline:
