@@ -56,8 +56,8 @@ OnSolved: TypeAlias = Callable[[bool, str], None]
 # Shortest time between two stream checks (s). A check takes one or two seconds.
 _CHECK_PERIOD_S = 30.0
 
-# Shortest time between two stream checks in durations of a solve: a check prolongs a solve by a half,
-# so on a busy computer most solves are done without a check.
+# Shortest time between two stream checks in durations of a solve: a check prolongs a solve by a
+# half, so on a busy computer most solves are done without a check.
 _SOLVES_PER_CHECK = 4.0
 
 # Options that change the verdict on a result, but not the result.
@@ -109,8 +109,9 @@ class SolveCycle:
         self._publish = publish
         # Earliest start of the next solve (steady time, s).
         self._rest_until_s = 0.0
-        # Start of the newest job (steady time, s), and durations of the last job that has ended (s).
+        # Start of the newest job (steady time, s).
         self._started_s = 0.0
+        # Duration and processor time of the last job that has ended (s).
         self._job_s = 0.0
         self._job_processor_s = 0.0
         # Callbacks that wait for a solve, with the time of the request (steady time, s).
