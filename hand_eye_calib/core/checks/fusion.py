@@ -29,7 +29,7 @@ from hand_eye_calib.core.checks.fault_regression import ROUNDS, noise_units
 from hand_eye_calib.core.checks.findings import Finding, Severity, finding
 from hand_eye_calib.core.checks.stream_pair import MIN_PAIRS
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.pairing.motion_pairs import PosePairs, pairs_over
+from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
 
 # Time constants T of the filters that are tried, s. A filter between two of them is detected by
 # both.
@@ -40,7 +40,7 @@ _MOST_MOTIONS = 3000
 _BLOCKS = 20
 
 # Limits of D: standard deviations of its rotation or its translation, and the share of the squared
-# residuals that D explains. Two sensors have at most 10.2 standard deviations (48 simulated and 33
+# residuals that D explains. Two sensors have at most 8.4 standard deviations (78 simulated and 33
 # real recordings).
 _SIGMAS = 14.0
 _SHARE = 0.01
@@ -137,18 +137,83 @@ def _best_fit(pose_pairs: PosePairs, T_parent_child: FloatArray) -> _Fit | None:
     """Return the fit of the filter that explains most, or None for too few motions."""
     if len(pose_pairs) < MIN_PAIRS:
         return None
-    motions = _Motions(pose_pairs, T_parent_child)
-    if motions.n_blocks < _BLOCKS:
+    differences = _Differences(pose_pairs, T_parent_child)
+    if differences.n_blocks < _BLOCKS:
         return None
-    fits = [motions.fit(time_constant_s) for time_constant_s in _TIME_CONSTANTS_S]
+    fits = [differences.fit(time_constant_s) for time_constant_s in _TIME_CONSTANTS_S]
     return max(fits, key=lambda fit: fit.share)
 
 
-class _Motions:
-    """Differences between the motions of both streams, with the regressors of usual errors.
+class _Regressors:
+    """Changes of the motions of the child by errors of its poses.
 
-    Poses of the parent are converted to those of the child by the estimated extrinsic. A regressor
-    is the perturbation (6,) of a pose in the child's axes: translation before rotation.
+    A regressor is the perturbation (6,) of a pose in the child's axes: translation before rotation.
+    The world of the poses does not matter.
+
+    Parameters
+    ----------
+    poses : (N, 4, 4) array
+        Poses of the child, measured or computed from the parent's.
+    T_parent_child : (4, 4) array
+    seconds : (N,) array
+    pairs : MotionPairs
+        First and last pose of each of K motions.
+    """
+
+    def __init__(
+        self, poses: FloatArray, T_parent_child: FloatArray, seconds: FloatArray, pairs: MotionPairs
+    ) -> None:
+        self._poses = poses.copy()
+        # A near origin avoids the rounding of map coordinates.
+        self._poses[:, :3, 3] -= poses[:, :3, 3].mean(axis=0)
+        self._T_parent_child = T_parent_child
+        self._seconds = seconds
+        self._start = pairs.i
+        self._end = pairs.j
+        self._adjoints = se3.adjoint(self._poses)
+        self._inverse_adjoints = se3.adjoint(se3.inverse(self._poses))
+        self._to_end = self._inverse_adjoints[self._end] @ self._adjoints[self._start]
+
+    def _between(self, perturbations: FloatArray) -> FloatArray:
+        """Return the change (K, 6, m) of motions by perturbations (N, 6, m) of poses."""
+        return perturbations[self._end] - self._to_end @ perturbations[self._start]
+
+    def usual_errors(self) -> FloatArray:
+        """Return the regressors (K, 6, 10) of errors that are no filter.
+
+        These are an error of the extrinsic (6), a clock offset, a scale, and a delay of the
+        positions of the child or of the parent after their orientations.
+        """
+        mount = np.eye(6) - self._to_end
+        steps = se3.log(se3.inverse(self._poses[:-1]) @ self._poses[1:])
+        rates = steps / np.diff(self._seconds)[:, None]
+        inner = 0.5 * (rates[1:] + rates[:-1])
+        of_clock = np.concatenate([rates[:1], inner, rates[-1:]])
+        parents = self._poses @ se3.inverse(self._T_parent_child)
+        of_parent = np.gradient(se3.translation_of(parents), self._seconds, axis=0)
+        of_child = np.gradient(se3.translation_of(self._poses), self._seconds, axis=0)
+        to_child = np.swapaxes(se3.rotation_of(self._poses), 1, 2)
+        errors = [of_clock]
+        for displacements in (se3.translation_of(self._poses), of_child, of_parent):
+            translations = se3.times(to_child, displacements)
+            errors.append(np.concatenate([translations, np.zeros_like(translations)], axis=1))
+        return np.concatenate([mount, self._between(np.stack(errors, axis=2))], axis=2)
+
+    def filtered(self, time_constant_s: float) -> FloatArray:
+        """Return the regressors (K, 6, 6) of D for a filter of a time constant (s)."""
+        kept = np.exp(-median(np.diff(self._seconds)) / time_constant_s)
+        high_passed = np.zeros_like(self._adjoints)
+        for k, step in enumerate(np.diff(self._adjoints, axis=0)):
+            high_passed[k + 1] = kept * (high_passed[k] + step)
+        return self._between(self._inverse_adjoints @ high_passed)
+
+
+class _Differences:
+    """Differences between the motions of both streams, with regressors and instruments.
+
+    Regressors are computed from the parent's poses, and contain their noise. The differences
+    contain the same noise, which biases D. So the same regressors, computed from the child's poses,
+    are the instruments (W. Greene, *Econometric Analysis*, 2012, chapter 8).
 
     Parameters
     ----------
@@ -158,85 +223,57 @@ class _Motions:
 
     def __init__(self, pose_pairs: PosePairs, T_parent_child: FloatArray) -> None:
         poses = pose_pairs.Ts_pw_p @ T_parent_child
-        # The origin does not matter. A near origin avoids the rounding of map coordinates.
-        poses[:, :3, 3] -= poses[:, :3, 3].mean(axis=0)
         seconds = (pose_pairs.stamps_ns - pose_pairs.stamps_ns[0]) * 1e-9
-        self._interval_s = median(np.diff(seconds))
         pairs = pairs_over(replace(pose_pairs, Ts_pw_p=poses), SHORT_S, _MOST_MOTIONS)
-        self._start = pairs.i
-        self._end = pairs.j
         motions_back = se3.inverse(pairs.Ts_parenti_parentj)
-        self._to_end = se3.adjoint(motions_back)
         self._residuals = se3.log(motions_back @ pairs.Ts_childi_childj)
         self._units = noise_units(self._residuals[:, :3], self._residuals[:, 3:])
-        self._adjoints = se3.adjoint(poses)
-        self._inverse_adjoints = se3.adjoint(se3.inverse(poses))
-        self._base = self._usual_errors(poses, seconds)
-        self._block_of = self._start * _BLOCKS // len(poses)
+        self._block_of = pairs.i * _BLOCKS // len(poses)
+        self._of_parent = _Regressors(poses, T_parent_child, seconds, pairs)
+        self._of_child = _Regressors(pose_pairs.Ts_cw_c, T_parent_child, seconds, pairs)
+        self._usual_errors = self._of_parent.usual_errors()
+        self._usual_instruments = self._of_child.usual_errors()
 
     @property
     def n_blocks(self) -> int:
         """Number of blocks of time that have motions."""
         return len(np.unique(self._block_of))
 
-    def _between(self, perturbations: FloatArray) -> FloatArray:
-        """Return the change (K, 6, m) of motions by perturbations (N, 6, m) of poses."""
-        return perturbations[self._end] - self._to_end @ perturbations[self._start]
-
-    def _usual_errors(self, poses: FloatArray, seconds: FloatArray) -> FloatArray:
-        """Return the regressors (K, 6, 9) of errors that are no filter.
-
-        These are an error of the extrinsic (6), a clock offset, a scale, and a delay of positions
-        after orientations.
-        """
-        mount = np.eye(6) - self._to_end
-        steps = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) / np.diff(seconds)[:, None]
-        inner = 0.5 * (steps[1:] + steps[:-1])
-        velocities = np.concatenate([steps[:1], inner, steps[-1:]])
-        positions = np.zeros_like(velocities)
-        to_child = np.swapaxes(se3.rotation_of(poses), 1, 2)
-        positions[:, :3] = se3.times(to_child, se3.translation_of(poses))
-        linear = velocities.copy()
-        linear[:, 3:] = 0.0
-        others = np.stack([velocities, positions, linear], axis=2)
-        return np.concatenate([mount, self._between(others)], axis=2)
-
     def fit(self, time_constant_s: float) -> _Fit:
         """Estimate the mount change D for a filter of a time constant (s)."""
-        in_child = self._inverse_adjoints @ self._high_passed(time_constant_s)
-        regressors = self._between(in_child)
-        residuals = self._residuals[:, :, None]
-        rows = np.concatenate([self._base, regressors, residuals], axis=2)
-        blocks = self._robust_blocks(rows / self._units[:, None])
-        n_base = self._base.shape[2]
+        rows = self._joined(self._usual_errors, self._of_parent.filtered(time_constant_s))
+        instruments = self._joined(
+            self._usual_instruments, self._of_child.filtered(time_constant_s)
+        )
+        n_base = self._usual_errors.shape[2]
         columns = range(n_base + 6)
+        weights = self._robust_weights(rows)
+        weighted = rows * weights[:, None, None]
+        table = (np.swapaxes(rows, 1, 2) @ weighted).sum(axis=0)
+        share = 1.0 - _cost(table, columns) / max(_cost(table, range(n_base)), 1e-300)
+        products = np.swapaxes(instruments, 1, 2) @ weighted
+        blocks = Blocks.gathered(products, self._block_of, _BLOCKS)
         mount_change = blocks.solve(columns)[n_base:]
         covariance = blocks.jackknife(columns)[n_base:, n_base:]
         translation_sigmas = _in_sigmas(mount_change[:3], covariance[:3, :3])
         rotation_sigmas = _in_sigmas(mount_change[3:], covariance[3:, 3:])
-        cost_without = max(_cost(blocks.total, range(n_base)), 1e-300)
-        share = 1.0 - _cost(blocks.total, columns) / cost_without
         return _Fit(time_constant_s, mount_change, translation_sigmas, rotation_sigmas, share)
 
-    def _high_passed(self, time_constant_s: float) -> FloatArray:
-        """Return N (N, 6, 6): the adjoints after a high-pass filter of a time constant (s)."""
-        kept = np.exp(-self._interval_s / time_constant_s)
-        filtered = np.zeros_like(self._adjoints)
-        for k, step in enumerate(np.diff(self._adjoints, axis=0)):
-            filtered[k + 1] = kept * (filtered[k] + step)
-        return filtered
+    def _joined(self, usual_errors: FloatArray, filtered: FloatArray) -> FloatArray:
+        """Return rows (K, 6, p + 1) of regressors and differences, in units of the noise."""
+        joined = np.concatenate([usual_errors, filtered, self._residuals[:, :, None]], axis=2)
+        return np.asarray(joined / self._units[:, None])
 
-    def _robust_blocks(self, rows: FloatArray) -> Blocks:
-        """Return the tables of rows (K, 6, p + 1) with robust weights of the motions."""
+    def _robust_weights(self, rows: FloatArray) -> FloatArray:
+        """Return robust weights (K,) of motions with rows (K, 6, p + 1)."""
         weights = np.ones(len(rows))
         for _ in range(ROUNDS):
-            products = np.swapaxes(rows, 1, 2) @ (rows * weights[:, None, None])
-            blocks = Blocks.gathered(products, self._block_of, _BLOCKS)
-            coefficients = blocks.solve(range(rows.shape[2] - 1))
+            table = (np.swapaxes(rows, 1, 2) @ (rows * weights[:, None, None])).sum(axis=0)
+            coefficients = solve(table, range(rows.shape[2] - 1))
             errors = rows[:, :, -1] - rows[:, :, :-1] @ coefficients
             squared = (errors**2).sum(axis=1)
             weights = robust_weights("cauchy", squared / (4.0 * median(squared) + 1e-300))
-        return blocks
+        return weights
 
 
 def _cost(table: FloatArray, columns: range) -> float:
