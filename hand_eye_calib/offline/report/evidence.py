@@ -128,6 +128,9 @@ class Evidence:
         Motion of the sensors.
     streams : StreamView
         Rates of both streams.
+    without_lever_arm : (N, 3) array, or None
+        The computed path if both sensors were at one place (m). None unless a sensor has positions
+        without orientations.
     has_positions_of_parent : bool
         Whether the parent has positions without orientations.
     is_upright : bool
@@ -140,6 +143,7 @@ class Evidence:
     angles: tuple[FloatArray, FloatArray] | None
     excitation: Excitation
     streams: StreamView
+    without_lever_arm: FloatArray | None
     has_positions_of_parent: bool
     is_upright: bool
 
@@ -157,8 +161,14 @@ def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
         oriented = PosePairs(pose_pairs.stamps_ns, pose_pairs.Ts_cw_c, pose_pairs.Ts_pw_p)
     parent, child = snapshot.streams
     shifted = child.shifted(calibration.time_offset_s).scaled(calibration.scale)
+    without_lever_arm = None
     if calibration.measured == "positions":
-        parent_path, child_path = _paths_of_positions(calibration, pose_pairs, parent_is_positions)
+        measured, computed, without_lever_arm = _paths_of_positions(
+            calibration, pose_pairs, parent_is_positions
+        )
+        parent_path, child_path = computed, measured
+        if parent_is_positions:
+            parent_path, child_path = measured, computed
     else:
         parent_path, child_path = _paths_of_poses(calibration, pose_pairs)
     return Evidence(
@@ -168,6 +178,7 @@ def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
         angles=_angles(calibration, pose_pairs) if calibration.measured == "poses" else None,
         excitation=excitation(oriented),
         streams=view_streams(parent, shifted, config.max_gap),
+        without_lever_arm=without_lever_arm,
         has_positions_of_parent=parent_is_positions,
         is_upright=_is_upright(oriented.Ts_pw_p),
     )
@@ -197,26 +208,31 @@ def view_streams(parent: Trajectory, child: Trajectory, max_gap_s: float) -> Str
 
 def _paths_of_positions(
     calibration: Calibration, pose_pairs: PosePairs, parent_is_positions: bool
-) -> tuple[FloatArray, FloatArray]:
-    """Return the paths (N, 3) of the sensor with positions, from the parent's and child's stream.
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return three paths (N, 3) of the sensor with positions, m.
 
-    The computed path is moved onto the measured one by the best rotation and by the mean.
+    The first path is measured. The second is computed from the poses of the other sensor and the
+    result, the third from these poses alone. All paths begin at the first measured position.
     """
     if parent_is_positions:
-        poses = pose_pairs.Ts_cw_c @ calibration.T_child_parent
+        poses = pose_pairs.Ts_cw_c
+        T_oriented_point = calibration.T_child_parent
         positions = se3.translation_of(pose_pairs.Ts_pw_p)
     else:
-        poses = pose_pairs.Ts_pw_p @ calibration.T_parent_child
+        poses = pose_pairs.Ts_pw_p
+        T_oriented_point = calibration.T_parent_child
         positions = se3.translation_of(pose_pairs.Ts_cw_c)
-    path = se3.translation_of(poses)
-    path = path - path.mean(axis=0)
-    center = positions.mean(axis=0)
-    rotation = se3.nearest_rotation((positions - center).T @ path)
-    path = path @ rotation.T + center
-    # Both paths begin at the first measured position.
     measured = positions - positions[0]
-    computed = path - positions[0]
-    return (measured, computed) if parent_is_positions else (computed, measured)
+    computed = _moved_onto(measured, se3.translation_of(poses @ T_oriented_point))
+    return measured, computed, _moved_onto(measured, se3.translation_of(poses))
+
+
+def _moved_onto(measured: FloatArray, path: FloatArray) -> FloatArray:
+    """Move a path (N, 3) onto a measured path (N, 3) by the best rotation and by the mean."""
+    center = measured.mean(axis=0)
+    path = path - path.mean(axis=0)
+    rotation = se3.nearest_rotation((measured - center).T @ path)
+    return path @ rotation.T + center
 
 
 def _paths_of_poses(

@@ -51,6 +51,8 @@ def figures_of(calibration: Calibration, evidence: Evidence | None) -> list[Draw
             figures.append(_figure_of_stops(calibration))
     if evidence and evidence.angles is not None:
         figures.append(_figure_of_coordinates(calibration, evidence))
+    if evidence and evidence.without_lever_arm is not None:
+        figures.append(_figure_of_positions(calibration, evidence, evidence.without_lever_arm))
     if calibration.motion_residuals:
         figures.append(_figure_of_residuals(calibration, calibration.motion_residuals))
     if evidence:
@@ -182,7 +184,7 @@ def _figure_of_paths(calibration: Calibration, evidence: Evidence) -> Drawn:
         f"{other} and the result. Half of the time they are within "
         f"{length(float(np.median(distances_m)))} of each other, and at most "
         f"{length(distances_m.max())} apart, at {farthest_s * factor:.1f} {unit}. "
-        "That includes drift and jumps of the odometry."
+        "That is mostly drift and jumps of the odometry, not an error of the result."
     )
     return as_drawn(figure, "trajectories", "Both trajectories, aligned", caption)
 
@@ -224,6 +226,49 @@ def _figure_of_coordinates(calibration: Calibration, evidence: Evidence) -> Draw
         f"{angle(float(np.median(angles_rad)))}. That includes drift."
     )
     return as_drawn(figure, "coordinates", "Both streams over time, aligned", caption)
+
+
+@page_style()
+def _figure_of_positions(
+    calibration: Calibration, evidence: Evidence, without_lever_arm: FloatArray
+) -> Drawn:
+    """Draw the measured positions over time, and their differences from computed positions.
+
+    The differences are those with the result, and those ``without_lever_arm`` (N, 3), m.
+    """
+    rows = _downsample(len(evidence.times_s), LOOK.max_coordinate_points)
+    factor, unit = _time_axis(evidence.times_s[-1])
+    times = evidence.times_s[rows] * factor
+    sensor = calibration.child_frame
+    other = calibration.parent_frame
+    measured = evidence.child
+    computed = evidence.parent
+    if evidence.has_positions_of_parent:
+        sensor, other = other, sensor
+        measured, computed = computed, measured
+    before = without_lever_arm - measured
+    after = computed - measured
+    figure, panels = make_panels(5.4, 3, 2, bottom=0.8, sharex=True)
+    for column, axis in enumerate("xyz"):
+        position, difference = panels[2 * column], panels[2 * column + 1]
+        position.plot(times, measured[rows, column], color=PARENT, lw=1.6, label="measured")
+        position.set_ylabel(f"{axis} (m)", labelpad=2)
+        difference.plot(times, before[rows, column], color=MUTED, lw=1.0, label="without lever arm")
+        difference.plot(times, after[rows, column], color=CHILD, lw=1.2, label="with the result")
+        difference.set_ylabel(f"{axis}: difference (m)", labelpad=2)
+    for panel in panels[-2:]:
+        panel.set_xlabel(f"time ({unit})")
+    handles = [panels[0].lines[0], *panels[1].lines]
+    figure.legend(handles=handles, loc="lower center", ncols=3)
+    median_before_m = float(np.median(np.linalg.norm(before, axis=1)))
+    median_after_m = float(np.median(np.linalg.norm(after, axis=1)))
+    caption = (
+        f"Left: the measured positions of {sensor}. Right: the positions computed from the poses "
+        f"of {other}, less the measured ones. Half of the time, they differ by less than "
+        f"{length(median_after_m)} with the result, and by less than {length(median_before_m)} "
+        "without a lever arm. That includes drift."
+    )
+    return as_drawn(figure, "coordinates", "Positions over time, before and after", caption)
 
 
 @page_style()
