@@ -70,7 +70,7 @@ def test_after_turns_about_all_axes_only_what_a_result_says_is_missing():
         ),
     )
     assert excitation.what_is_missing(seen_in(poses), weak).startswith(
-        "x still uncertain after the motion"
+        "x can hardly be determined from the motion"
     )
     hidden = DofObservability("yaw", DofVerdict.UNOBSERVABLE, np.inf)
     hiding = dataclasses.replace(

@@ -145,6 +145,6 @@ def test_details_and_report_state_it(capsys, tmp_path):
     arguments = ["calibrate", "sample:lidar.tum", "sample:camera.tum", "-v", "--out", str(tmp_path)]
     assert main(arguments) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert "An error would have shown from: " in printed
+    assert "Smallest detectable error: " in printed
     assert "deg about y" in printed
-    assert "An error would have shown from: " in (tmp_path / "report.html").read_text("utf-8")
+    assert "Smallest detectable error: " in (tmp_path / "report.html").read_text("utf-8")

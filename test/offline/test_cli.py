@@ -163,7 +163,8 @@ def test_out_saves_what_info_shows(run, new_bag, tmp_path):
     out_dir = tmp_path / "result"
     code, text, err = run("replay", new_bag(), *TOPICS, "--out", out_dir)
     wrote = f"hand_eye_calib: note: wrote {out_dir}/"
-    assert (code, err) == (0, f"{wrote}extrinsic.yaml\n{wrote}report.html\n")
+    files = "extrinsic.yaml, extrinsic.urdf.xacro and static_transform.launch.py"
+    assert (code, err) == (0, f"{wrote}{files}\n{wrote}report.html\n")
     files = ["extrinsic.urdf.xacro", "extrinsic.yaml", "report.html", "static_transform.launch.py"]
     assert sorted(path.name for path in out_dir.iterdir()) == files
     assert run("info", out_dir) == (0, text, "")
@@ -175,7 +176,7 @@ def test_out_saves_what_info_shows(run, new_bag, tmp_path):
     assert file["sha256"] == hashlib.sha256(Path(file["file"]).read_bytes()).hexdigest()
     assert provenance["parameters"]["method"] == "auto"
     again = run("replay", file["file"], *TOPICS, "--out", out_dir)
-    assert f"extrinsic.yaml; the earlier files are in {out_dir}/previous\n" in again[2]
+    assert f"launch.py; the earlier files are in {out_dir}/previous\n" in again[2]
 
 
 def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag):

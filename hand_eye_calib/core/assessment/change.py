@@ -25,11 +25,6 @@ UNKNOWN = np.sqrt(np.repeat([100.0, 10.0], 3))
 # Standard deviations (m, rad) above which an axis is unknown.
 UNKNOWN_FROM = 0.1 * UNKNOWN
 
-# Largest number of axes whose differences are listed. More differences are stated in all.
-_MOST_LISTED = 3
-# Rotation (rad, 45 deg) above which a difference is a matter of conventions, not of a mount.
-_CONVENTION_RAD = 0.25 * math.pi
-
 
 class Change(str, Enum):
     """Verdict on a difference of two extrinsics."""
@@ -70,13 +65,7 @@ class Moved:
     def sentence(self) -> str:
         """The verdict in one line, with its evidence."""
         if self.verdict is Change.MOVED:
-            advice = ""
-            if self._total(ROTATIONS) > _CONVENTION_RAD:
-                advice = (
-                    "; so large a rotation is usually another convention of axes, or the inverse "
-                    "transform"
-                )
-            return f"moved: {self.what}{advice}"
+            return f"moved: {self.what}"
         same = self._axes_that(Change.SAME)
         unknown = self._axes_that(Change.CANNOT_TELL)
         if not unknown:
@@ -90,7 +79,7 @@ class Moved:
     def what(self) -> str:
         """The axes that have moved; the two that differ most if none has moved on its own."""
         axes = self._axes_that(Change.MOVED)
-        if len(axes) > _MOST_LISTED:
+        if len(axes) > len(TRANSLATIONS):
             return f"{listing(axes)}, by {listing(self._totals())} in all"
         axes = axes or self._most_different_axes()
         moves = []
@@ -109,18 +98,14 @@ class Moved:
         different = [axis for axis, ratio in ratios.items() if ratio]
         return sorted(different, key=lambda axis: -ratios[axis])[:2]
 
-    def _total(self, axes: Sequence[str]) -> float:
-        """Return the length of the difference (m, rad) over three axes."""
-        return math.hypot(*(row.difference for axis, row in self.axes.items() if axis in axes))
-
     def _totals(self) -> list[str]:
-        """Return the differences over all axes, with the largest standard deviations, in words."""
+        """Return the distance and the angle over all axes in words, with the largest sigmas."""
         totals = []
         for axes in (TRANSLATIONS, ROTATIONS):
-            sigmas = [row.sigma for axis, row in self.axes.items() if axis in axes]
-            sigma = max(sigmas, default=math.inf)
+            rows = [self.axes[axis] for axis in axes]
+            sigma = max(row.sigma for row in rows)
             if math.isfinite(sigma):
-                total = amount(axes[0], self._total(axes))
+                total = amount(axes[0], math.hypot(*(row.difference for row in rows)))
                 totals.append(f"{total} +/- {amount(axes[0], sigma)}")
         return totals
 

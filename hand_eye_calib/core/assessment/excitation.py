@@ -186,7 +186,7 @@ def what_is_missing(seen: Excitation, calibration: Calibration | None = None) ->
     problem = "cannot be determined from"
     if calibration and not axes:
         verdicts = calibration.observability
-        problem = "still uncertain after"
+        problem = "can hardly be determined from"
         axes = [dof.name for dof in verdicts if dof.verdict is DofVerdict.WEAK]
     if not axes:
         return ""

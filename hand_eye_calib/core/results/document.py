@@ -38,8 +38,6 @@ _READABLE = (1, 2)
 
 # Share of a standard deviation below which an allowance changes none of its two digits.
 _NEGLIGIBLE_SHARE = 0.01
-# Ratio between the standard deviation of an angle and that of the rotation that is explained.
-_EXPLAINED_RATIO = 1.2
 
 # Fields of a result that are matrices in a document.
 _TRANSFORMS = ("T_parent_child", "T_method", "T_base_parent")
@@ -307,8 +305,9 @@ def angles_in_words(transform: Notation, result: Result) -> str:
     Near a pitch of 90 deg, roll and yaw vary together: a small rotation changes both by much.
     """
     rotation_rad = float(result.sigmas[3:].max())
-    largest_rad = math.radians(float(np.max(transform.sigma_rpy_deg)))
-    if not largest_rad > _EXPLAINED_RATIO * rotation_rad:
+    # Angles that are printed to the digits of the rotation need no explanation.
+    excess_deg = float(np.max(transform.sigma_rpy_deg)) - math.degrees(rotation_rad)
+    if not round(excess_deg, 1) > 0.0:
         return ""
     return (
         f"roll and yaw vary together at pitch {transform.rpy_deg[1]:.0f} deg; the rotation itself "

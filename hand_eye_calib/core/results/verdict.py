@@ -432,10 +432,11 @@ def _worse_than_target(result: Result) -> Iterator[Ground]:
     sizes = [f"{axes_in_words([axis.name])} {axis.sigma_beside_target()}" for axis in rough]
     sentence = f"standard deviations above the target of {_targets(rough)}: {listing(sizes)}"
     allowances = [(axis, math.sqrt(axis.total**2 - axis.sigma**2)) for axis in rough]
-    # A longer recording does not help if the allowance alone is above the target.
+    # The target cannot be reached if the allowance alone is above it. A longer recording still
+    # helps if the allowance is less than half of the rest.
     hopeless = [(axis.name, size) for axis, size in allowances if size > axis.target]
     advice = []
-    if len(hopeless) < len(rough):
+    if any(size <= axis.target or 2.0 * size < axis.sigma for axis, size in allowances):
         is_translation = bool({*names} & {*TRANSLATIONS})
         more = "more rotation about other axes" if is_translation else "more rotation"
         advice.append(f"record longer, with {more}")

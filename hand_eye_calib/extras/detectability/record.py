@@ -62,14 +62,14 @@ class DetectabilityPart(Part):
             return []
         facts = []
         if errors := _amounts(value.errors):
-            facts.append(f"An error would have shown from: {errors}")
+            facts.append(f"Smallest detectable error: {errors}")
         if shifts := _amounts(value.shifts):
-            facts.append(f"A shift of the mount half-way would have shown from: {shifts}")
+            facts.append(f"Smallest detectable shift of the mount half-way: {shifts}")
         if math.isfinite(value.time_offset_s) and math.isfinite(value.scale):
             milliseconds = two_digits(1e3 * value.time_offset_s)
             percent = two_digits(1e2 * value.scale)
             facts.append(
-                f"An error of the clocks would have shown from: {milliseconds} ms; of the child's "
+                f"Smallest detectable error of the clocks: {milliseconds} ms; of the child's "
                 f"lengths: {percent}%"
             )
         return facts

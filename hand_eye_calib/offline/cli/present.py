@@ -71,10 +71,14 @@ def deliver(
     if arguments.label:
         inputs = inputs | {"labels": dict(arguments.label)}
     if arguments.out:
-        from hand_eye_calib.formats.results import keep_earlier_results, save_result
+        from hand_eye_calib.formats import results
 
-        kept = keep_earlier_results(arguments.out)
-        note(f"wrote {save_result(calibration, arguments.out, inputs)}{kept}")
+        kept = results.keep_earlier_results(arguments.out)
+        path = results.save_result(calibration, arguments.out, inputs)
+        names = (results.XACRO_NAME, results.LAUNCH_NAME)
+        beside = [name for name in names if path.with_name(name).exists()]
+        for_robots = f", {listing(beside)}" if beside else ""
+        note(f"wrote {path}{for_robots}{kept}")
     steps = () if arguments.json else next_steps(calibration, arguments, snapshot)
     document = calibration.to_dict() | {"inputs": inputs} if arguments.json else None
     try:

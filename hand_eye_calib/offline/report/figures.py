@@ -3,8 +3,12 @@
 A caption only states sizes. The verdict has rules of its own.
 """
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.plain import Document
@@ -38,6 +42,15 @@ _WHY_EQUAL = {
     "speed": "Two points of one rigid body have the same speed while it does not rotate: the two "
     "curves must rise and fall together.",
 }
+
+
+class _Curve(NamedTuple):
+    """Curves of one colour in six panels: columns (N, 6), colour, width of the line, and name."""
+
+    columns: FloatArray
+    colour: str
+    width: float
+    name: str
 
 
 def figures_of(calibration: Calibration, evidence: Evidence | None) -> list[Drawn]:
@@ -189,34 +202,44 @@ def _figure_of_paths(calibration: Calibration, evidence: Evidence) -> Drawn:
     return as_drawn(figure, "trajectories", "Both trajectories, aligned", caption)
 
 
+def _figure_of_columns(
+    evidence: Evidence, labels: Sequence[str], curves: Sequence[_Curve]
+) -> Figure:
+    """Draw six columns over time: the first three in the left panels, the others in the right.
+
+    ``labels`` are those of the vertical axes.
+    """
+    rows = _downsample(len(evidence.times_s), LOOK.max_coordinate_points)
+    factor, unit = _time_axis(evidence.times_s[-1])
+    times = evidence.times_s[rows] * factor
+    figure, panels = make_panels(5.4, 3, 2, bottom=0.8, sharex=True)
+    for column, label in enumerate(labels):
+        panel = panels[2 * (column % 3) + column // 3]
+        for curve in curves:
+            values = curve.columns[rows, column]
+            name = plain_label(curve.name)
+            panel.plot(times, values, color=curve.colour, lw=curve.width, label=name)
+        panel.set_ylabel(label, labelpad=2)
+    for panel in panels[-2:]:
+        panel.set_xlabel(f"time ({unit})")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="lower center", ncols=3)
+    return figure
+
+
 @page_style()
 def _figure_of_coordinates(calibration: Calibration, evidence: Evidence) -> Drawn:
     """Draw position and turned angles of the parent over time, from both streams."""
     assert evidence.angles is not None
-    rows = _downsample(len(evidence.times_s), LOOK.max_coordinate_points)
-    factor, unit = _time_axis(evidence.times_s[-1])
-    times = evidence.times_s[rows] * factor
     measured = np.hstack([evidence.parent, np.degrees(evidence.angles[0])])
     computed = np.hstack([evidence.child, np.degrees(evidence.angles[1])])
-    figure, panels = make_panels(5.4, 3, 2, bottom=0.8, sharex=True)
     labels = ("x (m)", "y (m)", "z (m)", "about x (deg)", "about y (deg)", "about z (deg)")
     parent = calibration.parent_frame
     child = calibration.child_frame
-    for column, label in enumerate(labels):
-        # Positions are the left panels of each row, angles the right ones.
-        panel = panels[2 * (column % 3) + column // 3]
-        panel.plot(times, measured[rows, column], color=PARENT, lw=3.2, label=plain_label(parent))
-        panel.plot(
-            times,
-            computed[rows, column],
-            color=CHILD,
-            lw=1.1,
-            label=plain_label(f"{child}, through the result"),
-        )
-        panel.set_ylabel(label, labelpad=2)
-    for panel in panels[-2:]:
-        panel.set_xlabel(f"time ({unit})")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="lower center", ncols=2)
+    curves = (
+        _Curve(measured, PARENT, 3.2, parent),
+        _Curve(computed, CHILD, 1.1, f"{child}, through the result"),
+    )
+    figure = _figure_of_columns(evidence, labels, curves)
     distances_m = np.linalg.norm(evidence.child - evidence.parent, axis=1)
     angles_rad = np.linalg.norm(evidence.angles[1] - evidence.angles[0], axis=1)
     caption = (
@@ -236,9 +259,6 @@ def _figure_of_positions(
 
     The differences are those with the result, and those ``without_lever_arm`` (N, 3), m.
     """
-    rows = _downsample(len(evidence.times_s), LOOK.max_coordinate_points)
-    factor, unit = _time_axis(evidence.times_s[-1])
-    times = evidence.times_s[rows] * factor
     sensor = calibration.child_frame
     other = calibration.parent_frame
     measured = evidence.child
@@ -248,25 +268,20 @@ def _figure_of_positions(
         measured, computed = computed, measured
     before = without_lever_arm - measured
     after = computed - measured
-    figure, panels = make_panels(5.4, 3, 2, bottom=0.8, sharex=True)
-    for column, axis in enumerate("xyz"):
-        position, difference = panels[2 * column], panels[2 * column + 1]
-        position.plot(times, measured[rows, column], color=PARENT, lw=1.6, label="measured")
-        position.set_ylabel(f"{axis} (m)", labelpad=2)
-        difference.plot(times, before[rows, column], color=MUTED, lw=1.0, label="without lever arm")
-        difference.plot(times, after[rows, column], color=CHILD, lw=1.2, label="with the result")
-        difference.set_ylabel(f"{axis}: difference (m)", labelpad=2)
-    for panel in panels[-2:]:
-        panel.set_xlabel(f"time ({unit})")
-    handles = [panels[0].lines[0], *panels[1].lines]
-    figure.legend(handles=handles, loc="lower center", ncols=3)
-    median_before_m = float(np.median(np.linalg.norm(before, axis=1)))
-    median_after_m = float(np.median(np.linalg.norm(after, axis=1)))
+    nothing = np.full_like(measured, np.nan)
+    labels = [f"{axis} ({unit})" for unit in ("m", "difference, m") for axis in "xyz"]
+    curves = (
+        _Curve(np.hstack([measured, nothing]), PARENT, 1.6, "measured"),
+        _Curve(np.hstack([nothing, before]), MUTED, 1.0, "without lever arm"),
+        _Curve(np.hstack([nothing, after]), CHILD, 1.2, "with the result"),
+    )
+    figure = _figure_of_columns(evidence, labels, curves)
+    before_m = length(float(np.median(np.linalg.norm(before, axis=1))))
+    after_m = length(float(np.median(np.linalg.norm(after, axis=1))))
     caption = (
         f"Left: the measured positions of {sensor}. Right: the positions computed from the poses "
-        f"of {other}, less the measured ones. Half of the time, they differ by less than "
-        f"{length(median_after_m)} with the result, and by less than {length(median_before_m)} "
-        "without a lever arm. That includes drift."
+        f"of {other}, less the measured ones. Half of the time, they differ by less than {after_m} "
+        f"with the result, and by less than {before_m} without a lever arm. That includes drift."
     )
     return as_drawn(figure, "coordinates", "Positions over time, before and after", caption)
 

@@ -226,9 +226,9 @@ def _at_distance(calibration: Calibration) -> str:
     # The objects of an arm are near, and its stops have no errors of an odometry.
     are_stops = calibration.reference == "stops"
     distance_m = LOOK.near_object_m if are_stops else LOOK.object_m
-    errors = "one standard deviation"
+    errors = ""
     if not are_stops:
-        errors += ", constant odometry errors included"
+        errors = ", constant odometry errors included"
     # The object is on an axis of the child sensor. The direction with the largest error counts.
     variances = []
     for point in distance_m * np.eye(3):
@@ -237,8 +237,8 @@ def _at_distance(calibration: Calibration) -> str:
         variances.append(np.linalg.eigvalsh(J @ calibration.covariance @ J.T)[-1])
     child = printable(calibration.child_frame)
     return (
-        f"An object {distance_m:g} m from {child} is misplaced by up to "
-        f"{text.length(float(np.sqrt(max(variances))))} ({errors})."
+        f"The position of an object {distance_m:g} m from {child} has a standard deviation of "
+        f"{text.length(float(np.sqrt(max(variances))))} in its worst direction{errors}."
     )
 
 
