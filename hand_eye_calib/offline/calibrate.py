@@ -28,6 +28,7 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory, TrajectoryLike
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.records import CrossCheck
 from hand_eye_calib.formats.files import path_of
+from hand_eye_calib.offline.beside_motion import switched_off, with_measurements
 
 MethodName: TypeAlias = Literal[
     "auto", "dnlo", "dnl", "park", "taylor", "zhuang", "ali", "adaptive", "robust"
@@ -83,6 +84,7 @@ def calibrate(
     target_axes: str | None = None,
     parent_frame: str | None = None,
     child_frame: str | None = None,
+    ground: Literal["auto", "off"] | None = None,
     checks: bool | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
@@ -107,6 +109,9 @@ def calibrate(
     prior : mapping of str to (float, float) or str, optional
         Value and standard deviation of x, y, z (m), roll, pitch or yaw (rad), such as
         ``{"z": (1.85, 0.02)}``; see :data:`~hand_eye_calib.core.base.text.Prior`.
+    ground : {"auto", "off"}, optional
+        Whether clouds or IMU data of both sensors in a bag measure z, roll and pitch, too; only for
+        a bag. Default: auto.
     checks : bool, optional
         False: the streams are not checked, the result is not compared with other references and
         halves of the recording, and there is no second solve. True: the result is compared even
@@ -135,6 +140,10 @@ def calibrate(
         raise InputError(f"progress must be a function; got {type(progress).__name__}")
     if checks is not None:
         require_type("checks", checks, bool)
+    if ground not in (None, "auto", "off"):
+        raise ConfigError(f"ground must be 'auto' or 'off'; got {shown_value(ground)}")
+    if ground is not None and child is not None:
+        raise ConfigError("ground applies to a bag; for trajectories, call calibrate_on_ground")
     first, second = _read_both(parent, child, {"parent": parent_topic, "child": child_topic})
     values |= prior_fields({} if prior is None else prior)
     options = {
@@ -142,7 +151,14 @@ def calibrate(
         for field in fields(CalibratorConfig)
         if field.name in values
     }
-    result = run(whole_snapshot(first, second, options), checks=checks, progress=progress)
+    snapshot = whole_snapshot(first, second, options)
+    if child is None:
+        snapshot, notes = with_measurements(
+            snapshot, [path_of("a bag", parent)], switched_off(values)
+        )
+        for text in notes:
+            warnings.warn(text, UserWarning, stacklevel=2)
+    result = run(snapshot, checks=checks, progress=progress)
     return replace(result.calibration, recording=result.snapshot)
 
 

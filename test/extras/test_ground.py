@@ -1,5 +1,7 @@
 """The ground and gravity beside the motion, on simulated machines."""
 
+import json
+import shutil
 from dataclasses import replace
 from functools import cache, partial
 
@@ -9,7 +11,7 @@ from bag_making import ODOMETRY, header, pose_message, write_messages
 from ground_making import START_NS, Machine
 
 import hand_eye_calib as hec
-from hand_eye_calib.core.base.errors import InputError, NotEnoughDataError
+from hand_eye_calib.core.base.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.ground.planes import ground_of
 from hand_eye_calib.extras.ground.tracks import driving_direction, turning_axis
@@ -229,6 +231,8 @@ def write_drive(path, child_frame="rear", with_imu=False, names="xyz"):
     """Write a bag of two lidars, or of a lidar and an IMU, with their odometry."""
     drive, clouds = machine()
     messages = [*odometry_messages(drive.parent, "/a"), *odometry_messages(drive.child, "/b")]
+    third = replace(drive.child, sensor_frame="camera")
+    messages += odometry_messages(third, "/c")
     for topic, frame, scans in (
         ("/a/points", "lidar", clouds[0]),
         ("/b/points", "rear", clouds[1]),
@@ -286,3 +290,89 @@ def test_clouds_that_cannot_be_read_are_a_note(tmp_path, capsys, no_figures):
     code, result, printed = calibrated(tmp_path, tmp_path / "bag", capsys)
     assert (code, result.ground) == (3, None)
     assert "not used: /a/points: points have no x, y, z, but a, b, c" in printed.err
+
+
+# ------------------------------------------------------------------- all roads
+
+TOPICS = ("--parent-topic", "/a", "--child-topic", "/b")
+
+
+def by_command(*words):
+    """A road: a command with the bag, which saves its result."""
+
+    def run(bag, out, ground):
+        main([*words, str(bag), *TOPICS, "--out", str(out), "--ground", ground])
+        return hec.load(out)
+
+    return run
+
+
+def by_batch(bag, out, ground):
+    main(["batch", str(bag), *TOPICS, "--out", str(out), "--ground", ground, "--no-report"])
+    return hec.load(out / bag.name)
+
+
+def by_recordings(bag, out, ground):
+    again = out.parent / "again"
+    shutil.copytree(bag, again)
+    main(["calibrate", str(bag), str(again), *TOPICS, "--out", str(out), "--ground", ground])
+    return hec.load(out)
+
+
+def by_rig(bag, out, ground):
+    arguments = ["--topics", "/a", "/b", "/c", "--out", str(out), "--ground", ground]
+    main(["rig", str(bag), *arguments])
+    return hec.load(out / "rear")
+
+
+def by_python(bag, out, ground):
+    return hec.calibrate(bag, parent_topic="/a", child_topic="/b", ground=ground)
+
+
+ROADS = {
+    "calibrate": by_command("calibrate"),
+    "replay": by_command("replay"),
+    "batch": by_batch,
+    "recordings": by_recordings,
+    "rig": by_rig,
+    "Python": by_python,
+}
+
+
+@pytest.fixture(scope="module")
+def bag_of_lidars(tmp_path_factory):
+    """A bag of two lidars with clouds, and of a third sensor that has only poses."""
+    path = tmp_path_factory.mktemp("lidars") / "bag"
+    write_drive(path)
+    return path
+
+
+@pytest.mark.filterwarnings("ignore:ground from")
+@pytest.mark.parametrize("ground", ["auto", "off"])
+@pytest.mark.parametrize("road", ROADS)
+def test_every_road_uses_the_ground_of_a_bag(road, ground, bag_of_lidars, tmp_path, no_figures):
+    result = ROADS[road](bag_of_lidars, tmp_path / "out", ground)
+    assert result.hidden == ([] if ground == "auto" else ["z"])
+
+
+def test_python_names_what_it_uses(bag_of_lidars):
+    with pytest.warns(UserWarning, match="ground from /a/points and ground from /b/points are"):
+        hec.calibrate(bag_of_lidars, parent_topic="/a", child_topic="/b", checks=False)
+
+
+@pytest.mark.parametrize(
+    ("ground", "child", "message"),
+    [("none", None, "must be 'auto' or 'off'"), ("auto", "b.tum", "call calibrate_on_ground")],
+)
+def test_python_refuses_the_ground_of_trajectories(ground, child, message):
+    with pytest.raises(ConfigError, match=message):
+        hec.calibrate("a.tum", child, ground=ground)
+
+
+def test_the_list_names_ground_and_gravity(tmp_path, capsys):
+    write_drive(tmp_path / "bag", with_imu=True)
+    main(["calibrate", str(tmp_path / "bag"), "--list", "--json"])
+    rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)["topics"]}
+    assert rows["/a"]["measures"] == ""
+    assert (rows["/a/points"]["measures"], rows["/a/points"]["frames"]) == ("ground", ["lidar"])
+    assert (rows["/b/imu"]["measures"], rows["/b/imu"]["frames"]) == ("gravity", ["rear"])

@@ -21,7 +21,7 @@ from hand_eye_calib.core.solvers.registry import Method
 from hand_eye_calib.offline.calibrate import prior_fields
 
 # Keywords of calibrate that are no options of the engine.
-OWN_KEYWORDS = ("parent_topic", "child_topic", "prior", "progress", "checks")
+OWN_KEYWORDS = ("parent_topic", "child_topic", "prior", "ground", "progress", "checks")
 PRIOR_FIELDS = {f"prior_{axis}" for axis in AXIS_UNITS}
 
 

@@ -77,13 +77,18 @@ class BesideMotion(NamedTuple):
     Attributes
     ----------
     add_arguments : callable
-        ``add_arguments(parser)`` declares the arguments of the source.
+        ``add_arguments(parser)`` declares the argument of the source, which has its name.
     find : callable
-        ``find(arguments, snapshot)`` returns measurements for ``Snapshot.beside_motion``.
+        ``find(paths, snapshot)`` returns measurements for ``Snapshot.beside_motion``, and notes for
+        the user.
+    topics : callable
+        ``topics(bag)`` returns, for each topic of a bag that the source can read, the measured
+        quantity and the frame of the sensor.
     """
 
     add_arguments: Callable[[Any], None]
-    find: Callable[[Any, Any], tuple[Any, ...]]
+    find: Callable[[Any, Any], tuple[tuple[Any, ...], list[str]]]
+    topics: Callable[[Any], dict[str, tuple[str, str]]]
 
 
 class Measure(NamedTuple):

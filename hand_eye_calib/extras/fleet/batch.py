@@ -24,6 +24,7 @@ from hand_eye_calib.extras.fleet.together import together
 from hand_eye_calib.extras.fleet.work import Outcome, Row, Task, outcomes, tasks_of
 from hand_eye_calib.formats.bags.patterns import matching
 from hand_eye_calib.formats.results import save_result, save_text
+from hand_eye_calib.offline.beside_motion import switched_off
 from hand_eye_calib.offline.cli.options import (
     note,
     options_from,
@@ -115,6 +116,7 @@ def _all_done(
         vehicle,
         options=options_from(arguments),
         sources=sources_from(arguments),
+        without=tuple(switched_off(vars(arguments))),
         with_fingerprints=bool(out),
         with_report=bool(out) and not arguments.no_report,
     )

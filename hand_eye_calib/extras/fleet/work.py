@@ -57,6 +57,8 @@ class Task:
     options : dict
     sources : dict
         Topics or WORLD:SENSOR of "parent" and "child", if the user set them.
+    without : tuple of str
+        Names of the measurements beside motion that are switched off.
     with_fingerprints, with_report : bool
         Whether to compute hashes of the input files, and to render a report.
     """
@@ -66,6 +68,7 @@ class Task:
     vehicle: str = ""
     options: Options = field(default_factory=dict)
     sources: dict[str, str] = field(default_factory=dict)
+    without: tuple[str, ...] = ()
     with_fingerprints: bool = False
     with_report: bool = False
 
@@ -248,7 +251,8 @@ def work(task: Task) -> Outcome:
     limit_memory()
     try:
         with remote.local_copies(task.bags) as (paths, restore_urls):
-            recording = read_recording([*map(Path, paths)], task.sources, task.options)
+            bags = [*map(Path, paths)]
+            recording = read_recording(bags, task.sources, task.options, task.without)
             result = recording.solved(task.with_fingerprints)
             inputs = recording.inputs
             page = render(result, recording.snapshot, inputs) if task.with_report else ""

@@ -21,7 +21,7 @@ def register() -> None:
         when="the ground or gravity are more than 3 joint standard deviations from the motion",
         find=_disagreements,
     )
-    BESIDE_MOTION["ground"] = BesideMotion(_add_arguments, _find)
+    BESIDE_MOTION["ground"] = BesideMotion(_add_arguments, _find, _topics)
     PUBLIC_NAMES["calibrate_on_ground"] = "hand_eye_calib.extras.ground.calibrate"
     for name in ("ground_from_clouds", "gravity_from_accelerations", "gravity_from_attitude"):
         PUBLIC_NAMES[name] = "hand_eye_calib.extras.ground.tracks"
@@ -47,9 +47,13 @@ def _add_arguments(parser: Any) -> None:
     parser.add_argument("--ground", choices=("auto", "off"), default="auto", help=words)
 
 
-def _find(arguments: Any, snapshot: Any) -> Any:
-    if arguments.ground == "off":
-        return ()
+def _find(paths: Any, snapshot: Any) -> Any:
     from hand_eye_calib.extras.ground.bags import verticals_of_bag
 
-    return verticals_of_bag(arguments.paths, snapshot)
+    return verticals_of_bag(paths, snapshot)
+
+
+def _topics(bag: Any) -> Any:
+    from hand_eye_calib.extras.ground.bags import vertical_topics
+
+    return vertical_topics(bag)

@@ -22,7 +22,6 @@ from hand_eye_calib.extras.ground.tracks import (
 from hand_eye_calib.formats.bags.messages import POINTS_TYPE, ns_of
 from hand_eye_calib.formats.bags.points import rows_of_points
 from hand_eye_calib.formats.bags.reader import PoseBag
-from hand_eye_calib.offline.cli.options import note, waiting_for
 
 _IMU = "sensor_msgs/msg/Imu"
 
@@ -30,8 +29,16 @@ _IMU = "sensor_msgs/msg/Imu"
 _MAX_SCANS = 300
 
 
-def verticals_of_bag(paths: Sequence[Path], snapshot: Any) -> tuple[VerticalPair, ...]:
-    """Return the verticals of both sensors of a bag; an empty tuple if a sensor has none.
+# Quantity that the messages of a type measure.
+_QUANTITIES = {POINTS_TYPE: "ground", _IMU: "gravity"}
+
+
+def verticals_of_bag(
+    paths: Sequence[Path], snapshot: Any
+) -> tuple[tuple[VerticalPair, ...], list[str]]:
+    """Return the verticals of both sensors of a bag, and notes for the user.
+
+    There are no verticals if a sensor has neither clouds nor IMU data.
 
     A topic belongs to a sensor if its ``frame_id`` is the frame of the poses of this sensor. Clouds
     are preferred to IMU data, because the ground also determines the height.
@@ -44,13 +51,13 @@ def verticals_of_bag(paths: Sequence[Path], snapshot: Any) -> tuple[VerticalPair
     """
     config = snapshot.config
     if config.measured != "poses" or min(map(len, snapshot.streams)) < config.min_pairs:
-        return ()
+        return (), []
     with PoseBag(*paths) as bag:
         topics_of = _topics_by_frame(bag)
         parent = _topic_of(snapshot.parent_names, topics_of)
         child = _topic_of(snapshot.child_names, topics_of)
         if not (parent and child):
-            return ()
+            return (), []
         topics = (parent, child)
         has_imu = any(bag.topics[topic].type == _IMU for topic in topics)
         # A lidar needs a wider lane if the other sensor is an IMU.
@@ -58,16 +65,14 @@ def verticals_of_bag(paths: Sequence[Path], snapshot: Any) -> tuple[VerticalPair
         tracks = []
         for topic, stream in zip(topics, snapshot.streams, strict=True):
             try:
-                with waiting_for(f"reading {topic}"):
-                    tracks.append(_track(bag, topic, stream, beside))
+                tracks.append(_track(bag, topic, stream, beside))
             except (InputError, NotEnoughDataError) as error:
-                note(f"ground and gravity are not used: {topic}: {error}")
-                return ()
+                return (), [f"ground and gravity are not used: {topic}: {error}"]
     sources = []
     for track, topic in zip(tracks, topics, strict=True):
         sources.append(f"{track.source} from {topic}")
-    note(f"{listing(sources)} are used; to use the motion alone, set --ground off")
-    return (VerticalPair(*tracks),)
+    text = f"{listing(sources)} are used; to use the motion alone, set --ground off"
+    return (VerticalPair(*tracks),), [text]
 
 
 def _topics_by_frame(bag: PoseBag) -> Mapping[str, str]:
@@ -76,16 +81,27 @@ def _topics_by_frame(bag: PoseBag) -> Mapping[str, str]:
     If a frame has several topics of a type, the topic with most messages is returned.
     """
     topics_of: dict[str, str] = {}
-    for wanted in (POINTS_TYPE, _IMU):
-        topics = [topic for topic in bag.topics.values() if topic.type == wanted]
+    for topic, (_, frame) in vertical_topics(bag).items():
+        topics_of.setdefault(frame, topic)
+    return topics_of
+
+
+def vertical_topics(bag: PoseBag) -> dict[str, tuple[str, str]]:
+    """Return the quantity ("ground" or "gravity") and the frame of clouds and IMU data, by topic.
+
+    Topics with clouds are first; of each type, the topic with most messages is first.
+    """
+    found: dict[str, tuple[str, str]] = {}
+    for message_type, quantity in _QUANTITIES.items():
+        topics = [topic for topic in bag.topics.values() if topic.type == message_type]
         for topic in sorted(topics, key=lambda topic: -topic.count):
             run = next(bag.runs([topic.name]), None)
             if run is None:
                 continue
             with suppress(InputError):  # a damaged message
                 message = next(run._replace(messages=run.messages[:1]).decoded())
-                topics_of.setdefault(frame_name(message.header.frame_id), topic.name)
-    return topics_of
+                found[topic.name] = quantity, frame_name(message.header.frame_id)
+    return found
 
 
 def _topic_of(names: StreamFrames, topics_of: Mapping[str, str]) -> str:

@@ -1,10 +1,12 @@
 """The command line for rigs: calibrate three sensors or more, print and save the result."""
 
 import argparse
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.results.document import summary, transforms_of
+from hand_eye_calib.offline.beside_motion import switched_off, with_measurements
 from hand_eye_calib.offline.cli.options import (
     note,
     options_from,
@@ -24,6 +26,7 @@ from hand_eye_calib.offline.cli.reading import read_files
 
 if TYPE_CHECKING:
     from hand_eye_calib.core.base.plain import Document
+    from hand_eye_calib.core.engine.snapshot import Snapshot
     from hand_eye_calib.core.geometry.trajectory import Trajectory
     from hand_eye_calib.extras.rig.rig import RigCalibration
     from hand_eye_calib.formats.remote import RestoreUrls
@@ -46,7 +49,7 @@ def calibrate_rig(arguments: argparse.Namespace, restore_urls: "RestoreUrls") ->
     if arguments.label:
         inputs["labels"] = dict(arguments.label)
     with waiting_for(f"solving for {len(sensors)} sensors"):
-        rig = of_rig.calibrate_rig(sensors, inputs["options"])
+        rig = of_rig.calibrated(sensors, inputs["options"], partial(_completed, arguments))
     rig = rig.with_warnings(restore_urls(readings.warnings))
     if arguments.out:
         kept = keep_earlier_results(arguments.out)
@@ -61,6 +64,17 @@ def calibrate_rig(arguments: argparse.Namespace, restore_urls: "RestoreUrls") ->
 
             write_rig_report(arguments.out, rig, readings.names)
     return end(rig.calibrations)
+
+
+def _completed(arguments: argparse.Namespace, snapshot: "Snapshot") -> "Snapshot":
+    """Return the snapshot of two sensors with the measurements beside motion of a bag."""
+    if not arguments.topics:
+        return snapshot
+    without = switched_off(vars(arguments))
+    snapshot, notes = with_measurements(snapshot, arguments.paths, without)
+    for text in notes:
+        note(f"{snapshot.child_frame} in {snapshot.parent_frame}: {text}")
+    return snapshot
 
 
 class _Readings(NamedTuple):

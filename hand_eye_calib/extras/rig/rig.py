@@ -8,7 +8,7 @@ difference is the closure error. Weighted least squares distributes it among the
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -25,7 +25,7 @@ from hand_eye_calib.core.checks.findings import finding
 from hand_eye_calib.core.engine.attempts import Attempt
 from hand_eye_calib.core.engine.estimation import solve_poses
 from hand_eye_calib.core.engine.run import run
-from hand_eye_calib.core.engine.snapshot import whole_snapshot
+from hand_eye_calib.core.engine.snapshot import Snapshot, whole_snapshot
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import synchronise
@@ -79,12 +79,24 @@ def calibrate_rig(
         options["time_offset"] = time_offset
     if scale is not None:
         options["scale"] = scale
+    return calibrated(trajectories, options, lambda snapshot: snapshot)
+
+
+def calibrated(
+    trajectories: Mapping[str, Trajectory],
+    options: Mapping[str, Any],
+    complete: Callable[[Snapshot], Snapshot],
+) -> RigCalibration:
+    """Calibrate a rig; see :func:`calibrate_rig`.
+
+    ``complete`` adds measurements beside motion to the snapshot of two sensors.
+    """
     _require_rig(trajectories, options)
     first, *others = [
         replace(trajectory, sensor_frame=frame_name(name))
         for name, trajectory in trajectories.items()
     ]
-    attempts = [run(whole_snapshot(first, other, options)) for other in others]
+    attempts = [run(complete(whole_snapshot(first, other, options))) for other in others]
     # Results with the first sensor, and the other trajectories on the clock and in the unit of the
     # first trajectory.
     star = [attempt.calibration for attempt in attempts]

@@ -15,6 +15,7 @@ from hand_eye_calib.formats.bags.pose_table import PoseTable
 from hand_eye_calib.formats.bags.reader import PoseBag
 from hand_eye_calib.formats.bags.sources import Source, source_of
 from hand_eye_calib.formats.trajectory_files.dates import seconds
+from hand_eye_calib.offline.beside_motion import with_measurements
 from hand_eye_calib.offline.cli.options import (
     OPTION_FIELDS,
     STREAMS,
@@ -50,7 +51,10 @@ class SeveralRecordingsError(InputError):
 
 
 def read_recording(
-    paths: Sequence[Path], wanted: Mapping[str, str], options: Mapping[str, Any]
+    paths: Sequence[Path],
+    wanted: Mapping[str, str],
+    options: Mapping[str, Any],
+    without: Collection[str] = (),
 ) -> Recording:
     """Read the recording of a journal, of a bag or of the parts of a bag.
 
@@ -62,6 +66,8 @@ def read_recording(
         absent if the bag has only one candidate.
     options : mapping
         Options that the user has set.
+    without : collection of str
+        Names of the measurements beside motion that are switched off.
 
     Raises
     ------
@@ -75,7 +81,11 @@ def read_recording(
             f"{journal} is a session of its own", [[path] for path in paths]
         )
     if journal is None:
-        return _read_bags(paths, wanted, CalibratorConfig.from_options(dict(options)))
+        recording = _read_bags(paths, wanted, CalibratorConfig.from_options(dict(options)))
+        with waiting_for("looking for the ground and gravity"):
+            recording.snapshot, notes = with_measurements(recording.snapshot, paths, without)
+        note(*notes)
+        return recording
     if wanted:
         raise ConfigError(
             f"the journal {journal} has two streams; omit the options for topics, frames and stamps"

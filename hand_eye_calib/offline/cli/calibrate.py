@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.registry import BESIDE_MOTION, ROUTES, SEVERAL_RECORDINGS
+from hand_eye_calib.offline.beside_motion import switched_off
 from hand_eye_calib.offline.cli import options
 from hand_eye_calib.offline.cli.options import note, print_result, waiting_for
 
 if TYPE_CHECKING:
     from hand_eye_calib.core.base.plain import Document
-    from hand_eye_calib.core.engine.snapshot import Snapshot
     from hand_eye_calib.formats.remote import RestoreUrls
 
 EXAMPLES = """\
@@ -61,7 +61,7 @@ examples:
   hand_eye_calib calibrate gnss.csv slam.txt --time-offset estimate --prior z=1.85+/-0.02"""
 
 # Format of a row in the table of topics: topic, type, count, rate, poses and frames.
-_ROW = "{:<32} {:<42} {:>8} {:>10}  {:<5}  {}"
+_ROW = "{:<32} {:<42} {:>8} {:>10}  {:<7}  {}"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -178,24 +178,16 @@ def _run_locally(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int
         from hand_eye_calib.offline.cli import bags
 
         try:
-            recording = bags.read_recording(paths, options.sources_from(arguments), settings)
+            recording = bags.read_recording(
+                paths, options.sources_from(arguments), settings, switched_off(vars(arguments))
+            )
         except bags.SeveralRecordingsError as several:
             note(f"{several.reason}; they give one result, as recordings of one rig")
             return SEVERAL_RECORDINGS["one rig"](arguments, several.groups)
-        if "bag" in recording.inputs:
-            recording.snapshot = _with_measurements(arguments, recording.snapshot)
     calibration = recording.solved(with_fingerprints=bool(arguments.out))
     calibration = dataclasses.replace(calibration, warnings=tuple(with_urls(calibration.warnings)))
     bag = paths[0] if are_bags else None
     return deliver(calibration, with_urls(recording.inputs), arguments, recording.snapshot, bag)
-
-
-def _with_measurements(arguments: argparse.Namespace, snapshot: "Snapshot") -> "Snapshot":
-    """Return the snapshot of a bag with measurements of the extrinsic beside motion."""
-    measurements: list[object] = []
-    for source in BESIDE_MOTION.values():
-        measurements += source.find(arguments, snapshot)
-    return dataclasses.replace(snapshot, beside_motion=tuple(measurements))
 
 
 def _list_topics(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int:
@@ -215,15 +207,20 @@ def _list_topics(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int
             "Omit --list"
         )
     with PoseBag(*arguments.paths) as bag, waiting_for(f"reading {bag}"):
+        measured: dict[str, tuple[str, str]] = {}
+        for source in BESIDE_MOTION.values():
+            measured |= source.topics(bag)
         topics = []
         for topic in bag.topics.values():
+            quantity, frame = measured.get(topic.name, ("", ""))
             rate_hz = (topic.count - 1) / (bag.duration_s or 1.0) if topic.count > 1 else None
             topics.append(
                 {
                     **topic._asdict(),
                     "rate_hz": rate_hz,
-                    "frames": bag.edges_on(topic.name),
+                    "frames": bag.edges_on(topic.name) or [frame] * bool(frame),
                     "is_usable": topic.type in MESSAGE_TYPES,
+                    "measures": quantity,
                 }
             )
         document: Document = {
@@ -244,7 +241,7 @@ def _list_topics(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int
             row["type"] or "several types",
             row["count"],
             "" if row["rate_hz"] is None else f"{row['rate_hz']:.1f} Hz",
-            "yes" if row["is_usable"] else "",
+            "yes" if row["is_usable"] else row["measures"],
             " ".join(row["frames"]),
         ]
         lines.append(_ROW.format(*cells).rstrip())

@@ -1,0 +1,45 @@
+"""Measurements of the extrinsic beside motion, from the bag of the recording."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from hand_eye_calib.core.base.registry import BESIDE_MOTION
+from hand_eye_calib.core.engine.snapshot import Snapshot
+
+
+def switched_off(values: Mapping[str, Any]) -> list[str]:
+    """Return the names of the sources that options or parsed arguments switch off."""
+    return [name for name in BESIDE_MOTION if values.get(name) == "off"]
+
+
+def with_measurements(
+    snapshot: Snapshot, paths: Sequence[Path], without: Collection[str] = ()
+) -> tuple[Snapshot, list[str]]:
+    """Add the measurements beside motion that a bag has.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        Streams of the bag.
+    paths : sequence of Path
+        The bag, or its parts.
+    without : collection of str
+        Names of the sources that are switched off.
+
+    Returns
+    -------
+    snapshot : Snapshot
+    notes : list of str
+        Which topics are used, and why a topic is not used.
+    """
+    measurements: list[Any] = []
+    notes: list[str] = []
+    for name, source in BESIDE_MOTION.items():
+        if name in without:
+            continue
+        found, remarks = source.find(paths, snapshot)
+        measurements += found
+        notes += remarks
+    return replace(snapshot, beside_motion=tuple(measurements)), notes
