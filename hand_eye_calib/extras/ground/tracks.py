@@ -18,7 +18,7 @@ from scipy.constants import g
 
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.errors import NotEnoughDataError
-from hand_eye_calib.core.base.stats import median
+from hand_eye_calib.core.base.stats import median, medians
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Columns, Trajectory
 from hand_eye_calib.extras.ground.planes import ground_of
@@ -51,11 +51,15 @@ class VerticalTrack(Columns):
         opposite of gravity.
     heights_m : (N,) array or None
         Heights of the sensor over the ground; None for gravity.
+    bend_rad : float
+        Angle between the ground of the lane and that of the whole road, as on a crowned road. Zero
+        if both sensors measure the ground of the lane.
     """
 
     stamps_ns: IntArray
     ups: FloatArray
     heights_m: FloatArray | None = None
+    bend_rad: float = 0.0
 
     @property
     def source(self) -> str:
@@ -102,20 +106,29 @@ def ground_from_clouds(
     width_m = _LANE_WIDTHS_M[beside]
     stamps_ns = []
     planes = []
+    bends = []
     n_scans = 0
-    for stamp_ns, points in clouds:
+    for stamp_ns, cloud in clouds:
         n_scans += 1
-        plane = ground_of(np.asarray(points, dtype=float), up, ahead, width_m)
-        if plane is not None:
-            stamps_ns.append(stamp_ns)
-            planes.append(plane)
+        points = np.asarray(cloud, dtype=float)
+        plane = ground_of(points, up, ahead, width_m)
+        if plane is None:
+            continue
+        stamps_ns.append(stamp_ns)
+        planes.append(plane)
+        if beside == "gravity":
+            lane = ground_of(points, up, ahead, _LANE_WIDTHS_M["ground"])
+            if lane is not None:
+                bends.append(lane.normal - plane.normal)
     # On a ramp or beside walls, a third of the scans may have no ground. If fewer than half of the
     # scans have a plane, the machine does not drive on this plane.
     if 2 * len(planes) <= n_scans:
         raise NotEnoughDataError(f"{len(planes)} of {n_scans} scans contain the ground")
     normals, heights = zip(*planes, strict=True)
     stamps = np.array(stamps_ns, dtype=np.int64)
-    return VerticalTrack(stamps, np.array(normals), np.array(heights))
+    # The median vector is that of the road; single scans differ by noise and by walls.
+    bend_rad = float(np.linalg.norm(medians(np.array(bends).T))) if bends else 0.0
+    return VerticalTrack(stamps, np.array(normals), np.array(heights), bend_rad)
 
 
 def gravity_from_accelerations(
