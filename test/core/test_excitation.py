@@ -102,7 +102,7 @@ def test_a_vehicle_is_told_to_drive_over_a_ramp():
     assert seen.drives
     assert excitation.what_is_missing(seen) == (
         "z cannot be determined from the motion so far: tilt the sensors over a ramp or a kerb, or "
-        "measure it by hand"
+        "measure it by hand, or record the clouds of two lidars and run calibrate on the bag"
     )
 
 

@@ -241,6 +241,9 @@ def _motion_for_only_axis(name: str, others: Sequence[int], seen: Excitation) ->
     if name in ROTATIONS:
         return "move farther, straight on and in curves"
     if seen.drives:
-        return "tilt the sensors over a ramp or a kerb, or measure it by hand"
+        return (
+            "tilt the sensors over a ramp or a kerb, or measure it by hand, or record the clouds "
+            "of two lidars and run calibrate on the bag"
+        )
     axes = " and ".join("xyz"[other] for other in others)
     return f"tilt the sensors about {axes}, or measure it by hand"
