@@ -87,6 +87,7 @@ setup(
         f"{name}.offline.report": ["templates/*.html", "templates/*.css"],
         f"{name}.formats": ["templates/*", "*.yaml"],
         f"{name}.extras.fleet": ["*.html"],
+        f"{name}.extras.mount": ["*.html"],
         f"{name}.extras.rig": ["*.html"],
         f"{name}.online.watch": ["page/*"],
     },

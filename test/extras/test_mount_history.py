@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,8 +11,9 @@ import pytest
 from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
+from hand_eye_calib.extras.mount.compare import compare_digests
 from hand_eye_calib.extras.mount.digest import read_digest, read_digests, write_digest
-from hand_eye_calib.extras.mount.history import compare_digests, find_changes
+from hand_eye_calib.extras.mount.history import History, find_changes
 from hand_eye_calib.extras.mount.monitor import MountMonitor
 
 MOUNT = se3.exp(np.array([0.4, -0.2, 0.7, 0.3, -1.2, 0.6]))
@@ -82,8 +84,9 @@ def about_parent(axis, degrees):
     return np.r_[np.zeros(3), MOUNT[:3, :3].T @ turn]
 
 
-def arguments(path, json=False, installed=None):
-    return SimpleNamespace(results=[str(path)], json=json, installed=installed)
+def arguments(*paths, json=False, installed=None, fleet=None):
+    results = [str(path) for path in paths]
+    return SimpleNamespace(results=results, json=json, installed=installed, fleet=fleet)
 
 
 def test_a_digest_is_small_and_read_as_it_was_written(session, tmp_path):
@@ -183,3 +186,53 @@ def test_other_files_are_left_to_compare_and_unusable_digests_are_named(session,
     write_digest(tmp_path / "b", moved)
     with pytest.raises(InputError, match="the installed transform changed before 2023-11-21"):
         read_digests([tmp_path / "b"])
+
+
+def write_fleet(session, folder):
+    """Write the digests of three forklifts: one moved in week 60, one had an alarm, one is well."""
+    shifts = {"forklift_1": None, "forklift_2": about_parent("z", 0.3), "forklift_3": None}
+    for seed, (vehicle, shift) in enumerate(shifts.items(), start=910):
+        digests = weeks(session, seed, shift)
+        if vehicle == "forklift_3":
+            digests[-1] = dataclasses.replace(digests[-1], alarm="moved about z by 1.5 deg")
+        for digest in digests:
+            write_digest(folder / vehicle, digest)
+    return [folder / vehicle for vehicle in shifts]
+
+
+def test_the_page_of_a_fleet_has_the_history_of_each_vehicle(session, tmp_path, capsys):
+    vehicles = write_fleet(session, tmp_path)
+    page = tmp_path / "fleet.html"
+    assert compare_digests(arguments(*vehicles, fleet=page)) == 4
+    moved_week = dataclasses.replace(session, start_ns=START_NS + 60 * WEEK_NS).day
+    first, second, third = capsys.readouterr().out.splitlines()
+    assert first == "forklift_1: Mount of camera on lidar: no change in 100 sessions"
+    assert f"moved before {moved_week}" in second
+    assert "alarm in the session of" in third
+    html = page.read_text()
+    assert "<h1>2 of 3 mounts to check</h1>" in html
+    # The newest event comes first, and the vehicle that is well comes last.
+    order = re.findall(r'<th scope="row">(forklift_\d)</th>', html)
+    assert order == ["forklift_3", "forklift_2", "forklift_1"]
+    assert html.count('<figure class="card"') == 3
+    assert f"<p>moved before {moved_week}: " in html
+    assert compare_digests(arguments(vehicles[0], fleet=page, json=True)) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["forklift_1"]["changes"] == []
+    assert "<h1>No mount moved</h1>" in page.read_text()
+
+
+def test_the_offset_of_a_mount_becomes_more_precise_until_a_change(session):
+    history = History.of(weeks(session, 911, about_parent("z", 0.3)))
+    sigmas = [offset.axes["yaw"].sigma for offset in history.offsets]
+    assert sigmas[59] < 0.5 * sigmas[0]
+    assert sigmas[60] == pytest.approx(sigmas[0])
+    assert sigmas[-1] < 0.5 * sigmas[60]
+
+
+def test_a_page_of_a_fleet_needs_digests_of_every_vehicle(session, tmp_path):
+    write_digest(tmp_path / "a", session)
+    (tmp_path / "b").mkdir()
+    with pytest.raises(ConfigError, match="needs digests of the monitor; .*b has none"):
+        compare_digests(arguments(tmp_path / "a", tmp_path / "b", fleet=tmp_path / "page.html"))
+    assert not (tmp_path / "page.html").exists()

@@ -2,9 +2,10 @@
 
 import argparse
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.base.registry import COMPARISONS
 from hand_eye_calib.core.base.text import amount, distinct_names
 from hand_eye_calib.offline.cli.options import add_json_argument, print_result, waiting_for
@@ -19,6 +20,7 @@ examples:
   hand_eye_calib compare result --with "0.40 0 1.85 0 0 -90deg"
   hand_eye_calib compare monday/ tuesday/ wednesday/     which one has moved?
   hand_eye_calib compare live/digests/                   the history of a monitored mount
+  hand_eye_calib compare robot*/ --fleet fleet.html      a page of all monitored mounts
 
 exit codes: 0 same, 3 cannot tell, 4 moved; 1 bad input, 2 wrong usage"""
 
@@ -35,6 +37,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '"X Y Z ROLL PITCH YAW" in m and rad'
     )
     parser.add_argument("--with", dest="installed", metavar="SOURCE", help=installed)
+    fleet = (
+        "write a page with the history of the mount of each vehicle; every RESULT is then the "
+        "folder of a vehicle with digests of the monitor"
+    )
+    parser.add_argument("--fleet", metavar="FILE", type=Path, help=fleet)
     add_json_argument(parser)
 
 
@@ -47,6 +54,8 @@ def run(arguments: argparse.Namespace) -> int:
         code = compare_others(arguments)
         if code is not None:
             return code
+    if arguments.fleet:
+        raise ConfigError("--fleet needs digests of the monitor, and this installation has none")
     results = [load_result(path) for path in arguments.results]
     for path, result in zip(arguments.results, results, strict=True):
         if result.status.failure:

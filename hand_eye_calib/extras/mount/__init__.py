@@ -13,7 +13,7 @@ def register() -> None:
 
 def _compare(arguments: Any) -> int | None:
     """Compare digests, and return the exit code; None if the arguments are no digests."""
-    from hand_eye_calib.extras.mount.history import compare_digests
+    from hand_eye_calib.extras.mount.compare import compare_digests
 
     return compare_digests(arguments)
 

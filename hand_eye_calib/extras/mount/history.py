@@ -11,30 +11,23 @@ are then searched for further changes (binary segmentation: A. Scott, M. Knott, 
 method*, 1974).
 """
 
-import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from hand_eye_calib.core.assessment import change, moved
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.blocks import Blocks, information, inverse, score, shift_evidence
-from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.plain import plain
-from hand_eye_calib.core.base.text import amount, counted
+from hand_eye_calib.core.base.text import counted
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.extras.mount.digest import Digest, read_digests
+from hand_eye_calib.extras.mount.digest import Digest
 from hand_eye_calib.extras.mount.monitor import KNOCKS, TUNING
-from hand_eye_calib.offline.cli.options import print_result
-from hand_eye_calib.online.live.progress import AXIS_KEYS
 
 # Covariance (6, 6) of an offset about which nothing is known.
 _UNKNOWN = np.diag(change.UNKNOWN**2)
-
-# Width of the column of an axis on the terminal, in letters.
-_WIDTH = 26
 
 
 @dataclass(frozen=True)
@@ -54,6 +47,87 @@ class Changepoint:
     index: int
     log_ratio: float
     shift: change.Moved
+
+
+@dataclass(frozen=True)
+class History:
+    """History of one mount.
+
+    Attributes
+    ----------
+    digests : sequence of Digest
+        In order of time.
+    changes : sequence of Changepoint
+        In order of time.
+    offsets : sequence of Moved
+        For each session, the offset from the installed pose by all sessions since the last change,
+        along and about the axes of the parent sensor's frame.
+    """
+
+    digests: Sequence[Digest]
+    changes: Sequence[Changepoint]
+    offsets: Sequence[change.Moved]
+
+    @classmethod
+    def of(cls, digests: Sequence[Digest]) -> "History":
+        """Return the history of the sessions with these digests."""
+        changes = find_changes(digests)
+        cuts = {changepoint.index for changepoint in changes}
+        offsets = []
+        evidence = np.zeros((6, 7))
+        for index, digest in enumerate(digests):
+            if index in cuts:
+                evidence = np.zeros((6, 7))
+            # All sessions since the last change have the same offset, so their evidence is added.
+            evidence = evidence + _evidence_on_common_offset(digest)
+            to_parent = se3.block_diagonal(se3.rotation_of(digest.installed))
+            offsets.append(_shift_of(evidence, to_parent))
+        return cls(digests, changes, offsets)
+
+    @property
+    def has_moved(self) -> bool:
+        """Whether there is a change between sessions, or an alarm within one."""
+        return bool(self.changes) or any(digest.alarm for digest in self.digests)
+
+    @property
+    def newest_event_ns(self) -> int:
+        """Start of the newest session with a change or an alarm (ns); 0 without any."""
+        changed = [self.digests[changepoint.index].start_ns for changepoint in self.changes]
+        alarmed = [digest.start_ns for digest in self.digests if digest.alarm]
+        return max(changed + alarmed, default=0)
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in one line, with the newest change."""
+        first = self.digests[0]
+        mount = f"Mount of {first.child_frame} on {first.parent_frame}"
+        sessions = counted(len(self.digests), "session")
+        alarms = [digest for digest in self.digests if digest.alarm]
+        if self.changes:
+            newest = self.changes[-1]
+            day = self.digests[newest.index].day
+            return f"{mount}: moved before {day}: {newest.shift.what} ({sessions})"
+        if alarms:
+            # The monitor compares within a session, where the sessions as a whole may agree.
+            alarm = alarms[-1]
+            return f"{mount}: alarm in the session of {alarm.day}: {alarm.alarm} ({sessions})"
+        return f"{mount}: no change in {sessions}"
+
+    def document(self) -> dict[str, Any]:
+        """Return days of sessions, changes and alarms as plain values."""
+        rows = [
+            {
+                "session": self.digests[item.index].day,
+                "sentence": item.shift.what,
+                "axes": item.shift.axes,
+            }
+            for item in self.changes
+        ]
+        return {
+            "sessions": [digest.day for digest in self.digests],
+            "changes": plain(rows),
+            "alarms": {digest.day: digest.alarm for digest in self.digests if digest.alarm},
+        }
 
 
 def find_changes(digests: Sequence[Digest]) -> list[Changepoint]:
@@ -121,78 +195,3 @@ def _shift_of(table: FloatArray, to_parent: FloatArray) -> change.Moved:
     covariance = np.linalg.inv(information(table) + prior)
     values = to_parent @ covariance @ score(table)
     return change.moved(values, to_parent @ covariance @ to_parent.T, np.zeros(6))
-
-
-def compare_digests(arguments: argparse.Namespace) -> int | None:
-    """Print the history of a mount, and return the exit code of ``compare``.
-
-    The code is 4 after a change between sessions, and after an alarm of the monitor within one.
-    None is returned if the arguments are no digests.
-
-    Raises
-    ------
-    ConfigError
-        If the arguments name an installed transform, because the digests already contain it.
-    """
-    digests = read_digests([Path(path) for path in arguments.results])
-    if digests is None:
-        return None
-    if arguments.installed:
-        raise ConfigError("digests contain their installed transform: omit --with")
-    changes = find_changes(digests)
-    document = None
-    if arguments.json:
-        rows = [
-            {
-                "session": digests[item.index].day,
-                "sentence": item.shift.what,
-                "axes": item.shift.axes,
-            }
-            for item in changes
-        ]
-        document = {
-            "sessions": [digest.day for digest in digests],
-            "changes": plain(rows),
-            "alarms": {digest.day: digest.alarm for digest in digests if digest.alarm},
-        }
-    print_result(_lines(digests, changes), document)
-    has_alarm = any(digest.alarm for digest in digests)
-    return 4 if changes or has_alarm else 0
-
-
-def _lines(digests: Sequence[Digest], changes: Sequence[Changepoint]) -> Iterator[str]:
-    """Yield the lines for the terminal: the verdict, then a line for each session and change."""
-    first = digests[0]
-    mount = f"Mount of {first.child_frame} on {first.parent_frame}"
-    sessions = counted(len(digests), "session")
-    alarms = [digest for digest in digests if digest.alarm]
-    if changes:
-        newest = changes[-1]
-        day = digests[newest.index].day
-        yield f"{mount}: moved before {day}: {newest.shift.what} ({sessions})"
-    elif alarms:
-        # The monitor compares within a session, where the sessions as a whole may agree.
-        alarm = alarms[-1]
-        yield f"{mount}: alarm in the session of {alarm.day}: {alarm.alarm} ({sessions})"
-    else:
-        yield f"{mount}: no change in {sessions}"
-    names = "".join(f"{key.replace('_', ' '):>{_WIDTH}}" for key in AXIS_KEYS.values())
-    yield f"  {'session':<18}{'motion':>8}{names}"
-    by_index = {changepoint.index: changepoint for changepoint in changes}
-    offset = np.zeros((6, 7))
-    for index, digest in enumerate(digests):
-        if changepoint := by_index.get(index):
-            yield f"  -- moved before {digest.day}: {changepoint.shift.what}"
-            offset = np.zeros((6, 7))
-        # All sessions since the last change have the same offset, so their evidence is added.
-        offset = offset + _evidence_on_common_offset(digest)
-        shift = _shift_of(offset, se3.block_diagonal(se3.rotation_of(digest.installed)))
-        cells = [
-            f"{amount(axis, row.difference)} +/- {amount(axis, row.sigma)}"
-            for axis, row in shift.axes.items()
-        ]
-        yield f"  {digest.day:<18}{digest.seconds:>6} s" + "".join(
-            f"{cell:>{_WIDTH}}" for cell in cells
-        )
-        if digest.alarm:
-            yield f"  -- alarm in this session: {digest.alarm}"

@@ -1,0 +1,82 @@
+"""Digests of the monitor for the command ``compare``: on the terminal, and as a page of a fleet."""
+
+import argparse
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.base.text import amount, distinct_names
+from hand_eye_calib.extras.mount.digest import read_digests
+from hand_eye_calib.extras.mount.history import History
+from hand_eye_calib.formats.results import save_text
+from hand_eye_calib.offline.cli.options import note, print_result
+from hand_eye_calib.online.live.progress import AXIS_KEYS
+
+# Width of the column of an axis on the terminal, in letters.
+_WIDTH = 26
+
+
+def compare_digests(arguments: argparse.Namespace) -> int | None:
+    """Print the history of a mount, and return the exit code of ``compare``.
+
+    With ``--fleet``, print the verdict of each vehicle, and write the page of the fleet. The code
+    is 4 after a change between sessions, and after an alarm of the monitor within one. None is
+    returned if the arguments are no digests.
+
+    Raises
+    ------
+    ConfigError
+        If the arguments name an installed transform, because the digests already contain it.
+    """
+    paths = [Path(path) for path in arguments.results]
+    # With --fleet, each path is a vehicle; otherwise all paths are those of one mount.
+    groups = [[path] for path in paths] if arguments.fleet else [paths]
+    digests = [read_digests(group) for group in groups]
+    histories = [History.of(sessions) for sessions in digests if sessions is not None]
+    if len(histories) < len(groups):
+        if arguments.fleet:
+            without = paths[digests.index(None)]
+            raise ConfigError(f"--fleet needs digests of the monitor; {without} has none")
+        return None
+    if arguments.installed:
+        raise ConfigError("digests contain their installed transform: omit --with")
+    if arguments.fleet:
+        names = distinct_names(arguments.results)
+        _write_fleet(dict(zip(names, histories, strict=True)), arguments)
+    else:
+        document = histories[0].document() if arguments.json else None
+        print_result(_lines(histories[0]), document)
+    return 4 if any(history.has_moved for history in histories) else 0
+
+
+def _write_fleet(histories: Mapping[str, History], arguments: argparse.Namespace) -> None:
+    """Write the page of a fleet, and print a line for each vehicle."""
+    from hand_eye_calib.extras.mount.fleet_page import render_fleet
+
+    save_text(arguments.fleet, render_fleet(histories))
+    document = None
+    if arguments.json:
+        document = {name: history.document() for name, history in histories.items()}
+    lines = (f"{name}: {history.sentence}" for name, history in histories.items())
+    print_result(lines, document)
+    note(f"wrote {arguments.fleet}")
+
+
+def _lines(history: History) -> Iterator[str]:
+    """Yield the lines for the terminal: the verdict, then a line for each session and change."""
+    yield history.sentence
+    names = "".join(f"{key.replace('_', ' '):>{_WIDTH}}" for key in AXIS_KEYS.values())
+    yield f"  {'session':<18}{'motion':>8}{names}"
+    by_index = {changepoint.index: changepoint for changepoint in history.changes}
+    for index, (digest, offset) in enumerate(zip(history.digests, history.offsets, strict=True)):
+        if changepoint := by_index.get(index):
+            yield f"  -- moved before {digest.day}: {changepoint.shift.what}"
+        cells = [
+            f"{amount(axis, row.difference)} +/- {amount(axis, row.sigma)}"
+            for axis, row in offset.axes.items()
+        ]
+        yield f"  {digest.day:<18}{digest.seconds:>6} s" + "".join(
+            f"{cell:>{_WIDTH}}" for cell in cells
+        )
+        if digest.alarm:
+            yield f"  -- alarm in this session: {digest.alarm}"

@@ -1,0 +1,187 @@
+"""Page with the mounts of a fleet: for each vehicle, the history that its digests contain."""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
+from matplotlib.figure import Figure
+
+from hand_eye_calib.core.assessment import change
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.text import ABOUT, amount, axes_in_words, counted
+from hand_eye_calib.core.results.records import AXES
+from hand_eye_calib.extras.mount.history import History
+from hand_eye_calib.offline.report.report import page
+from hand_eye_calib.offline.report.style import (
+    BAD,
+    GRID,
+    LOOK,
+    MUTED,
+    PARENT,
+    Drawn,
+    as_drawn,
+    page_style,
+)
+
+# Height of the figure of a vehicle, inches.
+_HEIGHT = 3.9
+
+# Largest number of vehicles with a figure. All vehicles are in the table.
+_MAX_FIGURES = 12
+
+# An axis is drawn if its standard deviation is below this share of that of an unknown offset.
+_DETERMINED = 0.3
+
+_CAPTION = (
+    "Offset from the installed pose along and about the parent's axes, from all sessions since the "
+    "last change. The band is three standard deviations; it shrinks with the sessions. A dashed "
+    "line is a change of the mount, a dotted line an alarm within a session. An axis that the "
+    "motion does not determine has no line."
+)
+
+
+class _Row(NamedTuple):
+    """Row of a vehicle in the table of the page."""
+
+    vehicle: str
+    tone: str
+    word: str
+    since: str
+    what: str
+    n_sessions: int
+    newest: str
+
+
+def render_fleet(histories: Mapping[str, History]) -> str:
+    """Return the page as HTML; vehicles with the newest change or alarm come first.
+
+    Parameters
+    ----------
+    histories : mapping of str to History
+        History of each vehicle, by its name.
+    """
+    ordered = sorted(histories.items(), key=lambda item: item[1].newest_event_ns, reverse=True)
+    rows = [_row(name, history) for name, history in ordered]
+    n_moved = sum(row.tone != "good" for row in rows)
+    figures = [_figure(history, index) for index, (_, history) in enumerate(ordered[:_MAX_FIGURES])]
+    verdict = (
+        f"{n_moved} of {counted(len(rows), 'mount')} to check" if n_moved else "No mount moved"
+    )
+    n_sessions = sum(row.n_sessions for row in rows)
+    sentence = f"{counted(len(rows), 'vehicle')}, {counted(n_sessions, 'session')}"
+    return page(
+        Path(__file__).with_name("fleet_page.html"),
+        "bad" if n_moved else "good",
+        verdict,
+        sentence,
+        rows=rows,
+        vehicles=[
+            (row, _change_rows(history), _precision(history), figure)
+            for row, (_, history), figure in zip(rows, ordered, figures, strict=False)
+        ],
+        n_without_figure=len(rows) - len(figures),
+    )
+
+
+def _row(name: str, history: History) -> _Row:
+    """Return the row of a vehicle: its newest change, else its newest alarm."""
+    digests = history.digests
+    newest = digests[-1].day
+    if history.changes:
+        newest_change = history.changes[-1]
+        day = digests[newest_change.index].day
+        what = newest_change.shift.what
+        return _Row(name, "bad", "MOVED", day, what, len(digests), newest)
+    alarms = [digest for digest in digests if digest.alarm]
+    if alarms:
+        return _Row(name, "bad", "ALARM", alarms[-1].day, alarms[-1].alarm, len(digests), newest)
+    return _Row(name, "good", "NOT MOVED", "", "", len(digests), newest)
+
+
+def _change_rows(history: History) -> list[tuple[str, str]]:
+    """Return day and text of each change and alarm, in order of time."""
+    digests = history.digests
+    events = [
+        (digests[item.index].start_ns, f"moved before {digests[item.index].day}", item.shift.what)
+        for item in history.changes
+    ]
+    events += [
+        (digest.start_ns, f"alarm in the session of {digest.day}", digest.alarm)
+        for digest in digests
+        if digest.alarm
+    ]
+    return [(when, what) for _, when, what in sorted(events)]
+
+
+def _precision(history: History) -> list[tuple[str, str, str]]:
+    """Return, per axis, the standard deviation of the offset after the first and the last session.
+
+    These are sessions since the last change.
+    """
+    first = history.offsets[history.changes[-1].index if history.changes else 0]
+    last = history.offsets[-1]
+    return [
+        (
+            axes_in_words([axis]),
+            f"\u00b1 {amount(axis, first.axes[axis].sigma)}",
+            f"\u00b1 {amount(axis, last.axes[axis].sigma)}",
+        )
+        for axis in AXES
+    ]
+
+
+@page_style()
+def _figure(history: History, number: int) -> Drawn:
+    """Draw the offset of each axis over time; ``number`` is that of the vehicle on the page."""
+    figure = Figure(figsize=(LOOK.width, _HEIGHT), layout="constrained")
+    panels = figure.subplots(2, 3, sharex=True).ravel()
+    days = _days([digest.start_ns for digest in history.digests])
+    cuts = [changepoint.index for changepoint in history.changes]
+    alarms = [index for index, digest in enumerate(history.digests) if digest.alarm]
+    for axis, panel in zip(AXES, panels, strict=True):
+        _draw_axis(panel, axis, days, history.offsets, cuts)
+        for index in cuts:
+            panel.axvline(days[index], color=BAD, lw=1.0, ls="--")
+        for index in alarms:
+            panel.axvline(days[index], color=BAD, lw=1.0, ls=":")
+    locator = AutoDateLocator(minticks=2, maxticks=4)
+    panels[0].xaxis.set_major_locator(locator)
+    panels[0].xaxis.set_major_formatter(ConciseDateFormatter(locator))
+    return as_drawn(figure, f"mount-{number}", "Offset from the installed pose", _CAPTION)
+
+
+def _draw_axis(
+    panel: Any, axis: str, days: FloatArray, offsets: Sequence[change.Moved], cuts: Sequence[int]
+) -> None:
+    """Draw the offset of an axis and its band, interrupted at each change of the mount."""
+    factor, unit = (100.0, "cm") if axis in "xyz" else (np.degrees(1.0), "deg")
+    rows = [offset.axes[axis] for offset in offsets]
+    values = factor * np.array([row.difference for row in rows])
+    bands = factor * LOOK.sigmas * np.array([row.sigma for row in rows])
+    unknown = factor * LOOK.sigmas * float(change.UNKNOWN[AXES.index(axis)])
+    is_determined = bands < _DETERMINED * unknown
+    name = f"about {ABOUT[axis]}" if axis in ABOUT else axis
+    panel.set_title(f"{name}, {unit}" if is_determined.any() else f"{name}: not determined")
+    panel.axhline(0, color=GRID, lw=0.8)
+    edges = [0, *cuts, len(days)]
+    for start, end in pairwise(edges):
+        part = np.arange(start, end)[is_determined[start:end]]
+        panel.fill_between(
+            days[part],
+            (values - bands)[part],
+            (values + bands)[part],
+            color=PARENT,
+            alpha=0.2,
+            lw=0,
+        )
+        panel.plot(days[part], values[part], color=PARENT, marker="." if len(part) == 1 else "")
+    panel.tick_params(axis="y", colors=MUTED)
+
+
+def _days(stamps_ns: Sequence[int]) -> FloatArray:
+    """Return stamps (ns) as the days of Matplotlib."""
+    days: FloatArray = date2num(np.array(stamps_ns, dtype="datetime64[ns]"))
+    return days
