@@ -8,13 +8,13 @@ from bag_making import JAZZY, TF, fix, imu, tf_message
 from motions import disturbed, geodetic, wandering_poses
 from rosbags import rosbag2
 from scipy.spatial.transform import Rotation
-from vehicle_making import simulate_machine
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.simulation.drive import simulate_drive
 from hand_eye_calib.extras.simulation.options import HILLY_DRIVE
 from hand_eye_calib.formats.bags.writer import write_streams
+from reproduction.machines import simulate_machine
 
 # Lidar to camera on the pages: x 0.4 m, z 1.85 m, yaw -90 deg.
 T_LIDAR_CAMERA = se3.from_quat_xyzw(

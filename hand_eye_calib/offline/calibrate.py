@@ -42,6 +42,7 @@ _Measures: TypeAlias = Literal[
     "wheels",
     "wheel_odometry",
     "steering",
+    "tricycle",
     "omni",
     "driving",
 ]

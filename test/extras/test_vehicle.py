@@ -6,7 +6,6 @@ from functools import cache
 import numpy as np
 import pytest
 from rosbags import rosbag2
-from vehicle_making import simulate_machine
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import CalibratorConfig
@@ -14,11 +13,12 @@ from hand_eye_calib.core.base.errors import ConfigError, InputError, NotEnoughDa
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.formats.bags.writer import write_streams
 from hand_eye_calib.offline.cli.main import main
+from reproduction.machines import simulate_machine
 
 # Half of what three minutes of figures of eight reach by far: x, y (m), rotations (rad).
 POSE_TOLERANCES = [0.01, 0.01, np.radians(0.15), np.radians(0.15), np.radians(0.1)]
 # Share of each parameter, rad of a steering offset.
-PARAMETER_TOLERANCE = {"wheels": 0.004, "steering": 0.002, "omni": 0.005}
+PARAMETER_TOLERANCE = {"wheels": 0.004, "steering": 0.002, "tricycle": 0.002, "omni": 0.005}
 
 
 @cache
@@ -69,7 +69,7 @@ def test_a_prior_fills_what_is_out_of_reach():
     assert result.translation[2] == pytest.approx(0.8, abs=0.02)
 
 
-@pytest.mark.parametrize("course", ["straight", "circle"])
+@pytest.mark.parametrize("course", ["straight", "circle", "bend"])
 @pytest.mark.parametrize("has_wheels", [True, False])
 def test_a_drive_of_one_curve_is_refused(course, has_wheels):
     drive = machine(course=course)
@@ -79,6 +79,50 @@ def test_a_drive_of_one_curve_is_refused(course, has_wheels):
     assert [found.code for found in result.findings] == ["one_motion"]
     assert result.wheels is None
     assert np.isinf(result.sigmas[[0, 1, 5]]).all()
+
+
+def test_spinning_on_the_spot_is_refused():
+    drive = machine(course="spin")
+    result = hec.calibrate_vehicle(drive.sensor, drive.wheels)
+    assert result.verdict.value == "DO NOT USE"
+    assert "x" in result.headline or "yaw" in result.headline
+
+
+@pytest.mark.parametrize("course", ["eights", "wide"])
+@pytest.mark.parametrize(("model", "wrong"), [("steering", "tricycle"), ("tricycle", "steering")])
+def test_a_speed_of_the_other_wheel_is_refused(model, wrong, course):
+    drive = machine(model, course)
+    result = hec.calibrate_vehicle(drive.sensor, drive.wheels, parent_measures=wrong)
+    assert result.verdict.value == "DO NOT USE"
+    assert [found.code for found in result.findings] == [f"speed_of_{model}"]
+
+
+@pytest.mark.parametrize("change", [lambda values: values[:, ::-1], lambda values: -values])
+def test_wheels_that_turn_the_other_way_need_care(change):
+    drive = machine()
+    wheels = hec.wheel_trajectory(drive.stamps_ns, change(drive.values), "wheels")
+    result = hec.calibrate_vehicle(drive.sensor, wheels)
+    assert [found.code for found in result.findings] == ["upside_down"]
+    assert result.verdict.value == "USE WITH CARE"
+    confirmed = hec.calibrate_vehicle(
+        drive.sensor, wheels, prior={"roll": np.radians([result.rpy_deg[0], 10.0])}
+    )
+    assert not confirmed.findings
+
+
+def test_an_articulated_machine_is_no_car():
+    drive = machine("articulated")
+    result = hec.calibrate_vehicle(drive.sensor, drive.wheels)
+    assert [found.code for found in result.findings] == ["unrelated"]
+    assert result.verdict.value != "USE"
+
+
+def test_tracks_that_slip_in_curves_keep_the_pose():
+    drive = machine("skid")
+    result = hec.calibrate_vehicle(drive.sensor, drive.wheels)
+    errors = np.abs(pose_errors(result, drive.T_base_sensor))
+    assert (errors < POSE_TOLERANCES).all()
+    assert result.wheels["wheel_separation"].value > 1.3 * drive.parameters[2]
 
 
 def test_wheels_of_another_drive_are_doubted():
@@ -164,6 +208,11 @@ def test_too_short_a_drive_raises():
         hec.calibrate_vehicle(drive.sensor[:300], drive.wheels)
 
 
+def test_speeds_in_another_unit_are_refused():
+    with pytest.raises(InputError, match=r"in rad/s or m/s"):
+        hec.wheel_trajectory(np.arange(3) * 20_000_000, [[0.0, 2000.0]] * 3, "wheels")
+
+
 def test_wheels_need_increasing_stamps():
     with pytest.raises(InputError, match="increase"):
         hec.wheel_trajectory(np.zeros(3, dtype=np.int64), np.ones((3, 2)), "wheels")
@@ -235,6 +284,7 @@ def test_an_option_is_refused(option):
 HEADERS = {
     "wheels": "t,left_rad_s,right_rad_s",
     "steering": "t, speed_m_s, steering_angle_deg",
+    "tricycle": "t, drive_speed, steering_angle",
     "omni": "t,vx,vy,wz",
 }
 

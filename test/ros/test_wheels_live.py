@@ -4,10 +4,10 @@ import numpy as np
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 from ros_harness import RELIABLE_INPUTS, matrix, message
-from vehicle_making import simulate_machine
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.geometry import se3
+from reproduction.machines import simulate_machine
 
 
 def wheel_odometry(drive):

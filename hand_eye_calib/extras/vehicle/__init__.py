@@ -23,7 +23,7 @@ def register() -> None:
     The registered functions import their modules only when they are called.
     """
     needs = "wheels need the poses of a sensor"
-    for word in ("wheels", "wheel_odometry", "steering", "omni", "driving"):
+    for word in ("wheels", "wheel_odometry", "steering", "tricycle", "omni", "driving"):
         MEASURES[word] = Measure("vehicle", needs, read_as="poses", is_parent=True)
     OUT_OF_REACH["vehicle"] = ("z",)
     OUT_OF_REACH["vehicle_2d"] = ("z", "roll", "pitch")

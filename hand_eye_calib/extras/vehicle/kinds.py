@@ -3,9 +3,12 @@
 A kind supplies the functions that solve and check its data, see :mod:`..core.engine.kinds`.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from hand_eye_calib.core.assessment import common_mode, covariance
+from hand_eye_calib.core.assessment.moved import SIGNIFICANT
 from hand_eye_calib.core.assessment.prior import fuse
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import NotEnoughDataError
@@ -35,7 +38,7 @@ from hand_eye_calib.extras.vehicle.solving import (
     Y,
     fit_drive,
 )
-from hand_eye_calib.extras.vehicle.wheels import MODELS, steps_of
+from hand_eye_calib.extras.vehicle.wheels import MODELS, RIVALS, steps_of
 
 # Duration of a window (s) with wheel data.
 _WINDOW_S = 0.5
@@ -57,6 +60,10 @@ _ROUNDING_S = 1e-6
 # circle.
 _MIN_SIGNAL_TO_NOISE = 10.0
 
+# A fifth of the drive contains most of the information on an axis if, without this fifth, the
+# variance is more than this multiple. It is below 2 in figures of eight, above 5 with one bend.
+_MAX_CONCENTRATION = 4.0
+
 # Share of the forward motion or of the turns that wheels and sensor do not have in common. Above
 # this share they are probably not of the same drive. It is 0.02 in simulated drives with slip.
 _UNRELATED = 0.1
@@ -69,6 +76,9 @@ _MAX_SIGMAS_OF_HALVES = 3.3
 # The vehicle always drives the same curve if the turns (rad) of its windows usually deviate from
 # those of a constant curvature by less than this.
 _VARIED_TURN = 0.02
+
+# A vehicle turns on the spot if the unit vehicle drives less than this length per radian.
+_ON_THE_SPOT = 0.2
 
 # Options that have no meaning for a vehicle, and the values that are accepted.
 _ALLOWED: dict[str, tuple[object, ...]] = {
@@ -113,8 +123,22 @@ def _solve(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
         fixed.append(Y)
     if _is_flat(drive):
         fixed += TILT
-    fit = fit_drive(drive, _drive(pairs, wheels, config, offset_s, 2.0 * window_s), fixed)
-    return _calibration(fit, drive, pairs, offset_s, config)
+    longer = _drive(pairs, wheels, config, offset_s, 2.0 * window_s)
+    fit = fit_drive(drive, longer, fixed)
+    findings = _check_fit(fit, drive, config)
+    rival = RIVALS.get(config.parent_measures)
+    if rival:
+        model = MODELS[rival]
+        other = fit_drive(replace(drive, model=model), replace(longer, model=model), fixed)
+        if _log_ratio(other, fit) > SIGNIFICANT:
+            findings = (finding(f"speed_of_{rival}"),)
+    return _calibration(fit, findings, drive, pairs, offset_s, config)
+
+
+def _log_ratio(fit: Fit, other: Fit) -> float:
+    """Return the log likelihood ratio of two fits of the same windows: positive for the first."""
+    volumes = [np.linalg.slogdet(item.noise)[1] for item in (other, fit)]
+    return 0.5 * len(fit.weights) * float(np.subtract(*volumes))
 
 
 def _drive(
@@ -170,16 +194,20 @@ def _is_flat(drive: Drive) -> bool:
 
 
 def _calibration(
-    fit: Fit, drive: Drive, pairs: PosePairs, offset_s: float, config: CalibratorConfig
+    fit: Fit,
+    findings: tuple[Finding, ...],
+    drive: Drive,
+    pairs: PosePairs,
+    offset_s: float,
+    config: CalibratorConfig,
 ) -> Calibration:
-    """Return the result of a fit: pose, parameters of the wheels, clock offset and findings.
+    """Return the result of a fit and of its findings: pose, parameters of the wheels, clock offset.
 
     ``offset_s`` is the clock offset that the drive was made with; the fit estimates its remainder.
     """
     kind = "vehicle" if drive.model else "vehicle_alone"
     if _is_flat(drive):
         kind += "_2d"
-    findings = _check_fit(fit, drive)
     unknown_axes = OUT_OF_REACH[kind]
     if any(item.makes_unusable for item in findings):
         unknown_axes = AXES
@@ -229,30 +257,45 @@ def _calibration(
     return result.with_part("wheels", VehicleParameters(tuple(parameters), slip_share))
 
 
-def _check_fit(fit: Fit, drive: Drive) -> tuple[Finding, ...]:
+def _check_fit(fit: Fit, drive: Drive, config: CalibratorConfig) -> tuple[Finding, ...]:
     """Return the finding about a fit, if there is one.
 
-    It detects drives that do not determine the pose, wheels that are those of another drive, and
-    mounts that moved during the drive.
+    It detects drives that do not determine the pose, wheels that are those of another drive,
+    sensors that seem to be upside down, and mounts that moved during the drive.
     """
     # Indices of the unknowns of the axes that are estimated.
     index_of = {"x": 0, "yaw": YAW}
     if drive.model:
         index_of["y"] = Y
     ratios = fit.signal_to_noise(drive.components)
-    undetermined = [axis for axis in index_of if ratios[axis] < _MIN_SIGNAL_TO_NOISE]
+    undetermined = []
+    for axis, index in index_of.items():
+        is_concentrated = fit.concentration[index] > _MAX_CONCENTRATION
+        if is_concentrated or ratios[axis] < _MIN_SIGNAL_TO_NOISE:
+            undetermined.append(axis)
     if undetermined or not fit.converged:
-        key = "unrelated_wheels" if _has_varied_turns(drive) else "one_motion"
+        is_varied = _has_varied_turns(drive) and not _is_on_the_spot(drive)
+        key = "unrelated_wheels" if is_varied else "one_motion"
         return (finding(key, axes=listing(undetermined or [*index_of])),)
     if drive.model:
         share = _unrelated_share(fit, drive)
         if share > _UNRELATED:
             severity = Severity.ERROR if share > _UNUSABLE else Severity.WARNING
             return (finding("unrelated_wheels", severity=severity),)
+        if _is_upside_down(fit) and not {"roll", "pitch"} & {*config.prior()}:
+            roll = np.degrees(se3.rotation_to_rpy(se3.rotation_of(fit.T_base_sensor))[0])
+            return (finding("upside_down", roll=f"{roll:.0f}"),)
     # The estimate of a half has twice the variance, so the difference of both has four times it.
     sigmas = np.abs(np.subtract(*fit.halves)) / (2.0 * np.sqrt(np.diag(fit.covariance)))
     different = [axis for axis, index in index_of.items() if sigmas[index] > _MAX_SIGMAS_OF_HALVES]
     return (finding("vehicle_halves", axes=listing(different)),) if different else ()
+
+
+def _is_upside_down(fit: Fit) -> bool:
+    """Whether z of the sensor, or -y of a camera, points down."""
+    up = se3.rotation_of(fit.T_base_sensor)[2]
+    main = int(np.argmax(np.abs(up)))
+    return bool(up[2] < 0.0 if main == 2 else up[1] > 0.0 if main == 1 else False)
 
 
 def _has_varied_turns(drive: Drive) -> bool:
@@ -261,6 +304,14 @@ def _has_varied_turns(drive: Drive) -> bool:
     turns = np.linalg.norm(drive.xi[:, 3:], axis=1)
     curvature = lengths @ turns / (lengths @ lengths)
     return quantile(np.abs(turns - curvature * lengths), _USUAL) > _VARIED_TURN
+
+
+def _is_on_the_spot(drive: Drive) -> bool:
+    """Whether the wheels turn the vehicle on the spot."""
+    if drive.model is None:
+        return False
+    forward, left, turns = np.abs(drive.motions_of_unit_vehicle()).sum(axis=1)
+    return bool(np.hypot(forward, left) < _ON_THE_SPOT * turns)
 
 
 def _unrelated_share(fit: Fit, drive: Drive) -> float:

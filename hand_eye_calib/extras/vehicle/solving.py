@@ -57,6 +57,9 @@ _FIXED_SIGMA = 1e-6
 # Number of blocks of the jackknife. A block lasts some seconds, longer than a slip of the wheels.
 BLOCKS = 30
 
+# Number of parts of a drive, of which two neighbours together must not contain most information.
+_PARTS = 10
+
 # A window has weight 0 if noise exceeds its Mahalanobis distance with less than this probability.
 _TAIL = 0.01
 
@@ -106,6 +109,12 @@ class Drive:
     steps: FloatArray
     model: WheelModel | None
     components: Sequence[int]
+
+    def motions_of_unit_vehicle(self) -> FloatArray:
+        """Return the sums (3, K) of the steps in each window: forward, left and turn."""
+        totals = np.insert(np.cumsum(self.steps, axis=1), 0, 0.0, axis=1)
+        at_ends = np.array([np.interp(self.ends_s, self.stamps_s, total) for total in totals])
+        return at_ends[:, 1] - at_ends[:, 0]
 
     def measured(self, T: FloatArray) -> FloatArray:
         """Return the motions (K, 6) of the axle, measured by the sensor if its pose is T (4, 4)."""
@@ -177,6 +186,9 @@ class Fit:
         Covariance of the residuals.
     information : (U,) array
         Information on each unknown if all other unknowns are free: the inverse variance.
+    concentration : (U,) array
+        Largest factor by which the variance of each unknown grows if a fifth of the drive is
+        missing.
     halves : (2, U) array
         Estimates from each half of the drive alone, minus the estimate.
     objective : float
@@ -191,6 +203,7 @@ class Fit:
     weights: FloatArray
     noise: FloatArray
     information: FloatArray
+    concentration: FloatArray
     halves: FloatArray
     objective: float
     converged: bool
@@ -311,10 +324,23 @@ def _solve(
         weights=np.minimum(weights, 1.0),
         noise=noise,
         information=1.0 / np.diag(model),
+        concentration=_concentration(blocks, prior, model),
         halves=solve(blocks.merged(2).sums + prior, everything),
         objective=float(blocks.total[-1, -1]),
         converged=converged,
     )
+
+
+def _concentration(blocks: Blocks, prior: FloatArray, model: FloatArray) -> FloatArray:
+    """Return the concentration (U,) of a fit, see :class:`Fit`.
+
+    ``prior`` are the products of the prior equations, and ``model`` is the covariance (U, U).
+    """
+    parts = blocks.merged(_PARTS).sums
+    fifths = parts[:-1] + parts[1:]
+    remaining = (blocks.total - fifths + prior)[:, :-1, :-1]
+    variances = np.diagonal(inverse(remaining), axis1=1, axis2=2)
+    return np.asarray(variances.max(axis=0) / np.diag(model))
 
 
 def _weights(
@@ -363,7 +389,7 @@ def start_of(drive: Drive) -> tuple[FloatArray, FloatArray]:
         turn_ratio = -axis[main] if main == 1 else axis[main]
         displacements = np.linalg.norm(drive.xi[:, :3], axis=1)
     else:
-        forward, left, unit_turns = _motions_of_unit_vehicle(drive)
+        forward, left, unit_turns = drive.motions_of_unit_vehicle()
         displacements = forward + 1j * left
         turn_ratio = turns @ unit_turns / (unit_turns @ unit_turns + _MIN_VARIANCE)
     up = np.sign(turn_ratio) * axis
@@ -383,10 +409,3 @@ def start_of(drive: Drive) -> tuple[FloatArray, FloatArray]:
     if drive.model is not None:
         parameters = drive.model.parameters_of(length_ratio, abs(turn_ratio))
     return T, np.array([0.0, 0.0, *parameters])
-
-
-def _motions_of_unit_vehicle(drive: Drive) -> FloatArray:
-    """Return the sums (3, K) of the steps in each window: forward, left and turn."""
-    totals = np.insert(np.cumsum(drive.steps, axis=1), 0, 0.0, axis=1)
-    at_ends = np.array([np.interp(drive.ends_s, drive.stamps_s, total) for total in totals])
-    return at_ends[:, 1] - at_ends[:, 0]

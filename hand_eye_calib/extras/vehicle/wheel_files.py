@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hand_eye_calib.core.base.arrays import IntArray, floats
+from hand_eye_calib.core.base.arrays import FloatArray, IntArray, floats
 from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
@@ -24,21 +24,29 @@ from hand_eye_calib.formats.trajectory_files.table import Table
 _COLUMNS = {
     r"left\w*,right\w*": "wheels",
     r"(speed|v|velocity)\w*,(steering|angle)\w*": "steering",
+    r"(drive|driven|traction)\w*,(steering|angle)\w*": "tricycle",
     r"vx\w*,wz\w*": "wheel_odometry",
     r"vx\w*,vy\w*,wz\w*": "omni",
 }
+
+
+def _along_and_across(speed: FloatArray, angle: FloatArray) -> tuple[FloatArray, ...]:
+    """Return the rates of a unit vehicle from a speed and a steering angle."""
+    return speed * np.cos(angle), 0.0 * speed, speed * np.sin(angle)
+
 
 # Functions that compute forward speed, left speed and yaw rate of the unit vehicle from the columns
 # of wheel data.
 _RATES: dict[str, Callable[..., tuple[ArrayLike, ...]]] = {
     "wheels": lambda left, right: ((left + right) / 2.0, 0.0 * left, (right - left) / UNIT_TRACK),
-    "steering": lambda speed, angle: (speed, 0.0 * speed, speed * np.tan(angle)),
+    "steering": _along_and_across,
+    "tricycle": _along_and_across,
     "wheel_odometry": lambda speed, turn: (speed, 0.0 * speed, turn),
     "omni": lambda forward, left, turn: (forward, left, turn),
 }
 
 # Number of columns of wheel data without the stamps.
-_N_COLUMNS = {"wheels": 2, "steering": 2, "wheel_odometry": 2, "omni": 3}
+_N_COLUMNS = {"wheels": 2, "steering": 2, "tricycle": 2, "wheel_odometry": 2, "omni": 3}
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
@@ -50,11 +58,12 @@ def wheel_trajectory(stamps_ns: IntArray, values: ArrayLike, measures: str) -> T
     ----------
     stamps_ns : (N,) int64 array
     values : (N, 2) or (N, 3) array
-        Values at the stamps: rates of the left and the right wheel (``wheels``); speed and
-        steering angle, rad (``steering``); forward speed and yaw rate, rad/s (``wheel_odometry``);
-        or forward speed, left speed and yaw rate (``omni``). Rates and speeds are in rad/s of the
+        Values at the stamps: rates of the left and the right wheel (``wheels``); speed of the
+        fixed axle and steering angle, rad (``steering``); speed of the steered wheel and its
+        angle, rad (``tricycle``); forward speed and yaw rate, rad/s (``wheel_odometry``); or
+        forward speed, left speed and yaw rate (``omni``). Rates and speeds are in rad/s of the
         wheels or in m/s.
-    measures : {"wheels", "steering", "wheel_odometry", "omni"}
+    measures : {"wheels", "steering", "tricycle", "wheel_odometry", "omni"}
 
     Returns
     -------
@@ -64,7 +73,8 @@ def wheel_trajectory(stamps_ns: IntArray, values: ArrayLike, measures: str) -> T
     Raises
     ------
     InputError
-        If the stamps do not increase, or the values have another number of columns.
+        If the stamps do not increase, the values have another number of columns, or a step turns by
+        more than half a turn.
     ConfigError
         If ``measures`` is no kind of wheel data.
 
@@ -88,7 +98,13 @@ def wheel_trajectory(stamps_ns: IntArray, values: ArrayLike, measures: str) -> T
         raise InputError("stamps of wheel data must increase; sort the rows, drop repeated stamps")
     # Between two stamps, the mean of both rows is used.
     rates = _RATES[measures](*(values[:-1] + values[1:]).T / 2.0)
-    return trajectory_of(stamps_ns, np.stack(rates) * durations_s, measures)
+    steps = np.stack(rates) * durations_s
+    if np.abs(steps[2]).max(initial=0.0) > np.pi:
+        raise InputError(
+            f"wheel speeds of up to {np.abs(values[:, 0]).max():.0f} are too large for rows that "
+            f"are {durations_s.max():.3g} s apart; write them in rad/s or m/s, angles in rad"
+        )
+    return trajectory_of(stamps_ns, steps, measures)
 
 
 def table_of_wheels(path: str | Path, data: bytes, options: FileOptions) -> Table | None:

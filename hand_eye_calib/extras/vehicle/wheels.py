@@ -8,8 +8,11 @@ a model with the parameters of the real wheels computes the step of the axle (m,
   forward = (R_l l + R_r r) / 2,  turn = (R_r r - R_l l) / track.
 - Odometry of two wheels, with multipliers k and k_track and an additional curvature:
   forward = k dx,  turn = k da / k_track + curvature forward.
-- Steering, with radius R and an offset of the angle: tan(angle) = da / dx,  forward = R dx,
-  turn = forward tan(angle - offset) / wheelbase.
+- Steering: dx and da are the speed of the wheels times the cosine and the sine of the angle of the
+  steered wheel, with an offset o of this angle. The speed is that of the fixed axle:
+  forward = R sqrt(dx^2 + da^2) sign(dx),  turn = forward tan(angle - o) / wheelbase.
+- A tricycle, whose steered wheel is the driven one, so that the speed is that of this wheel:
+  forward = R (dx cos o + da sin o),  turn = R (da cos o - dx sin o) / wheelbase.
 - Omnidirectional, with multipliers: forward = k_x dx,  left = k_y dy,  turn = k_a da.
 
 Positions in the plane are complex numbers x + i y.
@@ -81,9 +84,19 @@ def _steering(
 ) -> tuple[FloatArray, ...]:
     """Return the steps of the rear axle of a vehicle with a steering angle."""
     radius, wheelbase, offset = parameters
-    forward = radius * dx
+    forward = radius * np.copysign(np.hypot(dx, da), dx)
     angle = np.arctan(da / (dx + _SMALL))
     return forward, dy, forward * np.tan(angle - offset) / wheelbase
+
+
+def _tricycle(
+    parameters: FloatArray, dx: FloatArray, dy: FloatArray, da: FloatArray
+) -> tuple[FloatArray, ...]:
+    """Return the steps of the fixed axle of a vehicle that is driven by its steered wheel."""
+    radius, wheelbase, offset = parameters
+    ahead = radius * (dx * np.cos(offset) + da * np.sin(offset))
+    aside = radius * (da * np.cos(offset) - dx * np.sin(offset))
+    return ahead, dy, aside / wheelbase
 
 
 def _omni(
@@ -112,12 +125,20 @@ MODELS = {
         _steering,
         lambda length, turn: (length, length / turn, 0.0),
     ),
+    "tricycle": WheelModel(
+        ("wheel_radius", "wheelbase", "steering_offset"),
+        _tricycle,
+        lambda length, turn: (length, length / turn, 0.0),
+    ),
     "omni": WheelModel(
         ("forward_multiplier", "left_multiplier", "turn_multiplier"),
         _omni,
         lambda length, turn: (length, length, turn),
     ),
 }
+
+#: Kinds of wheel data with the same columns, which are easily mistaken for each other.
+RIVALS = {"steering": "tricycle", "tricycle": "steering"}
 
 
 def path_of(steps: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -5,8 +5,8 @@ from hand_eye_calib.core.results.records import Severity
 
 WORDS = {
     "one_motion": FindingWords(
-        "this drive does not determine {axes}: the vehicle drives straight on, or always the same "
-        "curve",
+        "this drive does not determine {axes}: the vehicle drives straight on, always the same "
+        "curve, turns only once, or turns on the spot",
         "drive figures of eight for some minutes, with tight curves to both sides",
     ),
     "unrelated_wheels": FindingWords(
@@ -14,6 +14,26 @@ WORDS = {
         UNRELATED_ADVICE,
         "another recording, a wheel that turns backwards, or a machine that moves sideways",
         code="unrelated",
+    ),
+    "upside_down": FindingWords(
+        "the wheels turn the other way than the sensor, if the sensor is upright",
+        "exchange the columns of the left and the right wheel, or change the sign of the steering "
+        "angle or of the speed; if the sensor really is upside down, confirm it: "
+        "--prior roll={roll}deg+/-10deg",
+        "a steered wheel behind the axle, or z of the sensor that points down",
+        severity=Severity.WARNING,
+    ),
+    "speed_of_tricycle": FindingWords(
+        "the speed seems to be that of the steered wheel",
+        "set parent_measures to tricycle",
+        "a tyre that is much smaller under load in curves",
+        severity=Severity.ERROR,
+    ),
+    "speed_of_steering": FindingWords(
+        "the speed seems to be that of the fixed axle",
+        "set parent_measures to steering",
+        "a driver that already divides the speed by the cosine of the angle",
+        severity=Severity.ERROR,
     ),
     "vehicle_halves": FindingWords(
         "both halves of the drive give another {axes}",

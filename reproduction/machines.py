@@ -1,0 +1,226 @@
+"""Simulated machines with wheels and a sensor, and their true parameters."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import lfilter
+
+from hand_eye_calib.core.base.arrays import FloatArray, IntArray
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.extras.vehicle.wheel_files import wheel_trajectory
+
+# Step of the simulation (s), and the interval of the wheel data (s).
+_STEP_S = 0.005
+_WHEELS_S = 0.02
+_START_NS = 10**18
+
+
+class Machine(NamedTuple):
+    """Drive of a machine.
+
+    Attributes
+    ----------
+    stamps_ns : (N,) int64 array
+        Stamps of the wheel data.
+    values : (N, 2) or (N, 3) array
+        Values of the wheels, see :func:`~hand_eye_calib.wheel_trajectory`.
+    measures : str
+        Kind of wheel data.
+    sensor : Trajectory
+        Poses of the sensor. Its clock is ``clock_s`` behind that of the wheels.
+    T_base_sensor : (4, 4) array
+    parameters : list of float
+        True parameters of the wheels, in the order of the model.
+    clock_s : float
+    """
+
+    stamps_ns: IntArray
+    values: FloatArray
+    measures: str
+    sensor: Trajectory
+    T_base_sensor: FloatArray
+    parameters: list[float]
+    clock_s: float
+
+    @property
+    def wheels(self) -> Trajectory:
+        """Stream of the wheels for ``calibrate``."""
+        return wheel_trajectory(self.stamps_ns, self.values, self.measures)
+
+
+class Course(NamedTuple):
+    """Speeds (m/s) ahead and to the left and yaw rates (rad/s) of an axle, (N,) each."""
+
+    speed: FloatArray
+    left_speed: FloatArray
+    yaw_rate: FloatArray
+
+
+#: Courses of a machine. Only figures of eight, tight or wide, determine x, y and yaw.
+COURSES = ("eights", "wide", "straight", "circle", "bend", "left", "spin")
+
+#: Kinds of wheel data of the machines, and of data that no model describes: ``skid`` has tracks
+#: that slip more in tight curves, and ``articulated`` has the angle of its joint as steering angle.
+MACHINES = ("wheels", "steering", "tricycle", "omni", "skid", "articulated")
+_DATA = {"skid": "wheels", "articulated": "steering"}
+
+
+def simulate_machine(
+    seed: int,
+    machine: str = "wheels",
+    course: str = "eights",
+    duration_s: float = 180.0,
+    noise: float = 1.0,
+) -> Machine:
+    """Simulate a drive with slip, bumps and a noisy sensor. ``noise`` is a factor of all errors."""
+    rng = np.random.default_rng(seed)
+    times_s = np.arange(0.0, duration_s + 1.0, _STEP_S, dtype=float)
+    driven = _course(course, machine, rng, times_s)
+    Ts_world_base = _poses(rng, driven, noise)
+    slip = _slip_of_wheels(rng, driven.yaw_rate, noise * duration_s)
+    parameters, rates = _wheels(machine, rng, driven, 1.0 + slip)
+    every = round(_WHEELS_S / _STEP_S)
+    n_rows = len(times_s) // every
+    means = rates[: n_rows * every].reshape(n_rows, every, -1).mean(axis=1)
+    sigmas = 0.01 * np.abs(means).max(axis=0)
+    if machine in ("steering", "tricycle", "articulated"):
+        sigmas[1] = 0.002
+    values = means + noise * sigmas * rng.standard_normal(means.shape)
+    wheel_times_s = np.asarray((np.arange(n_rows) + 0.5) * _WHEELS_S - _STEP_S, dtype=float)
+    T_base_sensor = _mount(rng)
+    rows = np.arange(0, len(times_s), round(0.1 / _STEP_S))
+    poses = _measured(rng, Ts_world_base[rows] @ T_base_sensor, noise)
+    clock_s = 0.02
+    return Machine(
+        stamps_ns=_stamps_ns(wheel_times_s),
+        values=values,
+        measures=_DATA.get(machine, machine),
+        sensor=Trajectory(_stamps_ns(times_s[rows] - clock_s), poses, "lidar"),
+        T_base_sensor=T_base_sensor,
+        parameters=parameters,
+        clock_s=clock_s,
+    )
+
+
+def _stamps_ns(times_s: FloatArray) -> IntArray:
+    return _START_NS + np.round(times_s * 1e9).astype(np.int64)
+
+
+def _course(course: str, machine: str, rng: np.random.Generator, times_s: FloatArray) -> Course:
+    """Return the motion of the axle, which slips outwards in curves."""
+    phases = rng.uniform(0, 2 * np.pi, 3)
+    speed = 0.8 + 0.15 * np.sin(2 * np.pi * times_s / 23 + phases[0])
+    speed += 0.1 * np.sin(2 * np.pi * times_s / 7.1 + phases[1])
+    wave = np.sin(2 * np.pi * times_s / 14 + phases[2])
+    curvatures = {
+        "eights": 0.9 * wave,
+        "wide": 0.3 * wave,
+        "straight": 0.002 * np.sin(times_s),
+        "circle": 0.7 + 0.003 * np.sin(times_s),
+        "bend": 0.7 * np.exp(-(((times_s - times_s[-1] / 2.0) / 2.0) ** 2)),
+        "left": 0.5 + 0.4 * wave,
+    }
+    if course == "spin":
+        yaw_rate = 0.5 * wave
+        speed = 0.002 * np.sin(times_s)
+    else:
+        yaw_rate = curvatures[course] * speed
+    slip_angle = abs(rng.normal(0.0, 0.005)) * speed * yaw_rate
+    left_speed = -slip_angle * speed
+    if machine == "omni":
+        left_speed = np.zeros(len(times_s))
+        if course == "eights":
+            left_speed = 0.4 * np.sin(2 * np.pi * times_s / 11 + rng.uniform(0, 6))
+    return Course(speed, left_speed, yaw_rate)
+
+
+def _poses(rng: np.random.Generator, driven: Course, noise: float) -> FloatArray:
+    """Return poses of the base on a floor with bumps; the body leans outwards in curves."""
+    speed, left_speed, yaw_rate = driven
+    headings = np.cumsum(yaw_rate) * _STEP_S
+    middle = headings - yaw_rate * _STEP_S / 2
+    places = np.cumsum((speed + 1j * left_speed) * np.exp(1j * middle)) * _STEP_S
+    decay = np.exp(-_STEP_S / 0.3)
+    shocks = np.sqrt(1 - decay**2) * rng.standard_normal((len(speed), 3))
+    bumps = noise * lfilter([1.0], [1.0, -decay], shocks, axis=0) * [0.004, 0.004, 0.003]
+    roll = bumps[:, 0] + noise * 0.01 * speed * yaw_rate
+    rotations = se3.rotation_from_rpy(np.column_stack([roll, bumps[:, 1], headings]))
+    positions = np.column_stack([places.real, places.imag, bumps[:, 2]])
+    return se3.from_rotation_translation(rotations, positions)
+
+
+def _slip_of_wheels(
+    rng: np.random.Generator, yaw_rate: FloatArray, slipping_s: float
+) -> FloatArray:
+    """Return the share (N, 2) by which two wheels turn too fast: bursts in curves."""
+    slip = np.zeros((len(yaw_rate), 2))
+    for start in rng.integers(0, len(yaw_rate), size=int(slipping_s / 8)):
+        if abs(yaw_rate[start]) > 0.3 * np.abs(yaw_rate).max():
+            end = start + int(rng.uniform(0.2, 1.0) / _STEP_S)
+            slip[start:end, rng.integers(2)] += rng.uniform(0.03, 0.2)
+    return slip
+
+
+def _wheels(
+    machine: str, rng: np.random.Generator, driven: Course, slip: FloatArray
+) -> tuple[list[float], FloatArray]:
+    """Return true parameters 2 to 3 % off, and what the wheels measure (N, channels)."""
+    speed, left_speed, yaw_rate = driven
+    off = 1.0 + rng.normal(0.0, [0.02, 0.02, 0.03])
+    if machine in ("wheels", "skid"):
+        left, right, track = off * [0.1, 0.1, 0.5]
+        half_turn = yaw_rate * track / 2
+        if machine == "skid":
+            # Tracks slip when the machine turns, more in tight curves.
+            half_turn *= 1.5 + 0.3 * np.abs(yaw_rate)
+        wheels = np.column_stack([(speed - half_turn) / left, (speed + half_turn) / right])
+        return [left, right, track], wheels * slip
+    factor = off[0]
+    wheelbase = 1.2 * off[2]
+    offset = np.radians(1.0) * rng.choice([-1.0, 1.0])
+    angle = np.arctan2(wheelbase * yaw_rate, speed)
+    if machine == "steering":
+        car = np.column_stack([speed / factor * slip[:, 0], angle + offset])
+        return [factor, wheelbase, offset], car
+    if machine == "tricycle":
+        # The driven wheel is the steered wheel.
+        wheel_speed = np.hypot(speed, wheelbase * yaw_rate)
+        tricycle = np.column_stack([wheel_speed / factor * slip[:, 0], angle + offset])
+        return [factor, wheelbase, offset], tricycle
+    if machine == "articulated":
+        return [factor, wheelbase, offset], _articulated(driven, factor, wheelbase, slip)
+    rates = np.column_stack([speed, left_speed, yaw_rate]) / off
+    rates[:, :2] *= slip
+    return list(off), rates
+
+
+def _articulated(driven: Course, factor: float, wheelbase: float, slip: FloatArray) -> FloatArray:
+    """Return the speed of the front axle and the angle of the joint in the middle of a loader.
+
+    The yaw rate of the front part is ``(v sin g + l g') / (l (1 + cos g))`` for an angle g of the
+    joint, and a length l of both parts.
+    """
+    length = wheelbase / 2.0
+    angle = np.zeros(len(driven.speed))
+    for row in range(len(angle) - 1):
+        joint = angle[row]
+        turn = driven.yaw_rate[row] * length * (1.0 + np.cos(joint))
+        rate = (turn - driven.speed[row] * np.sin(joint)) / length
+        angle[row + 1] = joint + rate * _STEP_S
+    return np.column_stack([driven.speed / factor * slip[:, 0], angle])
+
+
+def _mount(rng: np.random.Generator) -> FloatArray:
+    """Return a pose of a sensor that is level to some degrees."""
+    xyz = [rng.uniform(-0.3, 1.0), rng.uniform(-0.4, 0.4), rng.uniform(0.2, 1.5)]
+    rpy = [*rng.normal(0, 0.03, 2), rng.uniform(-np.pi, np.pi)]
+    return se3.from_rotation_translation(se3.rotation_from_rpy(rpy), xyz)
+
+
+def _measured(rng: np.random.Generator, poses: FloatArray, noise: float) -> FloatArray:
+    """Return poses with drift, 4 mm and 0.06 deg of noise."""
+    drift = noise * rng.standard_normal((len(poses) - 1, 6)) * np.repeat([0.0007, 0.0001], 3)
+    white = noise * rng.standard_normal((len(poses), 6)) * np.repeat([0.004, 0.001], 3)
+    steps = se3.inverse(poses[:-1]) @ poses[1:] @ se3.exp(drift)
+    return se3.chained(steps) @ se3.exp(white)

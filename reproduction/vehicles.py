@@ -1,0 +1,155 @@
+"""``python -m reproduction.vehicles``: sensors on simulated machines against the truth.
+
+The machines drive figures of eight for three minutes. Further drives do not determine the pose.
+"""
+
+import argparse
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.extras.vehicle.calibrate import calibrate_vehicle
+from hand_eye_calib.offline.cli.main import exit_code_of
+from reproduction.machines import Machine, simulate_machine
+from reproduction.partial import QUANTILE_90
+from reproduction.writing import counted, markdown_table, seed_of, show
+
+# Models of wheels, and "driving" for a sensor without wheel data.
+_MODELS = ("wheels", "steering", "tricycle", "omni", "driving")
+_DEGENERATE = ("straight", "circle", "bend", "left", "spin")
+# The verdict must not be USE if an error is beyond this number of standard deviations.
+_BEYOND = 3.3
+
+
+class Drive(NamedTuple):
+    """Errors of a result and their standard deviations by name, and its verdict."""
+
+    errors: Mapping[str, float]
+    sigmas: Mapping[str, float]
+    verdict: str
+    headline: str
+
+    @property
+    def ratios(self) -> Mapping[str, float]:
+        """Sizes of the errors in standard deviations, of what is determined."""
+        ratios = {}
+        for name, error in self.errors.items():
+            if np.isfinite(self.sigmas[name]):
+                ratios[name] = abs(error) / self.sigmas[name]
+        return ratios
+
+
+def drive(seed: int, model: str, course: str = "eights") -> Drive:
+    """Simulate a machine and calibrate its sensor."""
+    machine = simulate_machine(seed, "wheels" if model == "driving" else model, course)
+    wheels = None if model == "driving" else machine.wheels
+    result = calibrate_vehicle(machine.sensor, wheels, child_kind="exact")
+    errors, sigmas = _errors_of(result, machine)
+    return Drive(errors, sigmas, result.verdict.value, result.headline)
+
+
+def _errors_of(result: Calibration, machine: Machine) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the errors of a result, and their standard deviations, by name."""
+    T = result.T_parent_child
+    turn = se3.rotation_of(T) @ se3.rotation_of(machine.T_base_sensor).T
+    errors = dict(
+        x=float(T[0, 3] - machine.T_base_sensor[0, 3]),
+        y=float(T[1, 3] - machine.T_base_sensor[1, 3]),
+        **dict(zip(("roll", "pitch", "yaw"), se3.rotation_log(turn).tolist(), strict=True)),
+    )
+    rows = {"x": 0, "y": 1, "roll": 3, "pitch": 4, "yaw": 5}
+    sigmas = {name: float(result.sigmas[row]) for name, row in rows.items()}
+    wheels = result.parts.get("wheels")
+    if wheels is not None:
+        errors["clock"] = result.time_offset_s - machine.clock_s
+        sigmas["clock"] = result.time_offset_sigma_s
+        for item, truth in zip(wheels.parameters, machine.parameters, strict=True):
+            unit = 1.0 if item.name.endswith("offset") else truth
+            errors[item.name] = (item.value - truth) / unit
+            sigmas[item.name] = item.sigma / unit
+    return errors, sigmas
+
+
+def accuracy(drives: Iterable[Drive]) -> list[dict[str, object]]:
+    """Rows of a table: cover of the 90 % intervals and errors of each unknown."""
+    rows: list[dict[str, object]] = []
+    drives = list(drives)
+    for name in drives[0].errors:
+        ratios = np.array([item.ratios[name] for item in drives if name in item.ratios])
+        errors = np.array([abs(item.errors[name]) for item in drives if name in item.ratios])
+        if not len(errors):
+            continue
+        rows.append(
+            {
+                "Unknown": name,
+                "90 % of errors below": _with_unit(name, float(np.quantile(errors, 0.9))),
+                "Largest": _with_unit(name, float(errors.max())),
+                "90 % intervals cover": f"{np.mean(ratios < QUANTILE_90):.0%}",
+                "Largest, sigma": f"{ratios.max():.1f}",
+            }
+        )
+    return rows
+
+
+def _with_unit(name: str, error: float) -> str:
+    if name in ("x", "y"):
+        return f"{1e3 * error:.1f} mm"
+    if name in ("roll", "pitch", "yaw", "steering_offset"):
+        return f"{np.degrees(error):.3f} deg"
+    return f"{1e3 * error:.1f} ms" if name == "clock" else f"{error:.2%}"
+
+
+def summary(drives: Iterable[Drive]) -> str:
+    """One line about the verdicts and the cover of all unknowns."""
+    drives = list(drives)
+    ratios: list[float] = []
+    n_wrong = 0
+    for item in drives:
+        ratios += item.ratios.values()
+        n_wrong += item.verdict == "USE" and max(item.ratios.values()) > _BEYOND
+    cover = np.mean(np.array(ratios) < QUANTILE_90)
+    return (
+        f"{counted(item.verdict for item in drives)}; the 90 % intervals cover {cover:.1%} of "
+        f"{len(ratios)} errors; USE beyond {_BEYOND} sigma: {n_wrong}"
+    )
+
+
+def main() -> int:
+    """Simulate, calibrate and print."""
+    parser = argparse.ArgumentParser(prog="python -m reproduction.vehicles", description=__doc__)
+    parser.add_argument("--drives", type=int, default=30, help="drives of each machine")
+    parser.add_argument("--seed", type=int, help="default: another one at every run")
+    arguments = parser.parse_args()
+    seed = seed_of(arguments.seed)
+    print(f"seeds from {seed}\n")
+    for model in _MODELS:
+        drives = [drive(seed + row, model) for row in range(arguments.drives)]
+        show(
+            None,
+            {model: f"## {model}\n\n{summary(drives)}\n\n{markdown_table(accuracy(drives))}\n"},
+        )
+    rows = []
+    for course in _DEGENERATE:
+        for model in _MODELS:
+            refused = [drive(seed + row, model, course) for row in range(arguments.drives // 3)]
+            beyond = [max(item.ratios.values(), default=0.0) > _BEYOND for item in refused]
+            used = [item.verdict == "USE" for item in refused]
+            rows.append(
+                {
+                    "Course": course,
+                    "Machine": model,
+                    "Verdicts": counted(item.verdict for item in refused),
+                    "USE beyond 3.3": int(np.sum(np.logical_and(beyond, used))),
+                    "Such as": Counter(item.headline for item in refused).most_common(1)[0][0],
+                }
+            )
+    show(None, {"degenerate": markdown_table(rows)})
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(exit_code_of(main))
