@@ -175,6 +175,13 @@ def test_the_time_of_a_confirmation_does_not_follow_a_longer_estimate():
     assert within.sentence.startswith("Confirming, 60 s: ")  # half of 80 s, in steps
 
 
+def test_the_end_of_a_confirmation_is_reported_to_a_few_seconds():
+    goal = Goal(TARGETS)
+    sentences = [goal.add(result(), seen(motion_s)).sentence for motion_s in (40.0, 53.0, 57.0)]
+    times = [sentence.partition(":")[0] for sentence in sentences]
+    assert times == ["Confirming, 30 s", "Confirming, 8 s", "Confirming, 4 s"]
+
+
 def test_a_much_longer_time_left_is_a_new_estimate():
     goal = Goal(TARGETS)
     goal.add(result(sigmas_m=0.0205), seen(40.0))

@@ -39,6 +39,9 @@ _MIN_MOTION_TO_JUDGE_S = 30.0
 # each result. Beyond the last finite step, the present motion cannot reach the target.
 _STEPS_S = np.array([0.0, 15, 30, 60, 90, 120, 180, 240, 360, 600, 900, 1200, np.inf])
 
+# Values (s) to which the end of a confirmation is rounded up: this time is known, not estimated.
+_LAST_STEPS_S = (4.0, 8.0)
+
 # Increase of a time left, in steps, from which on the reported time increases, too.
 _MIN_INCREASE_STEPS = 3
 
@@ -283,7 +286,8 @@ class Goal:
         motion_s = self._results[-1].motion_s
         left_s = self._time_left(newest, ratios)
         total_s = float(left_s.max())
-        if total_s > 0.0:
+        is_confirming = total_s <= 0.0
+        if not is_confirming:
             # The confirmation begins when the last axis is within its target.
             total_s += _confirming_motion(motion_s + total_s)
         else:
@@ -291,10 +295,13 @@ class Goal:
             # Forget the last reported total: the new one is known, not estimated, so that it may be
             # shorter by several steps.
             self._steps[-1] = len(_STEPS_S) - 1
-        *axes_left_s, total_s = self._in_steps(np.append(left_s, total_s))
+        *axes_left_s, total_in_steps_s = self._in_steps(np.append(left_s, total_s))
+        last_steps_s = [step_s for step_s in _LAST_STEPS_S if is_confirming and total_s <= step_s]
+        total_s = min([total_in_steps_s, *last_steps_s])
         axes = self._by_axis(newest.sigmas, axes_left_s)
+        left_text = duration(total_s).replace(".0 ", " ")
         progress = Progress(
-            sentence=f"Confirming, {duration(total_s)}: every axis is within its target. Go on.",
+            sentence=f"Confirming, {left_text}: every axis is within its target. Go on.",
             seconds_left=total_s,
             is_faulty=bool(self._faults),
             axes=axes,
