@@ -358,6 +358,19 @@ def held(child: Trajectory, interval_s: float, _: Random) -> Trajectory:
     return posed(child, child.poses[first[steps]])
 
 
+@_both("U12", "streams exchanged", (0.5, 0.3, 0.7), "share", "exchanged")
+def exchanged(parent: Trajectory, child: Trajectory, share: float, _: Random) -> Streams:
+    """From a share of the recording on, each stream has the poses of the other sensor."""
+    from_ns = child.stamps_ns[int(share * len(child))]
+    streams = []
+    for first, second in ((parent, child), (child, parent)):
+        before = first[first.stamps_ns < from_ns]
+        after = second[second.stamps_ns >= from_ns]
+        stamps_ns = np.concatenate([before.stamps_ns, after.stamps_ns])
+        streams.append(Trajectory(stamps_ns, np.concatenate([before.poses, after.poses])))
+    return streams[0], streams[1]
+
+
 _both("V1", "parent's positions late", (0.02, 0.05, 0.1), "s", "position_clock")(
     lambda parent, child, s, random: (late_positions(parent, s, random), child)
 )

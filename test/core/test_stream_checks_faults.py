@@ -23,7 +23,7 @@ from reproduction.coverage.classes import make
 from reproduction.fault_cases import FAULTS, LATER, SILENT, heading_drift
 
 # Not the strongest: seen by a solve or with no effect then, or named already if it is small.
-STRONGEST = {"S13": 1, "S10b": 2, "V1": 1, "U7": 0}
+STRONGEST = {"S13": 1, "S10b": 2, "V1": 1, "U7": 0, "U12": 1}
 NAMED = [fault for fault in (*FAULTS, *LATER, *SILENT) if fault.named]
 
 

@@ -16,7 +16,8 @@ import numpy as np
 
 from hand_eye_calib.core.assessment.common_mode import FLOOR_TRAVEL_S, usual_speed
 from hand_eye_calib.core.assessment.moved import SIGNIFICANT, MountChange, find_change
-from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.arrays import FloatArray, IntArray
+from hand_eye_calib.core.base.blocks import Blocks
 from hand_eye_calib.core.base.stats import median, quantile
 from hand_eye_calib.core.base.text import angle, length, listing
 from hand_eye_calib.core.checks.fault_regression import (
@@ -64,6 +65,13 @@ _SOUND_PART = 0.25
 # A part has other axes than the other part if the other part's extrinsic rotation leaves more than
 # this share of its rotations unexplained.
 _OTHER_PART = 0.5
+
+# Streams may be exchanged at the start of each of so many blocks of time but the first.
+_EXCHANGE_BLOCKS = 16
+# Quantile of the residuals that is compared: it is outside of the larger part.
+_EXCHANGE_QUANTILE = 0.85
+# Streams are exchanged if that leaves less than this share of the residuals.
+_EXCHANGE_GAIN = 0.4
 
 # Gains are estimated about axes with at least this share of the rotation (root mean square) about
 # the main axis.
@@ -208,12 +216,14 @@ def check_coordinates(pose_pairs: PosePairs, motions: MotionPairs) -> list[Findi
 def check_turned_parts(pose_pairs: PosePairs) -> list[Finding]:
     """Return the finding that the extrinsic rotation differs between two parts, or none.
 
-    A stream that starts anew with other axes leaves two sound parts of a recording. The noise model
-    follows one part and rejects the other as outliers.
+    A stream that starts anew with other axes leaves two sound parts of a recording, and so do
+    streams that are exchanged. The noise model follows one part and rejects the other as outliers.
     """
     motions = pairs_over(pose_pairs, SHORT_S, _MAX_SHORT_MOTIONS)
     angles = se3.rotation_angle(se3.rotation_of(motions.Ts_parenti_parentj))
     motions = motions[angles < MAX_ROTATION_RAD]
+    if exchanged := _check_exchanged(motions, pose_pairs.stamps_ns):
+        return [exchanged]
     for share in _SPLITS:
         split = int(share * len(pose_pairs))
         parts = (motions[motions.j < split], motions[motions.i >= split])
@@ -227,12 +237,46 @@ def check_turned_parts(pose_pairs: PosePairs) -> list[Finding]:
         by_other = min(_unexplained(parts[0], second), _unexplained(parts[1], first))
         if by_own >= _SOUND_PART or by_other <= max(_OTHER_PART, 3.0 * by_own):
             continue
+        at_s = float(pose_pairs.stamps_ns[split] - pose_pairs.stamps_ns[0]) * 1e-9
+        if _unexplained(parts[1], se3.inverse(first)) < _SOUND_PART:
+            return [finding("exchanged", at_s=at_s)]
         between = se3.rotation_of(first).T @ se3.rotation_of(second)
         turned_rad = float(se3.rotation_angle(between))
-        at_s = float(pose_pairs.stamps_ns[split] - pose_pairs.stamps_ns[0]) * 1e-9
         size = angle(turned_rad)
         return [finding("parts_turned", size=size, at_s=at_s, turned_rad=turned_rad)]
     return []
+
+
+def _check_exchanged(motions: MotionPairs, stamps_ns: IntArray) -> Finding | None:
+    """Return the finding that parent and child are exchanged from some time on, or None.
+
+    One rotation R maps rotation vectors of the child to those of the parent. After an exchange it
+    maps those of the parent to those of the child. R is estimated for each possible time.
+    """
+    if len(motions) < MIN_PAIRS:
+        return None
+    of_parent = se3.rotation_log(se3.rotation_of(motions.Ts_parenti_parentj))
+    of_child = se3.rotation_log(se3.rotation_of(motions.Ts_childi_childj))
+    block_of = motions.i * _EXCHANGE_BLOCKS // len(stamps_ns)
+    products = of_parent[:, :, None] * of_child[:, None, :]
+    blocks = Blocks.gathered(products, block_of, _EXCHANGE_BLOCKS)
+    cuts = np.arange(1, _EXCHANGE_BLOCKS)
+    exchanged = blocks.before(cuts) + np.swapaxes(blocks.since(cuts), 1, 2)
+    rotations = se3.nearest_rotation(exchanged)
+    best = int(np.argmax((rotations * exchanged).sum(axis=(1, 2))))
+    is_after = (block_of >= cuts[best])[:, None]
+    first = np.where(is_after, of_child, of_parent)
+    second = np.where(is_after, of_parent, of_child)
+    R = se3.nearest_rotation(blocks.total)
+    as_given = np.linalg.norm(of_parent - of_child @ R.T, axis=1)
+    as_exchanged = np.linalg.norm(first - second @ rotations[best].T, axis=1)
+    usual_rad = quantile(as_exchanged, _EXCHANGE_QUANTILE)
+    angles = np.linalg.norm(of_parent, axis=1)
+    is_sound = usual_rad < _SOUND_PART * quantile(angles, _EXCHANGE_QUANTILE)
+    if not is_sound or usual_rad > _EXCHANGE_GAIN * quantile(as_given, _EXCHANGE_QUANTILE):
+        return None
+    row = cuts[best] * len(stamps_ns) // _EXCHANGE_BLOCKS
+    return finding("exchanged", at_s=float(stamps_ns[row] - stamps_ns[0]) * 1e-9)
 
 
 def _unexplained(motions: MotionPairs, X: FloatArray) -> float:

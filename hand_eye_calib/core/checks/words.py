@@ -322,10 +322,17 @@ WORDS = {
         "that moves",
         severity=Severity.WARNING,
     ),
+    "exchanged": FindingWords(
+        "the streams are exchanged about {at_s:.0f} s after the start: each has the motion of the "
+        "other sensor from there on",
+        "find out where their names or topics were mixed up, or calibrate the parts before and "
+        "after on their own",
+        "topics that were remapped, or files whose names were mixed up",
+    ),
     "parts_turned": FindingWords(
         "two parts of the recording are sound by themselves, and their rotations differ by {size}",
         "calibrate the parts before and after on their own",
-        "a source that started anew with other axes, or streams that were swapped",
+        "a source that started anew with other axes",
         code="mount_moved",
     ),
     "mount_moved": FindingWords(
