@@ -31,6 +31,8 @@ _FORMAT = "hand_eye_calib/extrinsic"
 _DESCRIPTIONS = (".urdf", ".xml", ".xacro")
 # Endings of results, and of files of other programs.
 _DOCUMENTS = (".yaml", ".yml", ".json", ".txt", ".calib")
+# Endings of the files of bags.
+_BAGS = (".bag", ".mcap", ".db3")
 # Description of a file with an extrinsic, for messages.
 _EXPECTED = (
     f"a calibration: extrinsic.yaml of this package, or a file of {', '.join(EXPORT_FORMATS)}; "
@@ -83,6 +85,8 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
         if isinstance(document, Mapping) and document.get("format") == _FORMAT:
             return partial(_of_result, load_result(path), path)
         find = partial(_find, document)
+    elif path.is_file() and path.suffix not in _BAGS:
+        raise InputError(f"{path}: unknown kind of file; expected {_EXPECTED}, or a bag")
     else:
         find = frames_of_bag(path).pose
     return partial(stated, find, str(path))

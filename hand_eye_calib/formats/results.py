@@ -27,7 +27,7 @@ from hand_eye_calib.formats.files import (
     write_atomically,
     writing,
 )
-from hand_eye_calib.formats.yaml_files import read_yaml, yaml_text
+from hand_eye_calib.formats.yaml_files import UnreadableYamlError, read_yaml, yaml_text
 
 FILE_NAME = "extrinsic.yaml"
 RIG_NAME = "rig.yaml"
@@ -256,7 +256,15 @@ def load_result(path: str | Path) -> Calibration:
         if not (path / FILE_NAME).exists():
             raise InputError(f"{path} has no {FILE_NAME}: name the folder of a result (--out)")
         path = path / FILE_NAME
-    document = read_yaml(path)
+    if path.suffix in (".urdf", ".xacro"):
+        raise InputError(
+            f"{path} is a robot description, not a saved result: pass it to compare RESULT --with "
+            f"{path.name}, or to --installed"
+        )
+    try:
+        document = read_yaml(path)
+    except UnreadableYamlError as error:
+        raise InputError(f"{error}; restore the file, or calibrate again") from None
     with located(path):
         return Calibration.from_dict(document)
 

@@ -73,6 +73,10 @@ def _whole_number(loader: Any, node: Any) -> int:
 _Loader.add_constructor("tag:yaml.org,2002:int", _whole_number)
 
 
+class UnreadableYamlError(InputError):
+    """A file that is not YAML, such as a damaged file."""
+
+
 def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
     """Read a YAML file.
 
@@ -95,8 +99,10 @@ def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
         return yaml.load(text, Loader=_Loader)
     # The loader raises errors of many types for values that do not fit their tags.
     except Exception as error:
-        reason = shortened(" ".join(str(error).split()), LONGEST_NAME // 2) or type(error).__name__
-        raise InputError(f"{path} is not readable YAML: {reason}") from None
+        # The parser names its source, which is always a text.
+        words = re.sub(r' in "<[a-z ]+>",', ",", " ".join(str(error).split()))
+        reason = shortened(words, LONGEST_NAME // 2) or type(error).__name__
+        raise UnreadableYamlError(f"{path} is not readable YAML: {reason}") from None
 
 
 def yaml_text(document: Any) -> str:

@@ -5,6 +5,7 @@ import textwrap
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
+from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -167,6 +168,10 @@ def _read_both(
     parent: TrajectoryLike, child: TrajectoryLike | None, topics: Mapping[str, str | None]
 ) -> Sequence[Trajectory]:
     """Return the trajectories of parent and child; without a child, ``parent`` is a bag."""
+    if parent is None:
+        raise InputError("the parent must be a trajectory, a file or a bag; got None")
+    if child is None and not isinstance(parent, str | PathLike):
+        raise InputError("a child is missing: pass two trajectories, or the path of a bag")
     if child is None:
         return _read_bag(path_of("a bag without a child", parent), topics)
     for stream, topic in topics.items():

@@ -65,7 +65,7 @@ def test_extrinsics_and_closure(rig, calibrated):
         calibrated.covariance_measured("front", "rear")
     )
     assert (np.linalg.solve(between, error) ** 2).sum() < 18.5
-    assert "front" in repr(calibrated)
+    assert "3 sensors" in repr(calibrated)
 
 
 def test_a_sensor_of_inverse_poses_is_named_and_closes(rig):

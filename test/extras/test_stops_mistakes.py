@@ -554,7 +554,10 @@ def test_stops_that_were_left_out_are_counted_and_named(place, count, severity, 
     (finding,) = result.findings
     assert (finding.code, finding.severity) == ("outliers", severity)
     assert finding.evidence == {"count": count, "n_stops": 40}
-    assert f"{count} of 40 stops do not fit the others and were left out: 1" in result.headline
+    assert (
+        f"{count} of 40 stops clearly do not fit the others and were left out: stop"
+        in result.headline
+    )
     assert result.verdict is verdict
     error = se3.log(se3.inverse(result.T_parent_child) @ truth)
     assert np.linalg.norm(error[:3]) < WITHIN_M

@@ -331,7 +331,7 @@ def test_files_and_python_speak_of_the_same(tmp_path):
     assert again.comparison.installed == "drawing"
     assert hec.compare([again], Extrinsic(X, "drawing")).moved == ("result 1",)
     json.dumps(again.to_dict()["comparison"], allow_nan=False)
-    with pytest.raises(InputError, match="2 different names"):
+    with pytest.raises(InputError, match="a appears twice"):
         compare([again, again], names=["a", "a"])
 
 
@@ -395,7 +395,7 @@ def test_json_has_it_all(saved, run):
     ("words", "code", "text"),
     [
         (["first"], 1, "two results or more"),
-        (["first", "first"], 1, "2 different names"),
+        (["first", "first"], 1, "first appears twice: name each result once"),
         (["first", "--with", "absent.urdf"], 2, "no file 'absent.urdf'"),
         (["absent", "first"], 1, "cannot read absent"),
         (["first", "--with", "1e400 0 0 0 0 0"], 2, "must be at most 1e+06 m; got '1e400'"),

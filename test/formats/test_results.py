@@ -335,15 +335,15 @@ def edited(**changes):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "hand_eye_calib/extrinsic, version 1 or 2; found format None, version None"),
-        ("- 1", "found format None, version None"),
-        (edited(version=3), "expected format .*, version 1 or 2; found .*, version 3"),
+        ("", "not a saved result: expected format hand_eye_calib/extrinsic"),
+        ("- 1", "not a saved result"),
+        (edited(version=3), "expected format .*, version 1 or 2; found version 3: read it"),
         (edited(format="urdf"), "found format urdf"),
         (edited(T_parent_child={}), "the calibration has no 'matrix'"),
         (edited(T_parent_child={"matrix": [[1.0, 0.0]]}), "was changed after it was written"),
         (edited(status="splendid"), "was changed after it was written: 'splendid'"),
         (edited(warnings=None), "was changed after it was written"),
-        ("a: [1", "is not readable YAML"),
+        ("a: [1", "is not readable YAML: .*; restore the file, or calibrate again"),
     ],
 )
 def test_what_is_no_calibration_is_refused_with_the_file(tmp_path, text, message):

@@ -1,12 +1,15 @@
 """Wrong inputs: each is answered by one line that names the cause, with the right exit code."""
 
+import gzip
 import shlex
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+import hand_eye_calib as hec
 from hand_eye_calib.formats.files import local_path
 
 # Exit code, command, and a part of the answer.
@@ -24,7 +27,7 @@ TABLE = """
 1 | calibrate few.tum camera.tum | 10 synchronised pose pairs are needed, found 3
 1 | calibrate words.tum camera.tum | words.tum: no column for x, y, z, qx, qy, qz, qw
 1 | calibrate binary.tum camera.tum | binary.tum: not a text file
-1 | calibrate html.tum camera.tum | html.tum: it is XML of an unsupported kind
+1 | calibrate html.tum camera.tum | html.tum: it is a web page, perhaps of a sign-in
 1 | calibrate short.tum camera.tum | name the 7 with --columns
 1 | calibrate quat2.tum camera.tum | line 1: found a quaternion of length 2
 1 | calibrate zeroq.tum camera.tum | all 600 rows are empty, zero or not finite
@@ -49,13 +52,13 @@ TABLE = """
 2 | calibrate drive.mcap --child-fields t=x | --child-fields needs --child-topic
 2 | calibrate drive.mcap --stamps now | invalid choice: 'now' (choose from
 2 | calibrate lidar.tum camera.tum --stamps receive | --stamps applies to bags only
-2 | calibrate lidar.tum camera.tum --max-gap fast | --max-gap: must be a number; got 'fast'
+2 | calibrate lidar.tum camera.tum --max-gap fast | --max-gap: must be a number in s; got 'fast'
 2 | calibrate lidar.tum camera.tum --max-gap -1 | --max-gap: must be at least 0.001 s; got -1.0
 2 | calibrate lidar.tum camera.tum --max-gap nan | --max-gap: must be a finite number; got nan
 2 | calibrate lidar.tum camera.tum --max-gab 1 | did you mean --max-gap?
 2 | calibrate lidar.tum camera.tum --method best | --method: must be one of auto, dnlo
 2 | calibrate lidar.tum camera.tum --reference D5 | must be auto, A, B<n> such as B5
-2 | calibrate lidar.tum camera.tum --time-offset yes | must be estimate or a number; got 'yes'
+2 | calibrate lidar.tum camera.tum --time-offset yes | must be estimate or a number in s; got 'yes'
 2 | calibrate lidar.tum camera.tum --scale 0 | --scale: must be at least
 2 | calibrate lidar.tum camera.tum --prior z=1.85 | with its standard deviation; got '1.85'
 2 | calibrate lidar.tum camera.tum --prior h=1+/-0.1 | AXIS one of x, y, z, roll, pitch, yaw
@@ -69,7 +72,7 @@ TABLE = """
 1 | calibrate lidar.tum camera.tum --config bad.yaml | bad.yaml is not readable YAML
 2 | calibrate lidar.tum camera.tum --config list.yaml | expected a mapping of options to values
 2 | calibrate lidar.tum camera.tum --config typo.yaml | 'max_gapp'; did you mean 'max_gap'?
-2 | calibrate lidar.tum camera.tum --config value.yaml | 'max_gap' must be a number; got 'fast'
+2 | calibrate lidar.tum camera.tum --config value.yaml | 'max_gap' must be a number in s; got 'fast'
 2 | calibrate lidar.tum camera.tum --config other.yaml | the file has those of /talker
 1 | calibrate lidar.tum camera.tum --out junk.db3 --method park | cannot write junk
 2 | calibrate lidar.tum camera.tum --label vehicle | expected NAME=VALUE, such as vehicle=7
@@ -77,7 +80,7 @@ TABLE = """
 1 | calibrate lidar.tum camera.tum --parent-frame a --child-frame a | both streams name 'a'
 2 | calibrate lidar.tum camera.tum --format kity | invalid choice: 'kity' (choose from 'tum'
 1 | calibrate lidar.tum camera.tum --columns t,x | no column for y, z, qx, qy, qz, qw among t, x
-1 | calibrate lidar.tum camera.tum --pair-by row | found [600, 1200]
+1 | calibrate lidar.tum camera.tum --pair-by row | 1,200 in camera.tum: write a row
 1 | calibrate lidar.tum camera.tum --pair-by name | pair by time or row
 2 | calibrate lidar.tum camera.tum --stamp-unit h | choose from 's', 'ms', 'us', 'ns'
 2 | calibrate lidar.tum camera.tum --parent-quaternion zyxw | must be one of xyzw, wxyz, yzwx
@@ -90,11 +93,39 @@ TABLE = """
 2 | calibrate lidar.tum camera.tum --target charuco:5x7 | --target and --camera go together
 1 | calibrate samples.yaml | samples.yaml: expected samples of an arm
 1 | calibrate samples.npz | cannot read samples.npz: File is not a zip file
-1 | arm lidar.tum camera.tum | found [600, 1200]
+1 | arm lidar.tum camera.tum | or calibrate streams with stamps by time
 2 | arm sample:arm.yaml --setup both | invalid choice: 'both' (choose from 'hand', 'beside')
 1 | rig lidar.tum camera.tum empty.tum | empty.tum: the file contains no poses
 1 | rig drive.mcap --topics /lidar/odometry /camera/odometry /x | no topic /x in drive.mcap
-2 | batch folder | no bag matches folder/**
+1 | calibrate upper.csv camera.tum | upper.csv: it is a web page
+1 | calibrate letter.tum camera.tum | letter.tum: it is a document of a word processor
+1 | calibrate packed.tum camera.tum | packed.tum: it is a .zip archive or a spreadsheet; unpack it
+1 | calibrate packed.gz camera.tum | packed.gz: it is compressed; unpack it with gunzip
+1 | calibrate map.kml camera.tum | it is XML of an unsupported kind
+2 | calibrate lidar.tum camera.tum --parent-topic /a | --parent-topic applies to bags only
+2 | calibrate lidar.tum camera.tum --prior z=1,85+/-0.02 | z must be numbers in m or cm or mm
+2 | calibrate lidar.tum camera.tum --stamp-unit nss | did you mean ns?
+2 | calibrate lidar.tum camera.tum --target-translation far | must be numbers in m or cm or mm
+1 | calibrate drive.mcap --parent-topic /cam --child-topic /lidar/odometry | no topic /cam in
+2 | arm lidar.tum | lidar.tum contains no samples of an arm: expected a file that ends in
+2 | arm folder | folder contains no samples of an arm
+2 | arm lidar.tum lidar.tum | appears twice
+2 | arm lidar.tum camera.tum --parent-angles kuca | did you mean kuka?
+2 | arm sample:arm.yaml --setup besides | did you mean beside?
+2 | batch folder | no bag matches folder/**: expected folders with a metadata.yaml
+2 | batch lidar*.tumx | for trajectory files, use calibrate PARENT CHILD
+2 | check lidar.tum camera.tum --child-topic /a | --child-topic applies to bags only
+1 | info robot.urdf | robot.urdf is a robot description, not a saved result
+1 | info lidar.tum | not a saved result: expected format
+1 | info torn.yaml | torn.yaml is not readable YAML
+1 | compare torn.yaml --with robot.urdf | restore the file, or calibrate again
+1 | compare saved | or one and the installed transform (--with
+1 | compare saved saved | saved appears twice: name each result once
+1 | compare saved --with lidar.tum | lidar.tum: unknown kind of file; expected a calibration
+1 | compare saved --with robot.urdf | in the robot description; it has no transforms
+2 | compare saved --with "1 2 3 4 5" | expected a URDF, extrinsic.yaml, a bag, or X Y Z
+2 | export saved urdff | did you mean urdf?
+2 | simulate --out new --drive hily | did you mean hilly?
 2 | check | expected one bag or two trajectory files; got 0
 2 | check drive.mcap camera.tum | drive.mcap is a bag, and another path is not
 1 | info absent | cannot read absent: No such file or directory
@@ -114,6 +145,12 @@ TEXTS = {
     "one.tum": "0 0 0 0 0 0 0 1\n",
     "words.tum": "hello world\nthis is text\n",
     "html.tum": "<html><body>404</body></html>\n",
+    "upper.csv": "\n<!DOCTYPE HTML><HTML></HTML>\n",
+    "letter.tum": "{\\rtf1\\ansi\n0 0 0 0 0 0 0 1\n",
+    "packed.tum": "PK\x03\x04" + "0" * 20,
+    "map.kml": "<kml></kml>\n",
+    "torn.yaml": "format: {a: 1,\n",
+    "robot.urdf": "<robot name='r'><link name='a'/></robot>",
     "nohead.csv": "0,1,2,3\n1,2,3,4\n",
     "kitti.txt": "1 0 0 0 0 1 0 0 0 0 1 0\n" * 20,
     "times.txt": "0\n1\n",
@@ -141,6 +178,9 @@ def inputs(tmp_path_factory):
     (folder / "binary.tum").write_bytes(bytes(range(256)) * 10)
     (folder / "image.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     (folder / "cut.mcap").write_bytes((folder / "drive.mcap").read_bytes()[:3000])
+    (folder / "packed.gz").write_bytes(gzip.compress(b"0 0 0 0 0 0 0 1\n"))
+    lidar, camera = (hec.read_trajectory(f"sample:{name}.tum") for name in ("lidar", "camera"))
+    hec.save(hec.calibrate(lidar, camera), folder / "saved")
     write_poses(folder)
     return folder
 
@@ -200,3 +240,79 @@ def test_an_option_of_dnlo_has_a_note_with_another_method(run):
 def test_a_folder_may_be_called_sample():
     assert local_path("sample") == Path("sample")
     assert local_path("sample/lidar.tum") == Path("sample/lidar.tum")
+
+
+# ---- Python: an error of the package, which names the argument and what to pass
+
+SAMPLES = hec.read_arm_samples("sample:arm.yaml")
+LIDAR = hec.read_trajectory("sample:lidar.tum")
+IN_PYTHON = {
+    "no child": (lambda: hec.calibrate(LIDAR), "a child is missing: pass two trajectories"),
+    "no parent": (lambda: hec.calibrate(None, LIDAR), "the parent must be a trajectory"),
+    "stamps in seconds": (
+        lambda: hec.Trajectory(LIDAR.stamps_ns / 1e9, LIDAR.poses),
+        "multiply seconds by 1e9 and round them",
+    ),
+    "a number as prior": (
+        lambda: hec.CalibratorConfig(prior_z=1.85),
+        "prior.z must be a text with its standard deviation, such as '1.85",
+    ),
+    "a text as target": (
+        lambda: hec.CalibratorConfig(target_translation="two"),
+        "target.translation must be a number in m; got 'two'",
+    ),
+    "names as text": (
+        lambda: hec.calibrate_arm(SAMPLES.robot, SAMPLES.tracking, names="abc"),
+        "names must be of type Mapping; got str",
+    ),
+    "words as poses": (lambda: hec.robot_poses("abc", "kuka"), "rows must be numbers; got str"),
+    "a misspelt robot": (lambda: hec.robot_poses([[0.0] * 6], "kuca"), "did you mean kuka?"),
+    "files as poses": (
+        lambda: hec.calibrate_arm("hand.tum", "camera.tum"),
+        "robot: expected poses, not a path; read_arm_samples",
+    ),
+    "one result": (
+        lambda: hec.compare([hec.calibrate(LIDAR, hec.read_trajectory("sample:camera.tum"))]),
+        "or one and the installed transform",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", IN_PYTHON)
+def test_a_wrong_argument_in_python_is_answered_in_one_line(name):
+    call, message = IN_PYTHON[name]
+    with pytest.raises(hec.HandEyeCalibError) as caught:
+        call()
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_topic_that_another_sensor_has_is_not_proposed(run, inputs, monkeypatch):
+    monkeypatch.chdir(inputs)
+    topics = ["--parent-topic", "/lidr/odometry", "--child-topic", "/lidar/odometry"]
+    _, _, err = run("calibrate", "drive.mcap", *topics)
+    assert "no topic /lidr/odometry in drive.mcap" in err
+    assert "did you mean /lidar/odometry" not in err
+
+
+def test_an_option_of_the_second_file_is_named_and_obeyed(run, tmp_path):
+    stops = SAMPLES.robot
+    degrees = Rotation.from_matrix(stops[:, :3, :3]).as_euler("ZYX", degrees=True)
+    np.savetxt(tmp_path / "hand.txt", np.c_[stops[:, :3, 3], degrees])
+    child = Rotation.from_matrix(np.linalg.inv(SAMPLES.tracking)[:, :3, :3]).as_quat()
+    rows = np.c_[np.linalg.inv(SAMPLES.tracking)[:, :3, 3], child]
+    header = "x,y,z,qx,qy,qz,qw"
+    np.savetxt(tmp_path / "camera.csv", rows, delimiter=",", header=header, comments="")
+    paths = [str(tmp_path / name) for name in ("hand.txt", "camera.csv")]
+    _, _, err = run("arm", *paths, "--parent-angles", "kuka")
+    assert "camera.csv is read as format csv; to change this, set --child-format" in err
+    columns = ["--child-columns", "x,y,z,qx,qy,qz,q"]
+    code, _, err = run("arm", *paths, "--parent-angles", "kuka", *columns)
+    assert (code, "no column for qw" in err) == (1, True)
+
+
+def test_a_pattern_that_fits_no_recording_is_named(run, inputs, monkeypatch):
+    monkeypatch.chdir(inputs)
+    shutil.copy("drive.mcap", "drive2.mcap")
+    _, _, err = run("batch", "drive.mcap", "drive2.mcap", "--vehicle", "{vehicle}/*/x")
+    assert "--vehicle '{vehicle}/*/x' fits none of their paths; set it to" in err

@@ -285,7 +285,10 @@ def solved():
             lambda _: hec.calibrate(PARENT, CHILD, checks="no"),
             "checks must be of type bool; got str",
         ),
-        (lambda _: hec.calibrate(PARENT, CHILD, max_gap=[1]), "max_gap must be a number; got [1]"),
+        (
+            lambda _: hec.calibrate(PARENT, CHILD, max_gap=[1]),
+            "max_gap must be a number in s; got [1]",
+        ),
         (lambda _: hec.save(3, "out"), "the result must be of type Calibration; got int"),
         (lambda result: hec.save(result, 3), "directory must be of type str or PathLike; got int"),
         (lambda _: hec.load(None), "path must be of type str or PathLike; got NoneType"),

@@ -1,5 +1,6 @@
 """Comparison of results with the installed extrinsic, or with each other."""
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import combinations
@@ -72,7 +73,10 @@ def compare(
     if installed is not None:
         couples = [(("installed", installed), named) for named in by_name.items()]
     if not couples:
-        raise InputError("expected two results or more, or one and what is installed")
+        raise InputError(
+            "expected two results or more, or one and the installed transform (--with, in Python "
+            "installed)"
+        )
     differences = tuple(_difference(*couple) for couple in couples)
     verdict = Change.of_all([Change(difference.verdict) for difference in differences]).value
     moved_names = tuple(
@@ -99,7 +103,8 @@ def _by_name(results: Sequence[Calibration], names: Sequence[str] | None) -> dic
         names = [f"result {number}" for number in range(1, len(results) + 1)]
     by_name = dict(zip(names, results, strict=False))
     if len(by_name) < len(results):
-        raise InputError(f"expected {len(results)} different names, found {len(by_name)}")
+        twice = next(name for name, count in Counter(names).items() if count > 1)
+        raise InputError(f"{twice} appears twice: name each result once")
     return by_name
 
 

@@ -106,6 +106,11 @@ def check_value(field: OptionField, value: object) -> OptionValue:
         value = _as_float(value, has_words=bool(words))
     if type(value) is not kind or not isinstance(value, bool | int | float):
         expected = f"{' or '.join(words)} or a number" if words else _TYPE_NAMES[kind]
+        unit = field.metadata["unit"]
+        if name.startswith("prior."):
+            expected += " with its standard deviation, such as '1.85+/-0.02'"
+        elif unit:
+            expected += f" in {unit}"
         raise ConfigError(
             f"{name} must be {expected}; got {shown_value(value)}{did_you_mean(str(value), words)}"
         )

@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import (
     FARTHEST_M,
     QUATERNION_NORM_TOLERANCE,
+    Trajectory,
     far_position,
 )
 
@@ -149,6 +151,12 @@ def pose_stack(values: Any, label: str) -> FloatArray:
     InputError
         If a pose is invalid; the message names its row, counted from 1.
     """
+    if isinstance(values, str | PathLike):
+        raise InputError(
+            f"{label}: expected poses, not a path; read_arm_samples and read_trajectory read files"
+        )
+    if isinstance(values, Trajectory):
+        values = values.poses
     pair = _pair_of_stacks(values)
     Ts = _joined(*pair, label) if pair else _single_stack(values, label)
     is_finite = np.isfinite(Ts).all(axis=(1, 2))
@@ -469,4 +477,4 @@ class FrameTree:
         edges.sort()
         if len(edges) > _MAX_LISTED:
             edges[_MAX_LISTED:] = [f"and {len(edges) - _MAX_LISTED} more"]
-        return f"it has {', '.join(edges) or 'none'}"
+        return f"it has {', '.join(edges) or 'no transforms'}"

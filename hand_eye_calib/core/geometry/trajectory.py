@@ -172,9 +172,11 @@ class Trajectory(Columns):
         stamps_ns = np.ascontiguousarray(self.stamps_ns)
         poses = np.ascontiguousarray(floats("poses", self.poses))
         if stamps_ns.ndim != 1 or not np.issubdtype(stamps_ns.dtype, np.integer):
+            is_float = np.issubdtype(stamps_ns.dtype, np.floating)
+            hint = ": multiply seconds by 1e9 and round them" if is_float else ""
             raise InputError(
                 "stamps_ns must be one-dimensional integers (nanoseconds); "
-                f"found shape {stamps_ns.shape} of {stamps_ns.dtype}"
+                f"found shape {stamps_ns.shape} of {stamps_ns.dtype}{hint}"
             )
         if poses.shape != (len(stamps_ns), 4, 4):
             raise InputError(

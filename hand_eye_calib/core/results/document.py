@@ -223,6 +223,14 @@ def matrix_of(of: str, frame: str, matrix: FloatArray) -> Document:
     return {"of": of, "frame": frame, "units": "m, rad", "matrix": matrix}
 
 
+def _inliers_in_words(result: Result) -> dict[str, str]:
+    """Return the number of inliers as text, with its name: motion pairs, or stops of an arm."""
+    counts = f"{result.n_inliers:,} of {result.n_pairs:,}"
+    if result.reference == "stops":
+        return {"Stops": f"{counts} have more than half of the full weight"}
+    return {"Motion pairs": f"{counts} are inliers"}
+
+
 def summary(result: Result) -> dict[str, str]:
     """Return how a result was solved: names of quantities, and their values as text."""
     rate = result.clock_rate
@@ -235,7 +243,7 @@ def summary(result: Result) -> dict[str, str]:
         "Method": method,
         "Reference": result.reference_reason or result.reference,
         "Poses": f"{result.n_poses:,}",
-        "Motion pairs": f"{result.n_inliers:,} of {result.n_pairs:,} are inliers",
+        **_inliers_in_words(result),
         "Objective": f"{result.objective:.6g}",
         "Time offset": given_or_estimated(offset, result.time_offset_sigma_s, "s"),
         "Scale": given_or_estimated(result.scale, result.scale_sigma, ""),
@@ -402,10 +410,16 @@ def result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
     is_document = isinstance(data, Mapping)
     form = data.get("format") if is_document else None
     version = data.get("version") if is_document else None
-    if form != _FORMAT or version not in _READABLE:
+    if form != _FORMAT:
+        found = f"; found format {form}" if form else ""
         raise InputError(
-            f"expected format {_FORMAT}, version {_READABLE[0]} or {_READABLE[1]}; "
-            f"found format {form}, version {version}"
+            f"not a saved result: expected format {_FORMAT}, as in extrinsic.yaml that --out "
+            f"writes{found}"
+        )
+    if version not in _READABLE:
+        raise InputError(
+            f"expected format {_FORMAT}, version {_READABLE[0]} or {_READABLE[1]}; found version "
+            f"{version}: read it with the release that wrote it, or calibrate again"
         )
     try:
         return _result_from(of, _measured_parts(data))

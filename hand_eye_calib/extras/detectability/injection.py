@@ -236,5 +236,9 @@ def _smallest_shifts(blocks: Blocks, R: FloatArray) -> FloatArray:
     mixed = (S[:, :, None] * weighted).sum(axis=1)
     # squares a^2 +- 2 mixed a = threshold
     roots = np.sqrt(np.maximum(mixed**2 + squares * threshold[:, None], 0.0))
-    sizes = np.concatenate([roots - mixed, roots + mixed]) / np.concatenate([squares, squares])
+    distances = np.concatenate([roots - mixed, roots + mixed])
+    curvatures = np.concatenate([squares, squares])
+    # Without motion, no shift along an axis changes the score: its size is unlimited.
+    sizes = np.full_like(distances, np.inf)
+    np.divide(distances, curvatures, out=sizes, where=curvatures > 0.0)
     return _LOSS_OF_WEIGHT * np.asarray(np.quantile(np.maximum(sizes, 0.0), FOUND_SHARE, axis=0))

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.plain import json_text
-from hand_eye_calib.core.base.text import counted, listing
+from hand_eye_calib.core.base.text import counted, listing, shown_value
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
 from hand_eye_calib.extras.fleet import work
 from hand_eye_calib.extras.fleet.records import is_in_headline
@@ -64,10 +64,12 @@ def run_batch(arguments: argparse.Namespace) -> int:
     alone = [outcome for outcome in done if outcome.row["verdict"] and not outcome.row["vehicle"]]
     n_alone = len(alone)
     if n_alone > 1:
+        why = "set --vehicle to"
+        if arguments.vehicle:
+            why = f"--vehicle {shown_value(arguments.vehicle)} fits none of their paths; set it to"
         note(
-            f"{n_alone} recordings are not compared with each other: set "
-            "--vehicle to the position of the vehicle in their paths, such "
-            "as 'fleet/{vehicle}/*'"
+            f"{n_alone} recordings are not compared with each other: {why} the position of the "
+            "vehicle in their paths, such as 'fleet/{vehicle}/*'"
         )
     codes = [outcome.code for outcome in done]
     codes += [exit_code(result) for result in vehicles.values()]

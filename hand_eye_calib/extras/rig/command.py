@@ -11,7 +11,7 @@ from hand_eye_calib.offline.cli.options import (
     note,
     options_from,
     print_result,
-    refuse_stamps,
+    refuse_options_of_bags,
     waiting_for,
 )
 from hand_eye_calib.offline.cli.present import (
@@ -109,7 +109,7 @@ def _read_topics(arguments: argparse.Namespace) -> _Readings:
 
 def _read_files(arguments: argparse.Namespace) -> _Readings:
     """Read the trajectories of a rig from a file for each sensor."""
-    refuse_stamps(arguments)
+    refuse_options_of_bags(arguments)
     names = [*map(str, arguments.paths)]
     files = read_files(arguments, arguments.paths, {})
     note(*files.repairs)
@@ -135,7 +135,7 @@ def as_lines(rig: "RigCalibration", with_details: bool = False) -> list[str]:
 
     With details, the quaternion and a summary of each result are added.
     """
-    lines = [f"{rig.verdict.value}: {len(rig.sensors)} sensors", ""]
+    lines = [rig.headline, ""]
     for calibration in rig.calibrations:
         first, *others = verdict_lines(calibration)
         lines += [f"{calibration.child_frame} in {calibration.parent_frame}: {first}", *others]

@@ -292,8 +292,18 @@ class RigCalibration:
                 calibrations[k] = replace(calibrations[k], findings=findings)
         return replace(self, calibrations=tuple(calibrations))
 
+    @property
+    def headline(self) -> str:
+        """The verdict, and the names of its sensors if other sensors have a better verdict."""
+        results = self.calibrations
+        gravest = [result.child_frame for result in results if result.verdict is self.verdict]
+        of_sensors = f"{len(self.sensors)} sensors"
+        if len(gravest) < len(results):
+            of_sensors = f"{listing(gravest)} of {of_sensors}"
+        return f"{self.verdict.value}: {of_sensors}"
+
     def __repr__(self) -> str:
-        return f"{self.verdict.value}: {listing(self.sensors)}"
+        return self.headline
 
     def with_warnings(self, warnings: Sequence[str]) -> RigCalibration:
         """Return the rig with these warnings added to each extrinsic."""

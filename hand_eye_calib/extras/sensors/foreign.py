@@ -519,6 +519,11 @@ def _of_echo(data: bytes, _: str | None) -> _Rows:
 PROGRAMS: dict[bytes, _Reader | str] = {
     rb"\Asource_timestamp,destination_timestamp": "motions between images, no poses; chain them",
     rb"<gpx[\s>]": _of_gpx,
+    rb"(?i)\A\s*<(!doctype html|html)": "it is a web page, perhaps of a sign-in or an error; "
+    "download the file itself",
+    rb"\A\{\\rtf": "it is a document of a word processor; save it as plain text",
+    rb"\APK\x03\x04": "it is a .zip archive or a spreadsheet; unpack it, or save it as csv",
+    rb"\A\x1f\x8b": "it is compressed; unpack it with gunzip",
     rb"\A<": "it is XML of an unsupported kind; export the track as GPX, or poses as csv",
     rb"\AFMT, \d": "it is a log of ArduPilot; export positions and attitudes as "
     "csv, or record a bag",

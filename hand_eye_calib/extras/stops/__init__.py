@@ -73,6 +73,12 @@ def _are_stops(arguments: Any) -> bool:
         raise ConfigError("--target and --camera go together: a target and a camera's intrinsics")
     are_samples = len(arguments.paths) == 1 and _has_samples(arguments.paths[0])
     are_stops = are_samples or are_images or arguments.order == "none"
+    if arguments.command == "arm" and not (are_stops or arguments.child_topic):
+        raise ConfigError(
+            f"{arguments.paths[0]} contains no samples of an arm: expected a file that ends in "
+            f"{', '.join(sorted(_SAMPLES))}, a folder with files such as robot_1.txt and "
+            "target_1.txt, or two files with a row for each stop"
+        )
     is_arm = are_samples or are_images
     has_hand_file = are_stops and not are_samples
     _refuse_without_arm(arguments, is_arm, has_hand_file)
@@ -101,10 +107,10 @@ def _has_samples(path: Any) -> bool:
 
 def _calibrate(arguments: Any, _: Any) -> int:
     from hand_eye_calib.extras.stops import command as stops
-    from hand_eye_calib.offline.cli.options import refuse_stamps
+    from hand_eye_calib.offline.cli.options import refuse_options_of_bags
     from hand_eye_calib.offline.cli.present import deliver
 
-    refuse_stamps(arguments)
+    refuse_options_of_bags(arguments)
     return deliver(*stops.solved(arguments), arguments)
 
 

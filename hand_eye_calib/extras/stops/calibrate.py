@@ -10,7 +10,12 @@ from hand_eye_calib.core.assessment.covariance import UNKNOWN_SIGMAS, combined
 from hand_eye_calib.core.assessment.prior import fuse
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
-from hand_eye_calib.core.base.errors import ConfigError, InputError, NotEnoughDataError
+from hand_eye_calib.core.base.errors import (
+    ConfigError,
+    InputError,
+    NotEnoughDataError,
+    require_type,
+)
 from hand_eye_calib.core.base.option import option_name
 from hand_eye_calib.core.base.text import listing, shown_value
 from hand_eye_calib.core.checks.findings import Finding, Severity, finding
@@ -165,6 +170,8 @@ def calibrate_arm(
     config = _checked(config)
     if setup is not None and setup not in SETUPS:
         raise ConfigError(f"setup must be one of {', '.join(SETUPS)}; got {shown_value(setup)}")
+    if names is not None:
+        require_type("names", names, Mapping)
     named = {name: name for name in ("base", "hand", "camera", "target")}
     named |= names or {}
     poses = _checked_poses({"robot": robot, "tracking": tracking}, config, is_arm=True)
@@ -320,7 +327,7 @@ def _check_left_out(fit: RobotWorld, stops: Stops) -> list[Finding]:
             severity=Severity.WARNING if is_large else Severity.NOTE,
             count=count,
             n_stops=len(stops),
-            numbers=listing(numbers),
+            numbers=f"{'stop' if count == 1 else 'stops'} {listing(numbers)}",
         )
     ]
 

@@ -29,7 +29,7 @@ from hand_eye_calib.offline.cli.options import (
     options_from,
     with_progress,
 )
-from hand_eye_calib.offline.cli.reading import read_files
+from hand_eye_calib.offline.cli.reading import read_files, refuse_repeated_paths
 
 
 def solved(arguments: Namespace) -> tuple[Calibration, Document]:
@@ -52,6 +52,7 @@ def solved(arguments: Namespace) -> tuple[Calibration, Document]:
         return result, {"samples": _input(paths[0], len(samples.robot))}
     if len(paths) != 2:
         raise ConfigError("--order none takes two trajectory files, or the samples of an arm")
+    refuse_repeated_paths(paths)
     arguments.pair_by = arguments.pair_by or "row"
     if arguments.target:
         return _from_images(arguments, config, options)
@@ -64,7 +65,7 @@ def _from_two_files(
     """Calibrate two sensors from two files whose rows belong together."""
     if arguments.parent_angles:
         parent = _robot(arguments)
-        (child,) = _read(arguments, arguments.paths[1:], options)
+        (child,) = _read(arguments, arguments.paths[1:], options, STREAMS[1:])
     else:
         parent, child = _read(arguments, arguments.paths, options)
     _require_equal(arguments.paths, len(parent), len(child))
@@ -101,10 +102,13 @@ def _from_images(
 
 
 def _read(
-    arguments: Namespace, paths: Sequence[str | Path], options: Options
+    arguments: Namespace,
+    paths: Sequence[str | Path],
+    options: Options,
+    streams: Sequence[str] = STREAMS,
 ) -> Sequence[Trajectory]:
-    """Read trajectory files, and print their repairs and warnings."""
-    files = read_files(arguments, paths, options)
+    """Read the trajectory files of streams, and print their repairs and warnings."""
+    files = read_files(arguments, paths, options, streams)
     note(*files.repairs, *files.warnings)
     return files.trajectories
 

@@ -24,8 +24,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.arrays import FloatArray, floats
 from hand_eye_calib.core.base.errors import ConfigError, InputError, located
+from hand_eye_calib.core.base.option import did_you_mean
 from hand_eye_calib.core.base.text import shown_value
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import pose_stack
@@ -61,8 +62,11 @@ def robot_poses(rows: Any, robot: str) -> FloatArray:
     (1, 4, 4)
     """
     if robot not in ROBOTS:
-        raise ConfigError(f"the robot must be one of {', '.join(ROBOTS)}; got {shown_value(robot)}")
-    values = np.atleast_2d(np.asarray(rows, dtype=float))
+        hint = did_you_mean(str(robot), ROBOTS)
+        raise ConfigError(
+            f"the robot must be one of {', '.join(ROBOTS)}; got {shown_value(robot)}{hint}"
+        )
+    values = np.atleast_2d(floats("rows", rows))
     n_values = 7 if robot == "abb" else 6
     if values.ndim != 2 or values.shape[1] != n_values:
         raise InputError(f"a pose of {robot} has {n_values} numbers; found {values.shape[-1]}")

@@ -106,7 +106,8 @@ class StopsPart(Part):
 
     def facts(self, value: StopTable, result: Any) -> list[str]:
         """Return a line with the residual of each stop."""
-        return [f"residuals of the stops: {'; '.join(map(_row_in_words, value.rows))}"]
+        rows = "; ".join(map(_row_in_words, value.rows))
+        return [f"residuals of the stops (left out: weight 0): {rows}"]
 
 
 def _row_in_words(row: Stop) -> str:

@@ -110,8 +110,5 @@ class WorldsPart(Part):
         return {"T_world_world": transform}
 
     def headline(self, value: Worlds) -> str:
-        """Return the place of the camera and the option for the other one; empty without arm."""
-        if value.setup not in SETUPS:
-            return ""
-        other = "beside" if value.setup == "hand" else "hand"
-        return f"camera {SETUPS[value.setup]} (--setup {other} if it is {SETUPS[other]})"
+        """Return the place of the camera; empty without arm."""
+        return f"camera {SETUPS[value.setup]}" if value.setup in SETUPS else ""

@@ -29,7 +29,11 @@ def matching(pattern: str) -> list[str]:
             pattern = str(Path(pattern) / "**")
         paths = _local_bags(pattern)
     if not paths:
-        raise ConfigError(f"no bag matches {pattern}")
+        raise ConfigError(
+            f"no bag matches {pattern}: expected folders with a metadata.yaml, or files that end "
+            f"in {', '.join(_SUFFIXES)}; for trajectory files, use calibrate PARENT CHILD, or "
+            "calibrate_many in Python"
+        )
     return paths
 
 

@@ -161,8 +161,10 @@ class PoseBag:
             raise ConfigError(f"{source} measures {usual}; asked for are {wanted}")
         return wanted
 
-    def check(self, source: Source) -> None:
+    def check(self, source: Source, taken: Sequence[Source] = ()) -> None:
         """Raise InputError if a source cannot be read; the message lists the topics of the bag.
+
+        ``taken`` are the sources of other sensors, which the message does not propose.
 
         These are topics that are not in the bag or have no poses, and frames in a bag without
         transforms.
@@ -175,7 +177,10 @@ class PoseBag:
         topics = self._parts_of(topic)
         for name in topics:
             if name not in self.topics:
-                hint = did_you_mean(name, self.topics) or "."
+                hint = (
+                    did_you_mean(name, [topic for topic in self.topics if topic not in taken])
+                    or "."
+                )
                 raise InputError(f"no topic {name} in {self}{hint} {self._listing()}")
         if len(topics) > 1:
             self.measured(topics[0], "positions")
@@ -229,7 +234,7 @@ class PoseBag:
         """
         named = [source for source in (parent, child) if source]
         for source in named:
-            self.check(source)
+            self.check(source, named)
         if len(named) == 2 and parent == child:
             raise InputError(
                 f"parent and child topic are both {parent}; name two topics. {self._listing()}"

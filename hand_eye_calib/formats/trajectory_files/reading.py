@@ -20,7 +20,13 @@ from hand_eye_calib.core.base.arrays import IntArray
 from hand_eye_calib.core.base.config import PAIR_BY, STAMP_UNITS, TRAJECTORY_FORMATS
 from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.base.registry import FILE_READERS
-from hand_eye_calib.core.base.text import MUCH_NULL, distinct_names, shortened, without_poses
+from hand_eye_calib.core.base.text import (
+    MUCH_NULL,
+    distinct_names,
+    listing,
+    shortened,
+    without_poses,
+)
 from hand_eye_calib.core.geometry.trajectory import Trajectory, TrajectoryLike
 from hand_eye_calib.formats.files import LONGEST_NAME, decoded, local_path, read_bytes, read_text
 from hand_eye_calib.formats.trajectory_files.columns import (
@@ -365,8 +371,10 @@ def _rows_without_stamps(tables: Sequence[Table], pair_by: str) -> list[IntArray
     """
     n_rows = [table.n_rows for table in tables]
     if pair_by == "row" and len({*n_rows}) > 1:
+        counts = listing([f"{table.n_rows:,} in {table.path}" for table in tables])
         raise InputError(
-            f"pairing by row needs files with the same number of poses; found {n_rows}"
+            f"pairing by row needs as many poses in each file; found {counts}: write a row for "
+            "each stop into both, or calibrate streams with stamps by time"
         )
     # Index of the pose with each name, or from each row of the file.
     indices: list[dict[Any, int]] = []

@@ -172,7 +172,7 @@ def _run_locally(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int
     if not are_bags:
         if len(paths) != len(options.STREAMS):
             raise ConfigError(f"expected the trajectory files of two sensors; got {len(paths)}")
-        options.refuse_stamps(arguments)
+        options.refuse_options_of_bags(arguments)
         recording = reading.read_pair(arguments, settings)
     else:
         from hand_eye_calib.offline.cli import bags

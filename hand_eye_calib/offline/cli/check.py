@@ -120,7 +120,7 @@ def _read_streams(arguments: argparse.Namespace, settings: Mapping[str, Any]) ->
     if len(paths) != (1 if is_bag else 2):
         raise ConfigError(f"expected one bag or two trajectory files; got {len(paths)}")
     if not is_bag:
-        options.refuse_stamps(arguments)
+        options.refuse_options_of_bags(arguments)
         names = dict(zip(STREAMS, map(str, paths), strict=True))
         files = reading.read_files(arguments, paths, settings)
         note(*files.warnings)

@@ -7,6 +7,7 @@ command.
 
 import argparse
 import os
+import re
 import shlex
 import sys
 from collections.abc import Callable, Sequence
@@ -33,7 +34,7 @@ examples:
   hand_eye_calib COMMAND --help                  a command in short; --help all: every option
 
 exit codes: 0 good, 1 bad input or failed, 2 wrong usage, 3 solved but something is
-unobservable or the verdict is DO NOT USE"""
+unobservable or the verdict is DO NOT USE, 4 compare: the sensor has moved"""
 
 # Endings of the names of Python packages that belong to ROS 2.
 _ROS_SUFFIXES = ("rclpy", "_msgs", "_srvs", "_interfaces", "tf2_ros")
@@ -111,6 +112,10 @@ def named_command() -> int:
     return main([Path(sys.argv[0]).stem, *sys.argv[1:]])
 
 
+# Message of argparse about a value that is not among the choices of an option.
+_WRONG_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)$")
+
+
 class CommandParser(argparse.ArgumentParser):
     """Parser whose errors are one line on stderr, with exit code 2."""
 
@@ -121,7 +126,10 @@ class CommandParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print one line on stderr and exit with code 2."""
-        text = as_typed(f"{message} (see {self.prog} --help)")
+        hint = ""
+        if wrong := _WRONG_CHOICE.search(message):
+            hint = did_you_mean(wrong[1], re.findall(r"[\w-]+", wrong[2]))
+        text = as_typed(f"{message}{hint} (see {self.prog} --help)")
         self.exit(Exit.USAGE, f"hand_eye_calib: error: {text}\n")
 
 

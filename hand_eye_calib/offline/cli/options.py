@@ -482,9 +482,12 @@ def sources_from(arguments: argparse.Namespace) -> dict[str, str]:
     return {name: source for name, source in sources.items() if source}
 
 
-def refuse_stamps(arguments: argparse.Namespace) -> None:
-    """Raise a ConfigError if an option about the stamps of bags is set for trajectory files."""
-    for name in ("stamps", *(f"{stream}_stamps" for stream in STREAMS)):
+def refuse_options_of_bags(arguments: argparse.Namespace) -> None:
+    """Raise a ConfigError if an option about topics or stamps is set for trajectory files."""
+    of_streams = [
+        f"{stream}_{name}" for stream in STREAMS for name in ("stamps", "topic", "fields")
+    ]
+    for name in ("stamps", *of_streams):
         if getattr(arguments, name, None):
             raise ConfigError(f"--{flag(name)} applies to bags only; omit it for trajectory files")
 

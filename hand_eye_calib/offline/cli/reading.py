@@ -98,7 +98,7 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
         If only some paths are bags, if there is only one trajectory file, or if a path appears
         twice.
     """
-    _refuse_repeated_paths(paths)
+    refuse_repeated_paths(paths)
     urls = [path for path in paths if isinstance(path, str)]
     local_bags = [path for path in paths if isinstance(path, Path) and _looks_like_bag(path)]
     n_bags = len(urls) + len(local_bags)
@@ -118,7 +118,7 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
     return False
 
 
-def _refuse_repeated_paths(paths: Sequence[Path | str]) -> None:
+def refuse_repeated_paths(paths: Sequence[Path | str]) -> None:
     """Raise a ConfigError if a path appears twice."""
     for path, count in Counter(map(str, paths)).items():
         if count > 1:
@@ -179,7 +179,12 @@ class FilesRead(NamedTuple):
     warnings: list[str]
 
 
-def read_files(arguments: Namespace, paths: Sequence[Path | str], options: Options) -> FilesRead:
+def read_files(
+    arguments: Namespace,
+    paths: Sequence[Path | str],
+    options: Options,
+    streams: Sequence[str] = STREAMS,
+) -> FilesRead:
     """Read trajectory files; print notes on what was recognised from their content.
 
     Parameters
@@ -191,10 +196,12 @@ def read_files(arguments: Namespace, paths: Sequence[Path | str], options: Optio
     options : dict
         Options of the engine. Only "parent_measures" and "child_measures", the kinds of data, are
         used.
+    streams : sequence of str
+        Stream of each path, if there are at most two.
     """
     from hand_eye_calib.formats.trajectory_files.reading import read_trajectory_files
 
-    streams = STREAMS[: len(paths)] if len(paths) < 3 else [""] * len(paths)
+    streams = streams[: len(paths)] if len(paths) < 3 else [""] * len(paths)
     if len(paths) > 2:
         _refuse_options_of_two_files(arguments)
     files = []
