@@ -268,7 +268,7 @@ def solved():
     ("call", "message"),
     [
         (lambda _: hec.calibrate(3, CHILD), "expected a path, an array"),
-        (lambda _: hec.calibrate(PARENT), "a bag without a child must be of type str or PathLike"),
+        (lambda _: hec.calibrate(PARENT), "a child is missing: pass two trajectories"),
         (lambda _: hec.calibrate("absent"), "no bag at absent"),
         (lambda _: hec.calibrate(PARENT, "absent.tum"), "cannot read absent.tum"),
         (lambda _: hec.calibrate(PARENT, CHILD, parent_topic="/a"), "pass only the bag"),
