@@ -246,7 +246,7 @@ JUMPS = written_finding("jumps", Severity.ERROR, "every step is a jump")
 @pytest.mark.parametrize(("findings", "code"), [((), 1), ((JUMPS,), 3)])
 def test_the_exit_code_is_that_of_two_sensors(files, calibrated, run, monkeypatch, findings, code):
     failed = not_converged(calibrated, findings)
-    monkeypatch.setattr(of_rig, "calibrate_rig", lambda *_: failed)
+    monkeypatch.setattr(of_rig, "calibrated", lambda *_: failed)
     exit_code, _, err = run("calibrate", *files)
     assert exit_code == code == gravest_code(map(present.exit_code, failed.calibrations))
     advice = "front: the solver did not converge; do not use this result, record more varied motion"
