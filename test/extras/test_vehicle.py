@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from bag_making import JAZZY
 from rosbags import rosbag2
 
 import hand_eye_calib as hec
@@ -352,4 +353,86 @@ def test_odometry_of_a_bag(tmp_path):
     assert main(["calibrate", str(bag), *arguments]) == 0
     result = hec.load(tmp_path / "out")
     assert result.parent_frame == "base_footprint"
+    assert np.abs(pose_errors(result, drive.T_base_sensor))[:2].max() < 0.01
+
+
+def write_wheel_bag(path, type_, topic, messages, drive):
+    """Write messages at the stamps of the wheels, and the odometry of the lidar."""
+    lidar = hec.Trajectory(drive.sensor.stamps_ns, drive.sensor.poses, "lidar", "map")
+    with rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+        write_streams(writer, {"/lidar": (lidar, "nav_msgs/msg/Odometry")}, "mcap")
+        connection = writer.add_connection(topic, type_, typestore=JAZZY)
+        for stamp_ns, message in zip(drive.stamps_ns.tolist(), messages, strict=True):
+            writer.write(connection, stamp_ns, JAZZY.serialize_cdr(message, type_))
+
+
+def header(stamp_ns):
+    stamp = JAZZY.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
+    return JAZZY.types["std_msgs/msg/Header"](stamp, "")
+
+
+def joint_states(drive, names, has_velocity):
+    kind = JAZZY.types["sensor_msgs/msg/JointState"]
+    n_each = len(names) // 2
+    rates = np.repeat(drive.values, n_each, axis=1)
+    # Drivers integrate the rates.
+    positions = np.cumsum(rates, axis=0) * 0.02
+    nothing = np.zeros(0)
+    for stamp_ns, rate, position in zip(drive.stamps_ns.tolist(), rates, positions, strict=True):
+        velocity = rate if has_velocity else nothing
+        yield kind(header(stamp_ns), [*names], position, velocity, nothing)
+
+
+@pytest.mark.parametrize(
+    ("names", "fields", "has_velocity"),
+    [
+        (["wheel_left_joint", "wheel_right_joint"], "", True),
+        (["wheel_left_joint", "wheel_right_joint"], "", False),
+        (
+            ["front_left_wheel", "rear_left_wheel", "front_right_wheel", "rear_right_wheel"],
+            "",
+            True,
+        ),
+        (["joint_1", "joint_2"], "?joint_1,joint_2", True),
+    ],
+)
+def test_joint_states_of_a_bag(tmp_path, capsys, names, fields, has_velocity):
+    drive = machine()
+    bag = tmp_path / "bag"
+    messages = joint_states(drive, names, has_velocity)
+    write_wheel_bag(bag, "sensor_msgs/msg/JointState", "/joint_states", messages, drive)
+    arguments = ["--parent-topic", f"/joint_states{fields}", "--child-topic", "/lidar"]
+    assert main(["calibrate", str(bag), *arguments, "--out", str(tmp_path / "out")]) == 0
+    assert names[0] in capsys.readouterr().err
+    result = hec.load(tmp_path / "out")
+    assert np.abs(pose_errors(result, drive.T_base_sensor))[:2].max() < 0.01
+    radius = result.wheels["left_wheel_radius"].value
+    assert radius == pytest.approx(drive.parameters[0], rel=0.004)
+
+
+def test_joint_states_without_wheels_are_refused(tmp_path, capsys):
+    drive = machine()
+    bag = tmp_path / "bag"
+    messages = joint_states(drive, ["joint_1", "joint_2"], True)
+    write_wheel_bag(bag, "sensor_msgs/msg/JointState", "/joint_states", messages, drive)
+    assert main(["calibrate", str(bag), "--parent-topic", "/joint_states"]) == 1
+    assert "name the joints: /joint_states?LEFT,RIGHT" in capsys.readouterr().err
+
+
+def test_twists_of_a_bag(tmp_path):
+    drive = machine("omni")
+    vector = JAZZY.types["geometry_msgs/msg/Vector3"]
+    twist = JAZZY.types["geometry_msgs/msg/Twist"]
+    kind = JAZZY.types["geometry_msgs/msg/TwistStamped"]
+    messages = []
+    for stamp_ns, (forward, left, turn) in zip(
+        drive.stamps_ns.tolist(), drive.values.tolist(), strict=True
+    ):
+        rates = twist(vector(forward, left, 0.0), vector(0.0, 0.0, turn))
+        messages.append(kind(header(stamp_ns), rates))
+    bag = tmp_path / "bag"
+    write_wheel_bag(bag, "geometry_msgs/msg/TwistStamped", "/twist", messages, drive)
+    arguments = ["--parent-topic", "/twist", "--child-topic", "/lidar", "--parent-measures", "omni"]
+    assert main(["calibrate", str(bag), *arguments, "--out", str(tmp_path / "out")]) == 0
+    result = hec.load(tmp_path / "out")
     assert np.abs(pose_errors(result, drive.T_base_sensor))[:2].max() < 0.01

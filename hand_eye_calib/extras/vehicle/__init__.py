@@ -4,6 +4,7 @@ from typing import Any
 
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.registry import (
+    BAG_READINGS,
     FILE_READERS,
     FINDING_WORDS,
     KINDS,
@@ -33,6 +34,7 @@ def register() -> None:
     RESULT_PARTS["wheels"] = _parameters
     FINDING_WORDS["vehicle"] = _words
     FILE_READERS["wheels"] = _wheels
+    BAG_READINGS["sensor_msgs/msg/JointState"] = _joint_states
     PUBLIC_NAMES["calibrate_vehicle"] = "hand_eye_calib.extras.vehicle.calibrate"
     PUBLIC_NAMES["wheel_trajectory"] = "hand_eye_calib.extras.vehicle.wheel_files"
     ROUTES["vehicle"] = Route(_add_arguments, _is_alone, _calibrate)
@@ -65,6 +67,13 @@ def _wheels(*file: Any) -> Any:
     from hand_eye_calib.extras.vehicle.wheel_files import table_of_wheels
 
     return table_of_wheels(*file)
+
+
+def _joint_states(*source: Any) -> Any:
+    """Return the reader of the wheels in joint states."""
+    from hand_eye_calib.extras.vehicle.joint_states import JointStateReading
+
+    return JointStateReading(*source)
 
 
 def _add_arguments(parser: Any) -> None:

@@ -166,6 +166,8 @@ _OF_POINTS = ("positions",)
 
 PATH_TYPE = "nav_msgs/msg/Path"
 POINTS_TYPE = "sensor_msgs/msg/PointCloud2"
+#: Type of joint states, which may contain the wheels of a vehicle.
+JOINTS_TYPE = "sensor_msgs/msg/JointState"
 #: Types of images. Poses are computed from images of a target.
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 #: Types of lists of transforms, and of single transforms.
@@ -244,6 +246,7 @@ for _name, _fields in _FIELDS.items():
     _measures = _OF_POINTS if _name.endswith("Fix") else _OF_POSES
     _ROWS.append(MessageType(_name, _measures, fields=_fields))
 _ROWS.append(MessageType(POINTS_TYPE, _OF_POSES))
+_ROWS.append(MessageType(JOINTS_TYPE, ("wheels",)))
 
 MESSAGE_TYPES = {row.name: row for row in _ROWS}
 #: Types with a complete pose in each message, which is unpacked from the bytes.
@@ -277,7 +280,7 @@ def measured_as(message_type: str, wanted: str, source: object) -> str:
     possible = row.measures if row else _OF_POSES
     if wanted == "auto":
         return possible[0]
-    if (MEASURES[wanted].read_as or wanted) not in possible:
+    if not {wanted, MEASURES[wanted].read_as} & {*possible}:
         raise ConfigError(
             f"{source} has messages of type {message_type or 'tf2_msgs/msg/TFMessage'}, which "
             f"measure {' or '.join(possible)}; asked for are {wanted}"

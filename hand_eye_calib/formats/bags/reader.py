@@ -152,7 +152,7 @@ class PoseBag:
         """
         topic, _, fields = str(source).partition("?")
         if "=" not in fields:
-            return messages.measured_as(self.type_of(source), wanted, source)
+            return messages.measured_as(self.type_of(topic), wanted, source)
         # The source names fields of the messages, which determine the quantity.
         usual = sources.FieldReading("", topic, fields).measures
         if wanted == "auto":
@@ -358,6 +358,8 @@ class PoseBag:
         if ":" in fields and "=" not in fields:
             return BAG_READINGS["images of a target"](self, stream, topic, fields)
         type_ = self.type_of(topic)
+        if type_ == messages.JOINTS_TYPE and "=" not in fields:
+            return BAG_READINGS[type_](stream, topic, fields)
         row = messages.MESSAGE_TYPES.get(type_)
         if row:
             fields = fields or row.fields
