@@ -284,7 +284,8 @@ def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
     careful = replace(EXTRINSIC, result=replace(RESULT, verdict="USE WITH CARE"))
     view = view_of(state(comparison=comparison, extrinsic=careful, **done))
     assert (view.word, view.tone, view.buttons[0]) == ("DONE", Tone.ACT, "save")
-    assert view.sentence == "camera HAS MOVED: z by +3 cm ± 4 mm."
+    # Distance and angle of the axes that have moved; the bars contain each of them.
+    assert view.sentence == "camera HAS MOVED by 5.4 cm and 2.5 deg."
     assert view.advice == "Save. USE WITH CARE: a: b."
     assert view_of(state(**done)).text == "Known. Stop and save."
     saved = view_of(replace(state(**done), saved=SAVED))

@@ -1,10 +1,13 @@
 """The headline of a node: its most important fact, in a word and a sentence."""
 
+import math
 from collections.abc import Iterator
 from datetime import datetime
 from typing import NamedTuple
 
-from hand_eye_calib.core.base.text import capital
+from hand_eye_calib.core.base.text import AXIS_UNITS, amount, capital
+from hand_eye_calib.core.results.context import Difference
+from hand_eye_calib.online.live.progress import AXIS_KEYS
 from hand_eye_calib.online.live.state import (
     Level,
     NodeState,
@@ -141,13 +144,33 @@ def _at_goal(state: NodeState, session: ProgressState) -> Headline:
         caution = _sentence(": ".join((state.result.verdict, *gravest)))
     if state.result and session.comparison and session.comparison.verdict == "moved":
         tone = Tone.ACT
-        displacement = typeset(session.comparison.differences[0].change)
-        sentence = f"{state.result.child_frame} HAS MOVED: {displacement}."
+        displacement = _displacement(session.comparison.differences[0])
+        sentence = f"{state.result.child_frame} HAS MOVED by {displacement}."
         advice = "Save."
     if state.saved:
         sentence = f"{sentence} Saved {saved_at(state.saved)}."
         advice = ""
     return Headline(tone, DONE, sentence, f"{advice} {caution}".strip())
+
+
+def _displacement(difference: Difference) -> str:
+    """Return distance and angle by which the moved axes differ from the installed transform.
+
+    The bars contain the change of each axis. If no single axis has moved, all axes that are
+    determined count.
+    """
+    known = [key for key, row in difference.axes.items() if math.isfinite(row.sigma)]
+    moved = [key for key in known if difference.axes[key].verdict == "moved"]
+    squares = {"m": 0.0, "rad": 0.0}
+    for axis, key in AXIS_KEYS.items():
+        if key in (moved or known):
+            squares[AXIS_UNITS[axis]] += difference.axes[key].difference ** 2
+    parts = []
+    for axis in ("x", "yaw"):
+        size = math.sqrt(squares[AXIS_UNITS[axis]])
+        if size > 0.0:
+            parts.append(amount(axis, size))
+    return " and ".join(parts)
 
 
 def _silence(state: NodeState, silent_s: float) -> Headline:
