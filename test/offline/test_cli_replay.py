@@ -173,13 +173,14 @@ def test_list_shows_topics_types_counts_rates_and_frames(run, tmp_path):
     code, out, err = run(tmp_path / "drive", tmp_path / "tf", "--list")
     assert (code, err) == (0, "")
     rows = [line.split() for line in out.splitlines() if line.strip().startswith("/")]
-    assert ["/a", ODOMETRY, "100", "10.0", "Hz", "yes"] in rows
+    assert ["/a", ODOMETRY, "100", "10.0", "Hz", "yes", PARENT.sensor_frame] in rows
     assert ["/b", "geometry_msgs/msg/PoseStamped", "100", "10.0", "Hz", "yes"] in rows
     assert ["/tf_static", TF, "1", "base:lidar"] in rows
     code, out, err = run(tmp_path / "drive", tmp_path / "tf", "--list", "--json")
     document = json.loads(out)
     assert (code, err, document["warnings"]) == (0, "", [])
     assert document["duration_s"] == pytest.approx(9.9)
-    measured = {"count": 100, "rate_hz": pytest.approx(10), "frames": []}
+    measured = {"count": 100, "rate_hz": pytest.approx(10), "frames": [PARENT.sensor_frame]}
+    measured["measures"] = ""
     named = {"name": "/a", "type": ODOMETRY, "is_usable": True}
     assert document["topics"][0] == measured | named

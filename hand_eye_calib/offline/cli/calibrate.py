@@ -8,10 +8,11 @@ session; several recordings; the stops of an arm; the files of three sensors or 
 import argparse
 import dataclasses
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.base.registry import BESIDE_MOTION, ROUTES, SEVERAL_RECORDINGS
 from hand_eye_calib.offline.beside_motion import switched_off
 from hand_eye_calib.offline.cli import options
@@ -19,6 +20,7 @@ from hand_eye_calib.offline.cli.options import note, print_result, waiting_for
 
 if TYPE_CHECKING:
     from hand_eye_calib.core.base.plain import Document
+    from hand_eye_calib.formats.bags.reader import PoseBag
     from hand_eye_calib.formats.remote import RestoreUrls
 
 EXAMPLES = """\
@@ -218,7 +220,7 @@ def _list_topics(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int
                 {
                     **topic._asdict(),
                     "rate_hz": rate_hz,
-                    "frames": bag.edges_on(topic.name) or [frame] * bool(frame),
+                    "frames": bag.edges_on(topic.name) or _sensor_frames(bag, topic.name, frame),
                     "is_usable": topic.type in MESSAGE_TYPES,
                     "measures": quantity,
                 }
@@ -245,8 +247,22 @@ def _list_topics(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int
             " ".join(row["frames"]),
         ]
         lines.append(_ROW.format(*cells).rstrip())
-    lines.append(
+    advice = (
         "--parent-topic and --child-topic accept a topic with poses, or frames of /tf: odom:lidar"
     )
+    if not any(row["count"] for row in topics):
+        advice = "the bag has no messages: record again"
+    lines.append(advice)
     print_result(lines, document if arguments.json else None)
     return 0
+
+
+def _sensor_frames(bag: "PoseBag", topic: str, frame: str) -> list[str]:
+    """Return the frame of a topic's sensor as a list, which is empty if no message names it.
+
+    ``frame`` is the frame if it is known already, otherwise empty.
+    """
+    # A damaged message must not hide the other topics.
+    with suppress(InputError):
+        frame = frame or bag.sensor_frame(topic)
+    return [frame] if frame else []

@@ -23,6 +23,7 @@ from hand_eye_calib.core.results.calibration import Calibration, Verdict
 from hand_eye_calib.core.results.document import (
     Notation,
     allowance_in_words,
+    angles_in_words,
     extra_transforms,
     parts_of_sigmas,
     printed_numbers,
@@ -155,6 +156,7 @@ def render(
         stops=calibration.parts.get("stops"),
         numbers_of=partial(printed_numbers, out_of_reach=calibration.out_of_reach, sign="±"),
         parts_of=parts_of_sigmas,
+        angles_of=partial(angles_in_words, result=calibration),
         axes=list(_axes(calibration)),
         allowance=allowance_in_words(calibration),
         facts=_facts(calibration),
