@@ -122,7 +122,7 @@ def _moved_results(
         for difference in differences
         if difference.verdict == Change.MOVED
     ]
-    return (), f"moved: {listing(couples)} differ; they do not show which of them has moved"
+    return (), f"moved: {'; '.join(couples)} differ; they do not show which of them has moved"
 
 
 def with_comparison(result: Calibration, installed: Calibration | Extrinsic) -> Calibration:
