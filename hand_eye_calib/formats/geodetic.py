@@ -44,11 +44,12 @@ class LocalOrigin:
         """
         if self.geodetic is None:
             self.geodetic = float(lat_rad[0]), float(lon_rad[0]), float(height_m[0])
-        origin = np.array(self.geodetic)[:, None]
-        from_origin = _earth_centred(lat_rad, lon_rad, height_m) - _earth_centred(*origin)
-        # Product of vectors (N, 3) and axes (1, 3, 3). Sums give the same bits for one position (in
+        origin_lat, origin_lon, origin_height = np.array(self.geodetic)[:, None]
+        positions = _earth_centred(lat_rad, lon_rad, height_m)
+        from_origin = positions - _earth_centred(origin_lat, origin_lon, origin_height)
+        # Product of vectors (N, 3) and axes (1, 3, 3). Sums have the same bits for one position (in
         # live use) and for many positions. A matrix product does not.
-        terms = from_origin[:, :, None] * _axes(*origin[:2])
+        terms = from_origin[:, :, None] * _axes(origin_lat, origin_lon)
         return np.asarray(terms[:, 0] + terms[:, 1] + terms[:, 2])
 
 

@@ -222,7 +222,7 @@ class TestStreamChecks:
     @pytest.mark.parametrize(
         ("damage", "sentence"),
         [
-            (inverted, "the child stream seems to hold inverse poses"),
+            (inverted, "the child stream seems to contain inverse poses"),
             (in_millimetres, "solved with scale 0.001"),
         ],
     )

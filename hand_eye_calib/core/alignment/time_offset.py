@@ -313,10 +313,12 @@ def _twists(trajectory: Trajectory, stamps_ns: IntArray, span_s: float) -> Float
     at the ends of the trajectory.
     """
     span_ns = round(span_s * 1e9)
-    ends_ns = np.add.outer([-span_ns, span_ns], stamps_ns).clip(*trajectory.stamps_ns[[0, -1]])
-    before, after = np.split(trajectory.at(ends_ns.ravel()), 2)
+    first_ns, last_ns = trajectory.stamps_ns[[0, -1]]
+    from_ns = np.clip(stamps_ns - span_ns, first_ns, last_ns)
+    until_ns = np.clip(stamps_ns + span_ns, first_ns, last_ns)
+    before, after = np.split(trajectory.at(np.concatenate([from_ns, until_ns])), 2)
     steps = se3.log(se3.inverse(before) @ after)
-    spans_s = np.diff(ends_ns, axis=0)[0] * 1e-9
+    spans_s = (until_ns - from_ns) * 1e-9
     return np.asarray(steps / spans_s[:, None])
 
 

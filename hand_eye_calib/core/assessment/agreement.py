@@ -350,8 +350,10 @@ def _chi2_and_dof(products: FloatArray, ranks: FloatArray) -> tuple[FloatArray, 
     weights = information(products)
     scores = score(products)
     mean = np.linalg.solve(weights, scores[..., None])[..., 0]
-    chi2 = products[..., -1, -1] - (scores * mean).sum(axis=-1)
-    return np.maximum(chi2, 0.0), np.asarray(ranks - _ranks(weights), dtype=float)
+    explained = (scores * mean).sum(axis=-1)
+    chi2 = np.maximum(products[..., -1, -1] - explained, 0.0)
+    dof = np.asarray(ranks - _ranks(weights), dtype=float)
+    return chi2, dof
 
 
 def _ranks(weights: FloatArray) -> FloatArray:

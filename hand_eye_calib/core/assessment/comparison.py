@@ -78,23 +78,32 @@ def compare(
             "installed)"
         )
     differences = tuple(_difference(*couple) for couple in couples)
-    verdict = Change.of_all([Change(difference.verdict) for difference in differences]).value
+    verdicts = [Change(difference.verdict) for difference in differences]
+    verdict = Change.of_all(verdicts).value
     moved_names = tuple(
         difference.second for difference in differences if difference.verdict == Change.MOVED
     )
-    others = "another" if installed is None else "what is installed"
-    sentence = f"{verdict}: none of {len(results)} differs from {others}"
-    if installed is None and len(results) == 2 and verdict == Change.SAME.value:
+    sentence = f"{verdict}: none of {len(results)} differs from another"
+    if len(results) == 2 and verdict == Change.SAME.value:
         sentence = f"{verdict}: both agree"
-    if installed is not None and len(differences) == 1:
-        sentence = differences[0].sentence
-    elif moved_names and installed is None:
-        moved_names, sentence = _moved_results([*by_name], results, differences)
+    if installed is not None:
+        sentence = _sentence_of(differences, verdict, moved_names)
     elif moved_names:
-        sentence = f"moved: {listing(moved_names)} of {len(results)}"
+        moved_names, sentence = _moved_results([*by_name], results, differences)
     return Comparison(
         sentence=sentence, verdict=verdict, moved=moved_names, differences=differences
     )
+
+
+def _sentence_of(
+    differences: Sequence[Difference], verdict: str, moved_names: Sequence[str]
+) -> str:
+    """Return the sentence of a comparison with the installed extrinsic."""
+    if len(differences) == 1:
+        return differences[0].sentence
+    if moved_names:
+        return f"moved: {listing(moved_names)} of {len(differences)}"
+    return f"{verdict}: none of {len(differences)} differs from what is installed"
 
 
 def _by_name(results: Sequence[Calibration], names: Sequence[str] | None) -> dict[str, Calibration]:

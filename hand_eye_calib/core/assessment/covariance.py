@@ -345,9 +345,9 @@ def combined(T_parent_child: FloatArray, covariance: FloatArray, unknown: FloatA
     unknown : (6, U) array
         Orthonormal.
     """
-    known = np.eye(6) - unknown @ unknown.T
+    onto_known = np.eye(6) - unknown @ unknown.T
     scaled = UNKNOWN_SIGMAS[:, None] * unknown
-    whole = known @ covariance @ known + scaled @ scaled.T
+    whole = onto_known @ covariance @ onto_known + scaled @ scaled.T
     rotation = se3.rotation_of(T_parent_child)
     sigmas = sigmas_in_parent(rotation, whole)
     unknown_in_parent = se3.block_diagonal(rotation) @ unknown
@@ -518,8 +518,8 @@ def basis(directions: list[FloatArray]) -> FloatArray:
     """Return an orthonormal basis (6, U) of directions (6,), which may be linearly dependent."""
     if not directions:
         return np.zeros((6, 0))
-    left, sizes, _ = np.linalg.svd(np.array(directions).T, full_matrices=False)
-    return left[:, sizes > 1e-6 * sizes[0]]
+    vectors, sizes, _ = np.linalg.svd(np.array(directions).T, full_matrices=False)
+    return vectors[:, sizes > 1e-6 * sizes[0]]
 
 
 def judged(axis: str, sigma: float) -> DofObservability:

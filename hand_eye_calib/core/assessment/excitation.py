@@ -226,10 +226,10 @@ def _motion_for(name: str, seen: Excitation) -> str:
         return _motion_for_only_axis(name, others, seen)
     if turns_about_one_axis and seen.drives:
         return "tighter curves to both sides help most"
-    least = min(others, key=lambda other: rotation[other])
-    hint = f"rotations about {'xyz'[least]} help most"
+    weakest = min(others, key=lambda other: rotation[other])
+    hint = f"rotations about {'xyz'[weakest]} help most"
     if seen.has_vehicle_axes:
-        return f"{hint} ({_MANOEUVRES[least]})"
+        return f"{hint} ({_MANOEUVRES[weakest]})"
     return hint
 
 

@@ -305,8 +305,10 @@ def _long_run_variance(windows: Blocks) -> float:
     n_windows = len(windows.sums)
     cuts = np.arange(_MIN_WINDOWS_PER_SIDE, n_windows - _MIN_WINDOWS_PER_SIDE + 1)
     sides = np.stack([windows.before(cuts), windows.since(cuts)], axis=1)
+    estimates = most_likely(sides, _PRIOR_SHARE)
     side_of_window = (np.arange(n_windows) >= cuts[:, None]).astype(int)
-    answers = most_likely(sides, _PRIOR_SHARE)[np.arange(len(cuts))[:, None], side_of_window]
+    # Estimate of the side of each window, for each cut.
+    answers = estimates[np.arange(len(cuts))[:, None], side_of_window]
     has_evidence = np.trace(information(windows.sums), axis1=1, axis2=2) > 0
     squares = squares_about(windows.sums[has_evidence], answers[:, has_evidence], _PRIOR_SHARE)
     # Each window has six values; the two estimates use up twelve.

@@ -23,7 +23,7 @@ from hand_eye_calib.core.assessment.covariance import (
     Assessment,
     judged,
 )
-from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import sigmas_in_parent
 from hand_eye_calib.core.results.calibration import DofObservability, DofVerdict
@@ -79,10 +79,12 @@ def fuse(assessment: Assessment, prior: Prior) -> Assessment:
     posterior = whitening.root @ whitened_covariance @ whitening.root.T
     sigmas = sigmas_in_parent(se3.rotation_of(T), posterior)
     motion_sigmas = sigmas_in_parent(se3.rotation_of(start), covariance)
+    are_halved = halves_variance(sigmas, motion_sigmas)
     verdicts = []
-    for axis, sigma, motion_sigma in zip(AXES, sigmas.tolist(), motion_sigmas, strict=True):
-        has_prior = axis in prior
-        verdicts.append(_verdict_on(axis, sigma, motion_sigma, has_prior))
+    for axis, sigma, is_halved in zip(AXES, sigmas.tolist(), are_halved, strict=True):
+        # The value of an axis is mostly the prior's if the prior at least halves its variance.
+        is_from_prior = axis in prior and bool(is_halved)
+        verdicts.append(_verdict_on(axis, sigma, is_from_prior))
     from_motion = whitening.root @ whitened_covariance @ whitening.inverse_root
     return Assessment(T, posterior, tuple(verdicts), contradictions, from_motion)
 
@@ -141,15 +143,18 @@ def _minimum(
     return T, normal
 
 
-def _verdict_on(axis: str, sigma: float, motion_sigma: float, has_prior: bool) -> DofObservability:
-    """Return the verdict on an axis from its standard deviations, fused and by motion alone."""
+def _verdict_on(axis: str, sigma: float, is_from_prior: bool) -> DofObservability:
+    """Return the verdict on an axis by its standard deviation and the origin of its value."""
     verdict = judged(axis, sigma)
     is_observable = verdict.verdict is not DofVerdict.UNOBSERVABLE
-    # The value of an axis is mostly the prior's if the prior at least halves its variance.
-    is_halved = 2 * sigma**2 < motion_sigma**2
-    if is_observable and has_prior and is_halved:
+    if is_observable and is_from_prior:
         return DofObservability(axis, DofVerdict.PRIOR, sigma)
     return verdict
+
+
+def halves_variance(sigmas: FloatArray, motion_sigmas: FloatArray) -> BoolArray:
+    """Return a mask (6,) of the axes whose variance is at most half of the variance by motion."""
+    return np.asarray(2 * sigmas**2 < motion_sigmas**2)
 
 
 def widened(assessment: Assessment, spread: FloatArray) -> Assessment:
@@ -176,12 +181,12 @@ def _whitened(
     directions are whitened separately.
     """
     values, vectors = np.linalg.eigh(unknown @ unknown.T)
-    known = vectors[:, values < 0.5]
-    variances, axes = np.linalg.eigh(known.T @ covariance @ known)
+    known_directions = vectors[:, values < 0.5]
+    variances, axes = np.linalg.eigh(known_directions.T @ covariance @ known_directions)
     known_sigmas = np.sqrt(np.maximum(variances, ROUNDING_VARIANCE))
     is_translation = (unknown[:3] ** 2).sum(axis=0) > 0.5
     unknown_sigmas = np.where(is_translation, UNKNOWN_SIGMAS[0], UNKNOWN_SIGMAS[-1])
-    directions = np.concatenate([known @ axes, unknown], axis=1)
+    directions = np.concatenate([known_directions @ axes, unknown], axis=1)
     sigmas = np.concatenate([known_sigmas, unknown_sigmas])
     in_child = se3.rotation_of(T_parent_child).T @ se3.translation_of(T_parent_child)
     to_zero = -(unknown[:3].T @ in_child)

@@ -163,19 +163,19 @@ WORDS = {
     ),
     "axes": FindingWords(
         "{whose} positions are in other axes than its orientations: (x, y, z) should be ({detail})",
-        "write positions and orientations in the same right-handed axes; of angles in a file name "
-        "the column heading if they are clockwise from north, otherwise yaw",
+        "write positions and orientations in the same right-handed axes; in a file, call angles "
+        "that are clockwise from north heading, all others yaw",
     ),
     "euler_order": FindingWords(
-        "{whose} orientations seem to be angles in the other order: roll about x first, in turning "
-        "axes, and read as about fixed axes",
+        "{whose} orientations seem to be angles about turning axes, roll about x first, that were "
+        "read as angles about fixed axes",
         "write quaternions, or roll, pitch and yaw about the fixed axes x, y and z (REP 103)",
     ),
     "motions": FindingWords(
-        "the {stream} stream holds motions since the pose before, not poses: chained, they agree "
+        "the {stream} stream contains motions from pose to pose, not poses: chained, they agree "
         "with the other stream",
-        "write the poses in one world; of motions, the product of all up to each",
-        "such as odometry or scan matching that writes increments",
+        "write poses in one world: the product of all motions so far",
+        "odometry or scan matching that writes increments",
     ),
     "positions_turned": FindingWords(
         "{whose} positions are in other axes than its orientations, turned by {turned_deg:.0f} deg",
@@ -194,19 +194,19 @@ WORDS = {
         severity=Severity.WARNING,
     ),
     "inverse": FindingWords(
-        "the {stream} stream seems to hold inverse poses (of the world in the sensor, not of the "
-        "sensor in its world)",
+        "the {stream} stream seems to contain inverse poses (of the world in the sensor, not of "
+        "the sensor in its world)",
         "invert every pose of the {stream} stream",
     ),
     "inverse_both": FindingWords(
-        "both streams seem to hold inverse poses (of the world in the sensor): inverted, their "
+        "both streams seem to contain inverse poses (of the world in the sensor): inverted, their "
         "paths and the lever arm between them are shorter",
         "invert every pose of both streams, or the result is the pose of one world in the other "
         "(which is what a fixed camera beside an arm needs)",
     ),
     "inverse_unclear": FindingWords(
-        "two readings fit alike: {first}, or {second}. Neither noise nor shape of the motion tells "
-        "which is right",
+        "two readings fit alike: {first}, or {second}. Neither noise nor shape of the motion "
+        "decides between them",
         "give parent_invert and child_invert: none for poses of the sensor in its world, poses for "
         "poses of the world in the sensor",
         "small or short motion, or a fixed camera beside an arm",

@@ -137,10 +137,12 @@ def rotation_to_rpy(rotation: ArrayLike) -> FloatArray:
     R = np.asarray(rotation, dtype=float)
     cosine = np.hypot(R[..., 0, 0], R[..., 1, 0])
     is_singular = cosine < _SINGULAR_COSINE
-    roll_at_pole = np.arctan2(-R[..., 1, 2], R[..., 1, 1])
-    roll = np.where(is_singular, roll_at_pole, np.arctan2(R[..., 2, 1], R[..., 2, 2]))
+    singular_roll = np.arctan2(-R[..., 1, 2], R[..., 1, 1])
+    regular_roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
+    regular_yaw = np.arctan2(R[..., 1, 0], R[..., 0, 0])
+    roll = np.where(is_singular, singular_roll, regular_roll)
     pitch = np.arctan2(-R[..., 2, 0], cosine)
-    yaw = np.where(is_singular, 0.0, np.arctan2(R[..., 1, 0], R[..., 0, 0]))
+    yaw = np.where(is_singular, 0.0, regular_yaw)
     return np.stack([roll, pitch, yaw], axis=-1)
 
 
@@ -382,8 +384,9 @@ def interpolate(start: FloatArray, end: FloatArray, fraction: ArrayLike) -> Floa
     -------
     (..., 4, 4) array
     """
+    fractions = np.asarray(fraction, dtype=float)
     step = log(inverse(start) @ end)
-    return start @ exp(np.asarray(fraction, dtype=float)[..., None] * step)
+    return start @ exp(fractions[..., None] * step)
 
 
 def chained(steps: FloatArray) -> FloatArray:

@@ -361,9 +361,10 @@ class Trajectory(Columns):
         if self._unshifted is not None:
             return self._unshifted._steps
         spans_s = np.diff(self.stamps_ns)[:, None] * 1e-9
+        mean_spans_s = 0.5 * (spans_s[1:] + spans_s[:-1])
         steps = se3.log(se3.inverse(self.poses[:-1]) @ self.poses[1:])
         changes = np.zeros((len(self), 6))
-        changes[1:-1] = np.diff(steps / spans_s, axis=0) / (0.5 * (spans_s[1:] + spans_s[:-1]))
+        changes[1:-1] = np.diff(steps / spans_s, axis=0) / mean_spans_s
         shares = np.empty((len(changes) - 1, 6))
         for columns in (slice(0, 3), slice(3, 6)):
             vectors = changes[:, columns]
@@ -537,6 +538,7 @@ def repetitions(trajectory: Trajectory, least_s: float) -> list[tuple[int, int]]
     is_same = differences.max(axis=(1, 2)) < _SAME_POSE
     # A period begins where `is_same` becomes True, and ends where it becomes False.
     changes = np.diff(np.r_[False, is_same, False].astype(int))
-    periods_ns = trajectory.stamps_ns[np.flatnonzero(changes)].reshape(-1, 2)
-    is_long = np.diff(periods_ns, axis=1)[:, 0] >= least_s * 1e9
-    return [(from_ns, until_ns) for from_ns, until_ns in periods_ns[is_long].tolist()]
+    rows = np.flatnonzero(changes)
+    from_ns, until_ns = trajectory.stamps_ns[rows].reshape(-1, 2).T
+    is_long = until_ns - from_ns >= least_s * 1e9
+    return [*zip(from_ns[is_long].tolist(), until_ns[is_long].tolist(), strict=True)]

@@ -52,6 +52,14 @@ class PosePairs(Columns):
         Ts_cw_c[:, :3, 3] *= factor
         return replace(self, Ts_cw_c=Ts_cw_c)
 
+    def child_shifted(self, seconds: float) -> Self:
+        """Return the pose pairs with ``seconds`` added to the child's stamps.
+
+        The child's poses are interpolated at the common instants, and extrapolated at the ends.
+        """
+        child = Trajectory(self.stamps_ns, self.Ts_cw_c).shifted(seconds)
+        return replace(self, Ts_cw_c=child.at(self.stamps_ns, extrapolate=True))
+
     @classmethod
     def empty(cls) -> Self:
         """Return zero pose pairs."""

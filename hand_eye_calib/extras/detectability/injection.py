@@ -22,8 +22,6 @@ judge is the likelihood ratio of the stream checks (:mod:`hand_eye_calib.core.as
 Both injections are linear in the evidence, so nothing is solved again.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from hand_eye_calib.core.assessment import moved
@@ -32,7 +30,6 @@ from hand_eye_calib.core.base.blocks import Blocks, information, score
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.engine.snapshot import Snapshot
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.records import AXES, DofVerdict
@@ -92,9 +89,7 @@ def _on_clock_of(result: Calibration, snapshot: Snapshot) -> PosePairs:
     further_s = result.time_offset_s - float(snapshot.resolved.config.time_offset)
     if not further_s:
         return pose_pairs
-    stamps_ns = pose_pairs.stamps_ns
-    child = Trajectory(stamps_ns, pose_pairs.Ts_cw_c).shifted(further_s)
-    return replace(pose_pairs, Ts_cw_c=child.at(stamps_ns, extrapolate=True))
+    return pose_pairs.child_shifted(further_s)
 
 
 def detectability(result: Calibration, pose_pairs: PosePairs) -> Detectability:

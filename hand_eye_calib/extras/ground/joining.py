@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hand_eye_calib.core.assessment.covariance import judged
+from hand_eye_calib.core.assessment.prior import halves_variance
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.blocks import Blocks
 from hand_eye_calib.core.base.stats import CHI2, MEDIAN_NORMAL, median, medians
@@ -336,7 +337,7 @@ def _updated(calibration: Calibration, measurement: Measurement, gain: FloatArra
     covariance += gain @ measurement.covariance @ gain.T
     sigmas = sigmas_in_parent(se3.rotation_of(T), covariance)
     totals = np.hypot(sigmas, sigmas_in_parent(se3.rotation_of(T), allowance))
-    is_from_ground = _halves_variance(totals, calibration.sigmas)
+    is_from_ground = halves_variance(totals, calibration.sigmas)
     dofs = []
     for of_motion, sigma, has_prior in zip(
         calibration.observability_measured, sigmas.tolist(), is_from_ground, strict=True
@@ -361,11 +362,6 @@ def _updated(calibration: Calibration, measurement: Measurement, gain: FloatArra
     return updated
 
 
-def _halves_variance(sigmas: FloatArray, motion_sigmas: FloatArray) -> BoolArray:
-    """Return a mask (6,) of the axes whose variance an update has at least halved."""
-    return np.asarray(2 * sigmas**2 < motion_sigmas**2)
-
-
 def _ground_axes(
     calibration: Calibration, updated: Calibration, measurement: Measurement, distances: FloatArray
 ) -> tuple[GroundAxis, ...]:
@@ -374,7 +370,7 @@ def _ground_axes(
     ``distances`` (M,) are the differences of both values in joint standard deviations.
     """
     values = se3.xyz_rpy(calibration.T_parent_child).tolist()
-    is_from_ground = _halves_variance(updated.sigmas, calibration.sigmas)
+    is_from_ground = halves_variance(updated.sigmas, calibration.sigmas)
     ground_sigmas = np.sqrt(np.diag(measurement.covariance))
     axes = []
     for row, name in enumerate(measurement.axes):

@@ -155,6 +155,8 @@ def _is_ground(cells: FloatArray, inliers: FloatArray, plane: FloatArray) -> boo
     covariance = horizontal.T @ horizontal / len(inliers)
     # A single ring of a lidar is nearly a line, which determines no plane.
     is_wide = np.linalg.eigvalsh(covariance)[0] > _CELL_M**2
-    is_below = cells[:, 2] < _heights(cells, plane) - 3 * _MAX_INLIER_HEIGHT_M
-    is_lowest = is_below.mean() < _MAX_SHARE_BELOW
-    return bool(is_wide and is_lowest and _slopes(plane) < _MAX_SLOPE)
+    lowest = _heights(cells, plane) - 3 * _MAX_INLIER_HEIGHT_M
+    share_below = (cells[:, 2] < lowest).mean()
+    is_lowest = share_below < _MAX_SHARE_BELOW
+    is_level = _slopes(plane) < _MAX_SLOPE
+    return bool(is_wide and is_lowest and is_level)

@@ -477,7 +477,8 @@ def _evidence(
     squared = np.einsum("ki,ki->k", centred @ np.linalg.inv(noise), centred)
     weights = robust_weights("student", squared)
     table = moved.evidence(residuals, jacobians, noise, weights).sum(axis=0)
-    return table, (weights[:, None] * centred).T @ centred / len(centred)
+    scatter = (weights[:, None] * centred).T @ centred / len(centred)
+    return table, scatter
 
 
 def _long_run_variance(seconds: Blocks, previous: float) -> float:

@@ -281,8 +281,7 @@ def estimate_rotation(
     solution, Ts_cw_c = _solve_rotation(stamps_ns, Ts_pw_p, as_read, has_rates)
     findings = _check_rotation(Ts_pw_p, Ts_cw_c, solution.T_parent_child)
     rotations = replace(pose_pairs, Ts_pw_p=Ts_pw_p, Ts_cw_c=Ts_cw_c)
-    child = Trajectory(stamps_ns, Ts_cw_c).shifted(solution.time_offset_s)
-    on_one_clock = replace(rotations, Ts_cw_c=child.at(stamps_ns, extrapolate=True))
+    on_one_clock = rotations.child_shifted(solution.time_offset_s)
     of_model = covariance.assess_rotation(Ts_pw_p, solution)
     opinions = second_opinions(Ts_pw_p, on_one_clock.Ts_cw_c, solution.T_parent_child)
     assessment = of_model

@@ -69,7 +69,7 @@ _START_STEPS = 50
 _START_SETTLED_M = 1e-6
 # Prior information for a lever arm of zero at the start, as a share of that of an axis: for motion
 # that does not reveal the lever arm.
-_DRAWN = 1e-6
+_PULL_TO_ZERO = 1e-6
 
 # Number of parts of a recording whose paths are compared on their own.
 _PATH_PARTS = 10
@@ -85,7 +85,7 @@ class LeverArmSolution(ModelSolution):
     Attributes
     ----------
     lever_arm : (3,) array
-        m, in the axes of the sensor with poses.
+        Position of the antenna (m) in the axes of the sensor with poses.
     covariance : (3, 3) array
         Covariance under the model, with the misfit.
     imprecise : (N,) bool array
@@ -97,7 +97,7 @@ class LeverArmSolution(ModelSolution):
     imprecise: BoolArray
 
     def describe(self, stamps_ns: IntArray) -> Noise:
-        """Return the noise in numbers and in words, as of an AdaptiveSolution."""
+        """Return the noise in numbers and in words."""
         sigmas = fast_sigmas(self.levels)
         white = length(sigmas.translation_m)
         drift = f"{length(sigmas.walk_translation_m)} and {angle(sigmas.walk_rotation_rad)}"
@@ -247,14 +247,15 @@ class _State:
 
     @property
     def left_out(self) -> BoolArray:
-        """Positions (N,) that are no evidence."""
+        """Positions (N,) that are not used: outliers and imprecise ones."""
         return self.outliers.spikes | self.imprecise
 
     @property
     def course(self) -> increments.Course:
-        """Path of the antenna (the lever arm's end) as the odometry predicts it.
+        """Path of the antenna, at the end of the lever arm, as the odometry predicts it.
 
-        The path is rotated into the world of the positions, so it is free of their noise.
+        The path is in the axes of the positions' world, and does not contain the noise of the
+        positions.
         """
         streams = self.streams
         course = increments.course_of(replace(streams, Ts_cw_c=streams.Ts_pw_p @ self.X), self.X)
@@ -372,7 +373,7 @@ class _State:
         return replace(self, streams=streams, X=X, parameters=parameters)
 
 
-def _imprecise(squares: FloatArray, tuning: Tuning, least: float) -> BoolArray:
+def _imprecise(squares: FloatArray, tuning: Tuning, drift_m2: float) -> BoolArray:
     """Detect positions (N,) in neighbourhoods far less precise than the best quarter.
 
     Parameters
@@ -380,13 +381,15 @@ def _imprecise(squares: FloatArray, tuning: Tuning, least: float) -> BoolArray:
     squares : (N,) array
         Squared errors, m^2.
     tuning : Tuning
-    least : float
-        Least usual square (m^2): the odometry's drift from one position to the next.
+    drift_m2 : float
+        Variance of the odometry's drift from one position to the next: a lower bound of the usual
+        square.
     """
     window = np.ones(min(tuning.neighbours, len(squares)))
     sums = np.convolve(squares, window, mode="same")
     counts = np.convolve(np.ones(len(squares)), window, mode="same")
-    usual = max(float(np.quantile(sums / counts, 0.25)), least)
+    means = sums / counts
+    usual = max(float(np.quantile(means, 0.25)), drift_m2)
     return np.asarray(sums > tuning.worse * usual * counts)
 
 
@@ -448,10 +451,11 @@ def _solved(products: FloatArray) -> FloatArray:
 
 
 def _accelerations(streams: increments.Streams, X: FloatArray, tuning: Tuning) -> FloatArray:
-    """Accelerations (N, 6) of the antenna by the odometry, m/s^2, in the body's axes.
+    """Return the accelerations (N, 6) of the antenna by the odometry, m/s^2, in the body's axes.
 
-    They come from steps on either side of each pose, without the noise of the pose itself. They are
-    zero beside gaps and at the ends.
+    An acceleration is the difference of two velocities, before and after a pose, and does not
+    contain the noise of the pose itself. Accelerations next to gaps and at the ends are zero. So
+    are the last three columns.
     """
     path = se3.translation_of(streams.Ts_pw_p @ X)
     stamps_s = streams.stamps_s
@@ -460,12 +464,16 @@ def _accelerations(streams: increments.Streams, X: FloatArray, tuning: Tuning) -
     k = max(round(tuning.accelerating_s / interval_s), 1)
     if len(path) <= 4 * k:
         return accelerations
-    velocities = (path[k:] - path[:-k]) / (stamps_s[k:] - stamps_s[:-k])[:, None]
+    steps = path[k:] - path[:-k]
+    durations_s = stamps_s[k:] - stamps_s[:-k]
+    velocities = steps / durations_s[:, None]
     spans_s = (stamps_s[4 * k :] - stamps_s[: -4 * k])[:, None]
-    changes = (velocities[3 * k :] - velocities[: -3 * k]) / (0.75 * spans_s)
-    back = np.swapaxes(streams.Ts_pw_p[2 * k : -2 * k, :3, :3], 1, 2)
+    # Both velocities are means over a quarter of the span, three quarters of the span apart.
+    in_world = (velocities[3 * k :] - velocities[: -3 * k]) / (0.75 * spans_s)
+    middle = slice(2 * k, -2 * k)
+    to_body = np.swapaxes(streams.Ts_pw_p[middle, :3, :3], 1, 2)
     is_near = spans_s < tuning.near * 4 * k * interval_s
-    accelerations[2 * k : -2 * k, :3] = np.where(is_near, se3.times(back, changes), 0.0)
+    accelerations[middle, :3] = np.where(is_near, se3.times(to_body, in_world), 0.0)
     return accelerations
 
 
@@ -488,7 +496,7 @@ def _start(
     axes = _windows(se3.rotation_of(Ts_pw_p), size)
     path = _windows(se3.translation_of(Ts_pw_p), size)
     measured = _windows(positions, size)
-    information = np.einsum("nkij,nkil->njl", axes, axes) + _DRAWN * size * np.eye(3)
+    information = np.einsum("nkij,nkil->njl", axes, axes) + _PULL_TO_ZERO * size * np.eye(3)
     for _ in range(_START_STEPS):
         predicted = axes @ lever_arm + path
         turns = _rotations(measured, predicted)

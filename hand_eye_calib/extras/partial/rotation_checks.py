@@ -342,25 +342,40 @@ def _check_levels(streams: _Streams) -> list[Finding]:
         return _check_coarse_orientations(streams)
     rates = _rates(streams.measured)
     for axis, column in zip("xyz", rates.T, strict=True):
-        levels = np.unique(np.round(column / _ROUNDING_RAD_S)) * _ROUNDING_RAD_S
-        if _LEAST_LEVELS <= len(levels) < _FEW_LEVELS * len(column):
+        steps = _coarse_steps(column, _ROUNDING_RAD_S)
+        if steps is not None:
             # The mean of two rates has half the steps.
-            step_rad_s = 2.0 * median(np.diff(levels))
+            step_rad_s = 2.0 * median(steps)
             if step_rad_s > _STEP_RAD_S:
                 return [finding("coarse_rates", streams.name, step_rad_s=step_rad_s)]
             continue
-        limit = np.abs(column).max()
-        n_clipped = int((np.abs(column) > limit - _ROUNDING_RAD_S).sum())
-        n_near = int((np.abs(column) > (1.0 - _NEAR_LIMIT) * limit).sum()) - n_clipped
+        sizes = np.abs(column)
+        limit = sizes.max()
+        n_clipped = int((sizes > limit - _ROUNDING_RAD_S).sum())
+        n_near = int((sizes > (1.0 - _NEAR_LIMIT) * limit).sum()) - n_clipped
         if n_clipped >= max(_LEAST_CLIPPED, n_near):
-            share = n_clipped / len(column)
-            limit_deg_s = float(np.degrees(limit))
-            return [
-                finding(
-                    "clipped_rates", streams.name, axis=axis, share=share, limit_deg_s=limit_deg_s
-                )
-            ]
+            clipped = finding(
+                "clipped_rates",
+                streams.name,
+                axis=axis,
+                share=n_clipped / len(column),
+                limit_deg_s=float(np.degrees(limit)),
+            )
+            return [clipped]
     return []
+
+
+def _coarse_steps(values: FloatArray, rounding: float) -> FloatArray | None:
+    """Return the differences between neighbouring levels of values (N,), or None.
+
+    The result is None if the values have as many levels as those of a sensor with fine resolution,
+    or so few levels that the sensor does not turn. Values that differ by less than ``rounding`` are
+    one level.
+    """
+    levels = np.unique(np.round(values / rounding)) * rounding
+    if _LEAST_LEVELS <= len(levels) < _FEW_LEVELS * len(values):
+        return np.diff(levels)
+    return None
 
 
 def _check_coarse_orientations(streams: _Streams) -> list[Finding]:
@@ -368,10 +383,9 @@ def _check_coarse_orientations(streams: _Streams) -> list[Finding]:
     for name, stream in (("parent", streams.parent), ("child", streams.child)):
         angles_deg = np.degrees(se3.rotation_to_rpy(se3.rotation_of(stream.poses)))
         for column in angles_deg.T:
-            levels = np.unique(np.round(column / _ROUNDING_DEG)) * _ROUNDING_DEG
-            if not _LEAST_LEVELS <= len(levels) < _FEW_LEVELS * len(column):
+            steps_deg = _coarse_steps(column, _ROUNDING_DEG)
+            if steps_deg is None:
                 continue
-            steps_deg = np.diff(levels)
             step_deg = median(steps_deg)
             are_equal = np.abs(steps_deg - step_deg) < 10.0 * _ROUNDING_DEG
             if step_deg > _STEP_DEG and are_equal.mean() > 0.5:

@@ -162,10 +162,11 @@ class RotationFit(Fit):
         row = np.zeros(len(self._every_column))
         row[self.places["gains"]] = u**2
         row[self.places["shears"]] = [2.0 * u[k] * u[m] for k, m in PLANES]
+        gain = float(row @ self.joint.values)
         variance = row @ self.blocks.jackknife(self._every_column) @ row
         spread = row @ np.linalg.solve(self.blocks.total[:-1, :-1], row)
         bias = self.n_samples * abs(float(spread))
-        return float(row @ self.joint.values), float(np.sqrt(variance)), bias
+        return gain, float(np.sqrt(variance)), bias
 
     @property
     def bias_drift(self) -> float:

@@ -242,10 +242,14 @@ def _peaks(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatA
     polynomial = x / 5.0 - x**3 - y**5
     hollow = np.exp(-((x + 1.0) ** 2) - y**2) / 3.0
     total = (1.0 - x) ** 2 * hill - polynomial * middle - hollow
-    along_x = -2.0 * (1.0 - x) * (1.0 + x * (1.0 - x)) * hill
-    along_x += (2.0 * x * polynomial - 0.2 + 3.0 * x**2) * middle + 2.0 * (x + 1.0) * hollow
-    along_y = -2.0 * (y + 1.0) * (1.0 - x) ** 2 * hill
-    along_y += (2.0 * y * polynomial + 5.0 * y**4) * middle + 2.0 * y * hollow
+    hill_along_x = -2.0 * (1.0 - x) * (1.0 + x * (1.0 - x)) * hill
+    middle_along_x = (2.0 * x * polynomial - 0.2 + 3.0 * x**2) * middle
+    hollow_along_x = 2.0 * (x + 1.0) * hollow
+    hill_along_y = -2.0 * (y + 1.0) * (1.0 - x) ** 2 * hill
+    middle_along_y = (2.0 * y * polynomial + 5.0 * y**4) * middle
+    hollow_along_y = 2.0 * y * hollow
+    along_x = hill_along_x + (middle_along_x + hollow_along_x)
+    along_y = hill_along_y + (middle_along_y + hollow_along_y)
     return total, along_x, along_y
 
 

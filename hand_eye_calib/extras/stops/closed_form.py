@@ -57,10 +57,11 @@ def closest_rotations(
     # The sum of tr(X' R_a' Z R_b) is vec(X)' form vec(Z). Its largest singular vectors are X and Z
     # up to their length and a common sign; the sign makes determinants positive.
     form = np.einsum("nji,nka->iajk", weighted, R_b).reshape(9, 9)
-    left, _, right = np.linalg.svd(form)
-    matrices = np.stack([left[:, 0].reshape(3, 3), right[0].reshape(3, 3)])
-    sign = -1.0 if np.linalg.det(matrices[0]) < 0 else 1.0
-    X, Z = se3.nearest_rotation(sign * matrices)
+    left_vectors, _, right_vectors = np.linalg.svd(form)
+    matrix_X = left_vectors[:, 0].reshape(3, 3)
+    matrix_Z = right_vectors[0].reshape(3, 3)
+    sign = -1.0 if np.linalg.det(matrix_X) < 0 else 1.0
+    X, Z = se3.nearest_rotation(sign * np.stack([matrix_X, matrix_Z]))
     return X, Z
 
 

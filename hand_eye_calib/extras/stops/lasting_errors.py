@@ -40,7 +40,8 @@ def views_of_stops(Ts_world_parent: FloatArray, Ts_world_child: FloatArray) -> F
     rotations = se3.rotation_of(Ts_world_parent).reshape(-1, 9) / np.sqrt(2.0)
     turns_rad = np.linalg.norm(np.diff(rotations, axis=0), axis=1)
     changes_rad = turns_rad + ways_m / usual_m
-    return np.c_[np.cumsum(np.r_[0.0, changes_rad]), rotations, positions / usual_m]
+    lengths_rad = np.cumsum(np.append(0.0, changes_rad))
+    return np.column_stack([lengths_rad, rotations, positions / usual_m])
 
 
 def rest_weights(views: FloatArray) -> FloatArray:

@@ -151,9 +151,11 @@ def path_of(steps: FloatArray) -> tuple[FloatArray, FloatArray]:
     headings = np.append(0.0, np.cumsum(turns))
     # The chord of an arc has the direction of its middle, and the length of the arc times
     # sin(turn / 2) / (turn / 2). numpy's sinc(x) is sin(pi x) / (pi x).
-    middle = headings[:-1] + turns / 2.0
-    chords = (forward + 1j * left) * np.exp(1j * middle) * np.sinc(turns / (2.0 * np.pi))
-    return np.append(0.0, np.cumsum(chords)), headings
+    middle_directions = np.exp(1j * (headings[:-1] + turns / 2.0))
+    shortening = np.sinc(turns / (2.0 * np.pi))
+    chords = (forward + 1j * left) * middle_directions * shortening
+    positions = np.append(0.0, np.cumsum(chords))
+    return positions, headings
 
 
 def steps_between(chords: FloatArray, headings: FloatArray, turns: FloatArray) -> FloatArray:

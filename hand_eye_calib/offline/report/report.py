@@ -105,8 +105,14 @@ def page(template: Path, tone: str, verdict: str, sentence: str, **values: Any) 
     **values
         Other variables of the template.
     """
-    values |= {"tone": tone, "mark": MARKS[tone], "marks": MARKS, "verdict": verdict}
-    return _template(template).render(**values, sentence=text.capital(sentence))
+    return _template(template).render(
+        **values,
+        tone=tone,
+        mark=MARKS[tone],
+        marks=MARKS,
+        verdict=verdict,
+        sentence=text.capital(sentence),
+    )
 
 
 def render(

@@ -168,9 +168,17 @@ def _draw_sensor(
     """
     origin = T[:, 3]
     for axis, axis_colour in zip(T[:, :3].T, (BAD, GREEN, PARENT), strict=True):
-        panel.plot(*np.stack([origin, origin + axis_m * axis], axis=1), color=axis_colour)
+        tip = origin + axis_m * axis
+        horizontal, vertical = np.stack([origin, tip], axis=1)
+        panel.plot(horizontal, vertical, color=axis_colour)
     panel.plot(*origin, "o", color=colour, ms=5)
-    panel.annotate(plain_label(name), (*origin,), (5, below), textcoords="offset points", color=INK)
+    panel.annotate(
+        plain_label(name),
+        xy=(*origin,),
+        xytext=(5, below),
+        textcoords="offset points",
+        color=INK,
+    )
 
 
 @page_style()
