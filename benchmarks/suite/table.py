@@ -32,12 +32,12 @@ def tables(source, rows, memory):
     for size, name in ((SHORT, "short"), (LONG, "long")):
         found.append(
             _side_by_side(
-                f"Side by side: {source} {name} drive, {size:,} pairs",
+                f"All methods: {source} {name} drive, {size:,} pairs",
                 [row for row in of_pairs if row.size == size],
             )
         )
     found.append(_others([row for row in rows if row.size not in sizes], memory))
-    return [*found, Table("What is aimed at", ["aim", "measured", "met"], aims(rows, memory))]
+    return [*found, Table("Aims", ["aim", "measured", "met"], aims(rows, memory))]
 
 
 def show(found):
@@ -109,6 +109,6 @@ def _side_by_side(title, rows):
 def _others(rows, memory):
     lines = [[row.name, f"{row.size:,}" if row.size else "", _cell(row)] for row in rows]
     for size, (before, peak, data) in memory.items():
-        of_what = f"{before / 1e6:.0f} before and {data / 1e6:.0f} for the pairs among it"
+        of_what = f"of which {before / 1e6:.0f} before the solve, {data / 1e6:.0f} for the pairs"
         lines.append(["peak memory of dnlo fast", f"{size:,}", f"{peak / 1e6:.0f} MB, {of_what}"])
     return Table("Processes, bags, messages", ["size", "measured"], lines)
