@@ -24,6 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hand_eye_calib.core.assessment.covariance import UNOBSERVABLE
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.blocks import Blocks, information, score
 from hand_eye_calib.core.base.text import amount, axes_in_words, listing
@@ -31,8 +32,6 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import deviation
 from hand_eye_calib.core.results.records import AXES
 
-# A direction with a larger standard deviation (m, rad) is unknown.
-_UNKNOWN = 0.3
 # Variance (m^2, rad^2) of an unknown direction: so large that even many results together have no
 # information on the direction.
 _UNKNOWN_VARIANCE = 1e4
@@ -165,7 +164,7 @@ def agreement_of(
     common = _common(Ts_parent_child[belongs], stated[belongs], usual_scatter, start)
     rest = _explain(errors[belongs], weights[belongs], 0.0)
     sigmas = np.sqrt(np.diagonal(scattered, axis1=1, axis2=2))
-    sigmas = np.where(sigmas < _UNKNOWN, sigmas, np.nan)
+    sigmas = np.where(sigmas < UNOBSERVABLE, sigmas, np.nan)
     deviations = deviation(Ts_parent_child, common.T_parent_child)
     return Agreement(
         kind=explanation.kind,
@@ -246,7 +245,7 @@ def _common(
 def unknown_directions(covariance: FloatArray) -> FloatArray:
     """Return the orthonormal unknown directions (6, U) of a covariance (6, 6)."""
     values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors[:, values > _UNKNOWN**2])
+    return np.asarray(vectors[:, values > UNOBSERVABLE**2])
 
 
 def _without_unknown(covariance: FloatArray) -> FloatArray:
@@ -254,7 +253,8 @@ def _without_unknown(covariance: FloatArray) -> FloatArray:
     if not np.isfinite(covariance).all():
         return _UNKNOWN_VARIANCE * np.eye(6)
     values, vectors = np.linalg.eigh(covariance)
-    values = np.where(values < _UNKNOWN**2, np.maximum(values, 1e-12), _UNKNOWN_VARIANCE)
+    is_unknown = values >= UNOBSERVABLE**2
+    values = np.where(is_unknown, _UNKNOWN_VARIANCE, np.maximum(values, 1e-12))
     return (vectors * values) @ vectors.T
 
 
@@ -358,5 +358,5 @@ def _chi2_and_dof(products: FloatArray, ranks: FloatArray) -> tuple[FloatArray, 
 
 def _ranks(weights: FloatArray) -> FloatArray:
     """Return the numbers (...) of known directions of weights (..., 6, 6)."""
-    is_known = np.linalg.eigvalsh(weights) > 1 / _UNKNOWN**2
+    is_known = np.linalg.eigvalsh(weights) > 1 / UNOBSERVABLE**2
     return np.asarray(is_known.sum(axis=-1), dtype=float)

@@ -79,7 +79,8 @@ _HIDDEN_SHARE = 0.1
 
 # Standard deviations (m, rad) above which an axis is weak.
 WEAK = (0.05, float(np.radians(1.0)))
-# Standard deviation (m or rad) above which an axis is unobservable: its value is of no use.
+# Standard deviation (m or rad) above which an axis or a direction is unobservable: its value has no
+# use.
 UNOBSERVABLE = 0.3
 
 

@@ -42,6 +42,7 @@ def plain(value: Any) -> Any:
 
 
 def _plain_member(member: Enum) -> Any:
+    """Return the plain value of a member of an enum."""
     value = member.value
     return value.replace(" ", "_") if isinstance(value, str) else plain(value)
 

@@ -52,16 +52,17 @@ def amount(axis: str, value: float) -> str:
 
 
 def amount_beside(axis: str, value: float, other: float) -> str:
-    """Format an amount as :func:`amount`, with more digits if needed to differ from another."""
+    """Format an amount like :func:`amount`, with more digits if needed to differ from ``other``."""
     text = amount(axis, value)
     if text != amount(axis, other) or value == other or not math.isfinite(value):
         return text
-    unit = text.rpartition(" ")[2]
+    *_, unit = text.split(" ")
     factors = {name: factor for _, name, factor in _LENGTHS} | {"deg": math.degrees(1.0)}
     for decimals in range(_MAX_DECIMALS):
-        texts = [f"{factors[unit] * size:.{decimals}f}" for size in (value, other)]
-        if float(texts[0]) != float(texts[1]):
-            return f"{texts[0]} {unit}"
+        number = f"{factors[unit] * value:.{decimals}f}"
+        other_number = f"{factors[unit] * other:.{decimals}f}"
+        if float(number) != float(other_number):
+            return f"{number} {unit}"
     return text
 
 
@@ -130,9 +131,11 @@ def in_words(value: object) -> str:
 
 
 def given_or_estimated(value: float, sigma: float, unit: str) -> str:
-    """Format a number: with its standard deviation if estimated; ``sigma`` is 0 if it was set."""
-    text = f"{value:.4f} +/- {sigma:.4f} {unit}" if sigma else f"{value:g} {unit}"
-    return text.strip() + (", estimated" if sigma else "")
+    """Format a number that the user has set (``sigma`` is 0), or that was estimated."""
+    if not sigma:
+        return f"{value:g} {unit}".strip()
+    number = f"{value:.4f} +/- {sigma:.4f} {unit}".strip()
+    return f"{number}, estimated"
 
 
 def duration(seconds: float) -> str:
@@ -215,7 +218,7 @@ def shortened(text: str, length: int = _MAX_CHARACTERS) -> str:
 
 
 def shown_value(value: object) -> str:
-    """Format a value for a message, shortened."""
+    """Return the Python notation of a value, shortened, for a message."""
     return shortened(repr(value))
 
 
@@ -231,25 +234,27 @@ def parse_prior(name: str, text: str) -> tuple[float, float]:
         more than 5 m has no unit; or if the value has a unit other than m or rad, and the standard
         deviation has none.
     """
-    value, _, sigma = text.replace("±", "+/-").replace("+-", "+/-").partition("+/-")
+    in_one_notation = text.replace("±", "+/-").replace("+-", "+/-")
+    value, _, sigma = in_one_notation.partition("+/-")
+    value = value.strip()
+    sigma = sigma.strip()
     unit = AXIS_UNITS[name.removeprefix("prior.")]
     form = "VALUE+/-SIGMA, with its standard deviation"
-    if not sigma.strip():
+    if not sigma:
         raise ConfigError(f"{name} must be {form}; got {shown_value(text)}")
     (prior,) = quantities(name, [unit], value.split(), form)
     (prior_sigma,) = quantities(name, [unit], sigma.split(), form, 0.0)
-    words = value.strip(), sigma.strip()
-    unit_of_value = _unit_of(words[0])
+    unit_of_value = _unit_of(value)
     if unit == "m" and abs(prior) > _MAX_WITHOUT_UNIT_M and not unit_of_value:
-        in_cm = "+/-".join(_with_units(words, "cm"))
-        in_m = "+/-".join(_with_units(words, "m"))
+        in_cm = "+/-".join(_with_units((value, sigma), "cm"))
+        in_m = "+/-".join(_with_units((value, sigma), "m"))
         raise ConfigError(
-            f"{name} needs a unit: {words[0]} may be m, cm or mm; write {in_cm} or {in_m}"
+            f"{name} needs a unit: {value} may be m, cm or mm; write {in_cm} or {in_m}"
         )
-    if unit_of_value not in ("", unit) and not _unit_of(words[1]):
+    if unit_of_value not in ("", unit) and not _unit_of(sigma):
         raise ConfigError(
-            f"{name}: the standard deviation {words[1]} needs a unit: write "
-            f"{words[1]}{unit_of_value} or {words[1]}{unit}"
+            f"{name}: the standard deviation {sigma} needs a unit: write "
+            f"{sigma}{unit_of_value} or {sigma}{unit}"
         )
     return prior, prior_sigma
 
@@ -273,9 +278,10 @@ def prior_as_typed(axis: str, value: str, sigma: str) -> str:
     words = [word.strip().replace(",", ".") for word in (value, sigma)]
     if AXIS_UNITS[axis] == "rad":
         return "+/-".join(_with_units(words, "deg"))
-    value_without_unit = _QUANTITY.fullmatch(words[0]) and not _unit_of(words[0])
-    is_short = not value_without_unit or abs(float(words[0])) <= _MAX_WITHOUT_UNIT_M
-    return "+/-".join(_with_units(words, "m") if is_short else words)
+    is_number = _QUANTITY.fullmatch(words[0]) and not _unit_of(words[0])
+    if is_number and abs(float(words[0])) > _MAX_WITHOUT_UNIT_M:
+        return "+/-".join(words)
+    return "+/-".join(_with_units(words, "m"))
 
 
 def parse_pose(name: str, text: str) -> tuple[float, ...]:
@@ -344,22 +350,30 @@ def quantities(
         raise ConfigError(f"{name} must be {form}; got {shown_value(' '.join(words))}")
     values = []
     for unit, word in zip(units, words, strict=True):
-        match = _QUANTITY.fullmatch(word)
-        if not match or (match[2] or unit) not in _IN_SI[unit]:
-            allowed = " or ".join(_IN_SI[unit])
-            raise ConfigError(f"{name} must be numbers in {allowed}; got {shown_value(word)}")
-        value = float(match[1]) * _IN_SI[unit][match[2] or unit]
-        if abs(value) > _MAX_TYPED:
-            raise ConfigError(f"{name} must be at most {_MAX_TYPED:g} {unit}; got {word[:20]!r}")
+        value = _quantity(name, unit, word)
         if not value > above:
             raise ConfigError(f"{name} needs a standard deviation above 0; got {shown_value(word)}")
-        if unit == "rad" and not match[2] and abs(value) > 2 * math.pi:
+        if unit == "rad" and not _unit_of(word) and abs(value) > 2 * math.pi:
             raise ConfigError(
                 f"{name} is in radians without a unit; got {word[:20]}: write "
                 f"{word[:20]}deg for degrees"
             )
         values.append(value)
     return values
+
+
+def _quantity(name: str, unit: str, word: str) -> float:
+    """Return the number of a word in ``unit`` (m or rad); see :func:`quantities`."""
+    match = _QUANTITY.fullmatch(word)
+    factors = _IN_SI[unit]
+    unit_of_word = _unit_of(word) or unit
+    if not match or unit_of_word not in factors:
+        allowed = " or ".join(factors)
+        raise ConfigError(f"{name} must be numbers in {allowed}; got {shown_value(word)}")
+    value = float(match[1]) * factors[unit_of_word]
+    if abs(value) > _MAX_TYPED:
+        raise ConfigError(f"{name} must be at most {_MAX_TYPED:g} {unit}; got {word[:20]!r}")
+    return value
 
 
 def parse_reference(name: str, text: str) -> tuple[str, int]:
