@@ -82,6 +82,14 @@ def test_a_drive_of_one_curve_is_refused(course, has_wheels):
     assert np.isinf(result.sigmas[[0, 1, 5]]).all()
 
 
+def test_curves_to_one_side_make_roll_uncertain():
+    drive = machine(course="left")
+    result = hec.calibrate_vehicle(drive.sensor, drive.wheels, child_kind="exact")
+    errors = np.abs(pose_errors(result, drive.T_base_sensor))
+    assert errors[2] > np.radians(0.1)  # the body leans outwards
+    assert (errors < 3.3 * result.sigmas[[0, 1, 3, 4, 5]]).all()
+
+
 def test_spinning_on_the_spot_is_refused():
     drive = machine(course="spin")
     result = hec.calibrate_vehicle(drive.sensor, drive.wheels)

@@ -19,7 +19,9 @@ the tail of this distribution, where the wheels slip, have weight 0. The covaria
 - the square of 2/5 of the difference to the estimate over windows twice as long;
 - the square of 3/20 of the difference to the estimate without weights, for slip that is not
   detected;
-- the square of the bias of x and y that noise of the turns may cause.
+- the square of the bias of x and y that noise of the turns may cause;
+- the square of the bias of roll and y of a body that leans outwards, if most curves have the same
+  direction.
 """
 
 from collections.abc import Sequence
@@ -53,6 +55,14 @@ _PARAMETER_SHARE = 0.3
 _PARAMETER_SIGMA = 0.03
 # Prior standard deviation of an unknown that keeps its first value, in its unit.
 _FIXED_SIGMA = 1e-6
+
+# Standard deviation of the angle (rad) by which a body leans outwards per lateral acceleration
+# (m/s^2): the roll gradient of cars is 3 to 7 deg per g.
+_LEAN = 0.01
+
+# Height (m) of the sensor over the axis about which the body leans: a leaning body moves the sensor
+# sideways by the height times the angle. The height itself is out of reach.
+_HEIGHT = 1.0
 
 # Number of blocks of the jackknife. A block lasts some seconds, longer than a slip of the wheels.
 BLOCKS = 30
@@ -257,7 +267,25 @@ def fit_drive(drive: Drive, longer: Drive, fixed: Sequence[int]) -> Fit:
     # Bias of x and y towards zero, from noise of the turns.
     bias = np.zeros(len(sigmas))
     bias[:2] = fit.T_base_sensor[:2, 3] / [ratios["x"], ratios["y"]]
-    return replace(fit, covariance=covariance + np.outer(bias, bias))
+    covariance = covariance + np.outer(bias, bias)
+    lean = _LEAN * _lateral_acceleration(drive, fit.T_base_sensor)
+    covariance[TILT[0], TILT[0]] += lean**2
+    if Y not in fixed:
+        covariance[Y, Y] += (_HEIGHT * lean) ** 2
+    return replace(fit, covariance=covariance)
+
+
+def _lateral_acceleration(drive: Drive, T: FloatArray) -> float:
+    """Return the mean lateral acceleration (m/s^2) to the left; small if both curves are driven.
+
+    The turns determine roll, so windows are weighted by their squared turns. ``T`` is the pose of
+    the sensor.
+    """
+    axle = drive.measured(T)
+    durations_s = drive.ends_s[1] - drive.ends_s[0]
+    turns = axle[:, 5]
+    accelerations = axle[:, 0] * turns / durations_s**2
+    return float(np.average(accelerations, weights=turns**2 + _MIN_VARIANCE))
 
 
 def _difference(
