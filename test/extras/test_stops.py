@@ -419,25 +419,32 @@ def errors_m(fits, Xs):
     )
 
 
-def test_fits_in_both_frames_are_averaged_if_a_robot_has_wrong_dimensions(random, monkeypatch):
-    averaged = []
-    likelier = []
-    truths = []
-    for _ in range(12):
-        X, _, stops = recorded(random, 20)
-        # Errors of the robot that depend on its place.
-        reach_m = 0.005 * np.sin(3.0 * stops.Ts_world_parent[:, :3, 0])
-        robot = stops.Ts_world_parent @ se3.exp(np.c_[reach_m, 0.3 * reach_m])
-        stops = Stops(robot, stops.Ts_world_child)
-        truths.append(X)
-        averaged.append(solve(stops))
-        with monkeypatch.context() as patch:
-            patch.setattr(robot_world, "_LIKELIHOOD_SCALE", 1e-9)
-            likelier.append(solve(stops))
+def seen_by_a_camera(random, n):
+    """X, Z and stops of a target whose distance and rotation have the largest errors."""
+    X, Z, stops = recorded(random, n, noise=0.2)
+    measured = se3.inverse(stops.Ts_world_child)
+    position = se3.translation_of(measured)
+    sight = position / np.linalg.norm(position, axis=1, keepdims=True)
+    position = position + 0.01 * random.normal(size=(n, 1)) * sight
+    turns = se3.rotation_exp(0.01 * random.normal(size=(n, 3)))
+    measured = se3.from_rotation_translation(se3.rotation_of(measured) @ turns, position)
+    return X, Z, Stops(stops.Ts_world_parent, se3.inverse(measured))
 
-    assert np.mean(errors_m(averaged, truths)) < np.mean(errors_m(likelier, truths))
-    for fit, single in zip(averaged, likelier, strict=True):
-        assert np.all(np.diag(fit.covariance) >= np.diag(single.covariance))
+
+def test_errors_of_a_camera_are_weighted_by_their_source(random):
+    fits = []
+    single = []
+    truths = []
+    values = []
+    for _ in range(30):
+        X, Z, stops = seen_by_a_camera(random, 20)
+        truths.append(X)
+        fits.append(solve(stops))
+        rests = np.ones(len(stops))
+        single.append(robot_world._likelier_fit(stops, rests))
+        values.append(nees_of(solve(stops, stretch=1e-3), X, Z))
+    assert np.mean(errors_m(fits, truths)) < 0.8 * np.mean(errors_m(single, truths))
+    assert_nees(values, 8.0, 18.0)
 
 
 def nees_of(fit, X, Z):

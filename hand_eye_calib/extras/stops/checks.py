@@ -22,7 +22,7 @@ from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.checks.findings import Finding, Severity, conventions, finding
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.records import has_error
-from hand_eye_calib.extras.stops.robot_world import solve
+from hand_eye_calib.extras.stops.robot_world import objective_of
 from hand_eye_calib.extras.stops.rotation_checks import (
     MAX_UNEXPLAINED,
     MIN_IMPROVEMENT,
@@ -215,7 +215,7 @@ def _rivals(sample: StopPoses) -> list[RoughFit]:
 
 def _objective(sample: StopPoses, fit: RoughFit) -> float:
     """Return the negative log likelihood of stops solved under the hypothesis of a rough fit."""
-    return solve(sample.without(fit.mistakes, fit.scale or 1.0)).objective
+    return objective_of(sample.without(fit.mistakes, fit.scale or 1.0))
 
 
 def _check_conventions(

@@ -73,7 +73,7 @@ def next_stops(
     for axis, angle_deg in itertools.product("xyz", (_TURN_DEG, -_TURN_DEG)):
         vector = np.radians(angle_deg) * np.eye(3)["xyz".index(axis)]
         stop = _turned(stops[np.array([start])], fit, vector, is_inverse)
-        jacobian = whitened_rows(stop, fit, in_world=False)[0, :, :12]
+        jacobian = whitened_rows(stop, fit)[0, :, :12]
         gains[NextStop(axis, angle_deg, frame)] = jacobian.T @ jacobian
     levels = np.repeat([fit.level_m, fit.level_rad], 3)
     information = fit.information + np.diag(np.tile(1.0 / (_PRIOR_LEVELS * levels) ** 2, 2))

@@ -6,10 +6,12 @@ pose of the child in the parent. Z is the pose of the child's world in the paren
 target in the base of the robot. The order of the stops has no meaning.
 
 The error of stop i is ``xi_i = Log(B_i^-1 Z^-1 A_i X)`` in the frame of the child, or the same
-error in the frame of the child's world. It has a Student-t distribution with one variance for the
-three values of the position and one for those of the rotation. Solve by Gauss-Newton steps with
-weights and variances from the expectation-maximisation algorithm: K. L. Lange, R. J. A. Little,
-J. M. G. Taylor, *Robust statistical modeling using the t distribution*, JASA 84, 1989.
+error in the frame of the child's world. It has a Student-t distribution. For outliers and for
+hypotheses, it has one variance for the three values of the position and one for those of the
+rotation. Solve by Gauss-Newton steps with weights and variances from the expectation-maximisation
+algorithm: K. L. Lange, R. J. A. Little, J. M. G. Taylor, *Robust statistical modeling using the t
+distribution*, JASA 84, 1989. The result has the variances of
+:mod:`hand_eye_calib.extras.stops.error_components`.
 """
 
 import math
@@ -23,6 +25,7 @@ from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.base.stats import student_weights
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.stops.closed_form import Stops, robust_start
+from hand_eye_calib.extras.stops.error_components import fit_components
 from hand_eye_calib.extras.stops.lasting_errors import (
     correlations,
     kernel_weights,
@@ -43,15 +46,13 @@ _DEGREES = 16.0
 # exceed this limit once in 300,000 stops (chi-square).
 _OUTLIER_SQUARED = 36.0
 
-# Difference of the log likelihoods of both frames of the errors at which the likelier frame has e
-# times the weight of the other. Errors of a robot's geometry last, so likelihoods of independent
-# errors are too certain. Measured on KinHEC: 5 to 20 lower the errors of robots with wrong
-# dimensions by 7 to 10 %; above 10, noise of images loses.
-_LIKELIHOOD_SCALE = 10.0
-
 # Degrees of freedom while outliers are detected. Tails are so heavy then that a few outliers hardly
 # change the variances.
 _OUTLIER_DEGREES = 3.0
+
+# Smallest number of degrees of freedom, times the number of stops less two: with fewer, a few stops
+# would fit exactly and all others be outliers.
+_FEWEST_DEGREES = 16.0
 
 # Number of estimated values: six of X and six of Z.
 _N_VALUES = 12
@@ -154,51 +155,65 @@ def solve(stops: Stops, stretch: float = STRETCH) -> RobotWorld:
     Notes
     -----
     The start is the closed form of :mod:`hand_eye_calib.extras.stops.closed_form`. Outliers are
-    detected with heavy tails and left out. Errors may be normal in the frame of the child or in
-    that of the child's world (a target whose pose a camera measures). Both are fitted, and the fits
-    are averaged with weights of their likelihoods.
+    detected with heavy tails and left out, with errors in the frame of the child or in that of the
+    child's world (a target whose pose a camera measures), whichever is likelier. The fit of the
+    other stops has both kinds of errors: :mod:`hand_eye_calib.extras.stops.error_components`.
     """
     if len(stops) < MIN_STOPS:
         raise NotEnoughDataError(
             f"{len(stops)} stops are too few: at least {MIN_STOPS}, with rotations about two axes, "
             "are necessary; 15 or more are better"
         )
-    start = robust_start(stops)
     views = views_of_stops(stops.Ts_world_parent, stops.Ts_world_child)
     rests = rest_weights(views)
-    fits = [_fit_without_outliers(stops, start, in_world, rests) for in_world in (False, True)]
-    in_world = fits[1].objective < fits[0].objective
-    best = fits[int(in_world)]
-    other = fits[int(not in_world)]
-    is_kept = best.weights > 0.0
-    best = _with_lasting_errors(
-        stops[is_kept], best, in_world, rests[is_kept], views[is_kept], stretch
+    rough = _likelier_fit(stops, rests)
+    is_kept = rough.weights > 0.0
+    kept = stops[is_kept]
+    components = fit_components(
+        kept,
+        (rough.T_parent_child, rough.T_world_world),
+        np.square([rough.level_m, rough.level_rad]),
+        rests[is_kept],
+        max(_FEWEST_DEGREES / (len(stops) - 2), _DEGREES),
+        _linearise,
     )
-    return _averaged(best, other)
+    weights = np.zeros(len(stops))
+    weights[is_kept] = np.minimum(components.weights, 1.0)
+    fit = replace(
+        rough,
+        T_parent_child=components.T_parent_child,
+        T_world_world=components.T_world_world,
+        covariance=_inverse_of(components.information, rough),
+        weights=weights,
+    )
+    return _with_lasting_errors(
+        kept, fit, components.whitening, rests[is_kept], views[is_kept], stretch
+    )
 
 
-def _averaged(best: RobotWorld, other: RobotWorld) -> RobotWorld:
-    """Return the average of the fits with errors in either frame, weighted by their likelihoods.
+def objective_of(stops: Stops) -> float:
+    """Return the negative log likelihood of at least three stops, up to a constant."""
+    views = views_of_stops(stops.Ts_world_parent, stops.Ts_world_child)
+    return _likelier_fit(stops, rest_weights(views)).objective
 
-    The covariance contains the scatter of both fits. If ``other`` contradicts ``best``, the result
-    is ``best``.
+
+def _likelier_fit(stops: Stops, rests: FloatArray) -> RobotWorld:
+    """Return the fit with errors in the frame of the child or of its world, the likelier one.
+
+    ``rests`` (N,) are weights of stops at one place. Weights of outliers are 0.
     """
-    offsets = [
-        se3.log(se3.inverse(best.T_parent_child) @ other.T_parent_child),
-        se3.log(se3.inverse(best.T_world_world) @ other.T_world_world),
-    ]
-    offset = np.concatenate(offsets)
-    if offset @ np.linalg.solve(best.covariance, offset) > _OUTLIER_SQUARED:
-        return best
-    odds = math.exp((best.objective - other.objective) / _LIKELIHOOD_SCALE)
-    weight = odds / (1.0 + odds)
-    step_X, step_Z = se3.exp(weight * np.reshape(offset, (2, 6)))
-    return replace(
-        best,
-        T_parent_child=best.T_parent_child @ step_X,
-        T_world_world=best.T_world_world @ step_Z,
-        covariance=best.covariance + weight * (1.0 - weight) * np.outer(offset, offset),
-    )
+    start = robust_start(stops)
+    fits = [_fit_without_outliers(stops, start, in_world, rests) for in_world in (False, True)]
+    return min(fits, key=lambda fit: fit.objective)
+
+
+def _inverse_of(information: FloatArray, rough: RobotWorld) -> FloatArray:
+    """Return the covariance (12, 12) of X and Z; unobservable directions have large variances.
+
+    Their prior has a thousand times the standard deviations of a stop in the fit ``rough``.
+    """
+    prior = np.tile(np.repeat([1e-3 / rough.level_m, 1e-3 / rough.level_rad], 3), 2)
+    return np.asarray(np.linalg.inv(information + np.diag(prior**2)), dtype=float)
 
 
 def _fit_without_outliers(
@@ -213,8 +228,7 @@ def _fit_without_outliers(
     ``rests`` (N,) are weights of stops at one place. The result's weights are 0 for outliers.
     """
     n = len(stops)
-    # With fewer degrees of freedom, a few stops would fit exactly and all others be outliers.
-    fewest_degrees = 16.0 / (n - 2)
+    fewest_degrees = _FEWEST_DEGREES / (n - 2)
     rough = _fit(stops, start, in_world, max(fewest_degrees, _OUTLIER_DEGREES), rests)
     is_kept = rough.weights > 0.0
     fit = _fit(
@@ -237,7 +251,7 @@ def _fit_without_outliers(
 
 
 def _linearise(
-    stops: Stops, X: FloatArray, Z: FloatArray, in_world: bool
+    stops: Stops, X: FloatArray, Z: FloatArray, in_world: bool = False
 ) -> tuple[FloatArray, FloatArray]:
     """Return the errors xi (N, 6) of stops, and their derivatives (N, 6, 12).
 
@@ -348,22 +362,20 @@ def _fit(
     # Expected information of the Student-t likelihood: Lange, Little, Taylor 1989, section 4.
     rows *= np.sqrt((degrees + 6.0) / (degrees + 8.0) * rests / weights)[:, None, None]
     fisher = _products(rows)[:-1, :-1]
-    # Prior of unobservable directions: a thousand times the standard deviations of a stop.
-    weak_prior = np.diag(np.tile(np.repeat(1e-6 / variances, 3), 2))
     objective = 1.5 * n * np.log(variances).sum()
     objective += 0.5 * (degrees + 6.0) * rests @ np.log1p(distances / degrees)
-    is_inlier = distances < _OUTLIER_SQUARED
-    return RobotWorld(
+    fit = RobotWorld(
         T_parent_child=X,
         T_world_world=Z,
-        covariance=np.asarray(np.linalg.inv(fisher + weak_prior), dtype=float),
+        covariance=np.zeros((_N_VALUES, _N_VALUES)),
         information=fisher,
-        weights=np.where(is_inlier, np.minimum(weights / rests, 1.0), 0.0),
+        weights=np.where(distances < _OUTLIER_SQUARED, np.minimum(weights / rests, 1.0), 0.0),
         level_m=float(np.sqrt(variances[0])),
         level_rad=float(np.sqrt(variances[1])),
         objective=float(objective),
         converged=converged,
     )
+    return replace(fit, covariance=_inverse_of(fisher, fit))
 
 
 # ------------------------------------------------------------------ the covariance
@@ -394,7 +406,7 @@ class _Stretch(NamedTuple):
 def _with_lasting_errors(
     stops: Stops,
     fit: RobotWorld,
-    in_world: bool,
+    whitening: FloatArray,
     rests: FloatArray,
     views: FloatArray,
     stretch: float,
@@ -410,8 +422,8 @@ def _with_lasting_errors(
     stops : Stops
         Without outliers.
     fit : RobotWorld
-    in_world : bool
-        Whether the errors are in the frame of the child's world, else in that of the child.
+    whitening : (N, 6, 6) array
+        Matrices that make the errors of each stop independent, with variance 1.
     rests : (N,) array
         Weights of stops at one place.
     views : (N, 13) array
@@ -419,7 +431,7 @@ def _with_lasting_errors(
     stretch : float
         Prior standard deviation of the scale, as a share.
     """
-    rows = whitened_rows(stops, fit, in_world)
+    rows = whitening @ _rows_of(stops, fit)
     weighted = rows * np.sqrt(fit.weights[fit.weights > 0.0])[:, None, None]
     first = slice(_MAX_STOPS_AT_ONCE)
     shares = kernel_weights(correlations(views[first]), weighted[first])
@@ -447,22 +459,28 @@ def _with_lasting_errors(
     )
 
 
-def whitened_rows(stops: Stops, fit: RobotWorld, in_world: bool) -> FloatArray:
+def whitened_rows(stops: Stops, fit: RobotWorld) -> FloatArray:
     """Return derivatives and errors (N, 6, 14) of stops, over the standard deviations of errors.
 
-    The columns are the derivatives with respect to X and Z (12), the derivative with respect to the
-    scale of the child's lengths (1), and the errors (1). The errors are in the frame of the child's
-    world if ``in_world``, else in that of the child.
+    The columns are those of :func:`_rows_of`.
     """
-    errors, jacobian = _linearise(stops, fit.T_parent_child, fit.T_world_world, in_world)
-    by_length = np.zeros((len(stops), 6))
-    if in_world:
-        by_length[:, :3] = -se3.translation_of(stops.Ts_world_child)
-    else:
-        by_length[:, :3] = se3.translation_of(se3.inverse(stops.Ts_world_child))
-    rows = np.concatenate([jacobian, by_length[..., None], errors[..., None]], axis=2)
     levels = np.repeat([fit.level_m, fit.level_rad], 3)
-    return np.asarray(rows / levels[:, None])
+    return np.asarray(_rows_of(stops, fit) / levels[:, None])
+
+
+def _rows_of(stops: Stops, fit: RobotWorld) -> FloatArray:
+    """Return derivatives and errors (N, 6, 14) of stops, in the frame of the child.
+
+    The columns are the derivatives with respect to X and Z (12), the derivative with respect to the
+    scale of the child's lengths (1), and the errors (1). The derivative has the predicted positions
+    of the child. Measured positions have noise that is part of the errors, too, and would make the
+    estimated scale too small.
+    """
+    errors, jacobian = _linearise(stops, fit.T_parent_child, fit.T_world_world)
+    predicted = se3.inverse(fit.T_world_world) @ stops.Ts_world_parent @ fit.T_parent_child
+    by_length = np.zeros((len(stops), 6))
+    by_length[:, :3] = se3.translation_of(se3.inverse(predicted))
+    return np.concatenate([jacobian, by_length[..., None], errors[..., None]], axis=2)
 
 
 def _stretch_of(rows: FloatArray, lasting: FloatArray, stretch: float) -> _Stretch:

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError
@@ -24,8 +23,8 @@ from hand_eye_calib.extras.stops.rough_fit import (
 )
 from hand_eye_calib.extras.stops.worlds import SETUPS
 
-# The scale of the child's lengths is not 1 if the likelihood says so with this many standard
-# deviations, and if it differs from 1 by more than this share.
+# The scale of the child's lengths is not 1 if it differs from 1 by more than this many standard
+# deviations, and by more than this share.
 _MIN_SCALE_SIGMAS = 3.0
 _MIN_SCALE_CHANGE = 0.01
 
@@ -303,7 +302,7 @@ def _with_checked_scale(setup_fit: SetupFit, repaired: _Repaired, setup: str | N
     free = _with_estimated_scale(poses, setup_fit)
     is_auto = config.scale == "auto"
     has_other_unit = is_auto and repaired.unit != 1.0
-    if not (has_other_unit or _is_clearly_not_one(poses, free, as_given)):
+    if not (has_other_unit or _is_clearly_not_one(free)):
         return as_given
     is_size = 1.0 / _MAX_SIZE_RATIO < free.scale < _MAX_SIZE_RATIO
     scale = repaired.unit * free.scale
@@ -329,34 +328,11 @@ def _scale_in_words(scale: float, sigma: float, unit: float) -> str:
     )
 
 
-def _is_clearly_not_one(poses: StopPoses, free: SetupFit, as_given: SetupFit) -> bool:
-    """Return whether an estimated scale is clearly not 1, by a likelihood ratio test."""
-    if abs(np.log(free.scale)) < _MIN_SCALE_CHANGE:
-        return False
-    least_gain = 0.5 * _MIN_SCALE_SIGMAS**2 * free.fit.scale_inflation
-    gain = as_given.fit.objective - free.fit.objective
-    if free.scale < 1.0 and gain > least_gain:
-        gain = _gain_in_measured_lengths(poses, free, as_given)
-    return bool(gain > least_gain)
-
-
-def _gain_in_measured_lengths(poses: StopPoses, free: SetupFit, as_given: SetupFit) -> float:
-    """Return the gain of log likelihood by a scale below 1, per density of measured lengths.
-
-    A scale below 1 makes residuals smaller because it shrinks the child's positions with their
-    noise. The density of the measured (unscaled) positions has the additional term
-    ``3 log(scale)`` in its logarithm for each stop. The scale is optimised under this density,
-    between the estimated scale and 1.
-    """
-    mistakes = Mistakes(is_inverse=free.is_inverse)
-
-    def objective(log_scale: float) -> float:
-        fit = solve(poses.without(mistakes, float(np.exp(log_scale))))
-        return fit.objective - 3.0 * len(poses) * log_scale
-
-    bounds = (float(np.log(free.scale)), 0.0)
-    best = minimize_scalar(objective, bounds=bounds, options={"xatol": _MIN_SCALE_CHANGE})
-    return as_given.fit.objective - float(best.fun)
+def _is_clearly_not_one(free: SetupFit) -> bool:
+    """Return whether an estimated scale is clearly not 1."""
+    change = abs(float(np.log(free.scale)))
+    sigma = free.scale_sigma / free.scale
+    return change > max(_MIN_SCALE_CHANGE, _MIN_SCALE_SIGMAS * sigma)
 
 
 def _check_unknown(poses: StopPoses, fit: RobotWorld, findings: Sequence[Finding]) -> list[Finding]:

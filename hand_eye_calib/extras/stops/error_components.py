@@ -1,0 +1,178 @@
+"""Fit of X and Z from stops with several sources of error.
+
+The error of a stop, ``xi_i = Log(B_i^-1 Z^-1 A_i X)`` in the frame of the child, is a sum of four
+independent errors:
+
+- a position across the line of sight from the child to the origin of its world, such as errors of
+  the robot and of the pixels;
+- a position along the line of sight: the distance of a target is measured worse than its direction;
+- a rotation about the origin of the child, such as that of a robot's hand;
+- a rotation about the origin of the child's world, such as that of a target in a camera. This
+  rotation moves the child.
+
+Their variances are estimated by restricted maximum likelihood: D. A. Harville, *Maximum likelihood
+approaches to variance component estimation*, JASA 72, 1977. Each iteration is the update of
+H. Zhou, L. Hu, J. Zhou, K. Lange, *MM algorithms for variance components models*, Journal of
+Computational and Graphical Statistics 28(2), 2019, with a Gauss-Newton step of X and Z.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.stats import student_weights
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.extras.stops.closed_form import Stops
+
+# Prior standard deviation of the logarithm of each variance: a factor of 4.5. Measured on stops of
+# simulated arms.
+_PRIOR_SIGMA = 1.5
+
+# Share of the mean variance of positions that the errors of positions have at least at the start.
+_LEAST_POSITION_SHARE = 0.3
+
+# Largest number of iterations, and the changes at convergence: the step (squared, in standard
+# deviations of X and Z), and the logarithms of the variances.
+_MAX_ROUNDS = 100
+_SMALL_SQUARED_STEP = 1e-6
+_SMALL_CHANGE = 0.01
+
+# Smallest variance (m^2, rad^2): that of rounding in poses without errors.
+_MIN_VARIANCE = 1e-24
+
+# Errors (N, 6) of stops and their derivatives (N, 6, 12), for X and Z.
+Linearise = Callable[[Stops, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+
+
+@dataclass(frozen=True)
+class ComponentsFit:
+    """Fit of X and Z with the variances of all sources of error.
+
+    Attributes
+    ----------
+    T_parent_child, T_world_world : (4, 4) arrays
+        X and Z.
+    information : (12, 12) array
+        Fisher information about the right perturbations of X and Z.
+    whitening : (N, 6, 6) array
+        Matrices that make the errors of each stop independent, with variance 1.
+    weights : (N,) array
+        Weights of Student's t distribution for each stop.
+    """
+
+    T_parent_child: FloatArray
+    T_world_world: FloatArray
+    information: FloatArray
+    whitening: FloatArray
+    weights: FloatArray
+
+
+def fit_components(
+    stops: Stops,
+    start: tuple[FloatArray, FloatArray],
+    variances: FloatArray,
+    weights: FloatArray,
+    degrees: float,
+    linearise: Linearise,
+) -> ComponentsFit:
+    """Fit X, Z and the variances of the four sources of error.
+
+    Parameters
+    ----------
+    stops : Stops
+        Without outliers.
+    start : two (4, 4) arrays
+        X and Z to start from.
+    variances : (2,) array
+        Variances per axis of the positions (m^2) and rotations (rad^2) of a fit without sources.
+    weights : (N,) array
+        Weights of stops at one place.
+    degrees : float
+        Degrees of freedom of the Student-t distribution.
+    linearise : callable
+        Errors and derivatives in the frame of the child.
+    """
+    X, Z = start
+    sources = _covariances_of_sources(stops)
+    prior = _prior_variances(stops, variances)
+    components = prior
+    for _ in range(_MAX_ROUNDS):
+        covariances = np.tensordot(components, sources, 1) + _MIN_VARIANCE * np.eye(6)
+        precisions = np.linalg.inv(covariances)
+        errors, jacobian = linearise(stops, X, Z)
+        scores = np.einsum("nij,nj->ni", precisions, errors)
+        distances = np.einsum("ni,ni->n", errors, scores)
+        student = student_weights(distances, degrees)
+        shares = weights * student
+        by_values = precisions @ jacobian
+        normal = np.einsum("n,nij,nik->jk", shares, jacobian, by_values)
+        gradient = np.einsum("n,nij,ni->j", shares, by_values, errors)
+        # The step along unobservable directions is zero.
+        damped = normal + 1e-13 * np.trace(normal) * np.eye(len(normal))
+        step = -np.linalg.solve(damped, gradient)
+        step_X, step_Z = se3.exp(step.reshape(2, 6))
+        X = X @ step_X
+        Z = Z @ step_Z
+        quadratic = np.einsum("n,ni,knij,nj->k", shares, scores, sources, scores)
+        # Expected value of ``quadratic`` under these variances.
+        fitted = np.linalg.solve(damped, np.swapaxes(by_values, 1, 2))
+        projected = precisions - shares[:, None, None] * (by_values @ fitted)
+        expected = np.einsum("nij,knji->k", projected, sources)
+        updated = _updated(components, prior, quadratic, expected)
+        change = float(np.max(np.abs(np.log(updated / components))))
+        components = updated
+        if -step @ gradient < _SMALL_SQUARED_STEP and change < _SMALL_CHANGE:
+            break
+    whitening = np.swapaxes(np.linalg.cholesky(precisions), 1, 2)
+    # Expected information of the Student-t likelihood: K. L. Lange, R. J. A. Little,
+    # J. M. G. Taylor, *Robust statistical modeling using the t distribution*, JASA 84, 1989,
+    # section 4.
+    expected_weights = (degrees + 6.0) / (degrees + 8.0) * weights
+    information = np.einsum("n,nij,nik->jk", expected_weights, jacobian, by_values)
+    return ComponentsFit(X, Z, information, whitening, student)
+
+
+def _updated(
+    components: FloatArray, prior: FloatArray, quadratic: FloatArray, expected: FloatArray
+) -> FloatArray:
+    """Return the variances (4,) after one iteration of the MM algorithm with the prior."""
+    # Derivative of the prior's log density, times two.
+    pull = 2.0 * np.log(prior / components) / _PRIOR_SIGMA**2
+    numerator = components**2 * quadratic + np.maximum(pull, 0.0) * components
+    denominator = expected + np.maximum(-pull, 0.0) / components
+    return np.maximum(np.sqrt(numerator / denominator), _MIN_VARIANCE)
+
+
+def _prior_variances(stops: Stops, variances: FloatArray) -> FloatArray:
+    """Return the prior variances (4,) of the sources.
+
+    Half of the rotations is about either origin; the positions have what these rotations do not
+    explain.
+    """
+    squared_m2 = np.sum(se3.translation_of(stops.Ts_world_child) ** 2, axis=1)
+    of_rotations = 0.5 * variances[1]
+    # Variance per axis of positions that rotations about the other origin cause.
+    moved_m2 = of_rotations * 2.0 / 3.0 * float(np.median(squared_m2))
+    position = max(variances[0] - moved_m2, _LEAST_POSITION_SHARE * variances[0])
+    return np.array([position, position, of_rotations, of_rotations])
+
+
+def _covariances_of_sources(stops: Stops) -> FloatArray:
+    """Return the covariances (4, N, 6, 6) of the errors by each source with variance 1."""
+    n = len(stops)
+    to_world = se3.translation_of(se3.inverse(stops.Ts_world_child))
+    lengths = np.linalg.norm(to_world, axis=1, keepdims=True)
+    sight = to_world / np.maximum(lengths, np.sqrt(_MIN_VARIANCE))
+    along = sight[:, :, None] * sight[:, None, :]
+    levers = se3.skew(to_world)
+    covariances = np.zeros((4, n, 6, 6))
+    covariances[0, :, :3, :3] = np.eye(3) - along
+    covariances[1, :, :3, :3] = along
+    covariances[2, :, 3:, 3:] = np.eye(3)
+    covariances[3, :, :3, :3] = levers @ np.swapaxes(levers, 1, 2)
+    covariances[3, :, :3, 3:] = levers
+    covariances[3, :, 3:, :3] = np.swapaxes(levers, 1, 2)
+    covariances[3, :, 3:, 3:] = np.eye(3)
+    return covariances
