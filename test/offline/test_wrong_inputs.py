@@ -316,3 +316,13 @@ def test_a_pattern_that_fits_no_recording_is_named(run, inputs, monkeypatch):
     shutil.copy("drive.mcap", "drive2.mcap")
     _, _, err = run("batch", "drive.mcap", "drive2.mcap", "--vehicle", "{vehicle}/*/x")
     assert "--vehicle '{vehicle}/*/x' fits none of their paths; set it to" in err
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_sensor_that_never_moves_is_named_without_warnings_of_numpy(run, tmp_path):
+    rows = np.loadtxt(local_path("sample:camera.tum"))
+    rows[:, 1:] = rows[0, 1:]
+    np.savetxt(tmp_path / "still.tum", rows, fmt="%.9f")
+    code, out, _ = run("calibrate", "sample:lidar.tum", str(tmp_path / "still.tum"))
+    assert code == 3
+    assert "the child stream repeats the same pose" in out

@@ -53,6 +53,9 @@ _MIDDLE = (0.35, 0.65)
 # draws of 30 simulated drives: 68 % with a factor of 1.5, 91 % with 2, 93 % with 2.5.
 _LOSS_OF_WEIGHT = 2.0
 
+# Size (m or rad) that stands for an unlimited one, because quantiles need finite numbers.
+_UNLIMITED = 1e12
+
 # Time (s) between a pose and those that its velocity is the difference of.
 _VELOCITY_STEP_S = 0.1
 
@@ -234,6 +237,8 @@ def _smallest_shifts(blocks: Blocks, R: FloatArray) -> FloatArray:
     distances = np.concatenate([roots - mixed, roots + mixed])
     curvatures = np.concatenate([squares, squares])
     # Without motion, no shift along an axis changes the score: its size is unlimited.
-    sizes = np.full_like(distances, np.inf)
+    sizes = np.full_like(distances, _UNLIMITED)
     np.divide(distances, curvatures, out=sizes, where=curvatures > 0.0)
-    return _LOSS_OF_WEIGHT * np.asarray(np.quantile(np.maximum(sizes, 0.0), FOUND_SHARE, axis=0))
+    sizes = np.clip(sizes, 0.0, _UNLIMITED)
+    found = np.quantile(sizes, FOUND_SHARE, axis=0)
+    return np.where(found < _UNLIMITED / len(sizes), _LOSS_OF_WEIGHT * found, np.inf)
