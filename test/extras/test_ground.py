@@ -154,6 +154,26 @@ def test_walls_and_ceilings_are_no_ground():
     assert ground_of(np.empty((0, 3)), up, ahead, 4.0) is None
 
 
+def test_tall_grass_on_one_side_widens_sigma():
+    drive, clouds = machine()
+    to_base = drive.T_base_child
+    scans = []
+    for stamp_ns, points in clouds[1]:
+        in_base = points @ to_base[:3, :3].T + to_base[:3, 3]
+        is_grass = (in_base[:, 1] > 1.0) & (in_base[:, 2] < 0.3)
+        up = to_base[2, :3]
+        scans.append((stamp_ns, points + np.outer(0.12 * is_grass, up)))
+    parent, child = tracks_of_lidars(drive, clouds)
+    grassy = hec.ground_from_clouds(scans, drive.child)
+    assert grassy.bend_rad > 3 * child.bend_rad
+    sigmas = []
+    for track in (child, grassy):
+        result = hec.calibrate_on_ground(drive.parent, drive.child, parent, track)
+        sigmas.append(result.ground.axes[0].ground_sigma)
+        assert (errors_of(result, drive) < 3.3 * result.sigmas).all()
+    assert sigmas[1] > 1.2 * sigmas[0]
+
+
 def test_too_few_scans_with_ground_are_an_error():
     drive, clouds = machine()
     high = [(stamp_ns, np.add(points, [0.0, 0.0, 30.0])) for stamp_ns, points in clouds[0]]

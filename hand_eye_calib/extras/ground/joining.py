@@ -44,8 +44,8 @@ _HEIGHT_SIGMA_M = 0.007
 # Error of the vertical (rad), by what the sensor measures. Ground: 0.035 deg, from the same drives.
 # Gravity: data sheets of industrial accelerometers state a bias of 2 mg.
 _TILT_SIGMAS_RAD = {"ground": float(np.radians(0.035)), "gravity": 0.002}
-# Share of the bend of a road that remains in the vertical of the whole road: 0.3 to 0.5 on
-# simulated streets with a crown of 2 %.
+# Share of the bend of a road that remains in the vertical of the lane: 0.3 to 0.5 on simulated
+# streets with a crown of 2 %, for the whole road.
 _BEND_SHARE = 0.5
 
 
@@ -133,12 +133,12 @@ class VerticalPair:
         if parent.source != child.source:
             derivatives = _means(slope_derivatives[is_inlier], sections)
             values, covariance = _fit_with_slope(means, derivatives)
-            # The bend turns with the vehicle, and so looks like the mount.
-            tilt_variance = (_BEND_SHARE * max(parent.bend_rad, child.bend_rad)) ** 2
         else:
             values, covariance = _fit(means)
         for track in (parent, child):
             tilt_variance += _TILT_SIGMAS_RAD[track.source] ** 2
+            # The bend turns with the vehicle, and so looks like the mount.
+            tilt_variance += (_BEND_SHARE * track.bend_rad) ** 2
         variances = [tilt_variance, tilt_variance, 2 * _HEIGHT_SIGMA_M**2]
         # Rows: rotation about two horizontal axes, translation along the vertical.
         jacobian = np.zeros((3, 6))

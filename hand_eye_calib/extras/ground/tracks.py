@@ -32,6 +32,8 @@ _MAX_OTHER_SHARE = 0.3
 
 # Width of the lane (m) in which points are used, by what the other sensor measures.
 _LANE_WIDTHS_M = {"ground": 4.0, "gravity": 24.0}
+# Width of the narrower lane (m) that reveals a bend: a crown, or tall grass on one side.
+_NARROW_WIDTHS_M = {"ground": 2.0, "gravity": 4.0}
 
 # Window (s) over which accelerations are averaged. In a longer window, errors of the velocities
 # matter less, and drift of the attitude matters more.
@@ -52,8 +54,8 @@ class VerticalTrack(Columns):
     heights_m : (N,) array or None
         Heights of the sensor over the ground; None for gravity.
     bend_rad : float
-        Angle between the ground of the lane and that of the whole road, as on a crowned road. Zero
-        if both sensors measure the ground of the lane.
+        Angle between the ground of the lane and that of a narrower lane, as on a crowned road, or
+        beside tall grass. Zero for gravity.
     """
 
     stamps_ns: IntArray
@@ -116,14 +118,16 @@ def ground_from_clouds(
             continue
         stamps_ns.append(stamp_ns)
         planes.append(plane)
-        if beside == "gravity":
-            lane = ground_of(points, up, ahead, _LANE_WIDTHS_M["ground"])
-            if lane is not None:
-                bends.append(lane.normal - plane.normal)
+        narrow = ground_of(points, up, ahead, _NARROW_WIDTHS_M[beside])
+        if narrow is not None:
+            bends.append(narrow.normal - plane.normal)
     # On a ramp or beside walls, a third of the scans may have no ground. If fewer than half of the
     # scans have a plane, the machine does not drive on this plane.
     if 2 * len(planes) <= n_scans:
-        raise NotEnoughDataError(f"{len(planes)} of {n_scans} scans contain the ground")
+        raise NotEnoughDataError(
+            f"{len(planes)} of {n_scans} scans contain the ground: it must be visible within 12 m, "
+            "and the z axis of the lidar must point up"
+        )
     normals, heights = zip(*planes, strict=True)
     stamps = np.array(stamps_ns, dtype=np.int64)
     # The median vector is that of the road; single scans differ by noise and by walls.
