@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 from bag_making import ODOMETRY, header, pose_message, write_messages
 from ground_making import START_NS, Machine
+from published_data import data_folder
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.extras.ground.bags import vertical_topics, vertical_track
 from hand_eye_calib.extras.ground.planes import ground_of
 from hand_eye_calib.extras.ground.tracks import driving_direction, turning_axis
+from hand_eye_calib.formats.bags.reader import PoseBag
 from hand_eye_calib.offline.cli.main import main
 
 POINTS = "sensor_msgs/msg/PointCloud2"
@@ -188,6 +191,15 @@ def test_accelerations_without_gravity_are_an_error():
         hec.gravity_from_accelerations(stamps_ns, forces - [0, 0, 9.81], drive.child)
     with pytest.raises(NotEnoughDataError, match="less than 15 s"):
         hec.gravity_from_accelerations(stamps_ns[:100], forces[:100], drive.child)
+
+
+def test_a_real_imu_without_gravity_is_refused():
+    bag = data_folder() / "bags" / "fuse" / "turtlebot3.bag"
+    poses = hec.read_trajectory(bag, topic="/odom")
+    with PoseBag(bag) as messages:
+        assert vertical_topics(messages) == {"/imu": ("gravity", "base_footprint")}
+        with pytest.raises(NotEnoughDataError, match="must not subtract gravity"):
+            vertical_track(messages, "/imu", poses, "ground")
 
 
 def test_a_straight_drive_has_no_vertical():

@@ -65,7 +65,7 @@ def verticals_of_bag(
         tracks = []
         for topic, stream in zip(topics, snapshot.streams, strict=True):
             try:
-                tracks.append(_track(bag, topic, stream, beside))
+                tracks.append(vertical_track(bag, topic, stream, beside))
             except (InputError, NotEnoughDataError) as error:
                 return (), [f"ground and gravity are not used: {topic}: {error}"]
     sources = []
@@ -109,7 +109,7 @@ def _topic_of(names: StreamFrames, topics_of: Mapping[str, str]) -> str:
     return topics_of.get(names.sensor) or topics_of.get(names.option) or ""
 
 
-def _track(bag: PoseBag, topic: str, stream: Trajectory, beside: Source) -> VerticalTrack:
+def vertical_track(bag: PoseBag, topic: str, stream: Trajectory, beside: Source) -> VerticalTrack:
     """Return the vertical from the clouds or IMU data of a topic.
 
     ``stream`` has the poses of the sensor, and ``beside`` is what the other sensor measures.

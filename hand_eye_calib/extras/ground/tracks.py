@@ -178,7 +178,8 @@ def gravity_from_accelerations(
     length = median(np.linalg.norm(verticals, axis=1))
     if abs(length - g) > g / 20:
         raise NotEnoughDataError(
-            f"the mean acceleration is {length:.2f} m/s^2, not that of gravity"
+            f"the mean acceleration is {length:.2f} m/s^2, not that of gravity: the driver of the "
+            "IMU must not subtract gravity"
         )
     # The world of the poses tilts slowly, so its vertical is interpolated between the windows.
     stamps = trajectory.stamps_ns
