@@ -30,17 +30,13 @@ from hand_eye_calib.extras.stops.closed_form import Stops
 # simulated arms.
 _PRIOR_SIGMA = 1.5
 
-# Share of the mean variance of positions that the errors of positions have at least at the start.
-_LEAST_POSITION_SHARE = 0.3
-
-# Largest number of iterations, and the changes at convergence: the step (squared, in standard
-# deviations of X and Z), and the logarithms of the variances.
+# Largest number of iterations, and the change at convergence: of X and Z in standard deviations,
+# and of the logarithms of the variances.
 _MAX_ROUNDS = 100
-_SMALL_SQUARED_STEP = 1e-6
-_SMALL_CHANGE = 0.01
+_SMALL_CHANGE = 3e-3
 
 # Smallest variance (m^2, rad^2): that of rounding in poses without errors.
-_MIN_VARIANCE = 1e-24
+MIN_VARIANCE = 1e-24
 
 # Errors (N, 6) of stops and their derivatives (N, 6, 12), for X and Z.
 Linearise = Callable[[Stops, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
@@ -96,10 +92,11 @@ def fit_components(
     """
     X, Z = start
     sources = _covariances_of_sources(stops)
-    prior = _prior_variances(stops, variances)
+    # Half of all errors are about either origin.
+    prior = 0.5 * np.repeat(variances, 2)
     components = prior
     for _ in range(_MAX_ROUNDS):
-        covariances = np.tensordot(components, sources, 1) + _MIN_VARIANCE * np.eye(6)
+        covariances = np.tensordot(components, sources, 1) + MIN_VARIANCE * np.eye(6)
         precisions = np.linalg.inv(covariances)
         errors, jacobian = linearise(stops, X, Z)
         scores = np.einsum("nij,nj->ni", precisions, errors)
@@ -123,7 +120,7 @@ def fit_components(
         updated = _updated(components, prior, quadratic, expected)
         change = float(np.max(np.abs(np.log(updated / components))))
         components = updated
-        if -step @ gradient < _SMALL_SQUARED_STEP and change < _SMALL_CHANGE:
+        if -step @ gradient < _SMALL_CHANGE**2 and change < _SMALL_CHANGE:
             break
     whitening = np.swapaxes(np.linalg.cholesky(precisions), 1, 2)
     # Expected information of the Student-t likelihood: K. L. Lange, R. J. A. Little,
@@ -141,22 +138,12 @@ def _updated(
     # Derivative of the prior's log density, times two.
     pull = 2.0 * np.log(prior / components) / _PRIOR_SIGMA**2
     numerator = components**2 * quadratic + np.maximum(pull, 0.0) * components
-    denominator = expected + np.maximum(-pull, 0.0) / components
-    return np.maximum(np.sqrt(numerator / denominator), _MIN_VARIANCE)
-
-
-def _prior_variances(stops: Stops, variances: FloatArray) -> FloatArray:
-    """Return the prior variances (4,) of the sources.
-
-    Half of the rotations is about either origin; the positions have what these rotations do not
-    explain.
-    """
-    squared_m2 = np.sum(se3.translation_of(stops.Ts_world_child) ** 2, axis=1)
-    of_rotations = 0.5 * variances[1]
-    # Variance per axis of positions that rotations about the other origin cause.
-    moved_m2 = of_rotations * 2.0 / 3.0 * float(np.median(squared_m2))
-    position = max(variances[0] - moved_m2, _LEAST_POSITION_SHARE * variances[0])
-    return np.array([position, position, of_rotations, of_rotations])
+    # Rounding may make a value that should be zero negative.
+    denominator = np.maximum(expected, 0.0) + np.maximum(-pull, 0.0) / components
+    # A source without effect keeps its variance: that along the line of sight if all positions are
+    # zero.
+    squared = np.divide(numerator, denominator, out=components**2, where=denominator > 0.0)
+    return np.maximum(np.sqrt(squared), MIN_VARIANCE)
 
 
 def _covariances_of_sources(stops: Stops) -> FloatArray:
@@ -164,7 +151,7 @@ def _covariances_of_sources(stops: Stops) -> FloatArray:
     n = len(stops)
     to_world = se3.translation_of(se3.inverse(stops.Ts_world_child))
     lengths = np.linalg.norm(to_world, axis=1, keepdims=True)
-    sight = to_world / np.maximum(lengths, np.sqrt(_MIN_VARIANCE))
+    sight = to_world / np.maximum(lengths, np.sqrt(MIN_VARIANCE))
     along = sight[:, :, None] * sight[:, None, :]
     levers = se3.skew(to_world)
     covariances = np.zeros((4, n, 6, 6))

@@ -25,7 +25,7 @@ from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.base.stats import student_weights
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.stops.closed_form import Stops, robust_start
-from hand_eye_calib.extras.stops.error_components import fit_components
+from hand_eye_calib.extras.stops.error_components import MIN_VARIANCE, fit_components
 from hand_eye_calib.extras.stops.lasting_errors import (
     correlations,
     kernel_weights,
@@ -61,9 +61,6 @@ _N_VALUES = 12
 # standard deviations of the values) below which they have converged.
 _MAX_ROUNDS = 60
 _SMALL_STEP = 1e-2
-
-# Smallest variance of errors (m^2, rad^2): that of rounding in poses without errors.
-_MIN_VARIANCE = 1e-24
 
 # A direction of X is observable if the mean squared rotation between stops that determines it
 # exceeds this multiple of the variance of a measured rotation. Below it, errors of the rotations
@@ -297,9 +294,9 @@ def _variances(
     final_sum = ((degrees + 6.0) * n - 2.0 * n_free) / degrees
     means = final_sum / weights.sum() * (weights @ squared) / n_free
     if 3 * n <= _N_VALUES:
-        places_m2 = se3.translation_of(stops.Ts_world_child).var(axis=0).sum() + _MIN_VARIANCE
+        places_m2 = se3.translation_of(stops.Ts_world_child).var(axis=0).sum() + MIN_VARIANCE
         means = means @ [0.5 / places_m2, 0.5] * np.array([places_m2, 1.0])
-    return np.maximum(means, _MIN_VARIANCE)
+    return np.maximum(means, MIN_VARIANCE)
 
 
 def _products(rows: FloatArray) -> FloatArray:
