@@ -107,7 +107,7 @@ def test_details_and_report_have_residuals_and_views(tmp_path, capsys):
 
     out = " ".join(capsys.readouterr().out.split())
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "residuals of the stops: 1: " in out
+    assert "residuals of the stops (left out: weight 0): 1: " in out
     assert "record 3 more stops from stop" in out
     assert "record 3 more stops from stop" in page
     assert "Pose of target in base" in page

@@ -184,8 +184,7 @@ def test_files_of_other_tools(written, both_poses, tmp_path):
 def test_the_report_of_an_arm_states_the_error_of_a_near_object(tmp_path):
     assert main(["calibrate", "sample:arm.yaml", "--out", str(tmp_path / "arm")]) == 0
     page = (tmp_path / "arm" / "report.html").read_text()
-    assert "An object 0.5 m from camera is misplaced by up to" in page
-    assert "(one standard deviation)" in page
+    assert "The position of an object 0.5 m from camera has a standard deviation of" in page
 
 
 # ---- angles of robots
