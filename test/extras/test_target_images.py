@@ -1,5 +1,7 @@
 """Stops of a hand from images of a target, rendered here."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from bag_making import JAZZY, header, write_messages
@@ -231,7 +233,22 @@ def test_intrinsics_of_ros_and_kalibr(tmp_path, text):
         read_camera(tmp_path / "camera.yaml")
 
 
-@pytest.mark.parametrize("text", ["charuco:5x7", "charuco:5x7:0.03:0.04", "aprilgrid:6:1:1", "x"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "charuco:5x7",
+        "charuco:5x7:0.03:0.04",
+        "aprilgrid:6:1:1",
+        "chessboard:7x4",
+        "chessboard:7x2:0.03",
+        "chessboard:7x4:30:1",
+        "marker:x:0.1",
+        "marker:1:0",
+        "marker:-1:0.1",
+        "dots:3x4:0.1:0.05",
+        "x",
+    ],
+)
 def test_what_is_no_target(text):
     with pytest.raises(ConfigError, match="expected a target"):
         Target.parse(text)
@@ -241,3 +258,83 @@ def test_numbers_in_names_count_by_their_value(tmp_path):
     for name in ("10.png", "9.png", "notes.txt"):
         (tmp_path / name).touch()
     assert [path.name for path in images_in(tmp_path)] == ["9.png", "10.png"]
+
+
+def chessboard_picture(columns, rows, square):
+    """Squares around columns x rows inner corners, with a white border of a square."""
+    side = round(square * PIXELS_PER_M)
+    y, x = np.indices((rows + 3, columns + 3))
+    is_inside = (x > 0) & (x < columns + 2) & (y > 0) & (y < rows + 2)
+    is_black = is_inside & ((x + y) % 2 == 0)
+    return np.kron(np.where(is_black, 0, 255), np.ones((side, side))).astype(np.uint8)
+
+
+def marker_picture(name, number, size):
+    """A marker with a white border of a quarter of its side."""
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
+    side = round(size * PIXELS_PER_M)
+    marker = cv2.aruco.generateImageMarker(dictionary, number, side)
+    return np.pad(marker, side // 4, constant_values=255)
+
+
+def old_charuco_picture(columns, rows, square, marker):
+    """A ChArUco board of OpenCV before 4.6."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    board = cv2.aruco.CharucoBoard((columns, rows), square, marker, dictionary)
+    if not hasattr(board, "setLegacyPattern"):
+        pytest.skip("needs OpenCV 4.8 or newer")
+    board.setLegacyPattern(True)
+    size = (round(columns * square * PIXELS_PER_M), round(rows * square * PIXELS_PER_M))
+    return board.generateImage(size)
+
+
+def rolled(Ts, angles):
+    """Poses in a camera that is turned about its optical axis."""
+    turns = Rotation.from_rotvec(np.outer(angles, [0.0, 0.0, 1.0])).as_matrix()
+    return se3.from_rotation_translation(turns, np.zeros((len(turns), 3))) @ Ts
+
+
+BOARDS = {
+    "chessboard:7x4:0.03": partial(chessboard_picture, 7, 4, 0.03),
+    "chessboard:4x7:0.03": partial(chessboard_picture, 4, 7, 0.03),
+    "charuco-old:5x6:0.04:0.03:5X5_100": partial(old_charuco_picture, 5, 6, 0.04, 0.03),
+}
+MARKERS = {
+    "marker:7:0.16:5X5_50": partial(marker_picture, "5X5_50", 7, 0.16),
+    "marker:26:0.16:APRILTAG_36h11": partial(marker_picture, "APRILTAG_36h11", 26, 0.16),
+}
+
+
+@pytest.mark.parametrize("text", [*BOARDS, *MARKERS])
+def test_motions_of_other_targets(text):
+    """The camera turns about its optical axis, so that no side of the target stays up."""
+    rng = np.random.default_rng(8)
+    picture = (BOARDS | MARKERS)[text]()
+    center = np.array([picture.shape[1], picture.shape[0], 0.0]) / PIXELS_PER_M / 2.0
+    truth = rolled(views(8, center, rng), 2.0 * np.pi * np.arange(8) / 8)
+    camera = Camera(MATRIX, np.zeros(5), is_fisheye=False)
+    images = [rendered(picture, T, rng) for T in truth]
+    tracking = poses_of_target(images, Target.parse(text), camera)
+    assert len(tracking.images) >= 7
+    # Origin and axes of a target differ from those of its picture by a constant pose.
+    offsets = se3.inverse(truth[tracking.images]) @ tracking.Ts_camera_target
+    errors = se3.log(se3.inverse(offsets[0]) @ offsets)
+    most_m, most_rad = (0.001, 0.003) if text in BOARDS else (0.003, 0.01)
+    assert np.abs(errors[:, :3]).max() < most_m
+    assert np.abs(errors[:, 3:]).max() < most_rad
+
+
+def test_only_the_marker_of_the_target_is_used():
+    (T,) = views(1, [0.12, 0.12, 0.0], np.random.default_rng(9))
+    image = rendered(marker_picture("5X5_50", 7, 0.16), T, np.random.default_rng(10))
+    camera = Camera(MATRIX, np.zeros(5), is_fisheye=False)
+    for number in (6, 8):
+        with pytest.raises(InputError, match=f"4 corners of the target marker {number} of 5X5_50"):
+            poses_of_target([image], Target.parse(f"marker:{number}:0.16:5X5_50"), camera)
+    with pytest.raises(ConfigError, match="no marker 50; the last is 49"):
+        TargetFinder(Target.parse("marker:50:0.16:5X5_50"), camera)
+
+
+def test_a_chessboard_that_looks_the_same_after_half_a_turn_is_refused():
+    with pytest.raises(ConfigError, match="7x5 inner corners looks the same after half a turn"):
+        Target.parse("chessboard:7x5:0.03")

@@ -1,9 +1,13 @@
-"""Estimate poses of a camera from images of a ChArUco board, or of an AprilGrid of Kalibr."""
+"""Estimate poses of a camera from images of a flat target.
+
+Targets are ChArUco boards, AprilGrids of Kalibr, chessboards, and single markers (ArUco, AprilTag).
+"""
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -44,16 +48,25 @@ _TO_GREY = {
     "yuv422_yuy2": "YUV2GRAY_YUY2",
 }
 
+# OpenCV's name of the markers if the text of a target does not contain it.
+_DICTIONARY = "4X4_50"
+# Fewest inner corners along a side of a chessboard, as OpenCV requires.
+_FEWEST_ALONG_SIDE = 3
 # Largest side of a square or tag (m). A longer side is in another unit.
 _LARGEST_SIZE_M = 100.0
 # An image with fewer corners of the target is skipped.
 _FEWEST_CORNERS = 8
+# Corners of a single marker. All are required.
+_CORNERS_OF_MARKER = 4
 # An image with larger residuals of its corners (root mean square, pixels) is skipped.
 _LARGEST_RMS_PX = 5.0
 
 _EXPECTED_TARGET = (
-    "charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY], such as charuco:5x7:0.04:0.03:4X4_50, or "
-    "aprilgrid:COLUMNSxROWS:TAG:GAP, such as aprilgrid:6x6:0.088:0.0264; lengths in metres"
+    "charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY], such as charuco:5x7:0.04:0.03:4X4_50 "
+    "(charuco-old: boards made before OpenCV 4.6), aprilgrid:COLUMNSxROWS:TAG:GAP, such as "
+    "aprilgrid:6x6:0.088:0.0264, chessboard:COLUMNSxROWS:SQUARE (inner corners), such as "
+    "chessboard:8x5:0.03, or marker:NUMBER:SIDE[:DICTIONARY], such as "
+    "marker:26:0.1:APRILTAG_36h11; lengths in metres"
 )
 _EXPECTED_CAMERA = (
     "the intrinsics of a camera: camera_info of ROS, camchain of Kalibr, or camera_matrix and "
@@ -77,15 +90,19 @@ class Target:
 
     Attributes
     ----------
-    kind : {"charuco", "aprilgrid"}
+    kind : {"charuco", "charuco-old", "aprilgrid", "chessboard", "marker"}
+        ``charuco-old`` is the layout of OpenCV before 4.6: the upper left square contains a marker
+        if the number of rows is even.
     columns, rows : int
-        Numbers of squares or tags.
+        Numbers of squares or tags. Numbers of inner corners of a chessboard. 1 for a single marker.
     size : float
-        Side of a square or tag, m.
+        Side of a square, tag or single marker, m.
     marker : float
-        Side of the marker in a square, or gap between two tags, m.
+        Side of the marker in a square, or gap between two tags, m. 0 for other targets.
     dictionary : str
-        OpenCV's name of the markers without ``DICT_``.
+        OpenCV's name of the markers without ``DICT_``. Empty for a chessboard.
+    number : int
+        Number of a single marker in its dictionary. 0 for other targets.
     """
 
     kind: str
@@ -94,31 +111,80 @@ class Target:
     size: float
     marker: float
     dictionary: str
+    number: int = 0
+
+    def __str__(self) -> str:
+        if self.kind == "marker":
+            return f"marker {self.number} of {self.dictionary}"
+        markers = f" of {self.dictionary}" if self.dictionary else ""
+        return f"{self.kind} {self.columns}x{self.rows}{markers}"
+
+    @property
+    def fewest_corners(self) -> int:
+        """Smallest number of corners in an image that is used."""
+        return _CORNERS_OF_MARKER if self.kind == "marker" else _FEWEST_CORNERS
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read ``charuco:5x7:0.04:0.03:4X4_50`` or ``aprilgrid:6x6:0.088:0.0264``.
+        """Read a target, such as ``charuco:5x7:0.04:0.03:4X4_50``.
 
         Raises
         ------
         ConfigError
-            If the text is no target.
+            If the text is no target, or a chessboard looks the same after half a turn.
         """
         kind, *parts = text.split(":")
         try:
-            columns, rows = map(int, parts[0].split("x"))
-            size, marker = map(float, parts[1:3])
+            if kind == "marker":
+                target = cls._marker(parts)
+            elif kind == "chessboard":
+                target = cls._chessboard(parts)
+            else:
+                target = cls._grid(kind, parts)
         except (IndexError, ValueError):
             raise _no_target(text) from None
+        # The poses of such a chessboard are ambiguous.
+        if kind == "chessboard" and (target.columns + target.rows) % 2 == 0:
+            raise ConfigError(
+                f"a chessboard of {target.columns}x{target.rows} inner corners looks the same "
+                "after half a turn; use a board with an even and an odd number, or charuco"
+            )
+        return target
+
+    @classmethod
+    def _grid(cls, kind: str, parts: Sequence[str]) -> Self:
+        """Return a ChArUco board or an AprilGrid; raise ValueError if it has wrong numbers."""
+        columns, rows = map(int, parts[0].split("x"))
+        size, marker = map(float, parts[1:3])
         are_lengths = marker > 0.0 and 0.0 < size < _LARGEST_SIZE_M
         if min(columns, rows) < 2 or not are_lengths or len(parts) > 4:
-            raise _no_target(text)
+            raise ValueError("no grid")
         if kind == "aprilgrid":
             return cls(kind, columns, rows, size, marker, "APRILTAG_36h11")
-        if kind != "charuco" or marker >= size:
-            raise _no_target(text)
-        dictionary = parts[3] if len(parts) > 3 else "4X4_50"
+        if kind not in ("charuco", "charuco-old") or marker >= size:
+            raise ValueError("no ChArUco board")
+        dictionary = parts[3] if len(parts) > 3 else _DICTIONARY
         return cls(kind, columns, rows, size, marker, dictionary)
+
+    @classmethod
+    def _marker(cls, parts: Sequence[str]) -> Self:
+        """Return a single marker; raise ValueError if it has wrong numbers."""
+        number = int(parts[0])
+        size = float(parts[1])
+        if number < 0 or not 0.0 < size < _LARGEST_SIZE_M or len(parts) > 3:
+            raise ValueError("no marker")
+        dictionary = parts[2] if len(parts) > 2 else _DICTIONARY
+        return cls("marker", 1, 1, size, 0.0, dictionary, number)
+
+    @classmethod
+    def _chessboard(cls, parts: Sequence[str]) -> Self:
+        """Return a chessboard; raise ValueError if it has wrong numbers."""
+        columns, rows = map(int, parts[0].split("x"))
+        size = float(parts[1])
+        is_length = 0.0 < size < _LARGEST_SIZE_M
+        if min(columns, rows) < _FEWEST_ALONG_SIDE or not is_length or len(parts) > 2:
+            raise ValueError("no chessboard")
+        return cls("chessboard", columns, rows, size, 0.0, "")
 
 
 def _no_target(text: str) -> ConfigError:
@@ -298,13 +364,32 @@ class _Pose(NamedTuple):
     sigmas: FloatArray
 
 
+class _Detector(NamedTuple):
+    """Detection of the corners of a target.
+
+    Attributes
+    ----------
+    detect : callable
+        Return pixels of corners and numbers of markers or corners in a grey image, both None if
+        there are none.
+    corners : (n, k, 3) array
+        Places of the corners by these numbers, m. The first is that of ``Target.number``. k is 4
+        for tags and markers, and 1 for inner corners of boards.
+    """
+
+    detect: Callable[[Any], Any]
+    corners: FloatArray
+
+
 class TargetFinder:
     """Detect a target in grey images of a camera, and estimate its poses from its corners.
 
     Raises
     ------
     ConfigError
-        If OpenCV does not have the markers.
+        If OpenCV does not have the markers of the target.
+    MissingDependencyError
+        If OpenCV is not installed, or too old for the target.
     """
 
     def __init__(self, target: Target, camera: Camera) -> None:
@@ -314,27 +399,7 @@ class TargetFinder:
         self._n_images = 0
         # Poses by the index of the image.
         self._poses: dict[int, _Pose] = {}
-        aruco = self._cv2.aruco
-        markers = getattr(aruco, f"DICT_{target.dictionary}", None)
-        if markers is None:
-            raise ConfigError(
-                f"OpenCV has no markers {target.dictionary!r}; expected such as 4X4_50, 5X5_100"
-            )
-        dictionary = aruco.getPredefinedDictionary(markers)
-        # Corners (n, k, 3), m, by the number that is detected: k is 1 for the inner corners of a
-        # ChArUco board, and 4 for tags.
-        if target.kind == "charuco":
-            size = (target.columns, target.rows)
-            board = aruco.CharucoBoard(size, target.size, target.marker, dictionary)
-            self._detect = aruco.CharucoDetector(board).detectBoard
-            self._corners = np.asarray(board.getChessboardCorners(), dtype=float)[:, None]
-        else:
-            parameters = aruco.DetectorParameters()
-            # Kalibr's tags have a border of two bits.
-            parameters.markerBorderBits = 2
-            parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
-            self._detect = aruco.ArucoDetector(dictionary, parameters).detectMarkers
-            self._corners = _aprilgrid_corners(target)
+        self._detect, self._corners = _detector(self._cv2, target)
 
     def look(self, image: Any) -> bool:
         """Detect the target in the next image; return whether a pose was estimated."""
@@ -342,9 +407,10 @@ class TargetFinder:
         self._n_images += 1
         pixels, detected, *_ = self._detect(image)
         ids = np.ravel([] if detected is None else detected).astype(int)
-        is_on_target = ids < len(self._corners)
-        corners = self._corners[ids[is_on_target]].reshape(-1, 3)
-        if len(corners) < _FEWEST_CORNERS:
+        indices = ids - self._target.number
+        is_on_target = (indices >= 0) & (indices < len(self._corners))
+        corners = self._corners[indices[is_on_target]].reshape(-1, 3)
+        if len(corners) < self._target.fewest_corners:
             return False
         pixels = np.asarray(pixels, dtype=float).reshape(len(ids), -1, 2)[is_on_target]
         pose = self._pose(corners, pixels.reshape(-1, 1, 2))
@@ -362,11 +428,9 @@ class TargetFinder:
             If no image contains the target.
         """
         if not self._poses:
-            target = self._target
             raise InputError(
                 f"none of {self._n_images} images contains at least "
-                f"{_FEWEST_CORNERS} corners of the target {target.kind} "
-                f"{target.columns}x{target.rows} of {target.dictionary}"
+                f"{self._target.fewest_corners} corners of the target {self._target}"
             )
         Ts, rms_px, sigmas = map(np.array, zip(*self._poses.values(), strict=True))
         return TargetPoses(Ts, [*self._poses], rms_px, sigmas, self._n_images)
@@ -403,6 +467,84 @@ class TargetFinder:
         # OpenCV's parameters are rotations, then translations.
         turn_rad, shift_m = np.sqrt(variances.reshape(2, 3).mean(axis=1))
         return _Pose(T, rms_px, np.array([shift_m, turn_rad]))
+
+
+def _detector(cv2: Any, target: Target) -> _Detector:
+    """Return the detector of a target.
+
+    Raises
+    ------
+    ConfigError
+        If OpenCV does not have the markers of the target.
+    MissingDependencyError
+        If OpenCV is too old for the target.
+    """
+    if target.kind == "chessboard":
+        return _Detector(partial(_detect_chessboard, cv2, target), _chessboard_corners(target))
+    dictionary = _dictionary(cv2, target)
+    if target.kind == "aprilgrid":
+        # Kalibr's tags have a border of two bits.
+        return _tag_detector(cv2, dictionary, 2, _aprilgrid_corners(target))
+    if target.kind == "marker":
+        return _tag_detector(cv2, dictionary, 1, _marker_corners(target))
+    size = (target.columns, target.rows)
+    board = cv2.aruco.CharucoBoard(size, target.size, target.marker, dictionary)
+    if target.kind == "charuco-old":
+        if not hasattr(board, "setLegacyPattern"):
+            raise MissingDependencyError(
+                f"targets charuco-old need OpenCV 4.8 or newer: {installing('camera')}"
+            )
+        board.setLegacyPattern(True)
+    corners = np.asarray(board.getChessboardCorners(), dtype=float)[:, None]
+    return _Detector(cv2.aruco.CharucoDetector(board).detectBoard, corners)
+
+
+def _dictionary(cv2: Any, target: Target) -> Any:
+    """Return OpenCV's dictionary of the markers; raise ConfigError if it has not all of them."""
+    markers = getattr(cv2.aruco, f"DICT_{target.dictionary}", None)
+    if markers is None:
+        raise ConfigError(
+            f"OpenCV has no markers {target.dictionary!r}; expected such as 4X4_50, 5X5_100"
+        )
+    dictionary = cv2.aruco.getPredefinedDictionary(markers)
+    n_markers = len(dictionary.bytesList)
+    if target.number >= n_markers:
+        raise ConfigError(
+            f"{target.dictionary} has no marker {target.number}; the last is {n_markers - 1}"
+        )
+    return dictionary
+
+
+def _tag_detector(cv2: Any, dictionary: Any, border_bits: int, corners: FloatArray) -> _Detector:
+    """Return the detector of separate tags or markers with a black border of so many bits."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.markerBorderBits = border_bits
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    return _Detector(cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers, corners)
+
+
+def _detect_chessboard(cv2: Any, target: Target, image: Any) -> tuple[Any, Any]:
+    """Return pixels and numbers of the inner corners of a chessboard, or None twice."""
+    is_found, pixels = cv2.findChessboardCornersSB(image, (target.columns, target.rows))
+    if not is_found:
+        return None, None
+    return pixels, np.arange(len(pixels))
+
+
+def _chessboard_corners(target: Target) -> FloatArray:
+    """Return the inner corners (n, 1, 3) of a chessboard row by row, m."""
+    y, x = np.divmod(np.arange(target.columns * target.rows), target.columns)
+    places = target.size * np.stack([x, y, 0 * x], axis=-1)
+    return np.asarray(places[:, None])
+
+
+def _marker_corners(target: Target) -> FloatArray:
+    """Return the corners (1, 4, 3) of a single marker in OpenCV's order, m.
+
+    The origin is the centre of the marker.
+    """
+    square = target.size * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]) / 2
+    return np.asarray(square[None])
 
 
 def _aprilgrid_corners(target: Target) -> FloatArray:
