@@ -338,3 +338,23 @@ def test_only_the_marker_of_the_target_is_used():
 def test_a_chessboard_that_looks_the_same_after_half_a_turn_is_refused():
     with pytest.raises(ConfigError, match="7x5 inner corners looks the same after half a turn"):
         Target.parse("chessboard:7x5:0.03")
+
+
+@pytest.mark.parametrize("text", ["marker:7:0.16:5X5_50", "chessboard:7x4:0.03"])
+def test_sigmas_are_as_large_as_the_errors(text, monkeypatch):
+    """Corners with errors of 0.2 pixels. Only two of a marker's eight residuals are redundant."""
+    rng = np.random.default_rng(61)
+    target = Target.parse(text)
+    finder = TargetFinder(target, Camera(MATRIX, np.zeros(5), is_fisheye=False))
+    corners = finder._corners
+    numbers = target.number + np.arange(len(corners))
+    monkeypatch.setattr(finder, "_detect", lambda pixels: (pixels, numbers))
+    truth = views(400, corners.reshape(-1, 3).mean(axis=0), rng)
+    for T in truth:
+        rays = (corners @ T[:3, :3].T + T[:3, 3]) @ MATRIX.T
+        pixels = rays[..., :2] / rays[..., 2:]
+        finder.look(pixels + rng.normal(0.0, 0.2, pixels.shape))
+    tracking = finder.found()
+    errors = se3.log(se3.inverse(truth) @ tracking.Ts_camera_target).reshape(-1, 2, 3)
+    ratios = np.sqrt((errors**2).mean(axis=(0, 2)) / (tracking.sigmas**2).mean(axis=0))
+    assert ratios == pytest.approx([1.0, 1.0], abs=0.2)

@@ -334,8 +334,7 @@ class TargetPoses:
     rms_px : (N,) array
         Residuals of the corners of each image (root mean square, pixels).
     sigmas : (N, 2) array
-        Standard deviations (m, rad) of each pose. The error of a corner is assumed to be as large
-        as ``rms_px``.
+        Standard deviations (m, rad) of each pose, from the residuals of its corners.
     n_images : int
         Number of all images.
     """
@@ -460,8 +459,9 @@ class TargetFinder:
         rms_px, vector, shift, derivatives = min(candidates, key=itemgetter(0))
         T = se3.from_rotation_translation(cv2.Rodrigues(vector)[0], shift.ravel())
         jacobian = derivatives * np.tile(focal, len(corners))[:, None]
-        # Each of the two coordinates of a corner has half of the mean square.
-        variance_px2 = rms_px**2 / 2
+        # Each corner has two residuals. The pose has six degrees of freedom.
+        degrees_of_freedom = 2 * len(corners) - 6
+        variance_px2 = len(corners) * rms_px**2 / degrees_of_freedom
         unit_covariance = np.linalg.pinv(jacobian.T @ jacobian)
         variances = variance_px2 * np.diag(unit_covariance)
         # OpenCV's parameters are rotations, then translations.
