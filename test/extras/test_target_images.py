@@ -239,6 +239,7 @@ def test_intrinsics_of_ros_and_kalibr(tmp_path, text):
         "charuco:5x7",
         "charuco:5x7:0.03:0.04",
         "aprilgrid:6:1:1",
+        "aprilgrid:6x6:0.088:0.0264:4X4_50",
         "chessboard:7x4",
         "chessboard:7x2:0.03",
         "chessboard:7x4:30:1",

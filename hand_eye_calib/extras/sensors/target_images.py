@@ -157,7 +157,9 @@ class Target:
         columns, rows = map(int, parts[0].split("x"))
         size, marker = map(float, parts[1:3])
         are_lengths = marker > 0.0 and 0.0 < size < _LARGEST_SIZE_M
-        if min(columns, rows) < 2 or not are_lengths or len(parts) > 4:
+        # The tags of an AprilGrid have one dictionary, which is not named.
+        most_parts = 3 if kind == "aprilgrid" else 4
+        if min(columns, rows) < 2 or not are_lengths or len(parts) > most_parts:
             raise ValueError("no grid")
         if kind == "aprilgrid":
             return cls(kind, columns, rows, size, marker, "APRILTAG_36h11")
