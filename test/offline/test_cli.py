@@ -34,7 +34,14 @@ from hand_eye_calib.core.results.records import Severity
 from hand_eye_calib.formats.bags.writer import write_bag
 from hand_eye_calib.formats.results import load_result
 from hand_eye_calib.offline.cli.main import main
-from hand_eye_calib.offline.cli.options import fail, note, print_result, waiting_for, with_progress
+from hand_eye_calib.offline.cli.options import (
+    fail,
+    note,
+    print_result,
+    typed_options,
+    waiting_for,
+    with_progress,
+)
 from hand_eye_calib.offline.cli.present import as_lines
 
 pytestmark = pytest.mark.usefixtures("no_figures")
@@ -567,3 +574,9 @@ def test_control_characters_in_names_do_not_reach_the_terminal(capsys):
     assert "\ncam\\x1b[2Jera\\nStatus: ok in lidar" in text
     fail(hostile, 1)
     assert capsys.readouterr().err == "hand_eye_calib: error: cam\\x1b[2Jera\\nStatus: ok\n"
+
+
+def test_options_are_printed_as_they_are_typed():
+    options = {"prior.z": "VALUE+/-SIGMA", "max_gap": 0.2, "target.translation": 0.01}
+    typed = typed_options(options.items())
+    assert typed == "--prior z=VALUE+/-SIGMA --max-gap 0.2 --target-translation 0.01"

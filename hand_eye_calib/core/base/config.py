@@ -122,7 +122,7 @@ _KIND = _both(
     "Constant errors of the {} sensor's poses, which no recording reveals. "
     "odometry (lidar, camera, wheels): every standard deviation contains an "
     "allowance for them. exact (motion capture, surveyed, an INS with RTK, "
-    "simulated): none.",
+    "simulated without drift): none.",
     choices=("odometry", "exact"),
 )
 

@@ -120,7 +120,14 @@ def flag(name: str) -> str:
 
 def typed_options(options: Iterable[tuple[str, object]]) -> str:
     """Return pairs of public option name and value as a user types them on the command line."""
-    return " ".join(f"--{flag(name)} {value}" for name, value in options)
+    return " ".join(_typed_option(name, value) for name, value in options)
+
+
+def _typed_option(name: str, value: object) -> str:
+    """Return an option and its value, such as ``--max-gap 0.2`` or ``--prior z=1.85+/-0.02``."""
+    if name.startswith("prior."):
+        return f"--prior {name.removeprefix('prior.')}={value}"
+    return f"--{flag(name)} {value}"
 
 
 def as_typed(text: str) -> str:
