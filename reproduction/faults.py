@@ -115,7 +115,7 @@ def recordings(folder: Path | None) -> list[str]:
 
 
 def cases(folder: Path | None) -> list[Case]:
-    """All cases of the study: faults, those that were built later, clean recordings."""
+    """All cases of the study: recordings without faults, with each fault, and clean recordings."""
     names = recordings(folder)
     faulty = (_cases(code, len(fault.severities), names) for code, fault in _FAULTS.items())
     return [*_cases(_SOUND, 1, names), *chain.from_iterable(faulty), *clean_cases(folder)]

@@ -136,7 +136,12 @@ def _course(course: str, machine: str, rng: np.random.Generator, times_s: FloatA
 
 
 def _poses(rng: np.random.Generator, driven: Course, noise: float) -> FloatArray:
-    """Return poses of the base on a floor with bumps; the body leans outwards in curves."""
+    """Return poses of the base on a floor with bumps; the body leans outwards in curves.
+
+    ``noise`` multiplies bumps and lean. With 1, the bumps have standard deviations of 4 mrad in
+    roll and pitch and 3 mm in height, and a correlation time of 0.3 s. The lean is 10 mrad for a
+    lateral acceleration of 1 m/s^2.
+    """
     speed, left_speed, yaw_rate = driven
     headings = np.cumsum(yaw_rate) * _STEP_S
     middle = headings - yaw_rate * _STEP_S / 2

@@ -446,17 +446,20 @@ def options_of(kind: str, platform: str) -> dict[str, Any]:
     return {"target_rotation": float(np.radians(degrees))}
 
 
-def distance(kind: str, result: Calibration, truth: FloatArray) -> float:
-    """Largest error of a known axis over its standard deviation with the allowance."""
+def largest_ratio(kind: str, result: Calibration, truth: FloatArray) -> float:
+    """Return the largest ratio of an error to its standard deviation over the known axes.
+
+    The standard deviation includes the allowance for constant errors.
+    """
     if kind == "positions":
         errors = result.T_parent_child[:3, 3] - truth
         axes = slice(0, 3)
     else:
         errors = se3.rotation_log(truth @ result.T_parent_child[:3, :3].T)
         axes = slice(3, 6)
-    totals = result.sigmas[axes]
-    is_determined = np.isfinite(totals)
-    return float(np.abs(errors[is_determined] / totals[is_determined]).max(initial=0.0))
+    sigmas = result.sigmas[axes]
+    is_known = np.isfinite(sigmas)
+    return float(np.abs(errors[is_known] / sigmas[is_known]).max(initial=0.0))
 
 
 def rows(kind: str, seeds: Sequence[int]) -> Iterator[dict[str, object]]:
@@ -481,7 +484,7 @@ def rows(kind: str, seeds: Sequence[int]) -> Iterator[dict[str, object]]:
                 n_named += bool(codes & names)
                 n_findings += bool(codes)
                 if result.verdict is not hec.Verdict.DO_NOT_USE:
-                    distances.append(distance(kind, result, recording.truth))
+                    distances.append(largest_ratio(kind, result, recording.truth))
                     n_far += result.verdict is hec.Verdict.USE and distances[-1] > FAR_SIGMAS
         total = verdicts.total()
         yield {

@@ -217,8 +217,11 @@ def faulty(platform: str, fault: str, seed: int) -> Streams:
     return FAULTS[fault][0](streams, np.random.default_rng((seed, 903)))
 
 
-def distance(result: Calibration, truth: FloatArray) -> float:
-    """Largest error of a known axis over its standard deviation with the allowance."""
+def largest_ratio(result: Calibration, truth: FloatArray) -> float:
+    """Return the largest ratio of an error to its standard deviation over the known axes.
+
+    The standard deviation includes the allowance for constant errors.
+    """
     T = result.T_parent_child
     turned = se3.rotation_log(T[:3, :3] @ truth[:3, :3].T)
     errors = np.concatenate([T[:3, 3] - truth[:3, 3], turned])
@@ -250,7 +253,7 @@ def rows(faults: Sequence[str], seeds: Sequence[int]) -> Iterator[dict[str, obje
                 codes.update(serious)
                 n_named += fault != "clean" and bool(serious & FAULTS[fault][1])
                 if result.verdict is not hec.Verdict.DO_NOT_USE:
-                    distances.append(distance(result, streams.T_parent_child))
+                    distances.append(largest_ratio(result, streams.T_parent_child))
                     n_far += result.verdict is hec.Verdict.USE and distances[-1] > FAR_SIGMAS
         yield {
             "Fault": fault,

@@ -63,8 +63,9 @@ _SAME_PRINT = 0.00051
 
 
 def with_rectified(rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows of one drive by method and reference, with errors against the rectified truth and what
-    is gained over the method's B1 variant.
+    """Return the rows of one drive by method and reference, with two further groups of columns.
+
+    They are the errors against the rectified truth, and the gains over the method's B1 variant.
     """
     truth = RECTIFIED[rows["dataset"].iloc[0]]
     indexed = rows.set_index(["method", "reference"])
@@ -80,12 +81,12 @@ def with_rectified(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def best_variants(rows: pd.DataFrame, by: str = _ERRORS[2]) -> pd.DataFrame:
-    """Of each method the row with the smallest error, of :func:`with_rectified`."""
+    """Return the row of each method with the smallest error ``by``, from :func:`with_rectified`."""
     return rows.loc[[rows.loc[[method]][by].idxmin() for method in METHODS]]
 
 
 def write_summary_table(name: str, results: Results) -> list[Path]:
-    """Tables 1 and 2; returns the paths."""
+    """Write Table 1 or 2 and its comparison with the printed table; return the paths."""
     dataset = SUMMARY_TABLES[name]
     rows = with_rectified(results.rows[results.rows["dataset"] == dataset])
     best = best_variants(rows)
@@ -110,7 +111,7 @@ def write_summary_table(name: str, results: Results) -> list[Path]:
 
 
 def _print(value: float, bold: float | None = None) -> str:
-    """To three decimals; bold where that reads as ``bold`` does."""
+    """Return a value with three decimals; in bold type if ``bold`` has the same three decimals."""
     if np.isnan(value):
         return "-"
     text = f"{value:.3f}"
@@ -120,26 +121,34 @@ def _print(value: float, bold: float | None = None) -> str:
 def _compare_with_print(
     name: str, rows: pd.DataFrame, best: pd.DataFrame, results: Results
 ) -> list[Path]:
-    """Cell by cell: ours of our best variant, and as printed."""
+    """Write the cells of a summary table beside the printed ones, and return the paths.
+
+    A row of the CSV file has the value of our best variant and the printed value. The Markdown file
+    lists the cells that differ.
+    """
     dataset = SUMMARY_TABLES[name]
-    compared = pd.DataFrame(
-        {
-            "method": TITLES[method],
-            "our_best_variant": reference,
-            "papers_variant": variant,
-            "column": column,
-            "ours": ours,
-            "printed": number,
-            "agrees": same,
-            "why": "" if same else why,
-        }
-        for method, reference in best.index
-        for variant, *numbers in [PRINTED[dataset][method]]
-        for why in ["; ".join(dict.fromkeys(rows.loc[method].loc[[variant, "B1"], "why"]))]
-        for column, number in zip((*_ERRORS, *_GAINS), numbers, strict=True)
-        for ours in [float(best.loc[(method, reference), column])]
-        for same in [np.isnan(ours) if number is None else abs(ours - number) <= _SAME_PRINT]
-    )
+    cells: list[dict[str, Any]] = []
+    for method, reference in best.index:
+        variant, *numbers = PRINTED[dataset][method]
+        # The printed gains are relative to B1, so its reason explains a difference as well.
+        reasons = rows.loc[method].loc[[variant, "B1"], "why"]
+        why = "; ".join(dict.fromkeys(reasons))
+        for column, number in zip((*_ERRORS, *_GAINS), numbers, strict=True):
+            ours = float(best.loc[(method, reference), column])
+            agrees = np.isnan(ours) if number is None else abs(ours - number) <= _SAME_PRINT
+            cells.append(
+                {
+                    "method": TITLES[method],
+                    "our_best_variant": reference,
+                    "papers_variant": variant,
+                    "column": column,
+                    "ours": ours,
+                    "printed": number,
+                    "agrees": agrees,
+                    "why": "" if agrees else why,
+                }
+            )
+    compared = pd.DataFrame(cells)
     solved = results.rows[results.rows["dataset"] == dataset]
     return [
         write_csv(results.out / f"{name}_comparison.csv", compared),
@@ -157,7 +166,7 @@ def _compare_with_print(
 
 
 def write_variant_table(name: str, results: Results) -> list[Path]:
-    """Tables S1 to S12; returns the paths."""
+    """Write one of Tables S1 to S12 and its comparison with the paper; return the paths."""
     dataset, method = VARIANT_TABLES[name]
     solved = results.of(dataset, method)
     rows = with_rectified(solved).loc[method].loc[list(REFERENCES)]

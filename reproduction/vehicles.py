@@ -104,16 +104,16 @@ def _with_unit(name: str, error: float) -> str:
 
 
 def summary(drives: Iterable[Drive]) -> str:
-    """One line about the verdicts and the cover of all unknowns."""
+    """Return a line with the verdicts, and the coverage of the 90 % intervals of all unknowns."""
     drives = list(drives)
     ratios: list[float] = []
     n_wrong = 0
     for item in drives:
         ratios += item.ratios.values()
         n_wrong += item.verdict == "USE" and max(item.ratios.values()) > _BEYOND
-    cover = np.mean(np.array(ratios) < QUANTILE_90)
+    coverage = np.mean(np.array(ratios) < QUANTILE_90)
     return (
-        f"{counted(item.verdict for item in drives)}; the 90 % intervals cover {cover:.1%} of "
+        f"{counted(item.verdict for item in drives)}; the 90 % intervals cover {coverage:.1%} of "
         f"{len(ratios)} errors; USE beyond {_BEYOND} sigma: {n_wrong}"
     )
 

@@ -221,7 +221,8 @@ def write_atomically(contents: Mapping[Path, str | bytes]) -> None:
     Raises
     ------
     OSError
-        If a file cannot be written; the error names the file. The old files are not changed.
+        If a file cannot be written or renamed; the error names the file. No old file changes if a
+        file cannot be written. If one cannot be renamed, the files before it are already replaced.
     """
     temporaries = {
         path: path.with_name(f".{path.name[:100]}.{os.urandom(8).hex()}") for path in contents

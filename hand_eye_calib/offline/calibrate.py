@@ -263,7 +263,8 @@ def _prior_text(axis: str, pair: Any) -> str:
         value, sigma = map(float, pair)
     except (TypeError, ValueError):
         raise ConfigError(
-            f"prior {axis} must be (value, standard deviation) or a text; got {pair!r}"
+            f"prior {axis} must be (value, standard deviation) or a text such as '1.85+/-0.02'; "
+            f"got {pair!r}"
         ) from None
     return f"{value!r}+/-{sigma!r}"
 

@@ -105,7 +105,10 @@ def _ground_vehicle(
 
 
 def car(rng: np.random.Generator, duration_s: float) -> Motion:
-    """A car on hilly roads: 3-15 m/s, junctions and bends, slopes of some degrees."""
+    """A car on hilly roads: junctions and bends, slopes of some degrees.
+
+    The speed is about 9 m/s, with limits of 2 and 18 m/s.
+    """
     times = _grid(duration_s)
     speed = np.clip(9.0 + 3.5 * _waves(rng, times, 1, (0.01, 0.06))[:, 0], 2.0, 18.0)
     bends = _smooth_steps(rng, times, 6.0, lambda size: rng.normal(0.0, 0.18, size), 0.8)
@@ -118,7 +121,10 @@ def car(rng: np.random.Generator, duration_s: float) -> Motion:
 
 
 def agv(rng: np.random.Generator, duration_s: float, ramps: bool = True) -> Motion:
-    """An automated guided vehicle in a hall: turns on the flat, and ramps of 3-6 degrees."""
+    """An automated guided vehicle in a hall: turns, and ramps up and down of 3 or 6 degrees.
+
+    Without ``ramps`` the floor is flat and has no bumps.
+    """
     times = _grid(duration_s)
     speed = _smooth_steps(rng, times, 8.0, lambda size: rng.uniform(0.4, 1.4, size), 0.7)
     yaw_rate = _smooth_steps(rng, times, 5.0, lambda size: rng.normal(0.0, 0.35, size), 0.5)
@@ -137,7 +143,7 @@ def agv(rng: np.random.Generator, duration_s: float, ramps: bool = True) -> Moti
 
 
 def flat_agv(rng: np.random.Generator, duration_s: float) -> Motion:
-    """The same on a perfectly flat floor: the vertical offset stays unknown."""
+    """An automated guided vehicle on a perfectly flat floor: the vertical offset stays unknown."""
     return agv(rng, duration_s, ramps=False)
 
 

@@ -31,11 +31,11 @@ from reproduction.writing import markdown_table, seed_of, show, study_parser
 
 BASELINE = Path(__file__).with_name("baseline.json")
 
-# Recordings of each family.
+# Number of recordings of each family.
 USUAL = dict.fromkeys(CLASSES, 10) | dict.fromkeys(MIXED, 16)
 QUICK = dict.fromkeys(CLASSES, 3) | dict.fromkeys(MIXED, 6)
 _NEW_DRAW = dict.fromkeys(MIXED, 12)
-# Pieces of each real recording.
+# Number of pieces of each real recording.
 _PIECES = 2
 
 

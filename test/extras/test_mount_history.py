@@ -233,6 +233,6 @@ def test_the_offset_of_a_mount_becomes_more_precise_until_a_change(session):
 def test_a_page_of_a_fleet_needs_digests_of_every_vehicle(session, tmp_path):
     write_digest(tmp_path / "a", session)
     (tmp_path / "b").mkdir()
-    with pytest.raises(ConfigError, match="needs digests of the monitor; .*b has none"):
+    with pytest.raises(ConfigError, match="needs digests, which the monitor writes.*b has none"):
         compare_digests(arguments(tmp_path / "a", tmp_path / "b", fleet=tmp_path / "page.html"))
     assert not (tmp_path / "page.html").exists()

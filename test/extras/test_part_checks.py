@@ -69,7 +69,7 @@ def test_a_fault_of_the_path_is_named_and_its_error_is_within_sigma(fault, code,
     assert code in [*codes(result), *codes(result, "warning")]
     assert result.verdict is not hec.Verdict.USE
     truth = part_faults.positions(platform, fault, SEED).truth
-    assert part_faults.distance("positions", result, truth) < 2.5
+    assert part_faults.largest_ratio("positions", result, truth) < 2.5
 
 
 @pytest.mark.parametrize("platform", ["hand", "drone"])
@@ -94,7 +94,7 @@ def test_the_covariance_contains_smoothing_that_is_too_weak_for_a_finding():
     child = Trajectory.from_positions(recording.child.stamps_ns, smoothed, "antenna", "map")
     result = hec.calibrate(recording.parent, child, **part_faults.WIDE)
     assert codes(result) == []
-    assert part_faults.distance("positions", result, recording.truth) < 2.5
+    assert part_faults.largest_ratio("positions", result, recording.truth) < 2.5
 
 
 # Faults of rates and rotations, and the code of the finding on machines that move in other ways.
@@ -136,7 +136,7 @@ def test_a_fault_of_rotations_is_named_and_its_error_is_within_sigma(kind, fault
     assert result.verdict is not hec.Verdict.USE
     if result.verdict is hec.Verdict.USE_WITH_CARE:
         truth = part_faults.KINDS[kind][0](platform, fault, SEED).truth
-        assert part_faults.distance(kind, result, truth) < 2.5
+        assert part_faults.largest_ratio(kind, result, truth) < 2.5
 
 
 @pytest.mark.parametrize("platform", part_faults.PLATFORMS)

@@ -117,7 +117,10 @@ class TestPrior:
         ("prior", "message"),
         [
             ({"height": (1.85, 0.02)}, "prior takes x, y, z, roll, pitch, yaw; got"),
-            ({"z": 1.85}, r"prior z must be \(value, standard deviation\) or a text; got 1.85"),
+            (
+                {"z": 1.85},
+                r"prior z must be \(value, standard deviation\) or a text such as .*; got 1.85",
+            ),
             ({"z": (1.85, 0.02, 3)}, r"prior z must be \(value, standard deviation\)"),
             ({"z": (1.85, float("nan"))}, "prior.z must be numbers in m"),
         ],

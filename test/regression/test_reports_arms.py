@@ -66,7 +66,7 @@ RIGHT = [
         "",
     ),
     ("H.npy C.npy --order none --child-invert poses", IN_HAND, "parent", ""),
-    ("ur.csv camT.csv --order none", IN_HAND, "parent", "both hold inverse poses"),
+    ("ur.csv camT.csv --order none", IN_HAND, "parent", "both have inverse poses"),
     ("inv_both.npz --parent-invert poses --child-invert poses", IN_HAND, "hand", ""),
     ("inv_track.npz --child-invert poses", IN_HAND, "hand", ""),
 ]
@@ -97,7 +97,7 @@ def test_clean_samples_have_no_findings(arms, capsys, command):
     ("command", "text"),
     [
         ("shifted.npz", "moved down by 1 row"),
-        ("inv_both.npz", "the poses of one or both sides are inverse"),
+        ("inv_both.npz", "one side or both have inverse poses"),
         ("robot_mm.npz --scale 1000", "the parent stream's lengths are millimetres"),
         ("H.npy C.npy --order none", "one of the two files has inverse poses"),
     ],

@@ -37,7 +37,7 @@ from hand_eye_calib.core.results.records import AXES
 _UNKNOWN_VARIANCE = 1e4
 # Gauss-Newton steps of the common extrinsic.
 _ROUNDS = 2
-# Probability of a false alarm.
+# Significance level: probability of a false alarm.
 _LEVEL = 0.01
 # Grid of the factors of the usual scatter. Results that scatter by more are not of one mount.
 _FACTORS = np.geomspace(1 / 16, 16, 9)
@@ -271,9 +271,24 @@ class _Explanation(NamedTuple):
 def _explain(errors: FloatArray, weights: FloatArray, level: float) -> _Explanation:
     """Explain errors (N, 6) of results with weights (N, 6, 6).
 
-    An explanation splits the results into two groups with a mean each. The first group is a single
-    result, or all results since the mount has moved. If two explanations have the same p-value, a
-    single result is preferred.
+    Three or more results are split into two groups with a mean each. The first group is a single
+    result, or all results since the mount has moved. If two splits have the same p-value, a single
+    result is preferred. The kinds are:
+
+    - "single": there is one result.
+    - "one off" or "moved": the best split is significant at ``level``.
+    - "agree": no split is significant, and the chi-square test of all results accepts one
+      extrinsic (_LEVEL).
+    - "scatter": the test rejects one extrinsic for three or more results, and a scatter within the
+      grid of factors explains that.
+    - "differ": the test rejects one extrinsic for two results, or no such scatter explains it.
+
+    Parameters
+    ----------
+    errors : (N, 6) array
+    weights : (N, 6, 6) array
+    level : float
+        Significance level of the best split. With 0, no split is significant.
     """
     from scipy.special import chdtrc
 
@@ -285,13 +300,14 @@ def _explain(errors: FloatArray, weights: FloatArray, level: float) -> _Explanat
     total_chi2, total_dof = map(float, _chi2_and_dof(products.total, ranks.total))
     p_value = float(chdtrc(total_dof, total_chi2)) if total_dof else 1.0
     kind = "differ" if p_value < _LEVEL else "agree"
-    apart = number < 0
+    apart = np.zeros(n_results, dtype=bool)
     if n_results < 3:
         kind = kind if n_results == 2 else "single"
         return _Explanation(kind, apart, total_chi2, int(total_dof), p_value)
     since = np.arange(2, n_results - 1)
     p_values = _p_values_of_splits(products, ranks, since)
     best = int(np.argmin(p_values))
+    # The best of several splits is tested (Bonferroni correction).
     if len(p_values) * p_values[best] < level:
         if best < n_results:
             kind = "one off"
@@ -300,6 +316,7 @@ def _explain(errors: FloatArray, weights: FloatArray, level: float) -> _Explanat
             kind = "moved"
             apart = number >= since[best - n_results]
     elif kind == "differ" and total_chi2 < _FACTORS[-1] ** 2 * total_dof:
+        # The usual scatter times at most the largest factor explains chi-square.
         kind = "scatter"
     return _Explanation(kind, apart, total_chi2, int(total_dof), p_value)
 

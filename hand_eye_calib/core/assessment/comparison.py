@@ -202,8 +202,10 @@ def agreement_of_results(results: Sequence[Calibration], level: float = 0.01) ->
     """
     Ts = np.array([result.T_parent_child for result in results])
     measured = np.array([result.covariance_measured for result in results])
+    # From the axes of the child to those of the parent.
     covariances = turned(se3.rotation_of(Ts), measured)
     variances = [np.diag(scatter_of_recordings(covariance)) for covariance in covariances]
+    # The usual scatter of the rig: the median over its recordings.
     return agreement_of(Ts, covariances, np.sqrt(np.median(variances, axis=0)), level)
 
 

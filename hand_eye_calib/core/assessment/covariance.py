@@ -256,6 +256,8 @@ def widened_by_blocks(covariance: FloatArray, solution: ModelSolution, part: sli
     that the noise model may confuse slow rotation errors fixed to a sensor with errors fixed to a
     world. Errors fixed to a world average out while the sensor moves, so the model's covariance is
     then too small.
+
+    A recording with too few increments for the blocks keeps the model's covariance.
     """
     if len(solution.jumps) < BLOCKS * _LEAST_BLOCK_SIZE:
         return covariance

@@ -73,7 +73,7 @@ def select_reference(
     if len(pose_pairs) < MIN_POSES:
         raise NotEnoughDataError(
             f"reference auto needs at least {MIN_POSES} synchronised poses, "
-            f"found {len(pose_pairs)}; drive on, or name a reference"
+            f"found {len(pose_pairs)}; record longer, or name a reference such as B1"
         )
     poses = pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
     solution = solution or estimator.solve(pose_pairs.stamps_ns, *poses, quick=True)

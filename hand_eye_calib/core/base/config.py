@@ -112,9 +112,9 @@ _INVERT = _both(
 )
 _QUATERNION = _both(
     "xyzw",
-    "Order in which the {}'s quaternions were written. wxyz repairs values "
-    "that were read as x y z w; yzwx repairs values x y z w under the names "
-    "w x y z.",
+    "True order of the {}'s four quaternion numbers that are read as x y z w. "
+    "wxyz: the numbers are w x y z. yzwx: columns are named w x y z, but "
+    "contain x y z w.",
     choices=("xyzw", "wxyz", "yzwx"),
 )
 _KIND = _both(

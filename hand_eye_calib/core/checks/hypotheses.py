@@ -472,7 +472,8 @@ def _steadier(chosen: Explanation, streams: StreamPair, lag_s: float) -> tuple[E
     scatter = dict(zip(_CONVENTIONAL, scatters.flat, strict=True))
     scatter_of_chosen = scatter[hypothesis]
     smallest = min(scatter.values())
-    if smallest < min(trajectory.STEADY, scatter_of_chosen / trajectory.CLEARLY):
+    clearly_smaller = scatter_of_chosen / trajectory.WRONG_SCATTER_RATIO
+    if smallest < min(trajectory.STEADY_SCATTER, clearly_smaller):
         # Rounding makes the scatter of exact motion negative.
         limit = max(_ABOUT_EQUAL * smallest, 0.0)
         steadiest = [rival for rival in _CONVENTIONAL if scatter[rival] <= limit]
@@ -480,7 +481,7 @@ def _steadier(chosen: Explanation, streams: StreamPair, lag_s: float) -> tuple[E
         steady = _fitted(simplest, streams, lag_s)
         if steady.holds:
             return steady, True
-    return chosen, scatter_of_chosen < trajectory.STEADY
+    return chosen, scatter_of_chosen < trajectory.STEADY_SCATTER
 
 
 def _scatters(stream: trajectory.Trajectory) -> list[float]:

@@ -108,19 +108,22 @@ def check_copies(given: StreamPair, aligned: StreamPair, are_exact: bool) -> lis
         Whether the user called both streams exact, as for motion capture. Agreement to rounding is
         then a warning instead of an error, and noise is not compared.
     """
-    # A program interpolates its source at the stamps of the new stream. Either stream may be new.
+    # A program interpolates its source at the stamps of the computed stream. Either stream may be
+    # the computed one.
     pairs = [(streams.child, streams.parent) for streams in (given, aligned)]
     pairs += [(streams.parent, streams.child) for streams in (given, aligned)]
-    residual_rad = min(_residual_at_nearest(slow, fast) for slow, fast in pairs)
+    residual_rad = min(_residual_at_nearest(computed, source) for computed, source in pairs)
     if residual_rad < _ROUNDING_RAD:
         severity = Severity.WARNING if are_exact else Severity.ERROR
         text = f"both streams agree to {angle(residual_rad)}, which two sensors hardly do"
         return [_doubt(text, severity, residual_rad=residual_rad)]
     if are_exact:
         return []
-    more = max(_shared_noise(_second_half(slow, fast), fast) for slow, fast in pairs)
-    if more > 1.0:
-        return [_doubt("the noise of both streams is unusually alike", more=more)]
+    excess = max(
+        _shared_noise(_second_half(computed, source), source) for computed, source in pairs
+    )
+    if excess > 1.0:
+        return [_doubt("the noise of both streams is unusually alike", more=excess)]
     return []
 
 
@@ -129,32 +132,32 @@ def _doubt(text: str, severity: Severity | None = None, **evidence: float) -> Fi
     return finding("not_independent", "both", severity, None, evidence=text, **evidence)
 
 
-def _within(slow: Trajectory, fast: Trajectory) -> IntArray:
-    """Return the indices of poses of ``slow`` whose stamps are between both ends of ``fast``."""
-    first_ns, last_ns = fast.stamps_ns[[0, -1]]
-    return np.flatnonzero((slow.stamps_ns >= first_ns) & (slow.stamps_ns <= last_ns))
+def _within(computed: Trajectory, source: Trajectory) -> IntArray:
+    """Return the indices of poses of ``computed`` between first and last stamp of ``source``."""
+    first_ns, last_ns = source.stamps_ns[[0, -1]]
+    return np.flatnonzero((computed.stamps_ns >= first_ns) & (computed.stamps_ns <= last_ns))
 
 
-def _second_half(slow: Trajectory, fast: Trajectory) -> Trajectory:
-    """Return the first _NEAREST[1] poses of ``slow`` after the middle of the common time."""
-    rows = _within(slow, fast)
-    return slow[rows[len(rows) // 2 :][: _NEAREST[1]]]
+def _second_half(computed: Trajectory, source: Trajectory) -> Trajectory:
+    """Return the first _NEAREST[1] poses of ``computed`` after the middle of the common time."""
+    rows = _within(computed, source)
+    return computed[rows[len(rows) // 2 :][: _NEAREST[1]]]
 
 
-def _residual_at_nearest(slow: Trajectory, fast: Trajectory) -> float:
+def _residual_at_nearest(computed: Trajectory, source: Trajectory) -> float:
     """Return the residual angle (rad) between the rotations of both streams.
 
-    Poses of ``slow`` are used for which a pose of ``fast`` is nearest in time.
+    Poses of ``computed`` are used for which a pose of ``source`` is nearest in time.
     """
-    rows = _within(slow, fast)
-    after = np.clip(np.searchsorted(fast.stamps_ns, slow.stamps_ns[rows]), 1, len(fast) - 1)
-    around = np.abs(fast.stamps_ns[[after - 1, after]] - slow.stamps_ns[rows]).min(axis=0)
+    rows = _within(computed, source)
+    after = np.clip(np.searchsorted(source.stamps_ns, computed.stamps_ns[rows]), 1, len(source) - 1)
+    around = np.abs(source.stamps_ns[[after - 1, after]] - computed.stamps_ns[rows]).min(axis=0)
     nearest = np.sort(around)[: max(_NEAREST[0], len(rows) // 100)]
     rows = rows[around <= nearest.max(initial=0)]
-    slow = slow[rows[:: max(-(-len(rows) // _NEAREST[1]), 1)]]
-    between = fast.at(slow.stamps_ns, straight=True)
-    start = np.arange(len(slow) - 1)
-    return _residual(pairs_between(between, slow.poses, start, start + 1))
+    computed = computed[rows[:: max(-(-len(rows) // _NEAREST[1]), 1)]]
+    between = source.at(computed.stamps_ns, straight=True)
+    start = np.arange(len(computed) - 1)
+    return _residual(pairs_between(between, computed.poses, start, start + 1))
 
 
 def _residual(motions: MotionPairs) -> float:
@@ -174,28 +177,30 @@ def _residual(motions: MotionPairs) -> float:
     return residual_rad if residual_rad < _SMALL_SHARE * quantile(angles, USUAL) else np.inf
 
 
-def _shared_noise(slow: Trajectory, fast: Trajectory) -> float:
+def _shared_noise(computed: Trajectory, source: Trajectory) -> float:
     """Return the shared noise of both streams as a multiple of its limit for two sensors.
 
     The shared noise is the ratio of the noise of the quieter stream to the noise of the difference.
     It is large if one stream was computed from the other. The limits are _SHARED. The result is 0
     if the noise may be motion, or if a pose is missing.
     """
-    intervals_ns = np.diff(slow.stamps_ns)
-    if len(slow) < _NEAREST[0] or intervals_ns.max() > 1.5 * median(intervals_ns):
+    intervals_ns = np.diff(computed.stamps_ns)
+    if len(computed) < _NEAREST[0] or intervals_ns.max() > 1.5 * median(intervals_ns):
         return 0.0
-    of_slow = _second_differences(slow.poses)
-    of_fast = _second_differences(fast.at(slow.stamps_ns, straight=True))
-    of_fast = of_fast @ se3.nearest_rotation(of_fast[:, 1].T @ of_slow[:, 1])
-    difference = of_fast - of_slow
-    arms = se3.skew(of_slow[:, 1])
+    of_computed = _second_differences(computed.poses)
+    of_source = _second_differences(source.at(computed.stamps_ns, straight=True))
+    of_source = of_source @ se3.nearest_rotation(of_source[:, 1].T @ of_computed[:, 1])
+    difference = of_source - of_computed
+    arms = se3.skew(of_computed[:, 1])
     lever_arm = np.linalg.lstsq(arms.reshape(-1, 3), difference[:, 0].ravel(), rcond=None)[0]
     difference[:, 0] -= arms @ lever_arm
-    is_calm = _is_calm(of_slow, of_fast)
-    quarters = _upper_quarters(np.stack([of_slow, of_fast, difference]) * is_calm[:, None, None])
+    is_calm = _is_calm(of_computed, of_source)
+    quarters = _upper_quarters(
+        np.stack([of_computed, of_source, difference]) * is_calm[:, None, None]
+    )
     noise = quarters[:, :2]
     noise_of_difference = quarters[:, 2]
-    rotation = len(slow) * se3.rotation_of(slow.poses).var(axis=0).sum()
+    rotation = len(computed) * se3.rotation_of(computed.poses).var(axis=0).sum()
     if not noise[1, :, 1].max() < _LITTLE_NOISE * rotation:
         return 0.0
     smaller = noise.min(axis=1)
@@ -218,12 +223,12 @@ def _second_differences(Ts: FloatArray) -> FloatArray:
     return np.diff(steps, 2, axis=0).reshape(-1, 2, 3)
 
 
-def _is_calm(of_slow: FloatArray, of_fast: FloatArray) -> BoolArray:
+def _is_calm(of_computed: FloatArray, of_source: FloatArray) -> BoolArray:
     """Return which samples (N,) have no impulse that both streams contain.
 
     Arguments are second differences (N, 2, 3) of two streams.
     """
-    sizes = np.linalg.norm([of_slow, of_fast], axis=3)
+    sizes = np.linalg.norm([of_computed, of_source], axis=3)
     usual = _ABRUPT * np.median(sizes, axis=1, keepdims=True)
     return np.asarray((sizes <= usual).any(axis=0).all(axis=1))
 
@@ -231,12 +236,12 @@ def _is_calm(of_slow: FloatArray, of_fast: FloatArray) -> BoolArray:
 def _upper_quarters(second_differences: FloatArray) -> FloatArray:
     """Return the mean spectra (2, S, 2) of the third and the fourth quarter of frequencies.
 
-    ``second_differences`` is (S, N, 2, 3). The spectra are those of poses: the rise of the spectrum
-    with the frequency, which differences cause, is removed.
+    ``second_differences`` is (S, N, 2, 3). The spectra are those of the power of poses. The gain of
+    the differences is divided out, see :func:`_upper_spectra`.
     """
     spectra = (np.abs(np.fft.rfft(second_differences, axis=1)) ** 2).sum(axis=3)
-    angles = np.linspace(1e-3, np.pi / 2.0, spectra.shape[1])
-    spectra /= (2.0 * np.sin(angles))[:, None] ** 6
+    half_frequencies = np.linspace(1e-3, np.pi / 2.0, spectra.shape[1])
+    spectra /= (2.0 * np.sin(half_frequencies))[:, None] ** 6
     quarters = np.array_split(spectra, 4, axis=1)
     return np.stack([quarter.mean(axis=1) for quarter in quarters[2:]])
 
@@ -402,7 +407,7 @@ def _is_noise_shared(pose_pairs: PosePairs, X: FloatArray) -> bool:
 def _factors_of_noise(streams: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Regress the noise of the second of two streams on the noise of the first.
 
-    ``streams`` (2, N, 2, 3) are second differences of positions and orientations.
+    ``streams`` (2, N, 2, 3) are the results of :func:`_second_differences` for both streams.
 
     Returns
     -------
@@ -420,14 +425,18 @@ def _factors_of_noise(streams: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _upper_spectra(second_differences: FloatArray) -> NDArray[np.complex128]:
-    """Return the upper half of the spectra (S, F, 2, 3) of poses, from second differences.
+    """Return the upper half of the spectra (S, F, 2, 3) of S streams of poses.
 
-    ``second_differences`` is (S, N, 2, 3). The rise of the spectrum with the frequency, which
-    differences cause, is removed.
+    Parameters
+    ----------
+    second_differences : (S, N, 2, 3) array
+        Second differences of the motions from pose to pose. They are third differences of the
+        poses, which multiply the amplitude at the frequency w (rad per pose) by
+        ``(2 sin(w / 2))^3``. The spectra are divided by this gain.
     """
     spectra = np.fft.rfft(second_differences, axis=1)
-    angles = np.linspace(1e-3, np.pi / 2.0, spectra.shape[1])
-    spectra /= (2.0 * np.sin(angles))[:, None, None] ** 3
+    half_frequencies = np.linspace(1e-3, np.pi / 2.0, spectra.shape[1])
+    spectra /= (2.0 * np.sin(half_frequencies))[:, None, None] ** 3
     return np.asarray(spectra[:, spectra.shape[1] // 2 :])
 
 

@@ -48,21 +48,21 @@ _MOVES_SHARE = 0.1
 # difference. Measured: the largest distance of white noise is 2.2 times that in 6,000 draws.
 _MOVES_NOISES = 2.5
 
-# Two sensors take turns on one topic if the roughness from pose to pose exceeds the roughness over
-# some longer lag by this factor.
-_ALTERNATES = 2.0
-# Longest such lag, in poses.
+# If several sensors publish on one topic in turn, the positions repeat with a period (in poses).
+# The roughness from pose to pose exceeds the roughness over a period by at least this factor.
+_MIN_ROUGHNESS_RATIO = 2.0
+# Longest period, in poses.
 _MAX_PERIOD = 6
 # Smallest roughness from pose to pose, m.
 _MIN_ROUGHNESS_M = 0.01
 # Largest share of repeated positions. Streams that repeat poses are rough for another reason.
 _MAX_REPEATS = 0.1
-# The level of a sensor is the mean distance of its positions from the line between neighbours.
-# The mean is over this number of periods.
-_TURNS = 40
-# Smallest share of the mean squared distance that the levels explain. The levels of a body that
-# shakes or walks with nearly the same period change, so that they explain less.
-_STEADY_SHARE = 0.6
+# The level of a sensor is the mean deviation of its positions from the line between neighbouring
+# positions of the stream. The mean is over this number of periods.
+_PERIODS_OF_LEVEL = 40
+# Smallest share of the mean squared deviation that the levels explain. A body that shakes or walks
+# may have nearly the same period, but its levels vary, so they explain less.
+_MIN_EXPLAINED_BY_LEVELS = 0.6
 
 # Positions are on a grid if most differences are multiples of the smallest difference (the step).
 # Smallest number of differences.
@@ -173,13 +173,14 @@ def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> li
 def _interleaved(trajectory: Trajectory) -> float:
     """Return the roughness (m) of positions that alternate between sensors, or 0 for one sensor.
 
-    Sensors that publish on one topic take turns. Neighbouring poses then differ more than poses
-    that are one period apart.
+    Sensors that publish on one topic do so in turn, with a period in poses. Neighbouring poses then
+    differ more than poses that are one period apart.
     """
     positions = se3.translation_of(trajectory.poses)
     stamps_ns = trajectory.stamps_ns
     repeats = np.abs(np.diff(positions, axis=0)).max(axis=1) < _SAME
-    if len(positions) < (_TURNS + 2) * _MAX_PERIOD or repeats.mean() > _MAX_REPEATS:
+    fewest = (_PERIODS_OF_LEVEL + 2) * _MAX_PERIOD
+    if len(positions) < fewest or repeats.mean() > _MAX_REPEATS:
         return 0.0
     # Deviations of each position from the line between the positions ``lag`` before and after.
     deviations = []
@@ -192,17 +193,18 @@ def _interleaved(trajectory: Trajectory) -> float:
     roughness_m = [median(np.linalg.norm(vectors, axis=1)) for vectors in deviations]
     # Positions that alternate are rough from pose to pose, and smooth over whole periods.
     period = 2 + int(np.argmin(roughness_m[1:]))
-    if roughness_m[0] < max(_ALTERNATES * roughness_m[period - 1], _MIN_ROUGHNESS_M):
+    if roughness_m[0] < max(_MIN_ROUGHNESS_RATIO * roughness_m[period - 1], _MIN_ROUGHNESS_M):
         return 0.0
     in_world = deviations[0]
     in_sensor = np.einsum("kji,kj->ki", trajectory.poses[1:-1, :3, :3], in_world)
     # The levels repeat with the period, in the axes of the world or in those of the sensor.
     for vectors in (in_world, in_sensor):
-        n_windows = len(vectors) // (_TURNS * period)
-        windows = vectors[: n_windows * _TURNS * period].reshape(n_windows, _TURNS, period, 3)
+        n_windows = len(vectors) // (_PERIODS_OF_LEVEL * period)
+        n_used = n_windows * _PERIODS_OF_LEVEL * period
+        windows = vectors[:n_used].reshape(n_windows, _PERIODS_OF_LEVEL, period, 3)
         levels = (windows.mean(axis=1) ** 2).sum(axis=-1).mean(axis=-1)
         total = (windows**2).sum(axis=-1).mean(axis=(1, 2))
-        if median(levels / np.maximum(total, 1e-300)) >= _STEADY_SHARE:
+        if median(levels / np.maximum(total, 1e-300)) >= _MIN_EXPLAINED_BY_LEVELS:
             return roughness_m[0]
     return 0.0
 

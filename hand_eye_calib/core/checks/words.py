@@ -297,8 +297,8 @@ WORDS = {
     ),
     "model_scale": FindingWords(
         "the child's lengths are {size} % {than} than the parent's; the result allows for it",
-        "find out which of the two measures wrongly; have the scale estimated if neither is to be "
-        "trusted",
+        "find out which of the two measures wrongly; if you do not trust either, have the scale "
+        "estimated (scale estimate)",
         "a wheel radius, a camera's baseline or a map that is stretched",
     ),
     "axis_scale": FindingWords(

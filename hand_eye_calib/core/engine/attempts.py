@@ -112,9 +112,10 @@ def with_options(snapshot: Snapshot, options: Options) -> Snapshot:
         return replace(snapshot, config=config)
     if not len(snapshot.kept):
         return replace(snapshot, config=config, time_offset=None)
-    # The poses of the new snapshot must not contain the repairs, which it applies itself.
+    # The new snapshot repairs its streams itself, so its buffers must have streams without repairs.
     without_repairs = replace(snapshot.config, **defaults_of(STREAM_REPAIRS))
     parent, child = replace(snapshot, config=without_repairs).streams
+    # The kept pairs have larger gaps than the streams. So max_gap is that of the first pairing.
     return replace(
         snapshot,
         config=replace(config, max_gap=snapshot.max_gap_s),

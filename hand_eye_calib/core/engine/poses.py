@@ -21,7 +21,8 @@ INVERSIONS = frozenset({"parent_invert", "child_invert"})
 def solve(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
     """Solve synchronised poses, and cross-check the result if requested.
 
-    If ``cross_check`` is None, the result is cross-checked unless the user has set a reference.
+    If ``cross_check`` is None, the result is cross-checked unless the user has chosen the
+    reference of the motions, such as B1.
     """
     config = snapshot.config
     pairs = snapshot.pose_pairs
@@ -84,6 +85,8 @@ def _obsolete_codes(snapshot: Snapshot, calibration: Calibration | None) -> set[
     if len(snapshot.kept):
         # Kept pairs are downsampled, so that they have gaps even if the streams had none.
         obsolete.add("gaps")
+    # Motion that turns about one axis only leaves a direction of translation unobservable. If the
+    # result determines all of them, the motion turns about two axes.
     if calibration:
         unobserved = {DofVerdict.UNOBSERVABLE, DofVerdict.PRIOR}
         if unobserved.isdisjoint(dof.verdict for dof in calibration.observability[:3]):

@@ -148,6 +148,10 @@ def _solved_and_checked(snapshot: Snapshot, checks: bool | None, report: Progres
 def _best(first: Attempt, settled: Collection[str], on_clock: Attempt | None) -> Attempt:
     """Return the best attempt: the first one, or one solved again with options from its check.
 
+    First a reading is chosen: both streams as poses, or both as inverse poses. Then options that a
+    certain check demands are set. If they repair a stream, the time offset and the scale are
+    estimated after the repair, not here.
+
     ``settled`` are options that must not be changed. ``on_clock`` is the attempt with an estimated
     time offset if there is one already.
     """

@@ -32,7 +32,10 @@ class Stencil(NamedTuple):
 
 
 def stencil(stamps_s: FloatArray, step: int) -> Stencil:
-    """Return the rows around samples with stamps (N,); a step is ``step`` samples."""
+    """Return the rows one and two steps before and after each sample with stamps (N,).
+
+    A step has ``step`` samples. Rows beyond an end of the recording are replaced by this end.
+    """
     rows = np.arange(len(stamps_s))
     last = len(stamps_s) - 1
     before_2, before, after, after_2 = (np.clip(rows + k * step, 0, last) for k in (-2, -1, 1, 2))

@@ -48,9 +48,9 @@ _STEPS_IN_EXTENT = 50
 
 # A convention is wrong if its scatter of the direction of motion exceeds this value, see
 # :func:`scatter_of_direction` ...
-STEADY = 0.05
+STEADY_SCATTER = 0.05
 # ... and if it exceeds this multiple of the scatter in another convention.
-CLEARLY = 4.0
+WRONG_SCATTER_RATIO = 4.0
 
 # Correlation of neighbouring second differences of white noise: -4 s^2 / (6 s^2).
 _CORRELATION = -2.0 / 3.0

@@ -292,7 +292,8 @@ def _process_in_words(process: CorrelatedError) -> str:
     if process.part == "direction":
         return f"the direction of travel drifts by {angle(process.sigma)} within {duration}"
     size = length(process.sigma) if process.part == "translation" else angle(process.sigma)
-    return f"errors of {size} per axis last for {duration}, fixed to {_FIXED_TO[process.kind]}"
+    frame = _FIXED_TO[process.kind]
+    return f"errors of {size} per axis, correlated over {duration}, keep their direction in {frame}"
 
 
 def solve(

@@ -134,7 +134,7 @@ def _search_along(
 def _newton_step(
     levels: FloatArray, gradient: FloatArray, curvature: FloatArray, prior: Prior
 ) -> FloatArray:
-    """Return the Newton step of the levels (m,), with damping so that no level exceeds _MAX_STEP.
+    """Return the Newton step of the levels (m,), damped: no level moves by more than _MAX_STEP.
 
     A level does not move if it is at a bound and its descent direction crosses this bound.
     """

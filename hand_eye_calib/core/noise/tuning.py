@@ -148,14 +148,14 @@ class Tuning:
     accelerating_s: float = 0.2
     # An acceleration is not used if gaps between poses make its time span longer than the usual
     # span by this factor.
-    near: float = 2.5
+    longest_span_factor: float = 2.5
     # At a jump, the variance of the walk is this multiple of the variance that explains the step.
     jump_factor: float = 10.0
     # Number of neighbouring positions over which the quality of a position is measured.
     neighbours: int = 11
     # Positions are not used if their squared errors exceed those of the best quarter of the
     # recording by this factor: their weight would be small, and their errors are time-correlated.
-    worse: float = 16.0
+    worst_error_factor: float = 16.0
     # Number of poses in a window. For the starting values, each window is aligned on its own.
     window: int = 200
 

@@ -558,7 +558,7 @@ _OWN_RULES = (
     Rule(
         "unconfirmed",
         _CARE,
-        "the noise model determines an axis that no other method or reference determines",
+        "only the noise model determines an axis; no other method does",
         _unconfirmed,
     ),
     Rule(

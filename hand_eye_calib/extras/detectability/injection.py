@@ -17,9 +17,10 @@ noise model of the result is not used. So the smallest error that is found in ni
 also tests this sigma. A constant error of an odometry is the same in both halves; the allowance
 stands for it.
 
-*Shifts of the mount.* The child's poses after a time in the middle are moved by ``exp(a u)``. The
-judge is the likelihood ratio of the stream checks (:mod:`hand_eye_calib.core.assessment.moved`).
-Both injections are linear in the evidence, so nothing is solved again.
+*Shifts of the mount.* The child's poses after a time in the middle are moved by ``exp(a u)``: a
+shift of size a along the unit vector u. The judge is the likelihood ratio of the stream checks
+(:mod:`hand_eye_calib.core.assessment.moved`). Both injections are linear in the evidence, so
+nothing is solved again.
 """
 
 import numpy as np
@@ -48,10 +49,11 @@ _LEAST_SECONDS = 2 * _JACKKNIFE_BLOCKS[0]
 # Times of a shift of the mount, as shares of the recording.
 _MIDDLE = (0.35, 0.65)
 
-# Factor of the smallest shifts. The stream check estimates its noise anew, so a shift has less
-# weight than in the linear evidence. Of shifts of the stated size, this share is found in fresh
-# draws of 30 simulated drives: 68 % with a factor of 1.5, 91 % with 2, 93 % with 2.5.
-_LOSS_OF_WEIGHT = 2.0
+# The smallest shifts are multiplied by this factor, because a shift has less weight in the stream
+# check than in the linear evidence: the check estimates its noise anew, with the shift. Share of
+# shifts of the stated size that the check found in fresh draws of 30 simulated drives: 68 % with a
+# factor of 1.5, 91 % with 2, 93 % with 2.5.
+_WEIGHT_FACTOR = 2.0
 
 # Size (m or rad) that stands for an unlimited one, because quantiles need finite numbers.
 _UNLIMITED = 1e12
@@ -205,9 +207,10 @@ def _differences_of_halves(blocks: Blocks, columns: list[int]) -> FloatArray:
 def _smallest_shifts(blocks: Blocks, R: FloatArray) -> FloatArray:
     """Return the smallest shifts (6,) of the mount that nine of ten trials find.
 
-    A trial is a shift at one of ten times in the middle of the recording, of either sign. With the
-    evidence ``[H S]``, a shift a u has the score ``S + a H u``. The likelihood ratio is a quadratic
-    function of a. The size is its root, where the ratio becomes significant.
+    A trial is a shift at one of ten times in the middle of the recording, of either sign. Evidence
+    ``[H S]`` without a shift has the score ``S + a H u`` after a shift of size a along the unit
+    vector u. The log likelihood ratio is a quadratic function of a. The smallest size is the root a
+    at which the ratio reaches ``moved.SIGNIFICANT``.
 
     Parameters
     ----------
@@ -234,11 +237,13 @@ def _smallest_shifts(blocks: Blocks, R: FloatArray) -> FloatArray:
     mixed = (S[:, :, None] * weighted).sum(axis=1)
     # squares a^2 +- 2 mixed a = threshold
     roots = np.sqrt(np.maximum(mixed**2 + squares * threshold[:, None], 0.0))
-    distances = np.concatenate([roots - mixed, roots + mixed])
-    curvatures = np.concatenate([squares, squares])
+    numerators = np.concatenate([roots - mixed, roots + mixed])
+    denominators = np.concatenate([squares, squares])
     # Without motion, no shift along an axis changes the score: its size is unlimited.
-    sizes = np.full_like(distances, _UNLIMITED)
-    np.divide(distances, curvatures, out=sizes, where=curvatures > 0.0)
+    sizes = np.full_like(numerators, _UNLIMITED)
+    np.divide(numerators, denominators, out=sizes, where=denominators > 0.0)
     sizes = np.clip(sizes, 0.0, _UNLIMITED)
     found = np.quantile(sizes, FOUND_SHARE, axis=0)
-    return np.where(found < _UNLIMITED / len(sizes), _LOSS_OF_WEIGHT * found, np.inf)
+    # The quantile is interpolated between two sizes. Above this limit, one of them is unlimited.
+    is_limited = found < _UNLIMITED / len(sizes)
+    return np.where(is_limited, _WEIGHT_FACTOR * found, np.inf)

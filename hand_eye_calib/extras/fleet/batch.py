@@ -148,7 +148,10 @@ def _earlier_outcomes(tasks: Sequence[Task], directory: Path) -> dict[str, Outco
 
 
 def stored(task: Task, directory: Path) -> Outcome | None:
-    """Return the outcome of an earlier run; None if it is absent, failed or of other data."""
+    """Return the outcome of an earlier run; None if it is absent, failed or of other data.
+
+    A failed run has stored an empty key, see :func:`_store`. An empty key is never that of a task.
+    """
     try:
         about, text = (directory / task.name / work.STATE).read_text(encoding="utf-8").splitlines()
         state = json.loads(about)

@@ -1,4 +1,8 @@
-"""Measurements by the ground and gravity in a result, and the verdict if the motion disagrees."""
+"""Part of a result about the axes that the ground and gravity measure.
+
+The part compares these axes with the same axes from the motion. It also has the reasons for the
+verdict if both disagree.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

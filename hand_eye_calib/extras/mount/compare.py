@@ -36,7 +36,9 @@ def compare_digests(arguments: argparse.Namespace) -> int | None:
     if len(histories) < len(groups):
         if arguments.fleet:
             without = paths[digests.index(None)]
-            raise ConfigError(f"--fleet needs digests of the monitor; {without} has none")
+            raise ConfigError(
+                f"--fleet needs digests, which the monitor writes to digests/; {without} has none"
+            )
         return None
     if arguments.installed:
         raise ConfigError("digests contain their installed transform: omit --with")

@@ -261,7 +261,8 @@ class MountMonitor:
         seconds = poses.stamps_ns // _SECOND_NS
         # A motion lasts from pose i to the first pose j that is at least one second later.
         j = np.searchsorted(stamps_ns, stamps_ns + _SECOND_NS)
-        # A second is complete if a motion that starts in the next second has its end.
+        # The second in which the last finished motion starts is incomplete: further motions may
+        # start in it. All motions that start in earlier seconds are finished.
         has_end = j < len(stamps_ns)
         incomplete_s = int(seconds[has_end][-1]) if has_end.any() else -1
         self._tail = poses[seconds >= incomplete_s]

@@ -58,12 +58,13 @@ _SMOOTHING_S2 = 0.008
 _DRIFT = 0.02
 # Smallest delay (s) of a coordinate against the others that is reported.
 _LAG_S = 0.02
-# Smallest share of the squared residuals that the faults must explain, if the positions are on
-# another path than the poses. Otherwise no fault is reported as the reason.
-_NAMES_UNRELATED = 0.6
+# If the positions are on another path than the poses, a fault is reported as the reason only if the
+# faults explain at least this share of the squared residuals.
+_MIN_EXPLAINED_SHARE = 0.6
 
-# Largest unexplained share of a path that a lever arm explains after the sign of z is changed.
-_MIRRORED_PATH = 0.1
+# A path is mirrored if, after the sign of z is changed, a lever arm leaves less than this share of
+# the path unexplained.
+_MAX_UNEXPLAINED_IF_MIRRORED = 0.1
 
 
 def check_solved(
@@ -147,7 +148,7 @@ def _is_mirrored(stamps_ns: IntArray, poses: FloatArray, positions: FloatArray) 
     except np.linalg.LinAlgError:
         return False
     share = unexplained_share(poses, mirrored, solution.lever_arm, solution.scale)
-    return share < _MIRRORED_PATH
+    return share < _MAX_UNEXPLAINED_IF_MIRRORED
 
 
 def _is_copied(fitted: PositionFit, positions: FloatArray) -> bool:
@@ -204,7 +205,7 @@ def check_positions(fitted: PositionFit, stream: str, is_unrelated: bool) -> lis
     list of Finding
         At most one finding.
     """
-    if is_unrelated and fitted.explained_share < _NAMES_UNRELATED:
+    if is_unrelated and fitted.explained_share < _MIN_EXPLAINED_SHARE:
         return []
     suspects = [
         _smoothing(fitted, stream),

@@ -311,6 +311,7 @@ class _State:
             self,
             streams=self.streams[kept],
             outliers=Outliers(jumps, self.outliers.spikes[kept]),
+            # A kept increment may span several jumps: it gets the factor of the worst jump.
             walk_factors=np.where(jumps, self.walk_factors.max(), 1.0),
             imprecise=self.imprecise[kept],
         )
@@ -390,7 +391,7 @@ def _imprecise(squares: FloatArray, tuning: Tuning, drift_m2: float) -> BoolArra
     counts = np.convolve(np.ones(len(squares)), window, mode="same")
     means = sums / counts
     usual = max(float(np.quantile(means, 0.25)), drift_m2)
-    return np.asarray(sums > tuning.worse * usual * counts)
+    return np.asarray(sums > tuning.worst_error_factor * usual * counts)
 
 
 def _level_prior(model: NoiseModel, levels: FloatArray) -> reml.Prior:
@@ -472,7 +473,7 @@ def _accelerations(streams: increments.Streams, X: FloatArray, tuning: Tuning) -
     in_world = (velocities[3 * k :] - velocities[: -3 * k]) / (0.75 * spans_s)
     middle = slice(2 * k, -2 * k)
     to_body = np.swapaxes(streams.Ts_pw_p[middle, :3, :3], 1, 2)
-    is_near = spans_s < tuning.near * 4 * k * interval_s
+    is_near = spans_s < tuning.longest_span_factor * 4 * k * interval_s
     accelerations[middle, :3] = np.where(is_near, se3.times(to_body, in_world), 0.0)
     return accelerations
 
@@ -482,25 +483,29 @@ def _start(
 ) -> tuple[FloatArray, float, FloatArray]:
     """Fit windows of the recording, each aligned on its own, with robust weights.
 
+    The model in a window is ``scale A^T p = R lever_arm + t`` with the position p, the alignment A
+    of the window, and the pose (R, t). Positions are rows in the code: ``p^T A``.
+
     Returns
     -------
     lever_arm : (3,) array
     scale : float
         1 unless asked for.
-    rotations : (N, 3, 3) array
+    orientations : (N, 3, 3) array
         Of the other sensor in the world of the positions, window by window.
     """
     lever_arm = np.zeros(3)
     scale = 1.0
     size = min(window, len(positions))
-    axes = _windows(se3.rotation_of(Ts_pw_p), size)
+    rotations = _windows(se3.rotation_of(Ts_pw_p), size)
     path = _windows(se3.translation_of(Ts_pw_p), size)
     measured = _windows(positions, size)
-    information = np.einsum("nkij,nkil->njl", axes, axes) + _PULL_TO_ZERO * size * np.eye(3)
+    of_windows = np.einsum("nkij,nkil->njl", rotations, rotations)
+    information = of_windows + _PULL_TO_ZERO * size * np.eye(3)
     for _ in range(_START_STEPS):
-        predicted = axes @ lever_arm + path
-        turns = _rotations(measured, predicted)
-        rotated = measured @ turns
+        predicted = rotations @ lever_arm + path
+        alignments = _rotations(measured, predicted)
+        rotated = measured @ alignments
         if with_scale:
             products = (rotated * predicted).sum(axis=(1, 2))
             squares = (rotated**2).sum(axis=(1, 2))
@@ -508,15 +513,15 @@ def _start(
             # Paths that do not move have no scale.
             scale = float(np.median(scales)) or 1.0
         residuals = scale * rotated - path
-        errors = np.sqrt(((residuals - axes @ lever_arm) ** 2).sum(axis=2).mean(axis=1))
+        errors = np.sqrt(((residuals - rotations @ lever_arm) ** 2).sum(axis=2).mean(axis=1))
         weights = robust_weights("cauchy", (errors / (np.median(errors) + 1e-12)) ** 2)
-        score = np.einsum("n,nkij,nki->j", weights, axes, residuals)
+        score = np.einsum("n,nkij,nki->j", weights, rotations, residuals)
         previous = lever_arm
         lever_arm = np.linalg.solve(np.einsum("n,njl->jl", weights, information), score)
         if np.abs(lever_arm - previous).max() < _START_SETTLED_M:
             break
-    window_of_pose = np.minimum(np.arange(len(positions)) // size, len(turns) - 1)
-    return lever_arm, scale, turns[window_of_pose] @ se3.rotation_of(Ts_pw_p)
+    window_of_pose = np.minimum(np.arange(len(positions)) // size, len(alignments) - 1)
+    return lever_arm, scale, alignments[window_of_pose] @ se3.rotation_of(Ts_pw_p)
 
 
 def unexplained_share(

@@ -60,9 +60,9 @@ _UNMIRRORED = 0.06
 # Duration (s) of these rotation vectors: those of a second are too long to be mirrored by a matrix.
 _MIRRORED_S = 0.5
 
-# Largest share of the rotation that stays unexplained after orientations are inverted, if they are
-# reported as inverted.
-_EXPLAINED = 0.1
+# Orientations are inverted only if the inversion leaves at most this share of the rotation
+# unexplained.
+_MAX_UNEXPLAINED = 0.1
 # Smallest ratio of the unexplained shares without and with the inversion.
 _DECISIVE = 3.0
 
@@ -72,16 +72,16 @@ _UNIT_WITHIN = 0.2
 # Quantile of the rates that are compared: a sensor may rest for long.
 _TURNING = 0.75
 
-# Standard deviations from which on smoothing is clear. They are those of a jackknife of at most 16
-# blocks, whose distribution has heavy tails.
+# Smoothing is clear from this number of standard deviations. A jackknife of at most 16 blocks
+# estimates the standard deviation, so the ratio has heavy tails.
 _CLEAR_SIGMAS = 4.0
 # Smallest smoothing (s^2): that of a filter of 63 ms. EuRoC, KITTI and machines simulated with
 # seeds 77 and 78 have up to 0.0012 without a filter.
 _SMOOTHING_S2 = 0.004
 
-# Rates are coarse if their number of levels is below this share of their number.
+# Rates are coarse if the number of different values is below this share of the number of rates.
 _FEW_LEVELS = 0.1
-# Fewest levels of rates that turn.
+# Fewest different values of the rates of a sensor that turns.
 _LEAST_LEVELS = 5
 # Rounding of integrated rates (rad/s).
 _ROUNDING_RAD_S = 1e-9
@@ -298,7 +298,7 @@ def _check_conventions(streams: _Streams) -> list[Finding]:
     if streams.name == "parent":
         inverted = replace(pairs, Ts_cw_c=se3.put_right(pairs.Ts_cw_c, invert="orientations"))
     share = _unexplained(inverted)
-    if share > min(_EXPLAINED, _unexplained(pairs) / _DECISIVE):
+    if share > min(_MAX_UNEXPLAINED, _unexplained(pairs) / _DECISIVE):
         return []
     if not streams.has_rates:
         return [finding("inverse_rotations", "both", name="one stream")]

@@ -3,19 +3,27 @@
 The reference has the orientations G_i, rotated by the extrinsic to the axes of the measured sensor.
 The measured sensor has the orientations Q_i. In a window, their errors in the world are
 
-    e_i = Log(W' Q_i G_i') = G_i phi + int G S w dt - G_i w_i d + c (...) + nuisances + noise
+    e_i = Log(W^T Q_i G_i^T) = G_i phi + int G S w dt - G_i w_i d + c b_i + nuisances + noise
 
-with the rotation W between the worlds, the error phi of the extrinsic rotation (right perturbation,
-axes of the measured sensor), and the angular rates w about the measured sensor's axes. The
-symmetric matrix S has the gains of the axes on its diagonal, and their misalignment off the
-diagonal (D. Tedaldi, A. Pretto, E. Menegatti, *A robust and easy to implement method for IMU
-calibration without external equipments*, 2014). Any low-pass filter has a delay d and a smoothing c
-at low frequencies: of rates ``c (G w' - int G (w x w') dt)`` with the angular acceleration w', of
-orientations ``c G w'``.
+with
 
-The nuisances of a window are the error of W, and a constant bias of rates (of orientations: a drift
-of the world): neither bias nor drift looks like a fault. Rates of one stream are the instruments of
-those of the other.
+- the rotation W between the worlds,
+- the error phi of the extrinsic rotation (right perturbation, axes of the measured sensor),
+- the angular rates w about the axes of the measured sensor,
+- the symmetric matrix S: relative errors of the gains of the axes on the diagonal, misalignment of
+  the axes off the diagonal (D. Tedaldi, A. Pretto, E. Menegatti, *A robust and easy to implement
+  method for IMU calibration without external equipments*, 2014),
+- the delay d (s) and the smoothing c (s^2), which any low-pass filter has at low frequencies.
+
+The smoothing multiplies, with the angular acceleration a = dw/dt,
+
+    b_i = G_i a_i                            if the sensor measures orientations,
+    b_i = G_i a_i - int G (w x a) dt         if the sensor measures rates.
+
+The nuisances of a window are the error of W and a constant bias of rates. If the sensor measures
+orientations, a constant drift of the world replaces the bias. So neither bias nor drift looks like
+a fault. The rates of each stream are instrumental variables for the rates of the other stream,
+because their noise is independent.
 """
 
 from dataclasses import dataclass

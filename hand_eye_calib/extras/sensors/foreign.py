@@ -266,7 +266,7 @@ def _of_g2o(data: bytes, _: str | None) -> _Rows:
     """Read the vertices of a pose graph, in two or three dimensions."""
     vertices = [line.split()[1:9] for line in _lines(data) if line.startswith("VERTEX_SE")]
     if not vertices:
-        raise ValueError("a g2o graph without vertices; save it with them, optimised")
+        raise ValueError("a g2o graph without vertices; save the optimised graph with its vertices")
     vertices.sort(key=lambda row: int(row[0]))
     names = _POSE if len(vertices[0]) > len(_POSE) else ("x", "y", "yaw [rad]")
     return _Rows(("t [s]", *names), vertices, [_NUMBERED.format("vertices")])

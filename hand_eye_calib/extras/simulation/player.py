@@ -26,9 +26,9 @@ from hand_eye_calib.online.ros.conversions import LATCHED, to_time
 
 # Quality of service with which no message is lost.
 _LOSSLESS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
-# Largest time to wait for one callback (s).
+# Longest time to wait for one callback (s).
 _SPIN_S = 0.02
-# Largest time to wait for the node (s).
+# Longest time to wait until the node has done what the player needs for its next step (s).
 _PATIENCE_S = 120.0
 
 

@@ -281,7 +281,7 @@ def _setup_in_words(setup_fit: SetupFit) -> str:
     """Return the assumed place of the camera as text, with the options for inverse poses."""
     place = SETUPS["beside" if setup_fit.is_inverse else "hand"]
     return (
-        f"read as a camera {place}; if that is wrong, one side or both hold inverse poses: give "
+        f"read as a camera {place}; if that is wrong, one side or both have inverse poses: give "
         "parent_invert poses (robot), child_invert poses (target), or both; or exchange both sides"
     )
 

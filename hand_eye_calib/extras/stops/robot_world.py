@@ -256,12 +256,12 @@ def _linearise(
     frame of the child's world if ``in_world``, else in the frame of the child.
     """
     predicted = se3.inverse(Z) @ stops.Ts_world_parent @ X
-    measured = se3.inverse(stops.Ts_world_child)
+    measured_inverse = se3.inverse(stops.Ts_world_child)
     if in_world:
-        errors = se3.log(predicted @ measured)
+        errors = se3.log(predicted @ measured_inverse)
         frames = stops.Ts_world_child
     else:
-        errors = se3.log(measured @ predicted)
+        errors = se3.log(measured_inverse @ predicted)
         frames = np.broadcast_to(np.eye(4), predicted.shape)
     by_X = se3.adjoint(frames)
     by_Z = -se3.adjoint(frames @ se3.inverse(predicted))

@@ -194,13 +194,17 @@ def _in_metres(poses: StopPoses, config: CalibratorConfig, child_unit: float) ->
 def _with_user_options(
     examination: Examination, config: CalibratorConfig
 ) -> tuple[list[Finding], list[Finding]]:
-    """Return findings and repairs; a repair becomes a finding if the user set its option."""
+    """Return findings and repairs, by the options that the user set.
+
+    A repair becomes a finding if the user set one of its options, or one of the options of another
+    repair with the same code. An ambiguous finding is omitted if the user set all of its options.
+    """
     findings = []
     for issue in examination.findings:
+        is_decided = {*issue.options} <= config.given
         if issue.code != "ambiguous":
             findings.append(_with_user_values(issue, config))
-        elif not {*issue.options} <= config.given:
-            # The user has decided if all options of the finding are set.
+        elif not is_decided:
             findings.append(issue)
     settled_codes = {issue.code for issue in examination.repairs if {*issue.options} & config.given}
     repairs = []
@@ -215,14 +219,17 @@ def _with_user_options(
 def _with_user_values(issue: Finding, config: CalibratorConfig) -> Finding:
     """Return a finding whose options take account of the values that the user set.
 
-    The checks see poses after these options. Option values are combined: factors are multiplied,
-    and a convention that is undone twice returns to its default.
+    The checks examine poses after the user's options are applied. So the option of a finding and
+    the user's option are combined: factors are multiplied, and two inverse conventions give the
+    default.
     """
     options: dict[str, float | str] = {}
     for name, value in issue.options.items():
         current = getattr(config, name)
         if current == value or {current, value} == {"wxyz", "yzwx"}:
-            # The user's option undoes a convention that was right before.
+            # The data were right, and the user's option made them wrong: the finding proposes the
+            # inverse of that option. wxyz and yzwx are inverse to each other; every other
+            # convention is its own inverse.
             options[name] = getattr(CalibratorConfig, name)
         elif isinstance(value, float) and isinstance(current, float):
             options[name] = value * current

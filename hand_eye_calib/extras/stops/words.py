@@ -38,7 +38,7 @@ WORDS = {
     "inverse_stops": FindingWords(
         "one of the two files has inverse poses (of the world in the sensor, such as a target in "
         "the camera)",
-        "give parent_invert poses if it is the parent's; if it is the child's",
+        "invert this file: parent_invert poses for the parent, child_invert poses for the child",
         code="inverse",
     ),
     "ambiguous_stops": FindingWords(
@@ -53,7 +53,7 @@ WORDS = {
     ),
     "setup": FindingWords(
         "the stops fit a camera {other}, not one {place}",
-        "leave setup out; or, if one side or both hold inverse poses, give parent_invert poses "
+        "leave setup out; or, if one side or both have inverse poses, give parent_invert poses "
         "(robot), child_invert poses (target), or both",
     ),
     "copied_stops": FindingWords(
@@ -82,9 +82,9 @@ WORDS = {
         code="scale",
     ),
     "reading": FindingWords(
-        "{what}: probably the poses of one or both sides are inverse, or both are exchanged",
-        "give parent_invert poses if the robot's are, child_invert poses if the target's are, both "
-        "if both are, and parent_invert none with child_invert none if all is right",
+        "{what}: probably one side or both have inverse poses, or parent and child are exchanged",
+        "if the robot's poses are inverse, give parent_invert poses; if the target's are, give "
+        "child_invert poses; if none are, give parent_invert none and child_invert none",
         code="inverse",
     ),
     "turning_about_one_axis": FindingWords(

@@ -76,5 +76,5 @@ def calibrate_alone(arguments: Namespace) -> int:
         [*arguments.paths],
         tuple(files.warnings),
     )
-    calibration = recording.solved(bool(arguments.out))
+    calibration = recording.solved(with_fingerprints=bool(arguments.out))
     return deliver(calibration, recording.inputs, arguments, recording.snapshot)

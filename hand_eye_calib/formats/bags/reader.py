@@ -215,16 +215,15 @@ class PoseBag:
         """Choose the sources of the parent's and the child's poses.
 
         Sources that the user does not name must be obvious, see :mod:`.choice`. If no source is
-        named, the parent is the topic whose name contains parent, base or lidar. Without such a
-        name, the parent is the first topic by name.
+        named, the frames in ``frames`` decide which topic is the parent's. Otherwise the parent is
+        the topic whose name contains parent, base or lidar, or the first topic by name.
 
         Parameters
         ----------
         parent, child : Source, optional
             Sources as the user names them.
         frames : mapping of str to str, optional
-            Frames of the sensors that the user sets for "parent" or "child". The parent's topic is
-            chosen by these frames.
+            Frames of the sensors that the user sets for "parent" or "child".
 
         Raises
         ------

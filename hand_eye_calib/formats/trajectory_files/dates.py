@@ -50,8 +50,9 @@ def seconds_of(text: str) -> Decimal:
     """Return the seconds since 1970 of a date with or without a time of day.
 
     For a time of day alone, the seconds since midnight are returned. A time without a zone is UTC.
-    The digits after the seconds are decimals. After a separator such as that between minutes and
-    seconds (12:30:05:25), the digits are a number of milliseconds, microseconds or nanoseconds.
+    The digits after the seconds are decimals (12:30:05.25 has 250 ms). If the separator before the
+    digits is the same as that between minutes and seconds (12:30:05:25), the digits are a whole
+    number: up to 3 digits are milliseconds, up to 6 microseconds, up to 9 nanoseconds (25 ms).
 
     Raises
     ------

@@ -15,11 +15,11 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import (
-    CLEARLY,
     FARTHEST_M,
     QUATERNION_NORM_TOLERANCE,
     ROTATION_TOLERANCE,
-    STEADY,
+    STEADY_SCATTER,
+    WRONG_SCATTER_RATIO,
     far_position,
     scatter_of_direction,
 )
@@ -193,7 +193,7 @@ def _in_axes_of_earth(table: Table, positions: FloatArray, quats_xyzw: FloatArra
     if len(fitting) > 1:
         up = axes[:, :, 2]
         scatters = {name: _scatter_in_sensor(candidates[name], up) for name in fitting}
-        largest = max(CLEARLY * min(scatters.values()), _LEVEL)
+        largest = max(WRONG_SCATTER_RATIO * min(scatters.values()), _LEVEL)
         fitting = [name for name in fitting if scatters[name] <= largest]
     reason = ", because the motion fits that" if len(fitting) < len(candidates) else ""
     table.guess(
@@ -402,10 +402,10 @@ def _of_angles(table: Table, positions: FloatArray, convention: str) -> FloatArr
 
 
 def _conventions_that_fit(positions: FloatArray, candidates: Mapping[str, FloatArray]) -> list[str]:
-    """Return the conventions in which the direction of travel is steady in the sensor's axes.
+    """Return the conventions that the direction of travel in the sensor's axes does not exclude.
 
-    If the direction is steady in none of them, return those whose scatter is near the smallest
-    scatter.
+    A convention is excluded if its scatter of the direction exceeds STEADY_SCATTER, and also
+    exceeds the smallest scatter of all conventions by the factor WRONG_SCATTER_RATIO.
 
     Parameters
     ----------
@@ -418,5 +418,5 @@ def _conventions_that_fit(positions: FloatArray, candidates: Mapping[str, FloatA
         convention: scatter_of_direction(se3.from_quat_xyzw(positions, quats_xyzw))
         for convention, quats_xyzw in candidates.items()
     }
-    largest = max(STEADY, CLEARLY * min(scatters.values()))
+    largest = max(STEADY_SCATTER, WRONG_SCATTER_RATIO * min(scatters.values()))
     return [convention for convention, scatter in scatters.items() if scatter <= largest]

@@ -338,10 +338,10 @@ def _corrected_conventions(tables: Sequence[Table]) -> dict[int, str]:
 
 
 def _sensor_names(paths: Sequence[Path]) -> list[str]:
-    """Return a name for the sensor of each file; empty names if two paths are the same.
+    """Return a name for the sensor of each file.
 
-    The name is that of the file. If files have the same name, folders are added to distinguish
-    them.
+    The name is that of the file without suffix. If files have the same name, folders are added to
+    distinguish them. All names are empty if two paths are the same, or differ only in the suffix.
     """
     names = [path.stem for path in paths]
     if len({*names}) < len(names):
@@ -514,7 +514,10 @@ def _in_utf8(data: bytes) -> bytes:
 
 
 def _with_options(layout: Layout, options: FileOptions) -> Layout:
-    """Return the layout with the format and columns of the options."""
+    """Return the layout with the format and columns of the options.
+
+    Matrices in the stated columns are not transposable: their transposition is not guessed.
+    """
     format = options.format
     columns = layout.names
     if options.columns:

@@ -384,9 +384,15 @@ class PoseInput:
             self.refuse(with_stamp(stamp_ns), "unusable", str(error))
 
     def _check_frames(self, pose: PoseFields) -> None:
-        """Pass changed names of frames on to the engines, which refuse another sensor.
+        """Pass changed names of frames on to the engines.
 
-        As long as the name is empty, a parameter or a default names the frame.
+        A message type without a sensor frame has None. Its frame then has the name from a parameter
+        or the default.
+
+        Raises
+        ------
+        HandEyeCalibError
+            If the engines refuse a name, such as that of another sensor.
         """
         sensor = pose.sensor_frame
         has_new_sensor = sensor is not None and sensor != self._sensor_frame

@@ -85,7 +85,7 @@ class LiveSession:
         self._n_solved = 0
 
     def set_measures(self, stream: str, measures: str) -> None:
-        """Set what a stream measures, by its message type.
+        """Set what a stream measures. Its message type has determined that.
 
         Parameters
         ----------
@@ -193,9 +193,9 @@ class LiveSession:
         return JournalState(level=level, text=text, directory=directory)
 
     def _resume(self, directory: Path) -> Journal | None:
-        """Fill the engines from the session in a directory, and return the session.
+        """Fill the engines from the session in a directory, and return its journal.
 
-        None if there is no session, or if the journal cannot be read.
+        Returns None if there is no session, or if the journal cannot be read.
         """
         if not has_session(directory):
             self._log.info(f"no session to resume in {directory}: a new session begins")

@@ -19,7 +19,8 @@ from hand_eye_calib.online.live.progress import AXIS_KEYS, Progress
 # Period (s) at which the node publishes its state.
 REPORT_PERIOD_S = 1.0
 
-# Longest time (s) that the end of the node waits for a disk, a running solve or a slow subscriber.
+# When the node stops, it waits at most this time (s) for a disk, a running solve or a slow
+# subscriber.
 GRACE_S = 0.4
 
 # Time (s) within which a request for a solve is answered, even on a busy computer.
@@ -29,7 +30,7 @@ AxisValues: TypeAlias = Mapping[str, float | None]
 
 
 def as_printed(values: FloatArray) -> AxisValues:
-    """Return values (6,) of a printed pose by name; None for a value that is not finite."""
+    """Return x, y, z, roll, pitch, yaw (6,) by name; None for a value that is not finite."""
     return dict(zip(AXES, plain(values), strict=True))
 
 

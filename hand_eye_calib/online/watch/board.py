@@ -201,8 +201,8 @@ def _buttons(state: NodeState, word: str) -> Texts:
 def _axes_by_hand(state: NodeState, word: str) -> Texts:
     """Return axes whose prior a person may set, correct or remove, the most important first.
 
-    These are the axes whose prior contradicts the motion, the axis that the present motion cannot
-    determine, and all other axes with a prior.
+    ``word`` is the status on the board. These are the axes whose prior contradicts the motion, the
+    axis that the present motion cannot determine, and all other axes with a prior.
     """
     extrinsic = state.extrinsic
     if extrinsic is None or state.progress is None:
