@@ -3,10 +3,12 @@
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.core.base.registry import BESIDE_MOTION
-from hand_eye_calib.core.engine.snapshot import Snapshot
+
+if TYPE_CHECKING:
+    from hand_eye_calib.core.engine.snapshot import Snapshot
 
 
 def switched_off(values: Mapping[str, Any]) -> list[str]:
@@ -15,8 +17,8 @@ def switched_off(values: Mapping[str, Any]) -> list[str]:
 
 
 def with_measurements(
-    snapshot: Snapshot, paths: Sequence[Path], without: Collection[str] = ()
-) -> tuple[Snapshot, list[str]]:
+    snapshot: "Snapshot", paths: Sequence[Path], without: Collection[str] = ()
+) -> "tuple[Snapshot, list[str]]":
     """Add the measurements beside motion that a bag has.
 
     Parameters

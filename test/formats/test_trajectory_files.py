@@ -116,11 +116,12 @@ def test_files_that_cannot_be_read_or_written(tmp_path):
     (tmp_path / "image.png").write_bytes(b"\x89PNG\xff\xfe\x00")
     for name, message in (
         ("absent.txt", r"absent\.txt: No such file"),
-        (".", "directory"),
         ("image.png", r"image\.png: not a text file"),
     ):
         with pytest.raises(InputError, match=message):
             hec.read_trajectory(tmp_path / name)
+    with pytest.raises(ConfigError, match="is a folder: name the topic of the bag"):
+        hec.read_trajectory(tmp_path)
     with pytest.raises(InputError, match="cannot write .*absent"):
         write_trajectory(tmp_path / "absent" / "t.txt", TRAJECTORY)
 

@@ -394,7 +394,10 @@ def parsed(options):
         (["check", "a.mcap", "b.mcap"], "expected one bag or two trajectory files"),
         (["replay", "bag", "--methd", "dnl"], "unknown '--methd'; did you mean --method?"),
         (["replay", "bag", "--threshold", "-1"], "--threshold: must be at least 1e-12 m^2; got -1"),
-        (["replay", "bag", "--threshold", "big"], "--threshold: must be a number in m; got 'big'"),
+        (
+            ["replay", "bag", "--threshold", "big"],
+            "--threshold: must be a number in m^2; got 'big'",
+        ),
         (["replay", "bag", "--reference", "D4"], "--reference: must be auto, A, B<n> such as B5"),
         (["replay", "bag", "--method", "dnlp"], "got 'dnlp'; did you mean dnl"),
         (["info", "a", "b"], "unknown 'b'"),
