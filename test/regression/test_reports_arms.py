@@ -66,7 +66,7 @@ RIGHT = [
         "",
     ),
     ("H.npy C.npy --order none --child-invert poses", IN_HAND, "parent", ""),
-    ("ur.csv camT.csv --order none", IN_HAND, "parent", "both have inverse poses"),
+    ("ur.csv camT.csv --order none", IN_HAND, "parent", "both hold inverse poses"),
     ("inv_both.npz --parent-invert poses --child-invert poses", IN_HAND, "hand", ""),
     ("inv_track.npz --child-invert poses", IN_HAND, "hand", ""),
 ]
