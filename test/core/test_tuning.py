@@ -168,10 +168,10 @@ CHANGES = {
     "of_positions": (tuple(2.0 * sigma for sigma in TUNING.of_positions), "antenna"),
     "any_scale": (2.0, "antenna of another scale"),
     "accelerating_s": (0.4, "antenna"),
-    "near": (5.0, "antenna"),
+    "longest_span_factor": (5.0, "antenna"),
     "jump_factor": (20.0, "antenna"),
     "neighbours": (5, "antenna"),
-    "worse": (32.0, "antenna"),
+    "worst_error_factor": (32.0, "antenna"),
     "window": (100, "antenna"),
 }
 

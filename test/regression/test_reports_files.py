@@ -73,7 +73,7 @@ def test_the_truth_is_found_with_clocks_of_other_epochs(run_files, parent, child
 def test_motions_in_place_of_poses_are_named(run_files):
     _, document, _ = run_files("p.tum", "relative.tum")
     assert document["verdict"] == "DO_NOT_USE"
-    assert "motions since the pose before" in document["reasons"][0]["sentence"]
+    assert "motions from pose to pose" in document["reasons"][0]["sentence"]
 
 
 @pytest.mark.parametrize(("parent", "child", "cause"), CAUSES)
