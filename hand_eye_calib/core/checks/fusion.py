@@ -140,8 +140,27 @@ def _best_fit(pose_pairs: PosePairs, T_parent_child: FloatArray) -> _Fit | None:
     differences = _Differences(pose_pairs, T_parent_child)
     if differences.n_blocks < _BLOCKS:
         return None
-    fits = [differences.fit(time_constant_s) for time_constant_s in _TIME_CONSTANTS_S]
-    return max(fits, key=lambda fit: fit.share)
+    regressions = (differences.regression(constant_s) for constant_s in _TIME_CONSTANTS_S)
+    best = max(regressions, key=lambda regression: regression.share)
+    return differences.fit(best)
+
+
+class _Regression(NamedTuple):
+    """Robust regression of the differences for a filter.
+
+    Attributes
+    ----------
+    time_constant_s : float
+        Time constant of the filter, s.
+    weighted : (K, 6, p + 1) array
+        Regressors and differences of K motions, times the robust weights of the motions.
+    share : float
+        Share of the squared residuals that D explains.
+    """
+
+    time_constant_s: float
+    weighted: FloatArray
+    share: float
 
 
 class _Regressors:
@@ -239,25 +258,37 @@ class _Differences:
         """Number of blocks of time that have motions."""
         return len(np.unique(self._block_of))
 
-    def fit(self, time_constant_s: float) -> _Fit:
-        """Estimate the mount change D for a filter of a time constant (s)."""
+    @property
+    def _n_usual(self) -> int:
+        """Number of regressors of errors that are no filter."""
+        return self._usual_errors.shape[2]
+
+    def regression(self, time_constant_s: float) -> _Regression:
+        """Regress the differences on the regressors for a filter of a time constant (s)."""
         rows = self._joined(self._usual_errors, self._of_parent.filtered(time_constant_s))
+        weighted = rows * self._robust_weights(rows)[:, None, None]
+        table = (np.swapaxes(rows, 1, 2) @ weighted).sum(axis=0)
+        cost = _cost(table, range(self._n_usual + 6))
+        share = 1.0 - cost / max(_cost(table, range(self._n_usual)), 1e-300)
+        return _Regression(time_constant_s, weighted, share)
+
+    def fit(self, regression: _Regression) -> _Fit:
+        """Estimate the mount change D and its standard deviations with the instruments."""
+        time_constant_s = regression.time_constant_s
         instruments = self._joined(
             self._usual_instruments, self._of_child.filtered(time_constant_s)
         )
-        n_base = self._usual_errors.shape[2]
+        n_base = self._n_usual
         columns = range(n_base + 6)
-        weights = self._robust_weights(rows)
-        weighted = rows * weights[:, None, None]
-        table = (np.swapaxes(rows, 1, 2) @ weighted).sum(axis=0)
-        share = 1.0 - _cost(table, columns) / max(_cost(table, range(n_base)), 1e-300)
-        products = np.swapaxes(instruments, 1, 2) @ weighted
+        products = np.swapaxes(instruments, 1, 2) @ regression.weighted
         blocks = Blocks.gathered(products, self._block_of, _BLOCKS)
         mount_change = blocks.solve(columns)[n_base:]
         covariance = blocks.jackknife(columns)[n_base:, n_base:]
         translation_sigmas = _in_sigmas(mount_change[:3], covariance[:3, :3])
         rotation_sigmas = _in_sigmas(mount_change[3:], covariance[3:, 3:])
-        return _Fit(time_constant_s, mount_change, translation_sigmas, rotation_sigmas, share)
+        return _Fit(
+            time_constant_s, mount_change, translation_sigmas, rotation_sigmas, regression.share
+        )
 
     def _joined(self, usual_errors: FloatArray, filtered: FloatArray) -> FloatArray:
         """Return rows (K, 6, p + 1) of regressors and differences, in units of the noise."""
