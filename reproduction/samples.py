@@ -1,7 +1,8 @@
-"""Make the sample bag and the sample arm of the package: ``python -m reproduction.samples``.
+"""Make the samples of the package: ``python -m reproduction.samples``.
 
 The bag has the poses of the sample files ``lidar.tum`` and ``camera.tum``. The arm is simulated;
-the first lines of its file have the true extrinsic.
+the first lines of its file have the true extrinsic. The robot with two driven wheels and a lidar is
+simulated, too; its truth is in ``docs/tutorials/base_link.md``.
 """
 
 import argparse
@@ -19,6 +20,7 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.formats.bags.writer import write_streams
 from hand_eye_calib.formats.files import local_path
 from hand_eye_calib.formats.trajectory_files.reading import read_trajectory
+from reproduction.machines import Machine, simulate_machine
 
 # The arm: stops, camera on the hand, target on the table (x, y, z in m; rotation vector in rad).
 N_STOPS = 24
@@ -32,6 +34,11 @@ SPREAD_RAD = 0.35
 # Noise of the poses of the target: position (m), rotation (rad).
 NOISE = np.repeat([0.0005, 0.001], 3)
 SEED = 1
+
+# The robot: seed, duration of its drive (s), and rows of its wheels that are averaged.
+ROBOT_SEED = 5254
+ROBOT_S = 120.0
+ROBOT_ROWS = 2
 
 
 def write_sample_bag(path: Path) -> None:
@@ -82,6 +89,25 @@ def write_sample_arm(path: Path) -> None:
     path.write_text("\n".join([*lines, ""]), encoding="utf-8")
 
 
+def sample_robot() -> Machine:
+    """Simulate the robot: figures of eight on a flat floor, with slip."""
+    return simulate_machine(ROBOT_SEED, duration_s=ROBOT_S)
+
+
+def write_sample_robot(folder: Path) -> None:
+    """Write the trajectory of the lidar, and the rates of the wheels at 25 Hz."""
+    robot = sample_robot()
+    rows = np.column_stack([robot.sensor.stamps_ns * 1e-9, se3.to_rows(robot.sensor.poses)])
+    lines = [" ".join(f"{value:.6f}" for value in row) for row in rows.tolist()]
+    (folder / "robot_lidar.tum").write_text("\n".join([*lines, ""]), encoding="utf-8")
+    blocks = robot.values.reshape(-1, ROBOT_ROWS, 2)
+    times_s = robot.stamps_ns.reshape(-1, ROBOT_ROWS) * 1e-9
+    rows = np.column_stack([times_s.mean(axis=1), blocks.mean(axis=1)])
+    lines = ["t,left_rad_s,right_rad_s"]
+    lines += [f"{time:.3f},{left:.4f},{right:.4f}" for time, left, right in rows.tolist()]
+    (folder / "robot_wheels.csv").write_text("\n".join([*lines, ""]), encoding="utf-8")
+
+
 def se3_of(values: list[float]) -> FloatArray:
     """Return the transform (4, 4) of a position and a rotation vector."""
     return se3.from_rotation_translation(se3.rotation_exp(np.array(values[3:])), values[:3])
@@ -102,3 +128,4 @@ if __name__ == "__main__":
     folder = parser.parse_args().out
     write_sample_bag(folder / "drive.mcap")
     write_sample_arm(folder / "arm.yaml")
+    write_sample_robot(folder)

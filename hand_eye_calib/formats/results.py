@@ -18,6 +18,7 @@ from hand_eye_calib.core.base.errors import InputError, located, printable, requ
 from hand_eye_calib.core.base.version import version_of
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
 from hand_eye_calib.core.results.document import transform_arguments, usable_angles, usable_numbers
+from hand_eye_calib.core.results.parts import all_parts, part
 from hand_eye_calib.core.results.records import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.core.results.verdict import Judged
 from hand_eye_calib.formats.files import (
@@ -45,8 +46,9 @@ def save_result(
 ) -> Path:
     """Write ``extrinsic.yaml``, ``extrinsic.urdf.xacro`` and ``static_transform.launch.py``.
 
-    If the verdict is DO NOT USE, only ``extrinsic.yaml`` is written, and the other two files of an
-    earlier result are removed. If a file cannot be written, no file changes.
+    Parts of the result may have further files. If the verdict is DO NOT USE, only
+    ``extrinsic.yaml`` is written, and the other files of an earlier result are removed. If a file
+    cannot be written, no file changes.
 
     Parameters
     ----------
@@ -70,12 +72,20 @@ def save_result(
     require_type("the result", calibration, Calibration)
     directory = path_of("directory", directory)
     is_usable = calibration.verdict is not Verdict.DO_NOT_USE
-    texts = {
+    texts: dict[str, str | None] = dict.fromkeys(_names_of_parts())
+    for name, value in calibration.parts.items() if is_usable else ():
+        texts |= part(name).files(value, calibration)
+    texts |= {
         XACRO_NAME: xacro_text(calibration) if is_usable else None,
         LAUNCH_NAME: launch_text([calibration]) if is_usable else None,
         FILE_NAME: _yaml_text(calibration.to_dict(), inputs),
     }
     return _written(directory, texts)
+
+
+def _names_of_parts() -> list[str]:
+    """Return the names of the files that the parts of results have."""
+    return [name for extra in all_parts() for name in extra.file_names]
 
 
 def save(
@@ -215,7 +225,7 @@ def keep_earlier_results(directory: str | Path) -> str:
         If a file cannot be copied.
     """
     previous = Path(directory, "previous")
-    paths = [Path(directory, name) for name in (*_NAMES, RIG_NAME, REPORT_NAME)]
+    paths = [Path(directory, name) for name in (*_NAMES, *_names_of_parts(), RIG_NAME, REPORT_NAME)]
     copies = {previous / path.name: read_bytes(path) for path in paths if path.exists()}
     if not copies:
         return ""

@@ -81,6 +81,8 @@ def calibrate(
     parent_kind: _Kind | None = None,
     child_kind: _Kind | None = None,
     prior: Prior | None = None,
+    nominal_radius: float | None = None,
+    nominal_separation: float | None = None,
     target_translation: float | None = None,
     target_rotation: float | None = None,
     target_axes: str | None = None,

@@ -42,6 +42,8 @@ VALUES = {
     "child_quaternion": "wxyz",
     "parent_kind": "exact",
     "child_kind": "exact",
+    "nominal_radius": 0.1,
+    "nominal_separation": 0.5,
     "prior.x": "1+/-0.1",
     "prior.y": "1+/-0.1",
     "prior.z": "1+/-0.1",
@@ -55,7 +57,9 @@ VALUES = {
     "child_frame": "camera",
 }
 
-# Options that a kind of streams refuses: of methods of the paper, of lengths, of orientations.
+# Options that a kind of streams refuses: of wheels, of methods of the paper, of lengths, of
+# orientations.
+_OF_WHEELS = {"nominal_radius", "nominal_separation"}
 _OF_WHOLE_POSES = {"method", "reference", "backend", "threshold", "min_inlier_fraction"}
 REFUSED = {
     "poses": set(),
@@ -159,7 +163,7 @@ def test_an_option_is_obeyed_or_refused(option, kind):
     has_methods = kind in ("poses", "rig", "together")
     other_options = method if has_methods and option in _OF_DNLO else {}
     options = {**other_options, option: VALUES[option]}
-    if option in REFUSED[kind]:
+    if option in REFUSED[kind] | _OF_WHEELS:
         with pytest.raises(ConfigError, match=option.replace("_", ".")):
             document(kind, **options)
         return

@@ -12,6 +12,7 @@ import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.extras.vehicle.joints import middle_angle
 from hand_eye_calib.formats.bags.writer import write_streams
 from hand_eye_calib.offline.cli.main import main
 from reproduction.machines import simulate_machine
@@ -244,6 +245,8 @@ OBEYED = {
     "target_translation": 1e-4,
     "target_rotation": 1e-5,
     "target_axes": "x=1mm",
+    "nominal_radius": 0.11,
+    "nominal_separation": 0.55,
     "parent_frame": "axle",
     "child_frame": "laser",
     "prior": {"x": (0.1, 0.01)},
@@ -425,6 +428,94 @@ def test_joint_states_without_wheels_are_refused(tmp_path, capsys):
     write_wheel_bag(bag, "sensor_msgs/msg/JointState", "/joint_states", messages, drive)
     assert main(["calibrate", str(bag), "--parent-topic", "/joint_states"]) == 1
     assert "name the joints: /joint_states?LEFT,RIGHT" in capsys.readouterr().err
+
+
+def car_states(drive, wheel_names, steering_names):
+    """Joint states of a car: equal rear wheels, and the wheels of an Ackermann axle."""
+    kind = JAZZY.types["sensor_msgs/msg/JointState"]
+    names = [*wheel_names, *steering_names]
+    n_steered = len(steering_names)
+    sides = [0.0] if n_steered == 1 else [-0.4, 0.4]
+    for stamp_ns, (speed, angle) in zip(drive.stamps_ns.tolist(), drive.values, strict=True):
+        tangent = np.tan(angle)
+        angles = [float(np.arctan(tangent / (1.0 + side * tangent))) for side in sides]
+        positions = np.array([0.0] * len(wheel_names) + angles)
+        velocities = np.array([speed] * len(wheel_names) + [0.0] * n_steered)
+        yield kind(header(stamp_ns), names, positions, velocities, np.zeros(0))
+
+
+@pytest.mark.parametrize(
+    ("measures", "wheels", "steering", "fields"),
+    [
+        ("steering", ["rear_left_wheel", "rear_right_wheel"], ["left_steer", "right_steer"], ""),
+        ("steering", ["a", "b"], ["c", "d"], "?a+b,c+d"),
+        ("tricycle", ["front_drive_wheel"], ["front_steering_joint"], ""),
+    ],
+)
+def test_joint_states_of_a_steered_vehicle(tmp_path, measures, wheels, steering, fields):
+    drive = machine(measures)
+    bag = tmp_path / "bag"
+    messages = car_states(drive, wheels, steering)
+    write_wheel_bag(bag, "sensor_msgs/msg/JointState", "/joint_states", messages, drive)
+    arguments = ["--parent-topic", f"/joint_states{fields}", "--child-topic", "/lidar"]
+    arguments += ["--parent-measures", measures, "--out", str(tmp_path / "out")]
+    assert main(["calibrate", str(bag), *arguments]) == 0
+    result = hec.load(tmp_path / "out")
+    assert np.abs(pose_errors(result, drive.T_base_sensor))[:2].max() < 0.01
+    assert result.wheels["wheelbase"].value == pytest.approx(drive.parameters[1], rel=0.004)
+
+
+def test_joint_states_of_a_steered_vehicle_need_the_kind(tmp_path, capsys):
+    drive = machine("steering")
+    bag = tmp_path / "bag"
+    messages = car_states(drive, ["rear_left_wheel", "rear_right_wheel"], ["steer"])
+    write_wheel_bag(bag, "sensor_msgs/msg/JointState", "/joint_states", messages, drive)
+    arguments = ["--parent-topic", "/joint_states", "--child-topic", "/lidar"]
+    assert main(["calibrate", str(bag), *arguments]) == 1
+    assert "has steering joints, steer: set --parent-measures to" in capsys.readouterr().err
+
+
+def test_angles_of_a_steered_axle():
+    for angle in (-0.6, -0.1, -0.001, 0.0, 0.02, 0.3, 0.8):
+        tangent = np.tan(angle)
+        wheels = [np.arctan(tangent / (1.0 + side * tangent)) for side in (-0.3, 0.3)]
+        assert middle_angle(wheels) == pytest.approx(angle, rel=1e-3)
+    # Noise of both wheels has opposite signs where the wheels are straight.
+    assert middle_angle([0.002, -0.0019]) == pytest.approx(0.00005)
+
+
+def test_velocities_without_stamps_are_refused(tmp_path, capsys):
+    drive = machine("omni")
+    vector = JAZZY.types["geometry_msgs/msg/Vector3"]
+    twist = JAZZY.types["geometry_msgs/msg/Twist"]
+    speed = twist(vector(1.0, 0.0, 0.0), vector(0.0, 0.0, 0.0))
+    bag = tmp_path / "bag"
+    messages = [speed] * len(drive.stamps_ns)
+    write_wheel_bag(bag, "geometry_msgs/msg/Twist", "/cmd_vel", messages, drive)
+    arguments = ["--parent-topic", "/cmd_vel", "--child-topic", "/lidar"]
+    assert main(["calibrate", str(bag), *arguments, "--parent-measures", "omni"]) == 1
+    assert "it has no stamps, and is usually a command" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("header", "units"),
+    [
+        ("t,left_rpm,right_rpm", [np.pi / 30] * 2),
+        ("t,left_deg_s,right_deg_s", [np.pi / 180] * 2),
+        ("t,speed_km_h,steering_angle_deg", [1 / 3.6, np.pi / 180]),
+        ("t,left_rad_s,right_rad_s", [1.0, 1.0]),
+    ],
+)
+def test_units_in_the_names_of_columns(tmp_path, header, units):
+    stamps_ns = np.arange(3) * 20_000_000
+    values = np.array([[1.0, 2.0], [3.0, 4.0], [2.0, 1.0]])
+    path = tmp_path / "wheels.csv"
+    rows = np.column_stack([stamps_ns * 1e-9, values])
+    np.savetxt(path, rows, fmt="%.6f", delimiter=",", header=header, comments="")
+    with pytest.warns(UserWarning, match="by its columns"):
+        read = hec.read_trajectory(path)
+    expected = hec.wheel_trajectory(stamps_ns, values * units, read.measures)
+    assert read.poses == pytest.approx(expected.poses)
 
 
 def test_twists_of_a_bag(tmp_path):

@@ -1,11 +1,19 @@
 """The recordings that come with the package."""
 
 import numpy as np
+import pytest
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import deviation
-from reproduction.samples import CAMERA_IN_GRIPPER, se3_of, write_sample_arm
+from hand_eye_calib.formats.files import local_path
+from reproduction.samples import (
+    CAMERA_IN_GRIPPER,
+    sample_robot,
+    se3_of,
+    write_sample_arm,
+    write_sample_robot,
+)
 
 
 def test_the_bag_has_the_poses_of_the_files():
@@ -41,3 +49,24 @@ def test_the_arm_is_made_by_its_script(tmp_path):
     kept = hec.read_arm_samples("sample:arm.yaml")
     np.testing.assert_allclose(se3.log(se3.inverse(made.robot) @ kept.robot), 0.0, atol=1e-5)
     np.testing.assert_allclose(se3.log(se3.inverse(made.tracking) @ kept.tracking), 0.0, atol=1e-5)
+
+
+def test_the_robot_is_calibrated_within_its_standard_deviations():
+    truth = sample_robot()
+    with pytest.warns(UserWarning, match="by its columns"):
+        result = hec.calibrate_vehicle("sample:robot_lidar.tum", "sample:robot_wheels.csv")
+    assert result.verdict is hec.Verdict.USE
+    errors = deviation(result.T_parent_child, truth.T_base_sensor)
+    assert (np.abs(errors)[[0, 1, 3, 4, 5]] < 3.0 * result.sigmas[[0, 1, 3, 4, 5]]).all()
+    for parameter, value in zip(result.wheels.parameters, truth.parameters, strict=True):
+        assert abs(parameter.value - value) < 3.0 * parameter.sigma
+
+
+def test_the_robot_is_made_by_its_script(tmp_path):
+    write_sample_robot(tmp_path)
+    for name, separator, n_names in (("robot_lidar.tum", " ", 0), ("robot_wheels.csv", ",", 1)):
+        made, kept = (
+            np.loadtxt(path, delimiter=separator, skiprows=n_names)
+            for path in (tmp_path / name, local_path(f"sample:{name}"))
+        )
+        np.testing.assert_allclose(made, kept, atol=2e-4)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Self
 import hand_eye_calib.core.base.text as text
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.option import OptionSet, option
-from hand_eye_calib.core.base.registry import MEASURES
+from hand_eye_calib.core.base.registry import LIVE_READINGS, MEASURES
 
 TRAJECTORY_FORMATS = ("tum", "kitti", "euroc", "csv")
 # The same names as in formats/layouts.yaml.
@@ -94,7 +94,7 @@ _TF_SOURCE = _both(
 _TYPE = _both(
     "auto",
     "Message type of {}_odom. auto: the type of the publisher.",
-    choices=POSE_TYPES,
+    choices=(*POSE_TYPES, *LIVE_READINGS),
     read_only=True,
 )
 _MEASURES = _both(
@@ -261,6 +261,20 @@ class CalibratorConfig(OptionSet):
     child_quaternion: str = _QUATERNION["child"]
     parent_kind: str = _KIND["parent"]
     child_kind: str = _KIND["child"]
+    nominal_radius: float = option(
+        0.0,
+        "Radius of the wheels by their drawing, for wheel data: another estimate is reported. 0: "
+        "unknown.",
+        unit="m",
+        within=(0.0, 10.0),
+    )
+    nominal_separation: float = option(
+        0.0,
+        "Distance between the left and the right wheels by the drawing, for wheel data and the "
+        "parameters of a controller. 0: unknown.",
+        unit="m",
+        within=(0.0, 100.0),
+    )
     prior_x: str = _PRIOR["x"]
     prior_y: str = _PRIOR["y"]
     prior_z: str = _PRIOR["z"]

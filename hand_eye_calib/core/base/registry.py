@@ -177,6 +177,11 @@ SESSION_PAGES: Registry[Callable[..., None]] = Registry("page of a session")
 #: type or as "images of a target". ``rest`` is the text after the topic in the name of the source.
 BAG_READINGS: Registry[Callable[..., Any]] = Registry("kind of messages")
 
+#: Functions ``read(topic, measures)`` that return the reader of the messages of a live topic that
+#: are integrated to poses, by message type. The reader converts the bytes of a message to
+#: ``PoseFields``.
+LIVE_READINGS: Registry[Callable[[str, str], Any]] = Registry("kind of live messages")
+
 #: Functions that return a module that detects targets in the images of a folder.
 TARGET_IMAGES: Registry[Callable[[], Any]] = Registry("reader of images of a target")
 

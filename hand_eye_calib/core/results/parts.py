@@ -36,7 +36,11 @@ class Part:
     ----------
     without : mapping of str to object
         Attributes that the part adds to a result, and their values if the result lacks the part.
+    file_names : tuple of str
+        Names of the files that :meth:`files` may return.
     """
+
+    file_names: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -88,6 +92,10 @@ class Part:
     def facts(self, value: Any, result: Any) -> list[str]:
         """Return further lines, which are printed if a person asks for all details."""
         return []
+
+    def files(self, value: Any, result: Any) -> dict[str, str]:
+        """Return the texts of files that are saved beside a usable result, by their names."""
+        return {}
 
     def advice(self, value: Any, result: Any) -> str:
         """Return what to record next, for a result that is not USE; empty without advice."""

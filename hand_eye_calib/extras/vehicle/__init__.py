@@ -1,5 +1,6 @@
 """Calibration of a sensor in the frame of its vehicle, with the parameters of the wheels."""
 
+from functools import partial
 from typing import Any
 
 from hand_eye_calib.core.base.errors import ConfigError
@@ -8,6 +9,7 @@ from hand_eye_calib.core.base.registry import (
     FILE_READERS,
     FINDING_WORDS,
     KINDS,
+    LIVE_READINGS,
     MEASURES,
     OUT_OF_REACH,
     PUBLIC_NAMES,
@@ -15,6 +17,13 @@ from hand_eye_calib.core.base.registry import (
     ROUTES,
     Measure,
     Route,
+)
+
+# Types of live messages with velocities or wheels.
+_LIVE_TYPES = (
+    "geometry_msgs/msg/TwistStamped",
+    "geometry_msgs/msg/TwistWithCovarianceStamped",
+    "sensor_msgs/msg/JointState",
 )
 
 
@@ -35,6 +44,8 @@ def register() -> None:
     FINDING_WORDS["vehicle"] = _words
     FILE_READERS["wheels"] = _wheels
     BAG_READINGS["sensor_msgs/msg/JointState"] = _joint_states
+    for message_type in _LIVE_TYPES:
+        LIVE_READINGS[message_type] = partial(_live, message_type)
     PUBLIC_NAMES["calibrate_vehicle"] = "hand_eye_calib.extras.vehicle.calibrate"
     PUBLIC_NAMES["wheel_trajectory"] = "hand_eye_calib.extras.vehicle.wheel_files"
     ROUTES["vehicle"] = Route(_add_arguments, _is_alone, _calibrate)
@@ -49,10 +60,9 @@ def _vehicle() -> Any:
 
 def _parameters() -> Any:
     """Return the part of results with the parameters of the wheels."""
-    from hand_eye_calib.core.results.parts import Part
-    from hand_eye_calib.extras.vehicle.parameters import VehicleParameters, details
+    from hand_eye_calib.extras.vehicle.part import WheelPart
 
-    return Part("wheels", lambda: VehicleParameters, details)
+    return WheelPart()
 
 
 def _words() -> Any:
@@ -74,6 +84,13 @@ def _joint_states(*source: Any) -> Any:
     from hand_eye_calib.extras.vehicle.joint_states import JointStateReading
 
     return JointStateReading(*source)
+
+
+def _live(*topic: Any) -> Any:
+    """Return the reader of a live topic with velocities or wheels."""
+    from hand_eye_calib.extras.vehicle.live import live_reading
+
+    return live_reading(*topic)
 
 
 def _add_arguments(parser: Any) -> None:

@@ -80,6 +80,22 @@ _VARIED_TURN = 0.02
 # A vehicle turns on the spot if the unit vehicle drives less than this length per radian.
 _ON_THE_SPOT = 0.2
 
+# Radii of wheels (m) that are usual, from a small robot to a truck.
+_USUAL_RADII_M = (0.02, 1.25)
+# Factors of the odometry of wheels that are usual: a wrong radius, but no other unit.
+_USUAL_MULTIPLIERS = (0.5, 2.0)
+# Logarithm of the ratio of two radii that is usual: tyre pressure, wear and load change a radius by
+# some percent.
+_USUAL_DEVIATION = 0.1
+# Units of speeds, and the right value divided by the number in this unit.
+_UNITS = {
+    "rpm": np.pi / 30.0,
+    "deg/s": np.pi / 180.0,
+    "revolutions/s": 2.0 * np.pi,
+    "km/h": 1.0 / 3.6,
+    "mm/s": 1e-3,
+}
+
 # Options that have no meaning for a vehicle, and the values that are accepted.
 _ALLOWED: dict[str, tuple[object, ...]] = {
     "method": ("auto", "adaptive"),
@@ -253,8 +269,45 @@ def _calibration(
     sigmas = np.sqrt(np.diag(fit.covariance))[N_FIXED:]
     values = fit.others[N_FIXED - CLOCK :]
     parameters = map(VehicleParameter, drive.model.names, values.tolist(), sigmas.tolist())
-    slip_share = float(np.mean(fit.weights == 0.0))
-    return result.with_part("wheels", VehicleParameters(tuple(parameters), slip_share))
+    wheels = VehicleParameters(
+        tuple(parameters),
+        slip_share=float(np.mean(fit.weights == 0.0)),
+        measures=config.parent_measures,
+        nominal_radius_m=config.nominal_radius,
+        nominal_separation_m=config.nominal_separation,
+    )
+    result = replace(result, findings=result.findings + _check_size(wheels))
+    return result.with_part("wheels", wheels)
+
+
+def _check_size(wheels: VehicleParameters) -> tuple[Finding, ...]:
+    """Return the finding about a wheel of an unusual size, if there is one."""
+    radius = wheels.radius
+    # Odometry has a multiplier of the radius, or of the forward motion.
+    ratio = radius or wheels.parameters[0].value
+    nominal = wheels.nominal_radius_m
+    if radius and nominal:
+        ratio = radius / (1.0 if wheels.is_factor else nominal)
+        if abs(np.log(ratio)) < _USUAL_DEVIATION:
+            return ()
+        cause = _cause_of(ratio)
+        return (
+            finding("radius_not_nominal", radius=radius, ratio=ratio, nominal=nominal, cause=cause),
+        )
+    lowest, highest = _USUAL_RADII_M if radius else _USUAL_MULTIPLIERS
+    if lowest <= ratio <= highest:
+        return ()
+    if radius:
+        return (finding("unusual_radius", radius=radius),)
+    return (finding("unusual_multiplier", ratio=ratio, cause=_cause_of(ratio)),)
+
+
+def _cause_of(ratio: float) -> str:
+    """Return the likely cause of a radius that is ``ratio`` times the right one."""
+    for unit, factor in _UNITS.items():
+        if abs(np.log(ratio / factor)) < _USUAL_DEVIATION:
+            return f"speeds in {unit}"
+    return "a gear ratio, ticks of an encoder, or lengths of the sensor that are not metres"
 
 
 def _check_fit(fit: Fit, drive: Drive, config: CalibratorConfig) -> tuple[Finding, ...]:

@@ -1,12 +1,10 @@
 """Estimated parameters of the wheels of a vehicle, as a part of its result."""
 
 from dataclasses import dataclass
-from typing import Any
 
-from hand_eye_calib.core.base.text import with_sigma
-
-# Units of parameters, by the last word of their names. Other parameters are written without a unit.
-_UNITS = {"separation": " m", "wheelbase": " m", "offset": " rad", "curvature": " 1/m"}
+# A radius in this range is taken as a factor: the wheel data are in m/s, not in rad/s. Sizes of
+# wheels usually are within 2 % of the drawing, and only tractors have radii of a metre.
+_FACTORS = (0.8, 1.25)
 
 
 @dataclass(frozen=True)
@@ -30,21 +28,32 @@ class VehicleParameters:
         the configuration of the wheel odometry must be multiplied.
     slip_share : float
         Share of the time (0 to 1) in which wheels and sensor disagree, because the wheels slip.
+    measures : str
+        Kind of wheel data; empty in files of earlier versions.
+    nominal_radius_m, nominal_separation_m : float
+        Radius of a wheel, and distance between left and right wheels, by the options; 0 if unknown.
     """
 
     parameters: tuple[VehicleParameter, ...]
     slip_share: float
+    measures: str = ""
+    nominal_radius_m: float = 0.0
+    nominal_separation_m: float = 0.0
 
     def __getitem__(self, name: str) -> VehicleParameter:
         """Return a parameter by its name."""
         return {parameter.name: parameter for parameter in self.parameters}[name]
 
+    @property
+    def radius(self) -> float:
+        """Mean radius of the wheels (m) or its factor; 0 for odometry, which has multipliers."""
+        radii = [item.value for item in self.parameters if item.name.endswith("wheel_radius")]
+        return sum(radii) / len(radii) if radii else 0.0
 
-def details(wheels: VehicleParameters, result: Any) -> list[str]:
-    """Return lines for the user about the parameters of the wheels."""
-    lines = []
-    for parameter in wheels.parameters:
-        value_and_sigma = with_sigma(parameter.value, parameter.sigma, 4)
-        unit = _UNITS.get(parameter.name.rpartition("_")[2], "")
-        lines.append(f"{parameter.name}: {value_and_sigma}{unit}")
-    return [*lines, f"the wheels slip {wheels.slip_share:.1%} of the time"]
+    @property
+    def is_factor(self) -> bool:
+        """Whether the radius seems to be a factor, because the wheel data are in m/s."""
+        lowest, highest = _FACTORS
+        nominal = self.nominal_radius_m
+        is_nominal = lowest * nominal <= self.radius <= highest * nominal
+        return lowest <= self.radius <= highest and not is_nominal

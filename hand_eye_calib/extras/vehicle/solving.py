@@ -17,8 +17,8 @@ the tail of this distribution, where the wheels slip, have weight 0. The covaria
   weights;
 - the uncertainty of the priors;
 - the square of 2/5 of the difference to the estimate over windows twice as long;
-- the square of 3/20 of the difference to the estimate without weights, for slip that is not
-  detected;
+- the square of a share of the difference to the estimate without weights, for slip that is not
+  detected: 3/20, and for the size of a wheel the share that follows from its signal and noise;
 - the square of the bias of x and y that noise of the turns may cause;
 - the square of the bias of roll and y of a body that leans outwards, if most curves have the same
   direction.
@@ -78,6 +78,14 @@ _TAIL = 0.01
 _SHARE_OF_LONGER = 0.4
 # The same share for the estimate without weights.
 _SHARE_OF_UNWEIGHTED = 0.15
+
+# Sizes of slips, as shares of the speed of a wheel: tyres and rollers slip by 5 to 20 % in curves,
+# and a slip covers only a part of a window.
+_SLIPS = np.array([0.02, 0.05, 0.1])
+# Largest share of slip that is not detected; near 1, nothing is known about the bias.
+_MAX_UNDETECTED = 0.75
+# Factor of the argument of a logistic function that is close to the normal distribution.
+_LOGISTIC = 1.702
 
 # Largest number of Gauss-Newton steps.
 _MAX_ROUNDS = 20
@@ -255,11 +263,11 @@ def fit_drive(drive: Drive, longer: Drive, fixed: Sequence[int]) -> Fit:
     fit = _solve(drive, T, others, sigmas)
     covariance = fit.covariance
     alternatives = [
-        (_solve(longer, T, others, sigmas), _SHARE_OF_LONGER),
-        (_solve(drive, T, others, sigmas, is_weighted=False), _SHARE_OF_UNWEIGHTED),
+        (_solve(longer, T, others, sigmas), np.full(len(sigmas), _SHARE_OF_LONGER)),
+        (_solve(drive, T, others, sigmas, is_weighted=False), _shares_of_unweighted(drive, fit)),
     ]
-    for alternative, share in alternatives:
-        difference = share * _difference(
+    for alternative, shares in alternatives:
+        difference = shares * _difference(
             alternative.T_base_sensor, alternative.others, fit.T_base_sensor, fit.others
         )
         covariance = covariance + np.outer(difference, difference)
@@ -273,6 +281,35 @@ def fit_drive(drive: Drive, longer: Drive, fixed: Sequence[int]) -> Fit:
     if Y not in fixed:
         covariance[Y, Y] += (_HEIGHT * lean) ** 2
     return replace(fit, covariance=covariance)
+
+
+def _shares_of_unweighted(drive: Drive, fit: Fit) -> FloatArray:
+    """Return the bias from undetected slip, as a share (U,) of the difference without weights.
+
+    The slip of a wheel changes its motion by the same share as another size of this wheel. If a
+    part p of the slip is not detected, the bias is p times that of an estimate without weights,
+    and p / (1 - p) times the difference of both estimates.
+    """
+    shares = np.full(CLOCK + len(fit.others), _SHARE_OF_UNWEIGHTED)
+    if drive.model is None:
+        return shares
+    n_components = len(drive.components)
+    threshold = CHI2[_TAIL][n_components]
+    columns = drive.rows(fit.T_base_sensor, fit.others)
+    for index in range(N_FIXED, N_FIXED + drive.model.n_wheels):
+        # Squared size (K,) of the effect of a slip of 100 %, in standard deviations of the noise.
+        effect = fit.others[index - CLOCK] * columns[..., index]
+        squared = np.einsum("kc,cd,kd->k", effect, inverse(fit.noise), effect)
+        # Mean and standard deviation of a non-central chi-squared distribution, (3, K).
+        excess = _SLIPS[:, None] ** 2 * squared
+        mean = n_components + excess
+        sigma = np.sqrt(2.0 * (n_components + 2.0 * excess))
+        is_kept = 1.0 / (1.0 + np.exp(_LOGISTIC * (mean - threshold) / sigma))
+        weights = is_kept * (STUDENT + n_components) / (STUDENT + mean)
+        undetected = np.average(weights, axis=1, weights=squared) @ _SLIPS / _SLIPS.sum()
+        undetected = min(float(undetected), _MAX_UNDETECTED)
+        shares[index] = undetected / (1.0 - undetected)
+    return shares
 
 
 def _lateral_acceleration(drive: Drive, T: FloatArray) -> float:

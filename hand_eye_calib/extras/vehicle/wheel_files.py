@@ -4,8 +4,9 @@ The unit vehicle has wheels of radius 1, see :mod:`.wheels`.
 """
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,6 +31,12 @@ _COLUMNS = {
 }
 
 
+def _unit_of(column: str) -> float:
+    """Return the unit of a column by its name; 1 for rad/s, rad and m/s."""
+    units = [unit for name, unit in _UNITS.items() if column.endswith(f"_{name}")]
+    return units[0] if units else 1.0
+
+
 def _along_and_across(speed: FloatArray, angle: FloatArray) -> tuple[FloatArray, ...]:
     """Return the rates of a unit vehicle from a speed and a steering angle."""
     return speed * np.cos(angle), 0.0 * speed, speed * np.sin(angle)
@@ -47,6 +54,17 @@ _RATES: dict[str, Callable[..., tuple[ArrayLike, ...]]] = {
 
 # Number of columns of wheel data without the stamps.
 _N_COLUMNS = {"wheels": 2, "steering": 2, "tricycle": 2, "wheel_odometry": 2, "omni": 3}
+
+# Units at the end of the name of a column, in rad/s, rad or m/s.
+_UNITS = {
+    "rpm": np.pi / 30.0,
+    "deg": np.pi / 180.0,
+    "deg_s": np.pi / 180.0,
+    "dps": np.pi / 180.0,
+    "km_h": 1.0 / 3.6,
+    "kmh": 1.0 / 3.6,
+    "mm_s": 1e-3,
+}
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
@@ -93,15 +111,33 @@ def wheel_trajectory(stamps_ns: IntArray, values: ArrayLike, measures: str) -> T
             f"{measures} needs values of shape ({len(stamps_ns)}, {n_columns}), a row for each "
             f"stamp; got {values.shape}"
         )
+    # Between two stamps, the mean of both rows is used.
+    return unit_path(stamps_ns, (values[:-1] + values[1:]) / 2.0, measures)
+
+
+def unit_rates(measures: str, columns: Iterable[Any]) -> tuple[Any, ...]:
+    """Return forward speed, left speed and yaw rate of the unit vehicle from wheel data.
+
+    The columns are numbers or arrays.
+    """
+    return _RATES[measures](*columns)
+
+
+def unit_path(stamps_ns: IntArray, means: FloatArray, measures: str) -> Trajectory:
+    """Return the path of the unit vehicle from the wheel data (N - 1, C) between N stamps.
+
+    Raises
+    ------
+    InputError
+        If the stamps do not increase, or a step turns by more than half a turn.
+    """
     durations_s = np.diff(stamps_ns) * 1e-9
     if not (durations_s > 0.0).all():
         raise InputError("stamps of wheel data must increase; sort the rows, drop repeated stamps")
-    # Between two stamps, the mean of both rows is used.
-    rates = _RATES[measures](*(values[:-1] + values[1:]).T / 2.0)
-    steps = np.stack(rates) * durations_s
+    steps = np.stack(unit_rates(measures, means.T)) * durations_s
     if np.abs(steps[2]).max(initial=0.0) > np.pi:
         raise InputError(
-            f"wheel speeds of up to {np.abs(values[:, 0]).max():.0f} are too large for rows that "
+            f"wheel speeds of up to {np.abs(means[:, 0]).max():.0f} are too large for rows that "
             f"are {durations_s.max():.3g} s apart; write them in rad/s or m/s, angles in rad"
         )
     return trajectory_of(stamps_ns, steps, measures)
@@ -130,9 +166,7 @@ def table_of_wheels(path: str | Path, data: bytes, options: FileOptions) -> Tabl
     n_values = names.count(",") + 1
     rates = Table(path, (stamp, "x", "y", "z"), "positions")
     rates.fill(rows, lambda cells: cells[:4])
-    values = rates.values()[:, :n_values]
-    if "deg" in names:
-        values[:, 1] = np.radians(values[:, 1])
+    values = rates.values()[:, :n_values] * [_unit_of(name) for name in names.split(",")]
     wheels = wheel_trajectory(stamps_in_ns(rates, options.stamp_unit), values, kinds[0])
     table = Table(path, (stamp, *_POSE), "poses", sensor_frame=wheels.sensor_frame)
     table.fill_from_arrays(se3.to_rows(wheels.poses), rates.stamps)

@@ -52,11 +52,14 @@ class WheelModel(NamedTuple):
         First values (P,) of the parameters. ``parameters_of(length, turn)`` computes them from the
         ratios of the lengths and of the turns of the axle to those of the unit vehicle. Both wheels
         get the same radius.
+    n_wheels : int
+        Number of parameters, the first ones, that are sizes of wheels which may slip.
     """
 
     names: tuple[str, ...]
     steps_of: Callable[..., tuple[FloatArray, ...]]
     parameters_of: Callable[[float, float], tuple[float, ...]]
+    n_wheels: int = 1
 
 
 def _two_wheels(
@@ -114,6 +117,7 @@ MODELS = {
         ("left_wheel_radius", "right_wheel_radius", "wheel_separation"),
         _two_wheels,
         lambda length, turn: (length, length, UNIT_TRACK * length / turn),
+        n_wheels=2,
     ),
     "wheel_odometry": WheelModel(
         ("wheel_radius_multiplier", "wheel_separation_multiplier", "curvature"),
@@ -134,6 +138,7 @@ MODELS = {
         ("forward_multiplier", "left_multiplier", "turn_multiplier"),
         _omni,
         lambda length, turn: (length, length, turn),
+        n_wheels=2,
     ),
 }
 

@@ -35,6 +35,26 @@ WORDS = {
         "a driver that already divides the speed by the cosine of the angle",
         severity=Severity.ERROR,
     ),
+    "unusual_radius": FindingWords(
+        "a wheel radius of {radius:.4f} m is unusual",
+        "give the speeds of the wheels in rad/s or m/s, or name the columns with their unit "
+        "(left_rpm); if the radius is right, confirm it: --nominal-radius {radius:.4f}",
+        "speeds in rpm, degrees or ticks, or lengths of the sensor that are not metres",
+        severity=Severity.WARNING,
+    ),
+    "radius_not_nominal": FindingWords(
+        "the wheel radius is {radius:.4f} m, {ratio:.3g} times the nominal {nominal:.4f} m",
+        "correct nominal_radius, or the unit of the speeds: rad/s or m/s",
+        "{cause}",
+        severity=Severity.WARNING,
+    ),
+    "unusual_multiplier": FindingWords(
+        "the odometry of the wheels is {ratio:.3g} times too short",
+        "give speeds in m/s, and poses in m; correct the radius in the configuration of the "
+        "odometry, and record again",
+        "{cause}",
+        severity=Severity.WARNING,
+    ),
     "vehicle_halves": FindingWords(
         "both halves of the drive give another {axes}",
         "check that the sensor is fixed, and the pressure of the tyres; record again",

@@ -168,6 +168,8 @@ PATH_TYPE = "nav_msgs/msg/Path"
 POINTS_TYPE = "sensor_msgs/msg/PointCloud2"
 #: Type of joint states, which may contain the wheels of a vehicle.
 JOINTS_TYPE = "sensor_msgs/msg/JointState"
+#: Type of velocities without stamps.
+TWIST_TYPE = "geometry_msgs/msg/Twist"
 #: Types of images. Poses are computed from images of a target.
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 #: Types of lists of transforms, and of single transforms.
@@ -246,7 +248,7 @@ for _name, _fields in _FIELDS.items():
     _measures = _OF_POINTS if _name.endswith("Fix") else _OF_POSES
     _ROWS.append(MessageType(_name, _measures, fields=_fields))
 _ROWS.append(MessageType(POINTS_TYPE, _OF_POSES))
-_ROWS.append(MessageType(JOINTS_TYPE, ("wheels",)))
+_ROWS.append(MessageType(JOINTS_TYPE, ("wheels", "steering", "tricycle")))
 
 MESSAGE_TYPES = {row.name: row for row in _ROWS}
 #: Types with a complete pose in each message, which is unpacked from the bytes.

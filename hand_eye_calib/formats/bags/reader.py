@@ -199,6 +199,11 @@ class PoseBag:
         hint = "name its fields, TOPIC?t=header.stamp,x=..."
         if type_ in messages.TF_TYPES:
             hint = "name two of its frames instead, as odom:lidar"
+        elif type_ == messages.TWIST_TYPE:
+            hint = (
+                "it has no stamps, and is usually a command: record the measured velocity "
+                "as TwistStamped or Odometry"
+            )
         elif type_ in messages.IMAGE_TYPES:
             hint = f"name the target in the images, {topic}?charuco:5x7:0.04:0.03, or set --target"
         raise InputError(
@@ -358,7 +363,7 @@ class PoseBag:
             return BAG_READINGS["images of a target"](self, stream, topic, fields)
         type_ = self.type_of(topic)
         if type_ == messages.JOINTS_TYPE and "=" not in fields:
-            return BAG_READINGS[type_](stream, topic, fields)
+            return BAG_READINGS[type_](stream, topic, fields, measures.get(stream, "auto"))
         row = messages.MESSAGE_TYPES.get(type_)
         if row:
             fields = fields or row.fields

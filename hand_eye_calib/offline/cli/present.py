@@ -75,7 +75,8 @@ def deliver(
 
         kept = results.keep_earlier_results(arguments.out)
         path = results.save_result(calibration, arguments.out, inputs)
-        names = (results.XACRO_NAME, results.LAUNCH_NAME)
+        names = [results.XACRO_NAME, results.LAUNCH_NAME]
+        names += [file for name in calibration.parts for file in part(name).file_names]
         beside = [name for name in names if path.with_name(name).exists()]
         for_robots = f", {listing(beside)}" if beside else ""
         note(f"wrote {path}{for_robots}{kept}")

@@ -14,6 +14,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from hand_eye_calib.core.base.config import POSE_TYPES, CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError, InputError, NoPoseError
+from hand_eye_calib.core.base.registry import LIVE_READINGS
 from hand_eye_calib.core.base.text import counted, listing
 from hand_eye_calib.formats.bags import messages
 from hand_eye_calib.formats.transforms import PoseFields, TfSource, TfStream
@@ -26,7 +27,7 @@ from hand_eye_calib.online.ros.tf import DYNAMIC_TOPIC, STATIC_TOPIC, message_ty
 _QOS_OVERRIDES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
 
 # Message types in the order of preference, without the first entry of POSE_TYPES, "auto".
-_TYPES = POSE_TYPES[1:]
+_TYPES = (*POSE_TYPES[1:], *LIVE_READINGS)
 
 # Errors that rclpy raises for QoS overrides that it cannot apply.
 _BAD_QOS = (ParameterException, InvalidQosOverridesError, RuntimeError, AssertionError, ValueError)
@@ -153,7 +154,11 @@ class TopicInput(RosInput):
         """
         measures = messages.measured_as(type_name, self._wanted, self.topic)
         self._session.set_measures(self.name, measures)
-        self._read = messages.MessageReader(type_name, measures, self._session.origin(self.name))
+        if type_name in LIVE_READINGS:
+            self._read = LIVE_READINGS[type_name](self.topic, measures)
+        else:
+            origin = self._session.origin(self.name)
+            self._read = messages.MessageReader(type_name, measures, origin)
         # rclpy passes the information about a message to any callback with two arguments. The
         # annotations of rclpy do not allow such a callback, hence Any.
         callback: Any = self._receive
