@@ -44,9 +44,11 @@ YAW = 4
 CLOCK = 5
 
 # Prior standard deviations of the unknowns before the parameters of the wheels, in their units.
-# They keep the iteration in bounds. Only the last is a real prior: the slip angle of rear axles of
-# cars is 0.003 to 0.007 rad per m/s^2 (2 to 4 deg per g).
+# They keep the iteration in bounds. Only the last is a real prior, that of the slip angle.
 _PRIOR_SIGMAS = (3.0, 3.0, 1.0, 1.0, 1.0, 0.2, 0.005)
+# Mean of the prior of the slip angle (rad s^2/m): an axle slips outwards, that of cars by 0.003 to
+# 0.007 rad per m/s^2 (2 to 4 deg per g), that of slow robots with hard tyres by less.
+_PRIOR_SLIP = 0.003
 # Number of unknowns before the parameters of the wheels.
 N_FIXED = len(_PRIOR_SIGMAS)
 # Prior standard deviation of a parameter of the wheels: this share of its first value ...
@@ -299,12 +301,13 @@ def _shares_of_unweighted(drive: Drive, fit: Fit) -> FloatArray:
     for index in range(N_FIXED, N_FIXED + drive.model.n_wheels):
         # Squared size (K,) of the effect of a slip of 100 %, in standard deviations of the noise.
         effect = fit.others[index - CLOCK] * columns[..., index]
-        squared = np.einsum("kc,cd,kd->k", effect, inverse(fit.noise), effect)
+        squared = np.einsum("kc,cd,kd->k", effect, inverse(fit.noise), effect) + _MIN_VARIANCE
         # Mean and standard deviation of a non-central chi-squared distribution, (3, K).
         excess = _SLIPS[:, None] ** 2 * squared
         mean = n_components + excess
         sigma = np.sqrt(2.0 * (n_components + 2.0 * excess))
-        is_kept = 1.0 / (1.0 + np.exp(_LOGISTIC * (mean - threshold) / sigma))
+        # The hyperbolic tangent is a logistic function that does not overflow.
+        is_kept = 0.5 - 0.5 * np.tanh(_LOGISTIC * (mean - threshold) / sigma / 2.0)
         weights = is_kept * (STUDENT + n_components) / (STUDENT + mean)
         undetected = np.average(weights, axis=1, weights=squared) @ _SLIPS / _SLIPS.sum()
         undetected = min(float(undetected), _MAX_UNDETECTED)
@@ -473,4 +476,4 @@ def start_of(drive: Drive) -> tuple[FloatArray, FloatArray]:
     parameters: tuple[float, ...] = ()
     if drive.model is not None:
         parameters = drive.model.parameters_of(length_ratio, abs(turn_ratio))
-    return T, np.array([0.0, 0.0, *parameters])
+    return T, np.array([0.0, _PRIOR_SLIP, *parameters])
