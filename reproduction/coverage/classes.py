@@ -54,9 +54,15 @@ def simulate(
     kind: RecordingClass,
     seed: int | tuple[int, ...],
     T_parent_child: FloatArray | None = None,
+    noise_seed: tuple[int, ...] | None = None,
 ) -> Simulated:
-    """One recording; the same seed gives the same. The extrinsic is drawn if it is not given."""
+    """One recording; the same seed gives the same. The extrinsic is drawn if it is not given.
+
+    Another ``noise_seed`` gives other errors of the sensors on the same drive.
+    """
     motion_rng, mount_rng, parent_rng, child_rng = np.random.default_rng(seed).spawn(4)
+    if noise_seed is not None:
+        parent_rng, child_rng = np.random.default_rng(noise_seed).spawn(2)
     dt = 1.0 / kind.rate_hz
     times_s: FloatArray = dt * np.arange(round(kind.duration_s * kind.rate_hz), dtype=np.float64)
     motion = kind.motion(motion_rng, kind.duration_s)

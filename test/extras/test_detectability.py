@@ -1,15 +1,18 @@
 """Smallest errors that a recording contradicts: linear injections against those into streams."""
 
 from dataclasses import replace
+from html import unescape
 
 import numpy as np
 import pytest
 
 import hand_eye_calib as hec
-from hand_eye_calib.core.assessment.moved import SIGNIFICANT, evidence_by_second, find_change
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.results.parts import facts_of
+from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.extras.detectability import injection
+from hand_eye_calib.extras.detectability.injection import evidence_of
 from hand_eye_calib.offline.cli.main import main
 
 ALL_COLUMNS = list(range(8))
@@ -30,13 +33,6 @@ def pose_pairs(result):
     return result.recording.pose_pairs
 
 
-def evidence(pose_pairs, T_parent_child):
-    def columns(pairs):
-        return injection._columns_of_streams(pairs, pose_pairs)
-
-    return evidence_by_second(pose_pairs, T_parent_child, columns)[1]
-
-
 def with_child(pose_pairs, change):
     child = Trajectory(pose_pairs.stamps_ns, pose_pairs.Ts_cw_c)
     changed = change(child).at(pose_pairs.stamps_ns, extrapolate=True)
@@ -48,39 +44,53 @@ def test_an_error_of_the_result_is_linear_in_the_evidence(result, pose_pairs, ax
     xi = np.zeros(6)
     xi[axis] = 0.02
     wrong = result.T_parent_child @ se3.exp(xi)
-    before = evidence(pose_pairs, result.T_parent_child).solve(range(6))
-    after = evidence(pose_pairs, wrong).solve(range(6))
+    before = evidence_of(pose_pairs, result.T_parent_child).solve(range(6))
+    after = evidence_of(pose_pairs, wrong).solve(range(6))
     np.testing.assert_allclose(after - before, -xi, atol=0.002)
 
 
 def test_an_error_of_the_clock_is_linear_in_the_evidence(result, pose_pairs):
     late = with_child(pose_pairs, lambda child: child.shifted(0.01))
-    before = evidence(pose_pairs, result.T_parent_child).solve(ALL_COLUMNS)
-    after = evidence(late, result.T_parent_child).solve(ALL_COLUMNS)
+    before = evidence_of(pose_pairs, result.T_parent_child).solve(ALL_COLUMNS)
+    after = evidence_of(late, result.T_parent_child).solve(ALL_COLUMNS)
     assert abs(after - before)[6] == pytest.approx(0.01, rel=0.15)
 
 
 def test_an_error_of_the_scale_is_linear_in_the_evidence(result, pose_pairs):
     longer = with_child(pose_pairs, lambda child: child.scaled(1.01))
-    before = evidence(pose_pairs, result.T_parent_child).solve(ALL_COLUMNS)
-    after = evidence(longer, result.T_parent_child).solve(ALL_COLUMNS)
+    before = evidence_of(pose_pairs, result.T_parent_child).solve(ALL_COLUMNS)
+    after = evidence_of(longer, result.T_parent_child).solve(ALL_COLUMNS)
     assert abs(after - before)[7] == pytest.approx(0.01, rel=0.15)
 
 
-@pytest.mark.parametrize("axis", ["x", "y", "z", "roll", "pitch", "yaw"])
-def test_the_stream_check_finds_a_shift_of_the_smallest_size(result, pose_pairs, axis):
-    size = result.detectability.shifts[axis]
+@pytest.mark.parametrize(("axis", "factor"), [("x", 1.3), ("yaw", -1.3), ("z", 0.3), ("roll", 0.3)])
+def test_calibrate_reports_a_shift_from_the_smallest_size_on(drive, result, axis, factor):
     in_parent = np.zeros(6)
-    in_parent[["x", "y", "z", "roll", "pitch", "yaw"].index(axis)] = size
+    in_parent[AXES.index(axis)] = factor * result.detectability.shifts[axis]
     xi = np.kron(np.eye(2), result.T_parent_child[:3, :3].T) @ in_parent
-    middle = len(pose_pairs) // 2
-    ratios = []
-    for factor in (0.3, 1.3):
-        Ts_cw_c = pose_pairs.Ts_cw_c.copy()
-        Ts_cw_c[middle:] = Ts_cw_c[middle:] @ se3.exp(factor * xi)
-        moved = replace(pose_pairs, Ts_cw_c=Ts_cw_c)
-        ratios.append(find_change(moved, result.T_parent_child).log_ratio)
-    assert ratios[0] < SIGNIFICANT < ratios[1]
+    poses = drive.child.poses.copy()
+    middle = len(poses) // 2
+    poses[middle:] = poses[middle:] @ se3.exp(xi)
+    moved = hec.calibrate(drive.parent, replace(drive.child, poses=poses))
+    is_reported = any(finding.code == "mount_moved" for finding in moved.findings)
+    assert is_reported == (abs(factor) > 1.0)
+
+
+def test_a_shift_that_the_stream_check_does_not_report_is_not_stated(
+    result, pose_pairs, monkeypatch
+):
+    monkeypatch.setattr(injection, "slow_suspects", lambda *_: [])
+    sizes = injection.detectability(result, pose_pairs)
+    assert sizes.errors == result.detectability.errors
+    assert {*sizes.shifts.values()} == {np.inf}
+
+
+def test_no_size_is_below_what_sigma_makes_detectable(result, pose_pairs):
+    """A method with a large sigma cannot have errors that a better method would contradict."""
+    wide = replace(result, covariance_measured=400.0 * result.covariance_measured)
+    sizes = injection.detectability(wide, pose_pairs).errors
+    least = 3.0 * np.hypot(2.0 * wide.sigmas_measured, wide.allowance)
+    assert (np.array([*sizes.values()]) >= least).all()
 
 
 def test_the_true_error_is_smaller(drive, result):
@@ -145,6 +155,9 @@ def test_details_and_report_state_it(capsys, tmp_path):
     arguments = ["calibrate", "sample:lidar.tum", "sample:camera.tum", "-v", "--out", str(tmp_path)]
     assert main(arguments) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert "Smallest detectable error: " in printed
-    assert "deg about y" in printed
-    assert "Smallest detectable error: " in (tmp_path / "report.html").read_text("utf-8")
+    report = " ".join((tmp_path / "report.html").read_text("utf-8").split())
+    for text in (printed, unescape(report)):
+        for fact in facts_of(hec.load(tmp_path)):
+            assert fact in text
+        assert "deg about y" in text
+        assert "half of the recording contradicts such an error in nine of ten trials" in text

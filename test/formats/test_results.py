@@ -7,6 +7,7 @@ import os
 import re
 import shlex
 import stat
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -369,13 +370,34 @@ def test_files_that_cannot_be_read(tmp_path):
     "changes", [{}, {"warnings": ()}, {"covariance_allowance": 1e-6 * np.eye(6)}], ids=str
 )
 def test_documents_follow_the_schema(changes, tmp_path):
+    document = validated(calibration(**changes), tmp_path)
+    assert document["observability"][2]["sigma_measured"] is None
+
+
+def validated(result, folder):
+    """The document of a result, as JSON and as its file; both must follow the schema."""
     jsonschema = pytest.importorskip("jsonschema")
     schema = json.loads((ROOT / "docs" / "extrinsic.schema.json").read_text(encoding="utf-8"))
-    result = calibration(**changes)
-    path = save_result(result, tmp_path)
-    for document in (json.loads(json_text(result.to_dict())), yaml.safe_load(path.read_text())):
-        jsonschema.validate(document, schema)
-    assert document["observability"][2]["sigma_measured"] is None
+    path = save_result(result, folder)
+    document = json.loads(json_text(result.to_dict()))
+    for written in (document, yaml.safe_load(path.read_text())):
+        jsonschema.validate(written, schema)
+    return document
+
+
+def test_documents_of_recordings_follow_the_schema(tmp_path):
+    drive = hec.simulate(5, poses=600)
+    result = hec.calibrate(drive.parent, drive.child)
+    document = validated(result, tmp_path)
+    sizes = document["detectability"]
+    assert sizes["errors"] == result.detectability.errors
+    jsonschema = pytest.importorskip("jsonschema")
+    unnamed = replace(result.detectability, shifts={"x": 0.01})
+    with pytest.raises(jsonschema.ValidationError, match="required property"):
+        validated(result.with_part("detectability", unnamed), tmp_path)
+    no_axis = replace(result.detectability, errors=dict.fromkeys(sizes["errors"], np.inf))
+    hidden = validated(result.with_part("detectability", no_axis), tmp_path)
+    assert hidden["detectability"]["errors"]["z"] is None
 
 
 def test_every_sigma_of_a_document_has_the_allowance_and_its_parts_beside_it():

@@ -100,6 +100,16 @@ def view_of(document, now_s=0.5):
     return board.view(now_s)
 
 
+def test_evidence_is_displayed_at_the_end_alone():
+    fact = "An error of the result would have shown from 2 cm along x on"
+    extrinsic = replace(EXTRINSIC, result=replace(RESULT, facts=(fact,)))
+    view = view_of(state(at=REACHED, extrinsic=extrinsic))
+    assert view.word == "DONE"
+    assert [line.text for line in view.result if line.name == "evidence"] == [fact]
+    assert fact in fragment(view)
+    assert fact not in fragment(view_of(state(extrinsic=extrinsic)))
+
+
 def test_a_state_survives_its_json_and_nothing_else_is_one():
     for document in (state(), mount()):
         assert from_plain(NodeState, plain(document)) == document

@@ -15,7 +15,7 @@ from source_code import ROOT
 LIMITS = {
     "hand_eye_calib": (217_000, 6.6, 925),
     "test": (175_500, 7.3, 315),
-    "reproduction": (49_000, 7.5, 200),
+    "reproduction": (49_900, 7.5, 200),
 }
 
 _NOT_CODE = {

@@ -157,7 +157,7 @@ def check_agreement(
     if same := check_same(best):
         return same
     speed_m_s = usual_speed(pose_pairs.stamps_ns, se3.translation_of(pose_pairs.Ts_pw_p))
-    suspects = _slow_suspects(pose_pairs, motions, X, speed_m_s)
+    suspects = slow_suspects(pose_pairs, motions, X, speed_m_s)
     short_motions = pairs_over(pose_pairs, SHORT_S, _MAX_SHORT_MOTIONS)
     if fast := delay_regression(pose_pairs, short_motions, X):
         suspects += delay_suspects(fast, pose_pairs, speed_m_s, offset_s)
@@ -172,7 +172,7 @@ def check_agreement(
     return findings
 
 
-def _slow_suspects(
+def slow_suspects(
     pose_pairs: PosePairs, motions: MotionPairs, X: FloatArray, speed_m_s: float
 ) -> list[Suspect]:
     """Return the fault that explains most of the motions over some seconds.

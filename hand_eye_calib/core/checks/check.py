@@ -61,7 +61,7 @@ _SLOW_GAP_INTERVALS = 1.5
 _LEVER_ARM_SIGMAS = 3.0
 
 # Largest number of motions over some seconds, for the regression on small faults.
-_MAX_MOTIONS = 1500
+MAX_MOTIONS = 1500
 
 # Shortest duration of both streams of a live session before they are checked.
 MIN_DURATION_S = 20.0
@@ -412,7 +412,7 @@ def _explain(
             return explanation, [*explanation.findings]
         if correlation.is_clear:
             pairs = streams.synchronised
-            coordinates = agreement.check_coordinates(pairs, _motions(pairs, _MAX_MOTIONS))
+            coordinates = agreement.check_coordinates(pairs, _motions(pairs, MAX_MOTIONS))
             return None, coordinates or [*explanation.findings]
     # The angular rates of a frozen stream are no evidence.
     if is_frozen:
@@ -469,7 +469,7 @@ def _check_agreeing(
     if copied:
         return [*copied, *agreement.check_same(best)]
     pose_pairs = corrected.synchronised.child_scaled(fit.scale)
-    motions = _motions(pose_pairs, _MAX_MOTIONS)
+    motions = _motions(pose_pairs, MAX_MOTIONS)
     offset_s = arguments.time_offset_s + offset.seconds
     findings = agreement.check_agreement(pose_pairs, motions, fit.T_parent_child, best, offset_s)
     if arguments.are_exact:

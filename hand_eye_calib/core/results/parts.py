@@ -112,6 +112,15 @@ def advice_of(result: Any) -> list[str]:
     return [text for text in advice if text]
 
 
+def facts_of(result: Any, *without: str) -> list[str]:
+    """Return further lines about the parts of a result, except the parts ``without``."""
+    facts = []
+    for name, value in result.parts.items():
+        if name not in without:
+            facts += part(name).facts(value, result)
+    return facts
+
+
 @cache
 def part(name: str) -> Part:
     """Return a part by its name."""

@@ -62,17 +62,27 @@ class DetectabilityPart(Part):
             return []
         facts = []
         if errors := _amounts(value.errors):
-            facts.append(f"Smallest detectable error: {errors}")
-        if shifts := _amounts(value.shifts):
-            facts.append(f"Smallest detectable shift of the mount half-way: {shifts}")
-        if math.isfinite(value.time_offset_s) and math.isfinite(value.scale):
-            milliseconds = two_digits(1e3 * value.time_offset_s)
-            percent = two_digits(1e2 * value.scale)
             facts.append(
-                f"Smallest detectable error of the clocks: {milliseconds} ms; of the child's "
-                f"lengths: {percent}%"
+                f"An error of the result would have shown from {errors} on{_of_streams(value)}: "
+                "half of the recording contradicts such an error in nine of ten trials"
+            )
+        if shifts := _amounts(value.shifts):
+            facts.append(
+                f"A shift of the mount half-way would have shown from {shifts} on: the stream "
+                "checks report such a shift in nine of ten trials"
             )
         return facts
+
+
+def _of_streams(value: Detectability) -> str:
+    """Return the errors of clock and scale that would have shown; an empty text if none would."""
+    if not (math.isfinite(value.time_offset_s) and math.isfinite(value.scale)):
+        return ""
+    milliseconds = two_digits(1e3 * value.time_offset_s)
+    percent = two_digits(1e2 * value.scale)
+    return (
+        f", one of the clocks from {milliseconds} ms and one of the child's lengths from {percent}%"
+    )
 
 
 def _amounts(sizes: Mapping[str, float]) -> str:

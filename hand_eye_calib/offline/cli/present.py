@@ -22,7 +22,7 @@ from hand_eye_calib.core.results.document import (
     transforms_of,
     usable_numbers,
 )
-from hand_eye_calib.core.results.parts import advice_of, part
+from hand_eye_calib.core.results.parts import advice_of, facts_of, part
 from hand_eye_calib.core.results.records import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.core.results.verdict import shown
 from hand_eye_calib.offline.cli.options import (
@@ -171,8 +171,7 @@ def as_lines(
         )
     if with_details:
         details += [f"{name}: {value}" for name, value in summary(calibration).items()]
-        for name, value in calibration.parts.items():
-            details += part(name).facts(value, calibration)
+        details += facts_of(calibration)
     if details:
         lines.append("Details")
     for detail in details:

@@ -31,7 +31,7 @@ from hand_eye_calib.core.results.document import (
     transforms_of,
     usable_numbers,
 )
-from hand_eye_calib.core.results.parts import advice_of, part
+from hand_eye_calib.core.results.parts import advice_of, facts_of
 from hand_eye_calib.core.results.records import ROTATIONS
 from hand_eye_calib.core.results.verdict import shown, target_of
 from hand_eye_calib.offline.report.evidence import Evidence, gather, summarise
@@ -165,7 +165,7 @@ def render(
         angles_of=partial(angles_in_words, result=calibration),
         axes=list(_axes(calibration)),
         allowance=allowance_in_words(calibration),
-        facts=_facts(calibration),
+        facts=facts_of(calibration, "stops"),
         advice=advice,
         command=command,
         unknown=text.listing(by_hand),
@@ -199,15 +199,6 @@ def _other_transforms(calibration: Calibration) -> list[tuple[Notation, tuple[st
         (transforms[name], (printable(extra.source), printable(extra.target)))
         for name, extra in extra_transforms(calibration).items()
     ]
-
-
-def _facts(calibration: Calibration) -> list[str]:
-    """Return the facts of the parts of a result; stops have a section of their own."""
-    facts = []
-    for name, value in calibration.parts.items():
-        if name != "stops":
-            facts += part(name).facts(value, calibration)
-    return facts
 
 
 def _kind_of_result(calibration: Calibration) -> str:

@@ -12,6 +12,7 @@ from hand_eye_calib.core.base.text import duration, listing
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.context import Comparison
+from hand_eye_calib.core.results.parts import facts_of
 from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.online.live.progress import AXIS_KEYS
 from hand_eye_calib.online.live.state import Condition, InputState, Level, ResultState, as_printed
@@ -136,6 +137,7 @@ def state_of_result(result: Calibration, age_s: float) -> ResultState:
         time_offset_s=result.time_offset_s,
         scale=result.scale,
         age_s=age_s,
+        facts=tuple(facts_of(result)),
     )
 
 

@@ -99,6 +99,8 @@ class ResultState:
     pose, pose_sigma : mapping of str to float or None
         x, y, z (m), roll, pitch, yaw (rad) as printed, and standard deviations. None for an axis
         that is not determined.
+    facts : tuple of str
+        Sentences about the evidence, such as the smallest error that would have shown.
     age_s : float
         Time since the solve (s).
     """
@@ -115,6 +117,7 @@ class ResultState:
     time_offset_s: float
     scale: float
     age_s: float
+    facts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -165,7 +165,7 @@ def _view(state: NodeState, silent_s: float) -> View:
 
 def _with_result(view: View, state: NodeState) -> View:
     """Add the result to the view of a node that calibrates; a refuted result has no pose."""
-    view = replace(view, result=tuple(_result(state)))
+    view = replace(view, result=tuple(_result(state, view.word)))
     if result := state.result:
         view = replace(view, reasons=result.reasons)
         if state.standing is not Standing.REFUTED:
@@ -246,14 +246,20 @@ def _health(state: NodeState, is_old: bool) -> Iterator[Line]:
         yield Line(Tone.UNKNOWN if is_old else tone, name, text)
 
 
-def _result(state: NodeState) -> Iterator[Line]:
-    """Yield the lines of the result: verdict, warnings, priors, comparison, broadcast and files."""
+def _result(state: NodeState, word: str) -> Iterator[Line]:
+    """Yield the lines of the result: verdict, warnings, priors, comparison, broadcast and files.
+
+    ``word`` is the status on the board. At the end, lines with the evidence follow the warnings.
+    """
     result = state.result
     verdict = result.verdict if result else "no result yet"
     yield Line(_TONES.get(verdict, Tone.UNKNOWN), "verdict", verdict)
     if result:
         for warning in result.warnings:
             yield Line(Tone.ACT, "note", typeset(warning))
+        if word == DONE:
+            for fact in result.facts:
+                yield Line(Tone.GOOD, "evidence", typeset(fact))
     yield from _prior_lines(state)
     if state.progress and (comparison := state.progress.comparison):
         tone = _TONES.get(comparison.verdict, Tone.UNKNOWN)
