@@ -142,8 +142,7 @@ def test_a_first_result_takes_20_s_of_motion_or_a_rotation_of_30_deg(
     assert (cycle.published is not None) == has_result
     if not has_result:
         assert text == (
-            "Move the sensors: a first result takes 20 s of motion or a rotation of 30 deg, "
-            "so far 19 s and 29 deg."
+            "Move the sensors for 20 s, or turn them by 30 deg. So far: 19 s and 29 deg."
         )
         assert cycle.goal.progress.sentence == text
 
@@ -258,6 +257,15 @@ def test_a_solve_on_a_busy_computer_is_named_and_its_pause_is_short(cycle, lines
     assert slow == "The computer is slow: a result takes 10 s."
     cycle.conclude(dataclasses.replace(answer, seconds=1.0, processor_s=0.5))
     assert cycle.extrinsic_state(True, (Broadcast.OFF, "")).slow == ""
+
+
+def test_the_next_solve_has_hurry_if_other_programs_have_held_up_the_last_one(cycle):
+    hurries = [cycle.jobs[-1].has_hurry]
+    for seconds, processor_s in ((60.0, 0.5), (1.0, 0.1), (5.0, 4.9), (5.0, 0.4)):
+        cycle.conclude(Answer(0, seconds, seen(30.0), result(), processor_s=processor_s))
+        cycle._start()
+        hurries.append(cycle.jobs[-1].has_hurry)
+    assert hurries == [False, True, False, False, True]
 
 
 def test_a_running_solve_that_takes_long_is_named_before_it_ends(cycle, monkeypatch):

@@ -39,6 +39,15 @@ solving.excitation = noisy
 solving.main()
 """
 
+PRIORITY = """
+import os
+from hand_eye_calib.online.live import solving
+def priority(job):
+    return solving.Answer(job.session, os.getpriority(os.PRIO_PROCESS, 0))
+solving.answer = priority
+solving.main()
+"""
+
 
 def poses(**options):
     calibrator = Calibrator(CalibratorConfig(**{"reference": "B3", **options}))
@@ -108,6 +117,15 @@ def test_gives_the_same_bits_as_here_job_after_job(start):
         assert (remote.time_offset is None) == ("time_offset" not in options)
         if remote.time_offset is not None:
             assert remote.time_offset.seconds == work.snapshot().resolved.time_offset.seconds
+
+
+def test_only_a_job_in_a_hurry_has_the_priority_of_the_node(start):
+    of_node = os.getpriority(os.PRIO_PROCESS, 0)
+    lower = min(of_node + 3, 19)
+    process = start(PRIORITY)
+    for has_hurry, priority in ((False, lower), (True, of_node), (False, lower)):
+        process.submit(Job(0, poses(), has_hurry=has_hurry))
+        assert process.next().seconds == priority
 
 
 def test_libraries_that_print_do_not_disturb_the_answers(start):

@@ -61,10 +61,15 @@ def too_little_in_words(motion: Excitation) -> str:
     """Return a sentence about the motion that a first result needs, and the motion so far."""
     rotation_deg = np.degrees(motion.rotation.max())
     return (
-        f"Move the sensors: a first result takes {_MIN_MOTION_S:g} s of motion or a rotation of "
-        f"{np.degrees(_MIN_ROTATION_RAD):.0f} deg, so far {motion.motion_s:.0f} s and "
+        f"Move the sensors for {_MIN_MOTION_S:g} s, or turn them by "
+        f"{np.degrees(_MIN_ROTATION_RAD):.0f} deg. So far: {motion.motion_s:.0f} s and "
         f"{rotation_deg:.0f} deg."
     )
+
+
+def is_held_up(seconds: float, processor_s: float) -> bool:
+    """Whether a solve waited for the processor for more than half of its duration."""
+    return processor_s < _BUSY_SHARE * seconds
 
 
 def slow_in_words(seconds: float, last_s: float, last_processor_s: float) -> str:
@@ -79,7 +84,7 @@ def slow_in_words(seconds: float, last_s: float, last_processor_s: float) -> str
     """
     if seconds < _SLOW_SOLVE_S:
         return ""
-    is_busy = last_processor_s < _BUSY_SHARE * last_s or last_s < _SLOW_SOLVE_S
+    is_busy = is_held_up(last_s, last_processor_s) or last_s < _SLOW_SOLVE_S
     word = "busy" if is_busy else "slow"
     # Whole tens: the sentence does not change with every second of a running solve.
     return f"The computer is {word}: a result takes {duration(10.0 * (seconds // 10.0))}."

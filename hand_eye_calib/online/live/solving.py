@@ -18,6 +18,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -47,6 +48,10 @@ HANGS_AFTER_S = 600.0
 
 # Length (ns) of the newest part of the session. Advice about the motion refers to this part.
 _NEWEST_NS = 60_000_000_000
+
+# Priority of a job without hurry, relative to that of the node: its callbacks come first. At
+# 2 x 400 Hz, the latency p99 of the callbacks was 5 ms, and 14 ms without a lower priority.
+_NICENESS = 3
 
 # Fewest poses, received and not paired yet, with which a stream is checked.
 _MIN_UNPAIRED = 200
@@ -91,12 +96,16 @@ class Job:
         Whether to check the streams after the solve.
     options : Options
         Options that an earlier check has set.
+    has_hurry : bool
+        Whether the job has the priority of the node. With a lower priority, a solve takes twice as
+        long while other programs keep the processor busy.
     """
 
     session: int
     calibrator: Calibrator
     check: bool = False
     options: Options = field(default_factory=dict)
+    has_hurry: bool = False
 
 
 @dataclass(frozen=True)
@@ -238,17 +247,19 @@ def _failure(error: Exception) -> Failure:
 def main() -> None:
     """Answer jobs until standard input ends.
 
-    Standard input ends with the node, even if the node crashes. The process has the priority of the
-    node: with a lower one, a solve takes minutes while other programs are busy. The callbacks of
-    the node are as fast with any priority.
+    Standard input ends with the node, even if the node crashes.
     """
     # Standard output is the pipe. What a library prints goes to standard error instead.
     outgoing = os.fdopen(os.dup(1), "wb")
     os.dup2(sys.stderr.fileno(), 1)
     jobs: queue.SimpleQueue[Job] = queue.SimpleQueue()
     threading.Thread(target=_receive, args=(jobs,), daemon=True).start()
+    # On Linux, a thread has a priority of its own, and no thread can raise its priority again.
+    at_low_priority = ThreadPoolExecutor(1, initializer=os.nice, initargs=(_NICENESS,))
     while True:
-        pickle.dump(answer(jobs.get()), outgoing, pickle.HIGHEST_PROTOCOL)
+        job = jobs.get()
+        result = answer(job) if job.has_hurry else at_low_priority.submit(answer, job).result()
+        pickle.dump(result, outgoing, pickle.HIGHEST_PROTOCOL)
         outgoing.flush()
         # The arrays of a job are in reference cycles. Without a collection, the memory of the
         # process grew by a half in 60 solves.
