@@ -120,7 +120,7 @@ def test_messages_that_give_no_pose_are_no_sign_of_life(node, stream):
         source.accept(last_ns, lambda pose=pose: pose)
     state = state_of(node)
     assert state.inputs[stream].level is Level.WARN
-    assert "has messages, but no new pose for 8 s: their stamps repeat" in (
+    assert "has messages, but no new pose for 8 s. Check the source: the stamps repeat" in (
         state.inputs[stream].text
     )
     assert (state.progress.is_paused, view_of(state).word) == (True, "PAUSED")
@@ -203,8 +203,32 @@ def test_two_publishers_on_one_topic_are_a_warning_with_their_names(node):
     state = state_of(node)
     assert (state.inputs["child"].level, state.inputs["child"].publishers) == (Level.WARN, 2)
     assert state.inputs["child"].text.startswith(
-        "/child_odom has 2 publishers, /bag and /vio: poses of several sources mix; stop all but"
+        "/child_odom has 2 publishers: /bag and /vio. Stop all but one, then reset"
     )
     view = view_of(state)
     assert (view.word, view.tone) == ("CHECK INPUT", Tone.ACT)
     assert np.all([line.tone is Tone.ACT for line in view.health if line.name == "child input"])
+
+
+def test_poses_of_two_publishers_stay_a_warning_until_a_reset(node):
+    run(node, 20.0)
+    with_result(node)
+    child = node.inputs[1]
+
+    def receive(numbers):
+        """Receive messages of two publishers; return the text of the input once one has ended."""
+        child.publishers = ("/vio", "/bag")
+        for number in numbers:
+            child.count_mixed(number)
+        child.publishers = ("/vio",)
+        return state_of(node).inputs["child"].text
+
+    # A publisher was started again, and the graph still contains the old one.
+    assert receive((*range(300, 320), *range(20))) == "10.0 Hz"
+    alternating = [number for k in range(20) for number in (320 + k, 20 + k)]
+    assert receive(alternating) == (
+        "/child_odom had 2 publishers: /bag and /vio. Their poses are mixed: reset"
+    )
+    child.restart()
+    run(node, 1.0)
+    assert state_of(node).inputs["child"].text == "10.0 Hz"

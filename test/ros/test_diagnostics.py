@@ -181,7 +181,7 @@ def test_a_dead_publisher_pauses_the_session_and_a_second_one_is_named(start_nod
 
     child = state(has_two_publishers, "the second publisher").inputs["child"]
     assert child.level is Level.WARN
-    assert "/child_odom has 2 publishers, /peer and /peer: poses of several sources" in child.text
+    assert "/child_odom has 2 publishers: /peer and /peer. Stop all but one" in child.text
     for publisher in (publishers[1], second):
         peer.node.destroy_publisher(publisher)
 

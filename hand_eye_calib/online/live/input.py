@@ -30,6 +30,9 @@ _MAX_LOST_SHARE = 0.01
 _MAX_REPEATED_SHARE = 0.5
 # Fewest messages from which a share of repeated stamps is computed.
 _MIN_MESSAGES = 20
+# Fewest turns of the publishers of a topic after which their poses are mixed in the session.
+_MIN_TURNS = 10
+
 # Number of reports, one a second, over which rates and shares are computed. A bad message is
 # reported for as many seconds.
 _REPORTS = 10
@@ -269,6 +272,12 @@ class PoseInput:
         self._sensor_frame = ""
         self._world_frame = ""
         self._longest_gap_ns = 0
+        # Number of the last message while the topic had several publishers, and how often a number
+        # was below the number before it.
+        self._mixed_number: int | None = None
+        self._n_turns = 0
+        # Names of the publishers whose poses are mixed in this session.
+        self._mixed: tuple[str, ...] = ()
         # Time (steady, s) of the last pose.
         self._taken_s: float | None = None
         self._is_new = because_of is None
@@ -297,6 +306,17 @@ class PoseInput:
         # After a restart of the publisher, its numbers begin anew.
         if expected is not None and sequence_number is not None:
             self._lost += max(sequence_number - expected, 0)
+
+    def count_mixed(self, sequence_number: int) -> None:
+        """Count the turns of the publishers of a topic that has several.
+
+        A publisher that was started again also takes a turn, but a single one.
+        """
+        last = self._mixed_number
+        self._mixed_number = sequence_number
+        self._n_turns += last is not None and sequence_number < last
+        if self._n_turns >= _MIN_TURNS and len(self.publishers or ()) > 1:
+            self._mixed = tuple(sorted(self.publishers or ()))
 
     def accept(self, stamp_ns: int, read: Callable[[], PoseFields]) -> None:
         """Process a message; ``read`` is called once its stamp is accepted."""
@@ -476,8 +496,8 @@ class PoseInput:
         """Return advice if many messages have no pose or repeat a stamp; empty otherwise."""
         if null_share > MUCH_NULL:
             return (
-                f"{share(null_share)} of the messages have no pose (null, not finite or without a "
-                "fix): check whether the source loses track"
+                f"{share(null_share)} of the messages have no pose: check whether the source loses "
+                "track"
             )
         n_repeated = accepted.refused_duplicate
         n_messages = n_repeated + accepted.received
@@ -500,19 +520,20 @@ class PoseInput:
             self._log.info(text, GOES_ON_S)
             return Level.WARN, text
         if self.publishers is not None and len(self.publishers) > 1:
-            names = listing(sorted(self.publishers))
-            text = (
-                f"{self.topic} has {len(self.publishers)} publishers, {names}: poses of several "
-                "sources mix; stop all but one, or use a topic for each, and reset"
-            )
+            names = sorted(self.publishers)
+            has_several = f"{self.topic} has {len(names)} publishers: {listing(names)}"
+            text = f"{has_several}. Stop all but one, then reset"
             self._log.warning(text)
             return Level.WARN, text
+        if self._mixed:
+            had_several = f"{self.topic} had {len(self._mixed)} publishers: {listing(self._mixed)}"
+            return Level.WARN, f"{had_several}. Their poses are mixed: reset"
         if lost_share < _MAX_LOST_SHARE:
             return Level.OK, f"{rate_hz:.1f} Hz"
-        advice = "free processor time for the node, or publish at a lower rate"
-        text = f"{lost_share:.1%} of the messages are lost: {advice}"
+        advice = "Free processor time, or publish at a lower rate"
+        text = f"{lost_share:.1%} of the messages are lost. {advice}"
         self._log.warning(f"{self.topic}: {text}")
-        return Level.WARN, f"{rate_hz:.1f} Hz; {text}"
+        return Level.WARN, f"{rate_hz:.1f} Hz, {text}"
 
     def _why_paused(self, steady_s: float, arrived_s: float) -> str:
         """Return why poses no longer arrive; empty if they arrive, or if the reason is unknown."""
@@ -526,8 +547,8 @@ class PoseInput:
             return ""
         without_s = steady_s - self._taken_s
         return (
-            f"{self.topic} has messages, but no new pose for {without_s:.0f} s: their stamps "
-            "repeat or are too late, or their poses are null; check the source"
+            f"{self.topic} has messages, but no new pose for {without_s:.0f} s. Check the source: "
+            "the stamps repeat or are too late, or the poses are null"
         )
 
 

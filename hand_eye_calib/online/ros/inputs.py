@@ -183,8 +183,11 @@ class TopicInput(RosInput):
 
     def _receive(self, data: bytes, info: Mapping[str, int]) -> None:
         """Process a message in its serialized form."""
-        # With several publishers, the sequence numbers are useless: each publisher has its own.
-        self.count(info["publication_sequence_number"] if self._n_publishers == 1 else None)
+        # Each publisher has its own sequence numbers.
+        number = info["publication_sequence_number"]
+        self.count(number if self._n_publishers == 1 else None)
+        if self._n_publishers > 1:
+            self.count_mixed(number)
         try:
             stamp_ns = messages.Cursor(data, is_ros1=False).stamp_ns()
         except messages.MALFORMED as error:
