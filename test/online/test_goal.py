@@ -36,9 +36,9 @@ FLAT = (0.5, 1.0, 90.0)
 
 
 def progress_after(goal, *results):
-    """Return the progress after results from 40 s of motion on, 10 s apart."""
+    """Return the progress after results from 40 s of motion on, 20 s apart."""
     for k, calibration in enumerate(results):
-        progress = goal.add(calibration, seen(40.0 + 10.0 * k))
+        progress = goal.add(calibration, seen(40.0 + 20.0 * k))
     return progress
 
 
@@ -51,23 +51,23 @@ def test_the_session_ends_once_more_motion_has_confirmed_the_targets():
     goal.add(result(sigmas_m=0.0201), seen(30.0))
     within = goal.add(result(sigmas_m=0.0199), seen(40.0))
     assert (within.done, within.limiting_axis, max(seconds_left(within))) == (False, "", 0.0)
-    assert within.sentence == "Confirming, 30 s: every axis is within its target. Go on."
-    assert within.seconds_left == 30.0
-    assert goal.add(result(), seen(50.0)).seconds_left == 15.0
-    done = goal.add(result(), seen(60.0))
+    assert within.sentence == "Confirming, 40 s: every axis is within its target. Go on."
+    assert within.seconds_left == 40.0
+    assert goal.add(result(), seen(50.0)).seconds_left == 30.0
+    done = goal.add(result(), seen(80.0))
     assert (done.done, done.limiting_axis, done.seconds_left) == (True, "", 0.0)
     assert done.sentence.startswith("Done: good to 5 mm and 0.057 deg")
 
 
 def test_a_result_beyond_its_target_begins_the_confirmation_anew():
     goal = Goal(TARGETS)
-    for motion_s, sigma_m in ((40.0, 0.01), (50.0, 0.03), (60.0, 0.01), (80.0, 0.01)):
+    for motion_s, sigma_m in ((20.0, 0.01), (30.0, 0.03), (40.0, 0.01), (70.0, 0.01)):
         assert not goal.add(result(sigmas_m=sigma_m), seen(motion_s)).done
-    assert goal.add(result(), seen(90.0)).done
+    assert goal.add(result(), seen(80.0)).done
 
 
-@pytest.mark.parametrize(("since_s", "least_s"), [(20.0, 40.0), (100.0, 150.0), (400.0, 480.0)])
-def test_the_confirmation_takes_half_of_the_motion_from_20_to_75_s(since_s, least_s):
+@pytest.mark.parametrize(("since_s", "least_s"), [(10.0, 30.0), (60.0, 120.0), (400.0, 480.0)])
+def test_the_confirmation_takes_as_long_as_the_motion_before_20_to_75_s(since_s, least_s):
     goal = Goal(TARGETS)
     for motion_s in np.arange(since_s, least_s, 10.0):
         assert not goal.add(result(), seen(motion_s)).done
@@ -90,7 +90,7 @@ def test_a_target_below_the_allowance_is_no_fault_of_the_motion():
     progress = Goal(TARGETS).add(result(covariance_allowance=allowance), seen(40.0))
     assert progress.target_is_too_small
     assert progress.sentence == (
-        "More motion cannot make x good to 2 cm: 3 cm is the allowance for constant errors. "
+        "No motion makes x good to 2 cm: the allowance for constant errors is 3 cm. "
         "Stop and save, or set a larger target."
     )
 
@@ -128,7 +128,7 @@ def test_time_left_follows_from_the_variance_that_falls_with_time():
     assert progress.limiting_axis == "y"
     np.testing.assert_allclose(seconds_left(progress), [0, 120, 0, 0, 0, 0])
     assert progress.sentence == (
-        "Go on for about 4 min: y takes longest, tighter curves to both sides help most."
+        "Go on for about 4 min, y takes longest. Tighter curves to both sides help most."
     )
 
 
@@ -142,7 +142,7 @@ def test_the_motion_of_the_last_minute_counts_if_it_is_better():
     progress = goal.add(better, seen(320.0), newest_motion=seen(60.0, (0.5, 9.0, 90.0)))
     assert progress.axes["z"].seconds_left == pytest.approx(90.0)
     assert progress.sentence == (
-        "Go on for about 3 min: z takes longest, this motion is right, more of it."
+        "Go on for about 3 min, z takes longest. This motion is right, more of it."
     )
 
 
@@ -154,17 +154,17 @@ def test_the_motion_is_not_to_be_changed_while_the_motion_asked_for_is_driven():
     on_ramp = goal.add(hidden, seen(64.0, FLAT), newest_motion=ramp)
     assert not on_ramp.will_not_get_there
     assert on_ramp.sentence == (
-        "z is not determined well enough yet: this motion is right, more of it."
+        "z is not determined well enough yet. This motion is right, more of it."
     )
 
 
-def test_the_time_left_only_shrinks_by_one_step_at_a_result():
+def test_the_time_left_only_shrinks_by_two_steps_at_a_result():
     goal = Goal(TARGETS)
     times_s = []
     for motion_s, sigma_m in enumerate((0.043, 0.0205, 0.04, 0.04, 0.03, 0.004, 0.021, 0.03), 40):
         progress = goal.add(result(sigmas_m=(0.004, sigma_m, 0.004)), seen(motion_s))
         times_s.append(seconds_left(progress)[1])
-    assert times_s == [180.0, 120.0, 120.0, 120.0, 90.0, 0.0, 15.0, 15.0]
+    assert times_s == [180.0, 90.0, 90.0, 90.0, 60.0, 0.0, 15.0, 15.0]
 
 
 def test_the_time_of_a_confirmation_does_not_follow_a_longer_estimate():
@@ -172,14 +172,14 @@ def test_the_time_of_a_confirmation_does_not_follow_a_longer_estimate():
     goal.add(result(sigmas_m=0.06), seen(70.0))
     assert goal.progress.seconds_left > 240.0
     within = goal.add(result(sigmas_m=0.01), seen(80.0))
-    assert within.sentence.startswith("Confirming, 60 s: ")  # half of 80 s, in steps
+    assert within.sentence.startswith("Confirming, 75 s: ")
 
 
 def test_the_end_of_a_confirmation_is_reported_to_a_few_seconds():
     goal = Goal(TARGETS)
-    sentences = [goal.add(result(), seen(motion_s)).sentence for motion_s in (40.0, 53.0, 57.0)]
+    sentences = [goal.add(result(), seen(motion_s)).sentence for motion_s in (40.0, 73.0, 77.0)]
     times = [sentence.partition(":")[0] for sentence in sentences]
-    assert times == ["Confirming, 30 s", "Confirming, 8 s", "Confirming, 4 s"]
+    assert times == ["Confirming, 40 s", "Confirming, 8 s", "Confirming, 4 s"]
 
 
 def test_a_much_longer_time_left_is_a_new_estimate():
@@ -210,9 +210,9 @@ def test_a_good_result_stays_when_the_robot_is_parked_or_later_ones_are_clearly_
     goal = Goal(TARGETS)
     progress_after(goal, result(), result(), result())
     best = result(sigmas_m=0.004)
-    goal.add(best, seen(70.0))
+    goal.add(best, seen(90.0))
     for _ in range(5):
-        parked = goal.add(result(sigmas_m=0.03), seen(70.0))
+        parked = goal.add(result(sigmas_m=0.03), seen(90.0))
     assert parked.done
     assert goal.best is best
     goal.restart()
@@ -222,11 +222,11 @@ def test_a_good_result_stays_when_the_robot_is_parked_or_later_ones_are_clearly_
 def test_the_newest_of_equally_good_results_is_kept():
     goal = Goal(TARGETS)
     progress_after(goal, *[result(sigmas_m=0.004)] * 3)
-    for motion_s, sigma_m in ((64.0, 0.0045), (66.0, 0.0049)):
+    for motion_s, sigma_m in ((84.0, 0.0045), (86.0, 0.0049)):
         newest = result(sigmas_m=sigma_m)
         goal.add(newest, seen(motion_s))
         assert goal.best is newest
-    goal.add(result(sigmas_m=0.0055), seen(68.0))  # a quarter worse than the best there was
+    goal.add(result(sigmas_m=0.0055), seen(88.0))  # a quarter worse than the best there was
     assert goal.best is newest
 
 
@@ -241,10 +241,7 @@ def test_a_saved_result_tells_how_far_the_session_was(tmp_path):
     assert f"the session: {progress.sentence}" in text
 
 
-ON_A_FLAT_FLOOR = (
-    "tilt the sensors over a ramp or a kerb, or measure it by hand, or record the clouds of two "
-    "lidars and run calibrate on the bag"
-)
+ON_A_FLAT_FLOOR = "Tilt the sensors over a ramp or a kerb, or measure it by hand"
 
 
 def test_an_axis_that_stays_unobservable():
@@ -253,15 +250,15 @@ def test_an_axis_that_stays_unobservable():
     assert not goal.add(hidden, seen(20.0, FLAT)).will_not_get_there
     stuck = goal.add(hidden, seen(40.0, FLAT))
     assert (stuck.will_not_get_there, stuck.limiting_axis) == (True, "z")
-    assert stuck.sentence == f"This motion will not determine z well enough: {ON_A_FLAT_FLOOR}."
+    assert stuck.sentence == f"This motion will not determine z well enough. {ON_A_FLAT_FLOOR}."
 
 
 @pytest.mark.parametrize(
     ("axis", "rotation_deg", "words"),
     [
         ("y", (1, 1, 2), "move in curves, to both sides"),
-        ("z", (1, 2, 90), ON_A_FLAT_FLOOR),
-        ("y", (1, 90, 2), ON_A_FLAT_FLOOR),
+        ("z", (1, 2, 90), ON_A_FLAT_FLOOR.lower()),
+        ("y", (1, 90, 2), ON_A_FLAT_FLOOR.lower()),
         ("x", (1, 2, 90), "tighter curves to both sides help most"),
         ("roll", (1, 2, 90), "tighter curves to both sides help most"),
         ("yaw", (1, 2, 90), "move farther, straight on and in curves"),

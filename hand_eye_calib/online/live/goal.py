@@ -20,28 +20,29 @@ import numpy as np
 
 from hand_eye_calib.core.assessment.excitation import MIN_ROTATION, Excitation, helpful_motion
 from hand_eye_calib.core.base.arrays import FloatArray
-from hand_eye_calib.core.base.text import amount, axes_in_words, duration
+from hand_eye_calib.core.base.text import amount, axes_in_words, capital, duration
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, SolveStatus, Verdict
 from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.core.results.verdict import what_is_known
 from hand_eye_calib.online.live.progress import AXIS_KEYS, AxisProgress, Progress
 
-# Motion that confirms a first result within the targets, as a share of the motion of that result.
-_CONFIRMING_SHARE = 0.5
-# Bounds of the confirming motion (s).
+# Bounds of the motion (s) that confirms a first result within the targets. Within these bounds, the
+# motion is as long as the motion of that result.
 _MIN_CONFIRMATION_S = 20.0
 _MAX_CONFIRMATION_S = 75.0
 
 # Shortest motion (s) of a session in which the motion may be called useless for an axis.
 _MIN_MOTION_TO_JUDGE_S = 30.0
 
-# Values (s) to which a reported time left is rounded. The reported time decreases by one step for
-# each result. Beyond the last finite step, the present motion cannot reach the target.
+# Values (s) to which a reported time left is rounded. Beyond the last finite step, the present
+# motion cannot reach the target.
 _STEPS_S = np.array([0.0, 15, 30, 60, 90, 120, 180, 240, 360, 600, 900, 1200, np.inf])
 
-# Values (s) to which the end of a confirmation is rounded up: this time is known, not estimated.
-_LAST_STEPS_S = (4.0, 8.0)
+# Values (s) to which the time of a confirmation is rounded up: it is known, not estimated.
+_CONFIRMING_STEPS_S = np.array([4.0, 8, 12, 16, 20, 30, 40, 50, 60, 75])
 
+# Largest decrease of a reported time left from result to result, in steps.
+_MAX_DECREASE_STEPS = 2
 # Increase of a time left, in steps, from which on the reported time increases, too.
 _MIN_INCREASE_STEPS = 3
 
@@ -287,17 +288,14 @@ class Goal:
         left_s = self._time_left(newest, ratios)
         total_s = float(left_s.max())
         is_confirming = total_s <= 0.0
-        if not is_confirming:
-            # The confirmation begins when the last axis is within its target.
-            total_s += _confirming_motion(motion_s + total_s)
-        else:
-            total_s = self._confirmation_s(newest)
-            # Forget the last reported total: the new one is known, not estimated, so that it may be
-            # shorter by several steps.
+        # The confirmation begins when the last axis is within its target.
+        total_s += _confirming_motion(motion_s + total_s)
+        *axes_left_s, total_s = self._in_steps(np.append(left_s, total_s))
+        if is_confirming:
+            step = np.searchsorted(_CONFIRMING_STEPS_S, 0.99 * self._confirmation_s(newest))
+            total_s = float(_CONFIRMING_STEPS_S[step])
+            # Forget the last reported total, which was estimated.
             self._steps[-1] = len(_STEPS_S) - 1
-        *axes_left_s, total_in_steps_s = self._in_steps(np.append(left_s, total_s))
-        last_steps_s = [step_s for step_s in _LAST_STEPS_S if is_confirming and total_s <= step_s]
-        total_s = min([total_in_steps_s, *last_steps_s])
         axes = self._by_axis(newest.sigmas, axes_left_s)
         left_text = duration(total_s).replace(".0 ", " ")
         progress = Progress(
@@ -340,18 +338,18 @@ class Goal:
         is_long = self._results[-1].motion_s >= _MIN_MOTION_TO_JUDGE_S
         will_not_get_there = is_long and row.seconds_left == np.inf and not is_helpful
         assert self._motion is not None
-        motion = helpful_motion([axis], self._motion)
+        motion = capital(helpful_motion([axis], self._motion))
         axis_text = axes_in_words([axis])
         if will_not_get_there:
-            sentence = f"This motion will not determine {axis_text} well enough: {motion}."
+            sentence = f"This motion will not determine {axis_text} well enough. {motion}."
         else:
             if is_helpful:
-                motion = "this motion is right, more of it"
+                motion = "This motion is right, more of it"
             if np.isfinite(progress.seconds_left):
                 left = duration(progress.seconds_left)
-                sentence = f"Go on for about {left}: {axis_text} takes longest, {motion}."
+                sentence = f"Go on for about {left}, {axis_text} takes longest. {motion}."
             else:
-                sentence = f"{axis_text} is not determined well enough yet: {motion}."
+                sentence = f"{axis_text} is not determined well enough yet. {motion}."
         return replace(
             progress,
             sentence=sentence,
@@ -372,7 +370,7 @@ class Goal:
         )
 
     def _in_steps(self, left_s: FloatArray) -> list[float]:
-        """Round times left (7,), of six axes and in all, to steps that decrease one by one.
+        """Round times left (7,), of six axes and in all, to steps that decrease slowly.
 
         Estimates of the time left jump from result to result. So the reported time increases only
         if the new time is longer by several steps, unknown, or follows an unknown time.
@@ -384,7 +382,7 @@ class Goal:
         has_infinite = (before == infinite) | (steps == infinite)
         is_new = has_infinite | (steps == 0) | (steps >= before + _MIN_INCREASE_STEPS)
         # An axis that was within its target may exceed it again by the smallest step.
-        slower = np.clip(steps, before - 1, np.maximum(before, 1))
+        slower = np.clip(steps, before - _MAX_DECREASE_STEPS, np.maximum(before, 1))
         self._steps = np.where(is_new, steps, slower)
         return [float(seconds) for seconds in _STEPS_S[self._steps]]
 
@@ -428,8 +426,7 @@ def _own_faults(calibration: Calibration) -> list[str]:
 
 def _confirming_motion(motion_s: float) -> float:
     """Return the motion (s) that confirms a first result within the targets at ``motion_s``."""
-    share_s = _CONFIRMING_SHARE * motion_s
-    return min(max(share_s, _MIN_CONFIRMATION_S), _MAX_CONFIRMATION_S)
+    return min(max(motion_s, _MIN_CONFIRMATION_S), _MAX_CONFIRMATION_S)
 
 
 def _is_helpful(motion: Excitation, axis: str) -> bool:
@@ -447,7 +444,7 @@ def _is_helpful(motion: Excitation, axis: str) -> bool:
 def _too_small_in_words(axis: str, target: float, allowance: float) -> str:
     """Return the sentence about a target below the allowance."""
     return (
-        f"More motion cannot make {axes_in_words([axis])} good to {amount(axis, target)}: "
-        f"{amount(axis, allowance)} is the allowance for constant errors. "
+        f"No motion makes {axes_in_words([axis])} good to {amount(axis, target)}: "
+        f"the allowance for constant errors is {amount(axis, allowance)}. "
         "Stop and save, or set a larger target."
     )
