@@ -100,9 +100,16 @@ def test_an_arm_is_not_told_to_drive():
 def test_a_vehicle_is_told_to_drive_over_a_ramp():
     seen = seen_in(planar_poses(300))
     assert seen.drives
-    assert excitation.what_is_missing(seen) == (
+    advice = (
         "z cannot be determined from the motion so far: tilt the sensors over a ramp or a kerb, or "
-        "measure it by hand, or record the clouds of two lidars and run calibrate on the bag"
+        "measure it by hand"
+    )
+    assert excitation.what_is_missing(seen) == advice
+    # Only a recording may contain clouds.
+    poses = planar_poses(300)
+    recorded = calibrate(as_trajectory(poses), as_trajectory(child_of(poses)), reference="B5")
+    assert excitation.what_is_missing(seen, recorded) == (
+        f"{advice}, or record the clouds of two lidars and run calibrate on the bag"
     )
 
 

@@ -204,6 +204,14 @@ REACHED = {"done": True, "precision": "good to 4 mm"}
             *(0.5, Tone.ACT, "CHECK THE STREAMS", "Lengths are feet."),
         ),
         (
+            state(checks=replace(CHECKS, level=Level.WARN, text="a; b: c", gravest="a")),
+            *(0.5, Tone.ACT, "CHECK THE STREAMS", "A."),
+        ),
+        (
+            state(checks=replace(CHECKS, level=Level.WARN, text="a; b: c", gravest="a " * 16)),
+            *(0.5, Tone.ACT, "CHECK THE STREAMS", "The streams have a fault: read the checks"),
+        ),
+        (
             state(checks=replace(CHECKS, level=Level.WARN, age_s=None)),
             *(0.5, Tone.BUSY, "GO ON", "Go on for"),
         ),
@@ -330,6 +338,10 @@ def test_a_session_is_done_with_the_reason_of_its_verdict():
     assert view.text == "Known. Stop and save. USE WITH CARE: a: b."
     saved = view_of(replace(done, saved=SAVED))
     assert (saved.tone, saved.advice) == (Tone.ACT, "USE WITH CARE: a: b.")
+    long_reason = replace(careful.result, reasons=("a " * 16,))
+    careful = replace(careful, result=long_reason)
+    view = view_of(state(at={"done": True, "precision": "known"}, extrinsic=careful))
+    assert view.text == "Known. Stop and save. USE WITH CARE: read the reasons below."
 
 
 def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():

@@ -40,6 +40,11 @@ _LONG_STEP = 0.3
 # Manoeuvres that turn a vehicle about its x, y and z.
 _MANOEUVRES = ("one wheel over a kerb", "over a ramp or a bump", "curves to both sides")
 
+# Advice about the height of a vehicle that has only turned about its vertical axis, and what a
+# recording, but no live session, may contain in addition.
+_ON_A_FLAT_FLOOR = "tilt the sensors over a ramp or a kerb, or measure it by hand"
+_WITH_LIDARS = ", or record the clouds of two lidars and run calibrate on the bag"
+
 
 @dataclass(frozen=True)
 class Excitation:
@@ -190,7 +195,10 @@ def what_is_missing(seen: Excitation, calibration: Calibration | None = None) ->
         axes = [dof.name for dof in verdicts if dof.verdict is DofVerdict.WEAK]
     if not axes:
         return ""
-    return f"{axes_in_words(axes)} {problem} the motion so far: {helpful_motion(axes, seen)}"
+    motion = helpful_motion(axes, seen)
+    if calibration and motion == _ON_A_FLAT_FLOOR:
+        motion += _WITH_LIDARS
+    return f"{axes_in_words(axes)} {problem} the motion so far: {motion}"
 
 
 def helpful_motion(axes: Sequence[str], seen: Excitation) -> str:
@@ -241,9 +249,6 @@ def _motion_for_only_axis(name: str, others: Sequence[int], seen: Excitation) ->
     if name in ROTATIONS:
         return "move farther, straight on and in curves"
     if seen.drives:
-        return (
-            "tilt the sensors over a ramp or a kerb, or measure it by hand, or record the clouds "
-            "of two lidars and run calibrate on the bag"
-        )
+        return _ON_A_FLAT_FLOOR
     axes = " and ".join("xyz"[other] for other in others)
     return f"tilt the sensors about {axes}, or measure it by hand"

@@ -221,10 +221,20 @@ class InputState(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class ChecksState(Part):
-    """Findings of the stream checks; ``age_s`` is None before the first check."""
+    """Findings of the stream checks.
+
+    Attributes
+    ----------
+    age_s : float or None
+        Age of the last check (s); None before the first check.
+    findings : tuple of str
+    gravest : str
+        The gravest finding that counts, without cause and remedy; empty if there is none.
+    """
 
     age_s: float | None = None
     findings: tuple[str, ...] = ()
+    gravest: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

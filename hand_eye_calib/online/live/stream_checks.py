@@ -99,6 +99,7 @@ class StreamChecks:
             findings=tuple(
                 f"{finding.severity.value}: {_in_parameters(finding)}" for finding in findings
             ),
+            gravest=self.findings[0].what if self._faults else "",
         )
 
 

@@ -9,6 +9,7 @@ from hand_eye_calib.core.base.text import AXIS_UNITS, amount, capital
 from hand_eye_calib.core.results.context import Difference
 from hand_eye_calib.online.live.progress import AXIS_KEYS
 from hand_eye_calib.online.live.state import (
+    ChecksState,
     Level,
     NodeState,
     Part,
@@ -23,6 +24,11 @@ MOVED = "MOUNT MOVED"
 CHANGE_MOTION = "CHANGE THE MOTION"
 CHANGE_TARGET = "CHANGE THE TARGET"
 DONE = "DONE"
+
+
+# Most words of a text in a headline: a person at the machine reads it aloud in one breath. Longer
+# texts are on the same page below the headline.
+_MAX_WORDS = 15
 
 
 class Headline(NamedTuple):
@@ -61,8 +67,20 @@ def _alarm(state: NodeState) -> Headline | None:
     for tone, word, level, part in _conditions(state):
         if part is not None and part.level is level:
             advice = "Check it, then recalibrate or acknowledge." if word == MOVED else ""
-            return Headline(tone, word, _sentence(part.text), advice)
+            return Headline(tone, word, _sentence(_headline_text(part)), advice)
     return None
+
+
+def _headline_text(part: Part) -> str:
+    """Return the text of a part in a condition that requires a person."""
+    if not isinstance(part, ChecksState) or not part.gravest:
+        return part.text
+    return _in_one_breath(part.gravest, "the streams have a fault: read the checks below")
+
+
+def _in_one_breath(text: str, otherwise: str) -> str:
+    """Return a text if a person can read it aloud in one breath, otherwise another text."""
+    return text if len(text.split()) <= _MAX_WORDS else otherwise
 
 
 def _conditions(state: NodeState) -> Iterator[tuple[Tone, str, Level, Part | None]]:
@@ -140,8 +158,10 @@ def _at_goal(state: NodeState, session: ProgressState) -> Headline:
     caution = ""
     if state.result and state.result.verdict != "USE":
         tone = Tone.ACT
-        gravest = state.result.reasons[:1]
-        caution = _sentence(": ".join((state.result.verdict, *gravest)))
+        reasons = [
+            _in_one_breath(reason, "read the reasons below") for reason in state.result.reasons[:1]
+        ]
+        caution = _sentence(": ".join((state.result.verdict, *reasons)))
     if state.result and session.comparison and session.comparison.verdict == "moved":
         tone = Tone.ACT
         displacement = _displacement(session.comparison.differences[0])
