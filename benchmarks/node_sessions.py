@@ -1,18 +1,20 @@
-"""Twelve live sessions of the real node: do all surfaces agree, second by second?
+"""Fourteen live sessions of the real node: do all surfaces agree, second by second?
 
     OMP_NUM_THREADS=1 python benchmarks/node_sessions.py [SESSION ...] [--out DIRECTORY]
 
-Each session is a minute or two of simulated driving, published in real time, with one accident
-(a knock, a stream that stops, a wrong ``installed`` ...). A witness records the state of the node,
-its topics, ``/diagnostics``, ``/tf_static``, the page of ``watch``, the log and the saved files.
-They are compared at every second. Prints a table and fails (exit code 1) at a contradiction, or if
-a session does not end as it should. With ``--out``, all pages and headlines are kept
-(``watch_picture.py`` makes a moving picture of them).
+Twelve sessions are a minute or two of simulated driving, published in real time, with one accident
+(a knock, a stream that stops, a wrong ``installed`` ...). Two are ten minutes of a vehicle that
+drives over ramps: its advice and times left are compared with what happens. A witness records the
+state of the node, its topics, ``/diagnostics``, ``/tf_static``, the page of ``watch``, the log and
+the saved files. They are compared at every second, and every headline must be short. Prints a table
+and fails (exit code 1) at a contradiction, or if a session does not end as it should. With
+``--out``, all pages and headlines are kept (``watch_picture.py`` makes a moving picture of them).
 """
 
 import argparse
 import contextlib
 import dataclasses
+import functools
 import http.client
 import itertools
 import json
@@ -59,6 +61,8 @@ from hand_eye_calib.formats.results import load_result  # noqa: E402
 from hand_eye_calib.online.live.progress import AXIS_KEYS  # noqa: E402
 from hand_eye_calib.online.live.state import Broadcast, Standing  # noqa: E402
 from hand_eye_calib.online.watch.board import state_of  # noqa: E402
+from reproduction.coverage.classes import CLASSES, simulate  # noqa: E402
+from reproduction.coverage.motions import RAMP_PERIOD_S, agv_on_request  # noqa: E402
 
 # Seed of the drives.
 SEED = 5800
@@ -73,6 +77,14 @@ START_S = 6.0
 # Motion before which there must be neither a verdict nor advice.
 MIN_MOTION_S = 20.0
 MIN_ROTATION_DEG = 30.0
+
+# Most words of a sentence that is read aloud in one breath. A name of a topic or file is a word.
+MAX_WORDS = 15
+
+# Promises to the driver of a vehicle: time (s) from the moment when all axes are within their
+# targets for good to DONE, and smallest share of the times left within a factor of two.
+MAX_WAIT_S = 90.0
+MIN_GOOD_TIMES = 0.8
 
 # Headlines that may replace DONE and GO ON at any time.
 ALARMS = ("CHECK", "BAD INPUT", "BROKEN", "OLD RESULT", "PAUSED", "CHANGE")
@@ -112,6 +124,10 @@ class Session:
         Time (s) from which a second program publishes on the child's topic.
     must_appear : str
         Regular expression for a headline or a line of the page that must have been displayed.
+    vehicle : str
+        Class of the errors of a vehicle that drives over ramps; empty for a drive on hills.
+    flat_s : float
+        Time (s) before which this vehicle drives on a flat floor.
     """
 
     seconds: float
@@ -122,6 +138,8 @@ class Session:
     load: int = 0
     second_publisher_s: float = math.inf
     must_appear: str = ""
+    vehicle: str = ""
+    flat_s: float = 0.0
 
 
 # -------------------------------------------------------------------- accidents
@@ -239,11 +257,15 @@ SESSIONS = {
         110.0, "DONE", parameters=QUIET, accident=stop_child, must_appear="PAUSED|CHECK INPUT"
     ),
     "child dies, Ctrl-C": Session(55.0, "PAUSED|CHECK INPUT", parameters=QUIET, accident=end_child),
+    "ramps, 10 min": Session(600.0, "DONE", vehicle="agv_ramps"),
+    "flat, then ramps, 10 min": Session(600.0, "DONE", vehicle="agv_long", flat_s=90.0),
 }
 
 
 def simulated(session, seed):
     """Return the streams of a session, and the true extrinsic."""
+    if session.vehicle:
+        return simulated_vehicle(session, seed)
     parent_hz, child_hz = session.rates_hz
     config = dataclasses.replace(
         HILLY_DRIVE,
@@ -266,6 +288,18 @@ def simulated(session, seed):
     streams.Ts_parent, streams.Ts_child = add_noise(
         streams.Ts_parent, streams.Ts_child, REALISTIC, np.random.default_rng(seed)
     )
+    return streams, drive.T_parent_child
+
+
+def simulated_vehicle(session, seed):
+    """Return the streams of a vehicle that drives over ramps, and the true extrinsic."""
+    motion = functools.partial(agv_on_request, flat_s=session.flat_s)
+    kind = dataclasses.replace(CLASSES[session.vehicle], motion=motion, duration_s=session.seconds)
+    drive = simulate(kind, (seed,))
+    start_ns = min(drive.parent.stamps_ns[0], drive.child.stamps_ns[0])
+    times_s = [(stream.stamps_ns - start_ns) * 1e-9 for stream in (drive.parent, drive.child)]
+    poses = [stream.poses.copy() for stream in (drive.parent, drive.child)]
+    streams = Streams(times_s[0], poses[0], times_s[1], poses[1], drive.T_parent_child, np.eye(4))
     return streams, drive.T_parent_child
 
 
@@ -481,6 +515,70 @@ def compare_topics(witness, state, now_s):
             yield "/tf_static and ~/extrinsic differ"
 
 
+def long_sentences(pages):
+    """Yield each headline that has a sentence of too many words."""
+    for headline in dict.fromkeys(page.headline for page in pages):
+        for sentence in re.split(r"(?<=[.!?]) |(?<=[A-Z]:) ", headline):
+            n_words = len(sentence.split())
+            if n_words > MAX_WORDS:
+                yield f"{n_words} words: {sentence}"
+
+
+@dataclass(frozen=True)
+class Promises:
+    """What a session of a vehicle has promised to its driver.
+
+    Attributes
+    ----------
+    wait_s : float
+        Time (s) from the moment when all axes are within their targets for good, to DONE.
+    change_s : float
+        Time (s) with CHANGE THE MOTION while the vehicle drives over ramps.
+    n_times, n_good_times : int
+        Seconds with a time left before DONE, and those within a factor of two of what was left.
+    """
+
+    wait_s: float
+    change_s: float
+    n_times: int
+    n_good_times: int
+
+    def broken(self):
+        """Yield the promises that were broken."""
+        if not self.wait_s <= MAX_WAIT_S:
+            yield f"DONE {self.wait_s:.0f} s after all axes are within their targets for good"
+        if self.change_s:
+            yield f"CHANGE THE MOTION for {self.change_s:.0f} s while ramps are driven"
+        if self.n_good_times < MIN_GOOD_TIMES * self.n_times:
+            yield f"{self.n_good_times} of {self.n_times} times left within a factor of two"
+
+
+def promises(witness, start_s, end_s, flat_s):
+    """Compare the advice of a session of a vehicle with what has happened."""
+    seconds = range(int(end_s - start_s))
+    records = [newest(witness.states, start_s + second) for second in seconds]
+    progress = {
+        second: record[1].progress.progress
+        for second, record in zip(seconds, records, strict=True)
+        if record and record[1].progress
+    }
+    done_s = next((second for second, state in progress.items() if state.done), math.inf)
+    outside_s = 0
+    change_s = 0
+    ratios = []
+    for second, state in progress.items():
+        if second >= done_s:
+            break
+        if any(row.sigma > row.target for row in state.axes.values()):
+            outside_s = second
+        # The first ramp comes within a period, and takes 8 s.
+        change_s += state.will_not_get_there and second > flat_s + RAMP_PERIOD_S + 8.0
+        if math.isfinite(state.seconds_left):
+            ratios.append(state.seconds_left / (done_s - second))
+    n_good_times = sum(0.5 <= ratio <= 2.0 for ratio in ratios)
+    return Promises(done_s - outside_s, float(change_s), len(ratios), n_good_times)
+
+
 def end_contradictions(witness, log, folder):
     """Yield contradictions between the end of the session, its log and its files."""
     if "Traceback" in log:
@@ -535,6 +633,11 @@ def run(name, session, folder, seed):
         peer.close()
     problems = list(contradictions(witness, start_s, end_s))
     problems += [(math.inf, text) for text in end_contradictions(witness, node.log, folder)]
+    problems += [(math.inf, text) for text in long_sentences(page for _, page in witness.pages)]
+    if session.vehicle:
+        kept = promises(witness, start_s, end_s, session.flat_s)
+        print(f"{name}, seed {seed}: {kept}")
+        problems += [(math.inf, text) for text in kept.broken()]
     if code or watch_code:
         problems.append((math.inf, f"exit codes {code} of the node, {watch_code} of watch"))
     if not re.match(session.ends_with, last.word):

@@ -35,6 +35,10 @@ class Motion:
         return se3.log(se3.inverse(before) @ after) / (2.0 * step)
 
 
+# Time (s) from one ramp to the next of a vehicle that drives what the node asks for.
+RAMP_PERIOD_S = 31.0
+
+
 def _grid(duration_s: float) -> FloatArray:
     return np.arange(round((duration_s + 2 * _MARGIN_S) * _RATE) + 1) / _RATE - _MARGIN_S
 
@@ -135,11 +139,32 @@ def agv(rng: np.random.Generator, duration_s: float, ramps: bool = True) -> Moti
         slope = _smooth_steps(
             rng, times, 5.0, lambda size: rng.choice(np.radians(degrees), size), 0.4
         )
-    bumps = np.zeros((len(times), 3))
-    if ramps:
-        bumps[:, :2] = np.radians(0.25) * _waves(rng, times, 2, (0.3, 1.0))
-        bumps[:, 0] += slope * 0.25 * _waves(rng, times, 1, (0.03, 0.1))[:, 0]
+    bumps = _bumps_of_agv(rng, times, slope) if ramps else np.zeros((len(times), 3))
     return _ground_vehicle(times, speed, yaw_rate, slope, flat, bumps)
+
+
+def _bumps_of_agv(rng: np.random.Generator, times: FloatArray, slope: FloatArray) -> FloatArray:
+    """Extra roll, pitch (rad) and heave (N, 3) on a slope (N,) (rad) that is not quite straight."""
+    bumps = np.zeros((len(times), 3))
+    bumps[:, :2] = np.radians(0.25) * _waves(rng, times, 2, (0.3, 1.0))
+    bumps[:, 0] += slope * 0.25 * _waves(rng, times, 1, (0.03, 0.1))[:, 0]
+    return bumps
+
+
+def agv_on_request(rng: np.random.Generator, duration_s: float, flat_s: float = 0.0) -> Motion:
+    """An automated guided vehicle that drives what the node asks for: curves, and a ramp at times.
+
+    A ramp of 7 deg takes 8 s, up and down in turn. Before ``flat_s``, there are no ramps.
+    """
+    times = _grid(duration_s)
+    speed = _smooth_steps(rng, times, 8.0, lambda size: rng.uniform(0.6, 1.4, size), 0.7)
+    yaw_rate = _smooth_steps(rng, times, 5.0, lambda size: rng.normal(0.0, 0.35, size), 0.5)
+    ramps, since_s = np.divmod(times + rng.uniform(0.0, RAMP_PERIOD_S), RAMP_PERIOD_S)
+    share = np.clip(np.minimum(since_s, 8.0 - since_s), 0.0, 1.0)
+    slope = np.radians(7.0) * share * np.where(ramps % 2, 1.0, -1.0)
+    slope[times < flat_s] = 0.0
+    bumps = _bumps_of_agv(rng, times, slope)
+    return _ground_vehicle(times, speed, yaw_rate, slope, np.zeros_like(times), bumps)
 
 
 def flat_agv(rng: np.random.Generator, duration_s: float) -> Motion:
