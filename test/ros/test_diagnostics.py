@@ -21,19 +21,22 @@ PARTS = ("extrinsic", "progress", "parent input", "child input", "stream checks"
 
 @pytest.fixture
 def state(peer):
-    """``state(condition)``: the first state that meets a condition, among those still to come."""
+    """``state(condition)``: the first state that meets a condition, among those still to come.
+
+    ``meanwhile()`` is called again and again until then.
+    """
     heard = []
     peer.node.create_subscription(
         String, "calibrator/progress", lambda message: heard.append(state_of(message.data)), LATCHED
     )
 
-    def wait(condition, description="such a state"):
+    def wait(condition, description="such a state", meanwhile=lambda: None):
         start = len(heard)
 
         def met():
             return next((document for document in heard[start:] if condition(document)), None)
 
-        peer.spin_until(met, description)
+        peer.spin_until(lambda: meanwhile() or met(), description)
         return met()
 
     wait.heard = heard
@@ -114,13 +117,15 @@ def test_bad_input_is_an_error_by_topic_and_reason(start_node, peer, state):
 
     later_ns = itertools.count(int(stamps_ns[-1]), 10**8)
 
-    def only_the_parent_goes_on(document):
+    def only_the_parent_goes_on():
         stamp_ns = next(later_ns)
-        child = document.inputs["child"]
         publishers[0].publish(message(publishers[0].msg_type, stamp_ns, Ts_pw_p[-1], "lidar"))
+
+    def is_broken(document):
+        child = document.inputs["child"]
         return child.level is Level.WARN and "silent for" in child.text
 
-    state(only_the_parent_goes_on)
+    state(is_broken, "the silence of the child", only_the_parent_goes_on)
     for stamp_ns in stamps_ns[:8]:  # enough to be believed after the pause
         publishers[1].publish(
             message(publishers[1].msg_type, int(stamp_ns) + 12 * 10**9, Ts_cw_c[0], "other_camera")
@@ -169,29 +174,29 @@ def test_a_dead_publisher_pauses_the_session_and_a_second_one_is_named(start_nod
 
     def has_result(document):
         # On a busy computer, the first result comes long after the last pose of the drive.
-        both_go_on()
         return document.extrinsic.result and not document.progress.is_paused
 
-    state(has_result, "a result of streams that go on")
+    state(has_result, "a result of streams that go on", both_go_on)
     second = peer.publisher(publishers[1].msg_type, "child_odom")
 
     def has_two_publishers(document):
-        both_go_on()
         return document.inputs["child"].publishers == 2
 
-    child = state(has_two_publishers, "the second publisher").inputs["child"]
+    child = state(has_two_publishers, "the second publisher", both_go_on).inputs["child"]
     assert child.level is Level.WARN
     assert "/child_odom has 2 publishers: /peer and /peer. Stop all but one" in child.text
     for publisher in (publishers[1], second):
         peer.node.destroy_publisher(publisher)
 
-    def only_the_parent_goes_on(document):
+    def only_the_parent_goes_on():
         made = message(publishers[0].msg_type, next(later_ns), Ts_pw_p[-1], "lidar")
         publishers[0].publish(made)
+
+    def is_paused(document):
         paused = "Paused: no pose of child (/child_odom) for "
         return document.progress.text.startswith(paused)
 
-    child = state(only_the_parent_goes_on, "the pause")
+    child = state(is_paused, "the pause", only_the_parent_goes_on)
     assert child.progress.is_paused
     assert child.progress.level is Level.WARN
     gone = "it has no publisher any more"
@@ -278,4 +283,6 @@ class TestStreamChecks:
         assert not [
             sentence for sentence in newest.checks.findings if not sentence.startswith("note")
         ]
-        assert "[WARN]" not in node.log
+        warnings = [line for line in node.log.splitlines() if "[WARN]" in line]
+        # Other programs may keep the computer busy.
+        assert not [line for line in warnings if "The computer is busy" not in line]
