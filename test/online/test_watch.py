@@ -212,6 +212,17 @@ REACHED = {"done": True, "precision": "good to 4 mm"}
             *(0.5, Tone.ACT, "CHECK THE STREAMS", "The streams have a fault: read the checks"),
         ),
         (
+            state(
+                extrinsic=replace(EXTRINSIC, level=Level.WARN, text="a; b: c", contradicted=("z",))
+            ),
+            *(
+                0.5,
+                Tone.BAD,
+                "CHECK THE PRIOR",
+                "The prior on z contradicts the motion. Check value",
+            ),
+        ),
+        (
             state(checks=replace(CHECKS, level=Level.WARN, age_s=None)),
             *(0.5, Tone.BUSY, "GO ON", "Go on for"),
         ),

@@ -173,7 +173,8 @@ def test_every_surface_says_that_the_newest_solve_has_failed(with_result, failur
     assert view.tone in (Tone.BAD, Tone.ACT)
     for shown in (drawn(view), fragment(view)):
         assert word in shown
-    assert sentence.partition("; the result")[0][1:] in view.sentence
+    on_the_board = " ".join((view.sentence, *view.reasons))
+    assert sentence.partition("; the result")[0][1:] in on_the_board
     assert (view.values == ()) == is_refuted
     # the file, and the answer of ~/save
     assert saved

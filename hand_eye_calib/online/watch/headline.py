@@ -5,11 +5,12 @@ from collections.abc import Iterator
 from datetime import datetime
 from typing import NamedTuple
 
-from hand_eye_calib.core.base.text import AXIS_UNITS, amount, capital
+from hand_eye_calib.core.base.text import AXIS_UNITS, amount, axes_in_words, capital
 from hand_eye_calib.core.results.context import Difference
 from hand_eye_calib.online.live.progress import AXIS_KEYS
 from hand_eye_calib.online.live.state import (
     ChecksState,
+    ExtrinsicState,
     Level,
     NodeState,
     Part,
@@ -73,6 +74,9 @@ def _alarm(state: NodeState) -> Headline | None:
 
 def _headline_text(part: Part) -> str:
     """Return the text of a part in a condition that requires a person."""
+    if isinstance(part, ExtrinsicState) and part.contradicted and part.level is Level.WARN:
+        priors = f"the prior on {axes_in_words(part.contradicted)}"
+        return f"{priors} contradicts the motion. Check value, unit and sign, or remove it"
     if not isinstance(part, ChecksState) or not part.gravest:
         return part.text
     return _in_one_breath(part.gravest, "the streams have a fault: read the checks below")
