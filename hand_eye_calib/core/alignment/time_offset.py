@@ -240,11 +240,10 @@ def offset_over(
         The offset; without a fit if there are too few motions.
     """
     span_s = max(_MIN_SPAN_S, _SPAN_INTERVALS * child.interval_s)
-    middle_ns = int(child.stamps_ns[0] + (child.stamps_ns[-1] - child.stamps_ns[0]) // 2)
     offset_s = at.seconds
     start = at.fit or start
     settled_s = max(_SETTLED_S, negligible_s / 20)
-    rate = at.rate or ClockRate(ppm=0.0, sigma_ppm=np.inf, at_ns=middle_ns)
+    rate = at.rate or _unknown_rate(child)
     for _ in range(_MAX_ROUNDS):
         max_pairs = _MAX_PAIRS_OF_RATE if rate.is_used else MAX_PAIRS
         shifted = child.shifted(offset_s, rate.used, rate.at_ns)
@@ -266,6 +265,13 @@ def offset_over(
                 break
     estimated_rate = rate if np.isfinite(rate.sigma_ppm) else None
     return TimeOffset(offset_s, fit.offset_sigma_s, at.correlation, fit, rate=estimated_rate)
+
+
+def _unknown_rate(child: Trajectory) -> ClockRate:
+    """Return a clock rate of zero with an infinite standard deviation."""
+    first_ns, last_ns = child.stamps_ns[[0, -1]]
+    middle_ns = int(first_ns + (last_ns - first_ns) // 2)
+    return ClockRate(ppm=0.0, sigma_ppm=np.inf, at_ns=middle_ns)
 
 
 def _span_of_noise_s(fit: SimilarityFit, twists: FloatArray) -> float:

@@ -1,7 +1,7 @@
 """Comparison of results with the installed extrinsic, or with each other."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -69,41 +69,63 @@ def compare(
     require_same_frames(
         extrinsic for extrinsic in (*results, installed) if isinstance(extrinsic, Calibration)
     )
-    couples: list[tuple[_Named, tuple[str, Calibration]]] = [*combinations(by_name.items(), 2)]
     if installed is not None:
-        couples = [(("installed", installed), named) for named in by_name.items()]
-    if not couples:
-        raise InputError(
-            "expected two results or more, or one and the installed transform (--with, in Python "
-            "installed)"
-        )
-    differences = tuple(_difference(*couple) for couple in couples)
-    verdicts = [Change(difference.verdict) for difference in differences]
-    verdict = Change.of_all(verdicts).value
+        return _comparison_with_installed(by_name, installed)
+    return _comparison_with_each_other(by_name)
+
+
+def _comparison_with_installed(
+    by_name: Mapping[str, Calibration], installed: Calibration | Extrinsic
+) -> Comparison:
+    """Compare results with the installed extrinsic."""
+    differences = _differences([(("installed", installed), named) for named in by_name.items()])
+    verdict = _verdict_of(differences)
     moved_names = tuple(
         difference.second for difference in differences if difference.verdict == Change.MOVED
     )
-    sentence = f"{verdict}: none of {len(results)} differs from another"
-    if len(results) == 2 and verdict == Change.SAME.value:
-        sentence = f"{verdict}: both agree"
-    if installed is not None:
-        sentence = _sentence_of(differences, verdict, moved_names)
+    if len(differences) == 1:
+        sentence = differences[0].sentence
     elif moved_names:
-        moved_names, sentence = _moved_results([*by_name], results, differences)
+        sentence = f"moved: {listing(moved_names)} of {len(differences)}"
+    else:
+        sentence = f"{verdict}: none of {len(differences)} differs from what is installed"
     return Comparison(
         sentence=sentence, verdict=verdict, moved=moved_names, differences=differences
     )
 
 
-def _sentence_of(
-    differences: Sequence[Difference], verdict: str, moved_names: Sequence[str]
-) -> str:
-    """Return the sentence of a comparison with the installed extrinsic."""
-    if len(differences) == 1:
-        return differences[0].sentence
-    if moved_names:
-        return f"moved: {listing(moved_names)} of {len(differences)}"
-    return f"{verdict}: none of {len(differences)} differs from what is installed"
+def _comparison_with_each_other(by_name: Mapping[str, Calibration]) -> Comparison:
+    """Compare the results of several recordings of one rig."""
+    differences = _differences([*combinations(by_name.items(), 2)])
+    verdict = _verdict_of(differences)
+    moved_names: tuple[str, ...] = ()
+    if any(difference.verdict == Change.MOVED for difference in differences):
+        moved_names, sentence = _moved_results(by_name, differences)
+    elif len(by_name) == 2 and verdict == Change.SAME.value:
+        sentence = f"{verdict}: both agree"
+    else:
+        sentence = f"{verdict}: none of {len(by_name)} differs from another"
+    return Comparison(
+        sentence=sentence, verdict=verdict, moved=moved_names, differences=differences
+    )
+
+
+def _differences(
+    couples: Sequence[tuple[_Named, tuple[str, Calibration]]],
+) -> tuple[Difference, ...]:
+    """Test whether the two extrinsics of each couple differ."""
+    if not couples:
+        raise InputError(
+            "expected two results or more, or one and the installed transform (--with, in Python "
+            "installed)"
+        )
+    return tuple(_difference(*couple) for couple in couples)
+
+
+def _verdict_of(differences: Sequence[Difference]) -> str:
+    """Return the verdict of all differences together."""
+    verdicts = [Change(difference.verdict) for difference in differences]
+    return Change.of_all(verdicts).value
 
 
 def _by_name(results: Sequence[Calibration], names: Sequence[str] | None) -> dict[str, Calibration]:
@@ -118,11 +140,12 @@ def _by_name(results: Sequence[Calibration], names: Sequence[str] | None) -> dic
 
 
 def _moved_results(
-    names: Sequence[str], results: Sequence[Calibration], differences: Sequence[Difference]
+    by_name: Mapping[str, Calibration], differences: Sequence[Difference]
 ) -> tuple[tuple[str, ...], str]:
     """Return the names of the results that the others contradict, and a sentence about them."""
+    names = [*by_name]
     # At least two results differ significantly. A weaker level is enough to find which one moved.
-    agreement = agreement_of_results(results, level=0.05)
+    agreement = agreement_of_results([*by_name.values()], level=0.05)
     if agreement.kind in ("one off", "moved"):
         moved_names = tuple(names[index] for index in agreement.apart)
         return moved_names, f"moved: {agreement.sentence(names)}"

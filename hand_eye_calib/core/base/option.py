@@ -99,22 +99,30 @@ def check_value(field: OptionField, value: object) -> OptionValue:
     value = _of_python(value)
     if type(value) is int and not -_MAX_INT < value < _MAX_INT:
         raise ConfigError(f"{name}: the number is too large")
-    kind: type = float if words else type(field.default)
+    kind = _type_of(field)
     if isinstance(value, str) and (value in words or kind is str):
         return _checked_text(field, value)
     if kind is float:
         value = _as_float(value, has_words=bool(words))
     if type(value) is not kind or not isinstance(value, bool | int | float):
-        expected = f"{' or '.join(words)} or a number" if words else _TYPE_NAMES[kind]
-        unit = field.metadata["unit"]
-        if name.startswith("prior."):
-            expected += " with its standard deviation, such as '1.85+/-0.02'"
-        elif unit:
-            expected += f" in {unit}"
-        raise ConfigError(
-            f"{name} must be {expected}; got {shown_value(value)}{did_you_mean(str(value), words)}"
-        )
+        hint = did_you_mean(str(value), words)
+        raise ConfigError(f"{name} must be {_expected(field)}; got {shown_value(value)}{hint}")
     return _checked_number(field, value)
+
+
+def _type_of(field: OptionField) -> type:
+    """Return the type of an option. An option with words is otherwise a number."""
+    return float if field.metadata["words"] else type(field.default)
+
+
+def _expected(field: OptionField) -> str:
+    """Return the type and the unit of an option, for messages."""
+    words = field.metadata["words"]
+    unit = field.metadata["unit"]
+    expected = f"{' or '.join(words)} or a number" if words else _TYPE_NAMES[_type_of(field)]
+    if option_name(field).startswith("prior."):
+        return f"{expected} with its standard deviation, such as '1.85+/-0.02'"
+    return f"{expected} in {unit}" if unit else expected
 
 
 def _as_float(value: object, has_words: bool) -> object:
