@@ -10,7 +10,7 @@ and the standard gravity g.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -21,7 +21,7 @@ from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.base.stats import median, medians
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Columns, Trajectory
-from hand_eye_calib.extras.ground.planes import ground_of
+from hand_eye_calib.extras.ground.planes import Plane, ground_of
 
 #: Quantity that a vertical was measured by.
 Source: TypeAlias = Literal["ground", "gravity"]
@@ -103,36 +103,69 @@ def ground_from_clouds(
     >>> hec.ground_from_clouds(clouds, poses).heights_m.mean()  # doctest: +SKIP
     1.82
     """
-    up = turning_axis(trajectory)
-    ahead = driving_direction(trajectory)
-    width_m = _LANE_WIDTHS_M[beside]
-    stamps_ns = []
-    planes = []
-    bends = []
-    n_scans = 0
-    for stamp_ns, cloud in clouds:
-        n_scans += 1
-        points = np.asarray(cloud, dtype=float)
-        plane = ground_of(points, up, ahead, width_m)
-        if plane is None:
-            continue
-        stamps_ns.append(stamp_ns)
-        planes.append(plane)
-        narrow = ground_of(points, up, ahead, _NARROW_WIDTHS_M[beside])
-        if narrow is not None:
-            bends.append(narrow.normal - plane.normal)
+    scans = _ground_of_scans(
+        clouds, turning_axis(trajectory), driving_direction(trajectory), beside
+    )
+    n_planes = len(scans.planes)
     # On a ramp or beside walls, a third of the scans may have no ground. If fewer than half of the
     # scans have a plane, the machine does not drive on this plane.
-    if 2 * len(planes) <= n_scans:
+    if 2 * n_planes <= scans.n_scans:
         raise NotEnoughDataError(
-            f"{len(planes)} of {n_scans} scans contain the ground: it must be visible within 12 m, "
-            "and the z axis of the lidar must point up"
+            f"{n_planes} of {scans.n_scans} scans contain the ground: it must be visible within "
+            "12 m, and the z axis of the lidar must point up"
         )
-    normals, heights = zip(*planes, strict=True)
-    stamps = np.array(stamps_ns, dtype=np.int64)
-    # The median vector is that of the road; single scans differ by noise and by walls.
-    bend_rad = float(np.linalg.norm(medians(np.array(bends).T))) if bends else 0.0
-    return VerticalTrack(stamps, np.array(normals), np.array(heights), bend_rad)
+    normals, heights = zip(*scans.planes, strict=True)
+    stamps_ns = np.array(scans.stamps_ns, dtype=np.int64)
+    bend_rad = 0.0
+    if scans.bends:
+        # The median vector is that of the road; single scans differ by noise and by walls.
+        bend = medians(np.array(scans.bends).T)
+        bend_rad = float(np.linalg.norm(bend))
+    return VerticalTrack(stamps_ns, np.array(normals), np.array(heights), bend_rad)
+
+
+@dataclass
+class _GroundOfScans:
+    """Ground in the scans of a lidar.
+
+    Attributes
+    ----------
+    n_scans : int
+        Number of all scans.
+    stamps_ns : list of int
+        Stamps of the scans that contain the ground.
+    planes : list of Plane
+        Ground in the lane, of the same scans.
+    bends : list of (3,) arrays
+        Normal in a narrower lane minus normal in the lane, of the scans that have both.
+    """
+
+    n_scans: int = 0
+    stamps_ns: list[int] = field(default_factory=list)
+    planes: list[Plane] = field(default_factory=list)
+    bends: list[FloatArray] = field(default_factory=list)
+
+
+def _ground_of_scans(
+    clouds: Iterable[tuple[int, FloatArray]], up: FloatArray, ahead: FloatArray, beside: Source
+) -> _GroundOfScans:
+    """Return the ground in the scans, for the lane widths of the other sensor's quantity.
+
+    ``up`` and ``ahead`` are unit vectors in the frame of the lidar.
+    """
+    scans = _GroundOfScans()
+    for stamp_ns, cloud in clouds:
+        scans.n_scans += 1
+        points = np.asarray(cloud, dtype=float)
+        plane = ground_of(points, up, ahead, _LANE_WIDTHS_M[beside])
+        if plane is None:
+            continue
+        scans.stamps_ns.append(stamp_ns)
+        scans.planes.append(plane)
+        narrow = ground_of(points, up, ahead, _NARROW_WIDTHS_M[beside])
+        if narrow is not None:
+            scans.bends.append(narrow.normal - plane.normal)
+    return scans
 
 
 def gravity_from_accelerations(

@@ -20,7 +20,7 @@ def _compare(arguments: Any) -> int | None:
 
 def _watch(session: Any, *parts: Any) -> Any:
     """Return the monitor of a live session, and limit the poses that the session stores."""
-    from hand_eye_calib.extras.mount.monitor import LIMITS, MountWatch
+    from hand_eye_calib.extras.mount.live import LIMITS, MountWatch
 
     session.watch_only(LIMITS)
     return MountWatch(session, *parts)

@@ -33,12 +33,12 @@ def compare_digests(arguments: argparse.Namespace) -> int | None:
     groups = [[path] for path in paths] if arguments.fleet else [paths]
     digests = [read_digests(group) for group in groups]
     histories = [History.of(sessions) for sessions in digests if sessions is not None]
+    if len(histories) < len(groups) and arguments.fleet:
+        without = paths[digests.index(None)]
+        raise ConfigError(
+            f"--fleet needs digests, which the monitor writes to digests/; {without} has none"
+        )
     if len(histories) < len(groups):
-        if arguments.fleet:
-            without = paths[digests.index(None)]
-            raise ConfigError(
-                f"--fleet needs digests, which the monitor writes to digests/; {without} has none"
-            )
         return None
     if arguments.installed:
         raise ConfigError("digests contain their installed transform: omit --with")

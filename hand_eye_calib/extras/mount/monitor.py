@@ -18,31 +18,20 @@ in curves. Therefore each second has a scale parameter of its own. A sensor at r
 docs/session.md lists the shifts that the monitor detects.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime
-from pathlib import Path
 
 import numpy as np
 
 from hand_eye_calib.core.assessment import change, moved
 from hand_eye_calib.core.assessment.common_mode import floor_of_pairs
-from hand_eye_calib.core.assessment.comparison import SEEN_TARGETS
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.blocks import Blocks, information, inverse, score, shift_evidence
 from hand_eye_calib.core.base.stats import NINE_TIMES_OUT_OF_TEN, robust_weights
-from hand_eye_calib.core.base.text import axes_in_words
-from hand_eye_calib.core.engine.calibrator import BufferLimits
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.frames import Extrinsic
 from hand_eye_calib.core.geometry.se3 import sigmas_in_parent
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_between
-from hand_eye_calib.core.results.records import AXES
-from hand_eye_calib.extras.mount.digest import Digest, write_digest
-from hand_eye_calib.online.live.log import NodeLog
-from hand_eye_calib.online.live.progress import AXIS_KEYS
-from hand_eye_calib.online.live.session import LiveSession
-from hand_eye_calib.online.live.state import Level, MountState, Outcome, by_axis
+from hand_eye_calib.extras.mount.digest import Digest
 
 
 @dataclass(frozen=True)
@@ -114,12 +103,6 @@ _SECOND_NS = 1_000_000_000
 # only rotates the sensor is detected sooner with the second covariance than with the third.
 KNOCKS = np.array(
     [moved.shift_covariance(radians=1e-6), moved.shift_covariance(1e-6), moved.shift_covariance()]
-)
-
-# Limits of a session that is monitored but not calibrated: poses are paired soon, and few poses are
-# stored.
-LIMITS = BufferLimits(
-    capacity=4_000, pairing_starts=32, batch=64, batch_every=16, late_ns=500_000_000
 )
 
 
@@ -500,102 +483,3 @@ def _long_run_variance(seconds: Blocks, previous: float) -> float:
         limited = np.minimum(squares, TUNING.max_of_median * np.median(squares))
         variances.append((limited.sum() / 6 + prior) / (n_windows + TUNING.assumed_windows))
     return max(variances, default=previous)
-
-
-class MountWatch:
-    """Monitor of a live session; the node calls :meth:`look` about once a second.
-
-    Parameters
-    ----------
-    session : LiveSession
-    installed : callable
-        ``installed(parent_frame, child_frame)`` returns the installed pose; None while this pose is
-        unknown.
-    why_unknown : callable
-        Returns why the installed pose is unknown, as text.
-    log : NodeLog
-    """
-
-    def __init__(
-        self,
-        session: LiveSession,
-        installed: Callable[[str, str], Extrinsic | None],
-        why_unknown: Callable[[], str],
-        log: NodeLog,
-    ) -> None:
-        self._session = session
-        self._log = log
-        self._installed = installed
-        self._why_unknown = why_unknown
-        self._monitor: MountMonitor | None = None
-        self._last_ns = -1
-        self._frames = ("", "")
-
-    def restart(self) -> None:
-        """Accept earlier stamps after the stamps have jumped back; noise and evidence are kept."""
-        self._last_ns = -1
-        if self._monitor is not None:
-            self._monitor.restart()
-
-    def look(self) -> None:
-        """Add the new pose pairs to the monitor, and log an alarm."""
-        calibrator = self._session.calibrator
-        pairs = calibrator.take_pairs()
-        pairs = pairs[pairs.stamps_ns > self._last_ns]
-        if self._monitor is None and len(pairs):  # the frames are known from the first pair on
-            snapshot = calibrator.snapshot()
-            installed = self._installed(snapshot.parent_frame, snapshot.child_frame)
-            if installed is not None:
-                self._frames = snapshot.parent_frame, snapshot.child_frame
-                self._monitor = MountMonitor(installed.T_parent_child, installed.covariance)
-        if self._monitor is not None and len(pairs):
-            self._last_ns = int(pairs.stamps_ns[-1])
-            if alarm := self._monitor.add(pairs):
-                self._log.error(str(alarm))
-
-    def save(self, directory: Path) -> Outcome:
-        """Write the digest; return whether this succeeded, and a line about it for the user."""
-        digest = self._monitor.digest(*self._frames) if self._monitor else None
-        if digest is None:
-            return False, "no digest of the mount yet: the noise is being learned"
-        try:
-            path = write_digest(directory, digest)
-        except OSError as error:
-            text = f"the digest of the mount is not saved: {error}"
-            self._log.error(text)
-            return False, text
-        text = f"digest of the mount saved to {path}"
-        self._log.info(text)
-        return True, text
-
-    def state(self) -> MountState:
-        """Return the state for ``/diagnostics``: alarm, or detectable shifts on this robot."""
-        monitor = self._monitor
-        if monitor is None:
-            return MountState(level=Level.WARN, text=self._why_unknown() or "no poses yet")
-        visible = monitor.visible(TUNING.session_s)
-        alarm = monitor.alarm
-        if alarm is not None:
-            text = str(alarm)
-        elif monitor.is_learning:
-            text = f"learning the noise: {monitor.seconds} of {TUNING.learning_s} s of motion"
-        else:
-            text = "the mount has not moved"
-            # Axes along which only large shifts would be detected.
-            limits = SEEN_TARGETS * np.array(self._session.calibrator.config.targets)
-            axes = [AXES[index] for index in np.flatnonzero(visible > limits)]
-            if axes:
-                text += f"; {axes_in_words(axes)} cannot be monitored with this motion"
-        visible = np.where(visible < change.UNKNOWN_FROM, visible, np.nan)
-        shift = alarm.shift.axes if alarm else {}
-        return MountState(
-            level=Level.ERROR if alarm else Level.OK,
-            text=text,
-            is_learning=monitor.is_learning,
-            seconds_of_motion=monitor.seconds,
-            shift={AXIS_KEYS[axis]: row.difference for axis, row in shift.items()},
-            shift_sigma={AXIS_KEYS[axis]: row.sigma for axis, row in shift.items()},
-            visible_10min=by_axis(visible),
-            since_ns=alarm.since_ns if alarm else None,
-            newest_ns=self._last_ns,
-        )

@@ -113,29 +113,41 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
     """
     findings = [*calibration.findings] if calibration else []
     known_s = float(snapshot.resolved.config.time_offset)
-    parent, child = snapshot.streams
     # Pairs of a stored session may have gaps that its streams did not have: they are not checked.
     if not len(snapshot.kept):
         findings += _check_aligned(snapshot, calibration, known_s)
     hidden = calibration.hidden if calibration else []
-    of_clock: list[Finding] = []
-    if len(hidden) == 3 or any(found.code == "unrelated" for found in findings):
+    if len(hidden) == 3 or _has(findings, "unrelated"):
+        parent, child = snapshot.streams
         of_clock = _check_clock(parent, child, known_s, snapshot)
-    if of_clock:
-        # A wrong clock explains why the streams are unrelated: its finding replaces that one.
-        findings = [found for found in findings if found.code != "unrelated"] + of_clock
-    codes = {found.code for found in findings}
-    if calibration and "time_offset" not in codes:
-        of_solve = _check_solved(snapshot, calibration, is_unrelated="unrelated" in codes)
-        if of_solve and calibration.measured == "rotations":
-            # A cause explains why the streams are unrelated: its finding replaces that one.
-            findings = [found for found in findings if found.code != "unrelated"]
-        findings += of_solve
+        findings = _explained(findings, by=of_clock)
+    if calibration and not _has(findings, "time_offset"):
+        is_unrelated = _has(findings, "unrelated")
+        of_solve = _check_solved(snapshot, calibration, is_unrelated)
+        if calibration.measured == "rotations":
+            findings = _explained(findings, by=of_solve)
+        else:
+            findings += of_solve
     if hidden and not any(found.makes_unusable for found in findings):
         findings.append(checking.unobservable_axes(hidden))
     # Lengths in another unit come first: they cause the findings of the solve.
     findings.sort(key=lambda found: found.code != "lengths")
     return CheckResult(gravest_first(_without_repetitions(findings)))
+
+
+def _has(findings: Sequence[Finding], code: str) -> bool:
+    """Whether a finding has this code."""
+    return any(item.code == code for item in findings)
+
+
+def _explained(findings: list[Finding], by: Sequence[Finding]) -> list[Finding]:
+    """Return findings together with those that explain them.
+
+    The causes replace the finding that the streams are unrelated, if there are any.
+    """
+    if by:
+        findings = [item for item in findings if item.code != "unrelated"]
+    return [*findings, *by]
 
 
 def _check_solved(

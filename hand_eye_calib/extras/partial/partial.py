@@ -77,6 +77,15 @@ class _Paths:
     positions: FloatArray
     is_child: bool
 
+    @classmethod
+    def of(cls, pose_pairs: PosePairs, config: CalibratorConfig) -> "_Paths":
+        """Return the paths of synchronised streams, of which one measures positions."""
+        parent = pose_pairs.Ts_pw_p
+        child = pose_pairs.child_scaled(config.given_scale).Ts_cw_c
+        if config.child_measures == "positions":
+            return cls(pose_pairs.stamps_ns, parent, se3.translation_of(child), is_child=True)
+        return cls(pose_pairs.stamps_ns, child, se3.translation_of(parent), is_child=False)
+
     def solve(self, with_scale: bool) -> of_positions.LeverArmSolution:
         """Estimate the lever arm, and the scale if asked for."""
         return of_positions.solve(self.stamps_ns, self.poses, self.positions, with_scale)
@@ -116,16 +125,9 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
         If no lever arm explains the positions.
     """
     stamps_ns = pose_pairs.stamps_ns
-    Ts_pw_p = pose_pairs.Ts_pw_p
-    Ts_cw_c = pose_pairs.child_scaled(config.given_scale).Ts_cw_c
-    if config.child_measures == "positions":
-        sign = 1.0
-        paths = _Paths(stamps_ns, Ts_pw_p, se3.translation_of(Ts_cw_c), is_child=True)
-        allowance = _allowance(paths, config.parent_kind, config.child_kind)
-    else:
-        sign = -1.0
-        paths = _Paths(stamps_ns, Ts_cw_c, se3.translation_of(Ts_pw_p), is_child=False)
-        allowance = _allowance(paths, config.child_kind, config.parent_kind)
+    paths = _Paths.of(pose_pairs, config)
+    # From the lever arm of the sensor with positions to the extrinsic and to the child's clock.
+    sign = 1.0 if paths.is_child else -1.0
     try:
         solution = paths.solve(config.scale in ("auto", "estimate"))
     except np.linalg.LinAlgError:
@@ -153,7 +155,7 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
         measured="positions",
         noise=solution.describe(stamps_ns),
         T_method=T,
-        covariance_allowance=fused.allowance(allowance),
+        covariance_allowance=fused.allowance(_allowance(paths, config)),
         time_offset_s=offset_s,
         time_offset_sigma_s=solution.time_offset_sigma_s,
         scale=config.given_scale * scale,
@@ -162,12 +164,17 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     )
 
 
-def _allowance(paths: _Paths, kind_of_poses: str, kind_of_positions: str) -> FloatArray:
+def _allowance(paths: _Paths, config: CalibratorConfig) -> FloatArray:
     """Return the covariance (6, 6) of constant errors that no recording reveals.
 
     The reference point of a sensor is uncertain, unless its stream is exact. Poses that are not
     exact also add the distance that the sensor travels in ``FLOOR_TRAVEL_S``, as for full poses.
     """
+    kind_of_poses = config.parent_kind
+    kind_of_positions = config.child_kind
+    if not paths.is_child:
+        kind_of_poses = config.child_kind
+        kind_of_positions = config.parent_kind
     variance = _POINT_M**2
     if kind_of_positions != "exact":
         variance += _POINT_M**2

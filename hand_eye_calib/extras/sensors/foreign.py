@@ -137,19 +137,26 @@ def _lines(data: bytes) -> list[str]:
 # ---- positions on the earth
 
 
+def _cells_of_sentence(line: str) -> list[str] | None:
+    """Return the cells of an NMEA sentence; None if its checksum is wrong."""
+    # A sentence is between $ and *; its checksum follows.
+    start = line.find("$") + 1
+    sentence, _, checksum = line[start:].partition("*")
+    if checksum and _checksum(sentence) != checksum[:2].upper():
+        return None
+    return sentence.strip().split(",")
+
+
 def _of_nmea(data: bytes, _: str | None) -> _Rows:
     """Read GGA sentences; the previous RMC sentence states their day."""
     rows: list[list[float]] = []
     day_s = None
     n_damaged = 0
     for line in _lines(data):
-        # A sentence is between $ and *; its checksum follows.
-        start = line.find("$") + 1
-        sentence, _, checksum = line[start:].partition("*")
-        if checksum and _checksum(sentence) != checksum[:2].upper():
+        cells = _cells_of_sentence(line)
+        if cells is None:
             n_damaged += 1
             continue
-        cells = sentence.strip().split(",")
         # The first two letters are the talker, such as GP.
         kind = cells[0][-3:]
         if kind == "RMC":

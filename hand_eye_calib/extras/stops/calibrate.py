@@ -122,6 +122,14 @@ def calibrate_stops(
     return _calibration_of(solved, warnings, frames)
 
 
+def _names_of_frames(names: Any) -> dict[str, str]:
+    """Return the names of the frames of an arm, by default base, hand, camera and target."""
+    if names is not None:
+        require_type("names", names, Mapping)
+    named = {name: name for name in ("base", "hand", "camera", "target")}
+    return named | (names or {})
+
+
 def calibrate_arm(
     robot: Any,
     tracking: Any,
@@ -170,10 +178,7 @@ def calibrate_arm(
     config = _checked(config)
     if setup is not None and setup not in SETUPS:
         raise ConfigError(f"setup must be one of {', '.join(SETUPS)}; got {shown_value(setup)}")
-    if names is not None:
-        require_type("names", names, Mapping)
-    named = {name: name for name in ("base", "hand", "camera", "target")}
-    named |= names or {}
+    named = _names_of_frames(names)
     poses = _checked_poses({"robot": robot, "tracking": tracking}, config, is_arm=True)
     solved = solve_checked(poses, config, setup)
     solved = solved.adding(*_check_setup(solved.setup_fit, setup))

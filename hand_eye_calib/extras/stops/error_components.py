@@ -96,39 +96,84 @@ def fit_components(
     prior = 0.5 * np.repeat(variances, 2)
     components = prior
     for _ in range(_MAX_ROUNDS):
-        covariances = np.tensordot(components, sources, 1) + MIN_VARIANCE * np.eye(6)
-        precisions = np.linalg.inv(covariances)
         errors, jacobian = linearise(stops, X, Z)
-        scores = np.einsum("nij,nj->ni", precisions, errors)
-        distances = np.einsum("ni,ni->n", errors, scores)
-        student = student_weights(distances, degrees)
-        shares = weights * student
-        by_values = precisions @ jacobian
-        normal = np.einsum("n,nij,nik->jk", shares, jacobian, by_values)
-        gradient = np.einsum("n,nij,ni->j", shares, by_values, errors)
-        # The step along unobservable directions is zero.
-        damped = normal + 1e-13 * np.trace(normal) * np.eye(len(normal))
-        step = -np.linalg.solve(damped, gradient)
-        step_X, step_Z = se3.exp(step.reshape(2, 6))
+        iteration = _iteration(components, sources, errors, jacobian, weights, degrees)
+        step_X, step_Z = se3.exp(iteration.step.reshape(2, 6))
         X = X @ step_X
         Z = Z @ step_Z
-        quadratic = np.einsum("n,ni,knij,nj->k", shares, scores, sources, scores)
-        # Expected value of ``quadratic`` under these variances.
-        fitted = np.linalg.solve(damped, np.swapaxes(by_values, 1, 2))
-        projected = precisions - shares[:, None, None] * (by_values @ fitted)
-        expected = np.einsum("nij,knji->k", projected, sources)
-        updated = _updated(components, prior, quadratic, expected)
-        change = float(np.max(np.abs(np.log(updated / components))))
+        updated = _updated(components, prior, iteration.quadratic, iteration.expected)
+        log_change = float(np.max(np.abs(np.log(updated / components))))
         components = updated
-        if -step @ gradient < _SMALL_CHANGE**2 and change < _SMALL_CHANGE:
+        if iteration.decrease < _SMALL_CHANGE**2 and log_change < _SMALL_CHANGE:
             break
+    precisions = iteration.precisions
     whitening = np.swapaxes(np.linalg.cholesky(precisions), 1, 2)
     # Expected information of the Student-t likelihood: K. L. Lange, R. J. A. Little,
     # J. M. G. Taylor, *Robust statistical modeling using the t distribution*, JASA 84, 1989,
     # section 4.
     expected_weights = (degrees + 6.0) / (degrees + 8.0) * weights
-    information = np.einsum("n,nij,nik->jk", expected_weights, jacobian, by_values)
-    return ComponentsFit(X, Z, information, whitening, student)
+    information = np.einsum("n,nij,nik->jk", expected_weights, jacobian, precisions @ jacobian)
+    return ComponentsFit(X, Z, information, whitening, iteration.student)
+
+
+@dataclass(frozen=True)
+class _Iteration:
+    """Step of X and Z, and the terms that update the variances of the K = 4 sources.
+
+    Attributes
+    ----------
+    precisions : (N, 6, 6) array
+        Inverse covariances of the errors of each stop.
+    student : (N,) array
+        Weights of Student's t distribution.
+    step : (12,) array
+        Gauss-Newton step of X and Z.
+    decrease : float
+        Predicted decrease of the objective, times two.
+    quadratic : (K,) array
+        Weighted squares of the errors by each source.
+    expected : (K,) array
+        Expected value of ``quadratic`` under the present variances.
+    """
+
+    precisions: FloatArray
+    student: FloatArray
+    step: FloatArray
+    decrease: float
+    quadratic: FloatArray
+    expected: FloatArray
+
+
+def _iteration(
+    components: FloatArray,
+    sources: FloatArray,
+    errors: FloatArray,
+    jacobian: FloatArray,
+    weights: FloatArray,
+    degrees: float,
+) -> _Iteration:
+    """Return one iteration at errors (N, 6) and their derivatives (N, 6, 12).
+
+    ``components`` (4,) are the variances of the sources, ``sources`` (4, N, 6, 6) the covariances
+    with variance 1.
+    """
+    covariances = np.tensordot(components, sources, 1) + MIN_VARIANCE * np.eye(6)
+    precisions = np.asarray(np.linalg.inv(covariances), dtype=float)
+    scores = np.einsum("nij,nj->ni", precisions, errors)
+    distances = np.einsum("ni,ni->n", errors, scores)
+    student = student_weights(distances, degrees)
+    shares = weights * student
+    by_values = precisions @ jacobian
+    normal = np.einsum("n,nij,nik->jk", shares, jacobian, by_values)
+    gradient = np.einsum("n,nij,ni->j", shares, by_values, errors)
+    # The step along unobservable directions is zero.
+    damped = normal + 1e-13 * np.trace(normal) * np.eye(len(normal))
+    step = -np.linalg.solve(damped, gradient)
+    quadratic = np.einsum("n,ni,knij,nj->k", shares, scores, sources, scores)
+    fitted = np.linalg.solve(damped, np.swapaxes(by_values, 1, 2))
+    projected = precisions - shares[:, None, None] * (by_values @ fitted)
+    expected = np.einsum("nij,knji->k", projected, sources)
+    return _Iteration(precisions, student, step, -step @ gradient, quadratic, expected)
 
 
 def _updated(

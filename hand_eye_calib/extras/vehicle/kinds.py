@@ -3,6 +3,7 @@
 A kind supplies the functions that solve and check its data, see :mod:`..core.engine.kinds`.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from hand_eye_calib.core.assessment import common_mode, covariance
 from hand_eye_calib.core.assessment.moved import SIGNIFICANT
 from hand_eye_calib.core.assessment.prior import fuse
+from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.base.registry import OUT_OF_REACH
@@ -227,39 +229,17 @@ def _calibration(
     unknown_axes = OUT_OF_REACH[kind]
     if any(item.makes_unusable for item in findings):
         unknown_axes = AXES
-    T = fit.T_base_sensor
-    # Covariance (6, 6) of the pose in the axes of the vehicle; row and column 2 are those of z.
-    in_base = np.insert(np.insert(fit.covariance[:CLOCK, :CLOCK], 2, 0.0, axis=0), 2, 0.0, axis=1)
-    to_child = se3.block_diagonal(se3.rotation_of(T).T)
-    unknown = to_child[:, [AXES.index(axis) for axis in unknown_axes]]
-    assessment = covariance.combined(T, to_child @ in_base @ to_child.T, unknown)
-    fused = fuse(assessment, config.prior())
-    floor = np.zeros((6, 6))
-    if config.child_kind == "odometry":
-        speed_m_s = common_mode.usual_speed(pairs.stamps_ns, se3.translation_of(pairs.Ts_cw_c))
-        # Half of the floor, which is that of two odometries: only the sensor has one here.
-        floor = 0.5 * common_mode.common_mode_floor(speed_m_s)
-    # Residuals (K, 6), with zeros for the components that are not compared.
-    all_residuals = np.zeros(drive.xi.shape)
-    all_residuals[:, drive.components] = fit.residuals
-    start_ns, end_ns = pairs.stamps_ns[0] + np.round(drive.ends_s * 1e9).astype(np.int64)
-    residuals = Residuals(
-        translation=all_residuals[:, :3],
-        rotation=all_residuals[:, 3:] @ se3.rotation_of(T),
-        weights=fit.weights,
-        start_ns=start_ns,
-        end_ns=end_ns,
-    )
+    fused = fuse(_assessed(fit, unknown_axes), config.prior())
     result = estimation.calibration_of(
         fit,
         fused,
-        residuals,
+        _residuals_of(fit, drive, int(pairs.stamps_ns[0])),
         pairs.stamps_ns,
         config,
         reference="windows",
         measured=kind,
-        T_method=T,
-        covariance_allowance=fused.allowance(floor),
+        T_method=fit.T_base_sensor,
+        covariance_allowance=fused.allowance(_allowance(pairs, config)),
         time_offset_s=offset_s + float(fit.others[0]),
         time_offset_sigma_s=float(np.sqrt(fit.covariance[CLOCK, CLOCK])),
         findings=findings,
@@ -310,6 +290,43 @@ def _cause_of(ratio: float) -> str:
     return "a gear ratio, ticks of an encoder, or lengths of the sensor that are not metres"
 
 
+def _assessed(fit: Fit, unknown_axes: Sequence[str]) -> covariance.Assessment:
+    """Return the pose of a fit with its covariance, without the axes that are unknown."""
+    T = fit.T_base_sensor
+    without_z = fit.covariance[:CLOCK, :CLOCK]
+    # Covariance (6, 6) of the pose in the axes of the vehicle; row and column 2 are those of z.
+    in_base = np.insert(np.insert(without_z, 2, 0.0, axis=0), 2, 0.0, axis=1)
+    to_child = se3.block_diagonal(se3.rotation_of(T).T)
+    unknown = to_child[:, [AXES.index(axis) for axis in unknown_axes]]
+    return covariance.combined(T, to_child @ in_base @ to_child.T, unknown)
+
+
+def _allowance(pairs: PosePairs, config: CalibratorConfig) -> FloatArray:
+    """Return the covariance (6, 6) of constant errors of the sensor that no recording reveals."""
+    if config.child_kind != "odometry":
+        return np.zeros((6, 6))
+    speed_m_s = common_mode.usual_speed(pairs.stamps_ns, se3.translation_of(pairs.Ts_cw_c))
+    # The floor is that of two odometries. Here only the sensor has one: half of the floor.
+    return 0.5 * common_mode.common_mode_floor(speed_m_s)
+
+
+def _residuals_of(fit: Fit, drive: Drive, start_ns: int) -> Residuals:
+    """Return the residuals of a fit; ``start_ns`` is the stamp of the first pose.
+
+    Components that are not compared have the residual zero.
+    """
+    residuals = np.zeros(drive.xi.shape)
+    residuals[:, drive.components] = fit.residuals
+    window_start_ns, window_end_ns = start_ns + np.round(drive.ends_s * 1e9).astype(np.int64)
+    return Residuals(
+        translation=residuals[:, :3],
+        rotation=residuals[:, 3:] @ se3.rotation_of(fit.T_base_sensor),
+        weights=fit.weights,
+        start_ns=window_start_ns,
+        end_ns=window_end_ns,
+    )
+
+
 def _check_fit(fit: Fit, drive: Drive, config: CalibratorConfig) -> tuple[Finding, ...]:
     """Return the finding about a fit, if there is one.
 
@@ -320,28 +337,45 @@ def _check_fit(fit: Fit, drive: Drive, config: CalibratorConfig) -> tuple[Findin
     index_of = {"x": 0, "yaw": YAW}
     if drive.model:
         index_of["y"] = Y
+    undetermined = _undetermined_axes(fit, drive, index_of)
+    if undetermined or not fit.converged:
+        is_varied = _has_varied_turns(drive) and not _is_on_the_spot(drive)
+        key = "unrelated_wheels" if is_varied else "one_motion"
+        return (finding(key, axes=listing(undetermined or [*index_of])),)
+    contradicting = _check_wheels(fit, drive, config) if drive.model else ()
+    if contradicting:
+        return contradicting
+    # The estimate of a half has twice the variance, so the difference of both has four times it.
+    sigmas = 2.0 * np.sqrt(np.diag(fit.covariance))
+    differences = np.abs(np.subtract(*fit.halves)) / sigmas
+    different = [
+        axis for axis, index in index_of.items() if differences[index] > _MAX_SIGMAS_OF_HALVES
+    ]
+    return (finding("vehicle_halves", axes=listing(different)),) if different else ()
+
+
+def _undetermined_axes(fit: Fit, drive: Drive, index_of: Mapping[str, int]) -> list[str]:
+    """Return the axes that the drive does not determine, or only in a part of it."""
     ratios = fit.signal_to_noise(drive.components)
     undetermined = []
     for axis, index in index_of.items():
         is_concentrated = fit.concentration[index] > _MAX_CONCENTRATION
         if is_concentrated or ratios[axis] < _MIN_SIGNAL_TO_NOISE:
             undetermined.append(axis)
-    if undetermined or not fit.converged:
-        is_varied = _has_varied_turns(drive) and not _is_on_the_spot(drive)
-        key = "unrelated_wheels" if is_varied else "one_motion"
-        return (finding(key, axes=listing(undetermined or [*index_of])),)
-    if drive.model:
-        share = _unrelated_share(fit, drive)
-        if share > _UNRELATED:
-            severity = Severity.ERROR if share > _UNUSABLE else Severity.WARNING
-            return (finding("unrelated_wheels", severity=severity),)
-        if _is_upside_down(fit) and not {"roll", "pitch"} & {*config.prior()}:
-            roll = np.degrees(se3.rotation_to_rpy(se3.rotation_of(fit.T_base_sensor))[0])
-            return (finding("upside_down", roll=f"{roll:.0f}"),)
-    # The estimate of a half has twice the variance, so the difference of both has four times it.
-    sigmas = np.abs(np.subtract(*fit.halves)) / (2.0 * np.sqrt(np.diag(fit.covariance)))
-    different = [axis for axis, index in index_of.items() if sigmas[index] > _MAX_SIGMAS_OF_HALVES]
-    return (finding("vehicle_halves", axes=listing(different)),) if different else ()
+    return undetermined
+
+
+def _check_wheels(fit: Fit, drive: Drive, config: CalibratorConfig) -> tuple[Finding, ...]:
+    """Return the finding about wheels of another drive, or about a sensor upside down."""
+    share = _unrelated_share(fit, drive)
+    if share > _UNRELATED:
+        severity = Severity.ERROR if share > _UNUSABLE else Severity.WARNING
+        return (finding("unrelated_wheels", severity=severity),)
+    has_prior = bool({"roll", "pitch"} & {*config.prior()})
+    if not has_prior and _is_upside_down(fit):
+        roll = np.degrees(se3.rotation_to_rpy(se3.rotation_of(fit.T_base_sensor))[0])
+        return (finding("upside_down", roll=f"{roll:.0f}"),)
+    return ()
 
 
 def _is_upside_down(fit: Fit) -> bool:

@@ -336,6 +336,14 @@ def _difference(
     return np.concatenate([(T - from_T)[:2, 3], turn, others - from_others])
 
 
+def _spread_of_weights(n_components: int) -> float:
+    """Return the variance of an estimate with Student weights, divided by that with fixed weights.
+
+    ``n_components`` is the number of components of a residual.
+    """
+    return ((STUDENT + n_components + 2.0) / (STUDENT + n_components)) ** 2
+
+
 def _solve(
     drive: Drive,
     start: FloatArray,
@@ -380,10 +388,7 @@ def _solve(
             break
     spread = jackknife_covariance(solve(blocks.without() + prior, everything))
     if is_weighted:
-        # Ratio of the scatter of an estimate with weights of Student's t distribution to that with
-        # fixed weights.
-        n_components = len(drive.components)
-        spread *= ((STUDENT + n_components + 2.0) / (STUDENT + n_components)) ** 2
+        spread *= _spread_of_weights(len(drive.components))
     return Fit(
         T_base_sensor=T,
         others=others,
