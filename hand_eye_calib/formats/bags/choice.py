@@ -111,18 +111,19 @@ def choose(
     moving = _of_types(topics, messages.POSE_TYPES, _MIN_POSES)
     paths = _of_types(topics, {messages.PATH_TYPE})
     others = _of_types(topics, messages.FIELD_POSE_TYPES, _MIN_POSES)
-    # The choice is obvious if the number of topics fits.
-    for group in (poses, moving, moving + paths, moving + others):
-        if len(group) == n_missing:
-            return [topic.name for topic in group]
-    # The choice is also obvious if one topic of each sensor, or of each sensor of a known kind, is
-    # enough.
     candidates = [_Candidate(topic, frame_of(topic.name)) for topic in moving + paths + others]
     sensors = _topic_of_each_sensor(candidates)
+    names_of_groups = [
+        [topic.name for topic in group]
+        for group in (poses, moving, moving + paths, moving + others)
+    ]
+    names_of_groups.append([sensor.name for sensor in sensors])
     of_known_kinds = [sensor for sensor in sensors if sensor.rank < len(_SENSORS)]
-    for chosen in (sensors, of_known_kinds):
-        if len(chosen) == n_missing:
-            return [sensor.name for sensor in chosen]
+    names_of_groups.append([sensor.name for sensor in of_known_kinds])
+    # The choice is obvious if the number of topics in a group fits, or the number of sensors.
+    for names in names_of_groups:
+        if len(names) == n_missing:
+            return names
     if len(sensors) < n_missing <= len(candidates):
         sensors = candidates
     partners = topics

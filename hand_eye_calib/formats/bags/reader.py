@@ -372,10 +372,17 @@ class PoseBag:
         if row and row.unpack:
             wanted = self.measured(source, measures.get(stream, "auto"))
             return sources.TopicReading(stream, topic, type_, wanted)
+        return self._reading_of_several_poses(stream, topic, type_)
+
+    def _reading_of_several_poses(self, stream: str, topic: str, type_: str) -> Reading:
+        """Return the reader for a topic whose messages are not a pose each.
+
+        These are paths, clouds, and fixes with the rotations of another topic.
+        """
         if type_ == messages.PATH_TYPE:
             return sources.PathReading(stream, topic)
         if type_ == messages.POINTS_TYPE:
-            return BAG_READINGS[type_](self, stream, topic, fields)
+            return BAG_READINGS[type_](self, stream, topic, "")
         fixes, rotations = self._parts_of(topic)
         return sources.JoinedReading(
             sources.TopicReading(stream, fixes, self.type_of(fixes), "positions"),
