@@ -140,14 +140,7 @@ def calibrate(
     ('lidar', 'camera')
     """
     values = {name: value for name, value in locals().items() if value is not None}
-    if progress is not None and not callable(progress):
-        raise InputError(f"progress must be a function; got {type(progress).__name__}")
-    if checks is not None:
-        require_type("checks", checks, bool)
-    if ground not in (None, "auto", "off"):
-        raise ConfigError(f"ground must be 'auto' or 'off'; got {shown_value(ground)}")
-    if ground is not None and child is not None:
-        raise ConfigError("ground applies to a bag; for trajectories, call calibrate_on_ground")
+    _check_settings(progress, checks, ground, is_bag=child is None)
     first, second = _read_both(parent, child, {"parent": parent_topic, "child": child_topic})
     values |= prior_fields({} if prior is None else prior)
     options = {
@@ -164,6 +157,18 @@ def calibrate(
             warnings.warn(text, UserWarning, stacklevel=2)
     result = run(snapshot, checks=checks, progress=progress)
     return replace(result.calibration, recording=result.snapshot)
+
+
+def _check_settings(progress: Any, checks: Any, ground: Any, is_bag: bool) -> None:
+    """Raise an error for arguments of :func:`calibrate` that are not allowed."""
+    if progress is not None and not callable(progress):
+        raise InputError(f"progress must be a function; got {type(progress).__name__}")
+    if checks is not None:
+        require_type("checks", checks, bool)
+    if ground not in (None, "auto", "off"):
+        raise ConfigError(f"ground must be 'auto' or 'off'; got {shown_value(ground)}")
+    if ground is not None and not is_bag:
+        raise ConfigError("ground applies to a bag; for trajectories, call calibrate_on_ground")
 
 
 def _read_both(

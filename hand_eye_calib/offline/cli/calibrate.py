@@ -198,7 +198,6 @@ def _list_topics(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int
     A row has, among others, the mean rate over the whole bag, whether the topic has poses, and the
     frames of the first messages.
     """
-    from hand_eye_calib.formats.bags.messages import MESSAGE_TYPES
     from hand_eye_calib.formats.bags.reader import PoseBag
     from hand_eye_calib.offline.cli import reading
 
@@ -209,35 +208,48 @@ def _list_topics(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int
             "Omit --list"
         )
     with PoseBag(*arguments.paths) as bag, waiting_for(f"reading {bag}"):
-        measured: dict[str, tuple[str, str]] = {}
-        for source in BESIDE_MOTION.values():
-            measured |= source.topics(bag)
-        topics = []
-        for topic in bag.topics.values():
-            quantity, frame = measured.get(topic.name, ("", ""))
-            rate_hz = (topic.count - 1) / (bag.duration_s or 1.0) if topic.count > 1 else None
-            topics.append(
-                {
-                    **topic._asdict(),
-                    "rate_hz": rate_hz,
-                    "frames": bag.edges_on(topic.name) or _sensor_frames(bag, topic.name, frame),
-                    "is_usable": topic.type in MESSAGE_TYPES,
-                    "measures": quantity,
-                }
-            )
         document: Document = {
             "bag": str(bag),
             "start_ns": bag.start_ns,
             "end_ns": bag.end_ns,
             "duration_s": bag.duration_s,
-            "topics": topics,
+            "topics": _described_topics(bag),
             "warnings": bag.warnings,
         }
     document = with_urls(document)
     note(*document["warnings"])
+    print_result(_table_of_topics(document), document if arguments.json else None)
+    return 0
+
+
+def _described_topics(bag: "PoseBag") -> list["Document"]:
+    """Return a row for each topic of a bag, as plain values."""
+    from hand_eye_calib.formats.bags.messages import MESSAGE_TYPES
+
+    measured: dict[str, tuple[str, str]] = {}
+    for source in BESIDE_MOTION.values():
+        measured |= source.topics(bag)
+    rows = []
+    for topic in bag.topics.values():
+        quantity, frame = measured.get(topic.name, ("", ""))
+        rate_hz = (topic.count - 1) / (bag.duration_s or 1.0) if topic.count > 1 else None
+        rows.append(
+            {
+                **topic._asdict(),
+                "rate_hz": rate_hz,
+                "frames": bag.edges_on(topic.name) or _sensor_frames(bag, topic.name, frame),
+                "is_usable": topic.type in MESSAGE_TYPES,
+                "measures": quantity,
+            }
+        )
+    return rows
+
+
+def _table_of_topics(document: "Document") -> list[str]:
+    """Return the lines of the table of topics, with advice below."""
     lines = [f"{document['bag']}, {document['duration_s']:.1f} s"]
     lines.append(_ROW.format("topic", "type", "count", "rate", "poses", "frames"))
-    for row in topics:
+    for row in document["topics"]:
         cells = [
             row["name"],
             row["type"] or "several types",
@@ -250,11 +262,10 @@ def _list_topics(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int
     advice = (
         "--parent-topic and --child-topic accept a topic with poses, or frames of /tf: odom:lidar"
     )
-    if not any(row["count"] for row in topics):
+    if not any(row["count"] for row in document["topics"]):
         advice = "the bag has no messages: record again"
     lines.append(advice)
-    print_result(lines, document if arguments.json else None)
-    return 0
+    return lines
 
 
 def _sensor_frames(bag: "PoseBag", topic: str, frame: str) -> list[str]:

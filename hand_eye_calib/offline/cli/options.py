@@ -335,6 +335,11 @@ def options_from(arguments: argparse.Namespace) -> Options:
     return {**file_options, **dict(arguments.options)}
 
 
+def _is_of_node(option: str) -> bool:
+    """Whether only the node has this option, or every node of ROS."""
+    return option in _NODE_OPTIONS or option.partition(".")[0] in _ROS_OPTIONS
+
+
 def _read_config(path: Path) -> Options:
     """Return the options of a YAML file with options by name, or of a ROS parameter file."""
     from hand_eye_calib.formats.yaml_files import read_yaml
@@ -349,7 +354,7 @@ def _read_config(path: Path) -> Options:
     for option, value in settings.values:
         if option in OPTION_FIELDS:
             options |= [_option_in_file(path, option, value)]
-        elif option in _NODE_OPTIONS or option.partition(".")[0] in _ROS_OPTIONS:
+        elif _is_of_node(option):
             ignored.append(repr(option))
         elif value is not None or not option.endswith(_ROS_SECTION):
             # An empty section ros__parameters appears here as a name without value. It is not an
