@@ -39,7 +39,7 @@ BIASES = 2.0
 
 # Drift of an odometry along one axis, as a share of the distance. On a flat floor this drift is
 # the whole motion along z, and the other stream does not contain it.
-_DRIFT_SHARE = 0.02
+DRIFT_SHARE = 0.02
 
 # Two frames are called one frame if their distance is below this (m), or within its noise.
 _SAME_M = 0.005
@@ -48,7 +48,7 @@ SAME_RAD = float(np.radians(0.3))
 # Frames are compared only if the standard deviation of their rotation (rad) is at most this.
 MAX_SIGMA_RAD = float(np.radians(0.5))
 # A distance or an angle may be zero if it is below this number of standard deviations.
-_ZERO_SIGMAS = 3.0
+ZERO_SIGMAS = 3.0
 
 # Upper bounds of a lever arm (m), two standard deviations above its length. Below the first one,
 # two sensors with different orientations are called one place: no two sensors are closer.
@@ -66,7 +66,8 @@ _SOUND_PART = 0.25
 # this share of its rotations unexplained.
 _OTHER_PART = 0.5
 
-# Streams may be exchanged at the start of each of so many blocks of time but the first.
+# Number of blocks of time. At the start of each block except the first, an exchange of the streams
+# is tested.
 _EXCHANGE_BLOCKS = 16
 # Quantile of the residuals that is compared: it is outside of the larger part.
 _EXCHANGE_QUANTILE = 0.85
@@ -298,8 +299,8 @@ def check_same(extrinsic: ExtrinsicEstimate) -> list[Finding]:
     distance_m = float(np.linalg.norm(se3.translation_of(extrinsic.T_parent_child)))
     upper_m = distance_m + 2 * sigma_m
     angle_rad = float(se3.rotation_angle(se3.rotation_of(extrinsic.T_parent_child)))
-    is_parallel = angle_rad < max(SAME_RAD, _ZERO_SIGMAS * sigma_rad)
-    may_be_zero = distance_m < _ZERO_SIGMAS * sigma_m
+    is_parallel = angle_rad < max(SAME_RAD, ZERO_SIGMAS * sigma_rad)
+    may_be_zero = distance_m < ZERO_SIGMAS * sigma_m
     near_m = _PARALLEL_M if is_parallel or may_be_zero else _NEARLY_M
     if upper_m > near_m or sigma_rad > MAX_SIGMA_RAD:
         return []
@@ -385,7 +386,7 @@ def axis_gain(slow: Regression, stream: str) -> Finding | None:
     group = f"axes_{stream}"
     gain = largest_deviation(*slow.fit(group))
     of_noise = slow.biases(group)[gain.axis]
-    of_drift = _DRIFT_SHARE**2 * of_noise / slow.biases("scale")[0]
+    of_drift = DRIFT_SHARE**2 * of_noise / slow.biases("scale")[0]
     if abs(gain.size) < BIASES * (of_noise + of_drift):
         return None
     size = gain.size

@@ -67,7 +67,7 @@ class Column(NamedTuple):
 
 def by_axis(vectors: FloatArray) -> FloatArray:
     """Return vectors (..., 3) as diagonal matrices (..., 3, 3): one column for each coordinate."""
-    return np.asarray(vectors[..., None] * np.eye(3))
+    return vectors[..., None] * np.eye(3)
 
 
 class Split(NamedTuple):
@@ -168,7 +168,8 @@ class Fit:
 
     @property
     def _every_column(self) -> list[int]:
-        return list(range(self.blocks.sums.shape[-1] - 1))
+        n_columns = self.blocks.sums.shape[-1] - 1
+        return list(range(n_columns))
 
     @cached_property
     def joint(self) -> Estimate:
@@ -190,8 +191,9 @@ class Fit:
         Noise in a column reduces its estimate (errors in variables). The noise is assumed to be as
         large as that of the residuals.
         """
-        covariance = np.linalg.inv(self.blocks.total[:-1, :-1])
-        return np.asarray(self.n_samples * np.abs(np.diag(covariance)[self.places[name]]))
+        information = self.blocks.total[:-1, :-1]
+        variances = np.diag(np.linalg.inv(information))
+        return self.n_samples * np.abs(variances[self.places[name]])
 
     @property
     def explained_share(self) -> float:
@@ -225,7 +227,7 @@ class Fit:
         variances, axes = np.linalg.eigh(with_faults - without_faults)
         # Chance makes some variances smaller. They do not grow then, and add nothing.
         growth = (axes * np.maximum(variances, 0.0)) @ axes.T
-        return np.asarray(np.outer(shift, shift) + growth)
+        return np.outer(shift, shift) + growth
 
 
 def fit_columns(

@@ -6,6 +6,9 @@ from typing import Any
 
 from hand_eye_calib.core.checks.findings import Finding, Severity, finding
 
+#: Residuals below this share of the median motion are those of a copy, in slow streams.
+COPIED_SHARE = 0.01
+
 
 def copied(evidence: str, **residual: Any) -> list[Finding]:
     """Return the finding that one stream was computed from the other.
@@ -17,4 +20,4 @@ def copied(evidence: str, **residual: Any) -> list[Finding]:
 
 def as_errors(findings: Sequence[Finding]) -> list[Finding]:
     """Return the same findings as errors."""
-    return [replace(found, severity=Severity.ERROR) for found in findings]
+    return [replace(item, severity=Severity.ERROR) for item in findings]

@@ -128,16 +128,16 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
             findings = _explained(findings, by=of_solve)
         else:
             findings += of_solve
-    if hidden and not any(found.makes_unusable for found in findings):
+    if hidden and not any(issue.makes_unusable for issue in findings):
         findings.append(checking.unobservable_axes(hidden))
     # Lengths in another unit come first: they cause the findings of the solve.
-    findings.sort(key=lambda found: found.code != "lengths")
+    findings.sort(key=lambda issue: issue.code != "lengths")
     return CheckResult(gravest_first(_without_repetitions(findings)))
 
 
 def _has(findings: Sequence[Finding], code: str) -> bool:
     """Whether a finding has this code."""
-    return any(item.code == code for item in findings)
+    return any(issue.code == code for issue in findings)
 
 
 def _explained(findings: list[Finding], by: Sequence[Finding]) -> list[Finding]:
@@ -146,7 +146,7 @@ def _explained(findings: list[Finding], by: Sequence[Finding]) -> list[Finding]:
     The causes replace the finding that the streams are unrelated, if there are any.
     """
     if by:
-        findings = [item for item in findings if item.code != "unrelated"]
+        findings = [issue for issue in findings if issue.code != "unrelated"]
     return [*findings, *by]
 
 
@@ -177,9 +177,9 @@ def _check_aligned(
 def _without_repetitions(findings: Sequence[Finding]) -> list[Finding]:
     """Return the findings in their order, equal findings once."""
     different: list[Finding] = []
-    for found in findings:
-        if found not in different:
-            different.append(found)
+    for issue in findings:
+        if issue not in different:
+            different.append(issue)
     return different
 
 

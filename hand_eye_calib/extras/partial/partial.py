@@ -34,7 +34,7 @@ from hand_eye_calib.core.results.records import Residuals
 from hand_eye_calib.extras.partial import positions as of_positions
 from hand_eye_calib.extras.partial.position_columns import fit_positions
 from hand_eye_calib.extras.partial.rate_bias import RateBias
-from hand_eye_calib.extras.partial.rotation_checks import measured_stream
+from hand_eye_calib.extras.partial.rotation_checks import TURNING, measured_stream
 from hand_eye_calib.extras.partial.rotation_columns import fit_pairs
 
 # Share of the path of the positions that the poses do not explain: above this, a fault is searched.
@@ -47,8 +47,6 @@ _UNRELATED_ROTATION = 0.5
 
 # Number of poses that a motion spans in the comparison of the rotations of both streams.
 _SPAN = 10
-# Quantile of the rotation angles above which motions are compared: a sensor may rest for long.
-_TURNING = 0.75
 
 # A scale explains a path if it reduces the unexplained share at least by this factor.
 _MENDED_PATH = 0.5
@@ -142,7 +140,7 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
     fused = fuse(assessment, config.prior())
     findings = _check_path(solution, fused, paths, "scale" in config.given)
     offset_s = float(config.time_offset)
-    if not any(found.makes_unusable for found in findings):
+    if not any(issue.makes_unusable for issue in findings):
         offset_s += sign * solution.time_offset_s
     scale = paths.child_scale(solution.scale)
     return estimation.calibration_of(
@@ -384,7 +382,7 @@ def _check_rotation(
     pairs = motion_pairs(Ts_pw_p, Ts_cw_c, f"B{span}")
     residuals = np.linalg.norm(pairs.residuals(T_parent_child)[1], axis=1)
     angles = se3.rotation_angle(se3.rotation_of(pairs.Ts_parenti_parentj))
-    is_turning = angles >= np.quantile(angles, _TURNING)
+    is_turning = angles >= np.quantile(angles, TURNING)
     usual_angle = float(np.median(angles[is_turning]))
     share = float(np.median(residuals[is_turning]) / max(usual_angle, 1e-12))
     if share < _UNRELATED_ROTATION:

@@ -5,7 +5,6 @@ coordinate, a delay of a coordinate, and smoothing.
 """
 
 from collections.abc import Collection
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,14 +21,13 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs, synchronise
 from hand_eye_calib.core.results.calibration import Calibration
-from hand_eye_calib.extras.partial.copies import as_errors, copied
+from hand_eye_calib.extras.partial.copies import COPIED_SHARE, as_errors, copied
 from hand_eye_calib.extras.partial.position_columns import PositionFit, fit_positions
 from hand_eye_calib.extras.partial.positions import solve, unexplained_share
+from hand_eye_calib.extras.partial.suspects import Suspect, most_significant
 
 # A coordinate of a lever arm is zero if it is below this distance (m).
 _ZERO_M = 0.005
-# A coordinate is also zero if it is below this number of standard deviations.
-_ZERO_SIGMAS = 3.0
 
 # The upper bound of a coordinate is its size plus two standard deviations.
 # Two housings hardly fit if the upper bounds of two coordinates are below this distance (m).
@@ -41,8 +39,6 @@ _UNCERTAIN_M = 0.06
 # Median residual (m) below which positions were computed from the poses: no receiver or total
 # station measures to a twentieth of a millimetre.
 _COPIED_M = 5e-5
-# The same limit as a share of the median motion, for slow streams.
-_COPIED_SHARE = 0.01
 
 # Number of standard deviations above which smoothing is an error, and a late coordinate is
 # reported. A jackknife of at most 16 blocks estimates them, so their ratio has heavy tails.
@@ -54,8 +50,6 @@ _LIKELY_SIGMAS = 3.3
 # Smallest smoothing of positions that is an error (s^2): that of a filter of 0.13 s. Streams
 # without a filter have up to 0.006 (simulated machines with seeds 77 and 78, and NTU VIRAL).
 _SMOOTHING_S2 = 0.008
-# Drift of an odometry along a coordinate, as a share of the distance from the mean position.
-_DRIFT = 0.02
 # Smallest delay (s) of a coordinate against the others that is reported.
 _LAG_S = 0.02
 # If the positions are on another path than the poses, a fault is reported as the reason only if the
@@ -154,7 +148,7 @@ def _is_mirrored(stamps_ns: IntArray, poses: FloatArray, positions: FloatArray) 
 def _is_copied(fitted: PositionFit, positions: FloatArray) -> bool:
     """Return whether the residuals are so small that positions were computed from the poses."""
     moved_m = median(np.linalg.norm(np.diff(positions, axis=0), axis=1))
-    return fitted.residual < min(_COPIED_M, _COPIED_SHARE * moved_m)
+    return fitted.residual < min(_COPIED_M, COPIED_SHARE * moved_m)
 
 
 def check_position(
@@ -174,7 +168,7 @@ def check_position(
         return []
     lengths_m = np.abs(lever_arm[axes])
     sigmas_m = sigmas[axes]
-    if (lengths_m > np.maximum(_ZERO_M, _ZERO_SIGMAS * sigmas_m)).any():
+    if (lengths_m > np.maximum(_ZERO_M, agreement.ZERO_SIGMAS * sigmas_m)).any():
         return []
     uppers_m = np.sort(lengths_m + 2.0 * sigmas_m)
     if uppers_m[1] > _UNCERTAIN_M:
@@ -212,18 +206,10 @@ def check_positions(fitted: PositionFit, stream: str, is_unrelated: bool) -> lis
         _scale_of_axis(fitted, stream),
         _lag_of_axis(fitted, stream),
     ]
-    ranked = sorted(suspects, key=lambda suspect: suspect.sigmas, reverse=True)
-    return [suspect.found for suspect in ranked if suspect.found][:1]
+    return most_significant(suspects)
 
 
-class _Suspect(NamedTuple):
-    """A possible fault: its size in standard deviations, and its finding if it is significant."""
-
-    sigmas: float
-    found: Finding | None
-
-
-def _smoothing(fitted: PositionFit, stream: str) -> _Suspect:
+def _smoothing(fitted: PositionFit, stream: str) -> Suspect:
     """Test whether positions are smoothed.
 
     Significant smoothing is an error, because the lever arm follows from the positions in turns.
@@ -232,19 +218,20 @@ def _smoothing(fitted: PositionFit, stream: str) -> _Suspect:
     smoothing_s2 = float(values[0])
     n_sigmas = smoothing_s2 / max(float(sigmas[0]), 1e-12)
     if smoothing_s2 < _SMOOTHING_S2 or n_sigmas < _LIKELY_SIGMAS:
-        return _Suspect(n_sigmas, None)
-    found = finding(
+        return Suspect(n_sigmas, None)
+    severity = Severity.ERROR if n_sigmas > _CLEAR_SIGMAS else Severity.WARNING
+    issue = finding(
         "smoothed",
         stream,
-        Severity.ERROR if n_sigmas > _CLEAR_SIGMAS else Severity.WARNING,
+        severity,
         part="positions",
         smoothing_s=smoothing_s2**0.5,
         shift_m=smoothing_s2 * fitted.acceleration_m_s2,
     )
-    return _Suspect(n_sigmas, found)
+    return Suspect(n_sigmas, issue)
 
 
-def _scale_of_axis(fitted: PositionFit, stream: str) -> _Suspect:
+def _scale_of_axis(fitted: PositionFit, stream: str) -> Suspect:
     """Test whether a coordinate has another scale than the others.
 
     Drift and noise of the odometry reduce the estimated scale of a coordinate that hardly changes.
@@ -253,23 +240,24 @@ def _scale_of_axis(fitted: PositionFit, stream: str) -> _Suspect:
     """
     axis, size, sigma = largest_deviation(*fitted.estimate("scales"))
     noise = 3.0 * fitted.residual**2 * (1.0 - fitted.explained_share)
-    spurious = (_DRIFT * fitted.path_m) ** 2 + noise
+    # The drift is that of an odometry over the distance from the mean position.
+    spurious = (agreement.DRIFT_SHARE * fitted.path_m) ** 2 + noise
     max_bias = agreement.BIASES * spurious / fitted.spreads_m[axis] ** 2
     if -max_bias < size < 0.0 and not fitted.is_constant[axis]:
-        return _Suspect(0.0, None)
+        return Suspect(0.0, None)
     factor = 1.0 + size
     values = {"axis": "xyz"[axis], "factor": factor, "sigma": sigma}
-    return _Suspect(abs(size) / sigma, graded("axis_scale", stream, size, sigma, **values))
+    return Suspect(abs(size) / sigma, graded("axis_scale", stream, size, sigma, **values))
 
 
-def _lag_of_axis(fitted: PositionFit, stream: str) -> _Suspect:
+def _lag_of_axis(fitted: PositionFit, stream: str) -> Suspect:
     """Test whether a coordinate is late against the others."""
     axis, lag_s, sigma_s = largest_deviation(*fitted.estimate("delays"))
     n_sigmas = lag_s / sigma_s
     if lag_s < _LAG_S or n_sigmas < _CLEAR_SIGMAS:
-        return _Suspect(n_sigmas, None)
+        return Suspect(n_sigmas, None)
     shift_m = lag_s * float(fitted.speeds_m_s[axis])
-    found = graded(
+    issue = graded(
         "late",
         stream,
         shift_m,
@@ -280,4 +268,4 @@ def _lag_of_axis(fitted: PositionFit, stream: str) -> _Suspect:
         part=f"{'xyz'[axis]} coordinates",
         others="others",
     )
-    return _Suspect(n_sigmas, found)
+    return Suspect(n_sigmas, issue)

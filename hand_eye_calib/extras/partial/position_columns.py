@@ -154,7 +154,8 @@ def fit_positions(
 
 def _root_mean_square(vectors: FloatArray, is_used: BoolArray) -> FloatArray:
     """Return the root mean square (3,) of each coordinate of the used vectors (W, K, 3)."""
-    return np.asarray(np.sqrt((vectors[is_used] ** 2).mean(axis=0)))
+    squares = vectors[is_used] ** 2
+    return np.sqrt(squares.mean(axis=0))
 
 
 def _windows(
@@ -192,4 +193,4 @@ def _centred(vectors: FloatArray, is_used: BoolArray) -> FloatArray:
     """Return vectors (W, K, 3) minus the mean of the used vectors of their window."""
     counts = is_used.sum(axis=1)[:, None]
     means = (vectors * is_used[..., None]).sum(axis=1) / counts
-    return np.asarray(vectors - means[:, None])
+    return vectors - means[:, None]

@@ -302,7 +302,7 @@ class _State:
         )
 
     def sampled_space(self, model: NoiseModel | None = None) -> StateSpace:
-        """Return the state space of as many poses as noise levels need."""
+        """Return the state space of a sample of the poses that suffices for the noise levels."""
         kept = sample(len(self.streams), self.tuning)
         if kept is None:
             return self.space(model)
@@ -320,7 +320,8 @@ class _State:
     def fitted(self, kinds: tuple[str, ...] = ()) -> _State:
         """Return the state with fitted noise levels.
 
-        A lasting error of the positions, of one of these kinds, is added if the data ask for it.
+        A time-correlated error of the positions, of one of these kinds, is added if it lowers the
+        loss by more than ``least_gain``.
         """
         tuning = self.tuning
         prior = _level_prior(self.model, self.levels)
@@ -362,7 +363,7 @@ class _State:
         )
 
     def after(self, posterior: Posterior, step: FloatArray) -> _State:
-        """Return the state after a step, with the orientations that the positions ask for."""
+        """Return the state after a step, with the orientations that fit the positions best."""
         turns = posterior.states_after(np.r_[step, 0.0])[:, 3:6]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
         Ts_cw_c[:, :3, :3] = se3.rotation_of(Ts_cw_c) @ se3.rotation_exp(turns)
@@ -375,7 +376,7 @@ class _State:
 
 
 def _imprecise(squares: FloatArray, tuning: Tuning, drift_m2: float) -> BoolArray:
-    """Detect positions (N,) in neighbourhoods far less precise than the best quarter.
+    """Detect positions (N,) whose neighbourhood is far less precise than the best quarter.
 
     Parameters
     ----------
@@ -391,7 +392,7 @@ def _imprecise(squares: FloatArray, tuning: Tuning, drift_m2: float) -> BoolArra
     counts = np.convolve(np.ones(len(squares)), window, mode="same")
     means = sums / counts
     usual = max(float(np.quantile(means, 0.25)), drift_m2)
-    return np.asarray(sums > tuning.worst_error_factor * usual * counts)
+    return sums > tuning.worst_error_factor * usual * counts
 
 
 def _level_prior(model: NoiseModel, levels: FloatArray) -> reml.Prior:
@@ -455,8 +456,8 @@ def _accelerations(streams: increments.Streams, X: FloatArray, tuning: Tuning) -
     """Return the accelerations (N, 6) of the antenna by the odometry, m/s^2, in the body's axes.
 
     An acceleration is the difference of two velocities, before and after a pose, and does not
-    contain the noise of the pose itself. Accelerations next to gaps and at the ends are zero. So
-    are the last three columns.
+    contain the noise of the pose itself. Accelerations next to gaps and at the ends are zero. The
+    last three columns are zero, too.
     """
     path = se3.translation_of(streams.Ts_pw_p @ X)
     stamps_s = streams.stamps_s
@@ -555,7 +556,7 @@ def unexplained_share(
 
 
 def _windows(values: FloatArray, size: int) -> FloatArray:
-    """Values (n, size, ...) of windows of values (N, ...), each less its mean."""
+    """Values (n, size, ...) of windows of values (N, ...), minus the mean of their window."""
     whole = len(values) // size * size
     windows = values[:whole].reshape(-1, size, *values.shape[1:])
     return windows - windows.mean(axis=1, keepdims=True)

@@ -32,17 +32,13 @@ from hand_eye_calib.core.noise.increments import without_rate_bias
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over, synchronise
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
-from hand_eye_calib.extras.partial.copies import as_errors, copied
+from hand_eye_calib.extras.partial.copies import COPIED_SHARE, as_errors, copied
 from hand_eye_calib.extras.partial.rotation_columns import PLANES, RotationFit, fit_pairs
-
-# Number of standard deviations below which a rotation is zero.
-_ZERO_SIGMAS = 3.0
+from hand_eye_calib.extras.partial.suspects import Suspect, most_significant
 
 # Median residual (rad) below which rotations were computed from those of the other stream. It
 # corresponds to quaternions with five digits.
 _COPIED_RAD = 2e-5
-# The same limit as a share of the median motion, for slow streams.
-_COPIED_SHARE = 0.01
 
 # Residual (rad) of a window below which rates were computed from the orientations. Copies have
 # 7e-5, the most accurate odometries and gyroscopes of the study of faults 5e-4.
@@ -69,8 +65,8 @@ _DECISIVE = 3.0
 # Largest relative deviation of a ratio of rates from 57.3, if one unit is degrees and the other
 # radians.
 _UNIT_WITHIN = 0.2
-# Quantile of the rates that are compared: a sensor may rest for long.
-_TURNING = 0.75
+#: Quantile of rates or rotation angles that is compared: a sensor may rest for long.
+TURNING = 0.75
 
 # Smoothing is clear from this number of standard deviations. A jackknife of at most 16 blocks
 # estimates the standard deviation, so the ratio has heavy tails.
@@ -226,7 +222,7 @@ def check_rotation(
     if {"roll", "pitch", "yaw"} & {*priors} or not sigmas.max() < limit_rad:
         return []
     angles_rad = np.abs(se3.rotation_log(rotation))
-    if (angles_rad > np.maximum(agreement.SAME_RAD, _ZERO_SIGMAS * sigmas)).any():
+    if (angles_rad > np.maximum(agreement.SAME_RAD, agreement.ZERO_SIGMAS * sigmas)).any():
         return []
     angle_rad = float(np.linalg.norm(angles_rad))
     severity = Severity.ERROR if has_rates else Severity.WARNING
@@ -240,7 +236,7 @@ def _copied_rotations(pairs: PosePairs, rotation: FloatArray) -> list[Finding]:
         return []
     residual_rad = median(np.linalg.norm(of_child @ rotation.T - of_parent, axis=1))
     usual_rad = median(np.linalg.norm(of_parent, axis=1))
-    if residual_rad > min(_COPIED_RAD, _COPIED_SHARE * usual_rad):
+    if residual_rad > min(_COPIED_RAD, COPIED_SHARE * usual_rad):
         return []
     return copied("The rotations of both streams agree to rounding", residual_rad=residual_rad)
 
@@ -278,13 +274,13 @@ def _rates(stream: Trajectory) -> FloatArray:
     """Return the rates (N - 1, 3) between the rotations of a stream, rad/s."""
     rotations = se3.rotation_of(stream.poses)
     turns = se3.rotations_between(rotations[:-1], rotations[1:])
-    return np.asarray(turns / (np.diff(stream.stamps_ns) * 1e-9)[:, None])
+    return turns / (np.diff(stream.stamps_ns) * 1e-9)[:, None]
 
 
 def _large_rate(stream: Trajectory) -> float:
     """Return a large angular rate of a stream, rad/s, above zero."""
     rates = np.linalg.norm(_rates(stream), axis=1)
-    return max(float(np.quantile(rates, _TURNING)), 1e-12)
+    return max(float(np.quantile(rates, TURNING)), 1e-12)
 
 
 def _check_conventions(streams: _Streams) -> list[Finding]:
@@ -408,13 +404,6 @@ def _check_mount(pairs: PosePairs, rotation: FloatArray) -> list[Finding]:
     return [moved] if moved else []
 
 
-class _Suspect(NamedTuple):
-    """A possible fault: its size in standard deviations, and its finding if it is significant."""
-
-    sigmas: float
-    found: Finding | None
-
-
 def _check_response(streams: _Streams, rotation: FloatArray) -> list[Finding]:
     """Detect the fault that is most significant in the regression on all faults."""
     fitted = fit_pairs(streams.pairs, rotation, streams.name, streams.has_rates)
@@ -427,27 +416,26 @@ def _check_response(streams: _Streams, rotation: FloatArray) -> list[Finding]:
     # A gyroscope errs about its own axes. An attitude sensor errs about the vertical, too.
     of_kind = _shear if streams.has_rates else _main_gain
     suspects.append(of_kind(fitted, streams))
-    ranked = sorted(suspects, key=lambda suspect: suspect.sigmas, reverse=True)
-    findings = [suspect.found for suspect in ranked if suspect.found][:1]
+    findings = most_significant(suspects)
     if findings or not streams.has_rates or fitted.bias_drift < _BIAS_DRIFT_RAD_S:
         return findings
     return [finding("bias_drift", streams.name, deg_s=float(np.degrees(fitted.bias_drift)))]
 
 
-def _smoothing(fitted: RotationFit, streams: _Streams) -> _Suspect:
+def _smoothing(fitted: RotationFit, streams: _Streams) -> Suspect:
     """Test whether one stream is smoothed more than the other."""
     values, sigmas = fitted.estimate("smoothing")
     smoothing_s2 = float(values[0])
     n_sigmas = abs(smoothing_s2) / max(float(sigmas[0]), 1e-12)
     if abs(smoothing_s2) < _SMOOTHING_S2 or n_sigmas < _CLEAR_SIGMAS:
-        return _Suspect(n_sigmas, None)
+        return Suspect(n_sigmas, None)
     name = streams.name
     if smoothing_s2 < 0.0:
         name = "parent" if name == "child" else "child"
     stream = streams.child if name == "child" else streams.parent
     part = "rates" if stream.measures == "rates" else "orientations"
     seconds = abs(smoothing_s2) ** 0.5
-    return _Suspect(n_sigmas, finding("smoothed_rotations", name, part=part, smoothing_s=seconds))
+    return Suspect(n_sigmas, finding("smoothed_rotations", name, part=part, smoothing_s=seconds))
 
 
 class _Largest(NamedTuple):
@@ -472,35 +460,33 @@ def _largest(fitted: RotationFit, name: str) -> _Largest | None:
     return _Largest(place, float(values[place]), float(sigmas[place]))
 
 
-def _gain(fitted: RotationFit, streams: _Streams) -> _Suspect:
+def _gain(fitted: RotationFit, streams: _Streams) -> Suspect:
     """Test whether the rates about an axis of the sensor are too large or too small."""
     largest = _largest(fitted, "gains")
     if not largest:
-        return _Suspect(0.0, None)
+        return Suspect(0.0, None)
     place, gain, sigma = largest
-    found = graded(
-        "gain_of_axis", streams.name, gain, sigma, axis="xyz"[place], gain=1.0 + gain, sigma=sigma
-    )
-    return _Suspect(abs(gain) / sigma, found)
+    values = {"axis": "xyz"[place], "gain": 1.0 + gain, "sigma": sigma}
+    return Suspect(abs(gain) / sigma, graded("gain_of_axis", streams.name, gain, sigma, **values))
 
 
-def _main_gain(fitted: RotationFit, streams: _Streams) -> _Suspect:
+def _main_gain(fitted: RotationFit, streams: _Streams) -> Suspect:
     """Test whether the rotations about the main axis are too large or too small."""
     gain, sigma, bias = fitted.main_gain()
     if abs(gain) <= agreement.BIASES * bias:
-        return _Suspect(0.0, None)
+        return Suspect(0.0, None)
     values = {"axis": "main", "gain": 1.0 + gain, "sigma": sigma}
-    return _Suspect(abs(gain) / sigma, graded("gain_of_axis", streams.name, gain, sigma, **values))
+    return Suspect(abs(gain) / sigma, graded("gain_of_axis", streams.name, gain, sigma, **values))
 
 
-def _shear(fitted: RotationFit, streams: _Streams) -> _Suspect:
+def _shear(fitted: RotationFit, streams: _Streams) -> Suspect:
     """Test whether two axes of a gyroscope are not perpendicular."""
     largest = _largest(fitted, "shears")
     if not largest:
-        return _Suspect(0.0, None)
+        return Suspect(0.0, None)
     place, shear, sigma = largest
     first, second = ("xyz"[axis] for axis in PLANES[place])
     degrees = float(np.degrees(2.0 * abs(shear)))
     axes = f"{first} and {second}"
-    found = graded("misaligned", streams.name, shear, sigma, axes=axes, degrees=degrees)
-    return _Suspect(abs(shear) / sigma, found)
+    issue = graded("misaligned", streams.name, shear, sigma, axes=axes, degrees=degrees)
+    return Suspect(abs(shear) / sigma, issue)

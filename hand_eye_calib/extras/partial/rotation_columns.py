@@ -149,16 +149,18 @@ class RotationFit(Fit):
             places = np.array(self.places[name])[is_weak]
             weak += places.tolist()
             prior_sigmas += [_COLUMNS[name].sigma] * len(places)
-        known = [column for column in self._every_column if column not in weak]
+        strong = [column for column in self._every_column if column not in weak]
         total = self.blocks.total
-        effects = np.linalg.solve(total[np.ix_(known, known)], total[np.ix_(known, weak)])[:3]
+        among_strong = total[np.ix_(strong, strong)]
+        with_weak = total[np.ix_(strong, weak)]
+        effects = np.linalg.solve(among_strong, with_weak)[:3]
         of_weak = effects * np.array(prior_sigmas)
-        return self.open_to(known) + of_weak @ of_weak.T
+        return self.open_to(strong) + of_weak @ of_weak.T
 
     def main_gain(self) -> tuple[float, float, float]:
-        """Estimate the gain about the main axis u, less 1: u' S u.
+        """Estimate the gain about the main axis u, minus 1: u' S u.
 
-        If a machine turns about one axis only, this gain is certain, while those about the axes of
+        If a machine turns about one axis only, this gain is certain. The gains about the axes of
         the sensor are not.
 
         Returns
@@ -171,10 +173,11 @@ class RotationFit(Fit):
         row[self.places["gains"]] = u**2
         row[self.places["shears"]] = [2.0 * u[k] * u[m] for k, m in PLANES]
         gain = float(row @ self.joint.values)
-        variance = row @ self.blocks.jackknife(self._every_column) @ row
-        spread = row @ np.linalg.solve(self.blocks.total[:-1, :-1], row)
-        bias = self.n_samples * abs(float(spread))
-        return gain, float(np.sqrt(variance)), bias
+        jackknife = self.blocks.jackknife(self._every_column)
+        sigma = float(np.sqrt(row @ jackknife @ row))
+        information = self.blocks.total[:-1, :-1]
+        spread = float(row @ np.linalg.solve(information, row))
+        return gain, sigma, self.n_samples * abs(spread)
 
     @property
     def bias_drift(self) -> float:
@@ -260,8 +263,10 @@ def fit_rotations(
 
 def _integral(stamps_s: FloatArray, values: FloatArray) -> FloatArray:
     """Return the integral (N, ...) over time of values (N - 1, ...) between the stamps (N,)."""
-    intervals_s = np.diff(stamps_s).reshape(-1, *[1] * (values.ndim - 1))
-    return np.cumsum(np.concatenate([0.0 * values[:1], intervals_s * values]), axis=0)
+    n_axes = values.ndim - 1
+    intervals_s = np.diff(stamps_s).reshape(-1, *[1] * n_axes)
+    start = 0.0 * values[:1]
+    return np.cumsum(np.concatenate([start, intervals_s * values]), axis=0)
 
 
 def _motion(
