@@ -40,8 +40,6 @@ BLOCK_BYTES = 4 << 20
 
 #: Largest size of a YAML file (bytes).
 LARGEST_YAML = 1 << 20
-#: Whole numbers must be smaller than this limit, so that they fit into signed integers of 64 bits.
-LARGEST_INT = 1 << 63
 #: Largest number of nested levels in a YAML file.
 DEEPEST_YAML = 32
 

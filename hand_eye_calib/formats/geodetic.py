@@ -18,11 +18,6 @@ _RADIUS_M = 6_378_137.0
 _FLATTENING = 1.0 / 298.257223563
 # Square of the first eccentricity, e^2.
 _ECCENTRICITY_2 = _FLATTENING * (2.0 - _FLATTENING)
-# Positions are in ECEF if their distance from the centre of the earth is between both limits (m).
-# Every position on the ground is beyond the first limit.
-_MIN_ECEF_M = 6.3e6
-# Every position of an aircraft is within this limit.
-_MAX_ECEF_M = 6.45e6
 
 
 class LocalOrigin:
@@ -50,13 +45,7 @@ class LocalOrigin:
         # Product of vectors (N, 3) and axes (1, 3, 3). Sums have the same bits for one position (in
         # live use) and for many positions. A matrix product does not.
         terms = from_origin[:, :, None] * _axes(origin_lat, origin_lon)
-        return np.asarray(terms[:, 0] + terms[:, 1] + terms[:, 2])
-
-
-def are_earth_centred(positions: FloatArray) -> bool:
-    """Whether all positions (N, 3), m, may be in ECEF, judged by their distance from its origin."""
-    distances = np.linalg.norm(positions, axis=1)
-    return bool(((distances > _MIN_ECEF_M) & (distances < _MAX_ECEF_M)).all())
+        return terms[:, 0] + terms[:, 1] + terms[:, 2]
 
 
 def axes_of_places(positions: FloatArray) -> FloatArray:

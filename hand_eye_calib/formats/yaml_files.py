@@ -13,11 +13,11 @@ from typing import Any, ClassVar
 import yaml
 
 from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.base.option import LARGEST_INT
 from hand_eye_calib.core.base.plain import plain
 from hand_eye_calib.core.base.text import shortened
 from hand_eye_calib.formats.files import (
     DEEPEST_YAML,
-    LARGEST_INT,
     LARGEST_YAML,
     LONGEST_NAME,
     read_text,

@@ -160,7 +160,9 @@ def correlate_rates(
 
 def _shorter_s(parent_rates: FloatArray, child_rates: FloatArray, step_s: float) -> float:
     """Return the total duration (s) of finite rates, of the stream with fewer finite rates."""
-    return min(np.isfinite(parent_rates).sum(), np.isfinite(child_rates).sum()) * step_s
+    n_of_parent = np.isfinite(parent_rates).sum()
+    n_of_child = np.isfinite(child_rates).sum()
+    return min(n_of_parent, n_of_child) * step_s
 
 
 def _clear_repetitions(

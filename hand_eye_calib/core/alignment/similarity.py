@@ -355,7 +355,8 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
 
 def _rms_translation(motions: FloatArray) -> float:
     """Return the root mean square length of the translations of motions (K, 4, 4)."""
-    return float(np.linalg.norm(se3.translation_of(motions)) / len(motions) ** 0.5)
+    total = np.linalg.norm(se3.translation_of(motions))
+    return float(total / len(motions) ** 0.5)
 
 
 def _random_subsets(n_pairs: int) -> FloatArray:

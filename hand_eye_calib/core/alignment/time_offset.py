@@ -34,9 +34,8 @@ _LAGS_S = (1.0, 0.3, 3.0)
 _MAX_PAIRS_OF_RATE = 5 * MAX_PAIRS
 
 # The child's velocity at a stamp is its motion from one half span before to one half span after it.
-# Shorter spans contain so much noise, and longer ones so many poses of the motion pair, that the
-# offset is biased and its standard deviation too small.
-# Smallest half span (s).
+# Velocities over a shorter span are noisy. Those over a longer span share poses with the motion
+# pair. Both bias the offset and make its standard deviation too small. Smallest half span (s):
 _MIN_SPAN_S = 0.05
 # Largest half span (s) that is chosen because of noise.
 _MAX_SPAN_S = 0.3
@@ -100,7 +99,9 @@ class TimeOffset:
 
     def steadied(self, child: Trajectory) -> Trajectory:
         """Return the child with stamps corrected for the clock rate, if a rate was estimated."""
-        return child.shifted(0.0, self.rate.used, self.rate.at_ns) if self.rate else child
+        if self.rate is None:
+            return child
+        return child.shifted(0.0, self.rate.used, self.rate.at_ns)
 
     def largest_s(self, duration_s: float) -> float:
         """Return the largest offset (s) within a recording: its size plus half of the drift."""
@@ -309,7 +310,8 @@ def _twists_of_pairs(
     # Motions share poses: the velocity at each pose is computed once.
     poses, index_of_pose = np.unique(np.r_[pairs.i, pairs.j], return_inverse=True)
     twists = _twists(child, stamps_ns[poses], span_s)[index_of_pose]
-    return twists[: len(pairs)], twists[len(pairs) :]
+    at_starts, at_ends = np.split(twists, 2)
+    return at_starts, at_ends
 
 
 def _twists(trajectory: Trajectory, stamps_ns: IntArray, span_s: float) -> FloatArray:
@@ -325,7 +327,7 @@ def _twists(trajectory: Trajectory, stamps_ns: IntArray, span_s: float) -> Float
     before, after = np.split(trajectory.at(np.concatenate([from_ns, until_ns])), 2)
     steps = se3.log(se3.inverse(before) @ after)
     spans_s = (until_ns - from_ns) * 1e-9
-    return np.asarray(steps / spans_s[:, None])
+    return steps / spans_s[:, None]
 
 
 def _rate(fit: SimilarityFit, stamps_ns: IntArray, before: ClockRate) -> ClockRate:

@@ -245,7 +245,7 @@ def _common(
 def unknown_directions(covariance: FloatArray) -> FloatArray:
     """Return the orthonormal unknown directions (6, U) of a covariance (6, 6)."""
     values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors[:, values > UNOBSERVABLE**2])
+    return vectors[:, values > UNOBSERVABLE**2]
 
 
 def _without_unknown(covariance: FloatArray) -> FloatArray:

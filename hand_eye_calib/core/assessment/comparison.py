@@ -224,12 +224,12 @@ def agreement_of_results(results: Sequence[Calibration], level: float = 0.01) ->
     :func:`~hand_eye_calib.core.assessment.agreement.agreement_of`.
     """
     Ts = np.array([result.T_parent_child for result in results])
-    measured = np.array([result.covariance_measured for result in results])
-    # From the axes of the child to those of the parent.
-    covariances = turned(se3.rotation_of(Ts), measured)
-    variances = [np.diag(scatter_of_recordings(covariance)) for covariance in covariances]
+    in_child = np.array([result.covariance_measured for result in results])
+    in_parent = turned(se3.rotation_of(Ts), in_child)
+    variances = [np.diag(scatter_of_recordings(covariance)) for covariance in in_parent]
     # The usual scatter of the rig: the median over its recordings.
-    return agreement_of(Ts, covariances, np.sqrt(np.median(variances, axis=0)), level)
+    usual_scatter = np.sqrt(np.median(variances, axis=0))
+    return agreement_of(Ts, in_parent, usual_scatter, level)
 
 
 def require_same_frames(results: Iterable[Calibration]) -> None:

@@ -222,7 +222,7 @@ def assess_lever_arm(
     walk = np.exp(solution.levels[WALK_ROTATION])
 
     def rotation_variance(n_increments: int) -> FloatArray:
-        return np.asarray(2.0 * white + n_increments * walk)
+        return 2.0 * white + n_increments * walk
 
     hidden = _hidden_by_noise(Ts, np.eye(4), solution.jumps, rotation_variance)
     rotations = np.eye(6)[3:]
@@ -243,9 +243,11 @@ def _white_rotation_variance(rotations: FloatArray) -> float:
     """
     steps = se3.rotations_between(rotations[:-1], rotations[1:])
     squares = np.diff(steps, axis=0) ** 2
+    median_squares = np.median(squares, axis=0)
     # Differences of steps have six times the variance of white noise.
-    variances = np.median(squares, axis=0) / CHI2[0.5][1] / 6.0
-    return float(np.sort(variances)[:2].mean())
+    variances = median_squares / CHI2[0.5][1] / 6.0
+    two_smallest = np.sort(variances)[:2]
+    return float(two_smallest.mean())
 
 
 def widened_by_blocks(covariance: FloatArray, solution: ModelSolution, part: slice) -> FloatArray:

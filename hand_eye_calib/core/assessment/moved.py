@@ -101,7 +101,8 @@ def scatter_of_recordings(covariance: FloatArray) -> FloatArray:
 
 def shift_covariance(metres: float = _SHIFT_M, radians: float = _SHIFT_RAD) -> FloatArray:
     """Return the prior covariance L (6, 6) of shifts, from standard deviations per axis."""
-    return np.diag(np.repeat([metres**2, radians**2], 3))
+    variances = np.repeat([metres**2, radians**2], 3)
+    return np.diag(variances)
 
 
 _EXPECTED_SHIFTS = shift_covariance()
@@ -143,7 +144,8 @@ def most_likely(tables: FloatArray, ridge: float) -> FloatArray:
 
     ``ridge`` is the weight of the prior: SHIFT_INFORMATION times ``ridge`` is added to H.
     """
-    return _solve(information(tables) + ridge * SHIFT_INFORMATION, score(tables))
+    regular = information(tables) + ridge * SHIFT_INFORMATION
+    return _solve(regular, score(tables))
 
 
 def squares_about(tables: FloatArray, shifts: FloatArray, ridge: float) -> FloatArray:
@@ -212,9 +214,11 @@ def evidence(
     weights : (K,) array
         Robust weights of the motion pairs.
     """
-    whitened = np.swapaxes(jacobians, 1, 2) @ np.linalg.inv(noise)
+    precision = np.linalg.inv(noise)
+    whitened = np.swapaxes(jacobians, 1, 2) @ precision
+    weighted = whitened * weights[:, None, None]
     columns = np.concatenate([jacobians, -residuals[..., None]], axis=2)
-    return (whitened * weights[:, None, None]) @ columns
+    return weighted @ columns
 
 
 def noise_covariance(residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -308,8 +312,10 @@ def _long_run_variance(windows: Blocks) -> float:
     estimates = most_likely(sides, _PRIOR_SHARE)
     side_of_window = (np.arange(n_windows) >= cuts[:, None]).astype(int)
     # Estimate of the side of each window, for each cut.
-    answers = estimates[np.arange(len(cuts))[:, None], side_of_window]
-    has_evidence = np.trace(information(windows.sums), axis1=1, axis2=2) > 0
+    row_of_cut = np.arange(len(cuts))[:, None]
+    answers = estimates[row_of_cut, side_of_window]
+    traces = np.trace(information(windows.sums), axis1=1, axis2=2)
+    has_evidence = traces > 0
     squares = squares_about(windows.sums[has_evidence], answers[:, has_evidence], _PRIOR_SHARE)
     # Each window has six values; the two estimates use up twelve.
     dof = max(6 * int(has_evidence.sum()) - 12, 1)

@@ -95,7 +95,7 @@ def _unknown_directions(covariance: FloatArray) -> FloatArray:
     shares, vectors = np.linalg.eigh(relative)
     directions = UNKNOWN_SIGMAS[:, None] * vectors[:, shares > _UNKNOWN_SHARE]
     orthonormal, _ = np.linalg.qr(directions)
-    return np.asarray(orthonormal)
+    return orthonormal
 
 
 class _Whitening(NamedTuple):
@@ -154,7 +154,7 @@ def _verdict_on(axis: str, sigma: float, is_from_prior: bool) -> DofObservabilit
 
 def halves_variance(sigmas: FloatArray, motion_sigmas: FloatArray) -> BoolArray:
     """Return a mask (6,) of the axes whose variance is at most half of the variance by motion."""
-    return np.asarray(2 * sigmas**2 < motion_sigmas**2)
+    return 2 * sigmas**2 < motion_sigmas**2
 
 
 def widened(assessment: Assessment, spread: FloatArray) -> Assessment:

@@ -68,7 +68,7 @@ class Blocks:
     @property
     def total(self) -> FloatArray:
         """Sum (...) of all blocks."""
-        return np.asarray(self.sums.sum(axis=0))
+        return self.sums.sum(axis=0)
 
     def without(self) -> FloatArray:
         """Return the sums (B, ...) of all blocks except block b, for each b."""
@@ -76,11 +76,12 @@ class Blocks:
 
     def before(self, cuts: IntArray) -> FloatArray:
         """Return the sums (C, ...) of the blocks before each of the indices ``cuts`` (C,), >= 1."""
-        return np.asarray(np.cumsum(self.sums, axis=0)[cuts - 1])
+        return np.cumsum(self.sums, axis=0)[cuts - 1]
 
     def since(self, cuts: IntArray) -> FloatArray:
         """Return the sums (C, ...) of the blocks from each of the indices ``cuts`` (C,) on."""
-        return np.asarray(np.cumsum(self.sums[::-1], axis=0)[::-1][cuts])
+        sums_from_end = np.cumsum(self.sums[::-1], axis=0)
+        return sums_from_end[::-1][cuts]
 
     def shift_since(self, cuts: IntArray, prior: FloatArray) -> FloatArray:
         """Return information and score ``[H S]`` (C, p, p + 1) of a shift at each of the cuts (C,).
@@ -110,7 +111,8 @@ def information(tables: FloatArray) -> FloatArray:
 
 def score(tables: FloatArray) -> FloatArray:
     """Return the score S (..., p) of tables (..., p, p + 1) or (..., p + 1, p + 1)."""
-    return tables[..., : tables.shape[-1] - 1, -1]
+    n_unknowns = tables.shape[-1] - 1
+    return tables[..., :n_unknowns, -1]
 
 
 def inverse(matrices: FloatArray) -> FloatArray:
@@ -167,13 +169,14 @@ def solve(tables: FloatArray, columns: Sequence[int], target: int = -1) -> Float
         Coefficients of the columns; zero along directions without information.
     """
     normal = tables[..., columns, :][..., columns]
-    roots = np.sqrt(np.abs(np.diagonal(normal, axis1=-2, axis2=-1)))
+    diagonal = np.diagonal(normal, axis1=-2, axis2=-1)
+    roots = np.sqrt(np.abs(diagonal))
     units = np.divide(1.0, roots, out=np.zeros_like(roots), where=roots > _MIN_ROOT)
     balanced = normal * units[..., :, None] * units[..., None, :]
     damped = balanced + _DAMPING * np.eye(len(columns))
     scores = units * tables[..., columns, target]
     answers = np.linalg.solve(damped, scores[..., None])[..., 0]
-    return np.asarray(units * answers)
+    return units * answers
 
 
 def jackknife_covariance(answers: FloatArray) -> FloatArray:
@@ -184,4 +187,4 @@ def jackknife_covariance(answers: FloatArray) -> FloatArray:
     """
     n_blocks = len(answers)
     deviations = answers - answers.mean(axis=0)
-    return np.asarray((n_blocks - 1) / n_blocks * deviations.T @ deviations)
+    return (n_blocks - 1) / n_blocks * deviations.T @ deviations

@@ -14,8 +14,8 @@ OptionValue: TypeAlias = bool | int | float | str
 Options: TypeAlias = Mapping[str, Any]
 OptionField: TypeAlias = dataclasses.Field[Any]
 
-# Upper bound of the absolute value of whole numbers: parameters of ROS have 64 bits.
-_MAX_INT = 1 << 63
+#: Whole numbers must be smaller than this, so that they fit into signed integers of 64 bits.
+LARGEST_INT = 1 << 63
 
 _GROUPS = ("keyframe", "prior", "target")
 _TYPE_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
@@ -97,7 +97,7 @@ def check_value(field: OptionField, value: object) -> OptionValue:
     name = option_name(field)
     words = field.metadata["words"]
     value = _of_python(value)
-    if type(value) is int and not -_MAX_INT < value < _MAX_INT:
+    if type(value) is int and not -LARGEST_INT < value < LARGEST_INT:
         raise ConfigError(f"{name}: the number is too large")
     kind = _type_of(field)
     if isinstance(value, str) and (value in words or kind is str):

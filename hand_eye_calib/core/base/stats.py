@@ -51,11 +51,14 @@ def median(values: ArrayLike) -> float:
 
 def medians(values: FloatArray) -> FloatArray:
     """Return the medians (...) of finite values (..., K), K >= 1."""
-    half = values.shape[-1] // 2
-    if values.shape[-1] % 2:
-        return np.asarray(np.partition(values, half, axis=-1)[..., half])
+    count = values.shape[-1]
+    half = count // 2
+    if count % 2:
+        parted = np.partition(values, half, axis=-1)
+        return np.asarray(parted[..., half])
     parted = np.partition(values, (half - 1, half), axis=-1)
-    return np.asarray(0.5 * (parted[..., half - 1] + parted[..., half]))
+    in_the_middle = parted[..., half - 1] + parted[..., half]
+    return np.asarray(0.5 * in_the_middle)
 
 
 def quantile(values: ArrayLike, share: float) -> float:
@@ -74,7 +77,8 @@ def quantile(values: ArrayLike, share: float) -> float:
 
 def robust_sigma(vectors: FloatArray) -> FloatArray:
     """Return robust standard deviations (...) per axis of K vectors each (..., K, 3)."""
-    return medians(np.linalg.norm(vectors, axis=-1)) / MEDIAN_LENGTH
+    lengths = np.linalg.norm(vectors, axis=-1)
+    return medians(lengths) / MEDIAN_LENGTH
 
 
 def student_weights(squared: FloatArray, degrees: float = STUDENT) -> FloatArray:
@@ -157,10 +161,12 @@ def robust_regression(
     weights = np.ones(len(rows))
     for _ in range(rounds):
         roots = np.sqrt(weights)[:, None]
-        scaled = (roots[..., None] * rows).reshape(-1, rows.shape[2])
-        values = np.linalg.lstsq(scaled, (roots * targets).ravel(), rcond=_RANK_TOLERANCE)[0]
+        scaled_rows = (roots[..., None] * rows).reshape(-1, rows.shape[2])
+        scaled_targets = (roots * targets).ravel()
+        values = np.linalg.lstsq(scaled_rows, scaled_targets, rcond=_RANK_TOLERANCE)[0]
         lengths = np.linalg.norm(rows @ values - targets, axis=1)
-        weights = robust_weights(kind, (lengths / max(unit(lengths), _SMALLEST_UNIT)) ** 2)
+        divisor = max(unit(lengths), _SMALLEST_UNIT)
+        weights = robust_weights(kind, (lengths / divisor) ** 2)
     return np.asarray(values, dtype=float), lengths
 
 

@@ -77,7 +77,9 @@ def change(axis: str, value: float, sigma: float) -> str:
 
 def capital(text: str) -> str:
     """Capitalise the first letter of a text, unless the text begins with the axis x, y or z."""
-    return text if re.match(r"[xyz]\b", text) else f"{text[:1].upper()}{text[1:]}"
+    if re.match(r"[xyz]\b", text):
+        return text
+    return f"{text[:1].upper()}{text[1:]}"
 
 
 def axes_in_words(axes: Sequence[str]) -> str:
@@ -116,7 +118,9 @@ def with_sigma(value: float | None, sigma: float | None, min_decimals: int = 2) 
 
 def fixed(value: float, decimals: int = 4) -> str:
     """Format a number with a fixed number of decimals, without a minus sign before zero."""
-    return f"{round(value, decimals) + 0.0:.{decimals}f}"
+    # The sum turns -0.0 into 0.0.
+    rounded = round(value, decimals) + 0.0
+    return f"{rounded:.{decimals}f}"
 
 
 def in_words(value: object) -> str:
@@ -141,12 +145,14 @@ def given_or_estimated(value: float, sigma: float, unit: str) -> str:
 def duration(seconds: float) -> str:
     """Format a duration in seconds, minutes or hours."""
     unit, factor = _suitable_unit(seconds, _DURATIONS)
-    return f"{seconds / factor:.{1 if seconds < 10 else 0}f} {unit}"
+    decimals = 1 if seconds < 10 else 0
+    return f"{seconds / factor:.{decimals}f} {unit}"
 
 
 def share(value: float) -> str:
     """Format a share in per cent."""
-    return f"{value:.1%}" if value < 0.1 else f"{value:.0%}"
+    decimals = 1 if value < 0.1 else 0
+    return f"{value:.{decimals}%}"
 
 
 # Share of null poses in all messages above which the user is asked to check their source.
@@ -164,7 +170,9 @@ def without_poses(n_null: int, n_all: int) -> str:
 
 def listing(words: Sequence[str]) -> str:
     """Join words as in "x, y and z"."""
-    return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))
+    first = ", ".join(words[:-1])
+    last = "".join(words[-1:])
+    return f"{first} and {last}" if first else last
 
 
 def distinct_names(paths: Sequence[str]) -> list[str]:
@@ -187,7 +195,8 @@ def _n_shared(paths: Sequence[Sequence[str]]) -> int:
 
 def counted(count: int, noun: str) -> str:
     """Format a count with its noun, to which an s is appended for the plural."""
-    return f"{count:,} {noun}" if count == 1 else f"{count:,} {noun}s"
+    plural = "" if count == 1 else "s"
+    return f"{count:,} {noun}{plural}"
 
 
 # --------------------------- quantities that users type: in m and rad, or with a unit
@@ -294,7 +303,8 @@ def parse_pose(name: str, text: str) -> tuple[float, ...]:
     ConfigError
         If the text has another form.
     """
-    return tuple(quantities(name, [*AXIS_UNITS.values()], text.split(), "X Y Z ROLL PITCH YAW"))
+    units = [*AXIS_UNITS.values()]
+    return tuple(quantities(name, units, text.split(), "X Y Z ROLL PITCH YAW"))
 
 
 def parse_targets(name: str, text: str) -> dict[str, float]:

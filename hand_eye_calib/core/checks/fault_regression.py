@@ -131,11 +131,11 @@ class Regression:
         """
         columns = self._columns[group]
         squares = np.maximum(self._products[columns, columns], 1e-300)
-        return np.asarray(self._sigma**2 * self._total_weight / squares)
+        return self._sigma**2 * self._total_weight / squares
 
     def displacements_m(self, group: str) -> FloatArray:
         """Return the root mean square displacement (m,) that each fault of size 1 causes."""
-        return np.asarray(self._displacements_m[self._columns[group]])
+        return self._displacements_m[self._columns[group]]
 
     def explained_share(self, group: str, *nuisances: str) -> float:
         """Return the share (0 to 1) of the squared residuals that a group explains.

@@ -193,9 +193,10 @@ def repair_message(findings: Sequence[Finding], options: Options, verdicts: str 
     verdicts : str
         Text about the verdicts with and without the repair.
     """
-    what = "; ".join([found.what for found in findings])
+    faults = "; ".join([issue.what for issue in findings])
+    used = options_in_words(options)
     undo = options_in_words(defaults_of(options))
-    return f"repaired: {what}. Solved with {options_in_words(options)}{verdicts} (undo with {undo})"
+    return f"repaired: {faults}. Solved with {used}{verdicts} (undo with {undo})"
 
 
 def answered(findings: Sequence[Finding], config: CalibratorConfig) -> list[Finding]:

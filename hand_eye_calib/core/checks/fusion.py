@@ -292,8 +292,9 @@ class _Differences:
 
     def _joined(self, usual_errors: FloatArray, filtered: FloatArray) -> FloatArray:
         """Return rows (K, 6, p + 1) of regressors and differences, in units of the noise."""
-        joined = np.concatenate([usual_errors, filtered, self._residuals[:, :, None]], axis=2)
-        return np.asarray(joined / self._units[:, None])
+        residuals = self._residuals[:, :, None]
+        joined = np.concatenate([usual_errors, filtered, residuals], axis=2)
+        return joined / self._units[:, None]
 
     def _robust_weights(self, rows: FloatArray) -> FloatArray:
         """Return robust weights (K,) of motions with rows (K, 6, p + 1)."""

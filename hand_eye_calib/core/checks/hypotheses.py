@@ -108,8 +108,11 @@ class Hypothesis:
         The first number is that of the mistakes; each wrong axis is one more. The second number
         sorts equal numbers of mistakes: mistakes of the child come first.
         """
-        n_axes = 0 if self.axes is None else int((self.axes != np.eye(3)).any(axis=1).sum())
-        return len(self.mistakes) + n_axes, 2 * len(self.parent) + len(self.child)
+        n_mistakes = len(self.mistakes)
+        if self.axes is not None:
+            is_exchanged = (self.axes != np.eye(3)).any(axis=1)
+            n_mistakes += int(is_exchanged.sum())
+        return n_mistakes, 2 * len(self.parent) + len(self.child)
 
     def corrected(self, stream: str, poses: FloatArray) -> FloatArray:
         """Correct the poses (N, 4, 4) of the "parent" or the "child" stream for its mistakes."""
@@ -175,7 +178,8 @@ class Readings:
     @property
     def by_shape(self) -> int:
         """1 if the shape is clear evidence for the second reading, -1 for the first, else 0."""
-        return int(np.sign(self.shape)) if abs(self.shape) > CLEAR_SHAPE else 0
+        is_clear = abs(self.shape) > CLEAR_SHAPE
+        return int(np.sign(self.shape)) if is_clear else 0
 
     @property
     def is_clear(self) -> bool:

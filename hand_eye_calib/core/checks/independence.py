@@ -84,9 +84,10 @@ _STEADY_PATH_M = 190.0
 # two sensors adds up. Below the smallest multiple the noisier stream consists of motion, or the
 # copy has so little noise of its own that other checks detect it (_SHARED).
 _NOISE_OF_COPY = (0.33, 1.1)
-# The factor of a regression of the noise of a copy on the noise of its source is about 1; that of
-# two sensors is 0. Limit between them, and standard deviations from which on a factor is clear.
+# The noise of one stream is regressed on the noise of the other. The factor is about 1 for a copy
+# and its source, and 0 for two sensors. A factor above this limit is that of a copy ...
 _CONTAINED = 0.5
+# ... if it also exceeds this number of standard deviations.
 _CONTAINED_SIGMAS = 4.0
 # Largest number of poses that are compared.
 _MOST_POSES = 2000
@@ -150,14 +151,20 @@ def _residual_at_nearest(computed: Trajectory, source: Trajectory) -> float:
     Poses of ``computed`` are used for which a pose of ``source`` is nearest in time.
     """
     rows = _within(computed, source)
-    after = np.clip(np.searchsorted(source.stamps_ns, computed.stamps_ns[rows]), 1, len(source) - 1)
-    around = np.abs(source.stamps_ns[[after - 1, after]] - computed.stamps_ns[rows]).min(axis=0)
-    nearest = np.sort(around)[: max(_NEAREST[0], len(rows) // 100)]
-    rows = rows[around <= nearest.max(initial=0)]
-    computed = computed[rows[:: max(-(-len(rows) // _NEAREST[1]), 1)]]
-    between = source.at(computed.stamps_ns, straight=True)
+    stamps_ns = computed.stamps_ns[rows]
+    after = np.searchsorted(source.stamps_ns, stamps_ns)
+    after = np.clip(after, 1, len(source) - 1)
+    distances_ns = np.abs(source.stamps_ns[[after - 1, after]] - stamps_ns)
+    nearest_ns = distances_ns.min(axis=0)
+    n_near = max(_NEAREST[0], len(rows) // 100)
+    limit_ns = np.sort(nearest_ns)[:n_near].max(initial=0)
+    rows = rows[nearest_ns <= limit_ns]
+    # Use every k-th of these poses, so that at most _NEAREST[1] remain.
+    every = max(-(-len(rows) // _NEAREST[1]), 1)
+    computed = computed[rows[::every]]
+    of_source = source.at(computed.stamps_ns, straight=True)
     start = np.arange(len(computed) - 1)
-    return _residual(pairs_between(between, computed.poses, start, start + 1))
+    return _residual(pairs_between(of_source, computed.poses, start, start + 1))
 
 
 def _residual(motions: MotionPairs) -> float:
@@ -230,7 +237,7 @@ def _is_calm(of_computed: FloatArray, of_source: FloatArray) -> BoolArray:
     """
     sizes = np.linalg.norm([of_computed, of_source], axis=3)
     usual = _ABRUPT * np.median(sizes, axis=1, keepdims=True)
-    return np.asarray((sizes <= usual).any(axis=0).all(axis=1))
+    return (sizes <= usual).any(axis=0).all(axis=1)
 
 
 def _upper_quarters(second_differences: FloatArray) -> FloatArray:
@@ -239,9 +246,11 @@ def _upper_quarters(second_differences: FloatArray) -> FloatArray:
     ``second_differences`` is (S, N, 2, 3). The spectra are those of the power of poses. The gain of
     the differences is divided out, see :func:`_upper_spectra`.
     """
-    spectra = (np.abs(np.fft.rfft(second_differences, axis=1)) ** 2).sum(axis=3)
+    amplitudes = np.abs(np.fft.rfft(second_differences, axis=1))
+    spectra = (amplitudes**2).sum(axis=3)
     half_frequencies = np.linspace(1e-3, np.pi / 2.0, spectra.shape[1])
-    spectra /= (2.0 * np.sin(half_frequencies))[:, None] ** 6
+    gain_of_difference = 2.0 * np.sin(half_frequencies)
+    spectra /= gain_of_difference[:, None] ** 6
     quarters = np.array_split(spectra, 4, axis=1)
     return np.stack([quarter.mean(axis=1) for quarter in quarters[2:]])
 
@@ -307,18 +316,18 @@ class _AlignedPositions:
     def seconds(self) -> FloatArray:
         """Times (N,) since the first pose pair, s."""
         stamps_ns = self.pose_pairs.stamps_ns
-        return np.asarray((stamps_ns - stamps_ns[0]) * 1e-9)
+        return (stamps_ns - stamps_ns[0]) * 1e-9
 
     @cached_property
     def from_mean(self) -> FloatArray:
         """Points (N, 3) relative to their mean, m."""
-        return np.asarray(self.points - self.points.mean(axis=0))
+        return self.points - self.points.mean(axis=0)
 
     @cached_property
     def differences(self) -> FloatArray:
         """Differences (N, 3) of the aligned positions, in the parent's world, m."""
         others_from_mean = self.others - self.others.mean(axis=0)
-        return np.asarray(others_from_mean @ self.R.T - self.from_mean)
+        return others_from_mean @ self.R.T - self.from_mean
 
     def regressors(self, rotations: FloatArray) -> FloatArray:
         """Return the regressors (N, 3, 11) of errors of both worlds, X, scale and clock offset.
@@ -414,13 +423,15 @@ def _factors_of_noise(streams: FloatArray) -> tuple[FloatArray, FloatArray]:
     (2,) array, (2,) array
         Factors of positions and of orientations, and their standard deviations.
     """
-    spectra = _upper_spectra(streams)
-    source, copy = spectra
+    source, copy = _upper_spectra(streams)
     power = (np.abs(source) ** 2).sum(axis=(0, 2))
-    factors = (source.conj() * copy).real.sum(axis=(0, 2)) / np.maximum(power, 1e-300)
+    divisor = np.maximum(power, 1e-300)
+    products = (source.conj() * copy).real
+    factors = products.sum(axis=(0, 2)) / divisor
     residuals = copy - factors[:, None] * source
+    mean_squares = (np.abs(residuals) ** 2).mean(axis=(0, 2))
     # The real part of a coefficient has half of its power.
-    variances = 0.5 * (np.abs(residuals) ** 2).mean(axis=(0, 2)) / np.maximum(power, 1e-300)
+    variances = 0.5 * mean_squares / divisor
     return factors, np.sqrt(variances)
 
 
@@ -435,16 +446,20 @@ def _upper_spectra(second_differences: FloatArray) -> NDArray[np.complex128]:
         ``(2 sin(w / 2))^3``. The spectra are divided by this gain.
     """
     spectra = np.fft.rfft(second_differences, axis=1)
-    half_frequencies = np.linspace(1e-3, np.pi / 2.0, spectra.shape[1])
-    spectra /= (2.0 * np.sin(half_frequencies))[:, None, None] ** 3
-    return np.asarray(spectra[:, spectra.shape[1] // 2 :])
+    n_frequencies = spectra.shape[1]
+    half_frequencies = np.linspace(1e-3, np.pi / 2.0, n_frequencies)
+    gain_of_difference = 2.0 * np.sin(half_frequencies)
+    spectra /= gain_of_difference[:, None, None] ** 3
+    return spectra[:, n_frequencies // 2 :]
 
 
 def _size_of_changes(values: FloatArray, n_poses: int) -> FloatArray:
     """Return the _DIFFERENCE_SHARE quantile (d,) of changes of values (N, d) over some poses."""
     n_poses = max(n_poses, 1)
-    changes = np.sort(np.abs(values[n_poses:] - values[:-n_poses]), axis=0)
-    return np.maximum(changes[int(_DIFFERENCE_SHARE * len(changes))], 1e-12)
+    changes = np.abs(values[n_poses:] - values[:-n_poses])
+    row = int(_DIFFERENCE_SHARE * len(changes))
+    usual = np.sort(changes, axis=0)[row]
+    return np.maximum(usual, 1e-12)
 
 
 def _pose_differences(aligned: _AlignedPositions) -> FloatArray:
@@ -475,7 +490,7 @@ def _residuals(rows: FloatArray, targets: FloatArray) -> FloatArray:
     values, _ = robust_regression(
         "cauchy", rows, targets, ROUNDS, lambda lengths: 2.0 * median(lengths)
     )
-    return np.asarray(targets - rows @ values)
+    return targets - rows @ values
 
 
 def _alignment(points: FloatArray, others: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -20,7 +20,7 @@ from hand_eye_calib.core.checks.findings import Finding, finding
 from hand_eye_calib.core.checks.hypotheses import HOLDS
 from hand_eye_calib.core.checks.stream_pair import LAGS_S, MAX_PAIRS, StreamPair
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.geometry.trajectory import are_earth_centred
 
 # Largest rotation (rad) of a motion from pose to pose. If all orientations of a stream are below
 # this angle, it may hold motions.
@@ -29,10 +29,6 @@ _MAX_MOTION_RAD = 1.0
 # Smallest rotation (rad) between the axes of positions and orientations that is reported here.
 # Smaller rotations are left to :func:`agreement.check_agreement`.
 _MIN_TURN_RAD = 0.05
-
-# Smallest and largest distance (m) of ground and aircraft from the centre of the earth.
-_MIN_EARTH_M = 6.3e6
-_MAX_EARTH_M = 6.45e6
 
 # Rounds of robust weights in the fit of turned positions.
 _ROUNDS = 5
@@ -84,9 +80,11 @@ def check_earth_centred(aligned: StreamPair) -> list[Finding]:
     arm of inverse poses that explains nearly any motion.
     """
     pairs = _by_examined_stream(aligned)
-    return _check_turned(
-        {name: pair for name, pair in pairs.items() if _is_earth_centred(pair.child)}
-    )
+    earth_centred = {}
+    for name, pair in pairs.items():
+        if are_earth_centred(se3.translation_of(pair.child.poses)):
+            earth_centred[name] = pair
+    return _check_turned(earth_centred)
 
 
 def _by_examined_stream(streams: StreamPair) -> dict[str, StreamPair]:
@@ -161,18 +159,13 @@ def _find_turn(name: str, streams: StreamPair) -> _TurnedPositions | None:
             rotation = _fit_turn(streams, lag_s)
         except (NotEnoughDataError, np.linalg.LinAlgError):
             continue
-        positions = se3.translation_of(child.poses) @ rotation.T
-        poses = se3.from_rotation_translation(se3.rotation_of(child.poses), positions)
+        positions = se3.translation_of(child.poses)
+        turned = positions @ rotation.T
+        poses = se3.from_rotation_translation(se3.rotation_of(child.poses), turned)
         unexplained = _unexplained(replace(streams, child=replace(child, poses=poses)))
         if unexplained < HOLDS:
-            return _TurnedPositions(name, rotation, unexplained, _is_earth_centred(child))
+            return _TurnedPositions(name, rotation, unexplained, are_earth_centred(positions))
     return None
-
-
-def _is_earth_centred(stream: Trajectory) -> bool:
-    """Return whether all positions are as far from the origin as places on the earth."""
-    distances_m = np.linalg.norm(se3.translation_of(stream.poses), axis=1)
-    return bool(((distances_m > _MIN_EARTH_M) & (distances_m < _MAX_EARTH_M)).all())
 
 
 def _fit_turn(streams: StreamPair, lag_s: float) -> FloatArray:

@@ -75,7 +75,7 @@ class StepVelocities(NamedTuple):
     @property
     def speeds(self) -> FloatArray:
         """Sizes (N - 1,) of the velocities."""
-        return np.asarray(np.linalg.norm(self.values, axis=1))
+        return np.linalg.norm(self.values, axis=1)
 
 
 def step_velocities(trajectory: Trajectory) -> tuple[StepVelocities, StepVelocities]:
@@ -95,7 +95,8 @@ def _excess(velocities: FloatArray) -> FloatArray:
     padded = np.concatenate([velocities[2:0:-1], velocities, velocities[-2:-4:-1]])
     shifted = [padded[shift : shift + len(velocities)] for shift in range(5)]
     medians = np.partition(shifted, 2, axis=0)[2]
-    return np.asarray(np.linalg.norm(velocities - medians, axis=1))
+    excesses = np.linalg.norm(velocities - medians, axis=1)
+    return excesses
 
 
 def check_sampling(
@@ -123,8 +124,11 @@ def check_sampling(
 
 def check_interpolated(positions: FloatArray, stream: str) -> list[Finding]:
     """Detect positions (N, 3), in metres, that were interpolated between few measured ones."""
-    share, _ = _straight_share(positions, np.zeros(len(positions) - 2, dtype=bool))
-    return [finding("interpolated", stream, share=share)] if share > _STRAIGHT_SHARE else []
+    no_positions = np.zeros(len(positions) - 2, dtype=bool)
+    share, _ = _straight_share(positions, no_positions)
+    if share <= _STRAIGHT_SHARE:
+        return []
+    return [finding("interpolated", stream, share=share)]
 
 
 def _straight_share(positions: FloatArray, is_steady: BoolArray) -> tuple[float, BoolArray]:

@@ -112,10 +112,12 @@ def _shortest_path(poses: FloatArray, order: int) -> tuple[float, float]:
     lengths = [np.linalg.norm(steps, axis=1) + 1e-9]
     for _ in range(_ROUNDS):
         smallest = 0.01 * median(lengths[-1])
-        roots = np.sqrt(robust_weights("huber", (lengths[-1] / smallest) ** 2))
+        weights = robust_weights("huber", (lengths[-1] / smallest) ** 2)
+        roots = np.sqrt(weights)
         rows = (roots[:, None, None] * chords).reshape(-1, 3)
-        target = roots[:, None] * steps
-        point = np.linalg.lstsq(rows, target.ravel(), rcond=1e-6)[0]
-        lengths.append(np.linalg.norm(steps - chords @ point, axis=1) + 1e-9)
+        targets = (roots[:, None] * steps).ravel()
+        point = np.linalg.lstsq(rows, targets, rcond=1e-6)[0]
+        remaining = steps - chords @ point
+        lengths.append(np.linalg.norm(remaining, axis=1) + 1e-9)
     paths_m = [float(lengths_m.sum()) for lengths_m in lengths]
     return min(paths_m), paths_m[0]

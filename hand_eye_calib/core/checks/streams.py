@@ -11,7 +11,7 @@ from hand_eye_calib.core.base.stats import median, quantile
 from hand_eye_calib.core.checks.findings import LIMITS, Finding, finding, graded
 from hand_eye_calib.core.checks.sampling import check_sampling, step_velocities
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.trajectory import Trajectory, repetitions
+from hand_eye_calib.core.geometry.trajectory import SAME_POSE, Trajectory, repetitions
 from hand_eye_calib.core.pairing.motion_pairs import find_leap
 
 # A gap is longer than the option max_gap, and longer than this multiple of the median interval.
@@ -22,9 +22,6 @@ _GAP_INTERVALS = 5.0
 _JUMP_EXCESSES = 12.0
 # Limit as a multiple of the speed that nine tenths of the steps do not exceed.
 _JUMP_SPEEDS = 3.0
-
-# Largest difference (m, rad) of positions, heights and verticals that are equal to rounding.
-_SAME = 1e-6
 
 # A stream is not flat if its tilt (root mean square, rad) exceeds this angle.
 _MIN_TILT_RAD = 0.02
@@ -76,7 +73,7 @@ _MAX_MULTIPLE = 200.0
 # Steady motion has equal differences as well. A stream that nearly always moves must therefore have
 # this number of different multiples.
 _MIN_DIFFERENT = 5
-# Share of differences that are not zero from which on a stream nearly always moves.
+# A stream nearly always moves if more than this share of its differences is not zero.
 _MAX_MOVING = 0.9
 
 # Highest speed (m/s) of a vehicle that calibrates its sensors by motion: the speed of sound.
@@ -105,8 +102,10 @@ USUAL = 0.9
 
 def coarse(trajectory: Trajectory, step_s: float) -> Trajectory:
     """Return the first pose in each interval of ``step_s`` seconds; empty intervals are skipped."""
-    steps = (trajectory.stamps_ns - trajectory.stamps_ns[0]) // round(step_s * 1e9)
-    return trajectory[np.unique(steps, return_index=True)[1]]
+    elapsed_ns = trajectory.stamps_ns - trajectory.stamps_ns[0]
+    steps = elapsed_ns // round(step_s * 1e9)
+    _, first_rows = np.unique(steps, return_index=True)
+    return trajectory[first_rows]
 
 
 def are_gaps(intervals_s: FloatArray, max_gap_s: float) -> BoolArray:
@@ -178,7 +177,7 @@ def _interleaved(trajectory: Trajectory) -> float:
     """
     positions = se3.translation_of(trajectory.poses)
     stamps_ns = trajectory.stamps_ns
-    repeats = np.abs(np.diff(positions, axis=0)).max(axis=1) < _SAME
+    repeats = np.abs(np.diff(positions, axis=0)).max(axis=1) < SAME_POSE
     fewest = (_PERIODS_OF_LEVEL + 2) * _MAX_PERIOD
     if len(positions) < fewest or repeats.mean() > _MAX_REPEATS:
         return 0.0
@@ -212,7 +211,7 @@ def _interleaved(trajectory: Trajectory) -> float:
 def _grid_step(values: FloatArray) -> float:
     """Return the step (m) if nearly all differences of values (N,) are its multiples, else 0."""
     steps = np.abs(np.diff(values))
-    differences = steps[steps > _SAME]
+    differences = steps[steps > SAME_POSE]
     if len(differences) < _MIN_GRID:
         return 0.0
     step = float(differences.min())
@@ -235,7 +234,7 @@ def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
     ):
         vertical = flat.poses[:, 2, 2]
         heights = flat.poses[:, 2, 3]
-        if np.abs(vertical - vertical[0]).max() > _SAME or np.ptp(heights) > _SAME:
+        if np.abs(vertical - vertical[0]).max() > SAME_POSE or np.ptp(heights) > SAME_POSE:
             continue
         # The scatter in the world of the other sensor's axis of rotation: the direction in that
         # sensor whose image in the world scatters least.

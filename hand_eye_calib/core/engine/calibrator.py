@@ -129,7 +129,8 @@ class _PoseBuffer:
     def trajectory(self, until_ns: int = 2**63) -> Trajectory:
         """Return the poses up to a stamp, and a few more that interpolation needs."""
         end = bisect_right(self.stamps_ns, until_ns) + REACH
-        poses = np.array(self._poses[: _WIDTH * end]).reshape(-1, _WIDTH)
+        values = np.array(self._poses[: _WIDTH * end])
+        poses = values.reshape(-1, _WIDTH)
         stamps_ns = np.array(self.stamps_ns[:end], dtype=np.int64)
         return Trajectory.from_quat_xyzw(stamps_ns, poses[:, :3], poses[:, 3:])
 

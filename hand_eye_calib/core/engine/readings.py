@@ -80,7 +80,7 @@ def choose(
     options = [_options_of(findings) for findings in findings_of_readings]
     difference = _loss_difference(pairs_of(options[0]), pairs_of(options[1]))
     index = decide(readings, difference)
-    # Whether the streams as they are, without an inversion, are the first reading.
+    # Whether the first reading inverts no stream.
     can_be_right = readings.hypotheses[0].is_uninverted
     doubts: tuple[Finding, ...] = ()
     if index is None:

@@ -193,8 +193,8 @@ def _on_another_clock(snapshot: Snapshot) -> Attempt | None:
     smallest_s = abs(preliminary.seconds) - 3.0 * preliminary.sigma_s
     if fit is None or smallest_s < MOST_MOVED_S:
         return None
-    # If conventions or units are wrong, the streams are first solved as they are, because the
-    # message of the repair contains the verdict of this solve.
+    # If conventions or units are wrong, the streams are first solved without a repair: the message
+    # of the repair contains the verdict of this solve.
     if fit.has_own_unit or fit.unexplained > HOLDS:
         return None
     offset = refine_time_offset(*snapshot.streams, preliminary, snapshot.max_gap_s)
@@ -262,7 +262,7 @@ def _without_readings(result: CheckResult) -> tuple[Finding, ...]:
 
 
 def _repaired_unsolved(snapshot: Snapshot) -> Attempt | None:
-    """Repair streams that cannot be solved as they are; return None if no repair is certain."""
+    """Repair streams that cannot be solved otherwise; return None if no repair is certain."""
     result = check(snapshot)
     reading = _reading_of(snapshot, result, (), snapshot.config.given_time_offset_s)
     certain_options = _certain(reading.findings, snapshot.config.given)
@@ -292,7 +292,7 @@ def _repaired(
     settled : collection of str
         Options that must not be changed.
     verdict_as_given : str
-        Verdict of the streams as they are, for the message.
+        Verdict of the streams without the repair, for the message.
     """
     options = {name: value for name, value in certain_options.items() if value != "estimate"}
     second = _solved_with(snapshot, options) if options else None
@@ -427,7 +427,7 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
 
 
 def examine(snapshot: Snapshot) -> tuple[Finding, ...]:
-    """Return the findings of :func:`run` about the streams as they are, the gravest first.
+    """Return the findings about the streams without repairs, the gravest first.
 
     As in :func:`run`, the check starts from a solve, and one of two readings is chosen.
 

@@ -37,8 +37,10 @@ class RateIntegrator:
         if not len(stamps_ns):
             return np.empty((0, 3, 3))
         last_ns, last_rate = self._last or (stamps_ns[:1], rates[:1])
-        intervals_s = np.diff(np.concatenate([last_ns, stamps_ns])) * 1e-9
-        means = 0.5 * (rates + np.concatenate([last_rate, rates[:-1]]))
+        stamps_with_last_ns = np.concatenate([last_ns, stamps_ns])
+        intervals_s = np.diff(stamps_with_last_ns) * 1e-9
+        previous_rates = np.concatenate([last_rate, rates[:-1]])
+        means = 0.5 * (rates + previous_rates)
         steps = se3.rotation_exp(means * intervals_s[:, None])
         rotations = self._rotation @ se3.chained(steps)[1:]
         self._last = stamps_ns[-1:].copy(), rates[-1:].copy()

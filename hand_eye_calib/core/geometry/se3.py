@@ -41,7 +41,10 @@ def vee(matrices: FloatArray) -> FloatArray:
     For a rotation matrix, v is the axis times twice the sine of the angle.
     """
     twice = matrices - np.swapaxes(matrices, -1, -2)
-    return np.stack([twice[..., 2, 1], twice[..., 0, 2], twice[..., 1, 0]], axis=-1)
+    x = twice[..., 2, 1]
+    y = twice[..., 0, 2]
+    z = twice[..., 1, 0]
+    return np.stack([x, y, z], axis=-1)
 
 
 def cross(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -125,7 +128,8 @@ def rotation_from_rpy(rpy: ArrayLike) -> FloatArray:
 
 def _about_axes(angles: FloatArray) -> list[FloatArray]:
     """Return rotations (..., 3, 3) about x, about y and about z by angles (..., 3), rad."""
-    return [rotation_exp(angles[..., axis, None] * np.eye(3)[axis]) for axis in range(3)]
+    units = np.eye(3)
+    return [rotation_exp(angles[..., axis, None] * units[axis]) for axis in range(3)]
 
 
 def rotation_to_rpy(rotation: ArrayLike) -> FloatArray:
@@ -165,13 +169,14 @@ def nearest_rotation(matrices: FloatArray) -> FloatArray:
     """
     U, _, V_transposed = np.linalg.svd(matrices)
     U[..., :, 2] *= np.sign(np.linalg.det(U @ V_transposed))[..., None]
-    return np.asarray(U @ V_transposed)
+    return U @ V_transposed
 
 
 def rotation_log(rotation: ArrayLike) -> FloatArray:
     """Return rotation vectors (..., 3), rad, of length at most pi, of rotations (..., 3, 3)."""
     rotation = np.asarray(rotation, dtype=float)
-    return quat_log(_scaled_quats(rotation.reshape(-1, 3, 3))).reshape(rotation.shape[:-1])
+    quats = _scaled_quats(rotation.reshape(-1, 3, 3))
+    return quat_log(quats).reshape(rotation.shape[:-1])
 
 
 def rotations_between(start: FloatArray, end: FloatArray) -> FloatArray:
@@ -184,7 +189,7 @@ def rotations_between(start: FloatArray, end: FloatArray) -> FloatArray:
 
 def relative_rotations(start: FloatArray, end: FloatArray) -> FloatArray:
     """Return the rotations ``start' end`` (N, 3, 3), in the axes of ``start`` (N, 3, 3)."""
-    return np.asarray(np.swapaxes(start, 1, 2) @ end)
+    return np.swapaxes(start, 1, 2) @ end
 
 
 def quat_log(quat_xyzw: FloatArray) -> FloatArray:
@@ -227,8 +232,11 @@ def _scaled_quats(rotations: FloatArray) -> FloatArray:
 def rotation_exp(rotation_vector: ArrayLike) -> FloatArray:
     """Return rotation matrices (..., 3, 3) of rotation vectors (..., 3), rad."""
     rotation_vector = np.asarray(rotation_vector, dtype=float)
-    half = 0.5 * np.sqrt(np.einsum("...i,...i", rotation_vector, rotation_vector))
-    sine_ratio = np.where(half > 0.0, np.sin(half) / np.where(half > 0.0, half, 1.0), 1.0)
+    squared_angles = np.einsum("...i,...i", rotation_vector, rotation_vector)
+    half = 0.5 * np.sqrt(squared_angles)
+    is_turned = half > 0.0
+    divisors = np.where(is_turned, half, 1.0)
+    sine_ratio = np.where(is_turned, np.sin(half) / divisors, 1.0)
     vector = (0.5 * sine_ratio)[..., None] * rotation_vector
     return _matrices(vector[..., 0], vector[..., 1], vector[..., 2], np.cos(half))
 
@@ -341,7 +349,7 @@ def log(transforms: ArrayLike) -> FloatArray:
 
 def times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
     """Return the products (..., k) of matrices (..., k, m) and vectors (..., m)."""
-    return np.asarray((matrices @ vectors[..., None])[..., 0])
+    return (matrices @ vectors[..., None])[..., 0]
 
 
 def adjoint(transforms: ArrayLike) -> FloatArray:
@@ -431,7 +439,8 @@ def put_right(Ts: FloatArray, invert: str = "none", quaternion: str = "xyzw") ->
 
 def xyz_rpy(T_target_source: FloatArray) -> FloatArray:
     """Return x, y, z (m), roll, pitch and yaw (rad) of a transform (4, 4)."""
-    return np.r_[translation_of(T_target_source), rotation_to_rpy(rotation_of(T_target_source))]
+    rpy = rotation_to_rpy(rotation_of(T_target_source))
+    return np.r_[translation_of(T_target_source), rpy]
 
 
 # ------------------------------------------------------------- uncertainty of transforms
@@ -456,7 +465,7 @@ def turned(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
     origin. So the lever arm between both sensors has no effect.
     """
     both = block_diagonal(rotation)
-    return np.asarray(both @ covariance @ np.swapaxes(both, -1, -2))
+    return both @ covariance @ np.swapaxes(both, -1, -2)
 
 
 def block_diagonal(rotation: FloatArray) -> FloatArray:
@@ -474,7 +483,7 @@ def sigmas_in_parent(rotation_parent_child: FloatArray, covariance: FloatArray) 
     if not np.isfinite(covariance).all():
         return np.full(6, np.inf)
     variances = np.diag(turned(rotation_parent_child, covariance))
-    return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
+    return np.sqrt(np.maximum(variances, 0.0))
 
 
 def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArray:

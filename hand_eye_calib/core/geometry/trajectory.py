@@ -33,6 +33,11 @@ QUATERNION_NORM_TOLERANCE = 1e-2
 # 6.4e9, are still accepted.
 FARTHEST_M = 1e10
 
+# Distance of places on the earth from its centre (m): every position on the ground is farther ...
+_MIN_EARTH_M = 6.3e6
+# ... and every position of an aircraft is nearer.
+_MAX_EARTH_M = 6.45e6
+
 # Largest element of R'R - I for a rotation matrix R. A matrix with six digits passes, a scaled one
 # fails.
 ROTATION_TOLERANCE = 1e-3
@@ -82,8 +87,8 @@ def scatter_of_direction(poses: FloatArray) -> float:
     return 1.0 - float(np.linalg.norm(in_sensor.mean(axis=0)))
 
 
-# Two poses are equal if no elements of their matrices (m, or 1) differ by more than this.
-_SAME_POSE = 1e-6
+#: Poses, positions or angles that differ by less than this (m, rad) are equal to rounding.
+SAME_POSE = 1e-6
 
 # Smallest and largest stamp, ns.
 _STAMPS_NS = np.iinfo(np.int64)
@@ -97,7 +102,9 @@ class WithArrays:
     """
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, type(self)) and all(map(_equal, self.columns, other.columns))
+        if not isinstance(other, type(self)):
+            return False
+        return all(map(_equal, self.columns, other.columns))
 
     @property
     def columns(self) -> tuple[Any, ...]:
@@ -106,7 +113,9 @@ class WithArrays:
 
 
 def _equal(value: Any, other: Any) -> bool:
-    return np.array_equal(value, other) if isinstance(value, np.ndarray) else value == other
+    if isinstance(value, np.ndarray):
+        return np.array_equal(value, other)
+    return value == other
 
 
 class Columns(WithArrays):
@@ -283,7 +292,9 @@ class Trajectory(Columns):
     @property
     def duration_s(self) -> float:
         """Seconds from the first to the last pose; 0 for fewer than two poses."""
-        return float(self.stamps_ns[-1] - self.stamps_ns[0]) * 1e-9 if len(self) > 1 else 0.0
+        if len(self) < 2:
+            return 0.0
+        return float(self.stamps_ns[-1] - self.stamps_ns[0]) * 1e-9
 
     @property
     def interval_s(self) -> float:
@@ -432,7 +443,7 @@ class Trajectory(Columns):
 def _sums_nearby(values: FloatArray) -> FloatArray:
     """Return the sums (K,) of values (K,) and their neighbours on either side."""
     windows = sliding_window_view(np.pad(values, _NEARBY), 2 * _NEARBY + 1)
-    return np.asarray(windows.sum(axis=1))
+    return windows.sum(axis=1)
 
 
 class Table(Protocol):
@@ -447,7 +458,8 @@ TrajectoryLike: TypeAlias = Trajectory | str | PathLike[str] | np.ndarray | Tabl
 
 def far_position(x: float, y: float, z: float) -> str:
     """Describe a position farther than FARTHEST_M from the origin."""
-    return f"position ({x:.4g}, {y:.4g}, {z:.4g}) is more than {FARTHEST_M:g} m from the origin"
+    position = f"({x:.4g}, {y:.4g}, {z:.4g})"
+    return f"position {position} is more than {FARTHEST_M:g} m from the origin"
 
 
 def _check_finite(noun: str, rows: FloatArray) -> None:
@@ -478,6 +490,15 @@ def check_poses(poses: FloatArray) -> None:
             f"pose {int(np.argmax(is_wrong))} is not a rigid transform: its 3x3 part is not a "
             f"rotation matrix within {ROTATION_TOLERANCE} (scaled or left-handed axes?)"
         )
+
+
+def are_earth_centred(positions: FloatArray) -> bool:
+    """Whether all positions (N, 3), m, are as far from the origin as places on the earth.
+
+    Such positions are probably relative to the centre of the earth (ECEF).
+    """
+    distances_m = np.linalg.norm(positions, axis=1)
+    return bool(((distances_m > _MIN_EARTH_M) & (distances_m < _MAX_EARTH_M)).all())
 
 
 def corner_corrections(
@@ -535,7 +556,7 @@ def repetitions(trajectory: Trajectory, least_s: float) -> list[tuple[int, int]]
         Shortest period that is returned, in seconds.
     """
     differences = np.abs(np.diff(trajectory.poses, axis=0))
-    is_same = differences.max(axis=(1, 2)) < _SAME_POSE
+    is_same = differences.max(axis=(1, 2)) < SAME_POSE
     # A period begins where `is_same` becomes True, and ends where it becomes False.
     changes = np.diff(np.r_[False, is_same, False].astype(int))
     rows = np.flatnonzero(changes)

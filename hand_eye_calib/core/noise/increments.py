@@ -104,7 +104,7 @@ class Streams(Columns):
         rates = se3.log(self.motions_c) / np.diff(self.stamps_s)[:, None]
         padded = np.pad(rates, ((2, 2), (0, 0)), mode="edge")
         windows = np.lib.stride_tricks.sliding_window_view(padded, 4, axis=0)
-        return np.asarray(np.median(windows, axis=2))
+        return np.median(windows, axis=2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,8 +23,8 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray
 
-# Cyclic reduction ends if at most this number of rows remains; they become one dense matrix. Also:
-# number of triangular matrices from which on an inversion row by row takes half the time of LAPACK.
+# Cyclic reduction ends if at most this number of rows remains; they become one dense matrix. At
+# least this number of triangular matrices is inverted row by row, in half the time of LAPACK.
 _FEW = 64
 
 # Smallest eigenvalue of normal equations with ones on the diagonal that counts as information.
@@ -291,4 +291,4 @@ class NormalEquations:
     def unseen(self) -> FloatArray:
         """Unit vectors (p, U) of the U directions without information; only for one system."""
         axes = self._axes[:, ~self._is_observed]
-        return np.asarray(axes / np.linalg.norm(axes, axis=0))
+        return axes / np.linalg.norm(axes, axis=0)

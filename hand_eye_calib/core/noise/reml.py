@@ -166,7 +166,8 @@ def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
     traces = [float((white_D * basis).sum()) for basis in posterior.space.white_bases]
     walk_D = _walk_difference(posterior, walk)
     traces += [float((walk_D * basis).sum()) for basis in posterior.space.walk_bases]
-    gradient = [0.5 * np.exp(posterior.levels[: len(traces)]) * traces]
+    variances = np.exp(posterior.levels[: len(traces)])
+    gradient = [0.5 * variances * traces]
     gradient += [_group_gradient(posterior, group, states) for group in posterior.groups]
     information = _average_information(posterior, states[:, :, 0], walk[:, :, 0])
     return np.concatenate(gradient), information
@@ -190,7 +191,7 @@ def _walk_difference(posterior: Posterior, walk: FloatArray) -> FloatArray:
     total = np.tensordot(posterior.walk_weights, moments, axes=1)
     precision = posterior.walk_precision
     n_used = (~posterior.space.cut).sum()
-    return np.asarray(n_used * precision - precision @ total @ precision)
+    return n_used * precision - precision @ total @ precision
 
 
 def _group_gradient(posterior: Posterior, group: Markov, states: FloatArray) -> FloatArray:

@@ -197,7 +197,7 @@ class Markov:
         forces = self.changed(change).forces(values) - self.changed(-change).forces(values)
         factor = Factor(self.diagonal[:, None, None], self.between[:, None, None])
         moved = factor.restore(factor.whiten(forces[:, None]))[:, 0]
-        return np.asarray(moved / (-2.0 * LEVEL_CHANGE))
+        return moved / (-2.0 * LEVEL_CHANGE)
 
 
 class Posterior:
@@ -436,7 +436,7 @@ class Posterior:
         couplings[0, :, :size] += below[0]
         couplings[-1, :, size : 2 * size] += below[-1].T
         whitened = Factor(diagonal[1:-1], below[1:-1]).whiten(couplings)
-        return np.asarray(form - multiplied(whitened, whitened))
+        return form - multiplied(whitened, whitened)
 
 
 def _combine(columns: FloatArray, mixing: FloatArray) -> FloatArray:
@@ -456,4 +456,4 @@ def total_covariance(levels: FloatArray, bases: tuple[FloatArray, ...]) -> Float
 def _eliminate(form: FloatArray, size: int) -> FloatArray:
     """Minimise a quadratic form over its first ``size`` variables; return the rest of the form."""
     root = np.linalg.solve(np.linalg.cholesky(form[:size, :size]), form[:size, size:])
-    return np.asarray(form[size:, size:] - root.T @ root)
+    return form[size:, size:] - root.T @ root

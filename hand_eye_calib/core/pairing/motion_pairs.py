@@ -63,7 +63,9 @@ class PosePairs(Columns):
     @classmethod
     def empty(cls) -> Self:
         """Return zero pose pairs."""
-        return cls(np.empty(0, dtype=np.int64), np.empty((0, 4, 4)), np.empty((0, 4, 4)))
+        no_stamps = np.empty(0, dtype=np.int64)
+        no_poses = np.empty((0, 4, 4))
+        return cls(no_stamps, no_poses, no_poses)
 
 
 def slower_stream(parent_stamps_ns: IntArray, child_stamps_ns: IntArray) -> str:
@@ -286,9 +288,9 @@ def pairs_between(
     Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, i: IntArray, j: IntArray
 ) -> MotionPairs:
     """Return the motion pairs from the poses i to the poses j, (K,) arrays of indices."""
-    parent = motions(Ts_pw_p.take(i, axis=0), Ts_pw_p.take(j, axis=0))
-    child = motions(Ts_cw_c.take(i, axis=0), Ts_cw_c.take(j, axis=0))
-    return MotionPairs(parent, child, i, j)
+    of_parent = [Ts_pw_p.take(rows, axis=0) for rows in (i, j)]
+    of_child = [Ts_cw_c.take(rows, axis=0) for rows in (i, j)]
+    return MotionPairs(motions(*of_parent), motions(*of_child), i, j)
 
 
 def motions(start: FloatArray, end: FloatArray) -> FloatArray:
@@ -319,14 +321,17 @@ def pairs_over(pose_pairs: PosePairs, lag_s: float, max_pairs: int = MAX_PAIRS) 
     stamps_ns = pose_pairs.stamps_ns
     if len(stamps_ns) > 1:
         lag_s = max(lag_s, median(np.diff(stamps_ns)) * 1e-9)
-    i = np.linspace(0, len(stamps_ns) - 1, min(len(stamps_ns), max_pairs)).astype(int)
-    after = np.maximum(np.searchsorted(stamps_ns, stamps_ns[i] + round(lag_s * 1e9)), i + 1)
-    has_end = after < len(stamps_ns)
+    lag_ns = round(lag_s * 1e9)
+    n_poses = len(stamps_ns)
+    i = np.linspace(0, n_poses - 1, min(n_poses, max_pairs)).astype(int)
+    after = np.searchsorted(stamps_ns, stamps_ns[i] + lag_ns)
+    after = np.maximum(after, i + 1)
+    has_end = after < n_poses
     i = i[has_end]
     after = after[has_end]
     # Use the pose nearest to the end. The first pose after the end would more often have a late
     # stamp.
-    ends_ns = stamps_ns[i] + round(lag_s * 1e9)
+    ends_ns = stamps_ns[i] + lag_ns
     is_before = ends_ns - stamps_ns[after - 1] < stamps_ns[after] - ends_ns
     j = np.maximum(after - is_before, i + 1)
     is_near = stamps_ns[j] - stamps_ns[i] <= (1.5 * lag_s + 0.1) * 1e9

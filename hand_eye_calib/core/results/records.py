@@ -203,7 +203,7 @@ class Finding:
 
     @property
     def makes_unusable(self) -> bool:
-        """Whether a result from these streams as they are is unusable."""
+        """Whether a result is unusable unless this fault of the streams is repaired."""
         return self.severity is Severity.ERROR
 
     def to_dict(self) -> Document:

@@ -176,6 +176,6 @@ def start_rotations(pairs: MotionPairs) -> FloatArray:
     sign = np.linalg.det(U @ V_transposed)
     aligned = U @ np.diag([1.0, 1.0, sign]) @ V_transposed
     # The identity, and the rotations by pi about x, y and z.
-    diagonals = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
-    half_turns = diagonals[:, :, None] * np.eye(3, dtype=int)
-    return np.asarray(aligned @ half_turns)
+    diagonals = [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]
+    half_turns = [np.diag(diagonal) for diagonal in diagonals]
+    return aligned @ half_turns

@@ -157,7 +157,8 @@ def solve_without(
     (B, 4, 4) array
         Transforms X.
     """
-    fewest = min_inlier_fraction * float((~left_out).sum(axis=1).min())
+    n_remaining = (~left_out).sum(axis=1)
+    fewest = min_inlier_fraction * float(n_remaining.min())
     search = _Search(quadratic_form.condense(pairs), threshold, fewest)
     starts = np.repeat(solution.T_parent_child[None], len(left_out), axis=0)
     return search.settle(starts, _TOLERANCE, left_out)[0]
@@ -270,8 +271,10 @@ class _Search:
         n_rivals = 4 * (1 + _RIVALS_TIMES_PAIRS // (4 * n_pairs))
         inliers, _ = truncate(self.costs(T), self.threshold, self.floor)
         # Probability (2 n_rivals, K) with which each pair is in the subset of each rival.
-        of_inliers = np.repeat(_INLIER_SHARES, n_rivals // 2)[:, None] * inliers
-        of_all = np.repeat(_SUBSET_SIZES, n_rivals // 4)[:, None] * np.full(n_pairs, 1 / n_pairs)
+        shares = np.repeat(_INLIER_SHARES, n_rivals // 2)
+        sizes = np.repeat(_SUBSET_SIZES, n_rivals // 4)
+        of_inliers = shares[:, None] * inliers
+        of_all = sizes[:, None] * np.full(n_pairs, 1 / n_pairs)
         probabilities = np.concatenate([of_inliers, of_all])
         weights = (random.random(probabilities.shape) < probabilities).astype(float)
         Ts = np.repeat(T, len(weights), axis=0)

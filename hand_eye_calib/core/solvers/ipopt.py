@@ -69,10 +69,13 @@ def _minimum(
     """
     solver = casadi.nlpsol("solver", "ipopt", problem, _IPOPT_OPTIONS)
     # The start is not exactly the identity, because the rotation angle has no derivative at zero.
-    solution = solver(x0=np.r_[np.full(3, 1e-6), np.zeros(3), np.ones(n_weights)], **bounds)
-    pose = np.array(solution["x"]).ravel()[:6]
-    T_parent_child = se3.from_rotation_translation(se3.rotation_exp(pose[:3]), pose[3:])
-    return T_parent_child, bool(solver.stats()["success"])
+    start = np.r_[np.full(3, 1e-6), np.zeros(3), np.ones(n_weights)]
+    solution = solver(x0=start, **bounds)
+    unknowns = np.array(solution["x"]).ravel()
+    rotation = se3.rotation_exp(unknowns[:3])
+    T_parent_child = se3.from_rotation_translation(rotation, unknowns[3:6])
+    has_converged = bool(solver.stats()["success"])
+    return T_parent_child, has_converged
 
 
 def _cost_expressions(pairs: MotionPairs, pose: _Expression) -> _Expression:

@@ -126,7 +126,7 @@ def coefficients(pairs: MotionPairs) -> FloatArray:
 def costs(coefficients: FloatArray, T_parent_child: FloatArray) -> FloatArray:
     """Return the costs ``|A X - X B|_F^2`` (K,) of pairs with coefficients (K, 24)."""
     residuals = coefficients @ (_RESIDUAL @ T_parent_child.ravel()[_X_IN_T])
-    return np.asarray(np.einsum("ki,ki->k", residuals, residuals))
+    return np.einsum("ki,ki->k", residuals, residuals)
 
 
 def median_costs(coefficients: FloatArray, Ts: FloatArray, scales: FloatArray) -> FloatArray:

@@ -269,7 +269,7 @@ def _sandwich(hessian: FloatArray, scores: FloatArray, window: int) -> FloatArra
     sums = total[window:] - total[:-window]
     scatter = len(scores) / window / len(sums) * sums.T @ sums
     inverse = _inverse(hessian)
-    return np.asarray(inverse @ scatter @ inverse)
+    return inverse @ scatter @ inverse
 
 
 def _inverse(hessian: FloatArray) -> FloatArray:
@@ -280,15 +280,16 @@ def _inverse(hessian: FloatArray) -> FloatArray:
     """
     units = _units(hessian)
     balanced = np.linalg.pinv(hessian / units / units[:, None], RANK_TOLERANCE, hermitian=True)
-    return np.asarray(balanced / units / units[:, None])
+    return balanced / units / units[:, None]
 
 
 def _null_space(hessian: FloatArray) -> FloatArray:
     """Return unit vectors (6, k) of the k directions without information."""
     units = _units(hessian)
     values, vectors = np.linalg.eigh(hessian / units / units[:, None])
-    directions = vectors[:, values <= RANK_TOLERANCE * values[-1]] / units[:, None]
-    return np.asarray(directions / np.linalg.norm(directions, axis=0))
+    is_unknown = values <= RANK_TOLERANCE * values[-1]
+    directions = vectors[:, is_unknown] / units[:, None]
+    return directions / np.linalg.norm(directions, axis=0)
 
 
 def _units(hessian: FloatArray) -> FloatArray:
@@ -296,8 +297,10 @@ def _units(hessian: FloatArray) -> FloatArray:
 
     A scale is the root of the largest diagonal element of its component; 1 if this is zero.
     """
-    roots = np.sqrt(np.diag(hessian).reshape(2, 3).max(axis=1))
-    return np.repeat(np.where(roots > 0.0, roots, 1.0), 3)
+    largest = np.diag(hessian).reshape(2, 3).max(axis=1)
+    roots = np.sqrt(largest)
+    units = np.where(roots > 0.0, roots, 1.0)
+    return np.repeat(units, 3)
 
 
 def _log_volume(solution: RobustSolution) -> float:
@@ -353,10 +356,10 @@ def _weighted_translation(
     weights : (K,) array
         Factors of the equations of each pair.
     """
-    weighted_slopes = weights[:, None, None] * slopes
-    weighted_targets = weights[:, None] * targets
-    solution = np.linalg.lstsq(weighted_slopes.reshape(-1, 3), weighted_targets.ravel(), rcond=1e-9)
-    return np.asarray(solution[0], dtype=float)
+    weighted_slopes = (weights[:, None, None] * slopes).reshape(-1, 3)
+    weighted_targets = (weights[:, None] * targets).ravel()
+    translation, *_ = np.linalg.lstsq(weighted_slopes, weighted_targets, rcond=1e-9)
+    return np.asarray(translation, dtype=float)
 
 
 def _median_length(vectors: FloatArray) -> float:

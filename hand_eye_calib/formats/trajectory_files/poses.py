@@ -20,12 +20,12 @@ from hand_eye_calib.core.geometry.trajectory import (
     ROTATION_TOLERANCE,
     STEADY_SCATTER,
     WRONG_SCATTER_RATIO,
+    are_earth_centred,
     far_position,
     scatter_of_direction,
 )
 from hand_eye_calib.formats.geodetic import (
     LocalOrigin,
-    are_earth_centred,
     axes_of_places,
     rotations_to_first,
 )
@@ -109,7 +109,8 @@ def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, ...]:
 
 def _rotations_of(quats_xyzw: FloatArray) -> FloatArray:
     """Return the rotations (N, 3, 3) of quaternions (N, 4)."""
-    return se3.rotation_of(se3.from_quat_xyzw(np.zeros((len(quats_xyzw), 3)), quats_xyzw))
+    no_positions = np.zeros((len(quats_xyzw), 3))
+    return se3.rotation_of(se3.from_quat_xyzw(no_positions, quats_xyzw))
 
 
 def _positions(table: Table) -> tuple[FloatArray, FloatArray | None]:
