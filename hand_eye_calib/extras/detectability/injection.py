@@ -170,7 +170,8 @@ _BY_MOTION = (DofVerdict.OBSERVED, DofVerdict.WEAK)
 def _by_axis(sizes: FloatArray, is_known: list[bool]) -> dict[str, float]:
     """Return sizes (6,) by axis; infinite if they are too large or the axis is unknown."""
     is_stated = np.array(is_known) & (sizes < _LARGEST)
-    return dict(zip(AXES, np.where(is_stated, sizes, np.inf).tolist(), strict=True))
+    stated = np.where(is_stated, sizes, np.inf)
+    return dict(zip(AXES, stated.tolist(), strict=True))
 
 
 def _columns_of_streams(pairs: MotionPairs, pose_pairs: PosePairs) -> FloatArray:

@@ -77,7 +77,8 @@ class Task:
 
         A stored result with another key belongs to other data or options.
         """
-        text = json.dumps([asdict(self), list(map(_state, self.bags))], sort_keys=True)
+        states = list(map(_state, self.bags))
+        text = json.dumps([asdict(self), states], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
 

@@ -159,10 +159,13 @@ def _at_same_times(
     """
     child = child[np.argsort(child.stamps_ns, kind="stable")]
     stamps_ns = child.stamps_ns + round(offset_s * 1e9)
-    after = np.clip(np.searchsorted(stamps_ns, parent.stamps_ns), 1, len(stamps_ns) - 1)
-    differences = np.abs(stamps_ns[[after - 1, after]] - parent.stamps_ns)
-    nearest = after - (differences[0] <= differences[1])
-    is_near = differences.min(axis=0) < median(np.diff(stamps_ns))
+    after = np.searchsorted(stamps_ns, parent.stamps_ns)
+    after = np.clip(after, 1, len(stamps_ns) - 1)
+    to_before_ns, to_after_ns = np.abs(stamps_ns[[after - 1, after]] - parent.stamps_ns)
+    is_before_nearer = to_before_ns <= to_after_ns
+    nearest = after - is_before_nearer
+    usual_interval_ns = median(np.diff(stamps_ns))
+    is_near = np.minimum(to_before_ns, to_after_ns) < usual_interval_ns
     return parent[is_near], child[nearest[is_near]]
 
 
@@ -238,7 +241,7 @@ def _slope_derivatives(
     ups_in_world = np.einsum("kij,kj->ki", rotations, track.ups)
     horizontal = _measured_axes(ups_in_world)[0][:, :2]
     in_parent = to_parent @ np.swapaxes(rotations, 1, 2) @ horizontal
-    return np.asarray(basis[:, :2].T @ se3.skew(parent.ups) @ in_parent)
+    return basis[:, :2].T @ se3.skew(parent.ups) @ in_parent
 
 
 def _are_inliers(differences: FloatArray) -> BoolArray:
@@ -254,7 +257,8 @@ def _are_inliers(differences: FloatArray) -> BoolArray:
 
 def _sections_of(stream: Trajectory, stamps_ns: IntArray) -> IntArray:
     """Return the number of the section of the drive (K,) in which each stamp (K,) is."""
-    steps_m = np.linalg.norm(np.diff(se3.translation_of(stream.poses), axis=0), axis=1)
+    steps = np.diff(se3.translation_of(stream.poses), axis=0)
+    steps_m = np.linalg.norm(steps, axis=1)
     driven_m = np.append(0.0, np.cumsum(steps_m))
     shares = np.interp(stamps_ns, stream.stamps_ns, driven_m) / driven_m[-1]
     return np.minimum((_N_SECTIONS * shares).astype(int), _N_SECTIONS - 1)
@@ -265,7 +269,7 @@ def _means(values: FloatArray, sections: IntArray) -> FloatArray:
     numbers, row_of_value = np.unique(sections, return_inverse=True)
     counts = np.bincount(row_of_value)
     sums = Blocks.gathered(values, row_of_value, len(numbers)).sums
-    return np.asarray(sums / counts.reshape(-1, *[1] * (values.ndim - 1)))
+    return sums / counts.reshape(-1, *[1] * (values.ndim - 1))
 
 
 def _fit(means: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -321,8 +325,9 @@ def _correlation_factor(residuals: FloatArray) -> float:
 
     W. K. Newey, K. D. West, Econometrica 55, 1987, with one lag.
     """
-    correlation = (residuals[1:] * residuals[:-1]).sum() / (residuals**2).sum()
-    return 1.0 + 2.0 * max(float(correlation), 0.0)
+    products = residuals[1:] * residuals[:-1]
+    correlation = float(products.sum() / (residuals**2).sum())
+    return 1.0 + 2.0 * max(correlation, 0.0)
 
 
 def _updated(calibration: Calibration, measurement: Measurement, gain: FloatArray) -> Calibration:

@@ -103,7 +103,7 @@ def _cell_means(points: FloatArray, width_m: float) -> FloatArray:
     cubes = np.floor(used / _CELL_M).astype(int)
     _, cell_of_point, counts = np.unique(cubes, axis=0, return_inverse=True, return_counts=True)
     sums = Blocks.gathered(used, cell_of_point.ravel(), len(counts)).sums
-    return np.asarray(sums / counts[:, None])
+    return sums / counts[:, None]
 
 
 def _rows(cells: FloatArray) -> FloatArray:
@@ -113,7 +113,7 @@ def _rows(cells: FloatArray) -> FloatArray:
 
 def _heights(cells: FloatArray, planes: FloatArray) -> FloatArray:
     """Return the heights z (..., C) of planes (..., 3) at the x and y of cells (C, 3)."""
-    return np.asarray(planes @ _rows(cells).T)
+    return planes @ _rows(cells).T
 
 
 def _plane_by_ransac(cells: FloatArray) -> FloatArray | None:
@@ -133,7 +133,7 @@ def _plane_by_ransac(cells: FloatArray) -> FloatArray | None:
         return None
     distances = np.abs(cells[:, 2] - _heights(cells, planes))
     n_inliers = (distances < _MAX_INLIER_HEIGHT_M).sum(axis=1)
-    return np.asarray(planes[n_inliers.argmax()])
+    return planes[n_inliers.argmax()]
 
 
 def _slopes(planes: FloatArray) -> FloatArray:

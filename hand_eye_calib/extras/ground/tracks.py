@@ -283,7 +283,7 @@ def _velocities(trajectory: Trajectory, stamps_ns: IntArray) -> FloatArray:
     before = trajectory.at(stamps_ns - half_ns, extrapolate=True)
     after = trajectory.at(stamps_ns + half_ns, extrapolate=True)
     moved_m = se3.translation_of(after) - se3.translation_of(before)
-    return np.asarray(moved_m * 1e9 / (2 * half_ns))
+    return moved_m * 1e9 / (2 * half_ns)
 
 
 def turning_axis(trajectory: Trajectory) -> FloatArray:
@@ -305,7 +305,7 @@ def turning_axis(trajectory: Trajectory) -> FloatArray:
     if squares[1] >= _MAX_OTHER_SHARE**2 * squares[2]:
         raise NotEnoughDataError("the sensor does not turn about the vertical alone")
     axis = axes[:, 2]
-    return np.asarray(axis * np.sign(axis[2]))
+    return axis * np.sign(axis[2])
 
 
 def driving_direction(trajectory: Trajectory) -> FloatArray:
@@ -317,4 +317,4 @@ def driving_direction(trajectory: Trajectory) -> FloatArray:
     before = trajectory.poses[:-step:step]
     motions = se3.translation_of(se3.inverse(before) @ trajectory.poses[step::step])
     _, axes = np.linalg.eigh(motions.T @ motions)
-    return np.asarray(axes[:, 2])
+    return axes[:, 2]

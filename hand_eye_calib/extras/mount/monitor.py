@@ -433,7 +433,7 @@ class MountMonitor:
         log_volumes = np.linalg.slogdet(volumes)[1]
         detected_sigmas = np.sqrt(2.0 * TUNING.threshold + log_volumes) + NINE_TIMES_OUT_OF_TEN
         sigmas = sigmas_in_parent(se3.rotation_of(self._installed), covariance)
-        return np.asarray(np.repeat(detected_sigmas, 3) * sigmas)
+        return np.repeat(detected_sigmas, 3) * sigmas
 
 
 def _is_motion(motions: MotionPairs, noise: FloatArray) -> bool:

@@ -369,7 +369,8 @@ class RigCalibration:
 
     def _covariance(self, first: str, second: str, with_allowance: bool) -> FloatArray:
         """Return :meth:`covariance`, with or without the allowance."""
-        low, high = sorted(map(self.sensors.index, (first, second)))
+        numbers = [self.sensors.index(first), self.sensors.index(second)]
+        low, high = sorted(numbers)
         if low == high:
             return np.zeros((6, 6))
         # Results whose covariances are added, with the poses of their child sensors.
@@ -380,7 +381,7 @@ class RigCalibration:
         # Add in the frame of the rig's first sensor, and transform the sum to the second sensor.
         to_second = se3.adjoint(self.T(second, self.sensors[0]))
         in_first = np.sum([_in_first(*result, with_allowance) for result in results], axis=0)
-        return np.asarray(to_second @ in_first @ to_second.T)
+        return to_second @ in_first @ to_second.T
 
     def to_dict(self) -> Document:
         """Return the rig in plain values."""
@@ -405,7 +406,7 @@ def _in_first(calibration: Calibration, X: FloatArray, with_allowance: bool = Fa
     covariance = calibration.covariance_measured + _ROUNDING * np.eye(6)
     if with_allowance:
         covariance = covariance + calibration.covariance_allowance
-    return np.asarray(adjoint @ covariance @ adjoint.T)
+    return adjoint @ covariance @ adjoint.T
 
 
 def closure(to_second: Calibration, between: Calibration, to_third: Calibration) -> Closure:

@@ -414,7 +414,8 @@ def _of_vicon(data: bytes, choice: str | None) -> _Rows:
 
 
 def _of_numpy(data: bytes, _: str | None) -> _Rows:
-    return _Rows(*columns_of_array(np.load(io.BytesIO(data), allow_pickle=False)))
+    array = np.load(io.BytesIO(data), allow_pickle=False)
+    return _Rows(*columns_of_array(array))
 
 
 def _of_pcd(data: bytes, _: str | None) -> _Rows:

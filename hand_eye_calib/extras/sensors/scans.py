@@ -63,7 +63,8 @@ class Step(NamedTuple):
 class Tuning:
     """Constants of the registration."""
 
-    # Longest scan (ns). The unit of the times of points is the largest one that obeys this limit.
+    # Longest duration of a scan (ns). Messages do not state the unit of the times of points. The
+    # largest unit is assumed in which no scan is longer.
     longest_ns: float = 1e9
     # Smallest and largest range that is used (m). Nearer points are on the robot itself, farther
     # points are too sparse.
@@ -340,7 +341,7 @@ class ScanReading(Reading):
         powers = np.vander(parts * TUNING.part_s, len(since_s))
         Ts = se3.exp(powers @ polynomial)[part_of_point]
         rotated = np.einsum("nij,nj->ni", se3.rotation_of(Ts), scan.points)
-        return np.asarray(rotated + se3.translation_of(Ts))
+        return rotated + se3.translation_of(Ts)
 
     def _thinned(self, points: FloatArray, step: Step) -> Any:
         """Return one point in each voxel, with its local plane, from points (N, 3)."""

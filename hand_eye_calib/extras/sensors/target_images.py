@@ -518,7 +518,7 @@ def _dictionary(cv2: Any, target: Target) -> Any:
 
 
 def _tag_detector(cv2: Any, dictionary: Any, border_bits: int, corners: FloatArray) -> _Detector:
-    """Return the detector of separate tags or markers with a black border of so many bits."""
+    """Return the detector of separate markers, whose black border is ``border_bits`` cells wide."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border_bits
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
@@ -535,9 +535,10 @@ def _detect_chessboard(cv2: Any, target: Target, image: Any) -> tuple[Any, Any]:
 
 def _chessboard_corners(target: Target) -> FloatArray:
     """Return the inner corners (n, 1, 3) of a chessboard row by row, m."""
-    y, x = np.divmod(np.arange(target.columns * target.rows), target.columns)
+    numbers = np.arange(target.columns * target.rows)
+    y, x = np.divmod(numbers, target.columns)
     places = target.size * np.stack([x, y, 0 * x], axis=-1)
-    return np.asarray(places[:, None])
+    return places[:, None]
 
 
 def _marker_corners(target: Target) -> FloatArray:
@@ -545,8 +546,9 @@ def _marker_corners(target: Target) -> FloatArray:
 
     The origin is the centre of the marker.
     """
-    square = target.size * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]) / 2
-    return np.asarray(square[None])
+    signs = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+    square = target.size * signs / 2
+    return square[None]
 
 
 def _aprilgrid_corners(target: Target) -> FloatArray:
@@ -555,10 +557,12 @@ def _aprilgrid_corners(target: Target) -> FloatArray:
     The tags begin at the lower left, row by row upward. In OpenCV, the tags of this family are
     upside down, so that the corners of a tag begin at its lower right, and follow clockwise.
     """
-    square = target.size * np.array([[1, 0, 0], [0, 0, 0], [0, 1, 0], [1, 1, 0]])
-    y, x = np.divmod(np.arange(target.columns * target.rows), target.columns)
+    unit_square = np.array([[1, 0, 0], [0, 0, 0], [0, 1, 0], [1, 1, 0]])
+    square = target.size * unit_square
+    numbers = np.arange(target.columns * target.rows)
+    y, x = np.divmod(numbers, target.columns)
     places = (target.size + target.marker) * np.stack([x, y, 0 * x], axis=-1)
-    return np.asarray(places[:, None] + square)
+    return places[:, None] + square
 
 
 def _opencv() -> Any:

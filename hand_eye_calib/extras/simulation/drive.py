@@ -158,7 +158,8 @@ def _ground_track(
     The track consists of circular arcs, because each random yaw rate is constant for a hold time.
     """
     # Duration, yaw rate, start time and first heading of each arc.
-    holds_s = np.full(int(times_s.max() // config.hold_time) + 2, config.hold_time)
+    n_arcs = int(times_s.max() // config.hold_time) + 2
+    holds_s = np.full(n_arcs, config.hold_time)
     holds_s[0] = _FIRST_HOLD_S
     yaw_rates = rng.uniform(-config.max_yaw_rate, config.max_yaw_rate, len(holds_s))
     starts_s = np.cumsum(holds_s) - holds_s
@@ -198,14 +199,16 @@ def _poses_on_terrain(
         # This formula was fitted to the published noise-free poses. It reproduces their heading
         # exactly, and pitch and roll to 0.01 rad. Yaw is the heading. Pitch and roll are the arc
         # sines of x and y of the normal. The rotation matrix is then transposed.
-        angles = np.stack([headings, *np.arcsin(normals[:, :2].T)], axis=-1)
-        rotations = np.swapaxes(se3.rotation_from_rpy(angles[:, ::-1]), -1, -2)
+        yaw_pitch_roll = np.stack([headings, *np.arcsin(normals[:, :2].T)], axis=-1)
+        transposed = se3.rotation_from_rpy(yaw_pitch_roll[:, ::-1])
+        rotations = np.swapaxes(transposed, -1, -2)
     else:
         # z is along the normal, and x is in the vertical plane of the heading.
         ahead = np.stack([np.cos(headings), np.sin(headings), np.zeros_like(headings)], axis=-1)
         y_axes = np.cross(normals, ahead)
         y_axes /= np.linalg.norm(y_axes, axis=-1, keepdims=True)
-        rotations = np.stack([np.cross(y_axes, normals), y_axes, normals], axis=-1)
+        x_axes = np.cross(y_axes, normals)
+        rotations = np.stack([x_axes, y_axes, normals], axis=-1)
     return se3.from_rotation_translation(rotations, np.column_stack([positions, z]))
 
 

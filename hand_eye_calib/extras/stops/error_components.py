@@ -182,9 +182,12 @@ def _updated(
     """Return the variances (4,) after one iteration of the MM algorithm with the prior."""
     # Derivative of the prior's log density, times two.
     pull = 2.0 * np.log(prior / components) / _PRIOR_SIGMA**2
-    numerator = components**2 * quadratic + np.maximum(pull, 0.0) * components
+    upwards = np.maximum(pull, 0.0)
+    downwards = np.maximum(-pull, 0.0)
+    numerator = components**2 * quadratic + upwards * components
     # Rounding may make a value that should be zero negative.
-    denominator = np.maximum(expected, 0.0) + np.maximum(-pull, 0.0) / components
+    not_negative = np.maximum(expected, 0.0)
+    denominator = not_negative + downwards / components
     # A source without effect keeps its variance: that along the line of sight if all positions are
     # zero.
     squared = np.divide(numerator, denominator, out=components**2, where=denominator > 0.0)

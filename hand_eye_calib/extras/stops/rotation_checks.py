@@ -150,20 +150,27 @@ def _likeliest_block(angles: FloatArray, angles_of_other: FloatArray) -> tuple[f
     a Cauchy distribution. Its scale is their 20 % quantile without or with the shift, whichever is
     smaller.
     """
-    in_place = np.abs(angles - angles_of_other)[:-1, :-1]
-    shifted = np.abs(angles[:-1, :-1] - angles_of_other[1:, 1:])
-    # Angles between a row before the block and a row in the block.
-    across = np.abs(angles[:-1, :-1] - angles_of_other[:-1, 1:])
-    quantiles_rad = [np.quantile(above_diagonal(off), 0.2) for off in (in_place, shifted)]
-    scale_rad = min(quantiles_rad) + _ROUNDING
-    in_place, shifted, across = [
-        np.log1p((off / scale_rad) ** 2) for off in (in_place, shifted, across)
+    own = angles[:-1, :-1]
+    in_place_rad = np.abs(angles - angles_of_other)[:-1, :-1]
+    shifted_rad = np.abs(own - angles_of_other[1:, 1:])
+    # Differences of angles between a row before the block and a row in the block.
+    across_rad = np.abs(own - angles_of_other[:-1, 1:])
+    quantiles_rad = [
+        np.quantile(above_diagonal(differences_rad), 0.2)
+        for differences_rad in (in_place_rad, shifted_rad)
     ]
+    scale_rad = min(quantiles_rad) + _ROUNDING
+    # Negative log likelihoods of the Cauchy distribution.
+    in_place = np.log1p((in_place_rad / scale_rad) ** 2)
+    shifted = np.log1p((shifted_rad / scale_rad) ** 2)
+    across = np.log1p((across_rad / scale_rad) ** 2)
     n = len(in_place)
     costs = []
     for first in range(n):
-        cost = in_place[:first, :first].sum() + shifted[first:, first:].sum()
-        costs.append(cost + 2.0 * across[:first, first:].sum())
+        before_block = in_place[:first, :first].sum()
+        in_block = shifted[first:, first:].sum()
+        between = 2.0 * across[:first, first:].sum()
+        costs.append(before_block + in_block + between)
     gain = (in_place.sum() - min(costs)) / (n * (n - 1))
     return float(gain), int(np.argmin(costs))
 

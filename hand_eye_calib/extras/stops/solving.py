@@ -292,7 +292,7 @@ def _with_estimated_scale(poses: StopPoses, setup_fit: SetupFit) -> SetupFit:
 
 
 def _with_checked_scale(setup_fit: SetupFit, repaired: _Repaired, setup: str | None) -> SetupFit:
-    """Return the fit with the child's lengths as they are, or multiplied by an estimated scale.
+    """Return the fit with unchanged lengths of the child, or with an estimated scale.
 
     The scale is estimated if it is clearly not 1, or if the user asks for it. The first case is
     added to the findings of ``repaired`` unless the option ``scale`` allows it.
@@ -324,7 +324,7 @@ def _with_checked_scale(setup_fit: SetupFit, repaired: _Repaired, setup: str | N
 
 
 def _scale_in_words(scale: float, sigma: float, unit: float) -> str:
-    """Return the estimated scale as text, with the option for the lengths as they are.
+    """Return the estimated scale as text, with the option that leaves the lengths unchanged.
 
     ``unit`` is the factor from the child's lengths to metres if the option must contain it, else 1.
     """
