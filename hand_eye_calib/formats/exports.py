@@ -283,5 +283,7 @@ def _listed(values: FloatArray, separator: str = ", ") -> str:
 def _number(value: float) -> str:
     """Return a number as text that every parser reads: a decimal point and no exponent."""
     # Adding 0.0 turns -0.0 into 0.0.
-    text = f"{round(float(value), _DECIMALS) + 0.0:.{_DECIMALS}f}".rstrip("0")
+    # The sum turns -0.0 into 0.0.
+    rounded = round(float(value), _DECIMALS) + 0.0
+    text = f"{rounded:.{_DECIMALS}f}".rstrip("0")
     return f"{text}0" if text.endswith(".") else text

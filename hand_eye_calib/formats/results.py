@@ -316,7 +316,8 @@ def launch_text(calibrations: Sequence[Judged]) -> str:
 
 def _template(name: str) -> str:
     """Return the template of a file, with fields in braces."""
-    return Path(__file__).with_name("templates").joinpath(f"{name}.in").read_text("utf-8")
+    folder = Path(__file__).with_name("templates")
+    return (folder / f"{name}.in").read_text("utf-8")
 
 
 def _remarks(calibration: Judged) -> list[str]:

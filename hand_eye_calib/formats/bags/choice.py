@@ -43,7 +43,8 @@ class TopicInfo(NamedTuple):
     count: int  # type: ignore[assignment]
 
     def __str__(self) -> str:
-        return f"{self.name} ({self.type or 'several types'}, {self.count} messages)"
+        kind = self.type or "several types"
+        return f"{self.name} ({kind}, {self.count} messages)"
 
 
 class _Candidate(NamedTuple):

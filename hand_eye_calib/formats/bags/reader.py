@@ -113,7 +113,8 @@ class PoseBag:
 
     def _listing(self) -> str:
         """Return a sentence with all topics of the bag, for messages."""
-        return f"The bag has {', '.join(map(str, self.topics.values())) or 'no topics'}"
+        topics = ", ".join(map(str, self.topics.values()))
+        return f"The bag has {topics or 'no topics'}"
 
     def type_of(self, source: Source) -> str:
         """Return the message type of a topic; empty for frames and for missing topics."""

@@ -45,7 +45,8 @@ _NO_POSES = PoseTable.of([], np.empty((0, 7)))
 
 def source_of(text: str) -> Source:
     """Return the source that a user names: a topic as text, or ``WORLD:SENSOR`` as two frames."""
-    return TfSource.parse(text) if ":" in text.partition("?")[0] else text
+    topic, _, _ = text.partition("?")
+    return TfSource.parse(text) if ":" in topic else text
 
 
 class Reading(ABC):
@@ -211,7 +212,7 @@ def are_believable(stamps_ns: IntArray, bag_ns: IntArray) -> BoolArray:
     smaller_steps_s = np.minimum(steps_s[:-1], steps_s[1:])
     between_neighbours_s = np.abs(padded_s[2:] - padded_s[:-2])
     usual_step_s = np.median(steps_s[1:-1])
-    return np.asarray(smaller_steps_s <= _JUMP_S + between_neighbours_s + usual_step_s)
+    return smaller_steps_s <= _JUMP_S + between_neighbours_s + usual_step_s
 
 
 class JoinedReading(Reading):
@@ -362,7 +363,8 @@ def _integrated(stamps_ns: IntArray, twists: FloatArray) -> FloatArray:
     The first pose is the identity. Between two stamps, the twist is the mean of both.
     """
     intervals_s = np.diff(stamps_ns) * 1e-9
-    steps = (twists[1:] + twists[:-1]) / 2 * intervals_s[:, None]
+    means = (twists[1:] + twists[:-1]) / 2
+    steps = means * intervals_s[:, None]
     return se3.to_rows(se3.chained(se3.exp(steps)))
 
 

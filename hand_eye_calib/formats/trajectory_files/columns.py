@@ -369,6 +369,7 @@ def _split_words(words: list[str]) -> tuple[str, str]:
     is_time = any(_TIME_WORD.fullmatch(word) for word in words)
     for n_words in (2, 1):
         unit = _UNITS.get("/".join(words[-n_words:]), "")
-        if len(words) > n_words and unit and (unit in STAMP_UNITS) == is_time:
+        is_unit_of_time = unit in STAMP_UNITS
+        if unit and is_unit_of_time == is_time and len(words) > n_words:
             return "_".join(words[:-n_words]), unit
     return "_".join(words), ""

@@ -402,8 +402,9 @@ def _has_last_row(matrices: FloatArray) -> bool:
 
     Matrices that are not finite or all 0 contain no pose and are ignored.
     """
-    is_finite = np.isfinite(matrices).all(axis=(1, 2)) & matrices.any(axis=(1, 2))
-    last_rows = matrices[is_finite, 3]
+    is_finite = np.isfinite(matrices).all(axis=(1, 2))
+    is_zero = ~matrices.any(axis=(1, 2))
+    last_rows = matrices[is_finite & ~is_zero, 3]
     return bool(np.allclose(last_rows, [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=ROTATION_TOLERANCE))
 
 
@@ -512,4 +513,5 @@ def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:
 
 def tum_line(stamp_ns: int, pose: Iterable[float]) -> str:
     """Return the line of the format tum for a pose x y z qx qy qz qw, with all digits."""
-    return f"{seconds(stamp_ns)} {' '.join(map(repr, pose))}"
+    numbers = " ".join(map(repr, pose))
+    return f"{seconds(stamp_ns)} {numbers}"

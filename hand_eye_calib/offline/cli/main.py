@@ -59,7 +59,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     SystemExit
         From argparse: code 2 for wrong usage, 0 after ``--help``.
     """
-    return exit_code_of(lambda: _run(sys.argv[1:] if argv is None else argv))
+    words = sys.argv[1:] if argv is None else argv
+    return exit_code_of(lambda: _run(words))
 
 
 def exit_code_of(run: Callable[[], int]) -> int:
@@ -109,7 +110,8 @@ def named_command() -> int:
 
     ``ros2 run hand_eye_calib replay`` calls the executable ``replay``.
     """
-    return main([Path(sys.argv[0]).stem, *sys.argv[1:]])
+    executable, *words = sys.argv
+    return main([Path(executable).stem, *words])
 
 
 # Message of argparse about a value that is not among the choices of an option.
@@ -237,5 +239,7 @@ def _add_commands(parser: argparse.ArgumentParser) -> dict[str, argparse.Argumen
 def _refuse(rest: Sequence[str], parser: argparse.ArgumentParser) -> NoReturn:
     """Exit with an error about the first unknown option, or else the first unused argument."""
     options = [word for word in rest if word.startswith("-")]
-    option, _, _ = [*options, *rest][0].partition("=")
-    parser.error(f"unknown {option!r}{did_you_mean(option, parser._option_string_actions)}")
+    first, *_ = [*options, *rest]
+    option, _, _ = first.partition("=")
+    hint = did_you_mean(option, parser._option_string_actions)
+    parser.error(f"unknown {option!r}{hint}")

@@ -359,4 +359,6 @@ def _time_axis(duration_s: float) -> tuple[float, str]:
 
 def _downsample(count: int, max_points: int = LOOK.max_points) -> IntArray:
     """Return indices of evenly spaced points of ``count``, with the first and the last point."""
-    return np.unique(np.linspace(0, count - 1, min(count, max_points)).round().astype(int))
+    n_points = min(count, max_points)
+    rows = np.linspace(0, count - 1, n_points).round().astype(int)
+    return np.unique(rows)

@@ -17,13 +17,13 @@ from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.online.live.progress import AXIS_KEYS
 from hand_eye_calib.online.live.state import Condition, InputState, Level, ResultState, as_printed
 
-# Motion (s) or rotation (rad) from which on a first result is accepted: one of them suffices. With
-# less of both, estimates and advice jump.
+# A first result is accepted after this duration of motion (s), or after this rotation (rad). Before
+# that, estimates and advice jump.
 _MIN_MOTION_S = 20.0
 _MIN_ROTATION_RAD = float(np.radians(30.0))
 
-# Duration of a solve (s) from which on a person is told about it: advice and time left are then as
-# old as this.
+# Solves that last longer than this (s) are reported, because advice and time left refer to the data
+# before the solve.
 _SLOW_SOLVE_S = 10.0
 # Share of a processor that a solve gets, below which other programs keep the processor busy.
 _BUSY_SHARE = 0.5

@@ -43,7 +43,7 @@ _CONFIRMING_STEPS_S = np.array([4.0, 8, 12, 16, 20, 30, 40, 50, 60, 75])
 
 # Largest decrease of a reported time left from result to result, in steps.
 _MAX_DECREASE_STEPS = 2
-# Increase of a time left, in steps, from which on the reported time increases, too.
+# The reported time left increases only if the new time left is longer by this number of steps.
 _MIN_INCREASE_STEPS = 3
 
 # Largest ratio of standard deviations, newest to best result, at which the newest result replaces

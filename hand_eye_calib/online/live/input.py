@@ -24,7 +24,7 @@ from hand_eye_calib.online.live.log import GOES_ON_S, NodeLog
 from hand_eye_calib.online.live.session import LiveSession
 from hand_eye_calib.online.live.state import REPORT_PERIOD_S, Condition, InputState, Level
 
-# Share of lost messages from which on a person should act.
+# Largest share of lost messages that needs no action of a person.
 _MAX_LOST_SHARE = 0.01
 # Share of repeated stamps above which the publisher does not set its stamps.
 _MAX_REPEATED_SHARE = 0.5
@@ -92,7 +92,7 @@ class StampGuard:
     Attributes
     ----------
     last_ns : int or None
-        Newest accepted stamp of the session (ns); None before the first.
+        Newest accepted stamp of the session (ns); None before the first accepted message.
     """
 
     def __init__(self) -> None:

@@ -19,7 +19,7 @@ from hand_eye_calib.online.live.log import NodeLog
 # Period (s) at which poses are written to the disk. A crash loses the poses of one period.
 FLUSH_PERIOD_S = 0.25
 
-# Number of jobs in the queue from which on the disk counts as dead: one minute of batches.
+# The disk counts as dead if this number of jobs waits in the queue: one minute of batches.
 _MAX_WAITING = 240
 
 # Stream, stamp (ns), position (m) and quaternion (x, y, z, w).

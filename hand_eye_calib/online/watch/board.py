@@ -35,7 +35,7 @@ from hand_eye_calib.online.watch.headline import (
 )
 from hand_eye_calib.online.watch.view import AxisTexts, Line, Texts, Tone, View
 
-# Age (s) of the newest state from which on a node is silent: three reports are missing.
+# A node is silent if its newest state is older than this (s): three reports are missing.
 _SILENT_AFTER_S = 3.5 * REPORT_PERIOD_S
 
 # Time (s) for which the answer to a button is displayed.
