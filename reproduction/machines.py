@@ -13,6 +13,8 @@ from hand_eye_calib.extras.vehicle.wheel_files import wheel_trajectory
 # Step of the simulation (s), and the interval of the wheel data (s).
 _STEP_S = 0.005
 _WHEELS_S = 0.02
+# Length of a ramp up and down again (m).
+_RAMP_M = 12.0
 _START_NS = 10**18
 
 
@@ -72,14 +74,20 @@ def simulate_machine(
     course: str = "eights",
     duration_s: float = 180.0,
     noise: float = 1.0,
+    slip: float = 1.0,
+    ramp_rad: float = 0.0,
 ) -> Machine:
-    """Simulate a drive with slip, bumps and a noisy sensor. ``noise`` is a factor of all errors."""
+    """Simulate a drive with slip, bumps and a noisy sensor.
+
+    ``noise`` is a factor of all errors, ``slip`` of the number of slips of the wheels. The floor
+    rises and falls along the path by ``ramp_rad``.
+    """
     rng = np.random.default_rng(seed)
     times_s = np.arange(0.0, duration_s + 1.0, _STEP_S, dtype=float)
     driven = _course(course, machine, rng, times_s)
-    Ts_world_base = _poses(rng, driven, noise)
-    slip = _slip_of_wheels(rng, driven.yaw_rate, noise * duration_s)
-    parameters, rates = _wheels(machine, rng, driven, 1.0 + slip)
+    Ts_world_base = _poses(rng, driven, noise, ramp_rad)
+    slips = _slip_of_wheels(rng, driven.yaw_rate, slip * noise * duration_s)
+    parameters, rates = _wheels(machine, rng, driven, 1.0 + slips)
     every = round(_WHEELS_S / _STEP_S)
     n_rows = len(times_s) // every
     means = rates[: n_rows * every].reshape(n_rows, every, -1).mean(axis=1)
@@ -135,7 +143,7 @@ def _course(course: str, machine: str, rng: np.random.Generator, times_s: FloatA
     return Course(speed, left_speed, yaw_rate)
 
 
-def _poses(rng: np.random.Generator, driven: Course, noise: float) -> FloatArray:
+def _poses(rng: np.random.Generator, driven: Course, noise: float, ramp_rad: float) -> FloatArray:
     """Return poses of the base on a floor with bumps; the body leans outwards in curves.
 
     ``noise`` multiplies bumps and lean. With 1, the bumps have standard deviations of 4 mrad in
@@ -143,15 +151,19 @@ def _poses(rng: np.random.Generator, driven: Course, noise: float) -> FloatArray
     lateral acceleration of 1 m/s^2.
     """
     speed, left_speed, yaw_rate = driven
-    headings = np.cumsum(yaw_rate) * _STEP_S
+    # The vehicle pitches as the floor below it rises and falls.
+    pitch = ramp_rad * np.sin(2 * np.pi * np.cumsum(speed) * _STEP_S / _RAMP_M)
+    headings = np.cumsum(yaw_rate / np.cos(pitch)) * _STEP_S
     middle = headings - yaw_rate * _STEP_S / 2
-    places = np.cumsum((speed + 1j * left_speed) * np.exp(1j * middle)) * _STEP_S
+    ahead = speed * np.cos(pitch)
+    places = np.cumsum((ahead + 1j * left_speed) * np.exp(1j * middle)) * _STEP_S
+    heights = -np.cumsum(speed * np.sin(pitch)) * _STEP_S
     decay = np.exp(-_STEP_S / 0.3)
     shocks = np.sqrt(1 - decay**2) * rng.standard_normal((len(speed), 3))
     bumps = noise * lfilter([1.0], [1.0, -decay], shocks, axis=0) * [0.004, 0.004, 0.003]
     roll = bumps[:, 0] + noise * 0.01 * speed * yaw_rate
-    rotations = se3.rotation_from_rpy(np.column_stack([roll, bumps[:, 1], headings]))
-    positions = np.column_stack([places.real, places.imag, bumps[:, 2]])
+    rotations = se3.rotation_from_rpy(np.column_stack([roll, pitch + bumps[:, 1], headings]))
+    positions = np.column_stack([places.real, places.imag, heights + bumps[:, 2]])
     return se3.from_rotation_translation(rotations, positions)
 
 

@@ -21,6 +21,18 @@ from reproduction.writing import counted, markdown_table, seed_of, show
 # Models of wheels, and "driving" for a sensor without wheel data.
 _MODELS = ("wheels", "steering", "tricycle", "omni", "driving")
 _DEGENERATE = ("straight", "circle", "bend", "left", "spin")
+# Drives that disturb the estimate: machine, course, factor of the slips, and slope of ramps (deg).
+_DISTURBED = {
+    "no slip": ("wheels", "eights", 0.0, 0.0),
+    "slip 6 % of the time": ("wheels", "eights", 1.0, 0.0),
+    "slip 30 % of the time": ("wheels", "eights", 5.0, 0.0),
+    "slip in every curve": ("wheels", "eights", 15.0, 0.0),
+    "ramps of 3 deg": ("wheels", "eights", 1.0, 3.0),
+    "ramps of 8 deg": ("wheels", "eights", 1.0, 8.0),
+    "tracks": ("skid", "eights", 1.0, 0.0),
+    "articulated, tight curves": ("articulated", "eights", 1.0, 0.0),
+    "articulated, wide curves": ("articulated", "wide", 1.0, 0.0),
+}
 # The verdict must not be USE if an error is beyond this number of standard deviations.
 _BEYOND = 3.3
 
@@ -72,6 +84,34 @@ def _errors_of(result: Calibration, machine: Machine) -> tuple[dict[str, float],
             errors[item.name] = (item.value - truth) / unit
             sigmas[item.name] = item.sigma / unit
     return errors, sigmas
+
+
+def disturbed(seed: int, n_drives: int) -> list[dict[str, object]]:
+    """Rows of a table: largest errors of x, y and yaw, and verdicts, of each disturbed drive."""
+    rows: list[dict[str, object]] = []
+    for name, (model, course, slip, ramp_deg) in _DISTURBED.items():
+        results = []
+        for row in range(n_drives):
+            machine = simulate_machine(
+                seed + row, model, course, slip=slip, ramp_rad=np.radians(ramp_deg)
+            )
+            result = calibrate_vehicle(machine.sensor, machine.wheels, child_kind="exact")
+            errors, sigmas = _errors_of(result, machine)
+            results.append(Drive(errors, sigmas, result.verdict.value, result.headline))
+        largest = {
+            axis: _with_unit(axis, max(abs(item.errors[axis]) for item in results))
+            for axis in ("x", "y", "yaw")
+        }
+        ratios = [item.ratios[axis] for item in results for axis in largest if axis in item.ratios]
+        rows.append(
+            {
+                "Drive": name,
+                **largest,
+                "Largest, sigma": f"{max(ratios, default=np.nan):.1f}",
+                "Verdicts": counted(item.verdict for item in results),
+            }
+        )
+    return rows
 
 
 def accuracy(drives: Iterable[Drive]) -> list[dict[str, object]]:
@@ -148,6 +188,8 @@ def main() -> int:
                 }
             )
     show(None, {"degenerate": markdown_table(rows)})
+    rows = disturbed(seed, arguments.drives // 3)
+    show(None, {"disturbed": markdown_table(rows)})
     return 0
 
 

@@ -121,9 +121,18 @@ def test_wheels_that_turn_the_other_way_need_care(change):
     assert not confirmed.findings
 
 
+def test_much_slip_needs_care():
+    drive = simulate_machine(11, duration_s=120.0, slip=2.0)
+    result = hec.calibrate_vehicle(drive.sensor, drive.wheels)
+    assert result.verdict.value == "USE WITH CARE"
+    assert any("the wheels or the vehicle slip" in reason.sentence for reason in result.reasons)
+    assert np.abs(pose_errors(result, drive.T_base_sensor))[:2].max() < 0.01
+
+
 def test_an_articulated_machine_is_no_car():
     drive = machine("articulated")
     result = hec.calibrate_vehicle(drive.sensor, drive.wheels)
+    assert "bends in its middle" in result.findings[0].cause
     assert [found.code for found in result.findings] == ["unrelated"]
     assert result.verdict.value != "USE"
 

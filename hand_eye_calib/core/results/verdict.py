@@ -409,7 +409,12 @@ def _few_inliers(result: Result) -> Iterator[Ground]:
     uses_reference = METHODS[result.method].uses_reference
     if share < (FEWEST_INLIERS if uses_reference else FEWEST_OF_MODEL):
         text = f"{1 - share:.0%} of the motion pairs were rejected as outliers"
-        yield Ground(text, "find out why the odometry jumps, and record again")
+        advice = "find out why the odometry jumps, and record again"
+        if result.reference == "windows":
+            # The outliers of a vehicle are slips.
+            text = f"the wheels or the vehicle slip {1 - share:.0%} of the time"
+            advice = "drive more slowly in curves, on a floor with grip, and record again"
+        yield Ground(text, advice)
 
 
 _FLOOR_ADVICE = (

@@ -12,7 +12,8 @@ WORDS = {
     "unrelated_wheels": FindingWords(
         "the motion of the wheels, or of any vehicle, is not that of the sensor",
         UNRELATED_ADVICE,
-        "another recording, a wheel that turns backwards, or a machine that moves sideways",
+        "another recording, a wheel that turns backwards, or a machine that moves sideways or that "
+        "bends in its middle (articulated loaders have no model)",
         code="unrelated",
     ),
     "upside_down": FindingWords(
