@@ -107,7 +107,7 @@ class Problem:
     def space(self, fit: Fit, kept: IntArray | None = None) -> StateSpace:
         """Return the state space at a fit, of all poses or of the subset ``kept`` (indices)."""
         if kept is not None:
-            fit = fit.at_poses(kept, self.tuning.longest_gap)
+            fit = fit.at_poses(kept, self.tuning.burst[-1])
         linearisation = linearise(
             fit.poses, fit.course, fit.T, fit.parameters, self.columns, fit.error
         )
@@ -522,7 +522,6 @@ def _likeliest(
         # An estimated clock offset has an error for sure.
         choices_of_time = choices_of_time[-1:]
     products = posterior.products - problem.prior(fit)
-    log_odds = np.log(tuning.odds)
     n_rows = 6.0 * len(problem.streams)
     hypotheses = []
     for time_columns in choices_of_time:
@@ -533,7 +532,7 @@ def _likeliest(
         normal = NormalEquations(products + problem.prior(rival))
         loss = 2.0 * n_rows * np.log1p(max(float(normal.cost), 0.0) / n_rows)
         loss += float(normal.log_determinant + 2.0 * np.log(rival.sigmas).sum())
-        loss -= 2.0 * log_odds * len(present)
+        loss += 2.0 * tuning.least_gain * len(present)
         hypotheses.append(_Hypothesis(rival, normal, loss))
     return min(hypotheses, key=lambda hypothesis: hypothesis.loss)
 

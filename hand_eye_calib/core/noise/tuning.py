@@ -28,12 +28,11 @@ class Tuning:
     # Largest number of poses that noise levels are fitted to.
     most_poses: int = 300
     # Indices of the poses of one burst, relative to its first pose. Bursts are spread evenly: fast
-    # errors are visible within a burst, slow errors between bursts.
+    # errors are visible within a burst, slow errors between bursts. An increment over more poses
+    # than the longest index is not used: over such a gap, a walk of the rotation shifts positions,
+    # which the model of one increment does not contain. In recordings of thousands of poses, the
+    # fitted walk was a tenth of the true one.
     burst: tuple[int, ...] = (0, 1, 2, 3, 5, 8, 13, 21, 34, 55)
-    # Increments over more poses than this are not used for noise levels. Over such a gap, a walk of
-    # the rotation shifts positions, which the model of one increment does not contain. In
-    # recordings of thousands of poses, the fitted walk was a tenth of the true one.
-    longest_gap: int = 60
     # Prior mean of the log variance of the jitter of stamps (s^2): the variance of 1 ms.
     jitter: float = -14.0
     # Prior precision of log time constants: their prior standard deviation is 1.8, a factor of 6.
@@ -79,7 +78,8 @@ class Tuning:
 
     # -- Time-correlated errors --
     # Time-correlated errors are added if all of them together, with white noise and walk fitted
-    # again, lower the loss by at least this. Akaike's criterion for two levels would be 2.
+    # again, lower the loss by at least this. Akaike's criterion for two levels would be 2. A
+    # systematic error is added if it lowers the loss by this: its prior odds are exp(-4).
     least_gain: float = 4.0
     # A process is dropped if the data have less information than this on its log variance, unless
     # the first steps of the search have increased its variance.
@@ -104,8 +104,6 @@ class Tuning:
     sizes: tuple[float, ...] = (0.03, 0.03, 0.03, 0.03, 0.1, 1.0, 1.0, 1.0)
     # Prior standard deviations before errors are selected. Biases are usually small.
     first_sizes: tuple[float, ...] = (0.03, 0.0026, 0.0026, 0.0026, 0.1, 1.0, 1.0, 1.0)
-    # Prior odds that a systematic error is present.
-    odds: float = 0.03
     # Prior standard deviation of an error that is absent: in effect, the error is zero.
     absent_sigma: float = 1e-6
     # The gain of a bias is multiplied by this factor when it is compared with that of a scale. A
@@ -141,8 +139,6 @@ class Tuning:
     # direction (rad: 0.15 deg), of the time offset (s), of the response of positions to
     # acceleration (s^2).
     of_positions: tuple[float, ...] = (*[10.0] * 3, 0.01, *[math.radians(0.15)] * 3, 1.0, 0.002)
-    # Prior standard deviation of the scale if the odometry has an unknown unit.
-    any_scale: float = 1.0
     # Time (s) between the two positions of a velocity; an acceleration is the difference of two
     # velocities.
     accelerating_s: float = 0.2

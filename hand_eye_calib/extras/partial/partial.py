@@ -226,7 +226,7 @@ def _check_path(
         if unit and not is_near and unexplained < _UNRELATED_PATH:
             return (unit,)
         if not is_scale_given and unexplained < min(_SUSPECT_PATH, _MENDED_PATH * share):
-            return _check_scale(scaled, scaled.model.tuning.any_scale, paths)
+            return _check_scale(scaled, np.inf, paths)
     share = min(share, 1.0)
     severity = Severity.WARNING if is_near else Severity.ERROR
     return (finding("unrelated_positions", severity=severity, share=share),)

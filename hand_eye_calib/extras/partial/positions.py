@@ -219,7 +219,7 @@ class _State:
         n = len(streams) - 1
         sigmas = np.array(tuning.of_positions)
         if with_scale:
-            sigmas[3] = tuning.any_scale
+            sigmas[3] = np.inf
         interval_s = float(np.median(np.diff(stamps_s)))
         duration_s = float(stamps_s[-1])
         state = cls(
@@ -306,7 +306,7 @@ class _State:
         kept = sample(len(self.streams), self.tuning)
         if kept is None:
             return self.space(model)
-        jumps = self.outliers.across(kept, self.tuning.longest_gap).jumps
+        jumps = self.outliers.across(kept, self.tuning.burst[-1]).jumps
         subset = replace(
             self,
             streams=self.streams[kept],
