@@ -15,7 +15,7 @@ import hand_eye_calib as hec
 from hand_eye_calib.core.assessment.covariance import assess_adaptive
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import deviation
-from hand_eye_calib.core.noise import estimator, increments
+from hand_eye_calib.core.noise import estimator, increments, partwise, stages
 from hand_eye_calib.core.noise.noise_model import CENTRES
 from hand_eye_calib.core.noise.tuning import TUNING
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
@@ -354,6 +354,24 @@ def test_heavy_tails_leave_the_answer_near():
         solution = estimator.solve(stamps(200), parent @ noise[0], child_of(parent) @ noise[1])
         values.append(nees_of(solution))
     assert_nees(values, 0.0, 10.0, np.median)
+
+
+def test_a_long_recording_is_solved_in_parts(monkeypatch):
+    parent, child = fixed_to_body(*noisy_drive(6, 900), lasting(7, 900, [0.02, 0.0], 20))
+    child[300:, :3, 3] += [0.5, -0.3, 0.2]
+    whole = estimator.solve(stamps(900), parent, child)
+    for module in (partwise, stages):
+        monkeypatch.setattr(module, "MAX_POSES", 200)
+    in_parts = estimator.solve(stamps(900), parent, child)
+    sigmas = np.sqrt(np.diag(whole.cov_parent_child_in_child))
+    difference = deviation(in_parts.T_parent_child, whole.T_parent_child)
+    assert 0.0 < np.max(np.abs(difference) / sigmas) < 0.5
+    ratios = np.sqrt(np.diag(in_parts.cov_parent_child_in_child)) / sigmas
+    assert np.all((ratios > 0.95) & (ratios < 1.1))
+    assert np.flatnonzero(in_parts.jumps).tolist() == np.flatnonzero(whole.jumps).tolist() == [299]
+    assert ("body", "translation") in whole.model.processes
+    assert in_parts.model.processes == whole.model.processes
+    assert in_parts.converged
 
 
 def target_seen_by(camera, seed):

@@ -1,13 +1,16 @@
 """Compare the likelihood of the noise model with its definition by dense matrices."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from hand_eye_calib.core.base.blocks import Blocks
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.noise import reml
+from hand_eye_calib.core.noise import partwise, reml
 from hand_eye_calib.core.noise.normal import Factor, NormalEquations
 from hand_eye_calib.core.noise.outliers import chi_squares, innovation_chi_squares
+from hand_eye_calib.core.noise.partwise import PartwisePosterior
 from hand_eye_calib.core.noise.state_space import Posterior, StateSpace
 
 N_POSES = 15
@@ -258,3 +261,33 @@ def test_chi_squares_of_jitter_along_one_velocity_are_finite():
     values = np.ones((1, 6))
     chi_square = chi_squares(values, prior, 0.004 * prior, np.array([False]))
     assert 0.0 <= chi_square[0] < 1e-3
+
+
+def test_parts_have_the_posterior_of_a_trajectory_that_is_cut_between_them(monkeypatch):
+    monkeypatch.setattr(partwise, "MAX_POSES", 5)
+    whole = replace(space_of(cut=(4, 9)), group_sizes=(), prior=np.eye(N_PARAMETERS + 1))
+    whole = replace(whole, h1_processes=whole.h1_processes[:, :, :0], h0=whole.h0[:, :, :6])
+
+    def space_of_part(poses):
+        increments = poses[:-1]
+        bases = tuple(basis if len(basis) == 1 else basis[poses] for basis in whole.white_bases)
+        fields = {"white_bases": bases, "weights": whole.weights[poses]}
+        for name in ("intervals_s", "walk_factors", "columns", "h1_processes", "h0", "cut"):
+            fields[name] = getattr(whole, name)[increments]
+        return replace(whole, **fields)
+
+    levels = LEVELS[:5]
+    expected = Posterior(whole, levels)
+    posterior = PartwisePosterior(space_of_part, N_POSES, whole.prior, levels)
+    assert len([*posterior.parts()]) == 3
+    assert posterior.loss == pytest.approx(expected.loss, rel=1e-11)
+    np.testing.assert_allclose(posterior.products, expected.products, atol=1e-9)
+    step = posterior.normal.step
+    np.testing.assert_allclose(posterior.states_after(step), expected.states_after(step), atol=1e-9)
+    np.testing.assert_allclose(posterior.part_products().sum(axis=0), expected.products, atol=1e-9)
+    no_spikes = np.zeros(N_POSES, dtype=bool)
+    of_walk, of_white = innovation_chi_squares(posterior, no_spikes)
+    whole_walk, whole_white = innovation_chi_squares(expected, no_spikes)
+    np.testing.assert_allclose(of_white, whole_white, rtol=1e-6)
+    np.testing.assert_allclose(of_walk[~whole.cut], whole_walk[~whole.cut], rtol=1e-6)
+    np.testing.assert_array_equal(of_walk[whole.cut], 0.0)

@@ -56,6 +56,9 @@ SYSTEMATIC_OF_RATES = ("time", "rate")
 # Parts of a step of the child that may drift: its length (scale) and its direction.
 PATH_PARTS = ("scale", "direction")
 
+# Number of increments whose first residuals are computed at once. It limits the memory.
+_BATCH = 10_000
+
 # Lower bound of the variance (m^2) between steps and their neighbours. Smaller ones are rounding.
 _ROUNDING_M2 = 1e-18
 
@@ -260,6 +263,17 @@ def linearise(
     all_columns = np.concatenate([by_xi, systematic[:, :, columns], residuals[:, :, None]], axis=2)
     by_path = {"scale": by_steps[:, :, :1], "direction": by_steps[:, :, 1:]}
     return Linearisation(all_columns, adjoints, by_path)
+
+
+def first_residuals(streams: Streams, course: Course, T_parent_child: FloatArray) -> FloatArray:
+    """Return the residuals e (n, 6) of :func:`linearise` without systematic errors."""
+    residuals = []
+    for start in range(0, len(streams) - 1, _BATCH):
+        poses = slice(start, start + _BATCH + 1)
+        parameters = np.zeros(N_SYSTEMATIC)
+        part = linearise(streams[poses], course[poses], T_parent_child, parameters, [])
+        residuals.append(part.residuals)
+    return np.concatenate(residuals)
 
 
 def _child_motions(

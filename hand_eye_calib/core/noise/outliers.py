@@ -28,8 +28,9 @@ from hand_eye_calib.core.base.stats import (
     robust_weights,
 )
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.noise.increments import N_SYSTEMATIC, Course, Streams, linearise
+from hand_eye_calib.core.noise.increments import Course, Streams, first_residuals
 from hand_eye_calib.core.noise.normal import transposed
+from hand_eye_calib.core.noise.partwise import PartwisePosterior
 from hand_eye_calib.core.noise.state_space import WHITE, Posterior, total_covariance
 from hand_eye_calib.core.noise.tuning import Tuning
 
@@ -41,9 +42,6 @@ _MIN_JUMP = 1e-6
 _INCREASE_SHARE = 1e-9
 # ... and by this variance (m^2, rad^2), because S of positions or rotations alone may be singular.
 _INCREASE_VARIANCE = 1e-18
-
-# Number of poses whose chi-squares are computed at once. It limits the memory.
-_BATCH = 10_000
 
 
 @dataclass(frozen=True)
@@ -102,8 +100,7 @@ def first_outliers(
     jumps = is_large & ~(spikes[1:] | spikes[:-1])
     if spikes.any():
         poses = bridge_outliers(streams, T_parent_child, spikes)
-        parameters = np.zeros(N_SYSTEMATIC)
-        bridged_residuals = linearise(poses, course, T_parent_child, parameters, []).residuals
+        bridged_residuals = first_residuals(poses, course, T_parent_child)
         is_still_large = (_lengths(bridged_residuals) > limits).any(axis=1)
         jumps |= is_still_large & spikes[:-1]
     return Outliers(jumps, spikes)
@@ -115,12 +112,27 @@ def _lengths(residuals: FloatArray) -> FloatArray:
 
 
 def innovation_chi_squares(
-    posterior: Posterior, spikes: BoolArray
+    posterior: Posterior | PartwisePosterior, spikes: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the chi-squares of the increments (n,) and of the white errors of poses (N,).
 
-    ``spikes`` (N,) are outlier poses, which were not used.
+    ``spikes`` (N,) are outlier poses, which were not used. The chi-square is zero for an increment
+    between two parts of a long recording.
     """
+    of_walk = []
+    of_white = []
+    start = 0
+    for part in posterior.parts():
+        end = start + len(part.space.weights)
+        walk, white = _chi_squares_of_part(part, spikes[start:end])
+        of_walk.append(np.r_[walk, 0.0])
+        of_white.append(white)
+        start = end
+    return np.concatenate(of_walk)[:-1], np.concatenate(of_white)
+
+
+def _chi_squares_of_part(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Return the chi-squares of :func:`innovation_chi_squares` for one part of a recording."""
     space = posterior.space
     # Column 0 is the posterior mean, the others are a root of the covariance that the uncertainty
     # of the parameters adds.
@@ -153,19 +165,12 @@ def chi_squares(
     smoothed value is prior minus posterior. A value whose data are not used (``is_unused``) is an
     estimate from all other data: the covariance of its difference from zero is their sum.
     """
-    squares = np.empty(len(values))
-    # In batches: temporary arrays of a long recording would need as much memory as its posterior.
-    for start in range(0, len(values), _BATCH):
-        batch = slice(start, start + _BATCH)
-        unused = is_unused[batch]
-        prior_batch = prior[batch]
-        covariances = prior_batch - posterior[batch]
-        covariances[unused] = prior_batch[unused] + posterior[batch][unused]
-        # Only on the diagonal: a prior of jitter, which acts along one velocity, is singular.
-        covariances += (_INCREASE_SHARE * prior_batch + _INCREASE_VARIANCE) * np.eye(6)
-        weighted = np.linalg.solve(covariances, values[batch, :, None])[:, :, 0]
-        squares[batch] = (values[batch] * weighted).sum(axis=1)
-    return squares
+    covariances = prior - posterior
+    covariances[is_unused] = prior[is_unused] + posterior[is_unused]
+    # Only on the diagonal: a prior of jitter, which acts along one velocity, is singular.
+    covariances += (_INCREASE_SHARE * prior + _INCREASE_VARIANCE) * np.eye(6)
+    weighted = np.linalg.solve(covariances, values[:, :, None])[:, :, 0]
+    return np.asarray((values * weighted).sum(axis=1))
 
 
 def detect_outliers(
@@ -240,13 +245,18 @@ def bridge_outliers(streams: Streams, T_parent_child: FloatArray, spikes: BoolAr
     return Streams(streams.stamps_s, streams.Ts_pw_p, Ts_cw_c)
 
 
-def tail_weights(posterior: Posterior) -> FloatArray:
+def tail_weights(posterior: Posterior | PartwisePosterior) -> FloatArray:
     """Return weights (N,) of the white errors v for Student's t distribution.
 
     ``weight = (nu + 6) / (nu + E[v' S^-1 v])`` with nu = 4 degrees of freedom and the white
     covariance S. The expectation is that of the smoothed v, plus a share that smoothing removes.
     This share is assumed to be in inverse proportion to the weights of the poses.
     """
+    return np.concatenate([_tail_weights_of_part(part) for part in posterior.parts()])
+
+
+def _tail_weights_of_part(posterior: Posterior) -> FloatArray:
+    """Return the weights of :func:`tail_weights` for one part of a recording."""
     v = posterior.states_after(posterior.normal.step)[:, :WHITE]
     squares = (v * se3.times(posterior.white_precision, v)).sum(axis=1)
     weights = posterior.space.weights

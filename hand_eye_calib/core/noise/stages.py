@@ -36,6 +36,7 @@ from hand_eye_calib.core.noise.increments import (
     Course,
     Streams,
     course_of,
+    first_residuals,
     linearise,
 )
 from hand_eye_calib.core.noise.noise_model import (
@@ -59,6 +60,7 @@ from hand_eye_calib.core.noise.outliers import (
     innovation_chi_squares,
     tail_weights,
 )
+from hand_eye_calib.core.noise.partwise import MAX_POSES, PartwisePosterior
 from hand_eye_calib.core.noise.state_space import WHITE, Posterior, StateSpace
 from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 from hand_eye_calib.core.pairing.motion_pairs import motion_pairs
@@ -144,16 +146,27 @@ class Workspace:
         self.problem = problem
         # Only one posterior is stored, because the posterior of a long recording is large.
         self._fit: Fit | None = None
-        self._posterior: Posterior | None = None
+        self._posterior: Posterior | PartwisePosterior | None = None
 
-    def posterior(self, fit: Fit) -> Posterior:
+    def posterior(self, fit: Fit) -> Posterior | PartwisePosterior:
         """Return the posterior of all poses at a fit; the same fit again costs nothing."""
         if self._posterior is None or self._fit is not fit:
             # Release the memory of the stored posterior before the next one is computed.
             self._posterior = None
-            self._posterior = Posterior(self.problem.space(fit), fit.levels)
+            self._posterior = self._new_posterior(fit)
             self._fit = fit
         return self._posterior
+
+    def _new_posterior(self, fit: Fit) -> Posterior | PartwisePosterior:
+        problem = self.problem
+        n_poses = len(problem.streams)
+        if n_poses <= MAX_POSES:
+            return Posterior(problem.space(fit), fit.levels)
+
+        def space_of(poses: IntArray) -> StateSpace:
+            return problem.space(fit, poses)
+
+        return PartwisePosterior(space_of, n_poses, problem.prior(fit), fit.levels)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -279,7 +292,7 @@ def start(problem: Problem) -> Fit:
     pairs = motion_pairs(streams.Ts_pw_p, streams.Ts_cw_c, tuning.start_reference)
     T = Method("dnlo").solve(pairs).T_parent_child
     course = course_of(streams, T)
-    residuals = linearise(streams, course, T, np.zeros(N_SYSTEMATIC), []).residuals
+    residuals = first_residuals(streams, course, T)
     outliers = first_outliers(streams, course, T, residuals, tuning)
     interval_s = median(np.diff(streams.stamps_s))
     duration_s = float(np.ptp(streams.stamps_s))
@@ -393,12 +406,10 @@ def tails(workspace: Workspace, fit: Fit) -> Fit:
     if not fit.has_heavy_tails:
         return fit
     for _ in range(2):
-        posterior = workspace.posterior(fit)
-        # Three rounds of weights at constant levels. The third weights are those of the next fit.
-        for _ in range(2):
-            weights = np.where(fit.outliers.spikes, 0.0, tail_weights(posterior))
-            posterior = Posterior(replace(posterior.space, weights=weights), posterior.levels)
-        fit = noise(workspace, replace(fit, weights=tail_weights(posterior)))
+        # Three rounds of weights at constant levels.
+        for _ in range(3):
+            fit = replace(fit, weights=tail_weights(workspace.posterior(fit)))
+        fit = noise(workspace, fit)
     return _detect_in_rounds(workspace, fit, 2, with_spikes=False)
 
 
@@ -499,7 +510,10 @@ def systematic(workspace: Workspace, fit: Fit) -> Fit:
 
 
 def _likeliest(
-    problem: Problem, fit: Fit, posterior: Posterior, path_columns: list[int]
+    problem: Problem,
+    fit: Fit,
+    posterior: Posterior | PartwisePosterior,
+    path_columns: list[int],
 ) -> _Hypothesis:
     """Return the likelier hypothesis: some errors of the path, with or without a time offset.
 

@@ -26,6 +26,7 @@ Products need only the first triangular solution: ``Z' V^-1 Z = Z' W Z - Y' Y`` 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -51,7 +52,7 @@ _DIAGONAL_INCREASE = 1e-13
 LEVEL_CHANGE = 1e-5
 
 # Largest number of blocks of time that a recording is divided into for the jackknife.
-_MAX_BLOCKS = 20
+MAX_BLOCKS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -341,10 +342,14 @@ class Posterior:
         weighted = self._walk_precisions @ columns
         return weighted, self.factor.whiten(self.space.apply_u_transposed(weighted))
 
+    def parts(self) -> Iterator[Posterior]:
+        """Return the parts of a long recording; here, the whole recording is one part."""
+        yield self
+
     def states_after(self, step: FloatArray) -> FloatArray:
         """Return the posterior mean (N, d) of the states after a step (p,) of the parameters."""
         mixing = np.r_[step, 1.0][:, None]
-        return self.factor.restore(_combine(self.whitened, mixing))[:, :, 0]
+        return self.factor.restore(combined(self.whitened, mixing))[:, :, 0]
 
     def smoothed(self) -> tuple[FloatArray, FloatArray]:
         """Return the smoothed states (N, d, 1 + p) and walk (n, 6, 1 + p).
@@ -358,8 +363,8 @@ class Posterior:
         mixing[:-1, 0] = normal.step
         mixing[-1, 0] = 1.0
         mixing[:-1, 1:] = normal.root
-        states = self.factor.restore(_combine(self.whitened, mixing))
-        walk = _combine(self.space.columns, mixing) - self.space.apply_u(states)
+        states = self.factor.restore(combined(self.whitened, mixing))
+        walk = combined(self.space.columns, mixing) - self.space.apply_u(states)
         return states, walk
 
     def walk_covariances(self) -> FloatArray:
@@ -374,7 +379,7 @@ class Posterior:
         total -= transposed(mixed)
         return total
 
-    def part_products(self) -> FloatArray:
+    def part_products(self, n_blocks: int = MAX_BLOCKS) -> FloatArray:
         """Return the contribution of each block of time to ``products``, for a jackknife.
 
         A contribution is that of the innovations of a block, predicted from all earlier blocks. If
@@ -389,11 +394,11 @@ class Posterior:
         Returns
         -------
         (K, p + 1, p + 1) array
-            K is at most 20. The sum over K equals ``products``.
+            K is at most ``n_blocks``. The sum over K equals ``products``.
         """
         n, _, n_columns = self.space.columns.shape
         n_states = self.space.h0.shape[2]
-        ends = np.linspace(0, n, min(_MAX_BLOCKS, n) + 1).astype(int).tolist()
+        ends = np.linspace(0, n, min(n_blocks, n) + 1).astype(int).tolist()
         # Form of the state at the end of the last block, and of the columns.
         history = np.zeros((n_states + n_columns, n_states + n_columns))
         totals = [np.zeros((n_columns, n_columns))]
@@ -439,7 +444,7 @@ class Posterior:
         return form - multiplied(whitened, whitened)
 
 
-def _combine(columns: FloatArray, mixing: FloatArray) -> FloatArray:
+def combined(columns: FloatArray, mixing: FloatArray) -> FloatArray:
     """Return the linear combinations (n, d, l) of columns (n, d, k) with factors (k, l)."""
     n, size, _ = columns.shape
     return (columns.reshape(n * size, -1) @ mixing).reshape(n, size, -1)
