@@ -33,7 +33,8 @@ from reproduction.runner import kept
 from reproduction.writing import counted, markdown_table, put_into_page
 
 METHODS: tuple[MethodName, ...] = ("dnlo", "auto")
-_SEEDS = (0, 1)
+# Simulated drives that faults are put into.
+_N_DRIVES = 2
 _NOISE = NoiseConfig(gaussian=0.003)
 _TANGO = ("tango_caligula_mars",)
 _LIMIT_Z = 3.3
@@ -96,7 +97,7 @@ def run(arguments: argparse.Namespace) -> str:
     """
     folder = arguments.data_folder
     out = arguments.out
-    todo = clean_cases(folder) if arguments.clean else cases(folder)
+    todo = clean_cases(folder) if arguments.clean else cases(folder, arguments.seed)
     tasks = {case.key: (case, folder) for case in todo}
     records = kept(out / "faults.jsonl", _plain_outcome, tasks, arguments.jobs)
     text = report([Outcome(**record) for record in records.values()], folder)
@@ -109,14 +110,15 @@ def _plain_outcome(case: Case, folder: Path | None) -> dict[str, Any]:
     return asdict(outcome(case, folder))
 
 
-def recordings(folder: Path | None) -> list[str]:
-    """Names of the recordings that faults are put into."""
-    return [f"hilly_{seed}" for seed in _SEEDS] + list(_TANGO if folder else ())
+def recordings(folder: Path | None, first_seed: int = 0) -> list[str]:
+    """Names of the recordings that faults are put into; simulated drives from a seed on."""
+    seeds = range(first_seed, first_seed + _N_DRIVES)
+    return [f"hilly_{seed}" for seed in seeds] + list(_TANGO if folder else ())
 
 
-def cases(folder: Path | None) -> list[Case]:
+def cases(folder: Path | None, first_seed: int = 0) -> list[Case]:
     """All cases of the study: recordings without faults, with each fault, and clean recordings."""
-    names = recordings(folder)
+    names = recordings(folder, first_seed)
     faulty = (_cases(code, len(fault.severities), names) for code, fault in _FAULTS.items())
     return [*_cases(_SOUND, 1, names), *chain.from_iterable(faulty), *clean_cases(folder)]
 
