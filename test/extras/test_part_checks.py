@@ -79,6 +79,13 @@ def test_a_delay_of_positions_is_estimated(platform):
     assert result.time_offset_s == pytest.approx(-0.15, abs=0.02)
 
 
+def test_a_delay_is_estimated_although_a_lever_arm_hides_it_in_the_speeds():
+    recording = part_faults.positions("hand", "delayed 150 ms", 831500)
+    result = hec.calibrate(recording.parent, recording.child, **part_faults.WIDE)
+    assert result.findings == ()
+    assert result.time_offset_s == pytest.approx(-0.15, abs=0.005)
+
+
 def test_positions_too_few_to_detect_smoothing_are_to_be_used_with_care():
     recording = part_faults.positions("drone", "clean", SEED)
     short = recording.child[: len(recording.child) // 16]

@@ -21,7 +21,11 @@ from hand_eye_calib.core.engine.snapshot import MOST_MOVED_S, UNASKED_S, Snapsho
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.extras.partial import position_checks, rotation_checks
-from hand_eye_calib.extras.partial.partial import estimate_lever_arm, estimate_rotation
+from hand_eye_calib.extras.partial.partial import (
+    estimate_lever_arm,
+    estimate_rotation,
+    unexplained_path,
+)
 
 # Allowed values of options that only matter for full poses of both sensors.
 _OF_POSES: dict[str, tuple[object, ...]] = {
@@ -50,11 +54,17 @@ _FOUND_BY_SOLVE_S = 0.25
 _COARSE_INTERVALS = 0.2
 
 
+# Time offsets (s) that are tried if speeds are not correlated. The solve estimates the rest.
+_TRIED_OFFSETS_S = tuple(np.round(np.arange(-0.9, 0.95, 0.1), 3).tolist())
+# A tried offset counts if it leaves less than this share of the unexplained path without offset.
+_CLEAR_SHARE = 0.5
+
+
 def _solve_positions(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
     """Estimate the lever arm. ``cross_check`` has no effect: positions have no cross-check.
 
-    A delay may make positions look unrelated to the poses. The correlation of speeds then estimates
-    the delay, and the solve is repeated.
+    A delay may make positions look unrelated to the poses. The correlation of speeds, or the paths
+    themselves, then estimate the delay, and the solve is repeated.
     """
     result = _solve(snapshot, estimate_lever_arm)
     config = snapshot.config
@@ -63,11 +73,35 @@ def _solve_positions(snapshot: Snapshot, cross_check: bool | None) -> Calibratio
     known_s = float(config.time_offset)
     parent, child = snapshot.streams
     correlation = correlate_rates(parent, child.shifted(known_s), config.max_gap, of_speed=True)
-    if not correlation.is_clear or not MOST_MOVED_S < abs(correlation.offset_s) < UNASKED_S:
+    offset_s = correlation.offset_s if correlation.is_clear else _offset_of_paths(snapshot)
+    if not MOST_MOVED_S < abs(offset_s) < UNASKED_S:
         return result
-    config = replace(config, time_offset=known_s + correlation.offset_s)
-    shifted = _solve(replace(snapshot, config=config), estimate_lever_arm)
+    shifted = _solve(_shifted(snapshot, offset_s), estimate_lever_arm)
     return result if _is_unrelated(shifted) else shifted
+
+
+def _shifted(snapshot: Snapshot, offset_s: float) -> Snapshot:
+    """Return the snapshot with a time offset (s) in addition to that of its options."""
+    known_s = float(snapshot.config.time_offset)
+    return replace(snapshot, config=replace(snapshot.config, time_offset=known_s + offset_s))
+
+
+def _offset_of_paths(snapshot: Snapshot) -> float:
+    """Return the time offset (s) at which a lever arm explains most of the positions.
+
+    A long lever arm changes the speed of the antenna so much that speeds are not correlated. The
+    offset is 0 if no offset explains the positions clearly better.
+    """
+    shares = {}
+    for offset_s in _TRIED_OFFSETS_S:
+        pose_pairs = _shifted(snapshot, offset_s).pose_pairs
+        if len(pose_pairs) >= snapshot.config.min_pairs:
+            shares[offset_s] = unexplained_path(pose_pairs, snapshot.config)
+    if not shares:
+        return 0.0
+    best_s = min(shares, key=lambda offset_s: shares[offset_s])
+    is_clear = shares[best_s] < _CLEAR_SHARE * shares.get(0.0, 1.0)
+    return best_s if is_clear else 0.0
 
 
 def _is_unrelated(calibration: Calibration) -> bool:

@@ -105,6 +105,12 @@ class _Paths:
         return scale if self.is_child else 1.0 / scale
 
 
+def unexplained_path(pose_pairs: PosePairs, config: CalibratorConfig) -> float:
+    """Return the share of the path of the positions that the best lever arm does not explain."""
+    paths = _Paths.of(pose_pairs, config)
+    return of_positions.unexplained_at_start(paths.poses, paths.positions)
+
+
 def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
     """Solve and assess synchronised poses and positions.
 
