@@ -12,6 +12,7 @@ import hand_eye_calib as hec
 from hand_eye_calib.core.assessment.moved import SIGNIFICANT, find_change, possible_shift
 from hand_eye_calib.core.checks.check import check_streams
 from hand_eye_calib.core.checks.findings import Severity
+from hand_eye_calib.core.checks.open_delay import faulty_variance
 from hand_eye_calib.core.checks.streams import check_stream
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
@@ -19,11 +20,14 @@ from hand_eye_calib.core.pairing.motion_pairs import synchronise
 from hand_eye_calib.core.results.calibration import Verdict
 from hand_eye_calib.extras.simulation.drive import simulate_drive
 from hand_eye_calib.extras.simulation.options import HILLY_DRIVE, REALISTIC, NoiseConfig
+from reproduction import pose_faults
 from reproduction.coverage.classes import make
 from reproduction.fault_cases import FAULTS, LATER, SILENT, heading_drift
 
 # Not the strongest: seen by a solve or with no effect then, or named already if it is small.
 STRONGEST = {"S13": 1, "S10b": 2, "V1": 1, "U7": 0, "U12": 1}
+LATE_POSITIONS = next(fault for fault in LATER if fault.code == "V1")
+EXCHANGED = next(fault for fault in LATER if fault.code == "U12")
 NAMED = [fault for fault in (*FAULTS, *LATER, *SILENT) if fault.named]
 
 
@@ -47,6 +51,51 @@ def test_every_fault_is_named(fault):
 @pytest.mark.parametrize("seed", range(3))
 def test_a_sound_drive_has_no_finding(seed):
     assert [finding.code for finding in check_streams(*_streams(drive(seed))).findings] == []
+
+
+@functools.cache
+def late_parent(delay_s):
+    """Streams of the drive whose parent has late positions, and their result."""
+    sound = drive()
+    late = LATE_POSITIONS.damage(sound.parent, sound.child, delay_s, np.random.default_rng(0))
+    return late, hec.calibrate(*late)
+
+
+def test_sigma_contains_a_delay_of_positions_below_the_limit_of_a_finding():
+    _, result = late_parent(0.02)
+    (note,) = result.findings
+    assert (note.code, note.stream, note.severity) == ("position_clock", "parent", Severity.NOTE)
+    error = se3.deviation(result.T_parent_child, drive().T_parent_child)
+    assert abs(error[0]) > 0.025  # m: 20 ms at 1.5 m/s
+    assert (np.abs(error) < 2.0 * result.sigmas).all()
+    sound = hec.calibrate(*_streams(drive()))
+    assert sound.findings == ()
+    assert (sound.sigmas[:3] < 0.0095).all()
+
+
+def test_a_prior_limits_the_sigma_of_an_open_delay():
+    late, result = late_parent(0.02)
+    truth = float(drive().T_parent_child[0, 3])
+    known = hec.calibrate(*late, prior={"x": (truth, 0.005)})
+    assert known.sigmas[0] < 0.012 < 0.02 < result.sigmas[0]
+
+
+def test_an_uncertain_delay_does_not_change_its_prior():
+    assert faulty_variance(0.0, 1.0) < 0.1 * 0.03**2 * 1.05
+    assert faulty_variance(0.0, 0.002) < 1e-6
+    assert faulty_variance(0.03, 0.002) == pytest.approx(0.03**2, rel=0.02)
+    assert faulty_variance(0.01, 0.004) < faulty_variance(0.02, 0.004)
+
+
+# Machines on flat ground whose streams are exchanged: one rotation explains both parts.
+@pytest.mark.parametrize(
+    ("platform", "seed", "share"), [("agv", 674704, 0.3), ("car", 674702, 0.3)]
+)
+def test_exchanged_streams_on_flat_ground_are_named_by_their_displacements(platform, seed, share):
+    streams = pose_faults.clean(platform, seed)
+    exchanged = EXCHANGED.damage(streams.parent, streams.child, share, np.random.default_rng(0))
+    found = check_streams(*exchanged, earlier=None).findings
+    assert "exchanged" in {finding.code for finding in found if finding.makes_unusable}
 
 
 @pytest.mark.parametrize("seed", range(3))

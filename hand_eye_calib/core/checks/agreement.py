@@ -16,9 +16,8 @@ import numpy as np
 
 from hand_eye_calib.core.assessment.common_mode import FLOOR_TRAVEL_S, usual_speed
 from hand_eye_calib.core.assessment.moved import SIGNIFICANT, MountChange, find_change
-from hand_eye_calib.core.base.arrays import FloatArray, IntArray
-from hand_eye_calib.core.base.blocks import Blocks
-from hand_eye_calib.core.base.stats import median, quantile
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.base.text import angle, length, listing
 from hand_eye_calib.core.checks.fault_regression import (
     Regression,
@@ -26,7 +25,7 @@ from hand_eye_calib.core.checks.fault_regression import (
     motion_regression,
 )
 from hand_eye_calib.core.checks.findings import LIMITS, Finding, Severity, finding, graded
-from hand_eye_calib.core.checks.stream_pair import MAX_ROTATION_RAD, MIN_PAIRS
+from hand_eye_calib.core.checks.open_delay import NO_DELAY, Agreement, open_delay
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
 from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
@@ -57,22 +56,6 @@ _SAME_POSITION_M = 0.002
 _NEARLY_M = 0.012
 # The same bound for sensors with parallel axes, which are no accident.
 _PARALLEL_M = 0.03
-
-# Shares of the poses before the time at which a recording is split in two.
-_SPLITS = (0.5, 0.25, 0.75)
-# Largest share of its rotations that the extrinsic rotation of a sound part leaves unexplained.
-_SOUND_PART = 0.25
-# A part has other axes than the other part if the other part's extrinsic rotation leaves more than
-# this share of its rotations unexplained.
-_OTHER_PART = 0.5
-
-# Number of blocks of time. At the start of each block except the first, an exchange of the streams
-# is tested.
-_EXCHANGE_BLOCKS = 16
-# Quantile of the residuals that is compared: it is outside of the larger part.
-_EXCHANGE_QUANTILE = 0.85
-# Streams are exchanged if that leaves less than this share of the residuals.
-_EXCHANGE_GAIN = 0.4
 
 # Gains are estimated about axes with at least this share of the rotation (root mean square) about
 # the main axis.
@@ -134,8 +117,8 @@ def check_agreement(
     X: FloatArray,
     best: ExtrinsicEstimate,
     offset_s: float,
-) -> list[Finding]:
-    """Return the finding about a fault of two streams that agree, or none.
+) -> Agreement:
+    """Return the finding about a fault of two streams that agree, or none, and the open delay.
 
     One fault changes the residuals of several groups. The group that explains most names the
     fault, and the fault is reported if it is significant. If a drift between the odometries
@@ -156,11 +139,13 @@ def check_agreement(
         Clock offset of the orientations, s.
     """
     if same := check_same(best):
-        return same
+        return Agreement(same)
     speed_m_s = usual_speed(pose_pairs.stamps_ns, se3.translation_of(pose_pairs.Ts_pw_p))
     suspects = slow_suspects(pose_pairs, motions, X, speed_m_s)
     short_motions = pairs_over(pose_pairs, SHORT_S, _MAX_SHORT_MOTIONS)
+    delay = NO_DELAY
     if fast := delay_regression(pose_pairs, short_motions, X):
+        delay = open_delay(fast, X)
         suspects += delay_suspects(fast, pose_pairs, speed_m_s, offset_s)
         interval_s = median(np.diff(pose_pairs.stamps_ns)) * 1e-9
         suspects += smoothing_suspects(fast, interval_s, speed_m_s)
@@ -170,7 +155,7 @@ def check_agreement(
         if suspect.finding and suspect.explained_share > largest_share:
             largest_share = suspect.explained_share
             findings = [suspect.finding]
-    return findings
+    return Agreement(findings, delay)
 
 
 def slow_suspects(
@@ -212,84 +197,6 @@ def check_coordinates(pose_pairs: PosePairs, motions: MotionPairs) -> list[Findi
         return []
     gain = axis_gain(slow, stream)
     return [gain] if gain else []
-
-
-def check_turned_parts(pose_pairs: PosePairs) -> list[Finding]:
-    """Return the finding that the extrinsic rotation differs between two parts, or none.
-
-    A stream that starts anew with other axes leaves two sound parts of a recording, and so do
-    streams that are exchanged. The noise model follows one part and rejects the other as outliers.
-    """
-    motions = pairs_over(pose_pairs, SHORT_S, _MAX_SHORT_MOTIONS)
-    angles = se3.rotation_angle(se3.rotation_of(motions.Ts_parenti_parentj))
-    motions = motions[angles < MAX_ROTATION_RAD]
-    if exchanged := _check_exchanged(motions, pose_pairs.stamps_ns):
-        return [exchanged]
-    for share in _SPLITS:
-        split = int(share * len(pose_pairs))
-        parts = (motions[motions.j < split], motions[motions.i >= split])
-        if min(map(len, parts)) < MIN_PAIRS:
-            continue
-        first, second = (
-            se3.from_rotation_translation(align_rotation_vectors(part), np.zeros(3))
-            for part in parts
-        )
-        by_own = max(_unexplained(parts[0], first), _unexplained(parts[1], second))
-        by_other = min(_unexplained(parts[0], second), _unexplained(parts[1], first))
-        if by_own >= _SOUND_PART or by_other <= max(_OTHER_PART, 3.0 * by_own):
-            continue
-        at_s = float(pose_pairs.stamps_ns[split] - pose_pairs.stamps_ns[0]) * 1e-9
-        if _unexplained(parts[1], se3.inverse(first)) < _SOUND_PART:
-            return [finding("exchanged", at_s=at_s)]
-        between = se3.rotation_of(first).T @ se3.rotation_of(second)
-        turned_rad = float(se3.rotation_angle(between))
-        size = angle(turned_rad)
-        return [finding("parts_turned", size=size, at_s=at_s, turned_rad=turned_rad)]
-    return []
-
-
-def _check_exchanged(motions: MotionPairs, stamps_ns: IntArray) -> Finding | None:
-    """Return the finding that parent and child are exchanged from some time on, or None.
-
-    One rotation R maps rotation vectors of the child to those of the parent. After an exchange it
-    maps those of the parent to those of the child. R is estimated for each possible time.
-    """
-    if len(motions) < MIN_PAIRS:
-        return None
-    of_parent = se3.rotation_log(se3.rotation_of(motions.Ts_parenti_parentj))
-    of_child = se3.rotation_log(se3.rotation_of(motions.Ts_childi_childj))
-    block_of = motions.i * _EXCHANGE_BLOCKS // len(stamps_ns)
-    products = of_parent[:, :, None] * of_child[:, None, :]
-    blocks = Blocks.gathered(products, block_of, _EXCHANGE_BLOCKS)
-    cuts = np.arange(1, _EXCHANGE_BLOCKS)
-    exchanged = blocks.before(cuts) + np.swapaxes(blocks.since(cuts), 1, 2)
-    rotations = se3.nearest_rotation(exchanged)
-    best = int(np.argmax((rotations * exchanged).sum(axis=(1, 2))))
-    is_after = (block_of >= cuts[best])[:, None]
-    first = np.where(is_after, of_child, of_parent)
-    second = np.where(is_after, of_parent, of_child)
-    R = se3.nearest_rotation(blocks.total)
-    as_given = np.linalg.norm(of_parent - of_child @ R.T, axis=1)
-    as_exchanged = np.linalg.norm(first - second @ rotations[best].T, axis=1)
-    usual_rad = quantile(as_exchanged, _EXCHANGE_QUANTILE)
-    angles = np.linalg.norm(of_parent, axis=1)
-    is_sound = usual_rad < _SOUND_PART * quantile(angles, _EXCHANGE_QUANTILE)
-    if not is_sound or usual_rad > _EXCHANGE_GAIN * quantile(as_given, _EXCHANGE_QUANTILE):
-        return None
-    row = cuts[best] * len(stamps_ns) // _EXCHANGE_BLOCKS
-    return finding("exchanged", at_s=float(stamps_ns[row] - stamps_ns[0]) * 1e-9)
-
-
-def _unexplained(motions: MotionPairs, X: FloatArray) -> float:
-    """Return the share of the rotations that an extrinsic X (4, 4) leaves unexplained.
-
-    It is the median residual of the largest quarter of the rotations, divided by their median.
-    """
-    angles = se3.rotation_angle(se3.rotation_of(motions.Ts_parenti_parentj))
-    are_large = angles >= quantile(angles, 0.75)
-    _, residuals = motions.residuals(X)
-    residual_lengths = np.linalg.norm(residuals[are_large], axis=1)
-    return median(residual_lengths) / max(median(angles[are_large]), 1e-12)
 
 
 def check_same(extrinsic: ExtrinsicEstimate) -> list[Finding]:

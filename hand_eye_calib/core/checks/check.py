@@ -16,7 +16,7 @@ streams is called a *reading*.
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +30,7 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.base.text import axes_in_words
-from hand_eye_calib.core.checks import agreement, fusion, hypotheses, independence, misread
+from hand_eye_calib.core.checks import agreement, fusion, hypotheses, independence, misread, parts
 from hand_eye_calib.core.checks.agreement import ExtrinsicEstimate
 from hand_eye_calib.core.checks.clock_and_scale import (
     ROUNDED,
@@ -40,6 +40,7 @@ from hand_eye_calib.core.checks.clock_and_scale import (
 )
 from hand_eye_calib.core.checks.findings import LIMITS, Finding, finding, graded, gravest_first
 from hand_eye_calib.core.checks.hypotheses import Explanation, Readings
+from hand_eye_calib.core.checks.open_delay import NO_DELAY, Agreement
 from hand_eye_calib.core.checks.stream_pair import LAGS_S, MAX_PAIRS, MIN_PAIRS, StreamPair
 from hand_eye_calib.core.checks.streams import (
     check_flat,
@@ -85,12 +86,16 @@ class CheckResult:
     readings : Readings or None
         Two readings that fit about equally well, if the reading of the findings may be wrong. The
         other reading also inverts both streams.
+    open_covariance : (6, 6) array
+        Covariance of xi = (rho, phi) in ``T_parent_child @ exp(xi)``, in m and rad, for faults that
+        the streams neither prove nor exclude. It is part of the allowance of a checked result.
     """
 
     findings: tuple[Finding, ...]
     fit: SimilarityFit | None = None
     offset: TimeOffset | None = None
     readings: Readings | None = None
+    open_covariance: FloatArray = field(default_factory=lambda: NO_DELAY.covariance, compare=False)
 
 
 def check_streams(
@@ -139,7 +144,7 @@ def check_streams(
     frozen = check_frozen(aligned.parent, aligned.child)
     findings += frozen
     incomplete = check_flat(aligned.parent, aligned.child)
-    incomplete = incomplete or agreement.check_turned_parts(aligned.synchronised)
+    incomplete = incomplete or parts.check_turned_parts(aligned.synchronised)
     if incomplete:
         return CheckResult(gravest_first([*findings, *incomplete]))
     if not explanation:
@@ -237,11 +242,16 @@ def _check_explained(
     findings = in_metres(findings, [*lengths, *sizes], arguments.scale)
     is_sound = not _are_unusable([found for found in findings if found not in of_reading])
     findings += [*lengths, *check_offset(offset, arguments.time_offset_s), *sizes]
+    delay = NO_DELAY
     if is_sound and not lengths:
         earlier = arguments.earlier
         corrected, fit = _preferred_reading(streams, corrected, explanation, fit, offset, earlier)
-        findings += _check_agreeing(corrected, fit, offset, arguments)
-    return CheckResult(gravest_first(findings), explanation.fit, offset, readings)
+        agreeing, delay = _check_agreeing(corrected, fit, offset, arguments)
+        findings += agreeing
+        if delay.found and not agreeing:
+            findings.append(delay.found)
+    sorted_findings = gravest_first(findings)
+    return CheckResult(sorted_findings, explanation.fit, offset, readings, delay.covariance)
 
 
 def _lengths_of_explained(
@@ -456,8 +466,8 @@ def _check_agreeing(
     fit: SimilarityFit,
     offset: TimeOffset,
     arguments: _Arguments,
-) -> list[Finding]:
-    """Return the findings about streams that agree: copies, faults that bias X, and fusion.
+) -> Agreement:
+    """Check streams that agree for copies, faults that bias X, and fusion.
 
     ``corrected`` are the streams on one clock, with all mistakes undone.
     """
@@ -467,17 +477,22 @@ def _check_agreeing(
         best = earlier
     copied = independence.check_copies(arguments.original, corrected, arguments.are_exact)
     if copied:
-        return [*copied, *agreement.check_same(best)]
+        return Agreement([*copied, *agreement.check_same(best)])
     pose_pairs = corrected.synchronised.child_scaled(fit.scale)
+    if other := parts.check_other_extrinsic(pose_pairs, best.T_parent_child):
+        return Agreement(other)
     motions = _motions(pose_pairs, MAX_MOTIONS)
     offset_s = arguments.time_offset_s + offset.seconds
-    findings = agreement.check_agreement(pose_pairs, motions, fit.T_parent_child, best, offset_s)
+    agreeing = agreement.check_agreement(pose_pairs, motions, fit.T_parent_child, best, offset_s)
     if arguments.are_exact:
-        return findings
+        return agreeing
     correction = fusion.check_correction(pose_pairs, best.T_parent_child)
-    if correction and (correction.makes_unusable or not findings):
-        return [correction]
-    return findings or independence.check_drift(pose_pairs, best.T_parent_child)
+    if correction and (correction.makes_unusable or not agreeing.findings):
+        return agreeing._replace(findings=[correction])
+    if not agreeing.findings:
+        drift = independence.check_drift(pose_pairs, best.T_parent_child)
+        agreeing = agreeing._replace(findings=drift)
+    return agreeing
 
 
 def check_parts(

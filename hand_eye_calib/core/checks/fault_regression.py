@@ -137,6 +137,16 @@ class Regression:
         """Return the root mean square displacement (m,) that each fault of size 1 causes."""
         return self._displacements_m[self._columns[group]]
 
+    def response(self, group: str) -> FloatArray:
+        """Return the change (6, m) of X that each fault of size 1 causes if it is not estimated.
+
+        It is a change of the lever arm (m) and a rotation vector (rad), in the parent's axes.
+        """
+        of_extrinsic = self._columns_of(["lever", "rotation"])
+        information = self._products[np.ix_(of_extrinsic, of_extrinsic)]
+        coupling = self._products[np.ix_(of_extrinsic, self._columns[group])]
+        return np.asarray(np.linalg.pinv(information, hermitian=True) @ coupling)
+
     def explained_share(self, group: str, *nuisances: str) -> float:
         """Return the share (0 to 1) of the squared residuals that a group explains.
 

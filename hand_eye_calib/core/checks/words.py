@@ -280,6 +280,13 @@ WORDS = {
         "radians read as degrees, or half or twice the angles",
         code="rotation_gain",
     ),
+    "maybe_late": FindingWords(
+        "{whose} {part} may be {delay_s:.3f} +/- {sigma_s:.3f} s later than its {others}: the "
+        "allowance contains {shift_m:.2g} m for this delay",
+        "drive with more changes of speed, or use poses from one source",
+        "positions from another source or filter than the orientations, or chance",
+        code="position_clock",
+    ),
     "late": FindingWords(
         "{whose} {part} are {delay_s:.3f} +/- {sigma_s:.3f} s later than its {others}: at this "
         "speed they are off by {shift_m:.2g} m",

@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.checks import check as checking
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.clock_and_scale import check_model_scale
@@ -12,7 +14,9 @@ from hand_eye_calib.core.engine.cross_check import cross_checked
 from hand_eye_calib.core.engine.estimation import solve_poses
 from hand_eye_calib.core.engine.kinds import Kind
 from hand_eye_calib.core.engine.snapshot import MOST_MOVED_S, Snapshot
+from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict
+from hand_eye_calib.core.results.records import AXES
 
 #: Options that invert the poses of a stream.
 INVERSIONS = frozenset({"parent_invert", "child_invert"})
@@ -63,7 +67,31 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
             replace(finding, severity=Severity.NOTE) if finding.code == "inverse_both" else finding
             for finding in findings
         ]
-    return replace(result, findings=gravest_first(findings))
+    return replace(
+        result,
+        findings=gravest_first(findings),
+        open_covariance=_limited_by_prior(result.open_covariance, config, calibration),
+    )
+
+
+def _limited_by_prior(
+    covariance: FloatArray, config: CalibratorConfig, calibration: Calibration | None
+) -> FloatArray:
+    """Return a covariance (6, 6) whose standard deviations are at most those of the priors.
+
+    The covariance is that of an error of the motion, in the child's axes.
+    """
+    priors = config.prior()
+    if calibration is None or not priors:
+        return covariance
+    rotation = se3.rotation_of(calibration.T_parent_child)
+    of_parent = se3.turned(rotation, covariance)
+    factors = np.ones(len(AXES))
+    for index, axis in enumerate(AXES):
+        if axis in priors:
+            sigma = float(np.sqrt(max(of_parent[index, index], 1e-30)))
+            factors[index] = min(1.0, priors[axis][1] / sigma)
+    return se3.turned(rotation.T, of_parent * np.outer(factors, factors))
 
 
 def _extrinsic_estimate(calibration: Calibration | None) -> checking.ExtrinsicEstimate | None:

@@ -450,10 +450,17 @@ def examine(snapshot: Snapshot) -> tuple[Finding, ...]:
     return gravest_first((*reading.findings, *reading.doubts))
 
 
+def with_open_errors(calibration: Calibration, result: CheckResult) -> Calibration:
+    """Return the calibration whose allowance contains the faults that a check leaves open."""
+    allowance = calibration.covariance_allowance + result.open_covariance
+    return replace(calibration, covariance_allowance=allowance)
+
+
 def _checked(calibration: Calibration, snapshot: Snapshot) -> Attempt:
     """Check the streams of a result, and return the attempt."""
     result = check(snapshot, calibration)
-    return Attempt(replace(calibration, findings=result.findings), snapshot, result)
+    checked = with_open_errors(calibration, result)
+    return Attempt(replace(checked, findings=result.findings), snapshot, result)
 
 
 def _solved_with(snapshot: Snapshot, options: Options) -> Attempt | None:

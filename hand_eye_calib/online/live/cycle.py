@@ -319,6 +319,8 @@ class SolveCycle:
         self._take_motion(answer)
         self._take_check(answer)
         calibration = answer.calibration
+        if calibration is not None and answer.check is None:
+            calibration = self.checks.with_open_errors(calibration)
         self._failure = answer.failure
         if self.result is None and is_too_little(self._motion):
             calibration = None

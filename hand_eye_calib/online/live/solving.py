@@ -32,7 +32,7 @@ from hand_eye_calib.core.checks.findings import Finding, answered
 from hand_eye_calib.core.checks.streams import check_positions, check_stream
 from hand_eye_calib.core.engine.attempts import with_options
 from hand_eye_calib.core.engine.calibrator import Calibrator
-from hand_eye_calib.core.engine.run import check, review
+from hand_eye_calib.core.engine.run import check, review, with_open_errors
 from hand_eye_calib.core.engine.snapshot import STREAMS, Snapshot
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
@@ -204,7 +204,9 @@ def _checked(result: Answer, snapshot: Snapshot, options: Options) -> Answer:
         check=run.check,
         options=dict(run.options),
         messages=run.messages,
-        calibration=run.calibration if run.options else result.calibration,
+        calibration=run.calibration
+        if run.options
+        else with_open_errors(result.calibration, run.check),
     )
 
 

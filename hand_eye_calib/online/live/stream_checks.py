@@ -8,6 +8,8 @@ import numpy as np
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.checks.check import MIN_DURATION_S, MIN_ROTATION_RAD, CheckResult
 from hand_eye_calib.core.checks.findings import Finding, Severity, answered, gravest_first
+from hand_eye_calib.core.engine.run import with_open_errors
+from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.online.live.log import NodeLog
 from hand_eye_calib.online.live.state import ChecksState, Level
 
@@ -73,6 +75,10 @@ class StreamChecks:
             self._log.warning(_in_parameters(self._faults[key]))
         for key in before.keys() - self._faults.keys():
             self._log.info(f"no longer found: {before[key].what}")
+
+    def with_open_errors(self, calibration: Calibration) -> Calibration:
+        """Return a calibration whose allowance contains what the last check left open."""
+        return calibration if self._result is None else with_open_errors(calibration, self._result)
 
     @property
     def findings(self) -> tuple[Finding, ...]:

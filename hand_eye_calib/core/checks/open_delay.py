@@ -1,0 +1,123 @@
+"""Covariance of an extrinsic for a delay of positions that a recording neither proves nor excludes.
+
+Positions may be late against the orientations of their stream. At constant speed such a delay
+equals a lever arm, so that even a long recording estimates the delay to some milliseconds only. A
+delay below the limit of a finding still shifts the extrinsic.
+
+Model: most streams have delays tau with the standard deviation of the allowance. A few streams
+have a fault, and a larger standard deviation. The regression estimates the delay with a normal
+error. The mean square of tau that Bayes' rule returns for the faulty streams, times the squared
+change of the extrinsic for a unit delay, is the covariance.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hand_eye_calib.core.assessment.common_mode import FLOOR_TRAVEL_S
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.checks.fault_regression import Regression
+from hand_eye_calib.core.checks.findings import LIMITS, Finding, Severity, finding
+from hand_eye_calib.core.geometry import se3
+
+_STREAMS = ("child", "parent")
+
+# Share of the streams whose positions are late by a fault, and the standard deviation of their
+# delays (s).
+_FAULTY_SHARE = 0.1
+_FAULTY_S = 0.03
+# Largest standard deviation (s) of an estimated delay. A less certain estimate changes nothing: the
+# allowance was measured on such recordings.
+_MAX_SIGMA_S = 0.015
+
+
+class OpenDelay(NamedTuple):
+    """Delay of positions that a recording leaves open.
+
+    Attributes
+    ----------
+    covariance : (6, 6) array
+        Covariance of xi = (rho, phi) in ``T_parent_child @ exp(xi)``, in m and rad, in addition to
+        the allowance.
+    found : Finding or None
+        A note, if the covariance is large.
+    """
+
+    covariance: FloatArray
+    found: Finding | None = None
+
+
+#: Result of a check without an open delay.
+NO_DELAY = OpenDelay(np.zeros((6, 6)))
+
+
+class Agreement(NamedTuple):
+    """Findings about two streams that agree, and a delay of positions that remains open."""
+
+    findings: list[Finding]
+    delay: OpenDelay = NO_DELAY
+
+
+def open_delay(fast: Regression, X: FloatArray) -> OpenDelay:
+    """Return the delay that adds most to the covariance of an extrinsic.
+
+    Parameters
+    ----------
+    fast : Regression
+        Regression with the groups ``late_child`` and ``late_parent``.
+    X : (4, 4) array
+        Extrinsic of the regression.
+    """
+    # A late child is nearly the same as an early parent, so only one of both counts.
+    delays = [_of_stream(fast, stream, X) for stream in _STREAMS]
+    return max(delays, key=lambda delay: float(np.trace(delay.covariance[:3, :3])))
+
+
+def _of_stream(fast: Regression, stream: str, X: FloatArray) -> OpenDelay:
+    """Return the open delay of the positions of a stream."""
+    group = f"late_{stream}"
+    delays_s, sigmas_s = fast.fit(group)
+    delay_s = float(delays_s[0])
+    sigma_s = float(sigmas_s[0])
+    if not sigma_s < _MAX_SIGMA_S:
+        return NO_DELAY
+    variance_s2 = faulty_variance(delay_s, sigma_s)
+    # Change of the lever arm (m) and rotation of X (rad) in the parent's axes for a delay of 1 s.
+    response = fast.response(group)[:, 0]
+    R_child_parent = se3.rotation_of(X).T
+    by_delay = np.concatenate([R_child_parent @ response[:3], R_child_parent @ response[3:]])
+    covariance = variance_s2 * np.outer(by_delay, by_delay)
+    shift_m = float(np.sqrt(np.trace(covariance[:3, :3])))
+    if shift_m < LIMITS["late"].note:
+        return OpenDelay(covariance)
+    note = finding(
+        "maybe_late",
+        stream,
+        Severity.NOTE,
+        part="positions" if delay_s > 0 else "orientations",
+        others="orientations" if delay_s > 0 else "positions",
+        delay_s=abs(delay_s),
+        sigma_s=sigma_s,
+        shift_m=shift_m,
+    )
+    return OpenDelay(covariance, note)
+
+
+def faulty_variance(delay_s: float, sigma_s: float) -> float:
+    """Return the mean square (s^2) of a delay by a fault, given its estimate.
+
+    The mean square contains the probability of a fault.
+
+    Parameters
+    ----------
+    delay_s, sigma_s : float
+        Estimate of the delay and its standard deviation.
+    """
+    prior_variances = np.array([FLOOR_TRAVEL_S**2, _FAULTY_S**2])
+    variances = prior_variances + sigma_s**2
+    logs = np.log([1.0 - _FAULTY_SHARE, _FAULTY_SHARE])
+    logs -= 0.5 * (np.log(variances) + delay_s**2 / variances)
+    faulty_share = 1.0 / (1.0 + np.exp(logs[0] - logs[1]))
+    shrinkage = prior_variances[1] / variances[1]
+    mean_s = shrinkage * delay_s
+    return float(faulty_share * (mean_s**2 + shrinkage * sigma_s**2))

@@ -1,0 +1,223 @@
+"""Checks whether one extrinsic is right for all parts of a recording.
+
+A stream that starts anew with other axes, or streams that are exchanged, leave parts that are sound
+by themselves. A robust solve follows the larger part and rejects the other part as outliers.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from hand_eye_calib.core.alignment.similarity import SimilarityFit, fit_similarity
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.core.base.blocks import Blocks
+from hand_eye_calib.core.base.errors import NotEnoughDataError
+from hand_eye_calib.core.base.stats import median, quantile
+from hand_eye_calib.core.base.text import angle
+from hand_eye_calib.core.checks.findings import Finding, finding
+from hand_eye_calib.core.checks.stream_pair import MAX_ROTATION_RAD, MIN_PAIRS
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
+from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
+
+# Duration (s) and largest number of the motions that are compared.
+_SHORT_S = 1.0
+_MAX_MOTIONS = 6000
+
+# Shares of the poses before the time at which a recording is split in two.
+_SPLITS = (0.5, 0.25, 0.75)
+# Largest share of its rotations that the extrinsic rotation of a sound part leaves unexplained.
+_SOUND_PART = 0.25
+# A part has other axes than the other part if the other part's extrinsic rotation leaves more than
+# this share of its rotations unexplained.
+_OTHER_PART = 0.5
+
+# Number of blocks of time. At the start of each block except the first, an exchange of the streams
+# is tested.
+_EXCHANGE_BLOCKS = 16
+# Blocks at the start and at the end of a recording whose own extrinsics are tried.
+_END_BLOCKS = 4
+# Largest number of motions for such an extrinsic.
+_MAX_MOTIONS_OF_END = 300
+# Motions that are shorter than this share of the median displacement are ignored: residuals of a
+# sensor at rest are small with any extrinsic.
+_MOVING_SHARE = 0.3
+# Share of the displacements that an extrinsic of another part leaves unexplained, and the smallest
+# factor between this share and that of the extrinsic's own part.
+_OTHER_SHARE = 0.25
+_OTHER_FACTOR = 3.0
+
+# Quantile of the residuals that is compared: it is outside of the larger part.
+_EXCHANGE_QUANTILE = 0.85
+# Streams are exchanged if that leaves less than this share of the residuals.
+_EXCHANGE_GAIN = 0.4
+
+
+def check_turned_parts(pose_pairs: PosePairs) -> list[Finding]:
+    """Return the finding that the extrinsic rotation differs between two parts, or none.
+
+    A stream that starts anew with other axes leaves two sound parts of a recording, and so do
+    streams that are exchanged. The noise model follows one part and rejects the other as outliers.
+    """
+    motions = pairs_over(pose_pairs, _SHORT_S, _MAX_MOTIONS)
+    angles = se3.rotation_angle(se3.rotation_of(motions.Ts_parenti_parentj))
+    motions = motions[angles < MAX_ROTATION_RAD]
+    if exchanged := _check_exchanged(motions, pose_pairs.stamps_ns):
+        return [exchanged]
+    for share in _SPLITS:
+        split = int(share * len(pose_pairs))
+        parts = (motions[motions.j < split], motions[motions.i >= split])
+        if min(map(len, parts)) < MIN_PAIRS:
+            continue
+        first, second = (
+            se3.from_rotation_translation(align_rotation_vectors(part), np.zeros(3))
+            for part in parts
+        )
+        by_own = max(_unexplained(parts[0], first), _unexplained(parts[1], second))
+        by_other = min(_unexplained(parts[0], second), _unexplained(parts[1], first))
+        if by_own >= _SOUND_PART or by_other <= max(_OTHER_PART, 3.0 * by_own):
+            continue
+        at_s = float(pose_pairs.stamps_ns[split] - pose_pairs.stamps_ns[0]) * 1e-9
+        if _unexplained(parts[1], se3.inverse(first)) < _SOUND_PART:
+            return [finding("exchanged", at_s=at_s)]
+        between = se3.rotation_of(first).T @ se3.rotation_of(second)
+        turned_rad = float(se3.rotation_angle(between))
+        size = angle(turned_rad)
+        return [finding("parts_turned", size=size, at_s=at_s, turned_rad=turned_rad)]
+    return []
+
+
+def check_other_extrinsic(pose_pairs: PosePairs, X: FloatArray) -> list[Finding]:
+    """Return the finding that a part of a recording has another extrinsic, or none.
+
+    On flat ground one rotation explains the rotations before and after an exchange of the streams,
+    or after a restart with another heading. Only the displacements differ.
+
+    Parameters
+    ----------
+    pose_pairs : PosePairs
+        Poses on one clock, in one unit of length.
+    X : (4, 4) array
+        Extrinsic of the recording.
+    """
+    motions = pairs_over(pose_pairs, _SHORT_S, _MAX_MOTIONS)
+    lengths_m = np.linalg.norm(se3.translation_of(motions.Ts_parenti_parentj), axis=1)
+    motions = motions[lengths_m > _MOVING_SHARE * median(lengths_m)]
+    if len(motions) < MIN_PAIRS or (_unexplained_path(motions, X) < _OTHER_SHARE).all():
+        return []
+    block_of = motions.i * _EXCHANGE_BLOCKS // len(pose_pairs)
+    ends = (block_of < _END_BLOCKS, block_of >= _EXCHANGE_BLOCKS - _END_BLOCKS)
+    fits = [_own_fit(motions[is_end]) for is_end in ends]
+    for candidate in (X, *(fit.T_parent_child for fit in fits if fit)):
+        cut, is_other = _other_part(_unexplained_path(motions, candidate), block_of)
+        own = _own_fit(motions[is_other]) if is_other.any() else None
+        if own is None:
+            continue
+        row = cut * len(pose_pairs) // _EXCHANGE_BLOCKS
+        at_s = float(pose_pairs.stamps_ns[row] - pose_pairs.stamps_ns[0]) * 1e-9
+        exchanged = _exchanged(motions[is_other])
+        if median(_unexplained_path(exchanged, candidate)) < _OTHER_SHARE / _OTHER_FACTOR:
+            return [finding("exchanged", at_s=at_s)]
+        between = se3.rotation_of(candidate).T @ se3.rotation_of(own.T_parent_child)
+        turned_rad = float(se3.rotation_angle(between))
+        size = angle(turned_rad)
+        return [finding("parts_turned", size=size, at_s=at_s, turned_rad=turned_rad)]
+    return []
+
+
+def _exchanged(motions: MotionPairs) -> MotionPairs:
+    """Return motion pairs with parent and child exchanged."""
+    return replace(
+        motions,
+        Ts_parenti_parentj=motions.Ts_childi_childj,
+        Ts_childi_childj=motions.Ts_parenti_parentj,
+    )
+
+
+def _unexplained_path(motions: MotionPairs, X: FloatArray) -> FloatArray:
+    """Return the shares (K,) of the displacements that an extrinsic X (4, 4) leaves unexplained."""
+    residuals_m, _ = motions.residuals(X)
+    lengths_m = np.linalg.norm(se3.translation_of(motions.Ts_parenti_parentj), axis=1)
+    return np.asarray(np.linalg.norm(residuals_m, axis=1) / np.maximum(lengths_m, 1e-12))
+
+
+def _own_fit(motions: MotionPairs) -> SimilarityFit | None:
+    """Return the fit of the motions of a part, or None if no extrinsic explains the part."""
+    stride = -(-len(motions) // _MAX_MOTIONS_OF_END) or 1
+    try:
+        fit = fit_similarity(motions[::stride], same_unit=True)
+    except NotEnoughDataError:
+        return None
+    is_sound = median(_unexplained_path(motions, fit.T_parent_child)) < _OTHER_SHARE / _OTHER_FACTOR
+    return fit if is_sound else None
+
+
+def _other_part(shares: FloatArray, block_of: IntArray) -> tuple[int, BoolArray]:
+    """Return the block that another part starts or ends in, and a mask (K,) of that part.
+
+    ``shares`` (K,) are the unexplained shares of motions, and ``block_of`` (K,) their blocks. The
+    mask is empty if no part differs clearly from the rest.
+    """
+    blocks = np.unique(block_of)
+    usual = np.array([median(shares[block_of == block]) for block in blocks])
+    best = _OTHER_FACTOR
+    cut = 0
+    is_other = np.zeros(len(shares), dtype=bool)
+    # The block with the cut contains motions of both parts, and is ignored.
+    for k in range(1, len(blocks) - 1):
+        before = usual[:k]
+        after = usual[k + 1 :]
+        for other, own, is_side in (
+            (before, after, block_of < blocks[k]),
+            (after, before, block_of > blocks[k]),
+        ):
+            factor = other.min() / max(own.max(), 1e-12)
+            if other.min() > _OTHER_SHARE and factor > best:
+                best = factor
+                cut = int(blocks[k])
+                is_other = is_side
+    return cut, is_other
+
+
+def _check_exchanged(motions: MotionPairs, stamps_ns: IntArray) -> Finding | None:
+    """Return the finding that parent and child are exchanged from some time on, or None.
+
+    One rotation R maps rotation vectors of the child to those of the parent. After an exchange it
+    maps those of the parent to those of the child. R is estimated for each possible time.
+    """
+    if len(motions) < MIN_PAIRS:
+        return None
+    of_parent = se3.rotation_log(se3.rotation_of(motions.Ts_parenti_parentj))
+    of_child = se3.rotation_log(se3.rotation_of(motions.Ts_childi_childj))
+    block_of = motions.i * _EXCHANGE_BLOCKS // len(stamps_ns)
+    products = of_parent[:, :, None] * of_child[:, None, :]
+    blocks = Blocks.gathered(products, block_of, _EXCHANGE_BLOCKS)
+    cuts = np.arange(1, _EXCHANGE_BLOCKS)
+    exchanged = blocks.before(cuts) + np.swapaxes(blocks.since(cuts), 1, 2)
+    rotations = se3.nearest_rotation(exchanged)
+    best = int(np.argmax((rotations * exchanged).sum(axis=(1, 2))))
+    is_after = (block_of >= cuts[best])[:, None]
+    first = np.where(is_after, of_child, of_parent)
+    second = np.where(is_after, of_parent, of_child)
+    R = se3.nearest_rotation(blocks.total)
+    as_given = np.linalg.norm(of_parent - of_child @ R.T, axis=1)
+    as_exchanged = np.linalg.norm(first - second @ rotations[best].T, axis=1)
+    usual_rad = quantile(as_exchanged, _EXCHANGE_QUANTILE)
+    angles = np.linalg.norm(of_parent, axis=1)
+    is_sound = usual_rad < _SOUND_PART * quantile(angles, _EXCHANGE_QUANTILE)
+    if not is_sound or usual_rad > _EXCHANGE_GAIN * quantile(as_given, _EXCHANGE_QUANTILE):
+        return None
+    row = cuts[best] * len(stamps_ns) // _EXCHANGE_BLOCKS
+    return finding("exchanged", at_s=float(stamps_ns[row] - stamps_ns[0]) * 1e-9)
+
+
+def _unexplained(motions: MotionPairs, X: FloatArray) -> float:
+    """Return the share of the rotations that an extrinsic X (4, 4) leaves unexplained.
+
+    It is the median residual of the largest quarter of the rotations, divided by their median.
+    """
+    angles = se3.rotation_angle(se3.rotation_of(motions.Ts_parenti_parentj))
+    are_large = angles >= quantile(angles, 0.75)
+    _, residuals = motions.residuals(X)
+    residual_lengths = np.linalg.norm(residuals[are_large], axis=1)
+    return median(residual_lengths) / max(median(angles[are_large]), 1e-12)
