@@ -68,6 +68,7 @@ def test_sigma_contains_a_delay_of_positions_below_the_limit_of_a_finding():
     error = se3.deviation(result.T_parent_child, drive().T_parent_child)
     assert abs(error[0]) > 0.025  # m: 20 ms at 1.5 m/s
     assert (np.abs(error) < 2.0 * result.sigmas).all()
+    assert result.detectability.errors["x"] > 3.0 * result.allowance[0]
     sound = hec.calibrate(*_streams(drive()))
     assert sound.findings == ()
     assert (sound.sigmas[:3] < 0.0095).all()

@@ -81,7 +81,8 @@ def test_a_shift_that_the_stream_check_does_not_report_is_not_stated(
 ):
     monkeypatch.setattr(injection, "slow_suspects", lambda *_: [])
     sizes = injection.detectability(result, pose_pairs)
-    assert sizes.errors == result.detectability.errors
+    # The allowance contains the open delay of a stream since.
+    assert sizes.errors == pytest.approx(result.detectability.errors, rel=0.05)
     assert {*sizes.shifts.values()} == {np.inf}
 
 

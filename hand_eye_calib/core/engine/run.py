@@ -57,6 +57,10 @@ _ESTIMATED_CODES = ("time_offset", "scale", "unit_or_scale")
 _CLEAR_SPREAD = 0.5
 
 
+# Growth of a sigma by open faults above which a result is examined again.
+_MUCH_WIDER = 1.05
+
+
 @dataclass(frozen=True)
 class _Reading:
     """Chosen reading of both streams: as poses, or both as inverse poses.
@@ -450,16 +454,24 @@ def examine(snapshot: Snapshot) -> tuple[Finding, ...]:
     return gravest_first((*reading.findings, *reading.doubts))
 
 
-def with_open_errors(calibration: Calibration, result: CheckResult) -> Calibration:
-    """Return the calibration whose allowance contains the faults that a check leaves open."""
+def with_open_errors(
+    calibration: Calibration, result: CheckResult, snapshot: Snapshot | None = None
+) -> Calibration:
+    """Return the calibration whose allowance contains the faults that a check leaves open.
+
+    If sigmas grow much, the calibration is examined again with its snapshot.
+    """
     allowance = calibration.covariance_allowance + result.open_covariance
-    return replace(calibration, covariance_allowance=allowance)
+    wider = replace(calibration, covariance_allowance=allowance)
+    if snapshot and (wider.sigmas > _MUCH_WIDER * calibration.sigmas).any():
+        return snapshot.examined(wider)
+    return wider
 
 
 def _checked(calibration: Calibration, snapshot: Snapshot) -> Attempt:
     """Check the streams of a result, and return the attempt."""
     result = check(snapshot, calibration)
-    checked = with_open_errors(calibration, result)
+    checked = with_open_errors(calibration, result, snapshot)
     return Attempt(replace(checked, findings=result.findings), snapshot, result)
 
 

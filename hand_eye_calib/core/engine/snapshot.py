@@ -195,6 +195,12 @@ class Snapshot:
             pairs = PosePairs.concatenate(kept, pairs)
         return downsample(pairs, self.config.max_pairs)
 
+    def examined(self, calibration: Calibration) -> Calibration:
+        """Return a calibration with the examinations of the extras, which depend on its sigmas."""
+        for examine in RESULT_EXAMINATIONS.values():
+            calibration = examine(calibration, self.resolved)
+        return calibration
+
     def estimate(self, cross_check: bool | None = None) -> Calibration:
         """Estimate the extrinsic.
 
@@ -224,8 +230,7 @@ class Snapshot:
         for measurement in self.beside_motion:
             result = measurement.joined(result, resolved)
         if cross_check is not False:
-            for examine in RESULT_EXAMINATIONS.values():
-                result = examine(result, resolved)
+            result = self.examined(result)
         return replace(
             result,
             parent_frame=self.parent_frame,

@@ -206,7 +206,7 @@ def _checked(result: Answer, snapshot: Snapshot, options: Options) -> Answer:
         messages=run.messages,
         calibration=run.calibration
         if run.options
-        else with_open_errors(result.calibration, run.check),
+        else with_open_errors(result.calibration, run.check, snapshot),
     )
 
 
