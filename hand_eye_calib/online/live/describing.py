@@ -59,7 +59,7 @@ def is_too_little(motion: Excitation) -> bool:
 
 def too_little_in_words(motion: Excitation) -> str:
     """Return a sentence about the motion that a first result needs, and the motion so far."""
-    rotation_deg = np.degrees(motion.rotation.max())
+    rotation_deg = np.floor(np.degrees(motion.rotation.max()))
     return (
         f"Move the sensors for {_MIN_MOTION_S:g} s, or turn them by "
         f"{np.degrees(_MIN_ROTATION_RAD):.0f} deg. So far: {motion.motion_s:.0f} s and "

@@ -530,10 +530,10 @@ class PoseInput:
             return Level.WARN, f"{had_several}. Their poses are mixed: reset"
         if lost_share < _MAX_LOST_SHARE:
             return Level.OK, f"{rate_hz:.1f} Hz"
+        text = f"{share(lost_share)} of the messages are lost"
         advice = "Free processor time, or publish at a lower rate"
-        text = f"{lost_share:.1%} of the messages are lost. {advice}"
-        self._log.warning(f"{self.topic}: {text}")
-        return Level.WARN, f"{rate_hz:.1f} Hz, {text}"
+        self._log.warning(f"{self.topic}: {text}. {advice}")
+        return Level.WARN, f"{text} at {rate_hz:.0f} Hz. {advice}"
 
     def _why_paused(self, steady_s: float, arrived_s: float) -> str:
         """Return why poses no longer arrive; empty if they arrive, or if the reason is unknown."""
