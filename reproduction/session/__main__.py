@@ -1,7 +1,7 @@
 """``python -m reproduction.session``: the studies of docs/measurements.md.
 
-stop: is a session that is told to stop good enough? together: several recordings of one rig, for
-one result. alarms, delays: of the mount monitor.
+stop: is a session that is told to stop good enough? ramps: the same of vehicles over ramps.
+together: several recordings of one rig, for one result. alarms, delays: of the mount monitor.
 """
 
 import argparse
@@ -12,7 +12,7 @@ from pathlib import Path
 from hand_eye_calib.offline.cli.main import exit_code_of
 from reproduction.recordings import Rig, real_rigs
 from reproduction.runner import in_parallel, kept
-from reproduction.session import mount, stop, together
+from reproduction.session import mount, ramps, stop, together
 from reproduction.writing import show, study_parser
 
 
@@ -67,6 +67,12 @@ def _stop(arguments: argparse.Namespace) -> str:
     return "\n\n".join([*texts, _ABOUT_RULES, rules])
 
 
+def _ramps(arguments: argparse.Namespace) -> str:
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    rows_of_seeds = in_parallel(ramps.ends, [(seed,) for seed in seeds], arguments.jobs)
+    return ramps.table([row for rows in rows_of_seeds for row in rows])
+
+
 def _together(arguments: argparse.Namespace) -> str:
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     tasks = {f"{name} {seed}": (name, seed) for name in together.SIMULATED for seed in seeds}
@@ -92,6 +98,7 @@ def _delays(arguments: argparse.Namespace) -> str:
 
 STUDIES: dict[str, Callable[[argparse.Namespace], str]] = {
     "stop": _stop,
+    "ramps": _ramps,
     "together": _together,
     "alarms": _alarms,
     "delays": _delays,

@@ -78,6 +78,7 @@ RULES = [
     Rule(1.0, 0.0, 30.0, 30.0),
     Rule(1.0, 0.0, 60.0, 60.0),
     Rule(1.0, 0.5, 20.0, 60.0),
+    Rule(1.0, 0.5, 20.0, 75.0),
     Rule(1.0, 0.5, 20.0, 90.0),
     Rule(1.0, 0.5, 20.0, np.inf),
     Rule(1.0, 1.0, 20.0, 90.0),
@@ -181,7 +182,7 @@ def _steps(recorded: Recorded) -> Iterator[Step]:
     for end_s in _ends_s(duration_s):
         share = end_s / duration_s
         parts = [
-            _until(stream, start_ns + round(share * (end_ns - start_ns)))
+            until(stream, start_ns + round(share * (end_ns - start_ns)))
             for stream, (start_ns, end_ns) in zip(streams, (of_parent, of_child), strict=True)
         ]
         try:
@@ -194,7 +195,8 @@ def _steps(recorded: Recorded) -> Iterator[Step]:
         yield Step(end_s, error, calibration, seen)
 
 
-def _until(trajectory: Trajectory, stamp_ns: int) -> Trajectory:
+def until(trajectory: Trajectory, stamp_ns: int) -> Trajectory:
+    """The poses up to a stamp (ns), three at least."""
     return trajectory[: max(int(np.searchsorted(trajectory.stamps_ns, stamp_ns, side="right")), 3)]
 
 
@@ -221,10 +223,10 @@ def _stops(recorded: Recorded, steps: Sequence[Step], factor: float) -> Iterator
         n_good = int(((ratios >= 0.5) & (ratios <= 2.0)).sum())
         yield replace(stop, n_times=len(times), n_good_times=n_good)
     for rule in RULES:
-        yield _stop(recorded, str(rule), steps, factor, _end_of(rule, steps, factor))
+        yield _stop(recorded, str(rule), steps, factor, end_of(rule, steps, factor))
 
 
-def _end_of(rule: Rule, steps: Sequence[Step], factor: float) -> int | None:
+def end_of(rule: Rule, steps: Sequence[Step], factor: float) -> int | None:
     """Index of the part after which a rule ends the session."""
     targets = rule.of_target * factor * TARGET
     since_s = None

@@ -261,7 +261,7 @@ def test_a_solve_on_a_busy_computer_is_named_and_its_pause_is_short(cycle, lines
 
 def test_the_next_solve_has_hurry_if_other_programs_have_held_up_the_last_one(cycle):
     hurries = [cycle.jobs[-1].has_hurry]
-    for seconds, processor_s in ((60.0, 0.5), (1.0, 0.1), (5.0, 4.9), (5.0, 0.4)):
+    for seconds, processor_s in ((60.0, 0.5), (1.0, 0.1), (15.0, 14.0), (15.0, 0.4)):
         cycle.conclude(Answer(0, seconds, seen(30.0), result(), processor_s=processor_s))
         cycle._start()
         hurries.append(cycle.jobs[-1].has_hurry)

@@ -61,10 +61,6 @@ _CHECK_PERIOD_S = 30.0
 # half, so on a busy computer most solves are done without a check.
 _SOLVES_PER_CHECK = 4.0
 
-# Duration of a solve (s) from which on the next solve gets the priority of the node, if other
-# programs have held up the solve. Without them, a solve takes less.
-_HURRY_FROM_S = 4.0
-
 # Options that change the verdict on a result, but not the result.
 _TARGETS = ("target_translation", "target_rotation", "target_axes")
 
@@ -293,13 +289,12 @@ class SolveCycle:
             self._is_unchecked = False
             self._check_due_s = now_s + max(_CHECK_PERIOD_S, _SOLVES_PER_CHECK * self._job_s)
         self._submitted = self._session.copy_to_solve()
-        has_hurry = self._job_s > _HURRY_FROM_S and is_held_up(self._job_s, self._job_processor_s)
         job = Job(
             self._session.number,
             self._submitted,
             check,
             self._check_options,
-            has_hurry=has_hurry,
+            has_hurry=is_held_up(self._job_s, self._job_processor_s),
         )
         self._process.submit(job)
 

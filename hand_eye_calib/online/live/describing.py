@@ -68,8 +68,8 @@ def too_little_in_words(motion: Excitation) -> str:
 
 
 def is_held_up(seconds: float, processor_s: float) -> bool:
-    """Whether a solve waited for the processor for more than half of its duration."""
-    return processor_s < _BUSY_SHARE * seconds
+    """Whether a solve took long, and waited for the processor for more than half of the time."""
+    return seconds >= _SLOW_SOLVE_S and processor_s < _BUSY_SHARE * seconds
 
 
 def slow_in_words(seconds: float, last_s: float, last_processor_s: float) -> str:

@@ -169,7 +169,9 @@ def answer(job: Job) -> Answer:
         snapshot = configured.resolved
         result = replace(result, time_offset=snapshot.time_offset)
         pairs = snapshot.pose_pairs
-        result = replace(result, motion=excitation(pairs), newest_motion=excitation(_newest(pairs)))
+        result = replace(
+            result, motion=excitation(pairs), newest_motion=excitation(newest_pairs(pairs))
+        )
         result = replace(result, calibration=snapshot.estimate())
     except Exception as error:
         result = replace(result, failure=_failure(error))
@@ -187,7 +189,7 @@ def answer(job: Job) -> Answer:
     )
 
 
-def _newest(pairs: PosePairs) -> PosePairs:
+def newest_pairs(pairs: PosePairs) -> PosePairs:
     """Return the pairs of the last minute."""
     if not len(pairs):
         return pairs
