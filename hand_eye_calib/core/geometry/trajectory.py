@@ -177,6 +177,10 @@ class Trajectory(Columns):
     # Trajectory whose stamps were shifted to make this one. Both have the same `_steps`.
     _unshifted: ClassVar[Self | None] = None
 
+    def __hash__(self) -> int:
+        """Hash of the stamps, so that a function of a trajectory can be cached."""
+        return hash(self.stamps_ns.tobytes())
+
     def __post_init__(self) -> None:
         stamps_ns = np.ascontiguousarray(self.stamps_ns)
         poses = np.ascontiguousarray(floats("poses", self.poses))

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -62,12 +63,12 @@ def verticals_of_bag(
         has_imu = any(bag.topics[topic].type == _IMU for topic in topics)
         # A lidar needs a wider lane if the other sensor is an IMU.
         beside: Source = "gravity" if has_imu else "ground"
-        tracks = []
-        for topic, stream in zip(topics, snapshot.streams, strict=True):
-            try:
-                tracks.append(vertical_track(bag, topic, stream, beside))
-            except (InputError, NotEnoughDataError) as error:
-                return (), [f"ground and gravity are not used: {topic}: {error}"]
+    tracks = []
+    for topic, stream in zip(topics, snapshot.streams, strict=True):
+        try:
+            tracks.append(_track_of_bag(tuple(paths), topic, stream, beside))
+        except (InputError, NotEnoughDataError) as error:
+            return (), [f"ground and gravity are not used: {topic}: {error}"]
     sources = []
     for track, topic in zip(tracks, topics, strict=True):
         sources.append(f"{track.source} from {topic}")
@@ -107,6 +108,18 @@ def vertical_topics(bag: PoseBag) -> dict[str, tuple[str, str]]:
 def _topic_of(names: StreamFrames, topics_of: Mapping[str, str]) -> str:
     """Return the topic in the frame of a sensor; an empty text if there is none."""
     return topics_of.get(names.sensor) or topics_of.get(names.option) or ""
+
+
+@lru_cache(maxsize=2)
+def _track_of_bag(
+    paths: tuple[Path, ...], topic: str, stream: Trajectory, beside: Source
+) -> VerticalTrack:
+    """Return the vertical by a topic of a bag. All pairs of a rig share that of the first sensor.
+
+    The parameters are those of :func:`vertical_track`.
+    """
+    with PoseBag(*paths) as bag:
+        return vertical_track(bag, topic, stream, beside)
 
 
 def vertical_track(bag: PoseBag, topic: str, stream: Trajectory, beside: Source) -> VerticalTrack:

@@ -17,6 +17,8 @@ from hand_eye_calib.core.base.blocks import Blocks
 _MIN_RANGE_M = 1.5
 # Largest horizontal distance (m) of a point that is used: farther away, the road may bend.
 _MAX_RANGE_M = 12.0
+# Smallest horizontal distance (m) that the ground must reach: a deck of the machine is shorter.
+_MIN_REACH_M = 5.0
 # Side of a cell (m). Near rings of a lidar are dense; cells weight them as far rings.
 _CELL_M = 0.5
 # Number of random planes of RANSAC.
@@ -142,7 +144,7 @@ def _slopes(planes: FloatArray) -> FloatArray:
 
 
 def _is_ground(cells: FloatArray, inliers: FloatArray, plane: FloatArray) -> bool:
-    """Return whether a plane is wide, not too steep, and below nearly all cells.
+    """Return whether a plane is wide, not too steep, below nearly all cells, and no deck.
 
     Parameters
     ----------
@@ -159,4 +161,5 @@ def _is_ground(cells: FloatArray, inliers: FloatArray, plane: FloatArray) -> boo
     share_below = (cells[:, 2] < lowest).mean()
     is_lowest = share_below < _MAX_SHARE_BELOW
     is_level = _slopes(plane) < _MAX_SLOPE
-    return bool(is_wide and is_lowest and is_level)
+    is_beyond_machine = np.hypot(*inliers[:, :2].T).max() > _MIN_REACH_M
+    return bool(is_wide and is_lowest and is_level and is_beyond_machine)

@@ -111,8 +111,8 @@ def ground_from_clouds(
     # scans have a plane, the machine does not drive on this plane.
     if 2 * n_planes <= scans.n_scans:
         raise NotEnoughDataError(
-            f"{n_planes} of {scans.n_scans} scans contain the ground: it must be visible within "
-            "12 m, and the z axis of the lidar must point up"
+            f"{n_planes} of {scans.n_scans} scans contain the ground: it must be visible between 5 "
+            "and 12 m, and the z axis of the lidar must point up"
         )
     normals, heights = zip(*scans.planes, strict=True)
     stamps_ns = np.array(scans.stamps_ns, dtype=np.int64)

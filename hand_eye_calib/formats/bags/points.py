@@ -18,16 +18,22 @@ def rows_of_points(message: Any) -> Any:
     InputError
         If the message has no x, y and z, or is damaged.
     """
-    names = [field.name for field in message.fields]
+    # Some drivers repeat the names of unused fields.
+    fields = {field.name: field for field in message.fields}
+    names = [*fields]
     if not {*"xyz"} <= {*names}:
         raise InputError(f"points have no x, y, z, but {', '.join(names)}")
     size = message.point_step
-    n_bytes = message.height * message.width * size
+    width = message.width * size
+    # Rows of an organised cloud may end in unused bytes.
+    row_step = max(message.row_step, width) if message.height > 1 else width
     byte_order = ">" if message.is_bigendian else "<"
     try:
-        formats = [byte_order + _DATATYPES[field.datatype] for field in message.fields]
-        offsets = [field.offset for field in message.fields]
+        formats = [byte_order + _DATATYPES[field.datatype] for field in fields.values()]
+        offsets = [field.offset for field in fields.values()]
         dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size})
-        return np.asarray(message.data, dtype=np.uint8)[:n_bytes].view(dtype)
+        data = np.asarray(message.data, dtype=np.uint8)[: message.height * row_step]
+        rows = data.reshape(message.height, row_step)[:, :width]
+        return np.ascontiguousarray(rows).reshape(-1).view(dtype)
     except (ValueError, IndexError, TypeError) as error:
         raise InputError(f"a scan of points is damaged ({error}); record it again") from error
