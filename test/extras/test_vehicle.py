@@ -13,6 +13,7 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.vehicle.joints import middle_angle
+from hand_eye_calib.extras.vehicle.live import live_reading
 from hand_eye_calib.formats.bags.writer import write_streams
 from hand_eye_calib.offline.cli.main import main
 from reproduction.machines import simulate_machine
@@ -528,17 +529,38 @@ def test_units_in_the_names_of_columns(tmp_path, header, units):
     assert read.poses == pytest.approx(expected.poses)
 
 
-def test_twists_of_a_bag(tmp_path):
-    drive = machine("omni")
+def twists(drive):
+    """Velocities of an omnidirectional machine."""
     vector = JAZZY.types["geometry_msgs/msg/Vector3"]
     twist = JAZZY.types["geometry_msgs/msg/Twist"]
     kind = JAZZY.types["geometry_msgs/msg/TwistStamped"]
-    messages = []
     for stamp_ns, (forward, left, turn) in zip(
         drive.stamps_ns.tolist(), drive.values.tolist(), strict=True
     ):
         rates = twist(vector(forward, left, 0.0), vector(0.0, 0.0, turn))
-        messages.append(kind(header(stamp_ns), rates))
+        yield kind(header(stamp_ns), rates)
+
+
+@pytest.mark.parametrize("model", ["steering", "omni"])
+def test_live_messages_have_the_poses_of_a_bag(tmp_path, model):
+    drive = machine(model)
+    type_ = "geometry_msgs/msg/TwistStamped"
+    messages = [*twists(drive)] if model == "omni" else []
+    if not messages:
+        type_ = "sensor_msgs/msg/JointState"
+        messages = [*car_states(drive, ["rear_wheel"], ["left_steer", "right_steer"])]
+    write_wheel_bag(tmp_path / "bag", type_, "/wheels", messages, drive)
+    in_bag = hec.read_trajectory(tmp_path / "bag", topic="/wheels", measures=model)
+    read = live_reading(type_, "/wheels", model)
+    live = [read(bytes(JAZZY.serialize_cdr(message, type_))) for message in messages]
+    assert [pose.stamp_ns for pose in live] == in_bag.stamps_ns.tolist()
+    positions = np.array([pose.position for pose in live])
+    assert positions == pytest.approx(in_bag.poses[:, :3, 3], abs=1e-8)
+
+
+def test_twists_of_a_bag(tmp_path):
+    drive = machine("omni")
+    messages = [*twists(drive)]
     bag = tmp_path / "bag"
     write_wheel_bag(bag, "geometry_msgs/msg/TwistStamped", "/twist", messages, drive)
     arguments = ["--parent-topic", "/twist", "--child-topic", "/lidar", "--parent-measures", "omni"]
