@@ -179,8 +179,7 @@ def _filled_layout(result: Judged, name: str) -> str:
     if unknown := [axis for axis in result.unobservable() if axis in layout.axes]:
         raise InputError(
             "no file is written: this recording does not determine "
-            f"{axes_in_words(unknown)}; measure it by hand and calibrate "
-            "again with --prior"
+            f"{axes_in_words(unknown)}; measure it by hand and calibrate again with a prior"
         )
     target, source = frames
     offset_s = result.time_offset_s

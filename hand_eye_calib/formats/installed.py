@@ -21,7 +21,7 @@ from hand_eye_calib.core.geometry.frames import Extrinsic, FrameTree, numbers_of
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.records import AXES, ROTATIONS, TRANSLATIONS
 from hand_eye_calib.formats.exports import Layout, arranged, formats
-from hand_eye_calib.formats.files import read_bytes, similar
+from hand_eye_calib.formats.files import local_path, read_bytes, similar
 from hand_eye_calib.formats.results import FILE_NAME, load_result
 from hand_eye_calib.formats.yaml_files import read_yaml
 
@@ -63,8 +63,8 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
     ConfigError
         If the text is neither a file nor six numbers.
     """
-    path = Path(text)
-    if not os.path.exists(text):
+    path = local_path(text)
+    if not os.path.exists(path):
         try:
             values = parse_pose("installed", text)
         except ConfigError:
@@ -78,6 +78,9 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
         return lambda parent_frame, child_frame: Extrinsic(T, text)
     if (path / FILE_NAME).exists():
         path = path / FILE_NAME
+    if path.suffix == ".tum":
+        T = _only_pose(path)
+        return lambda parent_frame, child_frame: Extrinsic(T, text)
     if path.suffix in _DESCRIPTIONS:
         find = read_urdf(path).pose
     elif path.suffix in _DOCUMENTS:
@@ -90,6 +93,16 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
     else:
         find = frames_of_bag(path).pose
     return partial(stated, find, str(path))
+
+
+def _only_pose(path: Path) -> FloatArray:
+    """Return the pose (4, 4) of a TUM file with one pose, such as the truth of a simulation."""
+    lines = read_bytes(path).decode("utf-8", "replace").splitlines()
+    rows = [line.split() for line in lines if line.strip() and not line.startswith("#")]
+    with located(path):
+        if len(rows) != 1:
+            raise InputError(f"{len(rows)} poses; an installed transform is one pose")
+        return pose_of(rows[0][1:])
 
 
 def stated(

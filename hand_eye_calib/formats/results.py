@@ -15,6 +15,8 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 from hand_eye_calib.core.base.errors import InputError, located, printable, require_type
+from hand_eye_calib.core.base.registry import RESULT_METHODS
+from hand_eye_calib.core.base.spelling import Road
 from hand_eye_calib.core.base.version import version_of
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
 from hand_eye_calib.core.results.document import transform_arguments, usable_angles, usable_numbers
@@ -91,7 +93,7 @@ def _names_of_parts() -> list[str]:
 def save(
     calibration: Calibration, directory: str | Path, inputs: Mapping[str, Any] | None = None
 ) -> Path:
-    """Save a result, and keep the earlier result of the directory in its folder ``previous``.
+    """Save a result and its report; earlier files are kept in the folder ``previous``.
 
     Files, parameters and errors are those of :func:`save_result`. The report of the earlier result
     is kept in ``previous``, too, because it does not belong to the new result.
@@ -112,6 +114,9 @@ def save(
     if has_earlier:
         with writing(directory):
             Path(directory, REPORT_NAME).unlink(missing_ok=True)
+    # A result that was read from a file has no poses to draw.
+    if calibration.motion_residuals and "report" in RESULT_METHODS:
+        RESULT_METHODS["report"](calibration, Path(directory, REPORT_NAME))
     return path
 
 
@@ -244,6 +249,14 @@ def fingerprint(path: str | Path) -> dict[str, str | int]:
         return {"file": str(path), "bytes": file.tell(), "sha256": digest}
 
 
+def recording_of(path: str | Path) -> frozenset[str]:
+    """Return the SHA-256 of the input files of a saved result; empty if there are none."""
+    path = Path(path, FILE_NAME) if Path(path).is_dir() else Path(path)
+    provenance = read_yaml(path).get("provenance") or {}
+    files = (provenance.get("inputs") or {}).get("files") or []
+    return frozenset(str(file.get("sha256")) for file in files if isinstance(file, Mapping))
+
+
 def load_result(path: str | Path) -> Calibration:
     """Read a calibration that :func:`save_result` wrote: the file, or its directory.
 
@@ -326,7 +339,7 @@ def _remarks(calibration: Judged) -> list[str]:
     child = calibration.child_frame
     remarks = [
         calibration.headline,
-        *(f"{reason.sentence}: {reason.what_to_do}" for reason in calibration.reasons),
+        *(f"{reason.sentence}: {reason.advice_on(Road.NODE)}" for reason in calibration.reasons),
         f"Pose of {child} in {parent}: maps coordinates of {child} into {parent}.",
         f"Made by hand_eye_calib {version_of()}; {FILE_NAME} beside this file "
         "contains the covariance and the origin.",

@@ -52,10 +52,11 @@ def _plot(result: Any, ax: Any) -> Any:
 
 
 def _report(result: Any, path: Path) -> Path:
+    from hand_eye_calib.core.base.spelling import Road
     from hand_eye_calib.formats.results import save_text
     from hand_eye_calib.offline.report.report import render
 
-    return save_text(path, render(result, result.recording))
+    return save_text(path, render(result, result.recording, road=Road.PYTHON))
 
 
 def _html(result: Any) -> str:

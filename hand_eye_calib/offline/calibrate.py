@@ -17,6 +17,7 @@ from hand_eye_calib.core.base.errors import (
     require_type,
 )
 from hand_eye_calib.core.base.option import option_name
+from hand_eye_calib.core.base.spelling import Road, spelled
 from hand_eye_calib.core.base.text import AXIS_UNITS, Prior, shown_value
 from hand_eye_calib.core.engine.cross_check import (
     answers_of_halves,
@@ -50,6 +51,9 @@ _Measures: TypeAlias = Literal[
 _Invert: TypeAlias = Literal["none", "poses", "orientations"]
 _Kind: TypeAlias = Literal["odometry", "exact"]
 _Order: TypeAlias = Literal["xyzw", "wxyz", "yzwx"]
+
+# Endings of files with trajectories or samples of an arm, which are no bags.
+_TABLES = (".npz", ".json", ".samples", ".tum", ".txt", ".csv", ".yaml", ".yml")
 
 
 def calibrate(
@@ -156,7 +160,8 @@ def calibrate(
         for text in notes:
             warnings.warn(text, UserWarning, stacklevel=2)
     result = run(snapshot, checks=checks, progress=progress)
-    return replace(result.calibration, recording=result.snapshot)
+    in_python = tuple(spelled(text, Road.PYTHON) for text in result.calibration.warnings)
+    return replace(result.calibration, warnings=in_python, recording=result.snapshot)
 
 
 def _check_settings(progress: Any, checks: Any, ground: Any, is_bag: bool) -> None:
@@ -196,6 +201,11 @@ def _read_bag(path: Path, topics: Mapping[str, str | None]) -> Sequence[Trajecto
     from hand_eye_calib.formats.bags.reader import PoseBag
     from hand_eye_calib.formats.bags.sources import source_of
 
+    if path.suffix in _TABLES and path.is_file():
+        raise InputError(
+            f"{path} is one file: pass the trajectories of both sensors; samples of an arm are for "
+            "calibrate_arm, see read_arm_samples"
+        )
     named = {}
     for stream, topic in topics.items():
         if topic is not None:

@@ -435,7 +435,7 @@ class TestFullMotion:
         assert result.status.failure == "a prior contradicts the motion"
         assert result.verdict is Verdict.DO_NOT_USE
         assert result.reasons[0].sentence.startswith(f"the prior on {axis} is ")
-        assert result.reasons[0].what_to_do == f"check value, unit and sign of prior.{axis}"
+        assert result.reasons[0].advice == f"check value, unit and sign of prior.{axis}"
         np.testing.assert_array_equal(result.T_parent_child, plain.T_parent_child)
         np.testing.assert_array_equal(result.covariance_measured, plain.covariance_measured)
 

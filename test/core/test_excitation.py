@@ -69,9 +69,7 @@ def test_after_turns_about_all_axes_only_what_a_result_says_is_missing():
             *result.observability_measured[1:],
         ),
     )
-    assert excitation.what_is_missing(seen_in(poses), weak).startswith(
-        "x can hardly be determined from the motion"
-    )
+    assert excitation.what_is_missing(seen_in(poses), weak).startswith("x needs more motion: ")
     hidden = DofObservability("yaw", DofVerdict.UNOBSERVABLE, np.inf)
     hiding = dataclasses.replace(
         result, observability_measured=(*result.observability_measured[:5], hidden)

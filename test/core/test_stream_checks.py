@@ -201,7 +201,7 @@ class TestWhichStreamAndWhatToDo:
         parent, child = drive(wander=motions.planar_poses)
         note = check_streams(motions.as_trajectory(parent.poses @ lying), child).findings[0]
         assert (note.code, note.severity) == ("one_axis", Severity.NOTE)
-        assert note.what == "y cannot be determined from this motion, and will be unobservable"
+        assert note.what == "y cannot be determined from this motion, and will be unknown"
         assert note.options == {"prior.y": "VALUE+/-SIGMA"}
 
 

@@ -123,7 +123,7 @@ def test_a_tilted_plane_is_not_joined_and_named():
     (reason,) = [reason for reason in result.reasons if reason.rule == "ground"]
     assert {*reason.axes} <= {"roll", "pitch"}
     assert "by the motion" in reason.sentence
-    assert "--ground off" in reason.what_to_do
+    assert 'ground="off"' in reason.what_to_do
 
 
 def test_a_loading_edge_beside_a_ramp_is_not_joined():

@@ -214,7 +214,7 @@ def test_each_reason_stands_above_what_to_do_about_it(run, new_bag, tmp_path):
     assert lines[0] == "USE WITH CARE: all but z; measure z by hand; many jumps"
     assert lines[1:5] == [
         "- z cannot be determined from this motion",
-        "  -> measure it by hand and give --prior z=VALUE+/-SIGMA",
+        "  -> measure it by hand and give a prior: --prior z=VALUE+/-SIGMA",
         "- many jumps",
         "  -> find out why",
     ]
@@ -353,7 +353,7 @@ def test_help_lists_every_option_with_its_default(run):
         entry = words[words.rindex(f" {name} ") :].replace("- ", "-")
         entry = entry[: entry.find(" --", 1)]
         assert field.metadata["doc"] in entry, name
-        assert f"Unit: {field.metadata['unit']}." in entry or not field.metadata["unit"], name
+        assert f"Unit: {field.metadata['unit']}" in entry or not field.metadata["unit"], name
         assert f"Default: {field.default}." in entry or field.default == "", name
 
 

@@ -3,6 +3,7 @@
 import json
 import shutil
 
+import numpy as np
 import pytest
 
 import hand_eye_calib as hec
@@ -37,7 +38,25 @@ def test_arm_takes_two_files_as_stops(run, tmp_path):
     alone = as_json(run, "arm", *files, "--pair-by", "row")
     both = as_json(run, "calibrate", *files, "--order", "none", "--pair-by", "row")
     assert alone["reference"] == "stops"
-    assert alone["T_parent_child"] == both["T_parent_child"]
+    assert alone["T_parent_child"]["matrix"] == both["T_parent_child"]["matrix"]
+    assert (alone["setup"], alone["parent_frame"]) == ("hand", "hand")
+    placed = as_json(run, "arm", *files, "--setup", "hand")
+    assert placed["T_parent_child"] == alone["T_parent_child"]
+
+
+def test_files_of_an_arm_that_fit_two_places_of_the_camera_need_an_option(run, tmp_path):
+    samples = hec.read_arm_samples("sample:arm.yaml")
+    files = [tmp_path / "hand.tum", tmp_path / "target.tum"]
+    for file, poses in zip(files, (samples.robot, samples.tracking), strict=True):
+        stamps_ns = 1_000_000_000 * np.arange(len(poses))
+        hec.write_trajectory(file, hec.Trajectory(stamps_ns, np.asarray(poses)))
+    document = as_json(run, "arm", *files)
+    assert document["verdict"] == "DO_NOT_USE"
+    assert "setup beside" in document["reasons"][0]["what_to_do"]
+    on_hand = as_json(run, "arm", *files, "--child-invert", "poses")
+    assert (on_hand["verdict"], on_hand["setup"]) == ("USE", "hand")
+    beside = as_json(run, "arm", *files, "--setup", "beside")
+    assert (beside["verdict"], beside["setup"]) == ("USE", "beside")
 
 
 def test_rig_is_calibrate_for_three_files(run, tmp_path):

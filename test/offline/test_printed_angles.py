@@ -118,11 +118,11 @@ def test_one_sigma_is_stated_on_the_terminal_in_python_and_in_documents():
     assert [*in_python, *in_documents] == pytest.approx([whole_m] * 8)
     assert result.sigmas_measured[0] == pytest.approx(measured_m)
     assert result.allowance[0] == pytest.approx(allowance_m)
-    assert "x 0.3 +/- 0.0091" in repr(result)
+    assert "x 0.3000 +/- 0.0091 m" in repr(result)
     lines = as_lines(result)
     assert "  x        0.3000 +/- 0.0091 m  (4.3 mm measured, 8 mm allowance)" in lines
     assert any("the allowance is for constant odometry errors" in line for line in lines)
-    assert any("--parent-kind or --child-kind exact" in line for line in lines)
+    assert any("--parent-kind exact or --child-kind exact" in line for line in lines)
 
 
 def test_the_axis_of_a_sigma_with_only_a_measured_part_has_no_parts_printed():

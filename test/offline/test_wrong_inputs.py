@@ -88,7 +88,7 @@ TABLE = """
 2 | calibrate lidar.tum camera.tum --batch x | --batch cannot be combined with PATH
 2 | calibrate lidar.tum camera.tum --vehicle x | --dask and --vehicle need --batch
 2 | calibrate lidar.tum camera.tum --jobs 0 | expected a whole number of at least 1, got '0'
-2 | calibrate lidar.tum camera.tum --setup hand | it needs the samples of an arm or --target
+2 | calibrate lidar.tum camera.tum --setup hand | run arm with the samples of an arm
 2 | calibrate lidar.tum camera.tum --parent-angles ur | it needs two files and --order none
 2 | calibrate lidar.tum camera.tum --target charuco:5x7 | --target and --camera go together
 1 | calibrate samples.yaml | samples.yaml: expected samples of an arm
@@ -121,7 +121,7 @@ TABLE = """
 1 | compare torn.yaml --with robot.urdf | restore the file, or calibrate again
 1 | compare saved | or one and the installed transform (--with
 1 | compare saved saved | saved appears twice: name each result once
-1 | compare saved --with lidar.tum | lidar.tum: unknown kind of file; expected a calibration
+1 | compare saved --with lidar.tum | an installed transform is one pose
 1 | compare saved --with robot.urdf | in the robot description; it has no transforms
 2 | compare saved --with "1 2 3 4 5" | expected a URDF, extrinsic.yaml, a bag, or X Y Z
 2 | export saved urdff | did you mean urdf?

@@ -13,7 +13,7 @@ import result_making
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import BACKENDS, METHODS, CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError, InputError
-from hand_eye_calib.core.base.text import AXIS_UNITS
+from hand_eye_calib.core.base.text import AXIS_UNITS, with_sigma
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.core.solvers.all_pairs import pair_costs
@@ -371,4 +371,5 @@ def test_a_notebook_gets_six_numbers_in_degrees_and_three_views(solved):
 
 
 def test_a_printed_result_has_one_sigma(solved):
-    assert f"x {solved.translation[0]:.6g} +/- {solved.sigmas[0]:.2g}, " in repr(solved)
+    number = with_sigma(solved.translation[0], solved.sigmas[0], 3)
+    assert f"x {number} m, " in repr(solved)

@@ -154,7 +154,9 @@ def test_motion_that_hides_a_direction_is_published_with_a_warning(start_node, p
     assert not answer.success
     assert "status unobservable" in answer.message
     assert answer.message.startswith("USE WITH CARE: all but z; measure z by hand")
-    reason = "z cannot be determined from this motion; measure it by hand and give prior.z "
+    reason = (
+        "z cannot be determined from this motion; measure it by hand and give a prior: prior.z "
+    )
     node.wait_for_log("[WARN]", reason)
     np.testing.assert_allclose(matrix(extrinsic)[:2, 3], T_PARENT_CHILD[:2, 3], atol=1e-3)
     peer.spin_until(lambda: poses, "the pose with covariance")

@@ -188,17 +188,17 @@ def what_is_missing(seen: Excitation, calibration: Calibration | None = None) ->
         Empty if nothing is missing.
     """
     axes = calibration.hidden if calibration else [*seen.hidden_axes()]
-    problem = "cannot be determined from"
+    problem = "cannot be determined from the motion so far"
     if calibration and not axes:
         verdicts = calibration.observability
-        problem = "can hardly be determined from"
         axes = [dof.name for dof in verdicts if dof.verdict is DofVerdict.WEAK]
+        problem = "needs more motion" if len(axes) == 1 else "need more motion"
     if not axes:
         return ""
     motion = helpful_motion(axes, seen)
     if calibration and motion == _ON_A_FLAT_FLOOR:
         motion += _WITH_LIDARS
-    return f"{axes_in_words(axes)} {problem} the motion so far: {motion}"
+    return f"{axes_in_words(axes)} {problem}: {motion}"
 
 
 def helpful_motion(axes: Sequence[str], seen: Excitation) -> str:

@@ -138,7 +138,7 @@ def given_or_estimated(value: float, sigma: float, unit: str) -> str:
     """Format a number that the user has set (``sigma`` is 0), or that was estimated."""
     if not sigma:
         return f"{value:g} {unit}".strip()
-    number = f"{value:.4f} +/- {sigma:.4f} {unit}".strip()
+    number = f"{with_sigma(value, sigma, 4)} {unit}".strip()
     return f"{number}, estimated"
 
 

@@ -29,6 +29,7 @@ from hand_eye_calib.core.assessment.covariance import hidden_axes, lever_arm_pro
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import NotEnoughDataError
+from hand_eye_calib.core.base.spelling import PLACEHOLDER
 from hand_eye_calib.core.base.text import axes_in_words
 from hand_eye_calib.core.checks import agreement, fusion, hypotheses, independence, misread, parts
 from hand_eye_calib.core.checks.agreement import ExtrinsicEstimate
@@ -539,6 +540,6 @@ def _motions(pose_pairs: PosePairs, max_motions: int) -> MotionPairs:
 
 def unobservable_axes(axes: Sequence[str]) -> Finding:
     """Return the note that the motion does not determine some axes of X."""
-    options = {f"prior.{axis}": "VALUE+/-SIGMA" for axis in axes}
+    options = {f"prior.{axis}": PLACEHOLDER for axis in axes}
     pronoun = "it" if len(axes) == 1 else "them"
     return finding("one_axis", options=options, axes=axes_in_words(axes), it=pronoun)

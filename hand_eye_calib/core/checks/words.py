@@ -221,7 +221,7 @@ WORDS = {
     ),
     "time_offset": FindingWords(
         "the child's clock is {size_s:.4f} +/- {sigma_s:.4f} s {direction} the parent's{beyond}",
-        "add {total_s} s in all to the child's stamps, or have it estimated",
+        "set the offset to {total_s} s, or have it estimated",
     ),
     "large_time_offset": FindingWords(
         "the child's clock is {size_s:.2f} s {direction} the parent's, and no offset was given",
@@ -241,7 +241,7 @@ WORDS = {
     "unit_or_scale": FindingWords(
         "the child's lengths must be multiplied by {scale:.5g} +/- {sigma:.2g}: the parent's are "
         "{unit}, or the child has a scale of its own",
-        "give parent_scale {factor:g} if the parent's lengths are {unit}, or scale estimate if not",
+        "give scale estimate, or parent_scale {factor:g} if the parent's lengths are {unit}",
     ),
     "scale": FindingWords(
         "the child's lengths must be multiplied by {scale:.4f} +/- {sigma:.4f} to agree with the "
@@ -249,7 +249,7 @@ WORDS = {
         "have the scale estimated, or find out which of the two measures wrongly",
     ),
     "one_axis": FindingWords(
-        "{axes} cannot be determined from this motion, and will be unobservable",
+        "{axes} cannot be determined from this motion, and will be unknown",
         "rotate about other axes, too (a vehicle: over slopes or kerbs), or measure {it} and give "
         "a prior",
         severity=Severity.NOTE,

@@ -125,7 +125,11 @@ class Solved:
             )
         noise = None
         if isinstance(solution, AdaptiveSolution):
-            noise = solution.describe(self.stamps_ns)
+            noise = solution.describe(
+                self.stamps_ns,
+                self.time_offset.seconds if self.time_offset else None,
+                self.scale if self.scale_fit else None,
+            )
         residuals = Residuals(
             *self.pairs.residuals(fused.T_parent_child),
             self.weights,

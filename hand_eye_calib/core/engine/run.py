@@ -500,5 +500,12 @@ def _certain(findings: Collection[Finding], fixed: Collection[str]) -> dict[str,
             if not is_certain or name in fixed:
                 continue
             if finding.makes_unusable or is_clock_warning:
-                certain_options[name] = "estimate" if finding.code in _ESTIMATED_CODES else value
+                certain_options |= options_to_solve(replace(finding, options={name: value}))
     return certain_options
+
+
+def options_to_solve(finding: Finding) -> Options:
+    """Return the options of a finding for a solve; offset and scale are estimated in the solve."""
+    if finding.code in _ESTIMATED_CODES:
+        return dict.fromkeys(finding.options, "estimate")
+    return finding.options

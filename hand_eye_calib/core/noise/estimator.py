@@ -220,12 +220,21 @@ class AdaptiveSolution(ModelSolution):
             misfit=self.misfit,
         )
 
-    def describe(self, stamps_ns: IntArray) -> Noise:
+    def describe(
+        self, stamps_ns: IntArray, offset_s: float | None = None, scale: float | None = None
+    ) -> Noise:
         """Return the noise in numbers and in words, with the times of jumps and outliers.
 
-        ``stamps_ns`` (N,) are the stamps of the poses.
+        Parameters
+        ----------
+        stamps_ns : (N,) int64 array
+            Stamps of the poses.
+        offset_s, scale : float, optional
+            Time offset and scale that were estimated before and applied to the poses. The solution
+            refines them.
         """
-        sentences = self._noise_in_words() + self._systematic_in_words() + self.events(stamps_ns)
+        sentences = self._noise_in_words() + self._systematic_in_words(offset_s, scale)
+        sentences += self.events(stamps_ns)
         return replace(self.noise, in_words=tuple(sentences))
 
     def _noise_in_words(self) -> list[str]:
@@ -253,11 +262,14 @@ class AdaptiveSolution(ModelSolution):
             sentences.append(f"stamps jitter by {jitter_ms:.2g} ms")
         return sentences
 
-    def _systematic_in_words(self) -> list[str]:
-        """Return sentences about the significant systematic errors."""
+    def _systematic_in_words(self, offset_s: float | None, scale: float | None) -> list[str]:
+        """Return sentences about the significant systematic errors; see :meth:`describe`."""
         systematic = self.systematic.split("+")
         sentences = []
-        if "scale" in systematic:
+        if "scale" in systematic and scale is not None:
+            value = f"{scale * self.scale:.4f} +/- {scale * self.scale_sigma:.4f}"
+            sentences.append(f"the scale is {value}, refined from {scale:.4f}")
+        elif "scale" in systematic:
             percent = 100 * (self.scale - 1)
             sigma = 100 * self.scale_sigma
             size = f"{abs(percent):.2f} +/- {sigma:.2g} %"
@@ -274,6 +286,9 @@ class AdaptiveSolution(ModelSolution):
             rates = zip("xyz", *np.degrees(self.rate_bias), strict=True)
             about = ", ".join(f"{axis} {bias:.3g} +/- {sigma:.1g}" for axis, bias, sigma in rates)
             sentences.append(f"bias of the angular rates, along the child's axes: {about} deg/s")
+        elif "time" in systematic and offset_s is not None:
+            value = f"{offset_s + self.time_offset_s:.4f} +/- {self.time_offset_sigma_s:.4f} s"
+            sentences.append(f"the time offset is {value}, refined from {offset_s:.4f} s")
         elif "time" in systematic:
             ms = 1000 * self.time_offset_s
             sigma = 1000 * self.time_offset_sigma_s

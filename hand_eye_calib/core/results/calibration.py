@@ -67,10 +67,12 @@ class Calibration(Judged):
 
     def __repr__(self) -> str:
         frames = f"{self.child_frame} in {self.parent_frame}"
-        printed = zip(AXES, se3.xyz_rpy(self.T_parent_child), self.sigmas_printed, strict=True)
-        values = ", ".join(f"{axis} {at:.6g} +/- {sigma:.2g}" for axis, at, sigma in printed)
+        numbers = document.printed_numbers(
+            document.transforms_of(self)["T_parent_child"], self.out_of_reach
+        )
+        values = ", ".join(f"{axis} {number}" for axis, number in numbers.items())
         return (
-            f"<Calibration: {self.headline}\n {frames}: {values} (m, rad), "
+            f"<Calibration: {self.headline}\n {frames}: {values}, "
             f"{self.method} {self.reference}, {self.n_poses} poses>"
         )
 
@@ -78,15 +80,18 @@ class Calibration(Judged):
         """Return a DataFrame with a row for each of x, y, z, roll, pitch, yaw.
 
         A row has the printed number, its standard deviation with the allowance (m, rad), and the
-        verdict on the axis.
+        verdict on the axis. An unknown number is NaN.
 
         Raises
         ------
         MissingDependencyError
             Without pandas.
         """
-        values = se3.xyz_rpy(self.T_parent_child).tolist()
-        rows = zip(self.observability, values, self.sigmas_printed, strict=True)
+        sigmas = self.sigmas_printed
+        # Near gimbal lock, a known angle has no standard deviation.
+        is_known = np.isfinite(self.sigmas)
+        values = np.where(is_known, se3.xyz_rpy(self.T_parent_child), np.nan).tolist()
+        rows = zip(self.observability, values, sigmas, strict=True)
         table = []
         for dof, value, sigma in rows:
             row = {

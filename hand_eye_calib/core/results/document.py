@@ -28,13 +28,16 @@ from hand_eye_calib.core.results.records import (
     by_hand,
 )
 from hand_eye_calib.core.results.result import Result
-from hand_eye_calib.core.results.verdict import Judged, Verdict
+from hand_eye_calib.core.results.verdict import Judged, Reason, Verdict
 
 _FORMAT = "hand_eye_calib/extrinsic"
 # A change that an older reader cannot understand raises the version. In version 1, covariance and
 # sigma did not contain the allowance, and the allowance was called floor.
 _VERSION = 2
 _READABLE = (1, 2)
+
+# Logarithm of the ratio of two standard deviations below which both are the same for a reader.
+_SAME_ANGLES = 0.2
 
 # Share of a standard deviation below which an allowance changes none of its two digits.
 _NEGLIGIBLE_SHARE = 0.01
@@ -64,8 +67,9 @@ class Notation:
     """A transform in the notations of documents: translation, quaternion, angles and matrix.
 
     ``maps`` names source and target. Each number (m, deg) has a standard deviation (``sigma``), and
-    its part without the allowance (``sigma_measured``). An unknown number is NaN, and its standard
-    deviation is infinite. An unknown rotation has no quaternion.
+    its part without the allowance (``sigma_measured``). ``sigma_about_deg`` are the standard
+    deviations of the rotation about the axes x, y and z of the target. An unknown number is NaN,
+    and its standard deviation is infinite. An unknown rotation has no quaternion.
     """
 
     maps: str
@@ -76,6 +80,7 @@ class Notation:
     rpy_deg: FloatArray
     sigma_rpy_deg: FloatArray
     sigma_measured_rpy_deg: FloatArray
+    sigma_about_deg: FloatArray
     matrix: FloatArray
 
 
@@ -86,7 +91,7 @@ def document_of(result: Judged) -> Document:
     document: Document = {
         "verdict": result.verdict,
         "headline": result.headline,
-        "reasons": result.reasons,
+        "reasons": [_reason_of(reason) for reason in result.reasons],
         "format": _FORMAT,
         "version": _VERSION,
         "parent_frame": parent,
@@ -108,6 +113,13 @@ def document_of(result: Judged) -> Document:
     for extra in all_parts():
         document |= extra.write(result.parts.get(extra.name))
     return plain(document)
+
+
+def _reason_of(reason: Reason) -> Document:
+    """Return a reason in plain values; its options have the names that files use."""
+    document: Document = plain(reason)
+    document["what_to_do"] = document.pop("advice")
+    return document
 
 
 def _covariances_of(result: Result) -> Document:
@@ -206,6 +218,9 @@ def _notation(transform: _Transform, hidden: Collection[str]) -> Notation:
         rpy_deg=np.degrees(np.where(is_known, se3.rotation_to_rpy(R), np.nan)),
         sigma_rpy_deg=np.degrees(np.hypot(sigmas, sigmas_rpy(T, allowance))),
         sigma_measured_rpy_deg=np.degrees(sigmas),
+        sigma_about_deg=np.degrees(
+            np.hypot(sigmas_in_parent(R, measured)[3:], sigmas_in_parent(R, allowance)[3:])
+        ),
         matrix=T,
     )
 
@@ -308,18 +323,33 @@ def parts_of_sigmas(transform: Notation) -> dict[str, str]:
 
 
 def angles_in_words(transform: Notation, result: Result) -> str:
-    """Explain roll and yaw that are less certain than the rotation; empty if none is.
+    """Explain angles that are less or more certain than the rotation; empty if none is.
 
     Near a pitch of 90 deg, roll and yaw vary together: a small rotation changes both by much.
+    Angles are about fixed axes, one after the other. So their standard deviations may be others
+    than those about the axes of the target.
     """
     rotation_rad = float(result.sigmas[3:].max())
     # Angles that are printed to the digits of the rotation need no explanation.
     excess_deg = float(np.max(transform.sigma_rpy_deg)) - math.degrees(rotation_rad)
     if not round(excess_deg, 1) > 0.0:
-        return ""
+        return _about_axes_in_words(transform)
     return (
         f"roll and yaw vary together at pitch {transform.rpy_deg[1]:.0f} deg; the rotation itself "
         f"is good to {amount('roll', rotation_rad)}"
+    )
+
+
+def _about_axes_in_words(transform: Notation) -> str:
+    """Return the standard deviations about x, y and z if those of the angles differ from them."""
+    about_deg = transform.sigma_about_deg
+    ratios = transform.sigma_rpy_deg / about_deg
+    if not np.isfinite(ratios).all() or np.abs(np.log(ratios)).max() < _SAME_ANGLES:
+        return ""
+    sizes = listing([amount("roll", math.radians(sigma)) for sigma in about_deg.tolist()])
+    return (
+        "roll, pitch and yaw are turns one after the other; about the axes x, y and z the rotation "
+        f"is good to {sizes}"
     )
 
 
@@ -331,7 +361,7 @@ def allowance_in_words(result: Result) -> str:
     of = "" if result.measured == "positions" else "odometry "
     return (
         f"the allowance is for constant {of}errors, which no recording reveals; a sensor without "
-        "them, such as motion capture, needs parent_kind or child_kind exact"
+        "them, such as motion capture, needs parent_kind exact or child_kind exact"
     )
 
 

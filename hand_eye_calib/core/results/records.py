@@ -14,6 +14,7 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.plain import Document, from_plain, plain
 from hand_eye_calib.core.base.registry import FINDING_WORDS
+from hand_eye_calib.core.base.spelling import Road, with_options
 from hand_eye_calib.core.geometry.trajectory import Columns
 
 # Motion pairs with more weight than this count as inliers.
@@ -145,6 +146,11 @@ class Severity(str, Enum):
     ERROR = "error"
 
 
+# Codes of notes that the user can act on. All other notes have no advice.
+_NOTES_WITH_ADVICE = ("one_axis",)
+#: Advice of all other notes.
+NO_ACTION = "no action is needed"
+
 #: Key of the templates for a finding that stores its sentences among its values.
 AS_WRITTEN = "as_written"
 
@@ -186,8 +192,19 @@ class Finding:
 
     @property
     def advice(self) -> str:
-        """What the user should do."""
+        """What the user should do, with options by their public names."""
         return self._filled(words_of(self.key).advice)
+
+    @property
+    def what_to_do(self) -> str:
+        """The advice with its options, as a Python program gives them."""
+        return self.advice_on(Road.PYTHON)
+
+    def advice_on(self, road: Road) -> str:
+        """Return the advice with its options, as a user of the road gives them."""
+        if self.severity is Severity.NOTE and self.code not in _NOTES_WITH_ADVICE:
+            return NO_ACTION
+        return with_options(self.advice, self.options, road)
 
     @property
     def cause(self) -> str:

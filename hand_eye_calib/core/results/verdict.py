@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 from hand_eye_calib.core.base.config import METHODS
 from hand_eye_calib.core.base.registry import EXTRA_RULES
+from hand_eye_calib.core.base.spelling import PLACEHOLDER, Road, with_options
 from hand_eye_calib.core.base.text import (
     amount,
     amount_beside,
@@ -66,8 +67,8 @@ class Reason:
         The verdict on the result if this were the only reason.
     sentence : str
         The problem, with its values.
-    what_to_do : str
-        What the user should do.
+    advice : str
+        What the user should do, with options by their public names.
     axes : tuple of str
         x, y, z, roll, pitch, yaw; empty if the reason concerns the whole result.
     options : mapping
@@ -86,10 +87,19 @@ class Reason:
     rule: str
     verdict: Verdict
     sentence: str
-    what_to_do: str
+    advice: str
     axes: tuple[str, ...] = ()
     options: Mapping[str, float | str] = field(default_factory=dict)
     kind: str = "suspicion"
+
+    @property
+    def what_to_do(self) -> str:
+        """The advice with its options, as a Python program gives them."""
+        return self.advice_on(Road.PYTHON)
+
+    def advice_on(self, road: Road) -> str:
+        """Return the advice with its options, as a user of the road gives them."""
+        return with_options(self.advice, self.options, road)
 
     @property
     def is_finding(self) -> bool:
@@ -101,7 +111,7 @@ class Ground(NamedTuple):
     """What a rule reports about one result: a :class:`Reason` without its rule and verdict."""
 
     sentence: str
-    what_to_do: str
+    advice: str
     axes: tuple[str, ...] = ()
     options: Mapping[str, float | str] = NO_OPTIONS
 
@@ -311,8 +321,8 @@ def _nothing_known(result: Result) -> Iterator[Ground]:
         has_one_axis = any(finding.code == "one_axis" for finding in result.findings)
         why = "do not turn about two axes" if has_one_axis else "turn too little for their errors"
         ground = _hidden_ground(result, f"these stops, which {why}")
-        advice = f"turn the hand about at least two axes between them, or {ground.what_to_do}"
-        yield ground._replace(what_to_do=advice)
+        advice = f"turn the hand about at least two axes between them, or {ground.advice}"
+        yield ground._replace(advice=advice)
 
 
 def _findings_of(severity: Severity, result: Result) -> Iterator[Ground]:
@@ -395,10 +405,11 @@ def _hidden_ground(result: Result, source: str) -> Ground:
     ``source`` names what does not determine them, such as "this motion".
     """
     axes = tuple(axis.name for axis in _axes(result) if axis.is_hidden)
-    priors = listing([f"prior.{axis} VALUE+/-SIGMA" for axis in axes])
-    them = "it" if len(axes) == 1 else "them"
+    advice = "measure it by hand and give a prior"
+    if len(axes) > 1:
+        advice = "measure them by hand and give priors"
     sentence = f"{axes_in_words(axes)} cannot be determined from {source}"
-    return Ground(sentence, f"measure {them} by hand and give {priors}", axes)
+    return Ground(sentence, advice, axes, {f"prior.{axis}": PLACEHOLDER for axis in axes})
 
 
 def _few_inliers(result: Result) -> Iterator[Ground]:
@@ -419,7 +430,7 @@ def _few_inliers(result: Result) -> Iterator[Ground]:
 
 _FLOOR_ADVICE = (
     "set the target that you need; if a stream has no such errors, such as motion capture, give "
-    "parent_kind or child_kind exact"
+    "parent_kind exact or child_kind exact"
 )
 
 
@@ -442,9 +453,7 @@ def _worse_than_target(result: Result) -> Iterator[Ground]:
     hopeless = [(axis.name, size) for axis, size in allowances if size > axis.target]
     advice = []
     if any(size <= axis.target or 2.0 * size < axis.sigma for axis, size in allowances):
-        is_translation = bool({*names} & {*TRANSLATIONS})
-        more = "more rotation about other axes" if is_translation else "more rotation"
-        advice.append(f"record longer, with {more}")
+        advice.append("record longer, with more motion")
     if hopeless:
         alone = f"constant odometry errors alone leave {_amounts(hopeless)}"
         advice.append(f"{alone}: {_FLOOR_ADVICE}")

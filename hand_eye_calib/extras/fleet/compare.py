@@ -1,14 +1,15 @@
 """Command ``compare RESULT...``: compare results with the installed transform or each other."""
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.base.registry import COMPARISONS
 from hand_eye_calib.core.base.text import amount, distinct_names
-from hand_eye_calib.offline.cli.options import add_json_argument, print_result, waiting_for
+from hand_eye_calib.offline.cli.options import add_json_argument, note, print_result, waiting_for
 
 if TYPE_CHECKING:
     from hand_eye_calib.core.results.calibration import Calibration
@@ -69,7 +70,22 @@ def run(arguments: argparse.Namespace) -> int:
             installed = open_installed(arguments.installed)(*frames)
     comparison = compare(results, installed, distinct_names(arguments.results))
     print_result(_lines(comparison, results[0]), comparison if arguments.json else None)
+    if not arguments.installed:
+        note(*_repeated_recordings(arguments.results))
     return {"same": 0, "moved": 4}.get(comparison.verdict, 3)
+
+
+def _repeated_recordings(paths: Sequence[str]) -> Iterator[str]:
+    """Yield a note for each two results of one recording."""
+    from hand_eye_calib.formats.results import recording_of
+
+    recordings = {path: recording_of(path) for path in paths}
+    for first, second in combinations(paths, 2):
+        if recordings[first] and recordings[first] == recordings[second]:
+            yield (
+                f"{first} and {second} are of the same recording, so that their agreement proves "
+                "nothing: record a second time"
+            )
 
 
 def _lines(comparison: "Comparison", result: "Calibration") -> Iterator[str]:
@@ -80,9 +96,9 @@ def _lines(comparison: "Comparison", result: "Calibration") -> Iterator[str]:
         if len(comparison.differences) > 1:
             title = f"{title}: {difference.sentence}"
         yield title
-        yield f"  {'':<6}{'difference':>12}{'+/-':>10}{'seen from':>12}"
+        yield f"  {'':<6}{'difference':>22}{'+/-':>10}{'seen from':>12}"
         for axis, row in difference.axes.items():
             size = amount(axis, row.difference)
             sigma = amount(axis, row.sigma)
             visible = amount(axis, row.visible)
-            yield f"  {axis:<6}{size:>12}{sigma:>10}{visible:>12}  {row.verdict}"
+            yield f"  {axis:<6}{size:>22}{sigma:>10}{visible:>12}  {row.verdict}"

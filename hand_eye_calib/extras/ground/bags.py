@@ -72,7 +72,7 @@ def verticals_of_bag(
     sources = []
     for track, topic in zip(tracks, topics, strict=True):
         sources.append(f"{track.source} from {topic}")
-    text = f"{listing(sources)} are used; to use the motion alone, set --ground off"
+    text = f"{listing(sources)} are used; to use the motion alone, set ground off"
     return (VerticalPair(*tracks),), [text]
 
 

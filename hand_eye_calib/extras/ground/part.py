@@ -130,6 +130,6 @@ def disagreements(result: Any) -> Iterator[Ground]:
     yield Ground(
         "; ".join(texts),
         "check that the lidar sees the road (not a loading edge or a ramp), and that clouds and "
-        "IMU data are in the frame of the sensor; --ground off leaves them out",
+        "IMU data are in the frame of the sensor; ground off leaves them out",
         names,
     )

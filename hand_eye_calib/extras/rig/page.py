@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from hand_eye_calib.core.base.spelling import Road
 from hand_eye_calib.core.engine.session_result import SessionResult
 from hand_eye_calib.core.results.document import printed_numbers, transforms_of
 from hand_eye_calib.extras.rig.rig import RigCalibration, calibrate_rig
@@ -15,18 +16,21 @@ from hand_eye_calib.offline.report.views import figure_of_views
 _NAMELESS = "child_sensor"
 
 
-def write_rig_report(directory: Path, rig: RigCalibration, names: Sequence[str]) -> None:
+def write_rig_report(
+    directory: Path, rig: RigCalibration, names: Sequence[str], road: Road = Road.TERMINAL
+) -> None:
     """Write the report of a rig; ``names`` are the files, topics or frames of its sensors."""
-    write_page(directory, lambda: render_rig(rig, names))
+    write_page(directory, lambda: render_rig(rig, names, road))
 
 
-def render_rig(rig: RigCalibration, inputs: Sequence[str]) -> str:
+def render_rig(rig: RigCalibration, inputs: Sequence[str], road: Road = Road.TERMINAL) -> str:
     """Return the report of a rig as HTML; ``inputs`` are the files, topics or frames."""
     return page(
         Path(__file__).with_name("rig.html"),
         TONES[rig.verdict.value],
         rig.verdict.value,
         "",
+        road,
         rig=rig,
         inputs=inputs,
         poses=[
@@ -63,4 +67,4 @@ def write_session_rig(directory: Path, session: SessionResult) -> None:
     rig = calibrate_rig(sensors, {name: options[name] for name in names})
     inputs = {**session.inputs, "sensors": list(rig.sensors)}
     save_rig(rig.to_dict(), rig.calibrations, directory / "rig", inputs)
-    write_rig_report(directory / "rig", rig, rig.sensors)
+    write_rig_report(directory / "rig", rig, rig.sensors, Road.NODE)

@@ -81,17 +81,16 @@ def _are_stops(arguments: Any) -> bool:
             f"{', '.join(sorted(_SAMPLES))}, a folder with files such as robot_1.txt and "
             "target_1.txt, or two files with a row for each stop"
         )
-    is_arm = are_samples or are_images
-    has_hand_file = are_stops and not are_samples
-    _refuse_without_arm(arguments, is_arm, has_hand_file)
+    _refuse_without_stops(arguments, are_stops, has_hand_file=are_stops and not are_samples)
     return are_stops
 
 
-def _refuse_without_arm(arguments: Any, is_arm: bool, has_hand_file: bool) -> None:
+def _refuse_without_stops(arguments: Any, are_stops: bool, has_hand_file: bool) -> None:
     """Raise ConfigError for an option of an arm, or of the file of its hand, without such input."""
-    if arguments.setup and not is_arm:
+    if arguments.setup and not are_stops:
         raise ConfigError(
-            "--setup says where the camera of an arm is; it needs the samples of an arm or --target"
+            "--setup is the place of the camera of an arm: run arm with the samples of an arm, or "
+            "with the files of hand and camera"
         )
     if arguments.parent_angles and not has_hand_file:
         raise ConfigError(

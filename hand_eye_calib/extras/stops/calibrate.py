@@ -32,6 +32,7 @@ from hand_eye_calib.extras.stops.rough_fit import StopPoses
 from hand_eye_calib.extras.stops.solving import SetupFit, SolvedStops, solve_checked
 from hand_eye_calib.extras.stops.stop_table import StopTable, stop_table
 from hand_eye_calib.extras.stops.worlds import SETUPS, Worlds
+from hand_eye_calib.offline.calibrate import prior_fields
 
 # Options that apply to stops, and the first parts of the names of further options that do.
 _OBEYED = {"min_pairs", "parent_frame", "child_frame", "scale", "parent_scale"}
@@ -75,6 +76,7 @@ def calibrate_stops(
     Ts_world_parent: Any,
     Ts_world_child: Any,
     config: CalibratorConfig | None = None,
+    **options: Any,
 ) -> Calibration:
     """Calibrate two sensors from stops: pairs of poses whose order has no meaning.
 
@@ -88,6 +90,8 @@ def calibrate_stops(
     config : CalibratorConfig, optional
         Conventions, units, scale, priors, targets and names of frames. Other options raise if they
         are set.
+    **options
+        The same options as keywords of :func:`hand_eye_calib.calibrate`, without ``config``.
 
     Returns
     -------
@@ -109,7 +113,7 @@ def calibrate_stops(
     >>> hec.calibrate_stops(hand, camera.poses).T_world_world.shape
     (4, 4)
     """
-    config = _checked(config)
+    config = _checked(config, options)
     poses = _checked_poses({"parent": Ts_world_parent, "child": Ts_world_child}, config)
     solved = solve_checked(poses, config)
     warnings = list(solved.warnings)
@@ -136,6 +140,7 @@ def calibrate_arm(
     config: Any = None,
     names: Any = None,
     setup: str | None = None,
+    **options: Any,
 ) -> Calibration:
     """Calibrate a camera on a robot's hand, or beside the robot with the target on the hand.
 
@@ -149,7 +154,7 @@ def calibrate_arm(
         Poses of the hand in the base (parent), and of the target in the camera (child), in the
         forms of :func:`calibrate_stops`. To set options for arrays of OpenCV, use pairs (R, t).
     config : CalibratorConfig, optional
-        As for :func:`calibrate_stops`.
+        As for :func:`calibrate_stops`; so are ``options``.
     names : mapping of str to str, optional
         Names of the frames base, hand, camera, target.
     setup : {"hand", "beside"}, optional
@@ -175,19 +180,43 @@ def calibrate_arm(
     if _are_arrays_of_opencv(config, names):
         robot, tracking = (robot, tracking), (config, names)
         config = names = None
-    config = _checked(config)
+    config = _checked(config, options)
     if setup is not None and setup not in SETUPS:
         raise ConfigError(f"setup must be one of {', '.join(SETUPS)}; got {shown_value(setup)}")
     named = _names_of_frames(names)
-    poses = _checked_poses({"robot": robot, "tracking": tracking}, config, is_arm=True)
+    poses = _checked_poses({"robot": robot, "tracking": tracking}, config)
+    poses = replace(poses, is_arm=True, has_target=True)
+    return _calibrated_arm(poses, config, named, setup)
+
+
+def calibrate_hand_and_camera(
+    Ts_base_hand: Any, Ts_target_camera: Any, config: CalibratorConfig, setup: str | None = None
+) -> Calibration:
+    """Calibrate an arm like :func:`calibrate_arm`, from poses of the camera in the target.
+
+    Poses of the target in a camera on the hand look like those of a camera beside the robot. So
+    this place needs the option ``setup``.
+    """
+    config = _checked(config, {})
+    poses = _checked_poses({"hand": Ts_base_hand, "camera": Ts_target_camera}, config)
+    return _calibrated_arm(replace(poses, is_arm=True), config, _names_of_frames(None), setup)
+
+
+def _calibrated_arm(
+    poses: StopPoses, config: CalibratorConfig, named: Mapping[str, str], setup: str | None
+) -> Calibration:
+    """Return the result of an arm; ``named`` are the frames base, hand, camera and target."""
     solved = solve_checked(poses, config, setup)
-    solved = solved.adding(*_check_setup(solved.setup_fit, setup))
+    setup_fit = solved.setup_fit
+    solved = solved.adding(*_check_setup(setup_fit, setup))
+    if setup_fit.is_inverse and not (poses.has_target or setup or config.given & _INVERSIONS):
+        solved = solved.adding(finding("beside_or_inverse", "child"))
     warnings = list(solved.warnings)
     if solved.is_usable and not config.given >= _INVERSIONS:
         if not setup:
-            warnings.append(_setup_in_words(solved.setup_fit))
-        solved = solved.adding(*_check_distances(solved.setup_fit, named))
-    return _calibration_of(solved, warnings, _frames_of_arm(named, solved.setup_fit.is_inverse))
+            warnings.append(_setup_in_words(setup_fit))
+        solved = solved.adding(*_check_distances(setup_fit, named))
+    return _calibration_of(solved, warnings, _frames_of_arm(named, setup_fit.is_inverse))
 
 
 # ------------------------------------------------------------------ options and poses
@@ -200,16 +229,22 @@ def _are_arrays_of_opencv(config: Any, names: Any) -> bool:
     return not (has_options or has_names)
 
 
-def _checked(config: CalibratorConfig | None) -> CalibratorConfig:
-    """Return the options, or the default ones.
+def _checked(config: CalibratorConfig | None, options: Mapping[str, Any]) -> CalibratorConfig:
+    """Return the options of ``config``, those of the keywords, or the default ones.
 
     Raises
     ------
     InputError
         If the options are no CalibratorConfig, such as an array of OpenCV.
     ConfigError
-        If an option is set that has no meaning for stops.
+        If an option is set that has no meaning for stops, or if there are both kinds of options.
     """
+    if config is not None and options:
+        raise ConfigError(f"give {', '.join(options)} in config, or without config as keywords")
+    if options:
+        prior = prior_fields(options.get("prior", {}))
+        others = {name: value for name, value in options.items() if name != "prior"}
+        config = CalibratorConfig(**{**others, **prior})
     if not isinstance(config, CalibratorConfig | None):
         raise InputError(
             f"the options are a CalibratorConfig; found {type(config).__name__}. Arrays of OpenCV "
@@ -229,9 +264,7 @@ def _checked(config: CalibratorConfig | None) -> CalibratorConfig:
     return config
 
 
-def _checked_poses(
-    sides: Mapping[str, Any], config: CalibratorConfig, is_arm: bool = False
-) -> StopPoses:
+def _checked_poses(sides: Mapping[str, Any], config: CalibratorConfig) -> StopPoses:
     """Return the poses of parent and child as stacks; ``sides`` are their values by name.
 
     Positions are zero if only rotations are measured.
@@ -255,7 +288,7 @@ def _checked_poses(
         zeros = np.zeros((n_stops, 3))
         parent = se3.from_rotation_translation(se3.rotation_of(parent), zeros)
         child = se3.from_rotation_translation(se3.rotation_of(child), zeros)
-    return StopPoses(parent, child, is_arm, has_positions)
+    return StopPoses(parent, child, has_positions=has_positions)
 
 
 # ------------------------------------------------------------------ findings about the fit

@@ -356,7 +356,7 @@ def _with_units(sample: StopPoses, examination: Examination, is_scale_free: bool
     if of_child != 1.0:
         units.append(_unit_finding("child", "scale", of_child))
     # The places of two vehicles may really be far apart, so large positions alone prove no unit.
-    is_certain = sample.is_arm or (len(units) == 1 and scale is not None)
+    is_certain = sample.has_target or (len(units) == 1 and scale is not None)
     examination = replace(examination, scale=scale)
     if is_scale_free and of_child != 1.0:
         units.pop()

@@ -18,7 +18,11 @@ from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.registry import TARGET_IMAGES
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import Calibration
-from hand_eye_calib.extras.stops.calibrate import calibrate_arm, calibrate_stops
+from hand_eye_calib.extras.stops.calibrate import (
+    calibrate_arm,
+    calibrate_hand_and_camera,
+    calibrate_stops,
+)
 from hand_eye_calib.extras.stops.robot_angles import read_robot_poses
 from hand_eye_calib.extras.stops.samples import read_arm_samples
 from hand_eye_calib.offline.cli.options import (
@@ -62,7 +66,7 @@ def solved(arguments: Namespace) -> tuple[Calibration, Document]:
 def _from_two_files(
     arguments: Namespace, config: CalibratorConfig, options: Options
 ) -> tuple[Calibration, Document]:
-    """Calibrate two sensors from two files whose rows belong together."""
+    """Calibrate an arm or two sensors from two files whose rows belong together."""
     if arguments.parent_angles:
         parent = _robot(arguments)
         (child,) = _read(arguments, arguments.paths[1:], options, STREAMS[1:])
@@ -70,7 +74,10 @@ def _from_two_files(
         parent, child = _read(arguments, arguments.paths, options)
     _require_equal(arguments.paths, len(parent), len(child))
     config = _measuring(config, {"parent": parent, "child": child})
-    result = calibrate_stops(parent.poses, child.poses, config)
+    if arguments.command == "arm" or arguments.setup:
+        result = calibrate_hand_and_camera(parent.poses, child.poses, config, arguments.setup)
+    else:
+        result = calibrate_stops(parent.poses, child.poses, config)
     return result, _inputs(arguments, len(parent), len(child))
 
 

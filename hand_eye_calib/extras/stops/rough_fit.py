@@ -45,9 +45,11 @@ class StopPoses:
     ----------
     parent, child : (N, 4, 4) arrays
         Poses of the parent sensor in its world, and of the child sensor in its own world. For an
-        arm: poses of the hand in the base, and of the target in the camera.
+        arm: poses of the hand in the base, and of the camera in the target.
     is_arm : bool
         True for an arm: the camera may be on the hand or beside the robot.
+    has_target : bool
+        True if the poses of the child are those of the target in the camera.
     has_positions : bool
         False if only the rotations are known.
     """
@@ -56,6 +58,7 @@ class StopPoses:
     child: FloatArray
     is_arm: bool = False
     has_positions: bool = True
+    has_target: bool = False
 
     def __len__(self) -> int:
         return len(self.parent)
@@ -79,7 +82,7 @@ class StopPoses:
         """Return stops of ``A X = Z B``, with mistakes undone and the child's lengths scaled."""
         A = _in_usual_convention(self.parent, mistakes.parent)
         B = _in_usual_convention(scaled(self.child, scale), mistakes.child)
-        if self.is_arm:
+        if self.has_target:
             B = se3.inverse(B)
         if mistakes.is_inverse:
             A = se3.inverse(A)

@@ -41,6 +41,12 @@ WORDS = {
         "invert this file: parent_invert poses for the parent, child_invert poses for the child",
         code="inverse",
     ),
+    "beside_or_inverse": FindingWords(
+        "these files fit a camera beside the robot, or one on the hand if a file has inverse poses",
+        "give setup beside; or, for a camera on the hand, child_invert poses if the second file "
+        "has the target in the camera, parent_invert poses if the first has the base in the hand",
+        code="inverse",
+    ),
     "ambiguous_stops": FindingWords(
         "two conventions explain these stops alike: {given}, or {other}",
         "look up the convention of both sources and give the options of the first, or",

@@ -20,7 +20,7 @@ WORDS = {
         "the wheels turn the other way than the sensor, if the sensor is upright",
         "exchange the columns of the left and the right wheel, or change the sign of the steering "
         "angle or of the speed; if the sensor really is upside down, confirm it: "
-        "--prior roll={roll}deg+/-10deg",
+        "prior.roll {roll}deg+/-10deg",
         "a steered wheel behind the axle, or z of the sensor that points down",
         severity=Severity.WARNING,
     ),
@@ -39,7 +39,7 @@ WORDS = {
     "unusual_radius": FindingWords(
         "a wheel radius of {radius:.4f} m is unusual",
         "give the speeds of the wheels in rad/s or m/s, or name the columns with their unit "
-        "(left_rpm); if the radius is right, confirm it: --nominal-radius {radius:.4f}",
+        "(left_rpm); if the radius is right, confirm it: nominal_radius {radius:.4f}",
         "speeds in rpm, degrees or ticks, or lengths of the sensor that are not metres",
         severity=Severity.WARNING,
     ),

@@ -2,10 +2,13 @@
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.base.spelling import Road
 from hand_eye_calib.core.base.text import angle, length
+from hand_eye_calib.core.results.records import NO_ACTION
 from hand_eye_calib.offline.cli import options
 from hand_eye_calib.offline.cli.options import (
     STREAMS,
@@ -42,9 +45,6 @@ most used options:
 
 {_EPILOG}"""
 
-# Codes of notes that the user can act on. All other notes are printed without advice.
-_NOTES_WITH_ADVICE = ("one_axis",)
-
 _HEADINGS = ("", "poses", "seconds", "per s", "longest gap", "path length", "rotation")
 
 
@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
     with waiting_for("checking the streams"):
         examined = examine(snapshot)
     repairs = [finding("disorder", text=text) for text in recording.repairs]
-    findings = gravest_first([*examined, *repairs])
+    findings = gravest_first([*map(_to_solve, examined), *repairs])
     streams = {
         stream: summarise(poses)
         for stream, poses in zip(STREAMS, snapshot.unpaired, strict=True)
@@ -95,6 +95,13 @@ def run(arguments: argparse.Namespace) -> int:
     if findings and findings[0].makes_unusable:
         return fail(findings[0], 1)
     return 0
+
+
+def _to_solve(finding: "Finding") -> "Finding":
+    """Return a finding with the options that a calibration uses to repair the streams."""
+    from hand_eye_calib.core.engine.run import options_to_solve
+
+    return replace(finding, options=options_to_solve(finding))
 
 
 class _Streams(NamedTuple):
@@ -181,11 +188,9 @@ def _finding_lines(findings: "Sequence[Finding]") -> Iterator[str]:
         if mark != "note":
             mark = mark.upper()
         yield f"{mark:<8} {finding.code:<17} {finding.stream}"
-        if mark == "note" and finding.code not in _NOTES_WITH_ADVICE:
-            yield from wrapped(f"{finding.what}; no action is needed", "    ", "    ")
+        advice = finding.advice_on(Road.TERMINAL)
+        if advice == NO_ACTION:
+            yield from wrapped(f"{finding.what}; {advice}", "    ", "    ")
             continue
-        advice = f"-> {finding.advice}"
-        if finding.options:
-            advice += f": {typed_options(finding.options.items())}"
-        for text in (finding.what, advice):
+        for text in (finding.what, f"-> {advice}"):
             yield from wrapped(text, "    ", "    ")

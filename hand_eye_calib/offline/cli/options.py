@@ -20,6 +20,7 @@ from typing import Any, NamedTuple, TypeVar
 import hand_eye_calib.core.base.config as config
 from hand_eye_calib.core.base.errors import ConfigError, InputError, printable
 from hand_eye_calib.core.base.option import Options, OptionValue, check_value, did_you_mean
+from hand_eye_calib.core.base.spelling import Road, spelled, spelled_options
 from hand_eye_calib.core.base.text import quantities
 from hand_eye_calib.formats.files import local_path
 
@@ -73,21 +74,12 @@ FILE_OPTIONS: dict[str, dict[str, Any]] = {
 # the messages.
 STAMPS = ("header", "receive")
 
-# Public names of all options that are translated in messages.
+# Names of options of the input that messages of readers contain.
 _INPUT_OPTIONS = (*FILE_OPTIONS, "pair_by", "stamps")
-_OPTIONS = {
-    *OPTION_FIELDS,
+_OPTIONS_OF_READERS = {
     *_INPUT_OPTIONS,
     *(f"{stream}_{name}" for stream in STREAMS for name in _INPUT_OPTIONS),
 }
-
-# Candidates for option names in a message: words in backticks; words with a dot or an underscore,
-# such as max_gap and prior.z; and scale before a value. Words in a path, after a dash or in quotes
-# are no candidates.
-_NAMES_IN_TEXT = re.compile(
-    r"`([\w.]+)`|(?<![\w./\\='-])([a-z]+(?:[._]+[a-z]+)+|scale(?= (?:none|auto|estimate\b|\d)))"
-    r"(?![\w/=-]|\.\w)( VALUE)?"
-)
 
 
 # ------------------------------------------------------------ what commands print
@@ -120,14 +112,7 @@ def flag(name: str) -> str:
 
 def typed_options(options: Iterable[tuple[str, object]]) -> str:
     """Return pairs of public option name and value as a user types them on the command line."""
-    return " ".join(_typed_option(name, value) for name, value in options)
-
-
-def _typed_option(name: str, value: object) -> str:
-    """Return an option and its value, such as ``--max-gap 0.2`` or ``--prior z=1.85+/-0.02``."""
-    if name.startswith("prior."):
-        return f"--prior {name.removeprefix('prior.')}={value}"
-    return f"--{flag(name)} {value}"
+    return spelled_options(options, Road.TERMINAL)
 
 
 def as_typed(text: str) -> str:
@@ -136,17 +121,7 @@ def as_typed(text: str) -> str:
     Messages of the engine contain public option names: ``raise max_gap`` becomes ``raise
     --max-gap``.
     """
-
-    def typed(match: re.Match[str]) -> str:
-        name = match[1] or match[2]
-        value = match[3] or ""
-        if name not in _OPTIONS:
-            return match[0]
-        if name.startswith("prior."):
-            return f"--prior {name.removeprefix('prior.')}{value.replace(' ', '=')}"
-        return f"--{flag(name)}{value}"
-
-    return _NAMES_IN_TEXT.sub(typed, text)
+    return spelled(text, Road.TERMINAL, _OPTIONS_OF_READERS)
 
 
 def note(*texts: object) -> None:
@@ -266,6 +241,8 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
         field = OPTION_FIELDS[name]
         meta = field.metadata
         unit = f" Unit: {meta['unit']}." if meta["unit"] else ""
+        if meta["unit"] == "rad":
+            unit = " Unit: rad, or typed as in 0.3deg."
         default = "" if field.default == "" else f" Default: {field.default}."
         value = "|".join([*meta["words"], flag(name).rpartition("-")[2].upper()])
         (group if name in _COMMON else rare).add_argument(

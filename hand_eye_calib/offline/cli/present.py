@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from hand_eye_calib.core.base.errors import ConfigError, printable
 from hand_eye_calib.core.base.plain import Document
+from hand_eye_calib.core.base.spelling import PLACEHOLDER, Road
 from hand_eye_calib.core.base.text import frame_name, listing
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, Verdict
 from hand_eye_calib.core.results.document import (
@@ -70,27 +71,33 @@ def deliver(
         calibration = _with_robot(calibration, arguments, bag)
     if arguments.label:
         inputs = inputs | {"labels": dict(arguments.label)}
-    if arguments.out:
-        from hand_eye_calib.formats import results
-
-        kept = results.keep_earlier_results(arguments.out)
-        path = results.save_result(calibration, arguments.out, inputs)
-        names = [results.XACRO_NAME, results.LAUNCH_NAME]
-        names += [file for name in calibration.parts for file in part(name).file_names]
-        beside = [name for name in names if path.with_name(name).exists()]
-        for_robots = f", {listing(beside)}" if beside else ""
-        note(f"wrote {path}{for_robots}{kept}")
+    written = _saved(calibration, arguments.out, inputs) if arguments.out else ""
     steps = () if arguments.json else next_steps(calibration, arguments, snapshot)
     document = calibration.to_dict() | {"inputs": inputs} if arguments.json else None
     try:
         print_result(as_lines(calibration, steps, arguments.verbose), document)
     # Write the report even if the program that reads stdout has closed it.
     finally:
+        if arguments.out:
+            note(written)
         if arguments.out and calibration.motion_residuals:
             from hand_eye_calib.offline.cli.reporting import write_report
 
             write_report(arguments.out, calibration, snapshot, inputs)
     return end([calibration])
+
+
+def _saved(calibration: Calibration, directory: Path, inputs: Document) -> str:
+    """Save a calibration, and return a note about the files."""
+    from hand_eye_calib.formats import results
+
+    kept = results.keep_earlier_results(directory)
+    path = results.save_result(calibration, directory, inputs)
+    names = [results.XACRO_NAME, results.LAUNCH_NAME]
+    names += [file for name in calibration.parts for file in part(name).file_names]
+    beside = [name for name in names if path.with_name(name).exists()]
+    for_robots = f", {listing(beside)}" if beside else ""
+    return f"wrote {path}{for_robots}{kept}"
 
 
 def _with_robot(
@@ -130,7 +137,7 @@ def end(calibrations: Sequence[Calibration]) -> int:
         if calibration.has_failed:
             reason = calibration.reasons[0]
             sensor = f"{calibration.child_frame}: " if len(calibrations) > 1 else ""
-            fail(f"{sensor}{reason.sentence}; do not use this result, {reason.what_to_do}")
+            fail(f"{sensor}{reason.sentence}; do not use this result, {reason.advice}")
     return gravest_code(map(exit_code, calibrations))
 
 
@@ -227,10 +234,7 @@ def verdict_lines(calibration: Calibration) -> Iterator[str]:
         # If the headline contains the sentence of the first reason, only the advice follows.
         if number or reason not in in_headline:
             yield from wrapped(reason.sentence, "- ", "  ")
-        advice = reason.what_to_do
-        if reason.options:
-            advice += f": {typed_options(reason.options.items())}"
-        yield from wrapped(advice, "  -> ", "     ")
+        yield from wrapped(reason.advice_on(Road.TERMINAL), "  -> ", "     ")
     for warning in calibration.warnings:
         yield from wrapped(f"Note: {warning}", "", "  ")
 
@@ -264,7 +268,8 @@ def next_steps(
 
             if motion := what_is_missing(excitation(snapshot.pose_pairs), calibration):
                 steps.append(motion)
-        extra += [f"--prior {axis}=VALUE+/-SIGMA" for axis in calibration.hidden[:3]]
+        priors = {f"prior.{axis}": PLACEHOLDER for axis in calibration.hidden}
+        extra += [typed_options([prior]) for prior in priors.items()]
     steps += advice_of(calibration)
     if extra:
         typed = shlex.join(arguments.typed)

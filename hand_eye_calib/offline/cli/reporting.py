@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hand_eye_calib.core.base.plain import Document
+from hand_eye_calib.core.base.spelling import Road
 from hand_eye_calib.core.engine.session_result import SessionResult
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.formats.results import save_text
@@ -18,7 +19,11 @@ REPORT = "report.html"
 
 
 def write_report(
-    directory: Path, calibration: Calibration, snapshot: "Snapshot | None", inputs: Document
+    directory: Path,
+    calibration: Calibration,
+    snapshot: "Snapshot | None",
+    inputs: Document,
+    road: Road = Road.TERMINAL,
 ) -> None:
     """Write the report of a result into a directory, and print its path.
 
@@ -30,10 +35,12 @@ def write_report(
         Poses and options of the result; None for the stops of an arm.
     inputs : dict
         Origin of the data, such as paths and topics, in plain values.
+    road : Road
+        Road of the user, which has its own spelling of options.
     """
     from hand_eye_calib.offline.report.report import render
 
-    write_page(directory, lambda: render(calibration, snapshot, inputs))
+    write_page(directory, lambda: render(calibration, snapshot, inputs, road))
 
 
 def write_page(directory: Path, page: Callable[[], str]) -> None:
@@ -57,4 +64,4 @@ def write_session_report(directory: Path, session: SessionResult) -> None:
     checked = check(session.snapshot, session.calibration)
     calibration = replace(session.calibration, findings=checked.findings)
     save_result(calibration, directory, session.inputs)
-    write_report(directory, calibration, session.snapshot, session.inputs)
+    write_report(directory, calibration, session.snapshot, session.inputs, Road.NODE)

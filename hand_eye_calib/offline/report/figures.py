@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.text import amount, angle, length, listing, share
-from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.core.results.calibration import Calibration, Verdict
 from hand_eye_calib.core.results.records import Residuals
 from hand_eye_calib.offline.report.evidence import Evidence, StreamView
 from hand_eye_calib.offline.report.style import (
@@ -191,14 +191,14 @@ def _figure_of_paths(calibration: Calibration, evidence: Evidence) -> Drawn:
     figure.legend(loc="lower center", ncols=3, borderaxespad=0)
     distances_m = np.linalg.norm(evidence.parent - evidence.child, axis=1)
     farthest_s = evidence.times_s[int(np.argmax(distances_m))]
-    path_m = float(np.linalg.norm(np.diff(evidence.parent, axis=0), axis=1).sum())
     caption = (
-        f"The path of {own}, {length(path_m)} long, and the same path computed from the poses of "
+        f"The path of {own}, and the same path computed from the poses of "
         f"{other} and the result. Half of the time they are within "
         f"{length(float(np.median(distances_m)))} of each other, and at most "
-        f"{length(distances_m.max())} apart, at {farthest_s * factor:.1f} {unit}. "
-        "That is mostly drift and jumps of the odometry, not an error of the result."
+        f"{length(distances_m.max())} apart, at {farthest_s * factor:.1f} {unit}."
     )
+    if calibration.verdict is not Verdict.DO_NOT_USE:
+        caption += " That is mostly drift and jumps of the odometry, not an error of the result."
     return as_drawn(figure, "trajectories", "Both trajectories, aligned", caption)
 
 

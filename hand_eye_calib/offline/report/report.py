@@ -15,6 +15,7 @@ from hand_eye_calib.core.base import text
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import printable
 from hand_eye_calib.core.base.plain import Document
+from hand_eye_calib.core.base.spelling import Road, spelled, spelled_options
 from hand_eye_calib.core.base.version import version_of
 from hand_eye_calib.core.engine.snapshot import Snapshot
 from hand_eye_calib.core.geometry import se3
@@ -47,12 +48,12 @@ TONES = {
     Verdict.DO_NOT_USE.value: "bad",
 }
 
-# Explanation of each verdict on an axis.
+# Word and explanation of each verdict on an axis.
 _WORDS = {
-    "observed": "determined by the motion",
-    "weak": "determined, but not well",
-    "unobservable": "do not use this value",
-    "prior": "mostly from a prior or the ground",
+    "observed": ("observed", "determined by the motion"),
+    "weak": ("weak", "determined, but not well"),
+    "unobservable": ("unknown", "do not use this value"),
+    "prior": ("prior", "mostly from a prior or the ground"),
 }
 _AXIS_NAMES = {
     "x": "along x",
@@ -76,7 +77,7 @@ _TEMPLATES = jinja2.Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_TEMPLATES.filters |= {"number": text.fixed, "printable": printable}
+_TEMPLATES.filters |= {"number": text.fixed, "printable": printable, "spelled": spelled}
 _TEMPLATES.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
 _TEMPLATES.globals |= dict(
     amount=text.amount, change=text.change, counted=text.counted, capital=text.capital
@@ -90,7 +91,14 @@ def _template(path: Path) -> jinja2.Template:
     return _TEMPLATES.from_string(path.read_text(encoding="utf-8"))
 
 
-def page(template: Path, tone: str, verdict: str, sentence: str, **values: Any) -> str:
+def page(
+    template: Path,
+    tone: str,
+    verdict: str,
+    sentence: str,
+    road: Road = Road.TERMINAL,
+    **values: Any,
+) -> str:
     """Return a page as HTML. Every page begins with a verdict.
 
     Parameters
@@ -102,6 +110,8 @@ def page(template: Path, tone: str, verdict: str, sentence: str, **values: Any) 
         One or two words.
     sentence : str
         The verdict in a sentence.
+    road : Road
+        Road of the user, which has its own spelling of options.
     **values
         Other variables of the template.
     """
@@ -111,12 +121,16 @@ def page(template: Path, tone: str, verdict: str, sentence: str, **values: Any) 
         mark=MARKS[tone],
         marks=MARKS,
         verdict=verdict,
-        sentence=text.capital(sentence),
+        sentence=text.capital(spelled(sentence, road)),
+        road=road,
     )
 
 
 def render(
-    calibration: Calibration, snapshot: Snapshot | None, inputs: Document | None = None
+    calibration: Calibration,
+    snapshot: Snapshot | None,
+    inputs: Document | None = None,
+    road: Road = Road.TERMINAL,
 ) -> str:
     """Return the report of a result as HTML.
 
@@ -127,6 +141,8 @@ def render(
         Poses and options of the result; None for the stops of an arm.
     inputs : dict, optional
         Origin of the data, such as paths and topics, in plain values.
+    road : Road
+        Road of the user, which has its own spelling of options.
     """
     inputs = inputs or {}
     command = calibration.static_transform_command()
@@ -150,6 +166,7 @@ def render(
         TONES[calibration.verdict.value],
         calibration.verdict.value,
         calibration.sentence,
+        road,
         calibration=calibration,
         at_distance=_at_distance(calibration),
         document=calibration.to_dict(),
@@ -164,7 +181,7 @@ def render(
         parts_of=parts_of_sigmas,
         angles_of=partial(angles_in_words, result=calibration),
         axes=list(_axes(calibration)),
-        allowance=allowance_in_words(calibration),
+        allowance=spelled(allowance_in_words(calibration), road),
         facts=facts_of(calibration, "stops"),
         advice=advice,
         command=command,
@@ -173,7 +190,7 @@ def render(
         reasons=shown(calibration.reasons),
         figures=figures_of(calibration, evidence),
         top_figures=_TOP_FIGURES,
-        **_data(calibration, snapshot, evidence, inputs),
+        **_data(calibration, snapshot, evidence, inputs, road),
     )
 
 
@@ -184,7 +201,7 @@ def render_brief(calibration: Calibration) -> str:
         calibration=calibration,
         numbers=printed_numbers(transform, calibration.out_of_reach, "±"),
         parts=parts_of_sigmas(transform),
-        allowance=allowance_in_words(calibration),
+        allowance=spelled(allowance_in_words(calibration), Road.PYTHON),
         views=figure_of_views([calibration]),
     )
 
@@ -218,9 +235,10 @@ def _sensor_name(frame: str, origin: Document) -> str:
 def _at_distance(calibration: Calibration) -> str:
     """Return a sentence about the position error of an object that the child sensor measures.
 
-    The sentence is empty if a standard deviation is unknown.
+    The sentence is empty if a standard deviation is unknown, or if the result must not be used.
     """
-    if not np.isfinite(calibration.sigmas).all():
+    is_bad = calibration.verdict is Verdict.DO_NOT_USE
+    if is_bad or not np.isfinite(calibration.sigmas).all():
         return ""
     # The objects of an arm are near, and its stops have no errors of an odometry.
     are_stops = calibration.reference == "stops"
@@ -261,8 +279,8 @@ class AxisRow(NamedTuple):
         Name of the axis, such as "roll", and its title, such as "about x (roll)".
     sigma : str
         Standard deviation with its unit.
-    verdict, words : str
-        Verdict on the axis, and its explanation.
+    verdict, word, words : str
+        Verdict on the axis, its printed word, and its explanation.
     bar : float
         Length of the bar of the standard deviation (per cent).
     measured : float
@@ -273,6 +291,7 @@ class AxisRow(NamedTuple):
     title: str
     sigma: str
     verdict: str
+    word: str
     words: str
     bar: float
     measured: float
@@ -290,7 +309,8 @@ def _axes(calibration: Calibration) -> Iterable[AxisRow]:
                 _AXIS_NAMES[dof.name],
                 text.amount(dof.name, dof.sigma),
                 dof.verdict.value,
-                _WORDS["unobservable" if is_bad else dof.verdict.value],
+                _WORDS[dof.verdict.value][0],
+                _WORDS["unobservable" if is_bad else dof.verdict.value][1],
                 _bar(dof.sigma / target),
                 _bar(measured / target),
             )
@@ -307,12 +327,16 @@ def _bar(ratio: float) -> float:
 
 
 def _data(
-    calibration: Calibration, snapshot: Snapshot | None, evidence: Evidence | None, inputs: Document
+    calibration: Calibration,
+    snapshot: Snapshot | None,
+    evidence: Evidence | None,
+    inputs: Document,
+    road: Road,
 ) -> Document:
     """Return the variables of the section "Data and solution" of the template."""
     defaults = CalibratorConfig().to_options()
     options = snapshot.config.to_options() if snapshot else defaults
-    changed = [f"{name} {value}" for name, value in options.items() if value != defaults[name]]
+    changed = [(name, value) for name, value in options.items() if value != defaults[name]]
     kind = "stops"
     if evidence:
         kind = f"synchronised pose pairs over {text.duration(evidence.times_s[-1])}"
@@ -327,7 +351,7 @@ def _data(
         "summary": {
             **summary(calibration),
             "Poses": f"{calibration.n_poses:,} {kind}",
-            "Options": ", ".join(changed) or "defaults",
+            "Options": spelled_options(changed, road) or "defaults",
             "Written": f"{now}, hand_eye_calib {version_of()}; extrinsic.yaml has the rest",
         },
         "streams": rows,

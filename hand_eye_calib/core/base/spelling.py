@@ -1,0 +1,140 @@
+"""Spelling of options in messages: on the command line, in Python, and in files and parameters.
+
+The engine writes options by their public names, such as ``prior.z 1.85+/-0.02``. A user of the
+command line types ``--prior z=1.85+/-0.02``, a Python program has ``prior={"z": (1.85, 0.02)}``.
+"""
+
+import re
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from enum import Enum
+from typing import TypeAlias
+
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.base.option import check_value
+
+Pairs: TypeAlias = Iterable[tuple[str, object]]
+
+
+class Road(Enum):
+    """Way on which a user gives options: command line, Python, or YAML files and parameters."""
+
+    TERMINAL = "terminal"
+    PYTHON = "python"
+    NODE = "node"
+
+
+#: Value of a prior that the user has to measure.
+PLACEHOLDER = "VALUE+/-SIGMA"
+
+_FIELDS = CalibratorConfig.by_name()
+# Arguments of extras that messages of the engine name, with their values.
+_CHOICES = {"ground": ("auto", "off"), "setup": ("hand", "beside")}
+
+# Candidates for an option in a message, with a possible value: a word in backticks; a word with a
+# dot or an underscore, such as max_gap and prior.z; and scale, ground and setup before a value.
+# Words in a path, after a dash or in quotes are no candidates.
+_OPTION_IN_TEXT = re.compile(
+    r"(?:`(?P<quoted>[\w.]+)`|(?<![\w./\\='-])(?P<name>[a-z]+\d?(?:[._]+[a-z]+)+|"
+    r"scale(?= (?:none|auto|estimate\b|\d))|ground(?= (?:auto|off)\b)|setup(?= (?:hand|beside)\b)))"
+    r"(?![\w/=-]|\.\w)(?: (?P<value>[^\s,;:()]*[^\s,;:().]))?"
+)
+# A prior in metres or radians.
+_PLAIN_PRIOR = re.compile(r"(-?[\d.]+)\+/-([\d.]+)")
+
+
+def spelled(text: str, road: Road, others: Iterable[str] = ()) -> str:
+    """Return a message of the engine with its options as a user of the road spells them.
+
+    ``others`` are names of further options of the road that messages contain.
+    """
+
+    def option(match: re.Match[str]) -> str:
+        name = match["quoted"] or match["name"]
+        value = match["value"]
+        if name not in _FIELDS and name not in _CHOICES and name not in others:
+            return match[0]
+        if value is None:
+            return _name_alone(name, road)
+        if _is_value(name, value):
+            return spelled_options([(name, value)], road)
+        return f"{_name_alone(name, road)} {value}"
+
+    return text if road is Road.NODE else _OPTION_IN_TEXT.sub(option, text)
+
+
+def spelled_options(options: Pairs, road: Road) -> str:
+    """Return pairs of public option name and value as a user of the road gives them."""
+    if road is Road.TERMINAL:
+        return " ".join(_typed(name, value) for name, value in options)
+    if road is Road.NODE:
+        return ", ".join(f"{name} {value}" for name, value in options)
+    arguments = []
+    priors = []
+    for name, value in options:
+        group, _, axis = name.partition(".")
+        if group == "prior":
+            priors.append(f'"{axis}": {_prior_of_python(str(value))}')
+        else:
+            arguments.append(f"{_name_alone(name, road)}={_value_of_python(value)}")
+    if priors:
+        arguments.append(f"prior={{{', '.join(priors)}}}")
+    return ", ".join(arguments)
+
+
+def with_options(advice: str, options: Mapping[str, object], road: Road) -> str:
+    """Return an advice with the options that it needs, as a user of the road gives them."""
+    text = spelled(advice, road)
+    return f"{text}: {spelled_options(options.items(), road)}" if options else text
+
+
+def _is_value(name: str, text: str) -> bool:
+    """Return whether a word behind an option in a message is the value of the option."""
+    if text == PLACEHOLDER or name not in _FIELDS:
+        return name not in _CHOICES or text in _CHOICES[name]
+    field = _FIELDS[name]
+    is_text = isinstance(field.default, str)
+    if is_text and not any(field.metadata[form] for form in ("parse", "choices", "words")):
+        # Any text may be the name of a frame.
+        return False
+    value: float | str = text
+    with suppress(ValueError):
+        value = float(text)
+    try:
+        check_value(field, int(value) if type(field.default) is int else value)
+    except (ConfigError, ValueError):
+        return False
+    return True
+
+
+def _typed(name: str, value: object) -> str:
+    """Return an option and its value, such as ``--max-gap 0.2`` or ``--prior z=1.85+/-0.02``."""
+    typed = _name_alone(name, Road.TERMINAL)
+    return f"{typed}={value}" if name.startswith("prior.") else f"{typed} {value}"
+
+
+def _name_alone(name: str, road: Road) -> str:
+    """Return an option without value, such as ``--max-gap``, ``--prior z`` or ``prior["z"]``."""
+    group, _, axis = name.partition(".")
+    if road is Road.TERMINAL:
+        return f"--prior {axis}" if group == "prior" else f"--{name}".translate(_DASHES)
+    return f'prior["{axis}"]' if group == "prior" else name.replace(".", "_")
+
+
+_DASHES = str.maketrans("._", "--")
+
+
+def _value_of_python(value: object) -> str:
+    """Return the Python notation of a value that may be the text of a number."""
+    with suppress(ValueError):
+        return f"{float(str(value)):.12g}"
+    return f'"{value}"' if isinstance(value, str) else str(value)
+
+
+def _prior_of_python(text: str) -> str:
+    """Return the Python notation of a prior: a pair of numbers, or a text with units."""
+    if text == PLACEHOLDER:
+        return "(VALUE, SIGMA)"
+    plain = _PLAIN_PRIOR.fullmatch(text)
+    return f"({plain[1]}, {plain[2]})" if plain else f'"{text}"'
