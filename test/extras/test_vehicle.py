@@ -92,10 +92,10 @@ def test_curves_to_one_side_make_roll_uncertain():
     assert (errors < 3.3 * result.sigmas[[0, 1, 3, 4, 5]]).all()
 
 
-@pytest.mark.parametrize("model", PARAMETER_TOLERANCE)
+@pytest.mark.parametrize("model", [*PARAMETER_TOLERANCE, ""])
 def test_spinning_on_the_spot_is_refused(model):
-    drive = machine(model, "spin")
-    result = hec.calibrate_vehicle(drive.sensor, drive.wheels)
+    drive = machine(model or "wheels", "spin")
+    result = hec.calibrate_vehicle(drive.sensor, drive.wheels if model else None)
     assert result.verdict.value == "DO NOT USE"
     assert [found.code for found in result.findings] == ["one_motion"]
 
