@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.formats.trajectory_files.file_options import FileOptions
 from hand_eye_calib.formats.trajectory_files.reading import (
-    FileOptions,
     read_trajectory,
     read_trajectory_files,
 )

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.formats.trajectory_files.reading import AUTO, FileOptions, read_trajectory_files
+from hand_eye_calib.formats.trajectory_files.file_options import AUTO, FileOptions
+from hand_eye_calib.formats.trajectory_files.reading import read_trajectory_files
 
 N = 60
 START_NS = 1_700_000_000_250_000_000

@@ -20,7 +20,7 @@ import hand_eye_calib as hec
 from hand_eye_calib.core.base.errors import InputError, MissingDependencyError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
-from hand_eye_calib.formats.trajectory_files.reading import AUTO
+from hand_eye_calib.formats.trajectory_files.file_options import AUTO
 from hand_eye_calib.offline.cli.main import main
 
 N = 40

@@ -18,7 +18,7 @@ from motions import (
 from hand_eye_calib.core.checks.check import check_streams
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.formats.geodetic import axes_of_places
-from hand_eye_calib.formats.trajectory_files.reading import AUTO
+from hand_eye_calib.formats.trajectory_files.file_options import AUTO
 from hand_eye_calib.formats.trajectory_files.table import write_trajectory
 
 # Place on the earth (m from its centre).

@@ -11,7 +11,8 @@ import hand_eye_calib as hec
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.formats.geodetic import LocalOrigin
-from hand_eye_calib.formats.trajectory_files.reading import AUTO, FileOptions, read_trajectory_files
+from hand_eye_calib.formats.trajectory_files.file_options import AUTO, FileOptions
+from hand_eye_calib.formats.trajectory_files.reading import read_trajectory_files
 from hand_eye_calib.offline.cli.main import main
 
 SCALAR_FIRST = [3, 0, 1, 2]

@@ -14,7 +14,8 @@ from hand_eye_calib.core.checks.findings import Severity
 from hand_eye_calib.core.checks.streams import check_lengths
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import DofVerdict, SolveStatus, Verdict
-from hand_eye_calib.formats.trajectory_files.reading import AUTO, FileOptions, read_trajectory_files
+from hand_eye_calib.formats.trajectory_files.file_options import AUTO, FileOptions
+from hand_eye_calib.formats.trajectory_files.reading import read_trajectory_files
 from hand_eye_calib.offline.calibrate import calibrate
 from reproduction.independent import shrimp_sensors
 from reproduction.recordings import between

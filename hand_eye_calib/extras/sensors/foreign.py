@@ -34,7 +34,7 @@ from hand_eye_calib.formats.trajectory_files.columns import (
     ROTATION_VECTOR,
 )
 from hand_eye_calib.formats.trajectory_files.dates import DAY_S, GPS_EPOCH_S, GPS_TIME, WEEK_S
-from hand_eye_calib.formats.trajectory_files.reading import FileOptions
+from hand_eye_calib.formats.trajectory_files.file_options import FileOptions
 from hand_eye_calib.formats.trajectory_files.table import Table, columns_of_array
 
 # Names of the columns of a pose.

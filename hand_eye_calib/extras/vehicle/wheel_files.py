@@ -17,7 +17,7 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.extras.vehicle.wheels import UNIT_TRACK, trajectory_of
 from hand_eye_calib.formats.files import LONGEST_LINE
-from hand_eye_calib.formats.trajectory_files.reading import FileOptions
+from hand_eye_calib.formats.trajectory_files.file_options import FileOptions
 from hand_eye_calib.formats.trajectory_files.stamps import stamps_in_ns
 from hand_eye_calib.formats.trajectory_files.table import Table
 

@@ -27,7 +27,7 @@ from hand_eye_calib.offline.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from hand_eye_calib.formats.trajectory_files.reading import FileOptions
+    from hand_eye_calib.formats.trajectory_files.file_options import FileOptions
 
 # Options that only the method dnlo uses.
 _OPTIONS_OF_DNLO = ("threshold", "min_inlier_fraction")
@@ -233,7 +233,7 @@ def _refuse_options_of_two_files(arguments: Namespace) -> None:
 
 def _options_of_file(arguments: Namespace, stream: str, options: Options) -> "FileOptions":
     """Return how to read the file of a stream; ``stream`` is empty with three files or more."""
-    from hand_eye_calib.formats.trajectory_files.reading import FileOptions
+    from hand_eye_calib.formats.trajectory_files.file_options import FileOptions
 
     settings: dict[str, Any] = {"format": "auto"}
     for name in (*FILE_OPTIONS, "pair_by"):
