@@ -279,7 +279,8 @@ def _span_of_noise_s(fit: SimilarityFit, twists: FloatArray) -> float:
     """Return the half span (s) of velocities that noise requires, from velocities (M, 6)."""
     squared_rates = (twists[:, 3:] ** 2).sum(axis=1)
     rms_rate = float(np.sqrt(np.mean(squared_rates)))
-    return min(_SPAN_OF_NOISE * fit.sigma_rotation / max(rms_rate, 1e-9), _MAX_SPAN_S)
+    span_s = _SPAN_OF_NOISE * fit.sigma_rotation / max(rms_rate, 1e-9)
+    return min(span_s, _MAX_SPAN_S)
 
 
 def _fit_of(

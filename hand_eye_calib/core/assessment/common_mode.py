@@ -50,7 +50,8 @@ def common_mode_floor(speed_m_s: float = 0.0) -> FloatArray:
         Covariance of xi = (rho, phi), in the child sensor's frame.
     """
     translation = FLOOR_TRANSLATION**2 + (FLOOR_TRAVEL_S * speed_m_s) ** 2
-    return np.diag(np.repeat([translation, FLOOR_ROTATION**2], 3))
+    rotation = FLOOR_ROTATION**2
+    return np.diag(np.repeat([translation, rotation], 3))
 
 
 def usual_speed(stamps_ns: IntArray, positions: FloatArray) -> float:

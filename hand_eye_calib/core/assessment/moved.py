@@ -96,7 +96,8 @@ def scatter_of_recordings(covariance: FloatArray) -> FloatArray:
     """
     variances = np.linalg.eigvalsh(covariance[:3, :3])
     is_vehicle = variances[2] > _VEHICLE_SIGMA_RATIO**2 * variances[1]
-    return np.diag((_SCATTER_OF_VEHICLES if is_vehicle else _SCATTER_IN_HAND) ** 2)
+    sigmas = _SCATTER_OF_VEHICLES if is_vehicle else _SCATTER_IN_HAND
+    return np.diag(sigmas**2)
 
 
 def shift_covariance(metres: float = _SHIFT_M, radians: float = _SHIFT_RAD) -> FloatArray:

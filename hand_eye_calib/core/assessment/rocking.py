@@ -94,7 +94,8 @@ def _products(rotations: FloatArray, baseline: int) -> FloatArray:
 
 def _turning_axis(rotations: FloatArray) -> FloatArray | None:
     """Return the axis (3,) in the sensor's frame that nearly all rotation is about, or None."""
-    powers, directions = np.linalg.eigh(_products(rotations, len(rotations) // 10))
+    products = _products(rotations, len(rotations) // 10)
+    powers, directions = np.linalg.eigh(products)
     is_single = powers[0] < _SHARE_OF_TILT**2 * powers[2]
     return directions[:, 0] if is_single else None
 

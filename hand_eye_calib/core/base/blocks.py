@@ -76,7 +76,8 @@ class Blocks:
 
     def before(self, cuts: IntArray) -> FloatArray:
         """Return the sums (C, ...) of the blocks before each of the indices ``cuts`` (C,), >= 1."""
-        return np.cumsum(self.sums, axis=0)[cuts - 1]
+        sums_from_start = np.cumsum(self.sums, axis=0)
+        return sums_from_start[cuts - 1]
 
     def since(self, cuts: IntArray) -> FloatArray:
         """Return the sums (C, ...) of the blocks from each of the indices ``cuts`` (C,) on."""

@@ -197,7 +197,8 @@ class _Regressors:
 
     def _between(self, perturbations: FloatArray) -> FloatArray:
         """Return the change (K, 6, m) of motions by perturbations (N, 6, m) of poses."""
-        return perturbations[self._end] - self._to_end @ perturbations[self._start]
+        at_start = self._to_end @ perturbations[self._start]
+        return perturbations[self._end] - at_start
 
     def usual_errors(self) -> FloatArray:
         """Return the regressors (K, 6, 10) of errors that are no filter.
@@ -218,7 +219,8 @@ class _Regressors:
         for displacements in (se3.translation_of(self._poses), of_child, of_parent):
             translations = se3.times(to_child, displacements)
             errors.append(np.concatenate([translations, np.zeros_like(translations)], axis=1))
-        return np.concatenate([mount, self._between(np.stack(errors, axis=2))], axis=2)
+        of_motions = self._between(np.stack(errors, axis=2))
+        return np.concatenate([mount, of_motions], axis=2)
 
     def filtered(self, time_constant_s: float) -> FloatArray:
         """Return the regressors (K, 6, 6) of D for a filter of a time constant (s)."""
@@ -275,7 +277,8 @@ class _Differences:
         table = _table(rows, weights)
         weighted = rows * weights[:, None, None]
         cost = _cost(table, range(self._n_usual + 6))
-        share = 1.0 - cost / max(_cost(table, range(self._n_usual)), 1e-300)
+        cost_without_filter = _cost(table, range(self._n_usual))
+        share = 1.0 - cost / max(cost_without_filter, 1e-300)
         return _Regression(time_constant_s, weighted, share)
 
     def fit(self, regression: _Regression) -> _Fit:

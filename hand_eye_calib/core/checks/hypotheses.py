@@ -237,7 +237,8 @@ class Explanation:
     def complexity(self) -> tuple[int, int]:
         """Key that sorts explanations, the simplest first. An odd scale is one more mistake."""
         n_mistakes, of_streams = self.hypothesis.complexity
-        return n_mistakes + int(abs(np.log(self.fit.scale)) > _ODD_SCALE), of_streams
+        has_odd_scale = abs(np.log(self.fit.scale)) > _ODD_SCALE
+        return n_mistakes + int(has_odd_scale), of_streams
 
 
 _MIRROR = -np.eye(3)

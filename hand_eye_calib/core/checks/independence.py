@@ -136,7 +136,9 @@ def _doubt(text: str, severity: Severity | None = None, **evidence: float) -> Fi
 def _within(computed: Trajectory, source: Trajectory) -> IntArray:
     """Return the indices of poses of ``computed`` between first and last stamp of ``source``."""
     first_ns, last_ns = source.stamps_ns[[0, -1]]
-    return np.flatnonzero((computed.stamps_ns >= first_ns) & (computed.stamps_ns <= last_ns))
+    stamps_ns = computed.stamps_ns
+    is_within = (stamps_ns >= first_ns) & (stamps_ns <= last_ns)
+    return np.flatnonzero(is_within)
 
 
 def _second_half(computed: Trajectory, source: Trajectory) -> Trajectory:

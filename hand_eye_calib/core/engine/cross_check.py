@@ -97,7 +97,9 @@ def _unconfirmed(result: Calibration, others: Sequence[Assessment]) -> BoolArray
     if len(others) < _MIN_OTHERS or METHODS[result.method].uses_reference:
         return np.zeros(len(AXES), dtype=bool)
     of_others = np.array([other.sigmas for other in others])
-    return np.isfinite(result.sigmas_measured) & np.isinf(of_others).all(axis=0)
+    is_known = np.isfinite(result.sigmas_measured)
+    is_known_to_none = np.isinf(of_others).all(axis=0)
+    return is_known & is_known_to_none
 
 
 def answers_of_whole(result: Calibration, pose_pairs: PosePairs) -> tuple[Assessment, ...]:

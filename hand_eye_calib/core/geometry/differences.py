@@ -28,7 +28,8 @@ class Stencil(NamedTuple):
     @property
     def step_s(self) -> FloatArray:
         """Duration (N, 1) of a step."""
-        return np.maximum(self.spans_s / 4.0, 1e-9)[:, None]
+        steps_s = np.maximum(self.spans_s / 4.0, 1e-9)
+        return steps_s[:, None]
 
 
 def stencil(stamps_s: FloatArray, step: int) -> Stencil:
@@ -53,7 +54,8 @@ def path_derivatives(
     before_2, before, after, after_2, _ = around
     velocities = (path[after] - path[before]) / (2.0 * step_s)
     bends = path[after_2] - path[after] - path[before] + path[before_2]
-    return velocities, bends / (3.0 * step_s**2)
+    accelerations = bends / (3.0 * step_s**2)
+    return velocities, accelerations
 
 
 def rotations_around(

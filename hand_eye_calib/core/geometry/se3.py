@@ -199,7 +199,9 @@ def quat_log(quat_xyzw: FloatArray) -> FloatArray:
     # Sine of half the angle, times the length of the quaternion.
     sine = np.sqrt(np.einsum("ni,ni->n", vector, vector))
     angle = np.copysign(2.0, scalar) * np.arctan2(sine, np.abs(scalar))
-    return vector * (angle / np.where(sine > 0.0, sine, 1.0))[:, None]
+    divisors = np.where(sine > 0.0, sine, 1.0)
+    ratios = angle / divisors
+    return vector * ratios[:, None]
 
 
 def _scaled_quats(rotations: FloatArray) -> FloatArray:

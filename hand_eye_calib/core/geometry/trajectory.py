@@ -543,7 +543,9 @@ def corner_corrections(
     """
     at_start = changes[start]
     at_end = changes[start + 1]
-    bend = ((2.0 - fraction)[:, None] * at_start + (1.0 + fraction)[:, None] * at_end) / 3.0
+    share_of_start = (2.0 - fraction)[:, None]
+    share_of_end = (1.0 + fraction)[:, None]
+    bend = (share_of_start * at_start + share_of_end * at_end) / 3.0
     interval_s = np.diff(stamps_ns)[start] * 1e-9
     # Double integral of a constant second derivative that is zero at both ends of the interval.
     half_square_s2 = 0.5 * fraction * (1.0 - fraction) * interval_s**2

@@ -211,7 +211,8 @@ class Result:
     @property
     def rpy_deg(self) -> FloatArray:
         """(3,) array: roll, pitch and yaw about fixed axes, as in URDF, degrees."""
-        return np.degrees(se3.rotation_to_rpy(se3.rotation_of(self.T_parent_child)))
+        rotation = se3.rotation_of(self.T_parent_child)
+        return np.degrees(se3.rotation_to_rpy(rotation))
 
     @property
     def T_child_parent(self) -> FloatArray:
@@ -221,7 +222,9 @@ class Result:
     @property
     def T_base_child(self) -> FloatArray | None:
         """(4, 4) array: pose of the child sensor in ``base_frame``; None without one."""
-        return None if self.T_base_parent is None else self.T_base_parent @ self.T_parent_child
+        if self.T_base_parent is None:
+            return None
+        return self.T_base_parent @ self.T_parent_child
 
     @property
     def mounting(self) -> tuple[str, FloatArray]:

@@ -139,8 +139,10 @@ def residual_rows(pairs: MotionPairs) -> FloatArray:
     ``x = (vec R, t, 1)`` with row-major vec.
     """
     rows = np.zeros((len(pairs), 3, quadratic_form.DIMENSION))
+    of_child = -se3.translation_of(pairs.Ts_childi_childj)
     for axis in range(3):
-        rows[:, axis, 3 * axis : 3 * axis + 3] = -se3.translation_of(pairs.Ts_childi_childj)
+        first = 3 * axis
+        rows[:, axis, first : first + 3] = of_child
     rows[:, :, 9:12] = se3.rotation_of(pairs.Ts_parenti_parentj) - np.eye(3)
     rows[:, :, 12] = se3.translation_of(pairs.Ts_parenti_parentj)
     return rows.reshape(-1, quadratic_form.DIMENSION)

@@ -112,4 +112,6 @@ def _rodrigues(rotation_vector: _Expression) -> _Expression:
     """Return the expression (3, 3) of the rotation matrix of a rotation vector."""
     angle = casadi.norm_2(rotation_vector)
     cross = casadi.skew(rotation_vector / angle)
-    return casadi.SX.eye(3) + casadi.sin(angle) * cross + (1 - casadi.cos(angle)) * cross @ cross
+    first_order = casadi.sin(angle) * cross
+    second_order = (1 - casadi.cos(angle)) * cross @ cross
+    return casadi.SX.eye(3) + first_order + second_order

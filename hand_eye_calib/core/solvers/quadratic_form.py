@@ -183,7 +183,8 @@ def monomials(T_parent_child: FloatArray) -> FloatArray:
     """
     entries = T_parent_child.reshape((*T_parent_child.shape[:-2], 16))
     first = entries.take(_X_IN_T[_ROWS], axis=-1)
-    return first * (entries.take(_X_IN_T[_COLUMNS], axis=-1) * _MULTIPLICITY)
+    second = entries.take(_X_IN_T[_COLUMNS], axis=-1)
+    return first * (second * _MULTIPLICITY)
 
 
 def expand(condensed: FloatArray) -> FloatArray:

@@ -214,7 +214,8 @@ def _components(pairs: MotionPairs, T_parent_child: FloatArray) -> tuple[_Compon
 def _scales(components: tuple[_Component, _Component]) -> FloatArray:
     """Return the standard deviations (2,) of both components, from medians of residuals."""
     medians = [median(np.abs(component.residuals).ravel()) for component in components]
-    return np.maximum(np.array(medians) / MEDIAN_NORMAL, _MIN_SCALE)
+    sigmas = np.array(medians) / MEDIAN_NORMAL
+    return np.maximum(sigmas, _MIN_SCALE)
 
 
 def _weights(components: tuple[_Component, _Component], scales: FloatArray) -> FloatArray:
