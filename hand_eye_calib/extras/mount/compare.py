@@ -29,16 +29,8 @@ def compare_digests(arguments: argparse.Namespace) -> int | None:
         If the arguments name an installed transform, because the digests already contain it.
     """
     paths = [Path(path) for path in arguments.results]
-    # With --fleet, each path is a vehicle; otherwise all paths are those of one mount.
-    groups = [[path] for path in paths] if arguments.fleet else [paths]
-    digests = [read_digests(group) for group in groups]
-    histories = [History.of(sessions) for sessions in digests if sessions is not None]
-    if len(histories) < len(groups) and arguments.fleet:
-        without = paths[digests.index(None)]
-        raise ConfigError(
-            f"--fleet needs digests, which the monitor writes to digests/; {without} has none"
-        )
-    if len(histories) < len(groups):
+    histories = _histories_of_fleet(paths) if arguments.fleet else _histories_of_mount(paths)
+    if not histories:
         return None
     if arguments.installed:
         raise ConfigError("digests contain their installed transform: omit --with")
@@ -49,6 +41,25 @@ def compare_digests(arguments: argparse.Namespace) -> int | None:
         document = histories[0].document() if arguments.json else None
         print_result(_lines(histories[0]), document)
     return 4 if any(history.has_moved for history in histories) else 0
+
+
+def _histories_of_mount(paths: list[Path]) -> list[History]:
+    """Return the history of the mount whose digests are in all paths; nothing without digests."""
+    sessions = read_digests(paths)
+    return [] if sessions is None else [History.of(sessions)]
+
+
+def _histories_of_fleet(paths: list[Path]) -> list[History]:
+    """Return the histories of vehicles. The digests of each vehicle are in a path of its own."""
+    histories = []
+    for path in paths:
+        sessions = read_digests([path])
+        if sessions is None:
+            raise ConfigError(
+                f"--fleet needs digests, which the monitor writes to digests/; {path} has none"
+            )
+        histories.append(History.of(sessions))
+    return histories
 
 
 def _write_fleet(histories: Mapping[str, History], arguments: argparse.Namespace) -> None:

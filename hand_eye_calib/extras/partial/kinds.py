@@ -221,7 +221,8 @@ def _least_lever_arm(calibration: Calibration) -> float:
     """Return the smallest length (m) of the lever arm that its uncertainty allows."""
     sigmas = np.sqrt(np.diag(calibration.covariance_measured))[:3]
     is_hidden = [axis in calibration.hidden for axis in "xyz"]
-    return checking.least_lever_arm(calibration.T_parent_child, np.where(is_hidden, np.inf, sigmas))
+    observed_sigmas = np.where(is_hidden, np.inf, sigmas)
+    return checking.least_lever_arm(calibration.T_parent_child, observed_sigmas)
 
 
 def _check_clock(

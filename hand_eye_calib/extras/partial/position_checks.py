@@ -147,7 +147,8 @@ def _is_mirrored(stamps_ns: IntArray, poses: FloatArray, positions: FloatArray) 
 
 def _is_copied(fitted: PositionFit, positions: FloatArray) -> bool:
     """Return whether the residuals are so small that positions were computed from the poses."""
-    moved_m = median(np.linalg.norm(np.diff(positions, axis=0), axis=1))
+    steps = np.diff(positions, axis=0)
+    moved_m = median(np.linalg.norm(steps, axis=1))
     return fitted.residual < min(_COPIED_M, COPIED_SHARE * moved_m)
 
 

@@ -129,10 +129,8 @@ class WheelJoints:
 
     def _found(self, names: Sequence[str]) -> Joints | None:
         """Return the joints by their names; None without wheels."""
-        lower = {name: name.lower() for name in names}
-        steered = tuple(name for name in names if "steer" in lower[name])
-        wheels = [name for name in names if "wheel" in lower[name] and name not in steered]
-        wheels = [name for name in wheels if "caster" not in lower[name]]
+        steered = tuple(name for name in names if "steer" in name.lower())
+        wheels = [name for name in names if _is_wheel(name)]
         if not wheels:
             return None
         if self._measures in STEERED:
@@ -142,8 +140,8 @@ class WheelJoints:
                 f"{self._topic} has steering joints, {listing(steered)}: set parent_measures to "
                 "steering (the wheels of the fixed axle) or to tricycle (the steered wheel drives)"
             )
-        left = tuple(name for name in wheels if re.search(_LEFT, lower[name]))
-        right = tuple(name for name in wheels if re.search(_RIGHT, lower[name]))
+        left = tuple(name for name in wheels if re.search(_LEFT, name.lower()))
+        right = tuple(name for name in wheels if re.search(_RIGHT, name.lower()))
         if not left or len(left) != len(right):
             raise self._unclear(names)
         return Joints(left, right)
@@ -190,6 +188,12 @@ class WheelJoints:
             durations_s = np.diff(stamps_ns)[:, None] * 1e-9
             means[:, :n_wheels] = np.diff(rows[:, :n_wheels], axis=0) / durations_s
         return means
+
+
+def _is_wheel(name: str) -> bool:
+    """Whether the name of a joint is that of a wheel that drives, and does not steer."""
+    lower = name.lower()
+    return "wheel" in lower and not ("steer" in lower or "caster" in lower)
 
 
 def middle_angle(angles: Sequence[float]) -> float:

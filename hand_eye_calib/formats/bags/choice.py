@@ -114,17 +114,19 @@ def choose(
     others = _of_types(topics, messages.FIELD_POSE_TYPES, _MIN_POSES)
     candidates = [_Candidate(topic, frame_of(topic.name)) for topic in moving + paths + others]
     sensors = _topic_of_each_sensor(candidates)
-    names_of_groups = [
-        [topic.name for topic in group]
-        for group in (poses, moving, moving + paths, moving + others)
-    ]
-    names_of_groups.append([sensor.name for sensor in sensors])
     of_known_kinds = [sensor for sensor in sensors if sensor.rank < len(_SENSORS)]
-    names_of_groups.append([sensor.name for sensor in of_known_kinds])
+    groups: list[Sequence[TopicInfo | _Candidate]] = [
+        poses,
+        moving,
+        moving + paths,
+        moving + others,
+        sensors,
+        of_known_kinds,
+    ]
     # The choice is obvious if the number of topics in a group fits, or the number of sensors.
-    for names in names_of_groups:
-        if len(names) == n_missing:
-            return names
+    for group in groups:
+        if len(group) == n_missing:
+            return [item.name for item in group]
     if len(sensors) < n_missing <= len(candidates):
         sensors = candidates
     partners = topics
@@ -244,4 +246,5 @@ def _options(missing: Sequence[str], names: Sequence[str]) -> dict[str, str]:
 
 def _listed(topics: Sequence[TopicInfo]) -> str:
     """Return topics as text for an error, shortened if they are many."""
-    return shortened(listing([str(topic) for topic in topics]), _LONGEST_LIST)
+    descriptions = [str(topic) for topic in topics]
+    return shortened(listing(descriptions), _LONGEST_LIST)

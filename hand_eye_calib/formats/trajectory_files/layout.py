@@ -310,7 +310,8 @@ def _refuse_other_number_of_names(
 
 def _are_names_of_quantities(names: Sequence[str]) -> bool:
     """Whether the names include those of a position, an orientation, rates or a pose."""
-    columns = named_columns(names)[0].keys()
+    by_name, _ = named_columns(names)
+    columns = by_name.keys()
     return is_pose(columns) or {"x", "qw"} <= columns or {"roll", "pitch"} <= columns
 
 

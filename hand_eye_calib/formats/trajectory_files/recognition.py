@@ -148,7 +148,8 @@ def _fits(pose: Sequence[str], values: FloatArray) -> bool:
 
 def _values_of(names: Sequence[str], pose: Sequence[str], values: FloatArray) -> FloatArray:
     """Return the values (N, k) of k quantities; column i of ``values`` is the quantity pose[i]."""
-    return values[:, [pose.index(name) for name in names]]
+    columns = [pose.index(name) for name in names]
+    return values[:, columns]
 
 
 def _are_seconds_and_ns(values: FloatArray) -> bool:

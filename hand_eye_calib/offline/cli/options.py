@@ -314,7 +314,8 @@ def options_from(arguments: argparse.Namespace) -> Options:
 
 def _is_of_node(option: str) -> bool:
     """Whether only the node has this option, or every node of ROS."""
-    return option in _NODE_OPTIONS or option.partition(".")[0] in _ROS_OPTIONS
+    group, _, _ = option.partition(".")
+    return option in _NODE_OPTIONS or group in _ROS_OPTIONS
 
 
 def _read_config(path: Path) -> Options:

@@ -255,7 +255,9 @@ def _between_worlds(pose_pairs: PosePairs, Ts_cw_p: FloatArray) -> FloatArray:
 
     ``Ts_cw_p`` (N, 4, 4) are the parent's poses in the child's world.
     """
-    rotations = se3.rotation_of(pose_pairs.Ts_pw_p) @ np.swapaxes(se3.rotation_of(Ts_cw_p), 1, 2)
+    to_parent_world = se3.rotation_of(pose_pairs.Ts_pw_p)
+    from_child_world = np.swapaxes(se3.rotation_of(Ts_cw_p), 1, 2)
+    rotations = to_parent_world @ from_child_world
     return se3.nearest_rotation(rotations.mean(axis=0))
 
 
