@@ -12,7 +12,7 @@ import pytest
 from browser import PATIENCE_S, Browser
 
 from hand_eye_calib.online.watch import view, web
-from hand_eye_calib.online.watch.view import Tone, View
+from hand_eye_calib.online.watch.view import Line, Tone, View
 from hand_eye_calib.online.watch.web import WebServer
 
 FOLDER = Path(web.__file__).parent / "page"
@@ -274,6 +274,14 @@ def test_saved_files_are_linked(page, tmp_path):
     assert page.get("a[data-file='report.html']", "href").endswith("/report.html?key=word")
     assert not page.get("a[data-file='report.html']", "hidden")
     assert page.get("a[data-file='extrinsic.yaml']", "hidden")
+
+
+def test_evidence_of_the_result_is_readable_at_the_end(page):
+    fact = "An error of the result would have shown from 2 cm along x on: <b> & 0.5 deg"
+    page.show(replace(GO_ON, word="DONE", result=(Line(Tone.GOOD, "evidence", fact),)))
+    assert fact in page.get(".health", "innerText")
+    assert page.get(".health", "checkVisibility()")
+    assert page.get(".health", "scrollWidth") <= page.get(".health", "clientWidth")
 
 
 # ------------------------------------------------------------------------ priors
