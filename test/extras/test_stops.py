@@ -269,7 +269,14 @@ def write_rows_of_matrices(folder, stop, robot, target):
         np.savetxt(folder / f"{name}_{stop}.txt", T[:3].reshape(1, -1))
 
 
-@pytest.mark.parametrize("write", [write_visp, write_zivid, write_rows_of_matrices])
+def write_poses_and_targets(folder, stop, robot, target):
+    for name, T in (("pos", robot), ("target_pos", target)):
+        np.savetxt(folder / f"{name}{stop:02d}.txt", T)
+
+
+@pytest.mark.parametrize(
+    "write", [write_visp, write_zivid, write_rows_of_matrices, write_poses_and_targets]
+)
 def test_a_folder_with_a_file_for_each_pose(write, both_poses, tmp_path):
     for stop, (robot, target) in enumerate(zip(*both_poses, strict=True)):
         write(tmp_path, stop, robot, target)

@@ -560,3 +560,28 @@ def test_stops_that_were_left_out_are_counted_and_named(place, count, severity, 
     assert result.verdict is verdict
     error = se3.log(se3.inverse(result.T_parent_child) @ truth)
     assert np.linalg.norm(error[:3]) < WITHIN_M
+
+
+def test_one_wrong_stop_of_five_is_left_out():
+    robot, target, truth = arm(ON_HAND, seed=31, n=5)
+    wrong = target.copy()
+    wrong[2] = wrong[2] @ se3.exp([0.3, -0.2, 0.2, 0.5, 0.8, -0.4])
+    result = calibrate_arm(robot, wrong)
+    assert result.verdict is hec.Verdict.USE_WITH_CARE
+    assert [issue.code for issue in result.findings] == ["outliers"]
+    error = se3.log(se3.inverse(result.T_parent_child) @ truth)
+    assert np.linalg.norm(error[:3]) < WITHIN_M
+
+
+def test_targets_detected_mirrored_at_half_of_the_stops_are_left_out():
+    robot, target, truth = arm(ON_HAND, seed=32, n=30)
+    random = np.random.default_rng(32)
+    is_wrong = random.permutation(30) < 14
+    tilts = se3.rotation_exp(0.4 * random.normal(size=(30, 3)))
+    wrong = np.where(
+        is_wrong[:, None, None], with_rotations(target, target[:, :3, :3] @ tilts), target
+    )
+    result = calibrate_arm(robot, wrong)
+    assert result.verdict is hec.Verdict.USE_WITH_CARE
+    error = se3.log(se3.inverse(result.T_parent_child) @ truth)
+    assert np.linalg.norm(error[:3]) < WITHIN_M

@@ -83,6 +83,15 @@ def aprilgrid_picture(columns, rows, size, gap):
     return picture
 
 
+VISP_CAMERA = """<?xml version="1.0"?><root><camera><name>Camera</name>
+<model><type>perspectiveProjWithoutDistortion</type>
+<px>901</px><py>901</py><u0>641</u0><v0>481</v0></model>
+<model><type>perspectiveProjWithDistortion</type>
+<px>900</px><py>900</py><u0>640</u0><v0>480</v0><kud>-0.1</kud><kdu>0.1</kdu></model>
+</camera></root>
+"""
+
+
 def poses_of_target(images, target, camera):
     finder = TargetFinder(target, camera)
     for image in images:
@@ -231,6 +240,44 @@ def test_intrinsics_of_ros_and_kalibr(tmp_path, text):
     (tmp_path / "camera.yaml").write_text("image_width: 3")
     with pytest.raises(InputError, match="intrinsics"):
         read_camera(tmp_path / "camera.yaml")
+
+
+def test_intrinsics_of_visp(tmp_path):
+    path = tmp_path / "camera.xml"
+    path.write_text(VISP_CAMERA)
+    camera = read_camera(path)
+    assert np.array_equal(camera.matrix, MATRIX)
+    assert list(camera.distortion) == [-0.1, 0.0, 0.0, 0.0]
+    models = VISP_CAMERA.split("</name>")[1].split("</camera>")[0]
+    for text in ("<root>", "<root/>", VISP_CAMERA.replace(models, 2 * models)):
+        path.write_text(text)
+        with pytest.raises(InputError, match="intrinsics"):
+            read_camera(path)
+
+
+def test_a_folder_with_images_and_a_file_for_each_pose(tmp_path, capsys, no_figures):
+    rng = np.random.default_rng(11)
+    picture = charuco_picture()
+    Ts_camera_target = views(10, [0.175, 0.125, 0.0], rng)
+    X = se3.exp([0.03, -0.05, 0.08, 0.2, -0.4, 1.2])
+    hand = se3.exp([0.7, 0.2, 0.1, 2.0, 0.5, -0.3]) @ se3.inverse(X @ Ts_camera_target)
+    hand = hand @ se3.exp(rng.normal(0.0, 1e-4, (10, 6)))
+    folder = tmp_path / "stops"
+    folder.mkdir()
+    for number, (T_camera_target, T_base_hand) in enumerate(
+        zip(Ts_camera_target, hand, strict=True), start=1
+    ):
+        cv2.imwrite(str(folder / f"image-{number}.png"), rendered(picture, T_camera_target, rng))
+        np.savetxt(folder / f"franka_pose_rPe_{number}.txt", T_base_hand)
+    (folder / "camera.xml").write_text(VISP_CAMERA.replace("-0.1", "0"))
+    arguments = ["--target", "charuco:7x5:0.05:0.037:5X5_100", "--out", str(tmp_path / "out")]
+    main(["arm", str(folder), "--camera", str(folder / "camera.xml"), *arguments])
+    assert "visible in 10 of 10 images" in capsys.readouterr().err
+    off = se3.log(se3.inverse(X) @ hec.load(tmp_path / "out").T_parent_child)
+    assert np.linalg.norm(off[:3]) < 2e-3
+    (folder / "franka_pose_rPe_3.txt").unlink()
+    assert main(["arm", str(folder), "--camera", str(folder / "camera.xml"), *arguments]) == 1
+    assert "9 poses and" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

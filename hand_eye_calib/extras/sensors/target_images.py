@@ -11,6 +11,7 @@ from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple, Self
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -69,8 +70,8 @@ _EXPECTED_TARGET = (
     "marker:26:0.1:APRILTAG_36h11; lengths in metres"
 )
 _EXPECTED_CAMERA = (
-    "the intrinsics of a camera: camera_info of ROS, camchain of Kalibr, or camera_matrix and "
-    "distortion_coefficients of OpenCV"
+    "the intrinsics of a camera: camera_info of ROS, camchain of Kalibr, camera_matrix and "
+    "distortion_coefficients of OpenCV, or XML of ViSP"
 )
 # Models of distortion, and whether they are those of a fisheye.
 _IS_FISHEYE = {
@@ -230,7 +231,15 @@ class Camera:
 
 
 def read_camera(path: str | Path) -> Camera:
-    """Read intrinsics from YAML of ROS, Kalibr or OpenCV; raise InputError if there are none."""
+    """Read intrinsics from YAML of ROS, Kalibr or OpenCV, or from XML of ViSP.
+
+    Raises
+    ------
+    InputError
+        If there are none.
+    """
+    if Path(path).suffix.lower() == ".xml":
+        return _camera_of_visp(Path(path))
     document: Any = read_yaml(path, _EXPECTED_CAMERA)
     try:
         document = document.get("cam0", document)
@@ -244,6 +253,29 @@ def read_camera(path: str | Path) -> Camera:
     except (AttributeError, KeyError, TypeError, ValueError):
         raise InputError(f"{path}: expected {_EXPECTED_CAMERA}") from None
     return Camera.of(path, matrix, distortion, document.get("distortion_model", ""))
+
+
+def _camera_of_visp(path: Path) -> Camera:
+    """Read the intrinsics of a file of ViSP, with distortion if the file has such a model.
+
+    ViSP's ``kud`` is the coefficient of the squared radius, as OpenCV's k1.
+    """
+    try:
+        models = list(ElementTree.fromstring(read_bytes(path)).iterfind(".//model"))
+        by_type = {model.findtext("type", ""): model for model in models}
+        plain = by_type.get("perspectiveProjWithoutDistortion")
+        model = by_type.get("perspectiveProjWithDistortion", plain)
+        if model is None or len(by_type) < len(models):
+            raise ValueError("no model, or models of several cameras")
+        focal_x = float(model.findtext("px", ""))
+        focal_y = float(model.findtext("py", ""))
+        centre_x = float(model.findtext("u0", ""))
+        centre_y = float(model.findtext("v0", ""))
+        k1 = float(model.findtext("kud", "0"))
+    except (ElementTree.ParseError, ValueError):
+        raise InputError(f"{path}: expected {_EXPECTED_CAMERA}, of one camera") from None
+    matrix = [focal_x, 0.0, centre_x, 0.0, focal_y, centre_y, 0.0, 0.0, 1.0]
+    return Camera.of(path, matrix, [k1, 0.0, 0.0, 0.0])
 
 
 def _entries(matrix: Any) -> Any:

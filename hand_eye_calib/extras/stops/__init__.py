@@ -57,14 +57,17 @@ def _add_arguments(parser: Any) -> None:
     add = parser.add_argument_group("images of a target").add_argument
     target = (
         "what the images of --child-topic show, or those of a folder, the second PATH, one for "
-        "each pose of a hand: such as "
+        "each pose of a hand (a file or a folder): such as "
         "charuco:5x7:0.04:0.03:4X4_50 (squares, side of a square and of a marker in m, markers; "
         "charuco-old for boards made before OpenCV 4.6), aprilgrid:6x6:0.088:0.0264 (tags, side of "
         "a tag, gap), chessboard:8x5:0.03 (inner corners, side) or marker:26:0.1:APRILTAG_36h11 "
         "(number, side, markers)"
     )
     add("--target", metavar="TARGET", help=target)
-    camera = "intrinsics: YAML of camera_info, Kalibr or OpenCV; a bag may have its own camera_info"
+    camera = (
+        "intrinsics: YAML of camera_info, Kalibr or OpenCV, XML of ViSP; a bag may have its own "
+        "camera_info"
+    )
     add("--camera", metavar="FILE", type=Path, help=camera)
 
 

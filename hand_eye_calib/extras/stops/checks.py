@@ -22,7 +22,7 @@ from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.checks.findings import Finding, Severity, conventions, finding
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.records import has_error
-from hand_eye_calib.extras.stops.robot_world import objective_of
+from hand_eye_calib.extras.stops.robot_world import inliers_of, objective_of
 from hand_eye_calib.extras.stops.rotation_checks import (
     MAX_UNEXPLAINED,
     MIN_IMPROVEMENT,
@@ -138,6 +138,8 @@ def examine(poses: StopPoses, is_scale_free: bool) -> Examination:
     findings = _check_conventions(sample, chosen.mistakes, rivals)
     if not (findings or repairs):
         findings = _check_agreement(chosen)
+        if has_error(findings):
+            findings = _check_inliers(sample, chosen)
     examination = Examination(tuple(findings), repairs)
     if has_error(findings):
         return examination
@@ -265,7 +267,11 @@ def _codes_and_streams(mistakes: Mistakes) -> list[tuple[str, str]]:
 
 
 def _check_agreement(fit: RoughFit) -> list[Finding]:
-    """Return a finding if the residuals of the best hypothesis are too large for noise."""
+    """Return a finding if the residuals of the best hypothesis are too large for noise.
+
+    It is a warning if errors of the rotations, at the distance of the target, explain residuals as
+    large as the spread of the positions.
+    """
     rotation_share = fit.rotation_share
     position_share = fit.position_share
     ratio = fit.position_ratio
@@ -274,7 +280,8 @@ def _check_agreement(fit: RoughFit) -> list[Finding]:
     if not (are_too_large or are_beyond_noise):
         return []
     contradict = position_share > _CONTRADICTING_SHARE and ratio > _CONTRADICTING_POSITION_RATIO
-    if fit.unexplained_share > MAX_UNEXPLAINED or contradict:
+    is_noise = rotation_share < _DOUBTFUL_SHARE and ratio < _MAX_POSITION_RATIO
+    if contradict or (fit.unexplained_share > MAX_UNEXPLAINED and not is_noise):
         severity = Severity.ERROR
     elif fit.unexplained_share >= _DOUBTFUL_SHARE:
         severity = Severity.WARNING
@@ -283,6 +290,18 @@ def _check_agreement(fit: RoughFit) -> list[Finding]:
     part = "rotations" if rotation_share > position_share else "positions"
     share = min(fit.unexplained_share, 1.0)
     return [finding("disagreeing_stops", severity=severity, part=part, share=share)]
+
+
+def _check_inliers(sample: StopPoses, fit: RoughFit) -> list[Finding]:
+    """Return a finding if the stops contradict each other without their outliers, too.
+
+    ``fit`` is the rough fit of all stops. Half of the stops, or more, must be inliers.
+    """
+    is_inlier = inliers_of(sample.without(fit.mistakes, fit.scale or 1.0))
+    if 2 * is_inlier.sum() >= len(sample):
+        inliers = replace(sample, parent=sample.parent[is_inlier], child=sample.child[is_inlier])
+        fit = rough_fit(inliers, fit.mistakes)
+    return _check_agreement(fit)
 
 
 # ------------------------------------------------------------------ axes

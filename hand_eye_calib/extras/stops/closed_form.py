@@ -13,10 +13,14 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.geometry import se3
 
-# Further starts: their number, and the random stops of each. If a tenth of the stops are outliers,
-# 59 % of the starts have none (0.9 to the 5th power).
-_N_STARTS = 12
-_STOPS_PER_START = 5
+# Further starts: their number, and the random stops of each. If half of the stops are outliers, the
+# chance of 60 starts without any start free of outliers is 0.03 % (0.875 to the 60th power).
+_N_STARTS = 60
+_STOPS_PER_START = 3
+
+# Quantile of the errors of all stops by which starts are compared: fewer stops than half may have
+# right poses.
+_COMPARED_QUANTILE = 0.4
 
 
 @dataclass(frozen=True)
@@ -81,32 +85,34 @@ def _closed_form(stops: Stops) -> tuple[FloatArray, FloatArray]:
     return X, Z
 
 
-def robust_start(stops: Stops) -> tuple[FloatArray, FloatArray]:
-    """Return X and Z (4, 4) by the closed form, robust to outliers.
+def starts_of(stops: Stops) -> list[tuple[FloatArray, FloatArray]]:
+    """Return X and Z (4, 4) by the closed form of all stops, and by that of a few stops.
 
-    The closed form is computed from all stops, and from random subsets if there are enough stops.
-    The one with the smallest median errors is returned.
+    The few stops are the best of random subsets: that with the smallest errors of other stops. If
+    the closed form of all stops is better, no other start is returned.
     """
     random = np.random.default_rng(0)
     n = len(stops)
-    candidates = [_closed_form(stops)]
-    if n > 2 * _STOPS_PER_START:
+    starts = [_closed_form(stops)]
+    if n > _STOPS_PER_START:
         for _ in range(_N_STARTS):
             rows = random.choice(n, _STOPS_PER_START, replace=False)
-            candidates.append(_closed_form(stops[rows]))
-    errors = []
-    for X, Z in candidates:
-        between = se3.inverse(stops.Ts_world_child) @ se3.inverse(Z)
-        errors.append(between @ stops.Ts_world_parent @ X)
-    return candidates[int(np.argmin(_logs_of_medians(np.stack(errors))))]
+            starts.append(_closed_form(stops[rows]))
+    between = se3.inverse(stops.Ts_world_child)
+    errors = np.stack([between @ se3.inverse(Z) @ stops.Ts_world_parent @ X for X, Z in starts])
+    best = int(np.argmin(_costs(errors)))
+    return starts[:1] if best == 0 else [starts[0], starts[best]]
 
 
-def _logs_of_medians(errors: FloatArray) -> FloatArray:
+def _costs(errors: FloatArray) -> FloatArray:
     """Return the cost (M,) of M candidates with errors (M, N, 4, 4) of N stops.
 
-    The cost is the logarithm of the median distance times the median angle.
+    The cost is the logarithm of the product of a quantile of the distances and a quantile of the
+    angles. The stops of a subset have small errors, so the quantile is above these.
     """
     tiny = np.finfo(float).tiny
-    distances_m = np.median(np.linalg.norm(se3.translation_of(errors), axis=-1), axis=1)
-    angles_rad = np.median(se3.rotation_angle(se3.rotation_of(errors)), axis=1)
+    n = errors.shape[1]
+    rank = min(max(_STOPS_PER_START, int(_COMPARED_QUANTILE * n)), n - 1)
+    distances_m = np.sort(np.linalg.norm(se3.translation_of(errors), axis=-1), axis=1)[:, rank]
+    angles_rad = np.sort(se3.rotation_angle(se3.rotation_of(errors)), axis=1)[:, rank]
     return np.asarray(np.log(distances_m + tiny) + np.log(angles_rad + tiny))

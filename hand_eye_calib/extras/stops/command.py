@@ -1,7 +1,7 @@
 """Command ``calibrate`` for stops.
 
-Input is a file with the samples of an arm, two files whose rows belong together, or a file with the
-poses of a hand and a folder with images of a target.
+Input is a file with the samples of an arm, two files whose rows belong together, or poses of a hand
+(a file, or a folder with a file for each pose) and a folder with images of a target.
 """
 
 from argparse import Namespace
@@ -23,6 +23,7 @@ from hand_eye_calib.extras.stops.calibrate import (
     calibrate_hand_and_camera,
     calibrate_stops,
 )
+from hand_eye_calib.extras.stops.pose_files import read_robot_folder
 from hand_eye_calib.extras.stops.robot_angles import read_robot_poses
 from hand_eye_calib.extras.stops.samples import read_arm_samples
 from hand_eye_calib.offline.cli.options import (
@@ -49,6 +50,8 @@ def solved(arguments: Namespace) -> tuple[Calibration, Document]:
     config = CalibratorConfig.from_options(options)
     _refuse_ignored(arguments)
     paths = [Path(path) for path in arguments.paths]
+    if arguments.target:
+        return _from_images(arguments, config, options)
     if len(paths) == 1:
         samples = read_arm_samples(paths[0])
         setup = arguments.setup
@@ -58,8 +61,6 @@ def solved(arguments: Namespace) -> tuple[Calibration, Document]:
         raise ConfigError("--order none takes two trajectory files, or the samples of an arm")
     refuse_repeated_paths(paths)
     arguments.pair_by = arguments.pair_by or "row"
-    if arguments.target:
-        return _from_images(arguments, config, options)
     return _from_two_files(arguments, config, options)
 
 
@@ -84,17 +85,27 @@ def _from_two_files(
 def _from_images(
     arguments: Namespace, config: CalibratorConfig, options: Options
 ) -> tuple[Calibration, Document]:
-    """Calibrate an arm from a file with poses of its hand and a folder with images of a target."""
-    hand_path, folder = map(Path, arguments.paths)
+    """Calibrate an arm from poses of its hand and a folder with images of a target.
+
+    A single path is a folder that contains both.
+    """
+    arguments.pair_by = arguments.pair_by or "row"
+    hand_path = Path(arguments.paths[0])
+    folder = Path(arguments.paths[-1])
     target_images = TARGET_IMAGES["folder"]()
-    if not folder.is_dir():
-        raise ConfigError("--target takes the poses of a hand and images: FILE FOLDER")
+    if len(arguments.paths) > 2 or not folder.is_dir():
+        raise ConfigError(
+            "--target takes the poses of a hand and images: FILE FOLDER, or FOLDER with both"
+        )
     images = target_images.images_in(folder)
     if arguments.parent_angles:
         hand = _robot(arguments)
+    elif hand_path.is_dir():
+        robot_poses = read_robot_folder(hand_path)
+        hand = Trajectory(np.arange(len(robot_poses)), robot_poses)
     else:
         (hand,) = _read(arguments, [hand_path], options)
-    _require_equal(arguments.paths, len(hand), len(images))
+    _require_equal([hand_path, folder], len(hand), len(images))
     config = _measuring(config, {"parent": hand})
     target = target_images.Target.parse(arguments.target)
     finder = target_images.TargetFinder(target, target_images.read_camera(arguments.camera))
@@ -141,7 +152,8 @@ def _input(path: str | Path, n_poses: int) -> Document:
 
 def _inputs(arguments: Namespace, n_parent: int, n_child: int) -> Document:
     """Return file and number of poses of both sides, for the result file."""
-    parent_path, child_path = arguments.paths
+    parent_path = arguments.paths[0]
+    child_path = arguments.paths[-1]
     return {"parent": _input(parent_path, n_parent), "child": _input(child_path, n_child)}
 
 

@@ -28,6 +28,9 @@ _SUFFIXES = (".yaml", ".yml", ".json", ".txt")
 _ROBOT_WORDS = {"pe", "robot", "hand", "gripper", "flange", "ee", "eef", "tcp", "tool"}
 _TARGET_WORDS = {"po", "target", "marker", "board", "tag", "object", "camera", "cam", "tracking"}
 
+# Words for poses of the robot if no file has a word above, as in ``pos01.yaml`` of Zivid.
+_POSE_WORDS = {"pos", "pose", "poses"}
+
 # Name of a file without its suffix: words, then the number of the stop.
 _NUMBERED_NAME = re.compile(r"(.*?)([0-9]{1,9})")
 
@@ -39,10 +42,11 @@ def files_of_sides(folder: Path) -> tuple[dict[int, Path], dict[int, Path]]:
     """Return the files of the robot and those of the target in a folder, by number of the stop.
 
     The files are in the folder itself or in its subfolders. Files without a word for the side are
-    ignored.
+    ignored, but ``pos01.yaml`` is of the robot if no other file is.
     """
     robot: dict[int, Path] = {}
     target: dict[int, Path] = {}
+    poses: dict[int, Path] = {}
     for path in sorted([*folder.glob("*"), *folder.glob("*/*")]):
         numbered = _NUMBERED_NAME.fullmatch(path.stem)
         if numbered is None or path.suffix not in _SUFFIXES:
@@ -55,7 +59,9 @@ def files_of_sides(folder: Path) -> tuple[dict[int, Path], dict[int, Path]]:
             robot[stop] = path
         elif words & _TARGET_WORDS:
             target[stop] = path
-    return robot, target
+        elif words & _POSE_WORDS:
+            poses[stop] = path
+    return robot or poses, target
 
 
 def is_pose_folder(path: Path) -> bool:
@@ -84,6 +90,22 @@ def read_pose_folder(folder: Path) -> tuple[FloatArray, FloatArray]:
     Ts_base_hand = np.stack([_read_pose(robot[stop]) for stop in stops])
     Ts_camera_target = np.stack([_read_pose(target[stop]) for stop in stops])
     return Ts_base_hand, Ts_camera_target
+
+
+def read_robot_folder(folder: Path) -> FloatArray:
+    """Return the poses (N, 4, 4) of the robot in a folder, in the order of their numbers.
+
+    Raises
+    ------
+    InputError
+        If the folder has no such file, or a file has no pose.
+    """
+    robot, _ = files_of_sides(folder)
+    if not robot:
+        raise InputError(
+            f"{folder}: expected a file for each pose of the hand, such as robot_1.txt"
+        )
+    return np.stack([_read_pose(robot[stop]) for stop in sorted(robot)])
 
 
 def _read_pose(path: Path) -> FloatArray:

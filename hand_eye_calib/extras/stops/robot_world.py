@@ -20,11 +20,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.base.stats import student_weights
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.extras.stops.closed_form import Stops, robust_start
+from hand_eye_calib.extras.stops.closed_form import Stops, starts_of
 from hand_eye_calib.extras.stops.error_components import MIN_VARIANCE, fit_components
 from hand_eye_calib.extras.stops.lasting_errors import (
     correlations,
@@ -151,7 +151,7 @@ def solve(stops: Stops, stretch: float = STRETCH) -> RobotWorld:
 
     Notes
     -----
-    The start is the closed form of :mod:`hand_eye_calib.extras.stops.closed_form`. Outliers are
+    The starts are closed forms of :mod:`hand_eye_calib.extras.stops.closed_form`. Outliers are
     detected with heavy tails and left out, with errors in the frame of the child or in that of the
     child's world (a target whose pose a camera measures), whichever is likelier. The fit of the
     other stops has both kinds of errors: :mod:`hand_eye_calib.extras.stops.error_components`.
@@ -190,8 +190,17 @@ def solve(stops: Stops, stretch: float = STRETCH) -> RobotWorld:
 
 def objective_of(stops: Stops) -> float:
     """Return the negative log likelihood of at least three stops, up to a constant."""
+    return _robust_fit(stops).objective
+
+
+def inliers_of(stops: Stops) -> BoolArray:
+    """Return a mask (N,) of the stops, at least three, that are not outliers."""
+    return _robust_fit(stops).weights > 0.0
+
+
+def _robust_fit(stops: Stops) -> RobotWorld:
     views = views_of_stops(stops.Ts_world_parent, stops.Ts_world_child)
-    return _likelier_fit(stops, rest_weights(views)).objective
+    return _likelier_fit(stops, rest_weights(views))
 
 
 def _likelier_fit(stops: Stops, rests: FloatArray) -> RobotWorld:
@@ -199,8 +208,11 @@ def _likelier_fit(stops: Stops, rests: FloatArray) -> RobotWorld:
 
     ``rests`` (N,) are weights of stops at one place. Weights of outliers are 0.
     """
-    start = robust_start(stops)
-    fits = [_fit_without_outliers(stops, start, in_world, rests) for in_world in (False, True)]
+    fits = [
+        _fit_without_outliers(stops, start, in_world, rests)
+        for start in starts_of(stops)
+        for in_world in (False, True)
+    ]
     return min(fits, key=lambda fit: fit.objective)
 
 
