@@ -453,7 +453,9 @@ def _worse_than_target(result: Result) -> Iterator[Ground]:
     hopeless = [(axis.name, size) for axis, size in allowances if size > axis.target]
     advice = []
     if any(size <= axis.target or 2.0 * size < axis.sigma for axis, size in allowances):
-        advice.append("record longer, with more motion")
+        are_stops = result.reference == "stops"
+        more = "more stops, with larger rotations" if are_stops else "longer, with more motion"
+        advice.append(f"record {more}")
     if hopeless:
         alone = f"constant odometry errors alone leave {_amounts(hopeless)}"
         advice.append(f"{alone}: {_FLOOR_ADVICE}")
