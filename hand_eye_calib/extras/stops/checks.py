@@ -138,8 +138,8 @@ def examine(poses: StopPoses, is_scale_free: bool) -> Examination:
     findings = _check_conventions(sample, chosen.mistakes, rivals)
     if not (findings or repairs):
         findings = _check_agreement(chosen)
-        if has_error(findings):
-            findings = _check_inliers(sample, chosen)
+        if has_error(findings) and _do_inliers_agree(sample, chosen):
+            findings = []
     examination = Examination(tuple(findings), repairs)
     if has_error(findings):
         return examination
@@ -267,11 +267,7 @@ def _codes_and_streams(mistakes: Mistakes) -> list[tuple[str, str]]:
 
 
 def _check_agreement(fit: RoughFit) -> list[Finding]:
-    """Return a finding if the residuals of the best hypothesis are too large for noise.
-
-    It is a warning if errors of the rotations, at the distance of the target, explain residuals as
-    large as the spread of the positions.
-    """
+    """Return a finding if the residuals of the best hypothesis are too large for noise."""
     rotation_share = fit.rotation_share
     position_share = fit.position_share
     ratio = fit.position_ratio
@@ -280,8 +276,7 @@ def _check_agreement(fit: RoughFit) -> list[Finding]:
     if not (are_too_large or are_beyond_noise):
         return []
     contradict = position_share > _CONTRADICTING_SHARE and ratio > _CONTRADICTING_POSITION_RATIO
-    is_noise = rotation_share < _DOUBTFUL_SHARE and ratio < _MAX_POSITION_RATIO
-    if contradict or (fit.unexplained_share > MAX_UNEXPLAINED and not is_noise):
+    if contradict or fit.unexplained_share > MAX_UNEXPLAINED:
         severity = Severity.ERROR
     elif fit.unexplained_share >= _DOUBTFUL_SHARE:
         severity = Severity.WARNING
@@ -292,16 +287,16 @@ def _check_agreement(fit: RoughFit) -> list[Finding]:
     return [finding("disagreeing_stops", severity=severity, part=part, share=share)]
 
 
-def _check_inliers(sample: StopPoses, fit: RoughFit) -> list[Finding]:
-    """Return a finding if the stops contradict each other without their outliers, too.
+def _do_inliers_agree(sample: StopPoses, fit: RoughFit) -> bool:
+    """Return whether the stops without their outliers do not contradict each other.
 
     ``fit`` is the rough fit of all stops. Half of the stops, or more, must be inliers.
     """
     is_inlier = inliers_of(sample.without(fit.mistakes, fit.scale or 1.0))
-    if 2 * is_inlier.sum() >= len(sample):
-        inliers = replace(sample, parent=sample.parent[is_inlier], child=sample.child[is_inlier])
-        fit = rough_fit(inliers, fit.mistakes)
-    return _check_agreement(fit)
+    if 2 * is_inlier.sum() < len(sample):
+        return False
+    inliers = replace(sample, parent=sample.parent[is_inlier], child=sample.child[is_inlier])
+    return not _check_agreement(rough_fit(inliers, fit.mistakes))
 
 
 # ------------------------------------------------------------------ axes
