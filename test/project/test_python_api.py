@@ -71,6 +71,7 @@ class TestOptionsOfCalibrate:
         numbers_given |= dict(parent_invert="poses", child_invert="orientations")
         numbers_given |= dict(parent_measures="rates", child_measures="rotations")
         numbers_given |= dict(parent_frame="lidar", child_frame="camera")
+        numbers_given |= dict(nominal_radius=0.1, nominal_separation=0.5)
         for stream in ("parent", "child"):
             numbers_given |= {f"{stream}_quaternion": "wxyz", f"{stream}_kind": "exact"}
         assert set(numbers_given) | {*OWN_KEYWORDS} == set(self.keywords())

@@ -55,6 +55,9 @@ CHANGES = {
     "target.translation": (1e-5, {}),
     "target.rotation": (1e-5, {}),
     "target.axes": ("yaw=1e-5", {}),
+    # Streams without wheel data are refused.
+    "nominal_radius": (0.1, {}),
+    "nominal_separation": (0.5, {}),
     **{f"prior.{axis}": ("1+/-0.001", {}) for axis in "xyz"},
     **{f"prior.{axis}": ("10deg+/-0.01deg", {}) for axis in ("roll", "pitch", "yaw")},
 }
