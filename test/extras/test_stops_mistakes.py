@@ -276,6 +276,35 @@ def test_positions_do_not_overrule_rotations_on_which_way_round_it_is(seed):
     assert "read as a camera on the hand" in words(result)
 
 
+def moved(Ts_camera_target, part, row, shift_m):
+    """Poses of the target in the camera, of which one part moved before the stop of a row."""
+    T_shift = pose((0.0, shift_m, 0.0), (0.0, 0.0, 0.0))
+    moved_later = Ts_camera_target.copy()
+    later = moved_later[row:]
+    moved_later[row:] = T_shift @ later if part == "camera" else later @ T_shift
+    return moved_later
+
+
+@pytest.mark.parametrize("place", [ON_HAND, BESIDE])
+@pytest.mark.parametrize("part", ["camera", "target"])
+@pytest.mark.parametrize(("row", "shift_m", "noise_m"), [(16, 0.08, 0.01), (22, 0.03, 0.001)])
+def test_what_moved_is_refused_by_name_with_its_size(place, part, row, shift_m, noise_m):
+    robot, tracking, _ = arm(place, seed=row, n=32, noise_m=noise_m)
+    result = calibrate_arm(robot, moved(tracking, part, row, shift_m))
+    assert result.verdict is hec.Verdict.DO_NOT_USE
+    (movement,) = result.findings
+    assert movement.code == "moved"
+    assert f"the {part} moved by" in movement.what
+    assert movement.evidence["size_mm"] == pytest.approx(1e3 * shift_m, rel=0.25)
+    assert abs(movement.evidence["number"] - (row + 1)) <= 2
+
+
+def test_movement_is_not_blamed_for_other_mistakes():
+    robot, tracking, _ = arm(ON_HAND, n=32)
+    result = calibrate_arm(robot, moved(tracking, "target", 16, 0.08)[::-1])
+    assert [finding.code for finding in result.findings] == ["rows"]
+
+
 @pytest.mark.parametrize("place", [ON_HAND, BESIDE])
 @pytest.mark.parametrize(("n", "noise_m"), [(10, 0.0005), (30, 0.002), (60, 0.0001), (40, 0.004)])
 def test_clean_stops_have_no_findings(place, n, noise_m):

@@ -35,6 +35,11 @@ _PRIOR_SIGMA = 1.5
 _MAX_ROUNDS = 100
 _SMALL_CHANGE = 3e-3
 
+# The same for a fit of linear values, whose standard deviations need two digits only.
+_MAX_LINEAR_ROUNDS = 30
+_SMALL_LINEAR_STEP = 0.1
+_SMALL_LOG_CHANGE = 0.05
+
 # Smallest variance (m^2, rad^2): that of rounding in poses without errors.
 MIN_VARIANCE = 1e-24
 
@@ -117,8 +122,68 @@ def fit_components(
 
 
 @dataclass(frozen=True)
+class LinearFit:
+    """Fit of P values that change the errors of stops linearly.
+
+    Attributes
+    ----------
+    values : (P,) array
+    covariance : (P, P) array
+        Covariance of ``values``. Unobservable directions have large variances.
+    weights : (N,) array
+        Weights of Student's t distribution for each stop.
+    """
+
+    values: FloatArray
+    covariance: FloatArray
+    weights: FloatArray
+
+
+def fit_linear(
+    stops: Stops,
+    errors: FloatArray,
+    jacobian: FloatArray,
+    variances: FloatArray,
+    weights: FloatArray,
+    degrees: float,
+) -> LinearFit:
+    """Fit P values and the variances of the four sources of error.
+
+    Parameters
+    ----------
+    stops : Stops
+    errors, jacobian : (N, 6) and (N, 6, P) arrays
+        Errors in the frame of the child if all values are zero, and their derivatives.
+    variances, weights, degrees
+        As for :func:`fit_components`.
+    """
+    sources = _covariances_of_sources(stops)
+    prior = 0.5 * np.repeat(variances, 2)
+    components = prior
+    lengths = np.sqrt(np.einsum("nij,nij->j", jacobian, jacobian) + MIN_VARIANCE)
+    columns = jacobian / lengths
+    values = np.zeros(len(lengths))
+    for _ in range(_MAX_LINEAR_ROUNDS):
+        remaining = errors + columns @ values
+        iteration = _iteration(components, sources, remaining, columns, weights, degrees)
+        values = values + iteration.step
+        updated = _updated(components, prior, iteration.quadratic, iteration.expected)
+        log_change = float(np.max(np.abs(np.log(updated / components))))
+        components = updated
+        if iteration.decrease < _SMALL_LINEAR_STEP**2 and log_change < _SMALL_LOG_CHANGE:
+            break
+    shares = (degrees + 6.0) / (degrees + 8.0) * weights
+    by_values = iteration.precisions @ columns
+    information = np.einsum("n,nij,nik->jk", shares, columns, by_values)
+    damping = 1e-10 * np.trace(information) * np.eye(len(values))
+    covariance = np.linalg.inv(information + damping) / np.outer(lengths, lengths)
+    covariance = np.asarray(covariance, dtype=float)
+    return LinearFit(values / lengths, covariance, iteration.student)
+
+
+@dataclass(frozen=True)
 class _Iteration:
-    """Step of X and Z, and the terms that update the variances of the K = 4 sources.
+    """Step of the P values, and the terms that update the variances of the K = 4 sources.
 
     Attributes
     ----------
@@ -126,8 +191,8 @@ class _Iteration:
         Inverse covariances of the errors of each stop.
     student : (N,) array
         Weights of Student's t distribution.
-    step : (12,) array
-        Gauss-Newton step of X and Z.
+    step : (P,) array
+        Gauss-Newton step of the values: those of X and Z, and further ones.
     decrease : float
         Predicted decrease of the objective, times two.
     quadratic : (K,) array
@@ -152,7 +217,7 @@ def _iteration(
     weights: FloatArray,
     degrees: float,
 ) -> _Iteration:
-    """Return one iteration at errors (N, 6) and their derivatives (N, 6, 12).
+    """Return one iteration at errors (N, 6) and their derivatives (N, 6, P).
 
     ``components`` (4,) are the variances of the sources, ``sources`` (4, N, 6, 6) the covariances
     with variance 1.

@@ -440,7 +440,7 @@ def _with_lasting_errors(
     stretch : float
         Prior standard deviation of the scale, as a share.
     """
-    rows = whitening @ _rows_of(stops, fit)
+    rows = whitening @ rows_of(stops, fit)
     weighted = rows * np.sqrt(fit.weights[fit.weights > 0.0])[:, None, None]
     first = slice(_MAX_STOPS_AT_ONCE)
     shares = kernel_weights(correlations(views[first]), weighted[first])
@@ -471,13 +471,13 @@ def _with_lasting_errors(
 def whitened_rows(stops: Stops, fit: RobotWorld) -> FloatArray:
     """Return derivatives and errors (N, 6, 14) of stops, over the standard deviations of errors.
 
-    The columns are those of :func:`_rows_of`.
+    The columns are those of :func:`rows_of`.
     """
     levels = np.repeat([fit.level_m, fit.level_rad], 3)
-    return np.asarray(_rows_of(stops, fit) / levels[:, None])
+    return np.asarray(rows_of(stops, fit) / levels[:, None])
 
 
-def _rows_of(stops: Stops, fit: RobotWorld) -> FloatArray:
+def rows_of(stops: Stops, fit: RobotWorld) -> FloatArray:
     """Return derivatives and errors (N, 6, 14) of stops, in the frame of the child.
 
     The columns are the derivatives with respect to X and Z (12), the derivative with respect to the

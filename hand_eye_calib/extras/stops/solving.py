@@ -14,6 +14,7 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.records import gravest_first, has_error
 from hand_eye_calib.extras.stops.checks import MIN_LEAD, Examination, examine
 from hand_eye_calib.extras.stops.closed_form import Stops
+from hand_eye_calib.extras.stops.movement import check_movement
 from hand_eye_calib.extras.stops.robot_world import RobotWorld, solve
 from hand_eye_calib.extras.stops.rough_fit import (
     Mistakes,
@@ -145,6 +146,7 @@ def solve_checked(
         other = "hand" if setup_fit.is_inverse else "beside"
         findings.insert(0, finding("setup", place=SETUPS[setup], other=SETUPS[other]))
     setup_fit = _with_checked_scale(setup_fit, repaired, setup)
+    findings = _with_movement(poses, setup_fit, findings)
     findings += _check_unknown(poses, setup_fit.fit, findings)
     setup_fit = replace(
         setup_fit,
@@ -340,6 +342,18 @@ def _is_clearly_not_one(free: SetupFit) -> bool:
     change = abs(float(np.log(free.scale)))
     sigma = free.scale_sigma / free.scale
     return change > max(_MIN_SCALE_CHANGE, _MIN_SCALE_SIGMAS * sigma)
+
+
+def _with_movement(poses: StopPoses, setup_fit: SetupFit, findings: list[Finding]) -> list[Finding]:
+    """Return the findings, with a movement of the camera or of the target if there is one.
+
+    The movement replaces the finding that stops disagree. Other errors may look like a movement.
+    """
+    others = [issue for issue in findings if issue.key != "disagreeing_stops"]
+    if has_error(others) or not (poses.has_positions and turns_about_two_axes(poses.parent)):
+        return findings
+    moved = check_movement(setup_fit.stops, setup_fit.fit, poses.is_arm)
+    return [moved, *others] if moved else findings
 
 
 def _check_unknown(poses: StopPoses, fit: RobotWorld, findings: Sequence[Finding]) -> list[Finding]:

@@ -35,6 +35,12 @@ WORDS = {
         "parameters of the arm",
         code="unrelated",
     ),
+    "moved_stops": FindingWords(
+        "{what} moved by {size_mm:.0f} mm and {turn_deg:.1f} deg at about stop {number} of "
+        "{n_stops}",
+        "fasten it and record anew; or calibrate the stops before and after it alone",
+        code="moved",
+    ),
     "inverse_stops": FindingWords(
         "one of the two files has inverse poses (of the world in the sensor, such as a target in "
         "the camera)",
