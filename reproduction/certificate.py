@@ -64,9 +64,11 @@ def write(name: str, results: Results) -> list[Path]:
 
 
 def prove_level(source: Source, dataset: str, level: float | None) -> list[dict[str, Any]]:
-    """Proofs of the cases of a data set at a level: whether each answer was proved, and how long
-    that took; other local minima, from rotations by pi beside it, and how many of them the
-    certificate let pass.
+    """Return the proofs of the cases of a data set at a level.
+
+    A proof says whether the answer was proved, and how long that took. It also counts the other
+    local minima that are reached from the answer rotated by pi, and those of them that were proved
+    by mistake.
     """
     proofs = []
     for case in source.cases(dataset, level):

@@ -306,13 +306,13 @@ def _long_drive(shown: Shown) -> Found:
     """
     best = shown.variants("kitti_long")
     dnlo = shown.drives["kitti_long"][_AT]["dnlo"]
-    middle = all(name in ("B5", "C5", "C10") for name in best.values())
-    holds = middle and best["dnlo"] == "C5" and dnlo["B5"] > dnlo["C5"]
+    is_middle = all(name in ("B5", "C5", "C10") for name in best.values())
+    holds = is_middle and best["dnlo"] == "C5" and dnlo["B5"] > dnlo["C5"]
     rectified = _listed(shown.variants("kitti_long", _RECTIFIED))
     evidence = (
         f"{_listed(best)}; DNLO C5 {dnlo['C5']:.3f} m, B5 {dnlo['B5']:.3f} m; by the rectified"
     )
-    return holds, middle, f"{evidence} truth {rectified}."
+    return holds, is_middle, f"{evidence} truth {rectified}."
 
 
 @RULES.append

@@ -85,14 +85,14 @@ def clean(platform: str, seed: int) -> Streams:
     errors, rate_hz = _CHILDREN[platform]
     # Seconds at the start and the end that only the parent has.
     margin_s = 0.3 + 0.37 / rate_hz
-    for of_sensor, hz, mount, start_s, random in (
+    for errors_of_sensor, hz, mount, start_s, rng in (
         (kind.odometry, kind.rate_hz, np.eye(4), 0.0, parent_rng),
         (errors, rate_hz, X, margin_s, child_rng),
     ):
         n_poses = round((kind.duration_s - 1.0 - 2.0 * start_s) * hz)
         times_s: FloatArray = start_s + np.arange(n_poses) / hz
         twists = motion.twists(times_s) @ se3.adjoint(se3.inverse(mount)).T
-        drawn = draw(of_sensor, motion.at(times_s) @ mount, twists, 1.0 / hz, random)
+        drawn = draw(errors_of_sensor, motion.at(times_s) @ mount, twists, 1.0 / hz, rng)
         streams.append(Trajectory(stamps_ns(times_s), drawn.poses))
     return Streams(streams[0], streams[1], X)
 

@@ -20,7 +20,8 @@ from hand_eye_calib.extras.simulation.options import HILLY_DRIVE
 from reproduction.partial import QUANTILE_90
 from reproduction.writing import markdown_table, show, study_parser
 
-# Errors per axis of the first sensor: white m and rad, walk m and rad from pose to pose.
+# Errors per axis of the first sensor: white noise (m, rad), then random walk from pose to pose (m,
+# rad).
 _ERRORS = np.array([4e-3, 2e-3, 1e-3, 5e-4])
 
 

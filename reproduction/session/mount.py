@@ -159,6 +159,7 @@ def delay_table(delays_measured: Sequence[Delay]) -> str:
     rows = []
     for kind, size in dict.fromkeys((delay.kind, delay.size) for delay in delays_measured):
         some = [delay for delay in delays_measured if (delay.kind, delay.size) == (kind, size)]
+        # A value of at most 1: the monitor said beforehand that ten minutes show this shift.
         announced, others = (
             np.array([delay.seconds for delay in some if (delay.announced <= 1.0) == is_said])
             for is_said in (True, False)

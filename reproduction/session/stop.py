@@ -116,13 +116,15 @@ class Stop:
     rule: str
     # Of the default targets.
     factor: float
-    # Whether it was told that this motion will not get there, and was right.
+    # Whether the user was told that this motion will not reach the target, and this was right.
     is_stuck: bool
     is_done: bool = False
-    # If it was told to stop: the largest error over its target, what the truth itself is unsure of
-    # taken off; when that was, and from when on, until then, all errors were within their targets.
+    # The next three are of sessions that were told to stop. Largest error over its target, less the
+    # uncertainty of the truth.
     worst: float = np.nan
+    # Time of the stop.
     seconds: float = np.nan
+    # Time since which all errors had been within their targets.
     earliest_s: float = np.nan
     # Shares of the times left before the end that were within a factor of two, by their number.
     n_times: int = 0

@@ -290,9 +290,10 @@ def shifts_at(blocks: Blocks, cuts: IntArray) -> FloatArray | None:
 
 
 def _worst_long_run_variance(blocks: Blocks) -> float | None:
-    """Return the long-run variance of the scores: a factor of at least 1.
+    """Return the largest ratio of long-run variance to the variance of independent scores.
 
-    ``blocks`` has ``[H S]`` of each second. Returns None if there are too few seconds.
+    The ratio is at least 1. ``blocks`` has ``[H S]`` of each second. Returns None if there are too
+    few seconds.
     """
     counts = [count for count in _WINDOW_COUNTS if len(blocks.sums) >= count * _MIN_WINDOW_S]
     if not counts:

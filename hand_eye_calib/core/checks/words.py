@@ -338,7 +338,7 @@ WORDS = {
     ),
     "parts_turned": FindingWords(
         "two parts of the recording are sound by themselves, and their rotations differ by {size}",
-        "calibrate the parts before and after on their own",
+        "calibrate each part on its own",
         "a source that started anew with other axes",
         code="mount_moved",
     ),

@@ -261,7 +261,7 @@ class Calibrator:
         position : sequence of 3 floats
             Position (m).
         quat_xyzw : sequence of 4 floats
-            Quaternion, scalar last, of length 1 to 1 %.
+            Quaternion, scalar last. Its length is 1 within 1 %.
 
         Returns
         -------

@@ -149,8 +149,8 @@ class NoiseModel:
         """
         to_child = se3.adjoint(se3.inverse(T_parent_child))
         intervals_s = np.diff(streams.stamps_s)
-        # Half of the rotation noise R is that of the parent, which also shifts the child by its
-        # lever arm: 1/2 (R + Ad(X^-1) R Ad(X^-1)').
+        # Half of the rotation noise R is that of the parent. Through the lever arm, it also
+        # displaces the child: 1/2 (R + Ad(X^-1) R Ad(X^-1)').
         rotations = 0.5 * (ROTATIONS + to_child @ ROTATIONS @ to_child.T)
         white_rotations = rotations[None]
         if self.centre != "sensors":

@@ -80,9 +80,8 @@ def _of_streams(value: Detectability) -> str:
         return ""
     milliseconds = two_digits(1e3 * value.time_offset_s)
     percent = two_digits(1e2 * value.scale)
-    return (
-        f", one of the clocks from {milliseconds} ms and one of the child's lengths from {percent}%"
-    )
+    of_clocks = f"an error of the clocks from {milliseconds} ms"
+    return f", {of_clocks}, and of the child's lengths from {percent}%"
 
 
 def _amounts(sizes: Mapping[str, float]) -> str:

@@ -71,8 +71,8 @@ class Tuning:
     # Standard deviation of the change of the common-mode error from hour to hour, as a share of the
     # common-mode error.
     wander: float = 0.25
-    # Prior standard deviation of the child's scale in a second. A scale that drifts by 0.5 % stays
-    # wrong for a minute. As independent errors of 60 seconds, this is sqrt(60) times as much.
+    # Prior standard deviation of the error of the child's scale in each second. A drift of 0.5 %
+    # lasts about a minute. Independent errors of each second need sqrt(60) times that.
     scale_sigma: float = 0.04
     # Lengths (s) of the windows from whose scores the long-run variance is estimated.
     windows_s: tuple[int, ...] = (10, 30, 90, 240)

@@ -78,7 +78,7 @@ class Split(NamedTuple):
     size : int
         Number K of samples of a window.
     is_enough : (W',) bool array
-        Which of all W' windows of the recording have enough used samples; W of them have.
+        Which of all W' windows of the recording have enough used samples. Only these W are kept.
     is_used : (W, K) bool array
         Samples without a gap nearby.
     """

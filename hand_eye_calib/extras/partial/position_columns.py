@@ -135,7 +135,8 @@ def fit_positions(
     if windows is None:
         return None
     is_used = windows.is_used
-    # Errors of the pose (A, a): translation and rotation of the world of the odometry.
+    # Columns for errors of the pose of the odometry's world: of its translation a, then of its
+    # rotation A.
     translation = np.broadcast_to(np.eye(3), windows.rotations.shape)
     world = np.concatenate([translation, se3.skew(windows.path)], axis=3)
     fitted = fit_columns(_COLUMNS, windows, is_used, windows.residuals, world)

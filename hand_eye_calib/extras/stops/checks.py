@@ -63,11 +63,11 @@ MIN_LEAD = 7.0
 # Largest number of hypotheses that are solved in full: those with the best rough fits.
 _MAX_RIVALS = 6
 
-# Largest spread (m) of the positions of an arm. A larger one has another unit.
+# Largest spread (m) of the positions of an arm. A larger spread means that the unit is not metres.
 _MAX_SPREAD_M = 3.0
 
-# Largest median distance (cm) of positions from their origin in centimetres. Positions with a
-# larger one are in millimetres.
+# Positions whose median distance from the origin is at most this number are in centimetres. Others
+# are in millimetres.
 _MAX_DISTANCE_CM = 200.0
 
 # Largest factor by which the assumed size of a target is wrong. A larger factor between the lengths

@@ -97,7 +97,8 @@ def fit_components(
     """
     X, Z = start
     sources = _covariances_of_sources(stops)
-    # Half of all errors are about either origin.
+    # Begin with equal halves: errors of positions across and along the line of sight, and errors of
+    # rotations about both origins.
     prior = 0.5 * np.repeat(variances, 2)
     components = prior
     for _ in range(_MAX_ROUNDS):

@@ -57,7 +57,7 @@ WORDS = {
         severity=Severity.WARNING,
     ),
     "vehicle_halves": FindingWords(
-        "both halves of the drive give another {axes}",
+        "the two halves of the drive give different values of {axes}",
         "check that the sensor is fixed, and the pressure of the tyres; record again",
         "a mount that moved, or a load that changed",
         severity=Severity.WARNING,

@@ -187,8 +187,10 @@ def _in_axes_of_earth(table: Table, positions: FloatArray, quats_xyzw: FloatArra
     rotations = _rotations_of(quats_xyzw)
     candidates = {
         "the axes of the earth, too": quats_xyzw,
-        "east, north and up of each place (ENU)": se3.to_quat_xyzw(axes @ rotations),
-        "north, east and down of each place (NED)": se3.to_quat_xyzw(axes @ _R_ENU_NED @ rotations),
+        "east, north and up at each position (ENU)": se3.to_quat_xyzw(axes @ rotations),
+        "north, east and down at each position (NED)": se3.to_quat_xyzw(
+            axes @ _R_ENU_NED @ rotations
+        ),
     }
     fitting = _conventions_that_fit(positions, candidates)
     if len(fitting) > 1:

@@ -381,7 +381,7 @@ def _option_in_file(path: Path, option: str, value: object) -> tuple[str, Option
 
 
 def _unknown_option(path: Path, option: str) -> ConfigError:
-    """Return the error about an option of a file that does not exist."""
+    """Return the error about an unknown option in a file of options."""
     # as_typed() does not change names in quotes: they keep the spelling of the file.
     names = sorted(map(repr, OPTION_FIELDS))
     hint = did_you_mean(repr(option), names) or f"; known are {', '.join(names)}"

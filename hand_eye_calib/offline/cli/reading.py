@@ -1,6 +1,7 @@
 """Read the trajectory files of two or more sensors, and solve a recording of two streams."""
 
 import dataclasses
+import itertools
 import re
 from argparse import Namespace
 from collections import Counter
@@ -224,10 +225,10 @@ def read_files(
 
 def _refuse_options_of_two_files(arguments: Namespace) -> None:
     """Raise a ConfigError if an option of the parent's or the child's file is set."""
-    for name in (f"{stream}_{name}" for stream in STREAMS for name in FILE_OPTIONS):
-        if getattr(arguments, name):
+    for stream, name in itertools.product(STREAMS, FILE_OPTIONS):
+        if getattr(arguments, f"{stream}_{name}"):
             raise ConfigError(
-                f"--{flag(name)} is for two files; for a rig, set the option for all files"
+                f"--{flag(f'{stream}_{name}')} is for two files; for a rig, use --{flag(name)}"
             )
 
 

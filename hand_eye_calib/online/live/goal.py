@@ -381,7 +381,7 @@ class Goal:
         steps = np.searchsorted(_STEPS_S, 0.95 * left_s)
         has_infinite = (before == infinite) | (steps == infinite)
         is_new = has_infinite | (steps == 0) | (steps >= before + _MIN_INCREASE_STEPS)
-        # An axis that was within its target may exceed it again by the smallest step.
+        # If an axis leaves its target again, its time rises to the smallest step only.
         slower = np.clip(steps, before - _MAX_DECREASE_STEPS, np.maximum(before, 1))
         self._steps = np.where(is_new, steps, slower)
         return [float(seconds) for seconds in _STEPS_S[self._steps]]

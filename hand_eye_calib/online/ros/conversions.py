@@ -12,8 +12,8 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import turned
 from hand_eye_calib.core.results.calibration import Calibration
 
-# Length of a queue of messages: seconds of a fast stream. For /tf_static, this is the number of
-# publishers whose last message a late subscriber receives.
+# Length of a queue of messages. It holds several seconds of a fast stream. For /tf_static, this is
+# the number of publishers whose last message a late subscriber receives.
 _QUEUE = 1000
 
 _RELIABLE = ReliabilityPolicy.RELIABLE

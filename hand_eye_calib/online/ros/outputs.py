@@ -127,7 +127,7 @@ def _values(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]
     A name consists of the keys that lead to the value, the axis last, such as ``sigma.x``. ``path``
     are the keys that lead to ``value``.
     """
-    # The list is that of a comparison: its first difference is from the installed transform.
+    # Of a list of differences, only the first is shown. It is from the installed transform.
     if isinstance(value, list) and value and isinstance(value[0], dict):
         value = value[0]
     if isinstance(value, dict):

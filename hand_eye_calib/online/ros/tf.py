@@ -191,7 +191,7 @@ class Robot:
 def _with_axis_of(installed: Extrinsic, calibration: Calibration) -> Calibration:
     """Return a result whose only unobservable axis has the installed value.
 
-    The result is returned as it is if several axes are unobservable, or an axis of rotation.
+    The result is unchanged if several axes are unobservable, or if the axis is roll, pitch or yaw.
     """
     unobservable = calibration.unobservable()
     if len(unobservable) != 1:
