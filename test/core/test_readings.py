@@ -120,7 +120,7 @@ class TestInverse:
         assert metres < 0.05
         assert degrees < 0.5
         (text,) = (text for text in result.warnings if text.startswith("repaired"))
-        assert "parent_invert poses, child_invert poses" in text
+        assert 'parent_invert="poses", child_invert="poses"' in text
         assert result.verdict is not hec.Verdict.DO_NOT_USE
 
     @pytest.mark.parametrize("stream", ["parent", "child"])

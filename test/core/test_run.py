@@ -36,7 +36,7 @@ def test_a_clock_offset_that_is_certain_is_used_and_said(streams):
     assert result.time_offset_s == pytest.approx(0.3, abs=0.01)
     assert result.time_offset_sigma_s > 0
     np.testing.assert_allclose(result.T_parent_child, expected, atol=0.02)
-    (warning,) = (text for text in result.warnings if "solved with time_offset estimate" in text)
+    (warning,) = (text for text in result.warnings if 'solved with time_offset="estimate"' in text)
     assert "the child's clock is 0.3" in warning
 
 
@@ -45,7 +45,7 @@ def test_a_unit_that_is_certain_is_used_and_said(streams):
     result = hec.calibrate(parent, child.scaled(1000.0), reference="B5")
     assert (result.scale, result.findings) == (0.001, ())
     np.testing.assert_allclose(result.T_parent_child, expected, atol=0.01)
-    assert any("solved with scale 0.001" in text for text in result.warnings)
+    assert any("solved with scale=0.001" in text for text in result.warnings)
     thrice = hec.calibrate(parent.scaled(3.0), child)
     assert (thrice.scale, thrice.findings) == (pytest.approx(3.0, abs=0.01), ())
 
@@ -88,7 +88,10 @@ def test_a_stream_in_another_convention_is_repaired_and_that_is_said(streams, st
     (warning,) = (text for text in result.warnings if text.startswith("repaired: "))
     done = {f"{stream}_{name}": value for name, value in convention.items()}
     usual = {name: getattr(CalibratorConfig, name) for name in done}
-    solved, undo = (", ".join(map(" ".join, options.items())) for options in (done, usual))
+    solved, undo = (
+        ", ".join(f'{name}="{value}"' for name, value in options.items())
+        for options in (done, usual)
+    )
     sentence = f"Solved with {solved}: USE; as the streams are: DO NOT USE (undo with {undo})"
     assert sentence in warning
 

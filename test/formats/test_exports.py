@@ -190,7 +190,7 @@ def test_px4_has_its_own_axes_and_a_delay():
 def test_an_axis_that_is_not_known_is_refused():
     flat = result("base_link", "lidar", **unknown("z"))
     for name in EXPORT_FORMATS:
-        with pytest.raises(InputError, match="does not determine z; .* --prior"):
+        with pytest.raises(InputError, match="does not determine z; .* with a prior"):
             flat.export(name)
     with pytest.raises(ConfigError, match="unknown format 'kalbir'; known are autoware"):
         flat.export("kalbir")

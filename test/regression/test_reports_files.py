@@ -90,5 +90,5 @@ def test_check_reads_both_streams_as_calibrate_does(capsys):
     assert main(["check", str(folder / "p.tum"), str(folder / "motive.csv")]) == 1
     out = capsys.readouterr().out
     # Before the choice between both readings, the check proposed to invert both streams.
-    assert out.startswith("DO NOT USE as they are: calibrate with --time-offset 1700000000.")
+    assert out.startswith("DO NOT USE as they are: calibrate with --time-offset estimate.")
     assert "inverse" not in out

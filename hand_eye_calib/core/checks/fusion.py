@@ -19,7 +19,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
 
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.blocks import Blocks, solve
@@ -228,11 +227,25 @@ class _Regressors:
         # The lower half of an adjoint repeats its rotation.
         upper = self._adjoints[:, :3]
         steps = np.diff(upper, axis=0, prepend=upper[:1])
-        high_passed = lfilter([kept], [1.0, -kept], steps, axis=0)
+        high_passed = kept * _decaying_sums(steps, kept)
         changes = np.zeros_like(self._from_end)
         changes[:, :3] = high_passed[self._end] - high_passed[self._start]
         changes[:, 3:, 3:] = changes[:, :3, :3]
         return self._from_end @ changes
+
+
+def _decaying_sums(values: FloatArray, kept: float) -> FloatArray:
+    """Return ``sums[n] = values[n] + kept * sums[n - 1]`` along the first axis (N, ...).
+
+    Each round doubles the number of values in a sum. ``scipy.signal`` takes longer to load than
+    this to compute.
+    """
+    sums = values.copy()
+    lag = 1
+    while lag < len(sums) and kept**lag > np.finfo(float).eps:
+        sums[lag:] += kept**lag * sums[:-lag]
+        lag *= 2
+    return sums
 
 
 class _Differences:

@@ -525,13 +525,15 @@ def _start(
     return lever_arm, scale, alignments[window_of_pose] @ se3.rotation_of(Ts_pw_p)
 
 
-def unexplained_at_start(Ts_pw_p: FloatArray, positions: FloatArray) -> float:
+def unexplained_at_start(
+    Ts_pw_p: FloatArray, positions: FloatArray, tuning: Tuning = TUNING
+) -> float:
     """Return the share of the path that the lever arm of the start does not explain.
 
     The lever arm of the start ignores the noise model, so it is fast. The scale is 1. The arguments
     are those of :func:`unexplained_share`.
     """
-    lever_arm, scale, _ = _start(Ts_pw_p, positions, False, TUNING.window)
+    lever_arm, scale, _ = _start(Ts_pw_p, positions, False, tuning.window)
     return unexplained_share(Ts_pw_p, positions, lever_arm, scale)
 
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.spelling import Road
 from hand_eye_calib.core.base.text import angle, length
-from hand_eye_calib.core.results.records import NO_ACTION
 from hand_eye_calib.offline.cli import options
 from hand_eye_calib.offline.cli.options import (
     STREAMS,
@@ -179,6 +178,7 @@ def _verdict(findings: "Sequence[Finding]") -> str:
 
 def _finding_lines(findings: "Sequence[Finding]") -> Iterator[str]:
     """Yield severity, code, stream, sentence and advice of each finding."""
+    from hand_eye_calib.core.results.records import NO_ACTION
     from hand_eye_calib.offline.cli.present import wrapped
 
     if not findings:
