@@ -348,6 +348,10 @@ def test_command_line(tmp_path, capsys):
     result = hec.load(out)
     assert result.wheels["wheel_separation"].value == pytest.approx(0.5, rel=0.1)
     assert result.inverse().wheels == result.wheels
+    report = (out / "report.html").read_text()
+    assert "Pose of" in report
+    # The path of wheels of unknown size cannot be compared with that of the lidar.
+    assert "Both trajectories, aligned" not in report
 
 
 def test_command_line_without_wheels(tmp_path, capsys):

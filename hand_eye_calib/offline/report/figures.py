@@ -56,8 +56,12 @@ class _Curve(NamedTuple):
 def figures_of(calibration: Calibration, evidence: Evidence | None) -> list[Drawn]:
     """Draw all figures of a result; ``evidence`` is None for the stops of an arm."""
     figures = []
+    titles = _titles_of_views(evidence)
+    if calibration.reference == "windows":
+        # The path of the wheels has nominal radii. It is no pose that can be compared.
+        evidence = None
     if calibration.measured != "rotations":
-        figures.append(figure_of_views([calibration], _titles_of_views(evidence)))
+        figures.append(figure_of_views([calibration], titles))
         if evidence:
             figures.append(_figure_of_paths(calibration, evidence))
         if "stops" in calibration.parts:

@@ -33,7 +33,7 @@ from hand_eye_calib.core.results.document import (
     usable_numbers,
 )
 from hand_eye_calib.core.results.parts import advice_of, facts_of
-from hand_eye_calib.core.results.records import ROTATIONS
+from hand_eye_calib.core.results.records import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.core.results.verdict import shown, target_of
 from hand_eye_calib.offline.report.evidence import Evidence, gather, summarise
 from hand_eye_calib.offline.report.figures import figures_of
@@ -221,9 +221,9 @@ def _other_transforms(calibration: Calibration) -> list[tuple[Notation, tuple[st
 def _kind_of_result(calibration: Calibration) -> str:
     """Return "Pose", or "Position" or "Orientation" if the streams determine only this part."""
     unknown = {*calibration.out_of_reach}
-    if unknown & {*ROTATIONS}:
+    if unknown >= {*ROTATIONS}:
         return "Position"
-    return "Orientation" if unknown else "Pose"
+    return "Orientation" if unknown >= {*TRANSLATIONS} else "Pose"
 
 
 def _sensor_name(frame: str, origin: Document) -> str:
