@@ -10,7 +10,7 @@ from sensor_msgs.msg import JointState
 import hand_eye_calib as hec
 from reproduction.machines import simulate_machine
 
-# Wheel data are averaged over so many rows, so that all messages fit into the queues.
+# Number of rows of wheel data whose mean is one message. With fewer rows, the queues overflow.
 ROWS = 5
 LEFT_AND_RIGHT = ("wheel_left_joint", "wheel_right_joint")
 

@@ -25,7 +25,7 @@ from hand_eye_calib.core.checks.fault_regression import (
     motion_regression,
 )
 from hand_eye_calib.core.checks.findings import LIMITS, Finding, Severity, finding, graded
-from hand_eye_calib.core.checks.open_delay import NO_DELAY, Agreement, open_delay
+from hand_eye_calib.core.checks.open_delay import NO_DELAY, OpenDelay, open_delay
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
 from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
@@ -67,9 +67,9 @@ _EXPLAINING_SHARE = 0.3
 # A fault that explains at most this share is no error: jumps of a clean recording may cause it.
 _ERROR_SHARE = 0.1
 
-# Duration (s) and largest number of the motions in which delays and smoothing are estimated.
+# Duration (s) and largest number of short motions, in which delays and smoothing are estimated.
 SHORT_S = 1.0
-_MAX_SHORT_MOTIONS = 6000
+MAX_SHORT_MOTIONS = 6000
 # Smallest delay (s) that is reported: streams of vehicles without faults differ by some
 # milliseconds.
 _MIN_DELAY_S = 2.5 * FLOOR_TRAVEL_S
@@ -111,6 +111,13 @@ class Suspect(NamedTuple):
     finding: Finding | None
 
 
+class Agreement(NamedTuple):
+    """Findings about two streams that agree, and a delay of positions that remains open."""
+
+    findings: list[Finding]
+    delay: OpenDelay = NO_DELAY
+
+
 def check_agreement(
     pose_pairs: PosePairs,
     motions: MotionPairs,
@@ -142,7 +149,7 @@ def check_agreement(
         return Agreement(same)
     speed_m_s = usual_speed(pose_pairs.stamps_ns, se3.translation_of(pose_pairs.Ts_pw_p))
     suspects = slow_suspects(pose_pairs, motions, X, speed_m_s)
-    short_motions = pairs_over(pose_pairs, SHORT_S, _MAX_SHORT_MOTIONS)
+    short_motions = pairs_over(pose_pairs, SHORT_S, MAX_SHORT_MOTIONS)
     delay = NO_DELAY
     if fast := delay_regression(pose_pairs, short_motions, X):
         delay = open_delay(fast, X)

@@ -32,7 +32,7 @@ from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.base.spelling import PLACEHOLDER
 from hand_eye_calib.core.base.text import axes_in_words
 from hand_eye_calib.core.checks import agreement, fusion, hypotheses, independence, misread, parts
-from hand_eye_calib.core.checks.agreement import ExtrinsicEstimate
+from hand_eye_calib.core.checks.agreement import Agreement, ExtrinsicEstimate
 from hand_eye_calib.core.checks.clock_and_scale import (
     ROUNDED,
     check_offset,
@@ -41,7 +41,7 @@ from hand_eye_calib.core.checks.clock_and_scale import (
 )
 from hand_eye_calib.core.checks.findings import LIMITS, Finding, finding, graded, gravest_first
 from hand_eye_calib.core.checks.hypotheses import Explanation, Readings
-from hand_eye_calib.core.checks.open_delay import NO_DELAY, Agreement
+from hand_eye_calib.core.checks.open_delay import NO_DELAY
 from hand_eye_calib.core.checks.stream_pair import LAGS_S, MAX_PAIRS, MIN_PAIRS, StreamPair
 from hand_eye_calib.core.checks.streams import (
     check_flat,

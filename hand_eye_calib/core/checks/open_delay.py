@@ -51,13 +51,6 @@ class OpenDelay(NamedTuple):
 NO_DELAY = OpenDelay(np.zeros((6, 6)))
 
 
-class Agreement(NamedTuple):
-    """Findings about two streams that agree, and a delay of positions that remains open."""
-
-    findings: list[Finding]
-    delay: OpenDelay = NO_DELAY
-
-
 def open_delay(fast: Regression, X: FloatArray) -> OpenDelay:
     """Return the delay that adds most to the covariance of an extrinsic.
 

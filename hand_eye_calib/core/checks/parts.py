@@ -14,15 +14,12 @@ from hand_eye_calib.core.base.blocks import Blocks
 from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.base.stats import median, quantile
 from hand_eye_calib.core.base.text import angle
+from hand_eye_calib.core.checks.agreement import MAX_SHORT_MOTIONS, SHORT_S
 from hand_eye_calib.core.checks.findings import Finding, finding
 from hand_eye_calib.core.checks.stream_pair import MAX_ROTATION_RAD, MIN_PAIRS
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
 from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
-
-# Duration (s) and largest number of the motions that are compared.
-_SHORT_S = 1.0
-_MAX_MOTIONS = 6000
 
 # Shares of the poses before the time at which a recording is split in two.
 _SPLITS = (0.5, 0.25, 0.75)
@@ -59,7 +56,7 @@ def check_turned_parts(pose_pairs: PosePairs) -> list[Finding]:
     A stream that starts anew with other axes leaves two sound parts of a recording, and so do
     streams that are exchanged. The noise model follows one part and rejects the other as outliers.
     """
-    motions = pairs_over(pose_pairs, _SHORT_S, _MAX_MOTIONS)
+    motions = pairs_over(pose_pairs, SHORT_S, MAX_SHORT_MOTIONS)
     angles = se3.rotation_angle(se3.rotation_of(motions.Ts_parenti_parentj))
     motions = motions[angles < MAX_ROTATION_RAD]
     if exchanged := _check_exchanged(motions, pose_pairs.stamps_ns):
@@ -77,13 +74,10 @@ def check_turned_parts(pose_pairs: PosePairs) -> list[Finding]:
         by_other = min(_unexplained(parts[0], second), _unexplained(parts[1], first))
         if by_own >= _SOUND_PART or by_other <= max(_OTHER_PART, 3.0 * by_own):
             continue
-        at_s = float(pose_pairs.stamps_ns[split] - pose_pairs.stamps_ns[0]) * 1e-9
+        at_s = _seconds_at(pose_pairs.stamps_ns, split)
         if _unexplained(parts[1], se3.inverse(first)) < _SOUND_PART:
             return [finding("exchanged", at_s=at_s)]
-        between = se3.rotation_of(first).T @ se3.rotation_of(second)
-        turned_rad = float(se3.rotation_angle(between))
-        size = angle(turned_rad)
-        return [finding("parts_turned", size=size, at_s=at_s, turned_rad=turned_rad)]
+        return [_parts_turned(first, second, at_s)]
     return []
 
 
@@ -100,7 +94,7 @@ def check_other_extrinsic(pose_pairs: PosePairs, X: FloatArray) -> list[Finding]
     X : (4, 4) array
         Extrinsic of the recording.
     """
-    motions = pairs_over(pose_pairs, _SHORT_S, _MAX_MOTIONS)
+    motions = pairs_over(pose_pairs, SHORT_S, MAX_SHORT_MOTIONS)
     lengths_m = np.linalg.norm(se3.translation_of(motions.Ts_parenti_parentj), axis=1)
     motions = motions[lengths_m > _MOVING_SHARE * median(lengths_m)]
     if len(motions) < MIN_PAIRS or (_unexplained_path(motions, X) < _OTHER_SHARE).all():
@@ -114,15 +108,24 @@ def check_other_extrinsic(pose_pairs: PosePairs, X: FloatArray) -> list[Finding]
         if own is None:
             continue
         row = cut * len(pose_pairs) // _EXCHANGE_BLOCKS
-        at_s = float(pose_pairs.stamps_ns[row] - pose_pairs.stamps_ns[0]) * 1e-9
+        at_s = _seconds_at(pose_pairs.stamps_ns, row)
         exchanged = _exchanged(motions[is_other])
         if median(_unexplained_path(exchanged, candidate)) < _OTHER_SHARE / _OTHER_FACTOR:
             return [finding("exchanged", at_s=at_s)]
-        between = se3.rotation_of(candidate).T @ se3.rotation_of(own.T_parent_child)
-        turned_rad = float(se3.rotation_angle(between))
-        size = angle(turned_rad)
-        return [finding("parts_turned", size=size, at_s=at_s, turned_rad=turned_rad)]
+        return [_parts_turned(candidate, own.T_parent_child, at_s)]
     return []
+
+
+def _seconds_at(stamps_ns: IntArray, row: int) -> float:
+    """Return the time (s) from the first pose to the pose of a row."""
+    return float(stamps_ns[row] - stamps_ns[0]) * 1e-9
+
+
+def _parts_turned(first: FloatArray, second: FloatArray, at_s: float) -> Finding:
+    """Return the finding that the extrinsics (4, 4) of two parts have different rotations."""
+    between = se3.rotation_of(first).T @ se3.rotation_of(second)
+    turned_rad = float(se3.rotation_angle(between))
+    return finding("parts_turned", size=angle(turned_rad), at_s=at_s, turned_rad=turned_rad)
 
 
 def _exchanged(motions: MotionPairs) -> MotionPairs:
@@ -208,7 +211,7 @@ def _check_exchanged(motions: MotionPairs, stamps_ns: IntArray) -> Finding | Non
     if not is_sound or usual_rad > _EXCHANGE_GAIN * quantile(as_given, _EXCHANGE_QUANTILE):
         return None
     row = cuts[best] * len(stamps_ns) // _EXCHANGE_BLOCKS
-    return finding("exchanged", at_s=float(stamps_ns[row] - stamps_ns[0]) * 1e-9)
+    return finding("exchanged", at_s=_seconds_at(stamps_ns, row))
 
 
 def _unexplained(motions: MotionPairs, X: FloatArray) -> float:

@@ -50,7 +50,7 @@ def _histories_of_mount(paths: list[Path]) -> list[History]:
 
 
 def _histories_of_fleet(paths: list[Path]) -> list[History]:
-    """Return the histories of vehicles. The digests of each vehicle are in a path of its own."""
+    """Return the history of each vehicle. Each path contains the digests of one vehicle."""
     histories = []
     for path in paths:
         sessions = read_digests([path])

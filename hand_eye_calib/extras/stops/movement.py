@@ -31,10 +31,10 @@ _DEGREES = 4.0
 # Smallest median weight of the stops of either part. Below it, the part consists of outliers.
 _MIN_WEIGHT = 0.3
 
-# Smallest squared size of a movement in standard deviations (six values): a constant, and a term
-# over the number of stops, because few stops hardly determine the variances. Measured without a
-# movement, as the largest value on the grid: up to 32 in simulated stops and stops of KinHEC with
-# noise, and once 67 for 30 stops of an arm with errors of its lengths and angles.
+# Smallest squared size of a movement in standard deviations (six values). It is the first number
+# plus the second number divided by the number of stops: few stops hardly determine the variances.
+# The largest value on the grid without a movement was 32 for simulated stops, and for stops of
+# KinHEC with noise. It was 67 for one arm of 30 stops with errors of its lengths and angles.
 _MIN_SQUARED = 40.0
 _MIN_SQUARED_TIMES_STOPS = 600.0
 

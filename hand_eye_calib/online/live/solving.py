@@ -258,7 +258,8 @@ def main() -> None:
     os.dup2(sys.stderr.fileno(), 1)
     jobs: queue.SimpleQueue[Job] = queue.SimpleQueue()
     threading.Thread(target=_receive, args=(jobs,), daemon=True).start()
-    # On Linux, a thread has a priority of its own, and no thread can raise its priority again.
+    # On Linux, each thread has its own priority. Once lowered, a priority cannot be raised again.
+    # So jobs without hurry have a thread for themselves.
     at_low_priority = ThreadPoolExecutor(1, initializer=os.nice, initargs=(_NICENESS,))
     while True:
         job = jobs.get()

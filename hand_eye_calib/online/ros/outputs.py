@@ -127,7 +127,8 @@ def _values(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]
     A name consists of the keys that lead to the value, the axis last, such as ``sigma.x``. ``path``
     are the keys that lead to ``value``.
     """
-    # Of a list of differences, only the first is shown. It is from the installed transform.
+    # The first of several differences is the difference from the installed transform. Only this
+    # difference is shown.
     if isinstance(value, list) and value and isinstance(value[0], dict):
         value = value[0]
     if isinstance(value, dict):
