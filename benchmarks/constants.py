@@ -40,7 +40,9 @@ def changed(name: str, factor: float) -> Tuning:
             return max(round(factor * number), min(number, 1))
         return float(number + np.log(factor)) if is_log else factor * number
 
-    new_value = tuple(map(multiplied, value)) if isinstance(value, tuple) else multiplied(value)
+    new_value = (
+        tuple(map(multiplied, value)) if isinstance(value, tuple) else multiplied(value)
+    )
     return dataclasses.replace(TUNING, **{name: new_value})
 
 
@@ -49,11 +51,17 @@ def measured(cases: Sequence[Case], tuning: Tuning = TUNING) -> FloatArray:
     rows = []
     for case in cases:
         found = outcome(case, {"tuning": tuning})
-        rows.append([np.nan] * 3 if found is None else [*found.errors, np.mean(found.in_sigmas**2)])
+        rows.append(
+            [np.nan] * 3
+            if found is None
+            else [*found.errors, np.mean(found.in_sigmas**2)]
+        )
         if not case.sigmas.any():
             poses = case.poses
             measured_m = poses.Ts_cw_c[:, :3, 3]
-            lever = positions.solve(poses.stamps_ns, poses.Ts_pw_p, measured_m, tuning=tuning)
+            lever = positions.solve(
+                poses.stamps_ns, poses.Ts_pw_p, measured_m, tuning=tuning
+            )
             off = lever.lever_arm - case.T_parent_child[:3, 3]
             square = float(off @ np.linalg.solve(lever.covariance, off)) / 3.0
             rows.append([float(np.linalg.norm(off)), np.nan, square])
@@ -69,7 +77,10 @@ def main() -> None:
     whole = measured(cases)
     rows = []
     for field in dataclasses.fields(TUNING)[1:]:
-        row: dict[str, object] = {"constant": field.name, "value": getattr(TUNING, field.name)}
+        row: dict[str, object] = {
+            "constant": field.name,
+            "value": getattr(TUNING, field.name),
+        }
         largest = 0.0
         for title, factor in (("halved", 0.5), ("doubled", 2.0)):
             logs = np.log(measured(cases, changed(field.name, factor)) / whole)

@@ -110,7 +110,9 @@ def measured_node(report, arguments):
     stop = CalibratorNode.stop
     conclude = cycle.SolveCycle.conclude
     solves = []
-    cycle.SolveCycle.conclude = lambda *answered: solves.append(0) or conclude(*answered)
+    cycle.SolveCycle.conclude = lambda *answered: (
+        solves.append(0) or conclude(*answered)
+    )
 
     def stop_and_report(self, timeout_s):
         start_s, start_cpu_s = used[0]
@@ -124,7 +126,9 @@ def measured_node(report, arguments):
             "duration": np.percentile(durations, [50, 99, 99.9, 100]).tolist(),
             "solves": len(solves),
             "pairs": result.n_pairs if result else 0,
-            "error": 1e3 * math.dist(result.translation, T_PARENT_CHILD[:3, 3]) if result else 0,
+            "error": 1e3 * math.dist(result.translation, T_PARENT_CHILD[:3, 3])
+            if result
+            else 0,
         }
         report.write_text(json.dumps(document), encoding="utf-8")
         return stop(self, timeout_s)
@@ -153,7 +157,12 @@ def cpu_seconds():
     ticks = 0
     for pid in (os.getpid(), *children(os.getpid())):
         with contextlib.suppress(FileNotFoundError):  # it has just been killed
-            stat = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+            stat = (
+                Path(f"/proc/{pid}/stat")
+                .read_text(encoding="ascii")
+                .rpartition(")")[2]
+                .split()
+            )
             ticks += int(stat[11]) + int(stat[12])
     return ticks / os.sysconf("SC_CLK_TCK")
 
@@ -202,7 +211,11 @@ def publish_alone(rate_hz, n_poses):
 
 def start(domain, *words, **more):
     """Another process of this file."""
-    environment = {"ROS_DOMAIN_ID": str(domain), "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+    environment = {
+        "ROS_DOMAIN_ID": str(domain),
+        "OMP_NUM_THREADS": "1",
+        "PYTHONUNBUFFERED": "1",
+    }
     command = [sys.executable, __file__, *map(str, words)]
     return subprocess.Popen(command, env=os.environ | environment | more, cwd=PROJECT)
 
@@ -245,7 +258,9 @@ def slow_processor(node, share):
         (group / "cgroup.procs").write_text(str(pid))
         groups.append(group)
     cores = os.sched_getaffinity(0)
-    waking = [subprocess.Popen([sys.executable, "-c", WAKES_UP, str(core)]) for core in cores]
+    waking = [
+        subprocess.Popen([sys.executable, "-c", WAKES_UP, str(core)]) for core in cores
+    ]
 
     def undo():
         end(waking)
@@ -259,7 +274,10 @@ def slow_processor(node, share):
 
 def others(count):
     """Programs that load all cores, at the usual priority; ends them."""
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    busy = [
+        subprocess.Popen([sys.executable, "-c", "while True: pass"])
+        for _ in range(count)
+    ]
     return lambda: end(busy)
 
 
@@ -287,7 +305,11 @@ def loaded_node(folder, name, seconds, disturb=None, **environment):
         "output_directory": folder / name,
         "report": "false",  # it would load the machine in the next part
     }
-    given = [word for option, value in options.items() for word in ("-p", f"{option}:={value}")]
+    given = [
+        word
+        for option, value in options.items()
+        for word in ("-p", f"{option}:={value}")
+    ]
     words = ("--node", report, "--ros-args", "--log-level", "warn", *given)
     node = start(domain, *words, **environment)
     undo = disturb(node) if disturb else lambda: None
@@ -330,7 +352,12 @@ def load(seen, most_latency_s=MOST_LATENCY_S, may_lose=False):
         ("callback p50 / p99 / p99.9 / max (ms)", callbacks, "", True),
         ("CPU (cores)", f"{seen['cpu']:.2f}", "", True),
         ("pairs, error (mm) of the last", last, "", True),
-        ("end after Ctrl-C (s), code", f"{seen['ended_s']:.2f}, {code}", "code 0", code == 0),
+        (
+            "end after Ctrl-C (s), code",
+            f"{seen['ended_s']:.2f}, {code}",
+            "code 0",
+            code == 0,
+        ),
     ]
 
 
@@ -375,7 +402,12 @@ def soak(hours):
     grown = last_mb / first_mb - 1
     n_poses = result.n_poses
     return [
-        (f"memory after 1 h, {hours} h (MB)", memory, "within 10 %", grown < MOST_GROWTH),
+        (
+            f"memory after 1 h, {hours} h (MB)",
+            memory,
+            "within 10 %",
+            grown < MOST_GROWTH,
+        ),
         ("solve after the first, last hour (ms)", solve, "flat", is_flat),
         ("per pose p99, worst hour (us)", f"{worst:.1f}", "< 50", worst < 50),
         ("poses kept", str(n_poses), "<= 5000", n_poses <= 5000),
@@ -387,7 +419,9 @@ def resident_mb():
     gc.collect()
     ctypes.CDLL(None).malloc_trim(0)
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS:"))
+    return next(
+        int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS:")
+    )
 
 
 # ---------------------------------------------------------------------- kill
@@ -402,7 +436,11 @@ def kill(folder, kills):
     output = folder / "kill"
     peer = Peer(domain)
     publishers = peer.publishers()
-    words = f"-p output_directory:={output}", "-p journal:=resume", "-p solve_period:=0.5"
+    words = (
+        f"-p output_directory:={output}",
+        "-p journal:=resume",
+        "-p solve_period:=0.5",
+    )
     save_result(earlier_result(), output)
     before = fingerprints(output)
     lost_s = []
@@ -420,7 +458,11 @@ def kill(folder, kills):
         begun_ns = START_NS + first * 1_000_000_000 // rate_hz
         n_more = random.randint(1, 3 * rate_hz)
         while n_more:
-            n_poses = n_more if has_poses_since(output / "journal", begun_ns) else rate_hz // 4
+            n_poses = (
+                n_more
+                if has_poses_since(output / "journal", begun_ns)
+                else rate_hz // 4
+            )
             n_more = 0 if n_poses == n_more else n_more
             publish(publishers, first, n_poses, rate_hz)
             first += n_poses
@@ -429,16 +471,30 @@ def kill(folder, kills):
         journal = read_journal(output / "journal")
         count = len(journal.stamps_ns)
         newest_ns = START_NS + (first - 1) * 1_000_000_000 // rate_hz
-        lost_s.append((newest_ns - min(newest(journal, stream) for stream in STREAMS)) * 1e-9)
-        unchanged += before.items() <= fingerprints(output).items()  # the node adds its own
+        lost_s.append(
+            (newest_ns - min(newest(journal, stream) for stream in STREAMS)) * 1e-9
+        )
+        unchanged += (
+            before.items() <= fingerprints(output).items()
+        )  # the node adds its own
         load_result(output)
     code, _ = node.stop(15)
     peer.close()
     lost = f"{np.mean(lost_s):.3f}, {max(lost_s):.3f}"
     return [
-        ("sessions resumed with all of it", f"{resumed} of {kills}", "all", resumed == kills),
+        (
+            "sessions resumed with all of it",
+            f"{resumed} of {kills}",
+            "all",
+            resumed == kills,
+        ),
         ("poses lost (s): mean, worst", lost, "< 1", max(lost_s) < MOST_LOST_S),
-        ("earlier result files unchanged", f"{unchanged} of {kills}", "all", unchanged == kills),
+        (
+            "earlier result files unchanged",
+            f"{unchanged} of {kills}",
+            "all",
+            unchanged == kills,
+        ),
         ("poses in the session at the end", str(count), "> 0", count > 0),
         ("end after SIGTERM, code", str(code), "0", code == 0),
     ]
@@ -481,11 +537,17 @@ def main(arguments):
         return measured_node(Path(arguments[1]), arguments[2:])
     if arguments[:1] == ["--publish"]:
         return publish_alone(int(arguments[1]), int(arguments[2]))
-    parser = argparse.ArgumentParser(description="Load, soak and crashes of the node, measured.")
+    parser = argparse.ArgumentParser(
+        description="Load, soak and crashes of the node, measured."
+    )
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="all by default")
     parser.add_argument("--seconds", type=float, default=60.0, help="length of a load")
-    parser.add_argument("--hours", type=int, default=10, help="length of soak, simulated")
-    parser.add_argument("--kills", type=int, default=20, help="how often to kill the node")
+    parser.add_argument(
+        "--hours", type=int, default=10, help="length of soak, simulated"
+    )
+    parser.add_argument(
+        "--kills", type=int, default=20, help="how often to kill the node"
+    )
     parser.add_argument("--share", type=float, default=0.4, help="of a core, for share")
     options = parser.parse_args(arguments)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -503,7 +565,10 @@ def main(arguments):
             return load(seen, MOST_LATENCY_OF_A_SHARE_S)
         n_programs = 4 * (os.cpu_count() or 1)
         hard = lambda _: others(n_programs)  # noqa: E731
-        return load(loaded_node(folder, part, options.seconds, hard, **{SLOW: "1"}), may_lose=True)
+        return load(
+            loaded_node(folder, part, options.seconds, hard, **{SLOW: "1"}),
+            may_lose=True,
+        )
 
     good = True
     with tempfile.TemporaryDirectory() as name:

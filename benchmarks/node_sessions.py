@@ -213,7 +213,9 @@ def flat(seconds, Ts):
     """Keep x, y and yaw."""
     rpy = np.zeros((len(Ts), 3))
     rpy[:, 2] = np.arctan2(Ts[:, 1, 0], Ts[:, 0, 0])
-    return se3.from_rotation_translation(se3.rotation_from_rpy(rpy), Ts[:, :3, 3] * [1.0, 1.0, 0.0])
+    return se3.from_rotation_translation(
+        se3.rotation_from_rpy(rpy), Ts[:, :3, 3] * [1.0, 1.0, 0.0]
+    )
 
 
 def start_straight(streams):
@@ -234,13 +236,19 @@ SESSIONS = {
     "100 Hz, load 8": Session(90.0, "DONE", (100.0, 100.0), QUIET, load=8),
     "50 and 7 Hz": Session(90.0, "DONE", (50.0, 7.0), QUIET),
     "knock": Session(
-        120.0, "CHECK THE STREAMS|GO ON|DONE", accident=knock, must_appear="CHECK THE STREAMS"
+        120.0,
+        "CHECK THE STREAMS|GO ON|DONE",
+        accident=knock,
+        must_appear="CHECK THE STREAMS",
     ),
     "wrong installed": Session(
         90.0, "DONE", parameters=QUIET | {"installed": ""}, must_appear="HAS MOVED"
     ),
     "contradicted prior": Session(
-        60.0, "CHECK THE PRIOR", parameters={"prior.z": "1.5+/-0.01"}, must_appear="contradicts"
+        60.0,
+        "CHECK THE PRIOR",
+        parameters={"prior.z": "1.5+/-0.01"},
+        must_appear="contradicts",
     ),
     "two publishers": Session(
         60.0, "BAD INPUT|CHECK", second_publisher_s=30.0, must_appear="publishers"
@@ -255,9 +263,15 @@ SESSIONS = {
     ),
     "parked": Session(120.0, "DONE", parameters=QUIET, accident=park),
     "child silent for 20 s": Session(
-        110.0, "DONE", parameters=QUIET, accident=stop_child, must_appear="PAUSED|CHECK INPUT"
+        110.0,
+        "DONE",
+        parameters=QUIET,
+        accident=stop_child,
+        must_appear="PAUSED|CHECK INPUT",
     ),
-    "child dies, Ctrl-C": Session(55.0, "PAUSED|CHECK INPUT", parameters=QUIET, accident=end_child),
+    "child dies, Ctrl-C": Session(
+        55.0, "PAUSED|CHECK INPUT", parameters=QUIET, accident=end_child
+    ),
     "ramps, 10 min": Session(600.0, "DONE", vehicle="agv_ramps"),
     "flat, then ramps, 10 min": Session(600.0, "DONE", vehicle="agv_long", flat_s=90.0),
 }
@@ -295,12 +309,18 @@ def simulated(session, seed):
 def simulated_vehicle(session, seed):
     """Return the streams of a vehicle that drives over ramps, and the true extrinsic."""
     motion = functools.partial(agv_on_request, flat_s=session.flat_s)
-    kind = dataclasses.replace(CLASSES[session.vehicle], motion=motion, duration_s=session.seconds)
+    kind = dataclasses.replace(
+        CLASSES[session.vehicle], motion=motion, duration_s=session.seconds
+    )
     drive = simulate(kind, (seed,))
     start_ns = min(drive.parent.stamps_ns[0], drive.child.stamps_ns[0])
-    times_s = [(stream.stamps_ns - start_ns) * 1e-9 for stream in (drive.parent, drive.child)]
+    times_s = [
+        (stream.stamps_ns - start_ns) * 1e-9 for stream in (drive.parent, drive.child)
+    ]
     poses = [stream.poses.copy() for stream in (drive.parent, drive.child)]
-    streams = Streams(times_s[0], poses[0], times_s[1], poses[1], drive.T_parent_child, np.eye(4))
+    streams = Streams(
+        times_s[0], poses[0], times_s[1], poses[1], drive.T_parent_child, np.eye(4)
+    )
     return streams, drive.T_parent_child
 
 
@@ -355,27 +375,44 @@ class Witness:
         self.pages = []
         node = peer.node
         self._subscribe(node, String, "/calibrator/progress", self._take_state)
-        self._subscribe(node, TransformStamped, "/calibrator/extrinsic", self.transforms)
+        self._subscribe(
+            node, TransformStamped, "/calibrator/extrinsic", self.transforms
+        )
 
-        node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, 10)
+        node.create_subscription(
+            DiagnosticArray, "/diagnostics", self._take_diagnostics, 10
+        )
         with contextlib.suppress(ImportError):
             from tf2_msgs.msg import TFMessage
 
             self._subscribe(node, TFMessage, "/tf_static", self.broadcasts)
         self._notes = folder / "watch.txt"
         environment = {"ROS_DOMAIN_ID": str(domain), "XDG_STATE_HOME": str(folder)}
-        command = [sys.executable, "-m", "hand_eye_calib", "watch", "--web", "127.0.0.1:0"]
+        command = [
+            sys.executable,
+            "-m",
+            "hand_eye_calib",
+            "watch",
+            "--web",
+            "127.0.0.1:0",
+        ]
         with self._notes.open("w") as notes:
             self._watch = subprocess.Popen(
                 command,
                 stdout=subprocess.DEVNULL,
                 stderr=notes,
-                env=os.environ | environment | {"PYTHONPATH": os.pathsep.join(sys.path)},
+                env=os.environ
+                | environment
+                | {"PYTHONPATH": os.pathsep.join(sys.path)},
             )
         threading.Thread(target=self._read_page, daemon=True).start()
 
     def _subscribe(self, node, kind, topic, target):
-        take = target if callable(target) else lambda data: target.append((time.time(), data))
+        take = (
+            target
+            if callable(target)
+            else lambda data: target.append((time.time(), data))
+        )
         node.create_subscription(kind, topic, take, LATCHED)
 
     def _take_state(self, text):
@@ -391,7 +428,9 @@ class Witness:
         address = None
         while address is None:
             time.sleep(0.1)
-            address = re.search(r"http://127.0.0.1:(\d+)/\?key=(\S+)", self._notes.read_text())
+            address = re.search(
+                r"http://127.0.0.1:(\d+)/\?key=(\S+)", self._notes.read_text()
+            )
         connection = http.client.HTTPConnection("127.0.0.1", int(address[1]))
         connection.request("GET", f"/events?key={address[2]}")
         events = connection.getresponse()
@@ -424,9 +463,9 @@ def contradictions(witness, start_s, end_s):
             continue
         before = newest(witness.states, now_s - SETTLED_S)
         after = newest(witness.states, now_s + SETTLED_S)
-        if before is None or not essence(before[1]) == essence(state_record[1]) == essence(
-            after[1]
-        ):
+        if before is None or not essence(before[1]) == essence(
+            state_record[1]
+        ) == essence(after[1]):
             continue  # one surface may be ahead of another for a moment
         yield from (
             (second, text)
@@ -456,7 +495,12 @@ def compare_page(page, state):
     progress = state.progress.progress if state.progress else None
     if (page.word == "DONE") and not (progress and progress.done):
         yield "the page is DONE, the state is not"
-    if progress and progress.done and page.word != "DONE" and not page.word.startswith(ALARMS):
+    if (
+        progress
+        and progress.done
+        and page.word != "DONE"
+        and not page.word.startswith(ALARMS)
+    ):
         yield f"the state is done, the page is {page.word}"
     verdict = result.verdict if result else "no result yet"
     if page.verdict != verdict:
@@ -464,7 +508,8 @@ def compare_page(page, state):
     if progress and progress.axes and not state.extrinsic.contradicted:
         full = [share >= 1.0 for share in page.shares.values()]
         within = [
-            progress.axes[key].sigma <= progress.axes[key].target for key in AXIS_KEYS.values()
+            progress.axes[key].sigma <= progress.axes[key].target
+            for key in AXIS_KEYS.values()
         ]
         by_hand = [progress.axes[key].seconds_left == 0 for key in AXIS_KEYS.values()]
         if any(a != (b or c) for a, b, c in zip(full, within, by_hand, strict=True)):
@@ -482,7 +527,9 @@ def compare_page(page, state):
                 yield f"{axis} is {text!r} on the page, {value:.3f} m in the state"
     motion_s = state.extrinsic.motion_s if state.extrinsic else 0.0
     rotation_deg = (
-        max(state.extrinsic.rotation_deg.values(), default=0.0) if state.extrinsic else 0.0
+        max(state.extrinsic.rotation_deg.values(), default=0.0)
+        if state.extrinsic
+        else 0.0
     )
     is_early = motion_s < MIN_MOTION_S and rotation_deg < MIN_ROTATION_DEG
     if is_early and page.word in ("CHANGE THE MOTION", "DONE"):
@@ -563,7 +610,9 @@ def promises(witness, start_s, end_s, flat_s):
         for second, record in zip(seconds, records, strict=True)
         if record and record[1].progress
     }
-    done_s = next((second for second, state in progress.items() if state.done), math.inf)
+    done_s = next(
+        (second for second, state in progress.items() if state.done), math.inf
+    )
     outside_s = 0
     change_s = 0
     ratios = []
@@ -611,9 +660,15 @@ def run(name, session, folder, seed):
     streams, T_parent_child = simulated(session, seed)
     domain = free_domain()
     peer = Peer(domain)
-    parameters = {"output_directory": folder / "out", "publish_tf": "true", **session.parameters}
+    parameters = {
+        "output_directory": folder / "out",
+        "publish_tf": "true",
+        **session.parameters,
+    }
     if "installed" in parameters:
-        wrong = T_parent_child @ se3.exp(np.array([0.15, 0.0, 0.0, 0.0, 0.0, math.radians(4.0)]))
+        wrong = T_parent_child @ se3.exp(
+            np.array([0.15, 0.0, 0.0, 0.0, 0.0, math.radians(4.0)])
+        )
         numbers = " ".join(f"{number:.6f}" for number in se3.xyz_rpy(wrong))
         parameters["installed"] = f"'{numbers}'"
     arguments = [f"-p {key}:={value}" for key, value in parameters.items()]
@@ -621,7 +676,9 @@ def run(name, session, folder, seed):
     node = NodeProcess(domain, folder / "node.log", arguments, fresh=True)
     end_load = others(session.load)
     try:
-        peer.spin_until(lambda: witness.pages and witness.states, "the page and the node")
+        peer.spin_until(
+            lambda: witness.pages and witness.states, "the page and the node"
+        )
         start_s = time.time() + START_S
         publishing = start_publishing(domain, streams, start_s, session)
         spin_to(peer, start_s + session.seconds + 4.0)
@@ -636,19 +693,29 @@ def run(name, session, folder, seed):
         watch_code = witness.close()
         peer.close()
     problems = list(contradictions(witness, start_s, end_s))
-    problems += [(math.inf, text) for text in end_contradictions(witness, node.log, folder)]
-    problems += [(math.inf, text) for text in long_sentences(page for _, page in witness.pages)]
+    problems += [
+        (math.inf, text) for text in end_contradictions(witness, node.log, folder)
+    ]
+    problems += [
+        (math.inf, text) for text in long_sentences(page for _, page in witness.pages)
+    ]
     if session.vehicle:
         kept = promises(witness, start_s, end_s, session.flat_s)
         print(f"{name}, seed {seed}: {kept}")
         problems += [(math.inf, text) for text in kept.broken()]
     if code or watch_code:
-        problems.append((math.inf, f"exit codes {code} of the node, {watch_code} of watch"))
+        problems.append(
+            (math.inf, f"exit codes {code} of the node, {watch_code} of watch")
+        )
     if not re.match(session.ends_with, last.word):
-        problems.append((math.inf, f"ends with {last.headline!r}, not {session.ends_with}"))
+        problems.append(
+            (math.inf, f"ends with {last.headline!r}, not {session.ends_with}")
+        )
     shown = "\n".join(page.html for _, page in witness.pages)
     if not re.search(session.must_appear, unescape(shown)):
-        problems.append((math.inf, f"the page has never displayed {session.must_appear!r}"))
+        problems.append(
+            (math.inf, f"the page has never displayed {session.must_appear!r}")
+        )
     return row_of(witness, start_s, end_s, last, T_parent_child), problems
 
 
@@ -671,7 +738,9 @@ def publish(streams, start_s, session):
         (publishers[0], streams.parent_s, streams.Ts_parent, "lidar"),
         (publishers[1], streams.child_s, streams.Ts_child, "camera"),
     ):
-        rows += [(time_s, publisher, T, frame) for time_s, T in zip(times_s, Ts, strict=True)]
+        rows += [
+            (time_s, publisher, T, frame) for time_s, T in zip(times_s, Ts, strict=True)
+        ]
     second = None
     for time_s, publisher, T, frame in sorted(rows, key=lambda row: row[0]):
         time.sleep(max(0.0, start_s + time_s - time.time()))
@@ -701,7 +770,8 @@ def row_of(witness, start_s, end_s, last, T_parent_child):
     during = [(t, state) for t, state in witness.states if start_s <= t <= end_s]
     first = next((t - start_s for t, state in during if state.result), math.nan)
     done = next(
-        (t - start_s for t, s in during if s.progress and s.progress.progress.done), math.nan
+        (t - start_s for t, s in during if s.progress and s.progress.progress.done),
+        math.nan,
     )
     verdicts = [state.result.verdict for _, state in during if state.result]
     flips = sum(a != b for a, b in itertools.pairwise(verdicts))
@@ -722,14 +792,26 @@ def row_of(witness, start_s, end_s, last, T_parent_child):
     ], witness
 
 
-HEADINGS = ["seconds", "result at", "DONE at", "verdicts", "headlines", "error mm", "last headline"]
+HEADINGS = [
+    "seconds",
+    "result at",
+    "DONE at",
+    "verdicts",
+    "headlines",
+    "error mm",
+    "last headline",
+]
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     names = ", ".join(SESSIONS)
-    parser.add_argument("sessions", nargs="*", metavar="SESSION", help=f"all by default: {names}")
-    parser.add_argument("--out", type=Path, help="directory for logs, pages and headlines")
+    parser.add_argument(
+        "sessions", nargs="*", metavar="SESSION", help=f"all by default: {names}"
+    )
+    parser.add_argument(
+        "--out", type=Path, help="directory for logs, pages and headlines"
+    )
     arguments = parser.parse_args()
     for name in arguments.sessions:
         if name not in SESSIONS:

@@ -27,7 +27,10 @@ import sys
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[1])]
+sys.path[:0] = [
+    str(Path(__file__).resolve().parent),
+    str(Path(__file__).resolve().parents[1]),
+]
 
 from suite import baseline, processes, rows, table  # noqa: E402
 from suite.data import LONG, MESSAGES, SHORT, drives  # noqa: E402
@@ -68,11 +71,17 @@ def main(arguments=None):
         description="Benchmarks of hand_eye_calib against the checked-in baseline."
     )
     parser.add_argument(
-        "--full", action="store_true", help="10^6 pairs, and the slow methods on 10^5 as well"
+        "--full",
+        action="store_true",
+        help="10^6 pairs, and the slow methods on 10^5 as well",
     )
-    parser.add_argument("--page", type=Path, metavar="FILE", help="put the tables into this page")
     parser.add_argument(
-        "--update", action="store_true", help="write a new baseline instead of comparing"
+        "--page", type=Path, metavar="FILE", help="put the tables into this page"
+    )
+    parser.add_argument(
+        "--update",
+        action="store_true",
+        help="write a new baseline instead of comparing",
     )
     options = parser.parse_args(arguments)
     if options.update and options.full:

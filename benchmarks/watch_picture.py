@@ -95,7 +95,12 @@ def photographs(pages, width):
     with tempfile.TemporaryDirectory() as folder:
         browser = Browser(folder)
         browser.open(f"http://127.0.0.1:{server.server_port}/?key=picture")
-        size = {"width": width, "height": HEIGHT, "deviceScaleFactor": 1, "mobile": True}
+        size = {
+            "width": width,
+            "height": HEIGHT,
+            "deviceScaleFactor": 1,
+            "mobile": True,
+        }
         browser.call("Emulation.setDeviceMetricsOverride", **size)
         for page in pages:
             server.html = page.html
@@ -113,16 +118,25 @@ def main():
     parser.add_argument("pages", type=Path, help="pages.jsonl of a session")
     parser.add_argument("target", type=Path, help="picture to write")
     parser.add_argument("--headline", default="", help="beginning of the only headline")
-    parser.add_argument("--width", type=int, default=390, help="pixels. Default: a phone")
+    parser.add_argument(
+        "--width", type=int, default=390, help="pixels. Default: a phone"
+    )
     arguments = parser.parse_args()
     pages = chosen_pages(arguments.pages)
     if arguments.headline:
-        pages = [page for page in pages if page.headline.startswith(arguments.headline)][-1:]
+        pages = [
+            page for page in pages if page.headline.startswith(arguments.headline)
+        ][-1:]
     if not pages:
         parser.error(f"no headline begins with {arguments.headline!r}")
     first, *others = photographs(pages, arguments.width)
     if others:
-        moving = {"save_all": True, "append_images": others, "duration": FRAME_MS, "loop": 0}
+        moving = {
+            "save_all": True,
+            "append_images": others,
+            "duration": FRAME_MS,
+            "loop": 0,
+        }
         first.save(arguments.target, quality=60, **moving)
     else:
         first.quantize(N_COLOURS).save(arguments.target, optimize=True)

@@ -33,7 +33,9 @@ class Page(HTMLParser):
 
 def faults(site):
     """A line for each link that leads nowhere or fetches from elsewhere."""
-    pages = {path: Page(path.read_text(encoding="utf-8")) for path in site.rglob("*.html")}
+    pages = {
+        path: Page(path.read_text(encoding="utf-8")) for path in site.rglob("*.html")
+    }
     for path, page in pages.items():
         for tag, name, target in page.links:
             parts = urlsplit(target)
@@ -42,7 +44,11 @@ def faults(site):
                     yield f"{path.relative_to(site)}: fetches {target}"
                 continue
             start = site if parts.path.startswith("/") else path.parent
-            found = (start / unquote(parts.path).lstrip("/")).resolve() if parts.path else path
+            found = (
+                (start / unquote(parts.path).lstrip("/")).resolve()
+                if parts.path
+                else path
+            )
             if not found.exists():
                 yield f"{path.relative_to(site)}: no {target}"
             elif found in pages and not pages[found].has(unquote(parts.fragment)):

@@ -29,7 +29,9 @@ def notebook_files(path):
     exporter = MarkdownExporter()
     notebook = nbformat.read(path, as_version=4)
     text, resources = exporter.from_notebook_node(notebook)
-    pictures = {f"{path.stem}_{name}": data for name, data in resources["outputs"].items()}
+    pictures = {
+        f"{path.stem}_{name}": data for name, data in resources["outputs"].items()
+    }
     for name in resources["outputs"]:
         text = text.replace(f"({name})", f"({path.stem}_{name})")
     text = re.sub(r"<style.*?</style>", "", text, flags=re.DOTALL)

@@ -9,14 +9,18 @@ from scipy.spatial.transform import Rotation
 import hand_eye_calib as hec
 
 T_LIDAR_CAMERA = np.eye(4)
-T_LIDAR_CAMERA[:3, :3] = Rotation.from_euler("xyz", [-90, 0, -90], degrees=True).as_matrix()
+T_LIDAR_CAMERA[:3, :3] = Rotation.from_euler(
+    "xyz", [-90, 0, -90], degrees=True
+).as_matrix()
 T_LIDAR_CAMERA[:3, 3] = [0.4, 0.0, -0.1]
 
 
 def poses_of_a_lidar(times_s: np.ndarray) -> np.ndarray:
     """Poses (N, 4, 4) on a winding path over hills."""
     poses = np.tile(np.eye(4), (len(times_s), 1, 1))
-    angles = np.stack([0.1 * np.sin(times_s), 0.1 * np.cos(1.3 * times_s), 0.5 * times_s], axis=1)
+    angles = np.stack(
+        [0.1 * np.sin(times_s), 0.1 * np.cos(1.3 * times_s), 0.5 * times_s], axis=1
+    )
     poses[:, :3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
     poses[:, :3, 3] = np.stack(
         [4 * np.sin(0.5 * times_s), 4 * np.cos(0.5 * times_s), 0 * times_s], 1

@@ -11,7 +11,9 @@ FOLDER = Path(__file__).resolve().parent
 def executed(path):
     """The notebook with fresh outputs and nothing that differs from run to run."""
     notebook = nbformat.read(path, as_version=4)
-    NotebookClient(notebook, timeout=300, resources={"metadata": {"path": path.parent}}).execute()
+    NotebookClient(
+        notebook, timeout=300, resources={"metadata": {"path": path.parent}}
+    ).execute()
     for cell in notebook.cells:
         cell.metadata.pop("execution", None)
     return notebook

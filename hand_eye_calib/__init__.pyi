@@ -11,12 +11,18 @@ from hand_eye_calib.core.results.records import SolveStatus as SolveStatus
 from hand_eye_calib.core.results.verdict import Reason as Reason
 from hand_eye_calib.core.results.verdict import Verdict as Verdict
 from hand_eye_calib.extras.fleet.together import calibrate_many as calibrate_many
-from hand_eye_calib.extras.fleet.together import calibrate_together as calibrate_together
-from hand_eye_calib.extras.ground.calibrate import calibrate_on_ground as calibrate_on_ground
+from hand_eye_calib.extras.fleet.together import (
+    calibrate_together as calibrate_together,
+)
+from hand_eye_calib.extras.ground.calibrate import (
+    calibrate_on_ground as calibrate_on_ground,
+)
 from hand_eye_calib.extras.ground.tracks import (
     gravity_from_accelerations as gravity_from_accelerations,
 )
-from hand_eye_calib.extras.ground.tracks import gravity_from_attitude as gravity_from_attitude
+from hand_eye_calib.extras.ground.tracks import (
+    gravity_from_attitude as gravity_from_attitude,
+)
 from hand_eye_calib.extras.ground.tracks import ground_from_clouds as ground_from_clouds
 from hand_eye_calib.extras.rig.rig import RigCalibration as RigCalibration
 from hand_eye_calib.extras.rig.rig import calibrate_rig as calibrate_rig
@@ -25,12 +31,20 @@ from hand_eye_calib.extras.stops.calibrate import calibrate_arm as calibrate_arm
 from hand_eye_calib.extras.stops.calibrate import calibrate_stops as calibrate_stops
 from hand_eye_calib.extras.stops.robot_angles import robot_poses as robot_poses
 from hand_eye_calib.extras.stops.samples import read_arm_samples as read_arm_samples
-from hand_eye_calib.extras.vehicle.calibrate import calibrate_vehicle as calibrate_vehicle
-from hand_eye_calib.extras.vehicle.wheel_files import wheel_trajectory as wheel_trajectory
+from hand_eye_calib.extras.vehicle.calibrate import (
+    calibrate_vehicle as calibrate_vehicle,
+)
+from hand_eye_calib.extras.vehicle.wheel_files import (
+    wheel_trajectory as wheel_trajectory,
+)
 from hand_eye_calib.formats.results import load as load
 from hand_eye_calib.formats.results import save as save
-from hand_eye_calib.formats.trajectory_files.reading import read_trajectory as read_trajectory
-from hand_eye_calib.formats.trajectory_files.table import write_trajectory as write_trajectory
+from hand_eye_calib.formats.trajectory_files.reading import (
+    read_trajectory as read_trajectory,
+)
+from hand_eye_calib.formats.trajectory_files.table import (
+    write_trajectory as write_trajectory,
+)
 from hand_eye_calib.offline.calibrate import calibrate as calibrate
 from hand_eye_calib.offline.calibrate import cross_check as cross_check
 from hand_eye_calib.offline.report.views import plot as plot

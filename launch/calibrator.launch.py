@@ -37,15 +37,26 @@ REMAPPED |= {f"{name}_topic": f"{name}_odom" for name in other_names()}
 REMAPPED |= {"tf_topic": "/tf", "tf_static_topic": "/tf_static"}
 
 # Arguments that are no parameters of the node: name, default and description.
-ARGUMENTS = {name: (topic, f"Topic in place of {topic}.") for name, topic in REMAPPED.items()} | {
+ARGUMENTS = {
+    name: (topic, f"Topic in place of {topic}.") for name, topic in REMAPPED.items()
+} | {
     "config_file": (str(CONFIG_FILE), "File with the node's parameters."),
     "name": ("calibrator", "Name of the node."),
     "namespace": ("", "Namespace of the node; relative topics are looked for in it."),
     "use_sim_time": ("", "true follows /clock, as with a bag played with --clock."),
     "log_level": ("", "Of this node: debug, info, warn, error or fatal."),
-    "watch": ("false", "true also serves the page of watch; its address is in the output."),
-    "record": ("", "Directory of a bag with the poses and the results, by ros2 bag record."),
-    "respawn": ("false", "true starts the node again if it dies; use it with journal:=resume."),
+    "watch": (
+        "false",
+        "true also serves the page of watch; its address is in the output.",
+    ),
+    "record": (
+        "",
+        "Directory of a bag with the poses and the results, by ros2 bag record.",
+    ),
+    "respawn": (
+        "false",
+        "true starts the node again if it dies; use it with journal:=resume.",
+    ),
 }
 
 
@@ -128,7 +139,9 @@ def recording(context: LaunchContext) -> list[ExecuteProcess]:
     topics = [argument(context, name) for name in names]
     topics += [f"{own_name}/{name}" for name in results]
     namespace = full_namespace(context)
-    topics = [name if name.startswith("/") else f"{namespace}/{name}" for name in topics]
+    topics = [
+        name if name.startswith("/") else f"{namespace}/{name}" for name in topics
+    ]
     topics.append("/diagnostics")
     command = ["ros2", "bag", "record", "-o", directory, *topics]
     return [ExecuteProcess(cmd=command, name="record", output="screen")]
@@ -154,8 +167,12 @@ def calibrator(context: LaunchContext) -> list[Node]:
             name=LaunchConfiguration("name"),
             namespace=LaunchConfiguration("namespace"),
             parameters=[LaunchConfiguration("config_file"), parameters],
-            remappings=[(old, LaunchConfiguration(name)) for name, old in REMAPPED.items()],
-            ros_arguments=["--log-level", f"{logger_name(context)}:={level}"] if level else [],
+            remappings=[
+                (old, LaunchConfiguration(name)) for name, old in REMAPPED.items()
+            ],
+            ros_arguments=["--log-level", f"{logger_name(context)}:={level}"]
+            if level
+            else [],
             respawn=is_true(context, "respawn"),
             output="screen",
         )
@@ -164,11 +181,16 @@ def calibrator(context: LaunchContext) -> list[Node]:
 
 def generate_launch_description() -> LaunchDescription:
     """Return arguments, node, page and recording."""
-    arguments = ARGUMENTS | {name: ("", describe(field)) for name, field in PARAMETERS.items()}
+    arguments = ARGUMENTS | {
+        name: ("", describe(field)) for name, field in PARAMETERS.items()
+    }
     return LaunchDescription(
         [
             DeclareLaunchArgument(name, default_value=default, description=description)
             for name, (default, description) in arguments.items()
         ]
-        + [OpaqueFunction(function=function) for function in (calibrator, page, recording)]
+        + [
+            OpaqueFunction(function=function)
+            for function in (calibrator, page, recording)
+        ]
     )

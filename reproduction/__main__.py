@@ -12,7 +12,15 @@ from pathlib import Path
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.offline.cli.main import exit_code_of
 from hand_eye_calib.offline.cli.options import note
-from reproduction import certificate, conclusions, faults, figures, findings, published, tables
+from reproduction import (
+    certificate,
+    conclusions,
+    faults,
+    figures,
+    findings,
+    published,
+    tables,
+)
 from reproduction.published import KITTI, METHODS, SIMULATED
 from reproduction.results import SIMULATION_METHODS, Results
 from reproduction.rows import TITLES, Cell, cells, solve_cell, table_of
@@ -76,7 +84,9 @@ _PAPER = [
     Artefact("findings", _EVERYTHING, findings.write),
 ]
 GROUPS = {artefact.name: [artefact] for artefact in _PAPER} | {
-    "s-figures": [artefact for artefact in _FIGURES if artefact.name.startswith("figS")],
+    "s-figures": [
+        artefact for artefact in _FIGURES if artefact.name.startswith("figS")
+    ],
     "s-tables": _VARIANTS,
     "certificate": [Artefact("certificate", [], certificate.write)],
     "all": _PAPER,
@@ -85,18 +95,34 @@ GROUPS = {artefact.name: [artefact] for artefact in _PAPER} | {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run an experiment; returns the exit code."""
-    parser = study_parser("reproduction", f"{__doc__}\n{_EPILOG}", "of certificate and faults")
+    parser = study_parser(
+        "reproduction", f"{__doc__}\n{_EPILOG}", "of certificate and faults"
+    )
     add = parser.add_argument
     add("id", metavar="ID", choices=tuple(EXPERIMENTS), help=", ".join(EXPERIMENTS))
     add("--data", choices=("published", "simulated"), default="published",
         help="published trajectories, or drives of our simulator. Default: published")  # fmt: skip
     add("--seed", type=int, default=0,
         help="with --data simulated, and of the drives of faults. Default: 0")  # fmt: skip
-    add("--runs", type=int, default=published.N_RUNS, help="simulated drives. Default: 38")
+    add(
+        "--runs",
+        type=int,
+        default=published.N_RUNS,
+        help="simulated drives. Default: 38",
+    )
     add("--out", metavar="DIR", type=Path, default=Path("reproduced"),
         help="directory for the files. Default: reproduced")  # fmt: skip
-    add("--jobs", type=int, default=os.cpu_count() or 1, help="processes. Default: all cores")
-    add("--clean", action="store_true", help="with faults: only the recordings without a fault")
+    add(
+        "--jobs",
+        type=int,
+        default=os.cpu_count() or 1,
+        help="processes. Default: all cores",
+    )
+    add(
+        "--clean",
+        action="store_true",
+        help="with faults: only the recordings without a fault",
+    )
     return exit_code_of(lambda: run(parser.parse_args(argv)))
 
 
@@ -107,7 +133,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.id == "faults":
         text = faults.run(arguments)
     else:
-        results, files = made(arguments.id, _source(arguments), arguments.out, arguments.jobs)
+        results, files = made(
+            arguments.id, _source(arguments), arguments.out, arguments.jobs
+        )
         text = said(results, files)
         if arguments.page is not None:
             page = (arguments.out / f"{arguments.id}.md").read_text(encoding="utf-8")
@@ -141,13 +169,17 @@ def made(
         if all(cell.dataset in source.datasets for cell in artefact.cells)
     ]
     if not artefacts:
-        raise ConfigError(f"{identifier} is about the KITTI drives: use --data published")
+        raise ConfigError(
+            f"{identifier} is about the KITTI drives: use --data published"
+        )
     if len(artefacts) < len(wanted):
         note("what is about the KITTI drives is left out: it needs the published data")
     out.mkdir(parents=True, exist_ok=True)
     todo = dict.fromkeys(cell for artefact in artefacts for cell in artefact.cells)
     solved = in_parallel(solve_cell, [(source, cell) for cell in todo], jobs)
-    results = Results(source, table_of([row for rows in solved for row in rows]), out, jobs)
+    results = Results(
+        source, table_of([row for rows in solved for row in rows]), out, jobs
+    )
     return results, {
         artefact.name: artefact.write(artefact.name, results) for artefact in artefacts
     }
@@ -157,11 +189,21 @@ def said(results: Results, files: dict[str, list[Path]]) -> str:
     """The text of a single artefact, how many rows agree, and where the files are."""
     lines = []
     for name, paths in files.items() if len(files) == 1 else ():
-        lines += [path.read_text(encoding="utf-8") for path in paths if path.name == f"{name}.md"]
-    for method, rows in results.rows.groupby("method") if results.source.is_published else ():
-        lines.append(f"{TITLES[method]:<20}{rows['agrees'].sum():>6} of {len(rows):>5} rows agree")
+        lines += [
+            path.read_text(encoding="utf-8")
+            for path in paths
+            if path.name == f"{name}.md"
+        ]
+    for method, rows in (
+        results.rows.groupby("method") if results.source.is_published else ()
+    ):
+        lines.append(
+            f"{TITLES[method]:<20}{rows['agrees'].sum():>6} of {len(rows):>5} rows agree"
+        )
     count = sum(map(len, files.values()))
-    return "\n".join([*lines, f"{count} files written to {results.out}: {', '.join(files)}"])
+    return "\n".join(
+        [*lines, f"{count} files written to {results.out}: {', '.join(files)}"]
+    )
 
 
 if __name__ == "__main__":

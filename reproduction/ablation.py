@@ -83,7 +83,9 @@ def _real_case(rig: Rig, parent: Any, child: Any) -> Case:
     pairs = pairs.child_scaled(settle_scale(pairs, snapshot.config.scale)[0])
     family = next((family for family in _FAMILIES if family in rig.name), rig.name)
     is_clock_free = snapshot.time_offset is not None
-    return Case(family, pairs, is_clock_free, rig.truth.T_parent_child, rig.truth.sigmas)
+    return Case(
+        family, pairs, is_clock_free, rig.truth.T_parent_child, rig.truth.sigmas
+    )
 
 
 def simulated_cases(seed: int, repeats: int) -> Iterator[Case]:
@@ -91,7 +93,9 @@ def simulated_cases(seed: int, repeats: int) -> Iterator[Case]:
     for name in MIXED:
         for number in range(repeats):
             drive = make(name, seed, number)
-            pairs = PosePairs(drive.parent.stamps_ns, drive.parent.poses, drive.child.poses)
+            pairs = PosePairs(
+                drive.parent.stamps_ns, drive.parent.poses, drive.child.poses
+            )
             yield Case(name, pairs, False, drive.T_parent_child, np.zeros(6))
 
 
@@ -122,13 +126,17 @@ def outcome(case: Case, options: dict[str, Any]) -> Outcome | None:
     variances = np.diag(to_parent @ solution.cov_parent_child_in_child @ to_parent.T)
     is_determined = np.isfinite(case.sigmas)
     squares = np.where(
-        is_determined, off**2 + 0.25 * np.where(is_determined, case.sigmas, 0.0) ** 2, 0.0
+        is_determined,
+        off**2 + 0.25 * np.where(is_determined, case.sigmas, 0.0) ** 2,
+        0.0,
     )
     sizes = [
         np.sqrt(squares[axes].sum()) if is_determined[axes].any() else np.nan
         for axes in (slice(0, 3), slice(3, 6))
     ]
-    in_sigmas = np.abs(off) / np.sqrt(variances + np.where(is_determined, case.sigmas, np.inf) ** 2)
+    in_sigmas = np.abs(off) / np.sqrt(
+        variances + np.where(is_determined, case.sigmas, np.inf) ** 2
+    )
     return Outcome(np.array(sizes), in_sigmas[is_determined])
 
 
@@ -163,13 +171,21 @@ def _row(
             else outcome_of_case.errors / reference.errors
         )
         logs.setdefault(case.family, []).append(np.log(np.maximum(ratios, 1e-3)))
-        inside += [] if outcome_of_case is None else [*(outcome_of_case.in_sigmas < 1.645)]
-    means = {family: np.mean(ratios_of_family, axis=0) for family, ratios_of_family in logs.items()}
+        inside += (
+            [] if outcome_of_case is None else [*(outcome_of_case.in_sigmas < 1.645)]
+        )
+    means = {
+        family: np.mean(ratios_of_family, axis=0)
+        for family, ratios_of_family in logs.items()
+    }
     by_family = [float(np.nanmean(mean)) for mean in means.values()]
     others = sorted(by_family)[:-1]
     return {
         "Without": name,
-        **{family: " ".join(f"{np.exp(x):.2f}" for x in mean) for family, mean in means.items()},
+        **{
+            family: " ".join(f"{np.exp(x):.2f}" for x in mean)
+            for family, mean in means.items()
+        },
         "All": f"{np.exp(np.mean(by_family)):.3f}",
         "All but its best": f"{np.exp(np.mean(others)):.3f}",
         "In 90 %": f"{100 * np.mean(inside):.0f} %",
@@ -180,11 +196,16 @@ def _row(
 def main() -> None:
     """Draw, solve and print."""
     parser = study_parser("reproduction.ablation", __doc__)
-    parser.add_argument("--repeats", type=int, default=10, help="recordings of each platform")
+    parser.add_argument(
+        "--repeats", type=int, default=10, help="recordings of each platform"
+    )
     parser.add_argument("--seed", type=int, help="default: another one at every run")
     arguments = parser.parse_args()
     seed = seed_of(arguments.seed)
-    cases = [*real_cases(arguments.data_folder), *simulated_cases(seed, arguments.repeats)]
+    cases = [
+        *real_cases(arguments.data_folder),
+        *simulated_cases(seed, arguments.repeats),
+    ]
     drawn_by = f"Seed {seed}, {len(cases)} recordings."
     show(arguments.page, {"ablation": f"{drawn_by}\n\n{table(cases)}"})
 

@@ -55,7 +55,9 @@ def solve(pairs: MotionPairs) -> Solution:
     # loses half of the digits.
     rows = np.asarray(np.linalg.qr(residual_rows(pairs), mode="r"))
     start_gradient = np.abs(_derivatives(_IDENTITY, rows)[1]).max()
-    rows *= np.sqrt(min(1.0, _LARGEST_START_GRADIENT / max(start_gradient, np.finfo(float).tiny)))
+    rows *= np.sqrt(
+        min(1.0, _LARGEST_START_GRADIENT / max(start_gradient, np.finfo(float).tiny))
+    )
     parameters = _IDENTITY
     shift = 0.0
     for _ in range(_MAX_ITERATIONS):
@@ -139,7 +141,9 @@ def _lift(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
     derivative = np.zeros((13, 7))
     derivative[:9, :4] = 2 * np.outer(P, factor_gradient) + 4 * factor * half_gradient
     derivative[9:12, 4:] = np.eye(3)
-    return np.concatenate([np.eye(3).ravel() + 2 * factor * P, parameters[4:], [1.0]]), derivative
+    return np.concatenate(
+        [np.eye(3).ravel() + 2 * factor * P, parameters[4:], [1.0]]
+    ), derivative
 
 
 def _value(parameters: FloatArray, rows: FloatArray) -> float:
@@ -147,7 +151,9 @@ def _value(parameters: FloatArray, rows: FloatArray) -> float:
     return float(residuals @ residuals)
 
 
-def _derivatives(parameters: FloatArray, rows: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+def _derivatives(
+    parameters: FloatArray, rows: FloatArray
+) -> tuple[float, FloatArray, FloatArray]:
     """Cost, gradient (7,) and Hessian (7, 7)."""
     x, derivative = _lift(parameters)
     q = parameters[:4]

@@ -21,7 +21,9 @@ from reproduction.runner import in_parallel
 from reproduction.sources import Source
 from reproduction.writing import markdown_table, write_csv, write_text
 
-_HALF_TURNS = np.array([np.diag(signs) for signs in ([1, -1, -1], [-1, 1, -1], [-1, -1, 1])])
+_HALF_TURNS = np.array(
+    [np.diag(signs) for signs in ([1, -1, -1], [-1, 1, -1], [-1, -1, 1])]
+)
 
 # A minimum counts as false if its cost is higher by this share.
 _HIGHER = 1e-3
@@ -29,7 +31,11 @@ _HIGHER = 1e-3
 
 def write(name: str, results: Results) -> list[Path]:
     """Try to prove every answer and write ``NAME.md`` and ``NAME.csv``; returns their paths."""
-    datasets = [dataset for dataset in (*SIMULATED, *KITTI) if dataset in results.source.datasets]
+    datasets = [
+        dataset
+        for dataset in (*SIMULATED, *KITTI)
+        if dataset in results.source.datasets
+    ]
     tasks = [
         (results.source, dataset, level)
         for dataset in datasets
@@ -63,7 +69,9 @@ def write(name: str, results: Results) -> list[Path]:
     ]
 
 
-def prove_level(source: Source, dataset: str, level: float | None) -> list[dict[str, Any]]:
+def prove_level(
+    source: Source, dataset: str, level: float | None
+) -> list[dict[str, Any]]:
     """Return the proofs of the cases of a data set at a level.
 
     A proof says whether the answer was proved, and how long that took. It also counts the other

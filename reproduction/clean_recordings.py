@@ -74,9 +74,14 @@ def recording(name: str, folder: Path | None) -> Clean:
     if kind in CLASSES:
         made = make(kind, int(seed))
     else:
-        made = simulate_drive(int(seed), HILLY_DRIVE, NoiseConfig(gaussian=_HILLY[kind]))
+        made = simulate_drive(
+            int(seed), HILLY_DRIVE, NoiseConfig(gaussian=_HILLY[kind])
+        )
     return Clean(
-        name=name, parent=made.parent, child=made.child, T_parent_child=made.T_parent_child
+        name=name,
+        parent=made.parent,
+        child=made.child,
+        T_parent_child=made.T_parent_child,
     )
 
 

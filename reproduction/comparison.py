@@ -14,7 +14,8 @@ _MOST_LISTED = 30
 def write_rows(path: Path, rows: pd.DataFrame) -> Path:
     """Every row with ours, theirs and why they differ, as CSV; returns the path."""
     named = {
-        name: f"{name}_{UNITS[name.removeprefix('published_')]}" for name in (*METRICS, *PUBLISHED)
+        name: f"{name}_{UNITS[name.removeprefix('published_')]}"
+        for name in (*METRICS, *PUBLISHED)
     } | {"published_objective": "objective_at_published"}
     columns = ["case", "method", "reference", *METRICS, *PUBLISHED]
     columns += ["objective", "published_objective", "agrees", "why"]
@@ -48,7 +49,8 @@ def describe_rows(rows: pd.DataFrame) -> str:
     ]
     return (
         "A row agrees where each of its four errors is within 0.1 % or 1e-6 (m, deg) of "
-        f"the published one.\n\n{table}" + (f"\n\n{markdown_table(listed)}" if listed else "")
+        f"the published one.\n\n{table}"
+        + (f"\n\n{markdown_table(listed)}" if listed else "")
     )
 
 
@@ -57,7 +59,9 @@ def describe_dnlo(rows: pd.DataFrame) -> str:
     errors moved.
     """
     rows = rows[rows["method"] == "dnlo"]
-    lower, equal, higher = (int((rows["verdict"] == x).sum()) for x in ("lower", "equal", "higher"))
+    lower, equal, higher = (
+        int((rows["verdict"] == x).sum()) for x in ("lower", "equal", "higher")
+    )
     others = rows[~rows["same_e_at"]]
     text = (
         "DNLO has many local minima and is compared by its objective, eq. (5), taken by the same "

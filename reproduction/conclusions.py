@@ -34,14 +34,17 @@ class Shown:
 
     def dnlo(self, dataset: str, metric: str = "e_at") -> dict[str, float]:
         """Scores of DNLO by reference."""
-        return {name: self.table.score(dataset, "dnlo", name, metric) for name in REFERENCES}
+        return {
+            name: self.table.score(dataset, "dnlo", name, metric) for name in REFERENCES
+        }
 
     @cached_property
     def best(self) -> dict[str, dict[str, str]]:
         """The best reference by data set and method."""
         return {
             dataset: {
-                method: self.table.best_reference(dataset, method) for method in _AS_PUBLISHED
+                method: self.table.best_reference(dataset, method)
+                for method in _AS_PUBLISHED
             }
             for dataset in SIMULATED
         }
@@ -49,11 +52,17 @@ class Shown:
     def scores(self, dataset: str) -> dict[str, float]:
         """Scores of the best variants by method."""
         references = self.best[dataset].items()
-        return {method: self.table.score(dataset, method, name) for method, name in references}
+        return {
+            method: self.table.score(dataset, method, name)
+            for method, name in references
+        }
 
     def drift(self, method: str) -> list[float]:
         """Mean e_at with the largest drift, by reference, that of A first."""
-        summaries = (self.table.summary("drift", 0.05, method, name, "e_at") for name in REFERENCES)
+        summaries = (
+            self.table.summary("drift", 0.05, method, name, "e_at")
+            for name in REFERENCES
+        )
         return [summary.centre for summary in summaries]
 
     @cached_property
@@ -87,14 +96,18 @@ def write(name: str, results: Results) -> list[Path]:
         for number, row in enumerate(rows, start=1)
     ]
     return [
-        write_text(results.out / f"{name}.md", "# The paper's conclusions, checked", *blocks),
+        write_text(
+            results.out / f"{name}.md", "# The paper's conclusions, checked", *blocks
+        ),
         write_csv(results.out / f"{name}.csv", rows),
     ]
 
 
 def _listed(values: Mapping[str, Any], form: str = "") -> str:
     """Methods or references with their values."""
-    return ", ".join(f"{TITLES.get(name, name)} {value:{form}}" for name, value in values.items())
+    return ", ".join(
+        f"{TITLES.get(name, name)} {value:{form}}" for name, value in values.items()
+    )
 
 
 @RULES.append
@@ -113,7 +126,10 @@ def _without_noise(shown: Shown) -> Found:
 def _longer_with_noise(shown: Shown) -> Found:
     """Longer reference distances are better with Gaussian noise (DNLO; 4.2.1)."""
     score = shown.dnlo("noise")
-    holds = score["B10"] < score["B5"] < score["B1"] and score["C10"] < score["C5"] < score["B1"]
+    holds = (
+        score["B10"] < score["B5"] < score["B1"]
+        and score["C10"] < score["C5"] < score["B1"]
+    )
     return holds, False, f"Mean e_at (m): {_listed(score, '.4f')}."
 
 
@@ -127,7 +143,11 @@ def _first_pose(shown: Shown) -> Found:
         a, *others = shown.dnlo(dataset).values()
         ratio[dataset] = a / min(others)
     holds = ratio["noise"] > 1 and min(ratio["outliers"], ratio["drift"]) > 2
-    return holds, False, f"e_at of A over that of the best other: {_listed(ratio, '.1f')}."
+    return (
+        holds,
+        False,
+        f"e_at of A over that of the best other: {_listed(ratio, '.1f')}.",
+    )
 
 
 @RULES.append
@@ -142,7 +162,9 @@ def _smallest_motions_first(shown: Shown) -> Found:
         for order in orders.values()
     ]
     first = all(order[0] == "B1" for order in orders.values())
-    evidence = "; ".join(f"{name}: {' < '.join(order)}" for name, order in orders.items())
+    evidence = "; ".join(
+        f"{name}: {' < '.join(order)}" for name, order in orders.items()
+    )
     return all(monotone) and first, any(monotone), f"{evidence}."
 
 
@@ -153,7 +175,11 @@ def _drift_of_dnlo(shown: Shown) -> Found:
     spread = max(others) / min(others)
     of_a = a / min(others)
     holds = spread < 2 and a > 3 * max(others)
-    return holds, False, f"At 0.05: factor {spread:.2f} among the others, A {of_a:.1f} times."
+    return (
+        holds,
+        False,
+        f"At 0.05: factor {spread:.2f} among the others, A {of_a:.1f} times.",
+    )
 
 
 @RULES.append
@@ -166,7 +192,9 @@ def _components(shown: Shown) -> Found:
     )
     height = (z / np.minimum(x, y)).max()
     tilt = (np.maximum(roll, pitch) / yaw).max()
-    evidence = f"Medians: z at most {height:.2f} of x and y, roll and pitch {tilt:.2f} of yaw."
+    evidence = (
+        f"Medians: z at most {height:.2f} of x and y, roll and pitch {tilt:.2f} of yaw."
+    )
     return height < 0.5 and tilt < 0.5, False, evidence
 
 
@@ -176,29 +204,48 @@ def _relative_errors(shown: Shown) -> Found:
     (DNLO; 4.2.1).
     """
     scores = {metric: shown.dnlo("mixture", metric) for metric in METRICS}
-    best = {metric: min(values, key=lambda x: values[x]) for metric, values in scores.items()}
-    evidence = "; ".join(f"{metric}: {_listed(scores[metric], '.3f')}" for metric in METRICS[:3])
+    best = {
+        metric: min(values, key=lambda x: values[x])
+        for metric, values in scores.items()
+    }
+    evidence = "; ".join(
+        f"{metric}: {_listed(scores[metric], '.3f')}" for metric in METRICS[:3]
+    )
     relative = best["e_rt"] == best["e_rR"] == "B1"
-    return relative and best["e_at"] != "B1", best["e_at"] != "B1", f"Medians of {evidence}."
+    return (
+        relative and best["e_at"] != "B1",
+        best["e_at"] != "B1",
+        f"Medians of {evidence}.",
+    )
 
 
 @RULES.append
 def _no_criterion(shown: Shown) -> Found:
     """Relative errors are no criterion for choosing the reference (4.2.1, 6)."""
     picks = {
-        method: [shown.table.best_reference("mixture", method, x) for x in ("e_rt", "e_at")]
+        method: [
+            shown.table.best_reference("mixture", method, x) for x in ("e_rt", "e_at")
+        ]
         for method in _AS_PUBLISHED
     }
-    holds = all(by_relative != by_absolute for by_relative, by_absolute in picks.values())
+    holds = all(
+        by_relative != by_absolute for by_relative, by_absolute in picks.values()
+    )
     evidence = _listed({method: " / ".join(names) for method, names in picks.items()})
-    return holds, False, f"Mixed noise, smallest median e_rt / smallest e_at: {evidence}."
+    return (
+        holds,
+        False,
+        f"Mixed noise, smallest median e_rt / smallest e_at: {evidence}.",
+    )
 
 
 @RULES.append
 def _best_with_noise(shown: Shown) -> Found:
     """With Gaussian noise B10 is the best variant of all methods but Zhuang (4.2.2)."""
     best = shown.best["noise"]
-    holds = all((name == "B10") == (method != "zhuang") for method, name in best.items())
+    holds = all(
+        (name == "B10") == (method != "zhuang") for method, name in best.items()
+    )
     return holds, False, f"{_listed(best)}."
 
 
@@ -224,14 +271,21 @@ def _ali_with_outliers(shown: Shown) -> Found:
     cost (4.2.2).
     """
     proper, published, dnl = (
-        [shown.table.score("outliers", method, best, metric) for metric in ("e_at", "e_aR")]
+        [
+            shown.table.score("outliers", method, best, metric)
+            for metric in ("e_at", "e_aR")
+        ]
         for method in ("ali", ALI_AS_PUBLISHED, "dnl")
         for best in [shown.table.best_reference("outliers", method)]
     )
     whose = {"as published": published, "properly": proper, "DNL": dnl}
-    evidence = ", ".join(f"{name} {e[0]:.3f} m, {e[1]:.1f} deg" for name, e in whose.items())
+    evidence = ", ".join(
+        f"{name} {e[0]:.3f} m, {e[1]:.1f} deg" for name, e in whose.items()
+    )
     return (
-        all(ours > 0.8 * theirs for ours, theirs in zip(proper, published, strict=True)),
+        all(
+            ours > 0.8 * theirs for ours, theirs in zip(proper, published, strict=True)
+        ),
         any(ours > 1.2 * other for ours, other in zip(proper, dnl, strict=True)),
         f"Mean errors of the best variants: {evidence}.",
     )
@@ -272,7 +326,11 @@ def _dnlo_against_others(shown: Shown) -> Found:
         scores = shown.scores(dataset)
         ratios[dataset] = scores["dnlo"] / min(scores.values())
     matched = sum(ratio < 1.05 for ratio in ratios.values())
-    return matched >= 3, matched >= 2, f"e_at over the best method's: {_listed(ratios, '.2f')}."
+    return (
+        matched >= 3,
+        matched >= 2,
+        f"e_at over the best method's: {_listed(ratios, '.2f')}.",
+    )
 
 
 @RULES.append
@@ -286,7 +344,9 @@ def _zhuang_on_the_short_drive(shown: Shown) -> Found:
     _, variant = best["e_rt (m)"].idxmin()
     holds = best["e_rt (m)"].idxmin()[0] == best[_AT].idxmax()[0] == "zhuang"
     dnl = rows.loc[("dnl", "B1"), "e_rt (m)"]
-    evidence = f"Zhuang {variant}: e_rt {zhuang['e_rt (m)']:.3f} m, e_at {zhuang[_AT]:.3f} m"
+    evidence = (
+        f"Zhuang {variant}: e_rt {zhuang['e_rt (m)']:.3f} m, e_at {zhuang[_AT]:.3f} m"
+    )
     return holds, False, f"{evidence}; DNL B1: e_rt {dnl:.3f} m."
 
 
@@ -295,7 +355,9 @@ def _short_drive(shown: Shown) -> Found:
     """On the short drive all other methods are best with B5 or B10 (5.2, Table 1)."""
     best = {name: shown.variants("kitti_short", name) for name in (_AT, _RECTIFIED)}
     references = {name for method, name in best[_AT].items() if method != "zhuang"}
-    evidence = f"{_listed(best[_AT])}; by the rectified truth {_listed(best[_RECTIFIED])}."
+    evidence = (
+        f"{_listed(best[_AT])}; by the rectified truth {_listed(best[_RECTIFIED])}."
+    )
     return references <= {"B5", "B10"}, False, evidence
 
 
@@ -310,7 +372,8 @@ def _long_drive(shown: Shown) -> Found:
     holds = is_middle and best["dnlo"] == "C5" and dnlo["B5"] > dnlo["C5"]
     rectified = _listed(shown.variants("kitti_long", _RECTIFIED))
     evidence = (
-        f"{_listed(best)}; DNLO C5 {dnlo['C5']:.3f} m, B5 {dnlo['B5']:.3f} m; by the rectified"
+        f"{_listed(best)}; DNLO C5 {dnlo['C5']:.3f} m, B5 "
+        f"{dnlo['B5']:.3f} m; by the rectified"
     )
     return holds, is_middle, f"{evidence} truth {rectified}."
 
@@ -319,10 +382,14 @@ def _long_drive(shown: Shown) -> Found:
 def _usual_reference(shown: Shown) -> Found:
     """The usual reference B1 is worse than others on realistic data (5.2, 6)."""
     published, rectified = (
-        [shown.variants(drive, by)[method] for drive in KITTI for method in METHODS].count("B1")
+        [
+            shown.variants(drive, by)[method] for drive in KITTI for method in METHODS
+        ].count("B1")
         for by in (_AT, _RECTIFIED)
     )
-    ranks = [shown.table.ranking("mixture", method).index("B1") for method in _AS_PUBLISHED]
+    ranks = [
+        shown.table.ranking("mixture", method).index("B1") for method in _AS_PUBLISHED
+    ]
     return (
         published <= 1,
         False,
@@ -341,7 +408,10 @@ def _reference_against_method(shown: Shown) -> Found:
         of = shown.drives[dataset][_AT] if dataset in KITTI else None
         errors = np.array(
             [
-                [shown.table.score(dataset, m, r) if of is None else of[m][r] for r in REFERENCES]
+                [
+                    shown.table.score(dataset, m, r) if of is None else of[m][r]
+                    for r in REFERENCES
+                ]
                 for m in (_AS_PUBLISHED if of is None else METHODS)
             ]
         )

@@ -47,7 +47,12 @@ _SECONDS = (0.05, 0.1, 0.2)
 
 
 def _both(
-    code: str, what: str, severities: Any, unit: str = "", named: str = "", **options: Any
+    code: str,
+    what: str,
+    severities: Any,
+    unit: str = "",
+    named: str = "",
+    **options: Any,
 ) -> Callable[[_OfBoth], _OfBoth]:
     """Enter a fault of both streams; ``named`` has the codes, a space between them."""
 
@@ -63,7 +68,9 @@ def _child(*about: Any, **options: Any) -> Callable[[_OfChild], _OfChild]:
     """Enter a fault of the child's stream alone."""
 
     def enter(change: _OfChild) -> _OfChild:
-        def damage(parent: Trajectory, child: Trajectory, value: float, random: Random) -> Streams:
+        def damage(
+            parent: Trajectory, child: Trajectory, value: float, random: Random
+        ) -> Streams:
             return parent, change(child, value, random)
 
         _both(*about, **options)(damage)
@@ -73,7 +80,9 @@ def _child(*about: Any, **options: Any) -> Callable[[_OfChild], _OfChild]:
 
 
 def with_parts(
-    stream: Trajectory, rotations: FloatArray | None = None, positions: FloatArray | None = None
+    stream: Trajectory,
+    rotations: FloatArray | None = None,
+    positions: FloatArray | None = None,
 ) -> Trajectory:
     """The stream with other orientations (N, 3, 3) or positions (N, 3)."""
     poses = stream.poses.copy()
@@ -115,7 +124,9 @@ def with_quats(stream: Trajectory, quats: FloatArray) -> Trajectory:
 
 def at_stamps(stamps_ns: Any, poses: FloatArray) -> Trajectory:
     """Poses in the order of their stamps; of equal ones the first."""
-    stamps_ns, first = np.unique(np.asarray(stamps_ns).astype(np.int64), return_index=True)
+    stamps_ns, first = np.unique(
+        np.asarray(stamps_ns).astype(np.int64), return_index=True
+    )
     return Trajectory(stamps_ns, poses[first])
 
 
@@ -173,18 +184,27 @@ def beside(metres: float) -> FloatArray:
 _POSITIONS = "smoothed_positions position_clock"
 
 
-@_both("S1", "child is the parent's own frame", (0.01, 0.003, 0.0), "m noise", "same_frame")
-def copied(parent: Trajectory, child: Trajectory, noise: float, random: Random) -> Streams:
+@_both(
+    "S1", "child is the parent's own frame", (0.01, 0.003, 0.0), "m noise", "same_frame"
+)
+def copied(
+    parent: Trajectory, child: Trajectory, noise: float, random: Random
+) -> Streams:
     world = se3.exp(random.standard_normal(6))
-    return parent, noisy(Trajectory(parent.stamps_ns, world @ parent.poses), noise, random)
+    return parent, noisy(
+        Trajectory(parent.stamps_ns, world @ parent.poses), noise, random
+    )
 
 
 @_both("S2", "child positions from the parent", (0.01, 0.003, 0.0), "m noise",
        "same_position same_frame")  # fmt: skip
-def fused(parent: Trajectory, child: Trajectory, noise: float, random: Random) -> Streams:
+def fused(
+    parent: Trajectory, child: Trajectory, noise: float, random: Random
+) -> Streams:
     """Positions from the parent's, turned by the rotation that both orientations give."""
     child = child[
-        (child.stamps_ns >= parent.stamps_ns[0]) & (child.stamps_ns <= parent.stamps_ns[-1])
+        (child.stamps_ns >= parent.stamps_ns[0])
+        & (child.stamps_ns <= parent.stamps_ns[-1])
     ]
     at_child = parent.at(child.stamps_ns)
     steps = (
@@ -224,7 +244,9 @@ def late_positions(child: Trajectory, delay_s: float, _: Random) -> Trajectory:
 @_child("S5", "positions smoothed, no delay", _SECONDS, "s", _POSITIONS)
 def smoothed(child: Trajectory, tau_s: float, _: Random) -> Trajectory:
     ahead = filtered_positions(child, tau_s)
-    return with_parts(child, positions=filtered(ahead[::-1], -child.stamps_ns[::-1], tau_s)[::-1])
+    return with_parts(
+        child, positions=filtered(ahead[::-1], -child.stamps_ns[::-1], tau_s)[::-1]
+    )
 
 
 _child(
@@ -234,7 +256,11 @@ _child(
     "s",
     f"smoothed_orientations {_POSITIONS}",
     time_offset="estimate",
-)(lambda child, s, _: with_parts(child, filtered_rotations(child, s), filtered_positions(child, s)))
+)(
+    lambda child, s, _: with_parts(
+        child, filtered_rotations(child, s), filtered_positions(child, s)
+    )
+)
 
 
 @_child("S7", "yaw gain", (0.005, 0.01, 0.02), "", "rotation_gain")
@@ -276,10 +302,14 @@ _child("S10b", "child in 2D", (0.5, 0.8, 1.0), "share", "flat unrelated noisy")(
 
 
 @_both("S11", "float32 positions", (2e3, 5e4, 5e5), "m east", "coarse_positions")
-def as_float32(parent: Trajectory, child: Trajectory, metres: float, _: Random) -> Streams:
+def as_float32(
+    parent: Trajectory, child: Trajectory, metres: float, _: Random
+) -> Streams:
     """Far from the origin, both streams on one map."""
     origin = np.array([metres, 9.0 * metres, 0.0])
-    on_map = [(positions_of(stream) + origin).astype(np.float32) for stream in (parent, child)]
+    on_map = [
+        (positions_of(stream) + origin).astype(np.float32) for stream in (parent, child)
+    ]
     return (
         with_parts(parent, positions=on_map[0].astype(float)),
         with_parts(child, positions=on_map[1].astype(float)),
@@ -287,8 +317,12 @@ def as_float32(parent: Trajectory, child: Trajectory, metres: float, _: Random) 
 
 
 @_both("S12", "both scalar first", (0.0,), "", "quaternion_order")
-def scalar_first(parent: Trajectory, child: Trajectory, _: float, random: Random) -> Streams:
-    quats = [np.roll(se3.to_quat_xyzw(stream.poses), 1, axis=1) for stream in (parent, child)]
+def scalar_first(
+    parent: Trajectory, child: Trajectory, _: float, random: Random
+) -> Streams:
+    quats = [
+        np.roll(se3.to_quat_xyzw(stream.poses), 1, axis=1) for stream in (parent, child)
+    ]
     return with_quats(parent, quats[0]), with_quats(child, quats[1])
 
 
@@ -297,8 +331,12 @@ def inverted(child: Trajectory, noise: float, random: Random) -> Trajectory:
     return posed(child, se3.inverse(noisy(child, noise, random).poses))
 
 
-@_child("S14", "orientations inverted", (0.0, 0.01, 0.03), "m noise", "inverse_orientation")
-def inverted_orientations(child: Trajectory, noise: float, random: Random) -> Trajectory:
+@_child(
+    "S14", "orientations inverted", (0.0, 0.01, 0.03), "m noise", "inverse_orientation"
+)
+def inverted_orientations(
+    child: Trajectory, noise: float, random: Random
+) -> Trajectory:
     rotations = noisy(child, noise, random).poses[:, :3, :3]
     return with_parts(child, np.swapaxes(rotations, 1, 2))
 
@@ -330,14 +368,18 @@ def restarted(child: Trajectory, gap_s: float, _: Random) -> Trajectory:
 
 @_both("U7", "parent's orientations smoothed", _SECONDS, "s",
        "smoothed_orientations position_clock")  # fmt: skip
-def smooth_parent(parent: Trajectory, child: Trajectory, tau_s: float, _: Random) -> Streams:
+def smooth_parent(
+    parent: Trajectory, child: Trajectory, tau_s: float, _: Random
+) -> Streams:
     """Low-passed and shifted back by the delay."""
     smooth = with_parts(parent, filtered_rotations(parent, tau_s))
     return with_parts(parent, delayed(smooth, -tau_s)[:, :3, :3]), child
 
 
 @_both("U10", "two recordings, remounted", (1.0, 2.0, 5.0), "deg")
-def remounted(parent: Trajectory, child: Trajectory, degrees: float, random: Random) -> Streams:
+def remounted(
+    parent: Trajectory, child: Trajectory, degrees: float, random: Random
+) -> Streams:
     """A minute apart, with another mount and other worlds in the second."""
     remount = loosened(child, degrees, random)
     half_ns = child.stamps_ns[len(child) // 2]
@@ -359,7 +401,9 @@ def held(child: Trajectory, interval_s: float, _: Random) -> Trajectory:
 
 
 @_both("U12", "streams exchanged", (0.5, 0.3, 0.7), "share", "exchanged")
-def exchanged(parent: Trajectory, child: Trajectory, share: float, _: Random) -> Streams:
+def exchanged(
+    parent: Trajectory, child: Trajectory, share: float, _: Random
+) -> Streams:
     """From a share of the recording on, each stream has the poses of the other sensor."""
     from_ns = child.stamps_ns[int(share * len(child))]
     streams = []
@@ -367,7 +411,9 @@ def exchanged(parent: Trajectory, child: Trajectory, share: float, _: Random) ->
         before = first[first.stamps_ns < from_ns]
         after = second[second.stamps_ns >= from_ns]
         stamps_ns = np.concatenate([before.stamps_ns, after.stamps_ns])
-        streams.append(Trajectory(stamps_ns, np.concatenate([before.poses, after.poses])))
+        streams.append(
+            Trajectory(stamps_ns, np.concatenate([before.poses, after.poses]))
+        )
     return streams[0], streams[1]
 
 
@@ -384,7 +430,9 @@ _child("V2", "child's orientations late", (0.02, 0.05, 0.1), "s", "position_cloc
 def heading_drift(child: Trajectory, degrees: float, _: Random) -> Trajectory:
     minutes = (child.stamps_ns - child.stamps_ns[0]) / 60e9
     worlds = np.tile(np.eye(4), (len(child), 1, 1))
-    worlds[:, :3, :3] = se3.rotation_exp(np.outer(np.radians(degrees) * minutes, [0.0, 0.0, 1.0]))
+    worlds[:, :3, :3] = se3.rotation_exp(
+        np.outer(np.radians(degrees) * minutes, [0.0, 0.0, 1.0])
+    )
     return posed(child, worlds @ child.poses)
 
 
@@ -453,7 +501,9 @@ def fast_clock(child: Trajectory, ppm: float, _: Random) -> Trajectory:
 
 
 @_both("W8", "heights zero", _THREE, "(which)")
-def heightless(parent: Trajectory, child: Trajectory, which: float, _: Random) -> Streams:
+def heightless(
+    parent: Trajectory, child: Trajectory, which: float, _: Random
+) -> Streams:
     """The parent's, those of both, and both upright besides."""
     flat = higher(parent, 0.0), higher(child, 0.0)
     if which == 0.0:
@@ -467,11 +517,19 @@ def in_bursts(child: Trajectory, seconds: float, _: Random) -> Trajectory:
     interval_ns = round(seconds * 1e9)
     bursts = (child.stamps_ns - child.stamps_ns[0]) // interval_ns
     order = np.arange(len(child)) - np.searchsorted(bursts, bursts)
-    came_ns = (bursts + 1) * interval_ns + np.round(order * _TOGETHER_S * 1e9).astype(np.int64)
+    came_ns = (bursts + 1) * interval_ns + np.round(order * _TOGETHER_S * 1e9).astype(
+        np.int64
+    )
     return at_stamps(child.stamps_ns[0] + came_ns, child.poses)
 
 
-@_child("X1", "positions turned against orientations", (1.5, 2.5, 4.0), "deg", "worlds_turned")
+@_child(
+    "X1",
+    "positions turned against orientations",
+    (1.5, 2.5, 4.0),
+    "deg",
+    "worlds_turned",
+)
 def turned_positions(stream: Trajectory, degrees: float, _: Random) -> Trajectory:
     """Positions in a world that is turned about z against that of the orientations."""
     turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
@@ -500,7 +558,9 @@ _child("X5", "heights constant", (0.0,), "", "axis_scale")(
 
 
 def _group(initials: str) -> tuple[Fault, ...]:
-    return tuple(fault for fault in _ALL if fault.code.replace("clock", "S")[0] in initials)
+    return tuple(
+        fault for fault in _ALL if fault.code.replace("clock", "S")[0] in initials
+    )
 
 
 FAULTS = _group("S")

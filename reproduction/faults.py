@@ -119,8 +119,14 @@ def recordings(folder: Path | None, first_seed: int = 0) -> list[str]:
 def cases(folder: Path | None, first_seed: int = 0) -> list[Case]:
     """All cases of the study: recordings without faults, with each fault, and clean recordings."""
     names = recordings(folder, first_seed)
-    faulty = (_cases(code, len(fault.severities), names) for code, fault in _FAULTS.items())
-    return [*_cases(_SOUND, 1, names), *chain.from_iterable(faulty), *clean_cases(folder)]
+    faulty = (
+        _cases(code, len(fault.severities), names) for code, fault in _FAULTS.items()
+    )
+    return [
+        *_cases(_SOUND, 1, names),
+        *chain.from_iterable(faulty),
+        *clean_cases(folder),
+    ]
 
 
 def clean_cases(folder: Path | None) -> list[Case]:
@@ -129,7 +135,10 @@ def clean_cases(folder: Path | None) -> list[Case]:
 
 
 def _cases(
-    fault: str, n_severities: int, names: Sequence[str], methods: Sequence[MethodName] = METHODS
+    fault: str,
+    n_severities: int,
+    names: Sequence[str],
+    methods: Sequence[MethodName] = METHODS,
 ) -> list[Case]:
     return [
         Case(fault=fault, severity=severity, recording=name, method=method)
@@ -147,13 +156,19 @@ def outcome(case: Case, folder: Path | None) -> Outcome:
     fault = _FAULTS.get(case.fault)
     if fault:
         random = np.random.default_rng(sum(map(ord, case.recording)))
-        parent, child = fault.damage(parent, child, fault.severities[case.severity], random)
+        parent, child = fault.damage(
+            parent, child, fault.severities[case.severity], random
+        )
         options = {**options, **fault.options}
     try:
-        result = calibrate(parent, child, method=case.method, max_pairs=_MAX_PAIRS, **options)
+        result = calibrate(
+            parent, child, method=case.method, max_pairs=_MAX_PAIRS, **options
+        )
     except HandEyeCalibError:
         return Outcome(
-            key=case.key, verdict=_NO_ANSWER, findings=_named(check_streams(parent, child).findings)
+            key=case.key,
+            verdict=_NO_ANSWER,
+            findings=_named(check_streams(parent, child).findings),
         )
     return _judged(case.key, result, T_parent_child)
 
@@ -173,7 +188,9 @@ def _named(findings: Iterable[Any]) -> list[str]:
     ]
 
 
-def _judged(key: str, result: Calibration, T_parent_child: FloatArray | None) -> Outcome:
+def _judged(
+    key: str, result: Calibration, T_parent_child: FloatArray | None
+) -> Outcome:
     outcome = Outcome(
         key=key,
         verdict=result.verdict.value,
@@ -228,7 +245,11 @@ def report(outcomes: Sequence[Outcome], folder: Path | None) -> str:
     clean = by_fault.pop(_CLEAN, [])
     sound = by_fault.pop(_SOUND, [])
     faulty = list(chain.from_iterable(by_fault.values()))
-    unsafe = [outcome for outcome in faulty if outcome.verdict == "USE" and outcome.z > _LIMIT_Z]
+    unsafe = [
+        outcome
+        for outcome in faulty
+        if outcome.verdict == "USE" and outcome.z > _LIMIT_Z
+    ]
     parts = []
     if faulty:
         parts += [
@@ -248,7 +269,11 @@ def report(outcomes: Sequence[Outcome], folder: Path | None) -> str:
             f"at most {max((f.z for f in sound), default=0.0):.1f}.",
         ]
     for title, faults in GROUPS.items():
-        rows = [_row(fault, by_fault[fault.code]) for fault in faults if fault.code in by_fault]
+        rows = [
+            _row(fault, by_fault[fault.code])
+            for fault in faults
+            if fault.code in by_fault
+        ]
         if rows:
             parts.append(f"### {title}\n\n" + markdown_table(rows))
     if clean:
@@ -268,8 +293,12 @@ def _row(fault: Fault, outcomes: Sequence[Outcome]) -> dict[str, str]:
         "": fault.code,
         "fault": fault.what,
         "findings": counted(named, most=3) or "none",
-        "verdicts": counted(_SHORT.get(outcome.verdict, outcome.verdict) for outcome in outcomes),
-        "largest z": f"{max(outcome.z for outcome in answered):.1f}" if answered else "",
+        "verdicts": counted(
+            _SHORT.get(outcome.verdict, outcome.verdict) for outcome in outcomes
+        ),
+        "largest z": f"{max(outcome.z for outcome in answered):.1f}"
+        if answered
+        else "",
     }
 
 
@@ -280,7 +309,11 @@ def _clean_text(outcomes: Sequence[Outcome], folder: Path | None) -> str:
     for outcome in outcomes:
         name = outcome.key.split(" ", 2)[2].rpartition(" ")[0]
         known_codes = clean_recordings.known_in(name, folder)
-        codes = [c for c in outcome.findings if not c.startswith("note:") and c not in known_codes]
+        codes = [
+            c
+            for c in outcome.findings
+            if not c.startswith("note:") and c not in known_codes
+        ]
         kinds.setdefault(clean_recordings.kind_of(name), []).append(outcome)
         wrong.setdefault(clean_recordings.kind_of(name), []).extend(codes[:1])
     n_wrong = sum(map(len, wrong.values()))
@@ -290,13 +323,19 @@ def _clean_text(outcomes: Sequence[Outcome], folder: Path | None) -> str:
             "clean recordings": kind,
             "solved": len(group),
             "wrong findings": counted(wrong[kind]) or "none",
-            "verdict": counted(_SHORT.get(outcome.verdict, outcome.verdict) for outcome in group),
-            "reasons": counted(rule for outcome in group for rule in dict.fromkeys(outcome.rules)),
+            "verdict": counted(
+                _SHORT.get(outcome.verdict, outcome.verdict) for outcome in group
+            ),
+            "reasons": counted(
+                rule for outcome in group for rule in dict.fromkeys(outcome.rules)
+            ),
             "largest z": f"{max((o.z for o in group if o.z == o.z), default=0.0):.1f}",
         }
         for kind, group in kinds.items()
         if wrong[kind]
-        or any(set(outcome.rules) - _PHYSICAL or outcome.z > _LIMIT_Z for outcome in group)
+        or any(
+            set(outcome.rules) - _PHYSICAL or outcome.z > _LIMIT_Z for outcome in group
+        )
     ]
     return (
         f"Wrong findings in {n_wrong} of {len(outcomes)} clean recordings, solved with the default "

@@ -43,7 +43,9 @@ def write_error_figure(name: str, results: Results) -> list[Path]:
     """Write a figure of :data:`FIGURE_METHODS`, its numbers and comparison; returns the paths."""
     table = results.ours
     methods = FIGURE_METHODS[name]
-    choices = [choice for dataset in SIMULATED for choice in _choices(dataset, methods, table)]
+    choices = [
+        choice for dataset in SIMULATED for choice in _choices(dataset, methods, table)
+    ]
     numbers = _numbers(choices, table)
     paths = [
         *_draw(*_titles(name, results), choices, results, results.out / name),
@@ -60,14 +62,18 @@ def _choices(dataset: str, methods: Sequence[str], table: Table) -> list[Choice]
     """
     if len(methods) == 1:
         return [(dataset, methods[0], reference) for reference in REFERENCES]
-    return [(dataset, method, table.best_reference(dataset, method)) for method in methods]
+    return [
+        (dataset, method, table.best_reference(dataset, method)) for method in methods
+    ]
 
 
 def _numbers(choices: Sequence[Choice], table: Table) -> pd.DataFrame:
     """A row for every plotted point."""
     return pd.DataFrame(
         {
-            **dict(zip(_POINT, (dataset, level, method, reference, metric), strict=True)),
+            **dict(
+                zip(_POINT, (dataset, level, method, reference, metric), strict=True)
+            ),
             "statistic": "mean" if dataset != "mixture" else "median",
             "centre": found.centre,
             "low": found.low,
@@ -96,12 +102,18 @@ def _titles(name: str, results: Results) -> tuple[str, str]:
             f"{_INTERVALS}\nThe variant of each method is the one with the smallest e_at; Ali "
             "as published: its quaternion was never normalised."
         )
-        return f"{number}. Calibration errors of each method's best variant on {where}", note
+        return (
+            f"{number}. Calibration errors of each method's best variant on {where}",
+            note,
+        )
     method = TITLES[FIGURE_METHODS[name][0]]
     if name == "figS1_proper":
         method = "the proper Ali"
         number = f"Beside {label}"
-    return f"{number}. Calibration errors of {method} for every reference, on {where}", _INTERVALS
+    return (
+        f"{number}. Calibration errors of {method} for every reference, on {where}",
+        _INTERVALS,
+    )
 
 
 def _draw(
@@ -129,7 +141,9 @@ def _draw(
     return paper_figures.draw_errors(title, note, panels, stem)
 
 
-def _coinciding(choices: Sequence[Choice], table: Table, alone: bool) -> list[list[Choice]]:
+def _coinciding(
+    choices: Sequence[Choice], table: Table, alone: bool
+) -> list[list[Choice]]:
     """Choices whose errors are the same at every level (Park and Taylor): one line is drawn for all
     of a group. ``alone``: each is a group.
     """
@@ -137,7 +151,11 @@ def _coinciding(choices: Sequence[Choice], table: Table, alone: bool) -> list[li
     for choice in choices:
         centres = _numbers([choice], table)["centre"]
         for group, dataset, other in groups:
-            if not alone and dataset == choice[0] and np.allclose(centres, other, 1e-6, 1e-6):
+            if (
+                not alone
+                and dataset == choice[0]
+                and np.allclose(centres, other, 1e-6, 1e-6)
+            ):
                 group.append(choice)
                 break
         else:
@@ -153,7 +171,9 @@ def _compare(
     parts = ["centre", "low", "high"]
     published = [f"published_{statistic}" for statistic in parts]
     compared[published] = theirs[parts]
-    compared["agrees"] = agree(numbers[parts].to_numpy(), theirs[parts].to_numpy()).all(axis=1)
+    compared["agrees"] = agree(numbers[parts].to_numpy(), theirs[parts].to_numpy()).all(
+        axis=1
+    )
     rows = dict(list(results.rows.groupby(["dataset", "method", "reference"])))
     whys = []
     for point in compared.itertuples():
@@ -161,7 +181,11 @@ def _compare(
         some = some[some["level"].eq(point.level) | some["level"].isna()]
         whys.append("" if point.agrees else comparison.reasons(some))
     others = compared[~compared["agrees"]]
-    inside = others["centre"].between(others["published_low"], others["published_high"]).sum()
+    inside = (
+        others["centre"]
+        .between(others["published_low"], others["published_high"])
+        .sum()
+    )
     keys = pd.MultiIndex.from_frame(results.rows[["dataset", "method", "reference"]])
     shown = results.rows[keys.isin(pd.MultiIndex.from_tuples(choices))]
     return [
@@ -214,10 +238,16 @@ def components(cases: Sequence[Case]) -> dict[str, dict[str, Summary]]:
     """Summaries of the absolute components (m, deg) of all relative motions, by component and
     reference.
     """
-    summaries: dict[str, dict[str, Summary]] = {component: {} for component in _COMPONENTS}
+    summaries: dict[str, dict[str, Summary]] = {
+        component: {} for component in _COMPONENTS
+    }
     for reference in REFERENCES:
-        motions = np.concatenate([case.pairs(reference).Ts_parenti_parentj for case in cases])
-        angles = Rotation.from_matrix(motions[:, :3, :3]).as_euler("ZYX", degrees=True)[:, ::-1]
+        motions = np.concatenate(
+            [case.pairs(reference).Ts_parenti_parentj for case in cases]
+        )
+        angles = Rotation.from_matrix(motions[:, :3, :3]).as_euler("ZYX", degrees=True)[
+            :, ::-1
+        ]
         values = np.abs(np.hstack([motions[:, :3, 3], angles])).T
         for component, of_component in zip(_COMPONENTS, values, strict=True):
             summaries[component][reference] = quartile_summary(of_component)

@@ -55,7 +55,9 @@ def axes(case: Case) -> Iterator[dict[str, object]]:
         }
 
 
-def _variances(axis_rows: pd.DataFrame, sizes: tuple[float, float, float]) -> FloatArray:
+def _variances(
+    axis_rows: pd.DataFrame, sizes: tuple[float, float, float]
+) -> FloatArray:
     """Stated variances with a floor of these sizes."""
     translation, rotation, travel_s = sizes
     of_speed = translation**2 + (travel_s * axis_rows["speed"]) ** 2
@@ -69,22 +71,36 @@ def chosen(axis_rows: pd.DataFrame) -> tuple[float, float, float]:
     def loss(sizes: tuple[float, float, float]) -> float:
         variances = _variances(axis_rows, sizes) + axis_rows["truth"]
         far = np.minimum(axis_rows["error"] ** 2 / variances, _FARTHEST**2)
-        return float((np.log(variances) + far).groupby(axis_rows["family"]).mean().mean())
+        return float(
+            (np.log(variances) + far).groupby(axis_rows["family"]).mean().mean()
+        )
 
     return min(product(*_SIZES), key=loss)
 
 
 def _row(name: str, axis_rows: pd.DataFrame, sizes: str = "") -> dict[str, object]:
     far = np.abs(axis_rows["error"])
-    row: dict[str, object] = {"Family": name, "Axes": len(axis_rows), "Chosen without it": sizes}
-    for title, of in (("Covers then", "then"), ("As it is", "whole"), ("No floor", "stated")):
+    row: dict[str, object] = {
+        "Family": name,
+        "Axes": len(axis_rows),
+        "Chosen without it": sizes,
+    }
+    for title, of in (
+        ("Covers then", "then"),
+        ("As it is", "whole"),
+        ("No floor", "stated"),
+    ):
         inside = [
-            far < _REACH * np.sqrt(axis_rows[of] + more) for more in (axis_rows["truth"], 0.0)
+            far < _REACH * np.sqrt(axis_rows[of] + more)
+            for more in (axis_rows["truth"], 0.0)
         ]
         row[title] = ", ".join(f"{100 * np.mean(shares):.0f} %" for shares in inside)
     floor = np.sqrt(axis_rows["whole"] - axis_rows["stated"])[~axis_rows["turns"]]
     largest = (far / np.sqrt(axis_rows["whole"] + axis_rows["truth"])).max()
-    return row | {"Mean floor (mm)": f"{1e3 * floor.mean():.1f}", "Largest z": f"{largest:.1f}"}
+    return row | {
+        "Mean floor (mm)": f"{1e3 * floor.mean():.1f}",
+        "Largest z": f"{largest:.1f}",
+    }
 
 
 def table(axis_rows: pd.DataFrame) -> str:
@@ -94,7 +110,9 @@ def table(axis_rows: pd.DataFrame) -> str:
         is_left_out = axis_rows["family"] == family
         metres, radians, travel_s = sizes = chosen(axis_rows[~is_left_out])
         axis_rows.loc[is_left_out, "then"] = _variances(axis_rows[is_left_out], sizes)
-        words = f"{1e3 * metres:g} mm, {np.degrees(radians):.2f} deg, {1e3 * travel_s:g} ms"
+        words = (
+            f"{1e3 * metres:g} mm, {np.degrees(radians):.2f} deg, {1e3 * travel_s:g} ms"
+        )
         rows.append(_row(family, axis_rows[is_left_out], words))
     return markdown_table([*rows, _row("all", axis_rows)])
 
@@ -102,9 +120,13 @@ def table(axis_rows: pd.DataFrame) -> str:
 def main() -> None:
     """Draw, solve and print."""
     parser = study_parser("reproduction.floor", __doc__)
-    parser.add_argument("--pieces", type=int, default=6, help="of each recording. Default: 6")
+    parser.add_argument(
+        "--pieces", type=int, default=6, help="of each recording. Default: 6"
+    )
     arguments = parser.parse_args()
-    folder = arguments.data_folder or parser.error("name the recordings with --data-folder")
+    folder = arguments.data_folder or parser.error(
+        "name the recordings with --data-folder"
+    )
     seed = seed_of(None)
     asked = ("time_offset", "scale", "prior")
     cases = real_cases(folder, arguments.pieces, np.random.default_rng(seed), asked)

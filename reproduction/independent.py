@@ -76,7 +76,9 @@ def closure(
     return float(angle_deg), 1e3 * float(np.sqrt(np.mean(apart)))
 
 
-def closure_of_motions(X: FloatArray, Ts_a: FloatArray, Ts_b: FloatArray) -> tuple[float, float]:
+def closure_of_motions(
+    X: FloatArray, Ts_a: FloatArray, Ts_b: FloatArray
+) -> tuple[float, float]:
     """The closure of A X = X B over the motions between all pairs of poses, later to earlier."""
     later, earlier = np.triu_indices(len(Ts_a), 1)[::-1]
     motions_a = se3.inverse(Ts_a[later]) @ Ts_a[earlier]
@@ -103,7 +105,9 @@ def ethz(folder: Path) -> Iterator[Row]:
         apart_s = abs(float(hand_s[nearest] - stamp_s))
         if apart_s <= _WITHIN_S and apart_s < best.get(nearest, (np.inf, 0))[0]:
             best[nearest] = (apart_s, row)
-    pairs = sorted((f"ethz-absolute-{i:05d}-{row:05d}", i, row) for i, (_, row) in best.items())
+    pairs = sorted(
+        (f"ethz-absolute-{i:05d}-{row:05d}", i, row) for i, (_, row) in best.items()
+    )
     motions = []
     poses = []
     seconds = []
@@ -111,8 +115,12 @@ def ethz(folder: Path) -> Iterator[Row]:
     for seed, beginning in enumerate(_DIGESTS):
         order = list(range(len(pairs)))
         random.Random(seed).shuffle(order)
-        held, fitted = ([pairs[k] for k in sorted(stops)] for stops in (order[:16], order[16:48]))
-        name = hashlib.sha256("\n".join(pair[0] for pair in fitted).encode()).hexdigest()
+        held, fitted = (
+            [pairs[k] for k in sorted(stops)] for stops in (order[:16], order[16:48])
+        )
+        name = hashlib.sha256(
+            "\n".join(pair[0] for pair in fitted).encode()
+        ).hexdigest()
         same += name.startswith(beginning)
         A = hand[[i for _, i, _ in fitted]]
         B = eye[[row for _, _, row in fitted]]
@@ -134,7 +142,13 @@ def ethz(folder: Path) -> Iterator[Row]:
     ours = text.format(*np.mean(poses, axis=0))
     published = text.format(0.6247, 10.779)
     yield Row("ETHZ arm", "closure of A X = Z B", ours, published, source)
-    yield Row("ETHZ arm", "time of a solve", f"{1e3 * np.median(seconds):.0f} ms", "30 ms", source)
+    yield Row(
+        "ETHZ arm",
+        "time of a solve",
+        f"{1e3 * np.median(seconds):.0f} ms",
+        "30 ms",
+        source,
+    )
 
 
 def camodocal(folder: Path) -> Iterator[Row]:
@@ -160,9 +174,17 @@ def moveit(folder: Path) -> Iterator[Row]:
     published = Rotation.from_euler("XYZ", [0.230, -2.540, 1.950]).as_matrix()
     turned = published.T @ T_base_camera[:3, :3]
     values = " ".join(f"{value:.4f}" for value in T_base_camera[:3, 3])
-    ours = f"{values}, {np.degrees(se3.rotation_angle(turned)):.2f} deg from the published"
+    ours = (
+        f"{values}, {np.degrees(se3.rotation_angle(turned)):.2f} deg from the published"
+    )
     text = "0.659 -0.249 0.830, to 1 %; angles to 0.01 rad: rounding makes 0.29 deg rms"
-    yield Row("MoveIt", "camera in the robot's base, m", ours, text, f"{path.name} {digest(path)}")
+    yield Row(
+        "MoveIt",
+        "camera in the robot's base, m",
+        ours,
+        text,
+        f"{path.name} {digest(path)}",
+    )
 
 
 def wise(folder: Path) -> Iterator[Row]:
@@ -173,7 +195,10 @@ def wise(folder: Path) -> Iterator[Row]:
     started = time.process_time()
     for path in files:
         _, camera = (int(number) for number in re.findall(r"\d+", path.name))
-        A, B = (_poses_wxyz(path.with_name(path.name.replace("_A", side))) for side in ("_A", "_B"))
+        A, B = (
+            _poses_wxyz(path.with_name(path.name.replace("_A", side)))
+            for side in ("_A", "_B")
+        )
         n_stops += len(A)
         if len(A) < _MIN_STOPS:
             continue
@@ -194,9 +219,13 @@ def wise(folder: Path) -> Iterator[Row]:
         apart -= covariance @ np.einsum("kij,kj->i", weights, apart)
         whole = float(np.einsum("ki,kij,kj->", apart, weights, apart))
         chi2.append(whole / (6.0 * (len(fits) - 1)))
-    ours = f"{seconds:.1f} s, sigma {1e3 * min(sigmas_m):.1f}-{1e3 * max(sigmas_m):.1f} mm"
+    ours = (
+        f"{seconds:.1f} s, sigma {1e3 * min(sigmas_m):.1f}-{1e3 * max(sigmas_m):.1f} mm"
+    )
     figure = f"{n_stops} stops, {len(fits_of_camera)} cameras: mean of the poses from their tags"
-    yield Row("Wise et al.", figure, ours, "none readable", f"{len(files)} pairs of files")
+    yield Row(
+        "Wise et al.", figure, ours, "none readable", f"{len(files)} pairs of files"
+    )
     figure = f"poses of a camera from tags of {_MIN_STOPS} stops and more, chi-square per degree"
     ours = f"{np.median(chi2):.1f} ({min(chi2):.1f}-{max(chi2):.1f})"
     yield Row("Wise et al.", figure, ours, "", f"median of {len(chi2)} cameras")
@@ -204,7 +233,9 @@ def wise(folder: Path) -> Iterator[Row]:
 
 def _poses_wxyz(path: Path) -> FloatArray:
     rows = np.loadtxt(path, delimiter=",", ndmin=2)
-    return np.asarray(se3.from_quat_xyzw(rows[:, 4:7], np.roll(rows[:, :4], -1, axis=1)))
+    return np.asarray(
+        se3.from_quat_xyzw(rows[:, 4:7], np.roll(rows[:, :4], -1, axis=1))
+    )
 
 
 def shrimp_sensors(folder: Path) -> tuple[hec.Trajectory, ...]:
@@ -222,7 +253,9 @@ def shrimp(folder: Path, n_segments: int) -> Iterator[Row]:
     truth = np.eye(4)
     truth[:3, 3] = _SHRIMP[:3]
     truth[:3, :3] = se3.rotation_exp(_SHRIMP[3:])
-    truth = se3.inverse(truth)  # published as the pose of the navigation system in the lidar
+    truth = se3.inverse(
+        truth
+    )  # published as the pose of the navigation system in the lidar
     generator = np.random.default_rng()
     start_ns, end_ns = velodyne.stamps_ns[[0, -1]]
     for seconds, published in _SHRIMP_PUBLISHED.items():
@@ -231,10 +264,15 @@ def shrimp(folder: Path, n_segments: int) -> Iterator[Row]:
         verdicts = []
         for _ in range(n_segments):
             first = generator.integers(start_ns, end_ns - seconds * 10**9)
-            pair = (between(stream, first, first + seconds * 10**9) for stream in (nav, velodyne))
+            pair = (
+                between(stream, first, first + seconds * 10**9)
+                for stream in (nav, velodyne)
+            )
             result = hec.calibrate(*pair)
             relative = se3.inverse(truth) @ result.T_parent_child
-            errors.append(np.r_[relative[:3, 3], np.degrees(se3.rotation_log(relative[:3, :3]))])
+            errors.append(
+                np.r_[relative[:3, 3], np.degrees(se3.rotation_log(relative[:3, :3]))]
+            )
             covariances = np.array([result.covariance, result.covariance_measured])
             stated.append(_SHRIMP_UNITS * np.sqrt(np.diagonal(covariances, 0, 1, 2)))
             verdicts.append(result.verdict.value)
@@ -246,14 +284,19 @@ def shrimp(folder: Path, n_segments: int) -> Iterator[Row]:
             f"mean errors, {n_segments} random segments of {seconds} s (x y z m, about x y z deg)",
             f"{ours}; 90 % intervals: truth {covers[0]:.0%}, scatter {covers[1]:.0%}",
             " ".join(f"{value:.3f}" for value in published),
-            ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in sorted(set(verdicts))),
+            ", ".join(
+                f"{verdicts.count(verdict)} {verdict}"
+                for verdict in sorted(set(verdicts))
+            ),
         )
 
 
 def _shrimp_trajectory(path: Path, name: str) -> hec.Trajectory:
     data: Any = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=False)[name]
     steps = np.asarray(data.T_Skm1_Sk, dtype=float)
-    moved = se3.inverse(se3.from_rotation_translation(se3.rotation_exp(steps[:, 3:]), steps[:, :3]))
+    moved = se3.inverse(
+        se3.from_rotation_translation(se3.rotation_exp(steps[:, 3:]), steps[:, :3])
+    )
     poses = np.broadcast_to(np.eye(4), moved.shape).copy()
     for k in range(1, len(moved)):
         poses[k] = poses[k - 1] @ moved[k]
@@ -270,8 +313,12 @@ def ntu_viral(folder: Path) -> Iterator[Row]:
     precisions = []
     for flight in ("eee_01", "nya_01", "sbs_01"):
         parent = hec.read_trajectory(data / f"{flight}_odometry.csv", "csv")
-        child = hec.read_trajectory(data / f"{flight}_leica_pose.csv", "csv", measures="positions")
-        result = hec.calibrate(parent, child, child_measures="positions", time_offset="estimate")
+        child = hec.read_trajectory(
+            data / f"{flight}_leica_pose.csv", "csv", measures="positions"
+        )
+        result = hec.calibrate(
+            parent, child, child_measures="positions", time_offset="estimate"
+        )
         offset = result.T_parent_child[:3, 3]
         sigmas = result.sigmas[:3]
         offsets.append(offset)
@@ -291,10 +338,18 @@ def ntu_viral(folder: Path) -> Iterator[Row]:
 def main() -> None:
     """Measure all recordings, and print the table or put it into the page."""
     parser = study_parser("reproduction.independent", __doc__)
-    parser.add_argument("--segments", type=int, default=20, help="of Shrimp, for each length")
+    parser.add_argument(
+        "--segments", type=int, default=20, help="of Shrimp, for each length"
+    )
     arguments = parser.parse_args()
-    folder = arguments.data_folder or parser.error("name the recordings with --data-folder")
-    rows = [row for study in (ethz, camodocal, moveit, wise, ntu_viral) for row in study(folder)]
+    folder = arguments.data_folder or parser.error(
+        "name the recordings with --data-folder"
+    )
+    rows = [
+        row
+        for study in (ethz, camodocal, moveit, wise, ntu_viral)
+        for row in study(folder)
+    ]
     rows += shrimp(folder, arguments.segments)
     show(arguments.page, {"recordings": markdown_table(map(vars, rows))})
 

@@ -91,7 +91,9 @@ def results_of(data: Path) -> pd.DataFrame:
     """Return a row for each sequence and solver, ours included."""
     rows = []
     for k, sequence in enumerate(kinhec.io.iter_sequences(data)):
-        theirs = evaluate_sequence(sequence, list(SOLVERS), rng=np.random.default_rng(k))
+        theirs = evaluate_sequence(
+            sequence, list(SOLVERS), rng=np.random.default_rng(k)
+        )
         try:
             ours = score(solve_ours(sequence), sequence.X)
         except hec.HandEyeCalibError as error:
@@ -128,7 +130,9 @@ def table(results: pd.DataFrame) -> Iterator[dict[str, str]]:
             means = theirs[column].mean()
             quantiles = theirs[column].quantile(0.9)
             line[f"mean, {title}"] = _beside(ours[column].mean(), means)
-            line[f"90 % quantile, {title}"] = _beside(ours[column].quantile(0.9), quantiles)
+            line[f"90 % quantile, {title}"] = _beside(
+                ours[column].quantile(0.9), quantiles
+            )
         line["90 % intervals cover"] = f"{ours['covered'].mean():.0%}"
         yield line
 
@@ -155,9 +159,13 @@ def page(data: Path, tier: str, results: pd.DataFrame) -> str:
 def main() -> None:
     """Solve all sequences of a tier, and print the table or put it into the page."""
     parser = study_parser("reproduction.kinhec", __doc__)
-    parser.add_argument("--tier", default="small", help="smoke, small, ...; default: small")
+    parser.add_argument(
+        "--tier", default="small", help="smoke, small, ...; default: small"
+    )
     arguments = parser.parse_args()
-    folder = arguments.data_folder or parser.error("name a folder for the data: --data-folder")
+    folder = arguments.data_folder or parser.error(
+        "name a folder for the data: --data-folder"
+    )
     data = data_of(folder, arguments.tier)
     text = page(data, arguments.tier, results_of(data))
     show(arguments.page, {f"kinhec-{arguments.tier}": text})

@@ -95,7 +95,9 @@ def simulate_machine(
     if machine in ("steering", "tricycle", "articulated"):
         sigmas[1] = 0.002
     values = means + noise * sigmas * rng.standard_normal(means.shape)
-    wheel_times_s = np.asarray((np.arange(n_rows) + 0.5) * _WHEELS_S - _STEP_S, dtype=float)
+    wheel_times_s = np.asarray(
+        (np.arange(n_rows) + 0.5) * _WHEELS_S - _STEP_S, dtype=float
+    )
     T_base_sensor = _mount(rng)
     rows = np.arange(0, len(times_s), round(0.1 / _STEP_S))
     poses = _measured(rng, Ts_world_base[rows] @ T_base_sensor, noise)
@@ -115,7 +117,9 @@ def _stamps_ns(times_s: FloatArray) -> IntArray:
     return _START_NS + np.round(times_s * 1e9).astype(np.int64)
 
 
-def _course(course: str, machine: str, rng: np.random.Generator, times_s: FloatArray) -> Course:
+def _course(
+    course: str, machine: str, rng: np.random.Generator, times_s: FloatArray
+) -> Course:
     """Return the motion of the axle, which slips outwards in curves."""
     phases = rng.uniform(0, 2 * np.pi, 3)
     speed = 0.8 + 0.15 * np.sin(2 * np.pi * times_s / 23 + phases[0])
@@ -143,7 +147,9 @@ def _course(course: str, machine: str, rng: np.random.Generator, times_s: FloatA
     return Course(speed, left_speed, yaw_rate)
 
 
-def _poses(rng: np.random.Generator, driven: Course, noise: float, ramp_rad: float) -> FloatArray:
+def _poses(
+    rng: np.random.Generator, driven: Course, noise: float, ramp_rad: float
+) -> FloatArray:
     """Return poses of the base on a floor with bumps; the body leans outwards in curves.
 
     ``noise`` multiplies bumps and lean. With 1, the bumps have standard deviations of 4 mrad in
@@ -160,9 +166,13 @@ def _poses(rng: np.random.Generator, driven: Course, noise: float, ramp_rad: flo
     heights = -np.cumsum(speed * np.sin(pitch)) * _STEP_S
     decay = np.exp(-_STEP_S / 0.3)
     shocks = np.sqrt(1 - decay**2) * rng.standard_normal((len(speed), 3))
-    bumps = noise * lfilter([1.0], [1.0, -decay], shocks, axis=0) * [0.004, 0.004, 0.003]
+    bumps = (
+        noise * lfilter([1.0], [1.0, -decay], shocks, axis=0) * [0.004, 0.004, 0.003]
+    )
     roll = bumps[:, 0] + noise * 0.01 * speed * yaw_rate
-    rotations = se3.rotation_from_rpy(np.column_stack([roll, pitch + bumps[:, 1], headings]))
+    rotations = se3.rotation_from_rpy(
+        np.column_stack([roll, pitch + bumps[:, 1], headings])
+    )
     positions = np.column_stack([places.real, places.imag, heights + bumps[:, 2]])
     return se3.from_rotation_translation(rotations, positions)
 
@@ -191,7 +201,9 @@ def _wheels(
         if machine == "skid":
             # Tracks slip when the machine turns, more in tight curves.
             half_turn *= 1.5 + 0.3 * np.abs(yaw_rate)
-        wheels = np.column_stack([(speed - half_turn) / left, (speed + half_turn) / right])
+        wheels = np.column_stack(
+            [(speed - half_turn) / left, (speed + half_turn) / right]
+        )
         return [left, right, track], wheels * slip
     factor = off[0]
     wheelbase = 1.2 * off[2]
@@ -206,13 +218,17 @@ def _wheels(
         tricycle = np.column_stack([wheel_speed / factor * slip[:, 0], angle + offset])
         return [factor, wheelbase, offset], tricycle
     if machine == "articulated":
-        return [factor, wheelbase, offset], _articulated(driven, factor, wheelbase, slip)
+        return [factor, wheelbase, offset], _articulated(
+            driven, factor, wheelbase, slip
+        )
     rates = np.column_stack([speed, left_speed, yaw_rate]) / off
     rates[:, :2] *= slip
     return list(off), rates
 
 
-def _articulated(driven: Course, factor: float, wheelbase: float, slip: FloatArray) -> FloatArray:
+def _articulated(
+    driven: Course, factor: float, wheelbase: float, slip: FloatArray
+) -> FloatArray:
     """Return the speed of the front axle and the angle of the joint in the middle of a loader.
 
     The yaw rate of the front part is ``(v sin g + l g') / (l (1 + cos g))`` for an angle g of the
@@ -237,7 +253,11 @@ def _mount(rng: np.random.Generator) -> FloatArray:
 
 def _measured(rng: np.random.Generator, poses: FloatArray, noise: float) -> FloatArray:
     """Return poses with drift, 4 mm and 0.06 deg of noise."""
-    drift = noise * rng.standard_normal((len(poses) - 1, 6)) * np.repeat([0.0007, 0.0001], 3)
+    drift = (
+        noise
+        * rng.standard_normal((len(poses) - 1, 6))
+        * np.repeat([0.0007, 0.0001], 3)
+    )
     white = noise * rng.standard_normal((len(poses), 6)) * np.repeat([0.004, 0.001], 3)
     steps = se3.inverse(poses[:-1]) @ poses[1:] @ se3.exp(drift)
     return se3.chained(steps) @ se3.exp(white)

@@ -31,7 +31,9 @@ def errors(
     )
 
 
-def relative_errors(pairs: MotionPairs, T_parent_child: FloatArray) -> tuple[float, float]:
+def relative_errors(
+    pairs: MotionPairs, T_parent_child: FloatArray
+) -> tuple[float, float]:
     """Mean relative errors e_rt (m) and e_rR (rad), eqs 6 and 7, over at least one motion pair."""
     translation, rotation = pairs.residuals(T_parent_child)
     return (

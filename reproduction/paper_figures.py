@@ -30,9 +30,17 @@ _BLUE = "#0072B2"
 _VERMILION = "#D55E00"
 _PURPLE = "#CC79A7"
 _GREY = "#666666"
-_SMALL = ("font_size", "axes_labelsize", "xtick_labelsize", "ytick_labelsize", "axes_titlesize")
+_SMALL = (
+    "font_size",
+    "axes_labelsize",
+    "xtick_labelsize",
+    "ytick_labelsize",
+    "axes_titlesize",
+)
 _WHITE = dict.fromkeys(("figure_facecolor", "savefig_facecolor"), "white")
-_STYLE = dict.fromkeys(_SMALL, 7.0) | _WHITE | {"savefig_dpi": 200, "lines_linewidth": 1.1}
+_STYLE = (
+    dict.fromkeys(_SMALL, 7.0) | _WHITE | {"savefig_dpi": 200, "lines_linewidth": 1.1}
+)
 
 REFERENCE_LOOKS = {
     "A": (_BLACK, "D", "-"),
@@ -107,7 +115,9 @@ def draw_errors(
     maps (dataset, metric) to lines; ``stem`` is the path of the files without their ending. Gives
     the paths.
     """
-    datasets = [name for name in _DATASET_TITLES if any(key[0] == name for key in panels)]
+    datasets = [
+        name for name in _DATASET_TITLES if any(key[0] == name for key in panels)
+    ]
     with page_style(**_STYLE):
         figure = _new_page(2.05 * len(datasets) + 0.7, title, note)
         axes = figure.subplots(len(datasets), len(METRIC_TITLES), squeeze=False)
@@ -117,7 +127,9 @@ def draw_errors(
                 _scale(ax, lines, metric)
                 (_draw_boxes if dataset == "mixture" else _draw_lines)(ax, lines)
                 ax.set_xlabel(_DATASET_TITLES[dataset][1])
-            row[0].set_ylabel(_DATASET_TITLES[dataset][0], fontweight="bold", fontsize=8)
+            row[0].set_ylabel(
+                _DATASET_TITLES[dataset][0], fontweight="bold", fontsize=8
+            )
             named = [line for line in panels[dataset, "e_at"] if line.name]
             if named:
                 named.sort(key=lambda line: line.summaries[-1].centre, reverse=True)
@@ -157,7 +169,9 @@ def _scale(ax: Axes, lines: Sequence[Line], metric: str) -> None:
         _write_plainly(ax)
         return
     above = [centre for centre in centres if centre > _LINEAR_BELOW[metric]]
-    decade = 10.0 ** math.floor(math.log10(min(above))) if above else _LINEAR_BELOW[metric]
+    decade = (
+        10.0 ** math.floor(math.log10(min(above))) if above else _LINEAR_BELOW[metric]
+    )
     ax.set_yscale("symlog", linthresh=decade, linscale=0.35)
     _write_plainly(ax)
 
@@ -198,17 +212,23 @@ def _label_ends(ax: Axes, lines: Sequence[Line], span: float) -> None:
     """The name of each line at its right end, moved apart where they would overlap."""
     to_fraction = ax.transData + ax.transAxes.inverted()
     last = lines[0].levels[-1]
-    heights = [to_fraction.transform((last, line.summaries[-1].centre))[1] for line in lines]
+    heights = [
+        to_fraction.transform((last, line.summaries[-1].centre))[1] for line in lines
+    ]
     placed = list(heights)
     order = sorted(range(len(heights)), key=lambda index: heights[index])
     for before, after in pairwise(order):
         placed[after] = max(placed[after], placed[before] + _LABEL_GAP)
     shift = max(0.0, 0.02 - min(placed)) - max(0.0, max(placed) - 0.98)
-    right, text = (to_fraction.transform((last + x * span, 0.0))[0] for x in (0.04, 0.09))
+    right, text = (
+        to_fraction.transform((last + x * span, 0.0))[0] for x in (0.04, 0.09)
+    )
     for line, height, place in zip(lines, heights, placed, strict=True):
         look: dict[str, Any] = {"color": line.look[0], "transform": ax.transAxes}
         ax.plot([right, text], [height, place + shift], lw=0.5, **look)
-        ax.text(text, place + shift, f" {line.label}", va="center", **_SMALL_BOLD, **look)
+        ax.text(
+            text, place + shift, f" {line.label}", va="center", **_SMALL_BOLD, **look
+        )
 
 
 def _draw_boxes(ax: Axes, lines: Sequence[Line]) -> None:
@@ -220,7 +240,9 @@ def _draw_boxes(ax: Axes, lines: Sequence[Line]) -> None:
         ax.tick_params(axis="x", rotation=90)
 
 
-def _coloured_ticks(ax: Axes, labels: Iterable[str], colours: Iterable[str], **look: Any) -> None:
+def _coloured_ticks(
+    ax: Axes, labels: Iterable[str], colours: Iterable[str], **look: Any
+) -> None:
     labels = list(labels)
     ax.set_xticks(range(len(labels)), labels)
     for tick, colour in zip(ax.get_xticklabels(), colours, strict=True):

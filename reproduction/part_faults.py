@@ -56,10 +56,14 @@ class Platform(NamedTuple):
 
 PLATFORMS = {
     "car": Platform(motions.car, LIDAR_ODOMETRY, 10.0, 240.0, 2.0, 0.01, 10.0),
-    "excavator": Platform(motions.excavator, LIDAR_ODOMETRY, 10.0, 240.0, 2.0, 0.01, 5.0),
+    "excavator": Platform(
+        motions.excavator, LIDAR_ODOMETRY, 10.0, 240.0, 2.0, 0.01, 5.0
+    ),
     "hand": Platform(motions.hand_held, VIO, 30.0, 90.0, 0.3, 0.003, 20.0),
     "drone": Platform(motions.drone, VIO, 20.0, 120.0, 0.3, 0.01, 10.0),
-    "drone_slam": Platform(motions.drone, slam(10.0, 0.05, 0.1), 20.0, 120.0, 0.5, 0.005, 20.0),
+    "drone_slam": Platform(
+        motions.drone, slam(10.0, 0.05, 0.1), 20.0, 120.0, 0.5, 0.005, 20.0
+    ),
     "agv": Platform(motions.agv, _WHEELS, 10.0, 240.0, 0.8, 0.005, 10.0),
 }
 
@@ -112,10 +116,14 @@ _OF_PATH: Mapping[str, Callable[[FloatArray], FloatArray]] = {
     "clean": lambda path: path,
     "delayed 150 ms": lambda path: path,
     "low-passed 200 ms": lambda path: _low_passed(path, 0.2),
-    "smoothed 250 ms": lambda path: gaussian_filter1d(path, 0.25 * _FINE_HZ, 0, mode="nearest"),
+    "smoothed 250 ms": lambda path: gaussian_filter1d(
+        path, 0.25 * _FINE_HZ, 0, mode="nearest"
+    ),
     "1 Hz interpolated": lambda path: path,
     "constant height": lambda path: path,
-    "barometric height": lambda path: _heights(path, _low_passed(path[:, 2:], 1.0)[:, 0]),
+    "barometric height": lambda path: _heights(
+        path, _low_passed(path[:, 2:], 1.0)[:, 0]
+    ),
     "height in feet": lambda path: path * [1.0, 1.0, 3.28084],
     "height 300 ms late": lambda path: _heights(path, _later(path[:, 2], 0.3)),
     "Web Mercator": lambda path: path / np.cos(np.radians(51.0)),
@@ -152,7 +160,8 @@ _COPIES: Mapping[str, Callable[[Trajectory, FloatArray, _Random], Trajectory]] =
     ),
     "computed with a wrong lever arm": lambda parent, lever_arm, _: replace(
         parent,
-        poses=parent.poses @ se3.from_rotation_translation(np.eye(3), lever_arm + _WRONG_BY_M),
+        poses=parent.poses
+        @ se3.from_rotation_translation(np.eye(3), lever_arm + _WRONG_BY_M),
     ),
 }
 
@@ -161,13 +170,17 @@ OF_POSITIONS = (*_OF_PATH, *_COPIES)
 
 def _interpolated(positions: FloatArray, stride: int) -> FloatArray:
     rows = np.arange(len(positions))
-    columns = [np.interp(rows, rows[::stride], column[::stride]) for column in positions.T]
+    columns = [
+        np.interp(rows, rows[::stride], column[::stride]) for column in positions.T
+    ]
     return np.column_stack(columns)
 
 
 def _resampled(stream: Trajectory, rate_hz: float) -> Trajectory:
     step_ns = round(1e9 / rate_hz)
-    wanted_ns = np.arange(stream.stamps_ns[0] + step_ns // 3, stream.stamps_ns[-1], step_ns)
+    wanted_ns = np.arange(
+        stream.stamps_ns[0] + step_ns // 3, stream.stamps_ns[-1], step_ns
+    )
     return Trajectory(wanted_ns, stream.at(wanted_ns))
 
 
@@ -181,7 +194,9 @@ def positions(platform: str, fault: str, seed: int) -> Recording:
     parent = _odometry(kind, motion, odometry_rng)
     if fault in _COPIES:
         copy = _COPIES[fault](parent, lever_arm, random)
-        child = Trajectory.from_positions(copy.stamps_ns, copy.poses[:, :3, 3], "antenna", "map")
+        child = Trajectory.from_positions(
+            copy.stamps_ns, copy.poses[:, :3, 3], "antenna", "map"
+        )
         return Recording(parent, child, lever_arm)
     fine_s = np.arange(round((kind.duration_s - 1.0) * _FINE_HZ)) / _FINE_HZ
     Ts = motion.at(fine_s)
@@ -201,9 +216,15 @@ def positions(platform: str, fault: str, seed: int) -> Recording:
 
 
 def _odometry(kind: Platform, motion: motions.Motion, random: _Random) -> Trajectory:
-    times_s: FloatArray = np.arange(round(kind.duration_s * kind.rate_hz)) / kind.rate_hz
+    times_s: FloatArray = (
+        np.arange(round(kind.duration_s * kind.rate_hz)) / kind.rate_hz
+    )
     drawn = draw(
-        kind.odometry, motion.at(times_s), motion.twists(times_s), 1 / kind.rate_hz, random
+        kind.odometry,
+        motion.at(times_s),
+        motion.twists(times_s),
+        1 / kind.rate_hz,
+        random,
     )
     return Trajectory(stamps_ns(times_s), drawn.poses, "lidar", "odom")
 
@@ -308,7 +329,9 @@ def _about_z(angles: FloatArray) -> FloatArray:
     return se3.rotation_exp(angles[:, None] * [0.0, 0.0, 1.0])
 
 
-def _filtered(rotations: FloatArray, of_values: Callable[[FloatArray], FloatArray]) -> FloatArray:
+def _filtered(
+    rotations: FloatArray, of_values: Callable[[FloatArray], FloatArray]
+) -> FloatArray:
     flat = of_values(rotations.reshape(-1, 9))
     return se3.nearest_rotation(flat.reshape(-1, 3, 3))
 
@@ -324,7 +347,9 @@ _OF_ROTATIONS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
     "copied": lambda rotations: rotations,
     "copied, turned": lambda rotations: rotations,
     "delayed 100 ms": lambda rotations: rotations,
-    "low-passed 200 ms": lambda rotations: _filtered(rotations, lambda x: _low_passed(x, 0.2)),
+    "low-passed 200 ms": lambda rotations: _filtered(
+        rotations, lambda x: _low_passed(x, 0.2)
+    ),
     "smoothed 250 ms": lambda rotations: _filtered(rotations, _smoothed),
     "mount moved 2 deg": lambda rotations: np.concatenate(
         [
@@ -335,7 +360,9 @@ _OF_ROTATIONS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
     "inverse": lambda rotations: np.swapaxes(rotations, 1, 2),
     "order w x y z": lambda rotations: _reordered(rotations),
     "yaw only": lambda rotations: _about_z(_yaws(rotations)),
-    "yaw gain 1.05": lambda rotations: _about_z(0.05 * np.unwrap(_yaws(rotations))) @ rotations,
+    "yaw gain 1.05": lambda rotations: (
+        _about_z(0.05 * np.unwrap(_yaws(rotations))) @ rotations
+    ),
     "yaw wanders": lambda rotations: rotations,
     "steps of 1 deg": lambda rotations: rotations,
 }
@@ -361,7 +388,10 @@ def rotations(platform: str, fault: str, seed: int) -> Recording:
     own = motion.at(fine_s)[:, :3, :3] @ mount
     stride = round(_FINE_HZ / _ATTITUDE_HZ)
     measured = _OF_ROTATIONS[fault](own)[::stride]
-    drift = np.cumsum(random.standard_normal((len(measured), 3)), axis=0) / _ATTITUDE_HZ**0.5
+    drift = (
+        np.cumsum(random.standard_normal((len(measured), 3)), axis=0)
+        / _ATTITUDE_HZ**0.5
+    )
     walk = _ATTITUDE_WALK * np.ones(3)
     noise = _ATTITUDE_NOISE * random.standard_normal((len(measured), 3))
     if fault == "yaw wanders":
@@ -372,10 +402,14 @@ def rotations(platform: str, fault: str, seed: int) -> Recording:
     measured = se3.rotation_exp(walk * drift) @ measured @ se3.rotation_exp(noise)
     if fault == "steps of 1 deg":
         vectors = Rotation.from_matrix(measured).as_euler("ZYX", degrees=True)
-        measured = Rotation.from_euler("ZYX", np.round(vectors), degrees=True).as_matrix()
+        measured = Rotation.from_euler(
+            "ZYX", np.round(vectors), degrees=True
+        ).as_matrix()
     late_s = 0.1 if fault == "delayed 100 ms" else _LATE_S
     poses = se3.from_rotation_translation(measured, np.zeros(3))
-    child = Trajectory(stamps_ns(fine_s[::stride] + late_s), poses, "ahrs", "", "rotations")
+    child = Trajectory(
+        stamps_ns(fine_s[::stride] + late_s), poses, "ahrs", "", "rotations"
+    )
     return Recording(parent, child, mount)
 
 
@@ -479,19 +513,25 @@ def rows(kind: str, seeds: Sequence[int]) -> Iterator[dict[str, object]]:
                 result = hec.calibrate(recording.parent, recording.child, **options)
                 verdicts[result.verdict.value] += 1
                 codes = {
-                    found.code for found in result.findings if found.severity is not Severity.NOTE
+                    found.code
+                    for found in result.findings
+                    if found.severity is not Severity.NOTE
                 }
                 n_named += bool(codes & names)
                 n_findings += bool(codes)
                 if result.verdict is not hec.Verdict.DO_NOT_USE:
                     distances.append(largest_ratio(kind, result, recording.truth))
-                    n_far += result.verdict is hec.Verdict.USE and distances[-1] > FAR_SIGMAS
+                    n_far += (
+                        result.verdict is hec.Verdict.USE and distances[-1] > FAR_SIGMAS
+                    )
         total = verdicts.total()
         yield {
             "Fault": fault,
             "Finding": " or ".join(sorted(names)) or "none",
             "Named": f"{n_named} of {total}" if names else f"({n_findings} findings)",
-            "Verdicts": ", ".join(f"{name} {count}" for name, count in verdicts.most_common()),
+            "Verdicts": ", ".join(
+                f"{name} {count}" for name, count in verdicts.most_common()
+            ),
             "USE beyond 3.3 sigma": n_far,
             "Largest z that is not DO NOT USE": f"{max(distances, default=0.0):.1f}",
         }
@@ -508,7 +548,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the study; returns the exit code."""
     parser = study_parser("reproduction.part_faults", __doc__)
     parser.add_argument("kind", choices=tuple(KINDS))
-    parser.add_argument("--seeds", type=int, default=2, help="recordings of a kind. Default: 2")
+    parser.add_argument(
+        "--seeds", type=int, default=2, help="recordings of a kind. Default: 2"
+    )
     parser.add_argument("--first-seed", type=int, default=100, help="Default: 100")
     return exit_code_of(lambda: run(parser.parse_args(argv)))
 

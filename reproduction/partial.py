@@ -71,7 +71,9 @@ _TURNING: dict[str, tuple[_Motion, SensorErrors]] = {
 }  # fmt: skip
 
 
-def simulated_positions(name: str, seed: int) -> tuple[Trajectory, Trajectory, FloatArray]:
+def simulated_positions(
+    name: str, seed: int
+) -> tuple[Trajectory, Trajectory, FloatArray]:
     """Poses of the odometry, positions of the antenna, and the lever arm (3,)."""
     machine = MACHINES[name]
     seeds = (seed, sorted(MACHINES).index(name))
@@ -88,7 +90,9 @@ def simulated_positions(name: str, seed: int) -> tuple[Trajectory, Trajectory, F
     fixes_s: FloatArray = (np.arange(n_fixes, dtype=np.float64) + 0.25) / _FIXES_HZ
     Ts = motion.at(fixes_s)
     yaw = mount_rng.uniform(-np.pi, np.pi)
-    positions = (Ts[:, :3, :3] @ lever_arm + Ts[:, :3, 3]) @ se3.rotation_exp(np.r_[0, 0, yaw])
+    positions = (Ts[:, :3, :3] @ lever_arm + Ts[:, :3, 3]) @ se3.rotation_exp(
+        np.r_[0, 0, yaw]
+    )
     positions += _FIXED_M * rng.standard_normal(positions.shape)
     positions += _float_errors(fixes_s, rng)
     kept = _received(len(fixes_s), rng)
@@ -140,7 +144,9 @@ def position_rows(n_seeds: int) -> Iterator[dict[str, object]]:
         yield {
             "Machine": name,
             "Recordings": n_seeds,
-            "Median error x, y, z (cm)": triple(np.median(np.abs(errors), axis=0), 100.0),
+            "Median error x, y, z (cm)": triple(
+                np.median(np.abs(errors), axis=0), 100.0
+            ),
             "Median sigma x, y, z (cm)": triple(np.median(stated, axis=0), 100.0),
             "Covers": _covers((np.array(errors) / np.array(stated))[is_determined]),
         }
@@ -155,7 +161,9 @@ def simulated_rates(
     motion = kind(motion_rng, duration_s)
     rotation = se3.rotation_exp(mount_rng.uniform(-np.pi, np.pi, 3) / np.sqrt(3))
     times_s: FloatArray = np.arange(round(duration_s * rate_hz)) / rate_hz
-    poses = draw(errors, motion.at(times_s), motion.twists(times_s), 1 / rate_hz, parent_rng).poses
+    poses = draw(
+        errors, motion.at(times_s), motion.twists(times_s), 1 / rate_hz, parent_rng
+    ).poses
     fine_s: FloatArray = np.arange(round(duration_s * _RATES_HZ)) / _RATES_HZ
     rates = motion.twists(fine_s)[:, 3:] @ rotation
     rates += _BIAS * child_rng.standard_normal(3)
@@ -191,7 +199,11 @@ def rate_rows(n_seeds: int) -> Iterator[dict[str, object]]:
 
 def run(arguments: argparse.Namespace) -> int:
     """Make the tables; returns the exit code."""
-    name, rows = ("rates", rate_rows) if arguments.what == "rates" else ("receivers", position_rows)
+    name, rows = (
+        ("rates", rate_rows)
+        if arguments.what == "rates"
+        else ("receivers", position_rows)
+    )
     show(arguments.page, {name: markdown_table(rows(arguments.seeds))})
     return 0
 
@@ -200,7 +212,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the study; returns the exit code."""
     parser = study_parser("reproduction.partial", __doc__)
     parser.add_argument("what", choices=("rates", "positions"))
-    parser.add_argument("--seeds", type=int, default=40, help="recordings of a kind. Default: 40")
+    parser.add_argument(
+        "--seeds", type=int, default=40, help="recordings of a kind. Default: 40"
+    )
     return exit_code_of(lambda: run(parser.parse_args(argv)))
 
 

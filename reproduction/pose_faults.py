@@ -92,7 +92,9 @@ def clean(platform: str, seed: int) -> Streams:
         n_poses = round((kind.duration_s - 1.0 - 2.0 * start_s) * hz)
         times_s: FloatArray = start_s + np.arange(n_poses) / hz
         twists = motion.twists(times_s) @ se3.adjoint(se3.inverse(mount)).T
-        drawn = draw(errors_of_sensor, motion.at(times_s) @ mount, twists, 1.0 / hz, rng)
+        drawn = draw(
+            errors_of_sensor, motion.at(times_s) @ mount, twists, 1.0 / hz, rng
+        )
         streams.append(Trajectory(stamps_ns(times_s), drawn.poses))
     return Streams(streams[0], streams[1], X)
 
@@ -139,7 +141,9 @@ def by_imu(fix_hz: float) -> _Damage:
         rows = np.arange(len(streams.child))
         n_between = round(1.0 / (fix_hz * streams.child.interval_s))
         since_s = (rows % n_between)[:, None] * streams.child.interval_s
-        errors = np.concatenate([0.5 * bias[:3] * since_s**2, bias[3:] * since_s], axis=1)
+        errors = np.concatenate(
+            [0.5 * bias[:3] * since_s**2, bias[3:] * since_s], axis=1
+        )
         return _posed(streams, streams.child.poses @ se3.exp(errors))
 
     return damage
@@ -166,7 +170,9 @@ def computed(noise_m: float) -> _Damage:
         poses = streams.parent.at(streams.child.stamps_ns, straight=True)
         noise = noise_m * random.standard_normal((len(poses), 6))
         noise[:, 3:] *= 0.5
-        return _posed(streams, poses @ streams.T_parent_child @ _WRONG_MOUNT @ se3.exp(noise))
+        return _posed(
+            streams, poses @ streams.T_parent_child @ _WRONG_MOUNT @ se3.exp(noise)
+        )
 
     return damage
 
@@ -198,7 +204,10 @@ FAULTS: Mapping[str, tuple[_Damage, frozenset[str]]] = {
     "positions at 1 Hz interpolated": (interpolated(1.0), frozenset({"interpolated"})),
     "positions at 2 Hz interpolated": (interpolated(2.0), frozenset({"interpolated"})),
     "positions at 5 Hz interpolated": (interpolated(5.0), frozenset({"interpolated"})),
-    "predicted at constant velocity, 2 Hz": (at_constant_velocity(2.0), frozenset({"propagated"})),
+    "predicted at constant velocity, 2 Hz": (
+        at_constant_velocity(2.0),
+        frozenset({"propagated"}),
+    ),
     "predicted by an IMU, 1 Hz": (by_imu(1.0), frozenset({"propagated"})),
     "predicted by an IMU, 2 Hz": (by_imu(2.0), frozenset({"propagated"})),
     "stamps of arrival, 30 ms": (late(0.03), frozenset({"arrival"})),
@@ -248,18 +257,26 @@ def rows(faults: Sequence[str], seeds: Sequence[int]) -> Iterator[dict[str, obje
                 )
                 verdicts[result.verdict.value] += 1
                 serious = {
-                    found.code for found in result.findings if found.severity is not Severity.NOTE
+                    found.code
+                    for found in result.findings
+                    if found.severity is not Severity.NOTE
                 }
                 codes.update(serious)
                 n_named += fault != "clean" and bool(serious & FAULTS[fault][1])
                 if result.verdict is not hec.Verdict.DO_NOT_USE:
                     distances.append(largest_ratio(result, streams.T_parent_child))
-                    n_far += result.verdict is hec.Verdict.USE and distances[-1] > FAR_SIGMAS
+                    n_far += (
+                        result.verdict is hec.Verdict.USE and distances[-1] > FAR_SIGMAS
+                    )
         yield {
             "Fault": fault,
             "Named": f"{n_named} of {verdicts.total()}",
-            "Verdicts": ", ".join(f"{name} {count}" for name, count in verdicts.most_common()),
-            "Findings": ", ".join(f"{name} {count}" for name, count in codes.most_common()),
+            "Verdicts": ", ".join(
+                f"{name} {count}" for name, count in verdicts.most_common()
+            ),
+            "Findings": ", ".join(
+                f"{name} {count}" for name, count in codes.most_common()
+            ),
             "USE beyond 3.3 sigma": n_far,
             "Largest z that is not DO NOT USE": f"{max(distances, default=0.0):.1f}",
         }
@@ -276,7 +293,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the study; returns the exit code."""
     parser = study_parser("reproduction.pose_faults", __doc__)
     parser.add_argument("faults", nargs="*", help="rows of the table. Default: all")
-    parser.add_argument("--seeds", type=int, default=1, help="recordings of a kind. Default: 1")
+    parser.add_argument(
+        "--seeds", type=int, default=1, help="recordings of a kind. Default: 1"
+    )
     parser.add_argument("--first-seed", type=int, default=100, help="Default: 100")
     return exit_code_of(lambda: run(parser.parse_args(argv)))
 

@@ -28,9 +28,15 @@ N_RUNS = 38
 # Level folders of a simulated data set and the levels' values, and the column of its CSV that has
 # them.
 _LEVELS: dict[str, dict[str, float | None]] = {
-    "noise": {f"noise_{level:.6f}": level for level in (0.0, 0.002, 0.004, 0.006, 0.008, 0.01)},
-    "outliers": {f"outliers_{level:.0f}": level for level in (0.0, 2.0, 4.0, 6.0, 8.0, 10.0)},
-    "drift": {f"drift_{level:.6f}": level for level in (0.0, 0.01, 0.02, 0.03, 0.04, 0.05)},
+    "noise": {
+        f"noise_{level:.6f}": level for level in (0.0, 0.002, 0.004, 0.006, 0.008, 0.01)
+    },
+    "outliers": {
+        f"outliers_{level:.0f}": level for level in (0.0, 2.0, 4.0, 6.0, 8.0, 10.0)
+    },
+    "drift": {
+        f"drift_{level:.6f}": level for level in (0.0, 0.01, 0.02, 0.03, 0.04, 0.05)
+    },
     "mixture": {".": None},
 }
 _LEVEL_COLUMNS: dict[str, str | None] = {
@@ -207,7 +213,9 @@ def _kitti_case(
 
 
 def load_simulated(
-    folder: str | Path, datasets: Sequence[str] = SIMULATED, levels: Sequence[float] | None = None
+    folder: str | Path,
+    datasets: Sequence[str] = SIMULATED,
+    levels: Sequence[float] | None = None,
 ) -> list[Case]:
     """The simulated cases by data set, level and the order of the published results: 38
     trajectories at each of six levels of noise, outliers and drift, or only at ``levels``; and in
@@ -217,7 +225,8 @@ def load_simulated(
     cases = []
     for dataset in datasets:
         results = _read_results(
-            results_folder(folder) / f"simulation_tests_{dataset}.csv", _LEVEL_COLUMNS[dataset]
+            results_folder(folder) / f"simulation_tests_{dataset}.csv",
+            _LEVEL_COLUMNS[dataset],
         )
         for level_folder, level in _LEVELS[dataset].items():
             if levels is None or level is None or level in levels:
@@ -261,7 +270,9 @@ def _match_runs(
         published = np.array([row.T_parent_child for row in results["park", "B1"]])
         ours = np.array(
             [
-                all_pairs.solve_park(motion_pairs(parent.poses, child.poses, "B1")).T_parent_child
+                all_pairs.solve_park(
+                    motion_pairs(parent.poses, child.poses, "B1")
+                ).T_parent_child
                 for _, parent, child, _ in runs
             ]
         )
@@ -290,14 +301,21 @@ def _read_results(path: Path, level_column: str | None) -> PublishedResults:
     with open(path, newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
             level = float(row[level_column]) if level_column else None
-            key = row["algorithm"].lower(), "A" if row["method"] == "A1" else row["method"]
+            key = (
+                row["algorithm"].lower(),
+                "A" if row["method"] == "A1" else row["method"],
+            )
             results.setdefault(level, {}).setdefault(key, []).append(_result(row))
     return results
 
 
 def _result(row: Mapping[str, str]) -> PublishedResult:
-    numbers = np.array(row["T"].replace("[", " ").replace("]", " ").split(), dtype=float)
+    numbers = np.array(
+        row["T"].replace("[", " ").replace("]", " ").split(), dtype=float
+    )
     e_rt = float(row["err_tr"])
     e_at = float(row["abs_tr"])
-    e_rR, e_aR = (float(np.radians(float(row[column]))) for column in ("err_R", "abs_R"))
+    e_rR, e_aR = (
+        float(np.radians(float(row[column]))) for column in ("err_R", "abs_R")
+    )
     return PublishedResult(numbers.reshape(4, 4), Errors(e_rt, e_rR, e_at, e_aR))

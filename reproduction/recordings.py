@@ -76,7 +76,9 @@ class Truth:
     sigmas: FloatArray
 
     @classmethod
-    def within(cls, T_parent_child: FloatArray, metres: object, degrees: object) -> Truth:
+    def within(
+        cls, T_parent_child: FloatArray, metres: object, degrees: object
+    ) -> Truth:
         """Known to so many metres and degrees, one number or one per axis."""
         parts = [np.full(3, 1.0) * metres, np.radians(np.full(3, 1.0) * degrees)]
         return cls(T_parent_child, np.concatenate(parts))
@@ -165,13 +167,21 @@ def _simple_kitti(folder: Path) -> list[Rig]:
 def _kitti(folder: Path) -> list[Rig]:
     short, long = (folder / "kitti_tests" / drive for drive in KITTI_DRIVES)
     files = {
-        "kitti_short": (short / "LIDAR_HDL64E/traj_HDL_aft_opt.csv", short / "cam01" / KEYFRAMES),
+        "kitti_short": (
+            short / "LIDAR_HDL64E/traj_HDL_aft_opt.csv",
+            short / "cam01" / KEYFRAMES,
+        ),
         "kitti_long": (long / "cam01" / KEYFRAMES, long / "cam23" / KEYFRAMES),
     }
     # The rectified calibration is what the SLAM saw: the published files differ from it by their
     # own rectification, 0.03 and 0.45 deg.
     return [
-        _single(name, Recording(*map(read_trajectory, pair)), _exact(RECTIFIED[name]), _FOUND)
+        _single(
+            name,
+            Recording(*map(read_trajectory, pair)),
+            _exact(RECTIFIED[name]),
+            _FOUND,
+        )
         for name, pair in files.items()
     ]
 
@@ -187,7 +197,10 @@ _ZXL19 = Truth.within(
 def zxl19_sensors(folder: Path) -> list[dict[str, Trajectory]]:
     """INS, lidar odometry and camera of the road vehicle, by name, in each of three recordings."""
     return [
-        {name: _read(folder / f"bag{bag}/{name}_FCPE.mat", _ZXL19_COLUMNS) for name in _ZXL19_NAMES}
+        {
+            name: _read(folder / f"bag{bag}/{name}_FCPE.mat", _ZXL19_COLUMNS)
+            for name in _ZXL19_NAMES
+        }
         for bag in (1, 2, 3)
     ]
 
@@ -199,7 +212,10 @@ def _zxl19(folder: Path) -> list[Rig]:
     sensors = zxl19_sensors(folder)
 
     def recordings(parent: str, child: str) -> dict[str, Recording]:
-        return {f"bag{n}": Recording(bag[parent], bag[child]) for n, bag in enumerate(sensors, 1)}
+        return {
+            f"bag{n}": Recording(bag[parent], bag[child])
+            for n, bag in enumerate(sensors, 1)
+        }
 
     lidars = recordings("INS", "LO")
     cameras = recordings("INS", "VO")
@@ -209,7 +225,13 @@ def _zxl19(folder: Path) -> list[Rig]:
     lidar = {**_FOUND, "prior": {"z": (0.0, 0.3)}}
     camera = {**_SCALE_FOUND, "prior": {"z": (-0.3, 0.3)}}
     return [
-        Rig(name="zxl19_lidar", recordings=lidars, options=lidar, truth=_ZXL19, is_cut=False),
+        Rig(
+            name="zxl19_lidar",
+            recordings=lidars,
+            options=lidar,
+            truth=_ZXL19,
+            is_cut=False,
+        ),
         Rig(name="zxl19_camera", recordings=cameras, options=camera, is_cut=False),
         _refused("zxl19_lidar without z", lidars, _FOUND),
         _refused("zxl19_camera without z", cameras, _SCALE_FOUND),
@@ -229,7 +251,10 @@ CYCLE = ("tango_caligula_mars", "tango_mars_nero", "tango_nero_caligula")
 
 def tango_devices(folder: Path) -> dict[str, Trajectory]:
     """The three hand-held devices by name."""
-    return {name: _read(folder / f"{file}.csv", _ASL_COLUMNS) for name, file in _DEVICES.items()}
+    return {
+        name: _read(folder / f"{file}.csv", _ASL_COLUMNS)
+        for name, file in _DEVICES.items()
+    }
 
 
 def _tango(folder: Path) -> list[Rig]:
@@ -274,8 +299,12 @@ def _asl(folder: Path, *names: str) -> Recording:
     return Recording(*(_read(folder / f"{name}.csv", _ASL_COLUMNS) for name in names))
 
 
-def _refused(name: str, recordings: Mapping[str, Recording], options: Mapping[str, Any]) -> Rig:
-    return Rig(name=name, recordings=recordings, options=options, is_cut=False, is_refused=True)
+def _refused(
+    name: str, recordings: Mapping[str, Recording], options: Mapping[str, Any]
+) -> Rig:
+    return Rig(
+        name=name, recordings=recordings, options=options, is_cut=False, is_refused=True
+    )
 
 
 def _single(
@@ -286,7 +315,8 @@ def _single(
 
 BOREAS = Truth.within(
     se3.from_rotation_translation(
-        Rotation.from_euler("xyz", [-180.0, 0.0, 46.67], degrees=True).as_matrix(), [0.0, 0.0, 0.21]
+        Rotation.from_euler("xyz", [-180.0, 0.0, 46.67], degrees=True).as_matrix(),
+        [0.0, 0.0, 0.21],
     ),
     0.0,
     0.005,
@@ -296,7 +326,8 @@ BOREAS = Truth.within(
 def _boreas(folder: Path) -> list[Rig]:
     drive = folder / "boreas-2021-08-05-13-34"
     recording = Recording(
-        _boreas_poses(drive / "lidar_poses.csv", 1_000), _boreas_poses(drive / "radar_poses.csv", 1)
+        _boreas_poses(drive / "lidar_poses.csv", 1_000),
+        _boreas_poses(drive / "radar_poses.csv", 1),
     )
     return [replace(_single("boreas", recording, BOREAS, {}), is_cut=False)]
 
@@ -309,10 +340,14 @@ def _boreas_poses(path: Path, unit_ns: int) -> Trajectory:
     def columns(*names: str) -> FloatArray:
         return np.array([[float(row[name]) for name in names] for row in rows])
 
-    rotations = Rotation.from_euler("XYZ", -columns("roll", "pitch", "heading")).as_matrix()
+    rotations = Rotation.from_euler(
+        "XYZ", -columns("roll", "pitch", "heading")
+    ).as_matrix()
     return Trajectory(
         np.array([int(row["GPSTime"]) * unit_ns for row in rows]),
-        se3.from_rotation_translation(rotations, columns("easting", "northing", "altitude")),
+        se3.from_rotation_translation(
+            rotations, columns("easting", "northing", "altitude")
+        ),
     )
 
 
@@ -322,7 +357,10 @@ def _read(path: Path, columns: str) -> Trajectory:
 
 
 def between(
-    trajectory: Trajectory, first_ns: float, last_ns: float, stamps_ns: IntArray | None = None
+    trajectory: Trajectory,
+    first_ns: float,
+    last_ns: float,
+    stamps_ns: IntArray | None = None,
 ) -> Trajectory:
     """The poses whose stamps, perhaps given on another clock, lie between two."""
     stamps_ns = trajectory.stamps_ns if stamps_ns is None else stamps_ns

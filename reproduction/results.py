@@ -49,7 +49,9 @@ def quartile_summary(values: ArrayLike) -> Summary:
     """Median and quartiles of (N,) values."""
     values = np.sort(values)
     low, median, high = np.quantile(values, (0.25, 0.5, 0.75))
-    inside = values[(values >= low - 1.5 * (high - low)) & (values <= high + 1.5 * (high - low))]
+    inside = values[
+        (values >= low - 1.5 * (high - low)) & (values <= high + 1.5 * (high - low))
+    ]
     whiskers = float(inside[0]), float(inside[-1])
     return Summary(float(median), float(low), float(high), whiskers, len(values))
 
@@ -61,39 +63,61 @@ class Table:
         keys = ["dataset", "level", "method", "reference"]
         self._errors = {
             (dataset, None if np.isnan(level) else level, method, reference): errors
-            for (dataset, level, method, reference), group in rows.groupby(keys, dropna=False)
+            for (dataset, level, method, reference), group in rows.groupby(
+                keys, dropna=False
+            )
             if np.isfinite(errors := group[list(METRICS)].to_numpy()).all()
         }
 
     def values(
-        self, dataset: str, level: float | None, method: str, reference: str, metric: str
+        self,
+        dataset: str,
+        level: float | None,
+        method: str,
+        reference: str,
+        metric: str,
     ) -> FloatArray:
         """(N,) errors of the runs."""
         return self._errors[dataset, level, method, reference][:, METRICS.index(metric)]
 
     def levels(self, dataset: str, method: str) -> tuple[float | None, ...]:
         """Levels of a data set, ascending; (None,) for the mixture."""
-        of_dataset = {key[1] for key in self._errors if (key[0], key[2]) == (dataset, method)}
+        of_dataset = {
+            key[1] for key in self._errors if (key[0], key[2]) == (dataset, method)
+        }
         return tuple(sorted(of_dataset, key=lambda level: level or 0.0))
 
     def summary(
-        self, dataset: str, level: float | None, method: str, reference: str, metric: str
+        self,
+        dataset: str,
+        level: float | None,
+        method: str,
+        reference: str,
+        metric: str,
     ) -> Summary:
         """As the paper does: the mixture by quartiles, the others by mean."""
         values = self.values(dataset, level, method, reference, metric)
-        return quartile_summary(values) if dataset == "mixture" else mean_summary(values)
+        return (
+            quartile_summary(values) if dataset == "mixture" else mean_summary(values)
+        )
 
-    def score(self, dataset: str, method: str, reference: str, metric: str = "e_at") -> float:
+    def score(
+        self, dataset: str, method: str, reference: str, metric: str = "e_at"
+    ) -> float:
         """The value that variants are compared by: the mean over levels of the mean over runs; of
         the mixture, the median.
         """
         levels = self.levels(dataset, method)
-        summaries = [self.summary(dataset, level, method, reference, metric) for level in levels]
+        summaries = [
+            self.summary(dataset, level, method, reference, metric) for level in levels
+        ]
         return float(np.mean([summary.centre for summary in summaries]))
 
     def ranking(self, dataset: str, method: str, metric: str = "e_at") -> list[str]:
         """References from the smallest score to the largest."""
-        return sorted(REFERENCES, key=lambda name: self.score(dataset, method, name, metric))
+        return sorted(
+            REFERENCES, key=lambda name: self.score(dataset, method, name, metric)
+        )
 
     def best_reference(self, dataset: str, method: str, metric: str = "e_at") -> str:
         """The reference with the smallest score."""
@@ -123,4 +147,6 @@ class Results:
 
     def of(self, dataset: str, method: str) -> pd.DataFrame:
         """Rows of a method on a data set."""
-        return self.rows[(self.rows["dataset"] == dataset) & (self.rows["method"] == method)]
+        return self.rows[
+            (self.rows["dataset"] == dataset) & (self.rows["method"] == method)
+        ]

@@ -39,15 +39,23 @@ class Rig(NamedTuple):
 def simulated(seed: int, n_poses: int, errors: FloatArray) -> Rig:
     """A drive with sensors whose errors have sigmas (S, 4)."""
     random = np.random.default_rng((21, seed))
-    drive = dataclasses.replace(HILLY_DRIVE, poses=n_poses, child_rate=10.0, child_delay=0.0)
+    drive = dataclasses.replace(
+        HILLY_DRIVE, poses=n_poses, child_rate=10.0, child_delay=0.0
+    )
     parent = simulate_drive((22, seed), drive).parent
     Xs = [np.eye(4)]
     poses = []
     for sensor, (white_m, white_rad, walk_m, walk_rad) in enumerate(errors):
         if sensor > 0:
-            Xs.append(se3.exp(np.r_[random.uniform(-1, 1, 3), random.normal(0, 0.7, 3)]))
+            Xs.append(
+                se3.exp(np.r_[random.uniform(-1, 1, 3), random.normal(0, 0.7, 3)])
+            )
         true = parent.poses @ Xs[sensor]
-        steps = se3.inverse(true[:-1]) @ true[1:] @ _errors(random, n_poses - 1, walk_m, walk_rad)
+        steps = (
+            se3.inverse(true[:-1])
+            @ true[1:]
+            @ _errors(random, n_poses - 1, walk_m, walk_rad)
+        )
         driven = [true[0]]
         for step in steps:
             driven.append(driven[-1] @ step)
@@ -55,7 +63,9 @@ def simulated(seed: int, n_poses: int, errors: FloatArray) -> Rig:
     return Rig(parent.stamps_ns, np.array(poses), np.array(Xs), errors)
 
 
-def _errors(random: np.random.Generator, n: int, metres: float, radians: float) -> FloatArray:
+def _errors(
+    random: np.random.Generator, n: int, metres: float, radians: float
+) -> FloatArray:
     return se3.exp(random.standard_normal((n, 6)) * np.repeat([metres, radians], 3))
 
 
@@ -92,8 +102,12 @@ def outcome(rig: Rig) -> Outcome:
     own = []
     for first, second in combinations(range(len(names)), 2):
         back = se3.inverse(rig.Xs[second]) @ rig.Xs[first]
-        errors[first, second] = se3.log(back @ calibration.T(names[first], names[second]))
-        own.append(np.diag(calibration.covariance_measured(names[first], names[second])))
+        errors[first, second] = se3.log(
+            back @ calibration.T(names[first], names[second])
+        )
+        own.append(
+            np.diag(calibration.covariance_measured(names[first], names[second]))
+        )
     pairwise = [
         se3.log(se3.inverse(rig.Xs[at + 1]) @ rig.Xs[at] @ neighbour.T_parent_child)
         for at, neighbour in enumerate(calibration.neighbours, start=1)
@@ -109,7 +123,8 @@ def outcome(rig: Rig) -> Outcome:
 def trajectories_of(rig: Rig, names: Sequence[str]) -> dict[str, Trajectory]:
     """The trajectories of all sensors by name."""
     return {
-        name: Trajectory(rig.stamps_ns, poses) for name, poses in zip(names, rig.poses, strict=True)
+        name: Trajectory(rig.stamps_ns, poses)
+        for name, poses in zip(names, rig.poses, strict=True)
     }
 
 
@@ -119,7 +134,9 @@ def simulated_table(repeats: int, n_poses: int) -> str:
     for name, errors_of in (("alike", alike), ("unequal", unequal)):
         for n_sensors in (3, 5):
             errors = errors_of(n_sensors)
-            outcomes = [outcome(simulated(seed, n_poses, errors)) for seed in range(repeats)]
+            outcomes = [
+                outcome(simulated(seed, n_poses, errors)) for seed in range(repeats)
+            ]
             rows.append({"Sensors": name, "S": n_sensors, **_row(outcomes)})
     return markdown_table(rows)
 
@@ -144,7 +161,10 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--poses", type=int, default=1200)
     arguments = parser.parse_args()
-    show(arguments.page, {"simulated": simulated_table(arguments.repeats, arguments.poses)})
+    show(
+        arguments.page,
+        {"simulated": simulated_table(arguments.repeats, arguments.poses)},
+    )
 
 
 if __name__ == "__main__":

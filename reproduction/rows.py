@@ -87,7 +87,9 @@ def _cases(source: Source, dataset: str, level: float | None) -> list[Case]:
 
 def _solve(case: Case, method: str, reference: str) -> dict[str, Any]:
     pairs = case.pairs(reference)
-    solve = ali_as_published.solve if method == ALI_AS_PUBLISHED else Method(method).solve
+    solve = (
+        ali_as_published.solve if method == ALI_AS_PUBLISHED else Method(method).solve
+    )
     solution = solve(pairs)
     errors_of_solution = errors(pairs, solution.T_parent_child, case.T_parent_child)
     row = {
@@ -118,7 +120,9 @@ def published_name(method: str) -> str:
     return "ali" if method == ALI_AS_PUBLISHED else method
 
 
-def _objective(method: str, pairs: MotionPairs, T_parent_child: FloatArray) -> float | None:
+def _objective(
+    method: str, pairs: MotionPairs, T_parent_child: FloatArray
+) -> float | None:
     """Cost of an answer by the formula of dnl and dnlo; None for the other methods."""
     if method not in ("dnl", "dnlo"):
         return None
@@ -141,7 +145,9 @@ def table_of(rows: Sequence[dict[str, Any]]) -> pd.DataFrame:
     numbers = ["level", *METRICS, "objective", *PUBLISHED, "published_objective"]
     table[numbers] = table[numbers].astype(float)
     table["case"] = [
-        "/".join([*path_to(row.dataset, None if np.isnan(row.level) else row.level), row.run])
+        "/".join(
+            [*path_to(row.dataset, None if np.isnan(row.level) else row.level), row.run]
+        )
         for row in table.itertuples()
     ]
     same = agree(table[list(METRICS)].to_numpy(), table[list(PUBLISHED)].to_numpy())
@@ -157,9 +163,12 @@ def table_of(rows: Sequence[dict[str, Any]]) -> pd.DataFrame:
     unsettled = "the iteration does not settle: its last step depends on rounding"
     reasons = {
         "": table["published_e_at"].isna() | table["agrees"],
-        "published answer is not the minimum: ours has the lower objective": table["verdict"]
+        "published answer is not the minimum: ours has the lower objective": table[
+            "verdict"
+        ]
         == "lower",
-        "same objective, another answer: the minimum is flat": table["verdict"] == "equal",
+        "same objective, another answer: the minimum is flat": table["verdict"]
+        == "equal",
         "our objective is higher": table["verdict"] == "higher",
         "published quaternion was never normalised": (table["method"] == "ali")
         & ~table["dataset"].isin(KITTI),

@@ -33,7 +33,10 @@ def in_parallel(
 
 
 def kept(
-    path: Path, function: Callable[..., Any], tasks: Mapping[str, tuple[Any, ...]], jobs: int
+    path: Path,
+    function: Callable[..., Any],
+    tasks: Mapping[str, tuple[Any, ...]],
+    jobs: int,
 ) -> dict[str, Any]:
     """Plain values of ``function(*task)`` by name, of the tasks and of those that the file has from
     earlier runs. What the file has is not solved again: remove it after a change of the code.
@@ -48,5 +51,7 @@ def kept(
     with path.open("a", encoding="utf-8") as file:
         for name, result in zip(missing, results, strict=True):
             outcomes[name] = result
-            print("", json.dumps({name: result}), sep="\n", end="", file=file, flush=True)
+            print(
+                "", json.dumps({name: result}), sep="\n", end="", file=file, flush=True
+            )
     return outcomes

@@ -97,20 +97,26 @@ def sample_robot() -> Machine:
 def write_sample_robot(folder: Path) -> None:
     """Write the trajectory of the lidar, and the rates of the wheels at 25 Hz."""
     robot = sample_robot()
-    rows = np.column_stack([robot.sensor.stamps_ns * 1e-9, se3.to_rows(robot.sensor.poses)])
+    rows = np.column_stack(
+        [robot.sensor.stamps_ns * 1e-9, se3.to_rows(robot.sensor.poses)]
+    )
     lines = [" ".join(f"{value:.6f}" for value in row) for row in rows.tolist()]
     (folder / "robot_lidar.tum").write_text("\n".join([*lines, ""]), encoding="utf-8")
     blocks = robot.values.reshape(-1, ROBOT_ROWS, 2)
     times_s = robot.stamps_ns.reshape(-1, ROBOT_ROWS) * 1e-9
     rows = np.column_stack([times_s.mean(axis=1), blocks.mean(axis=1)])
     lines = ["t,left_rad_s,right_rad_s"]
-    lines += [f"{time:.3f},{left:.4f},{right:.4f}" for time, left, right in rows.tolist()]
+    lines += [
+        f"{time:.3f},{left:.4f},{right:.4f}" for time, left, right in rows.tolist()
+    ]
     (folder / "robot_wheels.csv").write_text("\n".join([*lines, ""]), encoding="utf-8")
 
 
 def se3_of(values: list[float]) -> FloatArray:
     """Return the transform (4, 4) of a position and a rotation vector."""
-    return se3.from_rotation_translation(se3.rotation_exp(np.array(values[3:])), values[:3])
+    return se3.from_rotation_translation(
+        se3.rotation_exp(np.array(values[3:])), values[:3]
+    )
 
 
 def message_of(T: FloatArray) -> dict[str, dict[str, float]]:

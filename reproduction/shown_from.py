@@ -109,12 +109,16 @@ def outcome(
     if truth is not None:
         T_parent_child, sigmas = truth
         errors = np.abs(se3.deviation(result.T_parent_child, T_parent_child))
-        exceeds = (errors > np.hypot(stated, 3.0 * sigmas))[is_stated & np.isfinite(sigmas)]
+        exceeds = (errors > np.hypot(stated, 3.0 * sigmas))[
+            is_stated & np.isfinite(sigmas)
+        ]
     found, of_streams = _errors_found(result, sizes, again, rng)
     shift = _shift_found(result, sizes, again, options, rng)
     rules = {reason.rule for reason in result.reasons}
     is_undetectable = "undetectable" in rules
-    return Outcome(platform, exceeds, found[is_stated], of_streams, shift, cost, is_undetectable)
+    return Outcome(
+        platform, exceeds, found[is_stated], of_streams, shift, cost, is_undetectable
+    )
 
 
 def _errors_found(
@@ -206,7 +210,9 @@ def table(outcomes: list[Outcome]) -> str:
         row: dict[str, object] = {"platform": platform, "recordings": len(chosen)}
         for title, parts in columns.items():
             values = np.concatenate(parts)
-            row[title] = f"{np.mean(values):.1%} of {len(values)}" if len(values) else "-"
+            row[title] = (
+                f"{np.mean(values):.1%} of {len(values)}" if len(values) else "-"
+            )
         row["cost, solves"] = f"{np.mean([item.cost for item in chosen]):.2f}"
         rows.append(row)
     return markdown_table(rows)
@@ -214,11 +220,15 @@ def table(outcomes: list[Outcome]) -> str:
 
 def main() -> int:
     """Simulate, inject and print."""
-    parser = argparse.ArgumentParser(prog="python -m reproduction.shown_from", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m reproduction.shown_from", description=__doc__
+    )
     parser.add_argument("--drives", type=int, default=200, help="simulated drives")
     parser.add_argument("--seed", type=int, help="default: another one at every run")
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--data-folder", type=Path, help="folder of the real recordings")
+    parser.add_argument(
+        "--data-folder", type=Path, help="folder of the real recordings"
+    )
     arguments = parser.parse_args()
     seed = seed_of(arguments.seed)
     print(f"seeds from {seed}\n")

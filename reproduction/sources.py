@@ -3,7 +3,11 @@
 from dataclasses import dataclass
 
 from hand_eye_calib.extras.simulation.drive import simulate_drive
-from hand_eye_calib.extras.simulation.options import MIXTURE, PUBLISHED_DRIVE, NoiseConfig
+from hand_eye_calib.extras.simulation.options import (
+    MIXTURE,
+    PUBLISHED_DRIVE,
+    NoiseConfig,
+)
 from reproduction import published
 from reproduction.published import Case
 
@@ -23,7 +27,9 @@ class PublishedSource:
             return [published.load_kitti_short(self.folder)]
         if dataset == "kitti_long":
             return [published.load_kitti_long(self.folder)]
-        return published.load_simulated(self.folder, [dataset], None if level is None else [level])
+        return published.load_simulated(
+            self.folder, [dataset], None if level is None else [level]
+        )
 
 
 @dataclass(frozen=True)
@@ -56,4 +62,8 @@ def _noise(dataset: str, level: float | None) -> NoiseConfig:
         return MIXTURE
     if dataset == "noise":
         return NoiseConfig(gaussian=level)
-    return NoiseConfig(outliers=0.01 * level) if dataset == "outliers" else NoiseConfig(drift=level)
+    return (
+        NoiseConfig(outliers=0.01 * level)
+        if dataset == "outliers"
+        else NoiseConfig(drift=level)
+    )

@@ -69,11 +69,15 @@ def with_rectified(rows: pd.DataFrame) -> pd.DataFrame:
     """
     truth = RECTIFIED[rows["dataset"].iloc[0]]
     indexed = rows.set_index(["method", "reference"])
-    errors = [absolute_errors(np.reshape(T, (4, 4)), truth) for T in indexed["T_parent_child"]]
+    errors = [
+        absolute_errors(np.reshape(T, (4, 4)), truth) for T in indexed["T_parent_child"]
+    ]
     indexed[list(_RECTIFIED)] = np.array(errors) * [1.0, 180.0 / np.pi]
     indexed = indexed.rename(columns=dict(zip(METRICS, _ERRORS, strict=True)))
     absolute = [*_ERRORS[2:], *_RECTIFIED]
-    of_b1 = indexed.xs("B1", level="reference")[absolute].reindex(indexed.index, level="method")
+    of_b1 = indexed.xs("B1", level="reference")[absolute].reindex(
+        indexed.index, level="method"
+    )
     gains = of_b1 - indexed[absolute]
     gains[indexed.index.get_level_values("reference") == "B1"] = np.nan
     indexed[[*_GAINS, *_RECTIFIED_GAINS]] = gains
@@ -135,7 +139,9 @@ def _compare_with_print(
         why = "; ".join(dict.fromkeys(reasons))
         for column, number in zip((*_ERRORS, *_GAINS), numbers, strict=True):
             ours = float(best.loc[(method, reference), column])
-            agrees = np.isnan(ours) if number is None else abs(ours - number) <= _SAME_PRINT
+            agrees = (
+                np.isnan(ours) if number is None else abs(ours - number) <= _SAME_PRINT
+            )
             cells.append(
                 {
                     "method": TITLES[method],
@@ -174,7 +180,10 @@ def write_variant_table(name: str, results: Results) -> list[Path]:
     best = rows[_ERRORS[2]].idxmin()
     printed = (
         {"reference": name}
-        | {column: _print(row[column], row[column] if name == best else None) for column in columns}
+        | {
+            column: _print(row[column], row[column] if name == best else None)
+            for column in columns
+        }
         for name, row in rows.iterrows()
     )
     return [

@@ -64,14 +64,18 @@ def drive(seed: int, model: str, course: str = "eights") -> Drive:
     return Drive(errors, sigmas, result.verdict.value, result.headline)
 
 
-def _errors_of(result: Calibration, machine: Machine) -> tuple[dict[str, float], dict[str, float]]:
+def _errors_of(
+    result: Calibration, machine: Machine
+) -> tuple[dict[str, float], dict[str, float]]:
     """Return the errors of a result, and their standard deviations, by name."""
     T = result.T_parent_child
     turn = se3.rotation_of(T) @ se3.rotation_of(machine.T_base_sensor).T
     errors = dict(
         x=float(T[0, 3] - machine.T_base_sensor[0, 3]),
         y=float(T[1, 3] - machine.T_base_sensor[1, 3]),
-        **dict(zip(("roll", "pitch", "yaw"), se3.rotation_log(turn).tolist(), strict=True)),
+        **dict(
+            zip(("roll", "pitch", "yaw"), se3.rotation_log(turn).tolist(), strict=True)
+        ),
     )
     rows = {"x": 0, "y": 1, "roll": 3, "pitch": 4, "yaw": 5}
     sigmas = {name: float(result.sigmas[row]) for name, row in rows.items()}
@@ -95,14 +99,21 @@ def disturbed(seed: int, n_drives: int) -> list[dict[str, object]]:
             machine = simulate_machine(
                 seed + row, model, course, slip=slip, ramp_rad=np.radians(ramp_deg)
             )
-            result = calibrate_vehicle(machine.sensor, machine.wheels, child_kind="exact")
+            result = calibrate_vehicle(
+                machine.sensor, machine.wheels, child_kind="exact"
+            )
             errors, sigmas = _errors_of(result, machine)
             results.append(Drive(errors, sigmas, result.verdict.value, result.headline))
         largest = {
             axis: _with_unit(axis, max(abs(item.errors[axis]) for item in results))
             for axis in ("x", "y", "yaw")
         }
-        ratios = [item.ratios[axis] for item in results for axis in largest if axis in item.ratios]
+        ratios = [
+            item.ratios[axis]
+            for item in results
+            for axis in largest
+            if axis in item.ratios
+        ]
         rows.append(
             {
                 "Drive": name,
@@ -120,13 +131,17 @@ def accuracy(drives: Iterable[Drive]) -> list[dict[str, object]]:
     drives = list(drives)
     for name in drives[0].errors:
         ratios = np.array([item.ratios[name] for item in drives if name in item.ratios])
-        errors = np.array([abs(item.errors[name]) for item in drives if name in item.ratios])
+        errors = np.array(
+            [abs(item.errors[name]) for item in drives if name in item.ratios]
+        )
         if not len(errors):
             continue
         rows.append(
             {
                 "Unknown": name,
-                "90 % of errors below": _with_unit(name, float(np.quantile(errors, 0.9))),
+                "90 % of errors below": _with_unit(
+                    name, float(np.quantile(errors, 0.9))
+                ),
                 "Largest": _with_unit(name, float(errors.max())),
                 "90 % intervals cover": f"{np.mean(ratios < QUANTILE_90):.0%}",
                 "Largest, sigma": f"{ratios.max():.1f}",
@@ -160,7 +175,9 @@ def summary(drives: Iterable[Drive]) -> str:
 
 def main() -> int:
     """Simulate, calibrate and print."""
-    parser = argparse.ArgumentParser(prog="python -m reproduction.vehicles", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m reproduction.vehicles", description=__doc__
+    )
     parser.add_argument("--drives", type=int, default=30, help="drives of each machine")
     parser.add_argument("--seed", type=int, help="default: another one at every run")
     arguments = parser.parse_args()
@@ -170,13 +187,19 @@ def main() -> int:
         drives = [drive(seed + row, model) for row in range(arguments.drives)]
         show(
             None,
-            {model: f"## {model}\n\n{summary(drives)}\n\n{markdown_table(accuracy(drives))}\n"},
+            {
+                model: f"## {model}\n\n{summary(drives)}\n\n{markdown_table(accuracy(drives))}\n"
+            },
         )
     rows = []
     for course in _DEGENERATE:
         for model in _MODELS:
-            refused = [drive(seed + row, model, course) for row in range(arguments.drives // 3)]
-            beyond = [max(item.ratios.values(), default=0.0) > _BEYOND for item in refused]
+            refused = [
+                drive(seed + row, model, course) for row in range(arguments.drives // 3)
+            ]
+            beyond = [
+                max(item.ratios.values(), default=0.0) > _BEYOND for item in refused
+            ]
             used = [item.verdict == "USE" for item in refused]
             rows.append(
                 {
@@ -184,7 +207,9 @@ def main() -> int:
                     "Machine": model,
                     "Verdicts": counted(item.verdict for item in refused),
                     "USE beyond 3.3": int(np.sum(np.logical_and(beyond, used))),
-                    "Such as": Counter(item.headline for item in refused).most_common(1)[0][0],
+                    "Such as": Counter(item.headline for item in refused).most_common(
+                        1
+                    )[0][0],
                 }
             )
     show(None, {"degenerate": markdown_table(rows)})

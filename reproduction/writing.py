@@ -17,7 +17,11 @@ TableRow = Mapping[str, object]
 
 def write_csv(path: Path, rows: Iterable[TableRow] | pd.DataFrame) -> Path:
     """Write a table; returns the path. Numbers keep all digits."""
-    table = rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(list(rows), dtype=object)
+    table = (
+        rows
+        if isinstance(rows, pd.DataFrame)
+        else pd.DataFrame(list(rows), dtype=object)
+    )
     table.to_csv(path, index=False, lineterminator="\n")
     return path
 
@@ -33,8 +37,14 @@ def markdown_table(rows: Iterable[TableRow]) -> str:
     rows = list(rows)
     if not rows:
         return "Nothing."
-    lines: list[Iterable[object]] = [rows[0], ["---"] * len(rows[0]), *(r.values() for r in rows)]
-    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
+    lines: list[Iterable[object]] = [
+        rows[0],
+        ["---"] * len(rows[0]),
+        *(r.values() for r in rows),
+    ]
+    return "\n".join(
+        "| " + " | ".join(str(cell) for cell in line) + " |" for line in lines
+    )
 
 
 def put_into_page(page: Path, name: str, text: str) -> None:
@@ -46,7 +56,9 @@ def put_into_page(page: Path, name: str, text: str) -> None:
     before, marker, rest = page.read_text(encoding="utf-8").partition(begin)
     _, closed, after = rest.partition(end)
     if not (marker and closed):
-        raise InputError(f"{page} has no lines {begin.strip()} and {end} to put the tables into")
+        raise InputError(
+            f"{page} has no lines {begin.strip()} and {end} to put the tables into"
+        )
     body = re.sub(r"\A# .*\n+", "", text).strip()
     page.write_text(f"{before}{begin}\n{body}\n\n{end}{after}", encoding="utf-8")
 
@@ -95,7 +107,9 @@ def percent(count: int, whole: int) -> str:
 
 def counted(words: Iterable[str], most: int | None = None) -> str:
     """Words with how often they occur, the most frequent first."""
-    return ", ".join(f"{word} {count}" for word, count in Counter(words).most_common(most))
+    return ", ".join(
+        f"{word} {count}" for word, count in Counter(words).most_common(most)
+    )
 
 
 def triple(values: Iterable[float], factor: float = 1.0, form: str = ".1f") -> str:

@@ -49,10 +49,15 @@ def licence(name: str) -> str:
     stated = about.get("License-Expression") or about.get("License") or ""
     if stated and len(stated) < 40:
         return stated.strip()
-    classifiers = [text for text in about.get_all("Classifier") or () if "License" in text]
+    classifiers = [
+        text for text in about.get_all("Classifier") or () if "License" in text
+    ]
     return classifiers[0].rpartition(" :: ")[2] if classifiers else ""
 
 
 if __name__ == "__main__":
-    rows = [f"| {name} | {use} | {licence(name) or 'see its page'} |" for name, use in libraries()]
+    rows = [
+        f"| {name} | {use} | {licence(name) or 'see its page'} |"
+        for name, use in libraries()
+    ]
     PAGE.write_text(HEAD + "\n".join(rows) + "\n", encoding="utf-8")

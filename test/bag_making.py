@@ -13,10 +13,14 @@ from hand_eye_calib.formats.bags.writer import write_streams
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 NOETIC = get_typestore(Stores.ROS1_NOETIC)
 NOETIC.register(
-    get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
+    get_types_from_msg(
+        "geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"
+    )
 )
 NOETIC.register(
-    get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf/msg/tfMessage")
+    get_types_from_msg(
+        "geometry_msgs/TransformStamped[] transforms", "tf/msg/tfMessage"
+    )
 )
 TF = "tf2_msgs/msg/TFMessage"
 PATH = "nav_msgs/msg/Path"
@@ -62,7 +66,9 @@ def write_compressed(path, streams, storage="mcap", mode="STORAGE"):
     plugin = rosbag2.StoragePlugin[storage.upper()]
     writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
     if mode:
-        writer.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
+        writer.set_compression(
+            rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD
+        )
     with writer:
         write_streams(writer, streams, storage)
     return path
@@ -70,7 +76,9 @@ def write_compressed(path, streams, storage="mcap", mode="STORAGE"):
 
 def header(typestore, stamp_ns, frame):
     extra = {"seq": 0} if typestore is NOETIC else {}
-    stamp = typestore.types["builtin_interfaces/msg/Time"](*divmod(int(stamp_ns), 10**9))
+    stamp = typestore.types["builtin_interfaces/msg/Time"](
+        *divmod(int(stamp_ns), 10**9)
+    )
     return typestore.types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame, **extra)
 
 
@@ -79,9 +87,9 @@ def pose(typestore, matrix, kind="Pose"):
     types = typestore.types
     translation = matrix[:3, 3].tolist()
     quat_xyzw = se3.to_quat_xyzw(matrix).tolist()
-    vector = types["geometry_msgs/msg/Point" if kind == "Pose" else "geometry_msgs/msg/Vector3"](
-        *translation
-    )
+    vector = types[
+        "geometry_msgs/msg/Point" if kind == "Pose" else "geometry_msgs/msg/Vector3"
+    ](*translation)
     return types[f"geometry_msgs/msg/{kind}"](
         vector, types["geometry_msgs/msg/Quaternion"](*quat_xyzw)
     )
@@ -93,7 +101,9 @@ def tf_message(edges, message_type=TF):
     def make(typestore):
         transforms = [
             typestore.types["geometry_msgs/msg/TransformStamped"](
-                header(typestore, stamp_ns, parent), child, pose(typestore, matrix, "Transform")
+                header(typestore, stamp_ns, parent),
+                child,
+                pose(typestore, matrix, "Transform"),
             )
             for stamp_ns, parent, child, matrix in edges
         ]
@@ -184,8 +194,16 @@ def write_messages(path, messages, storage="mcap"):
         writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
     with writer:
         connections = {}
-        for bag_ns, topic, message_type, make in sorted(messages, key=lambda message: message[0]):
+        for bag_ns, topic, message_type, make in sorted(
+            messages, key=lambda message: message[0]
+        ):
             if topic not in connections:
-                connections[topic] = writer.add_connection(topic, message_type, typestore=typestore)
-            writer.write(connections[topic], int(bag_ns), serialize(make(typestore), message_type))
+                connections[topic] = writer.add_connection(
+                    topic, message_type, typestore=typestore
+                )
+            writer.write(
+                connections[topic],
+                int(bag_ns),
+                serialize(make(typestore), message_type),
+            )
     return path

@@ -56,7 +56,15 @@ class Browser:
         # The browser reads commands from descriptor 3 and writes to descriptor 4.
         redirected = f'exec "$@" 3<&{commands} 4>&{events}'
         self._process = subprocess.Popen(
-            ["bash", "-c", redirected, "bash", program, *OPTIONS, f"--user-data-dir={folder}"],
+            [
+                "bash",
+                "-c",
+                redirected,
+                "bash",
+                program,
+                *OPTIONS,
+                f"--user-data-dir={folder}",
+            ],
             pass_fds=(commands, events),
             stderr=subprocess.DEVNULL,
         )
@@ -82,7 +90,10 @@ class Browser:
     def evaluate(self, expression):
         """Return the value of a JavaScript expression; a promise is awaited."""
         result = self.call(
-            "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
+            "Runtime.evaluate",
+            expression=expression,
+            awaitPromise=True,
+            returnByValue=True,
         )
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
@@ -99,7 +110,9 @@ class Browser:
         self.session = None
         self._waiting.clear()
         tab = self.call("Target.createTarget", url="about:blank")["targetId"]
-        self.session = self.call("Target.attachToTarget", targetId=tab, flatten=True)["sessionId"]
+        self.session = self.call("Target.attachToTarget", targetId=tab, flatten=True)[
+            "sessionId"
+        ]
         self.call("Page.enable")
         self.call("Page.addScriptToEvaluateOnNewDocument", source=script)
         self.call("Page.navigate", url=address)
@@ -127,7 +140,9 @@ class Browser:
         )
         mouse = {"x": x, "y": y, "button": "left", "clickCount": 1}
         self.call("Input.dispatchMouseEvent", type="mousePressed", **mouse)
-        released = self._send("Input.dispatchMouseEvent", {"type": "mouseReleased", **mouse})
+        released = self._send(
+            "Input.dispatchMouseEvent", {"type": "mouseReleased", **mouse}
+        )
         messages = []
         for answer in answers:
             dialog = self._wait_for_event("Page.javascriptDialogOpening")

@@ -11,7 +11,9 @@ from hypothesis import settings
 from hand_eye_calib.offline.cli.main import main
 
 # Tests never time anything, and CI must not differ from run to run.
-settings.register_profile("hand_eye_calib", deadline=None, derandomize=True, print_blob=True)
+settings.register_profile(
+    "hand_eye_calib", deadline=None, derandomize=True, print_blob=True
+)
 settings.load_profile("hand_eye_calib")
 
 # A shell starts what runs in the background with Ctrl-C ignored, and children inherit that: tests
@@ -35,7 +37,11 @@ def pytest_xdist_make_scheduler(config, log):
 
     class FileScheduling(LoadScopeScheduling):
         def _split_scope(self, nodeid):
-            return "test/ros" if nodeid.startswith("test/ros/") else nodeid.partition("::")[0]
+            return (
+                "test/ros"
+                if nodeid.startswith("test/ros/")
+                else nodeid.partition("::")[0]
+            )
 
     return FileScheduling(config, log)
 
@@ -72,10 +78,14 @@ def run(capsys):
 @pytest.fixture
 def no_processes(monkeypatch):
     """Several recordings are calibrated in threads: each process would import for a second."""
-    monkeypatch.setattr("hand_eye_calib.extras.fleet.work._processes", ThreadPoolExecutor)
+    monkeypatch.setattr(
+        "hand_eye_calib.extras.fleet.work._processes", ThreadPoolExecutor
+    )
 
 
 @pytest.fixture
 def no_figures(monkeypatch):
     """Reports of this process have no figures: drawing takes several times as long as the solve."""
-    monkeypatch.setattr("hand_eye_calib.offline.report.report.figures_of", lambda *_: [])
+    monkeypatch.setattr(
+        "hand_eye_calib.offline.report.report.figures_of", lambda *_: []
+    )

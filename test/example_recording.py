@@ -47,13 +47,19 @@ def make(folder: Path) -> None:
     camera = _noisy(drive.stamps_ns, drive.poses @ T_LIDAR_CAMERA, 2, "camera", "vo")
     hec.write_trajectory(folder / "lidar.tum", lidar)
     hec.write_trajectory(folder / "camera.tum", camera)
-    np.savetxt(folder / "camera.csv", _rows(camera, scalar_first=True), "%.9f", delimiter=",")
+    np.savetxt(
+        folder / "camera.csv", _rows(camera, scalar_first=True), "%.9f", delimiter=","
+    )
     imu_ns, rates = _rates(camera)
     places = _geodetic(camera)
     _write_bag(folder / "my_drive", lidar, camera, places, (imu_ns, rates))
     _write_ins(folder / "ins.csv", camera, places)
     times = camera.stamps_ns[:, None] * 1e-9
-    _write_csv(folder / "gnss.csv", "time,latitude,longitude,height", np.hstack([times, places]))
+    _write_csv(
+        folder / "gnss.csv",
+        "time,latitude,longitude,height",
+        np.hstack([times, places]),
+    )
     robot = simulate_machine(7, duration_s=60.0)
     hec.write_trajectory(folder / "robot_lidar.tum", robot.sensor)
     columns = np.column_stack([robot.stamps_ns * 1e-9, robot.values])
@@ -64,10 +70,14 @@ def make(folder: Path) -> None:
     arm = wandering_poses(_POSES, seed=3)
     stamps_ns = drive.stamps_ns
     hec.write_trajectory(folder / "flange.tum", _noisy(stamps_ns, arm, 3))
-    hec.write_trajectory(folder / "camera_on_arm.tum", _noisy(stamps_ns, arm @ T_LIDAR_CAMERA, 4))
+    hec.write_trajectory(
+        folder / "camera_on_arm.tum", _noisy(stamps_ns, arm @ T_LIDAR_CAMERA, 4)
+    )
 
     camera_on_arm = disturbed(arm @ T_LIDAR_CAMERA, 5, 1e-3, 5e-4)
-    stops = zip(arm[::10].tolist(), se3.inverse(camera_on_arm[::10]).tolist(), strict=True)
+    stops = zip(
+        arm[::10].tolist(), se3.inverse(camera_on_arm[::10]).tolist(), strict=True
+    )
     (folder / "samples.yaml").write_text(json.dumps(list(stops)), encoding="utf-8")
 
     (folder / "robot.urdf").write_text(_ROBOT, encoding="utf-8")
@@ -83,7 +93,9 @@ def _noisy(stamps_ns, poses, seed, sensor="", world=""):
 def _rows(trajectory, scalar_first):
     quats = se3.to_quat_xyzw(trajectory.poses)
     quats = np.roll(quats, 1, axis=1) if scalar_first else quats
-    return np.column_stack([trajectory.stamps_ns * 1e-9, trajectory.poses[:, :3, 3], quats])
+    return np.column_stack(
+        [trajectory.stamps_ns * 1e-9, trajectory.poses[:, :3, 3], quats]
+    )
 
 
 def _rates(trajectory):
@@ -91,7 +103,9 @@ def _rates(trajectory):
     rotations = Rotation.from_matrix(trajectory.poses[:, :3, :3])
     steps_ns = np.diff(trajectory.stamps_ns)
     turned = (rotations[:-1].inv() * rotations[1:]).as_rotvec()
-    return trajectory.stamps_ns[:-1] + steps_ns // 2, turned / (steps_ns * 1e-9)[:, None]
+    return trajectory.stamps_ns[:-1] + steps_ns // 2, turned / (steps_ns * 1e-9)[
+        :, None
+    ]
 
 
 def _geodetic(trajectory):
@@ -103,7 +117,10 @@ def _write_bag(path, lidar, camera, places, rates):
     """Odometry of both sensors, the lidar's as /tf too, the antenna's fixes and the IMU's rates."""
     storage = rosbag2.StoragePlugin.MCAP
     with rosbag2.Writer(path, version=9, storage_plugin=storage) as writer:
-        streams = {"/lidar/odometry": (lidar, _ODOMETRY), "/camera/odometry": (camera, _ODOMETRY)}
+        streams = {
+            "/lidar/odometry": (lidar, _ODOMETRY),
+            "/camera/odometry": (camera, _ODOMETRY),
+        }
         write_streams(writer, streams, "mcap")
         connection = writer.add_connection("/tf", TF, typestore=JAZZY)
         for stamp_ns, pose in zip(lidar.stamps_ns.tolist(), lidar.poses, strict=True):
@@ -112,9 +129,13 @@ def _write_bag(path, lidar, camera, places, rates):
         connection = writer.add_connection(
             "/gnss/fix", "sensor_msgs/msg/NavSatFix", typestore=JAZZY
         )
-        for stamp_ns, place in zip(camera.stamps_ns.tolist(), places.tolist(), strict=True):
+        for stamp_ns, place in zip(
+            camera.stamps_ns.tolist(), places.tolist(), strict=True
+        ):
             writer.write(connection, stamp_ns, fix(2, *place, stamp_ns=stamp_ns))
-        connection = writer.add_connection("/imu", "sensor_msgs/msg/Imu", typestore=JAZZY)
+        connection = writer.add_connection(
+            "/imu", "sensor_msgs/msg/Imu", typestore=JAZZY
+        )
         for stamp_ns, rate in zip(rates[0].tolist(), rates[1].tolist(), strict=True):
             writer.write(connection, stamp_ns, imu(rate, stamp_ns=stamp_ns))
 
@@ -122,7 +143,9 @@ def _write_bag(path, lidar, camera, places, rates):
 def _write_ins(path, trajectory, places):
     """Latitude, longitude, height, and angles as an INS has them."""
     yaw, pitch, roll = (
-        Rotation.from_matrix(trajectory.poses[:, :3, :3]).as_euler("ZYX", degrees=True).T
+        Rotation.from_matrix(trajectory.poses[:, :3, :3])
+        .as_euler("ZYX", degrees=True)
+        .T
     )
     columns = [trajectory.stamps_ns * 1e-9, places, roll, -pitch, (90 - yaw) % 360]
     names = "time,latitude,longitude,height,roll_deg,pitch_deg,heading_deg"

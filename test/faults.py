@@ -11,7 +11,9 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory
 def reordered(stream):
     """Quaternions written w x y z and read as x y z w."""
     quats = np.roll(se3.to_quat_xyzw(stream.poses), 1, axis=1)
-    return Trajectory(stream.stamps_ns, se3.from_quat_xyzw(stream.poses[:, :3, 3], quats))
+    return Trajectory(
+        stream.stamps_ns, se3.from_quat_xyzw(stream.poses[:, :3, 3], quats)
+    )
 
 
 def inverted(stream):
@@ -46,17 +48,35 @@ def mirrored(stream):
 # Fault: what is done to (parent, child, some other drive's child), and the code of the finding that
 # names it.
 FAULTS = {
-    "offset 0.2 s": (lambda parent, child, other: (parent, child.shifted(-0.2)), "time_offset"),
-    "offset 500 s": (lambda parent, child, other: (parent, child.shifted(-500.0)), "time_offset"),
-    "wxyz": (lambda parent, child, other: (parent, reordered(child)), "quaternion_order"),
-    "inverse child": (lambda parent, child, other: (parent, inverted(child)), "inverse"),
+    "offset 0.2 s": (
+        lambda parent, child, other: (parent, child.shifted(-0.2)),
+        "time_offset",
+    ),
+    "offset 500 s": (
+        lambda parent, child, other: (parent, child.shifted(-500.0)),
+        "time_offset",
+    ),
+    "wxyz": (
+        lambda parent, child, other: (parent, reordered(child)),
+        "quaternion_order",
+    ),
+    "inverse child": (
+        lambda parent, child, other: (parent, inverted(child)),
+        "inverse",
+    ),
     "inverse both": (
         lambda parent, child, other: (inverted(parent), inverted(child)),
         "inverse_both",
     ),
-    "millimetres": (lambda parent, child, other: (parent, child.scaled(1000.0)), "units"),
+    "millimetres": (
+        lambda parent, child, other: (parent, child.scaled(1000.0)),
+        "units",
+    ),
     "scale 1.05": (lambda parent, child, other: (parent, child.scaled(1.05)), "scale"),
     "frozen child": (lambda parent, child, other: (parent, frozen(child)), "frozen"),
-    "swapped axes": (lambda parent, child, other: (parent, with_swapped_axes(child)), "axes"),
+    "swapped axes": (
+        lambda parent, child, other: (parent, with_swapped_axes(child)),
+        "axes",
+    ),
     "unrelated": (lambda parent, child, other: (parent, other), "unrelated"),
 }

@@ -68,6 +68,9 @@ def outcome(name, vehicle, T, covariance, day=0):
         warnings=(),
         child_frame="camera",
     )
-    stamps = {"first_stamp_ns": day * DAY_NS + 1, "last_stamp_ns": day * DAY_NS + 10**10 + 1}
+    stamps = {
+        "first_stamp_ns": day * DAY_NS + 1,
+        "last_stamp_ns": day * DAY_NS + 10**10 + 1,
+    }
     task = Task(name=name, bags=(f"bags/{name}",), vehicle=vehicle)
     return Outcome.of(task, None, result, {"parent": stamps, "child": stamps})

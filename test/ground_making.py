@@ -42,7 +42,9 @@ YARD = np.array(
     ],
     dtype=float,
 )
-STREET = np.array([[[-90, -12, -3], [90, -9, 8]], [[-90, 9, -3], [90, 12, 8]]], dtype=float)
+STREET = np.array(
+    [[[-90, -12, -3], [90, -9, 8]], [[-90, 9, -3], [90, 12, 8]]], dtype=float
+)
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,9 @@ class Machine:
         self.place = PLACES[place]
         self.rings = rings
         self.noise = noise
-        self.waves = self.rng.uniform(0.2, 0.8, (4, 2)) * self.rng.choice([-1, 1], (4, 2))
+        self.waves = self.rng.uniform(0.2, 0.8, (4, 2)) * self.rng.choice(
+            [-1, 1], (4, 2)
+        )
         self.phases = self.rng.uniform(0, 2 * np.pi, 4)
         self.times_s = np.arange(0.0, duration_s, STEP_S)
         self.T_base_parent = self._mount([0.8, 0.0, 1.4], 8.0)
@@ -92,7 +96,9 @@ class Machine:
 
     def _mount(self, position: list[float], tilt_deg: float) -> FloatArray:
         rng = self.rng
-        angles = np.radians([*rng.uniform(-tilt_deg, tilt_deg, 2), rng.uniform(-180, 180)])
+        angles = np.radians(
+            [*rng.uniform(-tilt_deg, tilt_deg, 2), rng.uniform(-180, 180)]
+        )
         offset = np.add(position, rng.uniform(-0.3, 0.3, 3))
         return se3.from_rotation_translation(se3.rotation_from_rpy(angles), offset)
 
@@ -118,14 +124,20 @@ class Machine:
         corners = []
         # Front left, front right, rear left and rear right wheel (m).
         for ahead, left in ((0.8, 0.5), (0.8, -0.5), (-0.8, 0.5), (-0.8, -0.5)):
-            corners.append(self.height(x + cos * ahead - sin * left, y + sin * ahead + cos * left))
+            corners.append(
+                self.height(x + cos * ahead - sin * left, y + sin * ahead + cos * left)
+            )
         front_left, front_right, rear_left, rear_right = corners
         pitch = (rear_left + rear_right - front_left - front_right) / 2 / 1.6
         roll = (front_left + rear_left - front_right - rear_right) / 2 / 1.0
         shaking = np.radians(0.15) * self.noise * _smooth_noise(rng, len(t), 60)
         sway = np.radians(0.15) * self.noise * _smooth_noise(rng, len(t), 60)
-        angles = np.column_stack([np.arctan(roll) + sway, np.arctan(pitch) + shaking, heading])
-        z = np.mean(corners, axis=0) + 0.004 * self.noise * _smooth_noise(rng, len(t), 40)
+        angles = np.column_stack(
+            [np.arctan(roll) + sway, np.arctan(pitch) + shaking, heading]
+        )
+        z = np.mean(corners, axis=0) + 0.004 * self.noise * _smooth_noise(
+            rng, len(t), 40
+        )
         return se3.from_rotation_translation(
             se3.rotation_from_rpy(angles), np.column_stack([x, y, z])
         )
@@ -141,8 +153,12 @@ class Machine:
         return se3.chained(steps) @ se3.exp(white * rng.standard_normal((len(Ts), 6)))
 
     def _trajectory(self, T_base_sensor: FloatArray, frame: str) -> Trajectory:
-        stamps_ns = START_NS + np.round(self.times_s[::POSE_STEPS] * 1e9).astype(np.int64)
-        return hec.Trajectory(stamps_ns, self._poses(T_base_sensor), frame, f"{frame}_odom")
+        stamps_ns = START_NS + np.round(self.times_s[::POSE_STEPS] * 1e9).astype(
+            np.int64
+        )
+        return hec.Trajectory(
+            stamps_ns, self._poses(T_base_sensor), frame, f"{frame}_odom"
+        )
 
     @cached_property
     def parent(self) -> Trajectory:
@@ -167,9 +183,14 @@ class Machine:
         for row in range(0, len(self.times_s), POSE_STEPS * stride):
             T = self.Ts_world_base[row] @ T_base_sensor
             ranges = self._ranges(T[:3, 3], rays @ T[:3, :3].T)
-            ranges = ranges + bias_m + self.noise * 0.02 * rng.standard_normal(len(ranges))
+            ranges = (
+                ranges + bias_m + self.noise * 0.02 * rng.standard_normal(len(ranges))
+            )
             hit = ranges < REACH_M
-            yield START_NS + round(self.times_s[row] * 1e9), ranges[hit, None] * stated[hit]
+            yield (
+                START_NS + round(self.times_s[row] * 1e9),
+                ranges[hit, None] * stated[hit],
+            )
 
     def _ranges(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         distances = self._ground_ranges(origin, directions)
@@ -197,7 +218,9 @@ class Machine:
             points = origin + distances[:, None] * directions
             excess = points[:, 2] - self.height(points[:, 0], points[:, 1]) - grass
             change = excess / np.maximum(-down, 0.1)
-            distances = np.where(falling, np.maximum(distances + 0.8 * change, 0.0), REACH_M)
+            distances = np.where(
+                falling, np.maximum(distances + 0.8 * change, 0.0), REACH_M
+            )
         return distances
 
     def accelerations(self, T_base_sensor: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -205,21 +228,29 @@ class Machine:
         rng = self.rng
         Ts = self.Ts_world_base @ T_base_sensor
         positions = Ts[:, :3, 3]
-        accelerations = np.gradient(np.gradient(positions, STEP_S, axis=0), STEP_S, axis=0)
-        forces = np.einsum("nji,nj->ni", Ts[:, :3, :3], np.add(accelerations, [0, 0, g]))
+        accelerations = np.gradient(
+            np.gradient(positions, STEP_S, axis=0), STEP_S, axis=0
+        )
+        forces = np.einsum(
+            "nji,nj->ni", Ts[:, :3, :3], np.add(accelerations, [0, 0, g])
+        )
         forces += self.noise * rng.normal(0, 0.02, 3)
         forces += self.noise * 0.2 * rng.standard_normal(forces.shape)
         return START_NS + np.round(self.times_s * 1e9).astype(np.int64), forces
 
 
-def road_course(t: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+def road_course(
+    t: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
     """Positions on a street: along one lane, a turn, and back along the other lane."""
     speed = 3.0
     straight_m = rng.uniform(56, 68)
     lane_m = rng.uniform(2.3, 2.8)
     step_m = speed * STEP_S
     is_turning = (speed * t) % (straight_m + np.pi * lane_m) > straight_m
-    heading = np.cumsum(gaussian_filter1d(is_turning.astype(float), 30)) * step_m / lane_m
+    heading = (
+        np.cumsum(gaussian_filter1d(is_turning.astype(float), 30)) * step_m / lane_m
+    )
     x = np.cumsum(np.cos(heading)) * step_m - straight_m / 2
     return x, np.cumsum(np.sin(heading)) * step_m - lane_m
 
@@ -264,7 +295,9 @@ def score_of(place: str, sensors: str, rings: int, seeds: Sequence[int]) -> Tabl
         result = calibrated_machine(machine, sensors)
         ground = result.parts.get("ground")
         n_joined += ground is not None and ground.is_joined
-        all_errors.append(se3.deviation(result.T_parent_child, machine.T_parent_child)[2:5])
+        all_errors.append(
+            se3.deviation(result.T_parent_child, machine.T_parent_child)[2:5]
+        )
         all_sigmas.append(result.sigmas[2:5])
     errors = np.array(all_errors)
     sigmas = np.array(all_sigmas)
@@ -276,7 +309,9 @@ def score_of(place: str, sensors: str, rings: int, seeds: Sequence[int]) -> Tabl
         "sensors": sensors,
         "rings": rings,
         "z (cm)": f"{100 * z_m:.1f}" if is_known[:, 0].all() else "-",
-        "worst": f"{100 * np.abs(errors[:, 0]).max():.1f}" if is_known[:, 0].all() else "-",
+        "worst": f"{100 * np.abs(errors[:, 0]).max():.1f}"
+        if is_known[:, 0].all()
+        else "-",
         "roll (deg)": f"{np.degrees(roll):.3f}",
         "pitch (deg)": f"{np.degrees(pitch):.3f}",
         "90 % intervals cover": f"{is_covered[is_known].mean():.0%} of {is_known.sum()}",

@@ -38,7 +38,9 @@ def planar_poses(n_poses, seed=0):
     """(N, 4, 4) poses of a vehicle on flat ground: x, y and yaw only."""
     random = np.random.default_rng(seed)
     yaw = np.cumsum(random.normal(0, 0.08, n_poses))
-    position = np.cumsum(0.1 * np.c_[np.cos(yaw), np.sin(yaw), np.zeros(n_poses)], axis=0)
+    position = np.cumsum(
+        0.1 * np.c_[np.cos(yaw), np.sin(yaw), np.zeros(n_poses)], axis=0
+    )
     return se3.from_rotation_translation(
         se3.rotation_exp(np.c_[np.zeros((n_poses, 2)), yaw]), position
     )
@@ -46,7 +48,11 @@ def planar_poses(n_poses, seed=0):
 
 def child_of(Ts_pw_p, T_parent_child=T_PARENT_CHILD, T_cw_pw=None):
     """Noise-free poses of the child sensor in a world of its own."""
-    T_cw_pw = se3.exp(np.array([3.0, -2.0, 1.0, 0.5, 0.2, -2.0])) if T_cw_pw is None else T_cw_pw
+    T_cw_pw = (
+        se3.exp(np.array([3.0, -2.0, 1.0, 0.5, 0.2, -2.0]))
+        if T_cw_pw is None
+        else T_cw_pw
+    )
     return T_cw_pw @ Ts_pw_p @ T_parent_child
 
 
@@ -62,20 +68,26 @@ def disturbed(poses, seed, sigma_m, sigma_rad):
 def smooth_poses(times_s):
     """(N, 4, 4) poses on a smooth curve in all six degrees of freedom."""
     k = np.arange(1, 7)
-    return se3.exp(np.sin(times_s[:, None] * (0.5 + 0.15 * k) + k) * np.repeat([3.0, 0.8], 3))
+    return se3.exp(
+        np.sin(times_s[:, None] * (0.5 + 0.15 * k) + k) * np.repeat([3.0, 0.8], 3)
+    )
 
 
 def as_trajectory(poses, rate_hz=10.0, start_ns=1_700_000_000_000_000_000, **frames):
     """Poses at a steady rate."""
     return Trajectory(
-        start_ns + np.round(np.arange(len(poses)) * 1e9 / rate_hz).astype(np.int64), poses, **frames
+        start_ns + np.round(np.arange(len(poses)) * 1e9 / rate_hz).astype(np.int64),
+        poses,
+        **frames,
     )
 
 
 def noisy_pair(poses, seed, *noise, rate_hz=10.0, mount=T_PARENT_CHILD):
     """Both trajectories, each with white noise (m, rad) of its own."""
     both = enumerate((poses, child_of(poses, mount)), start=seed)
-    return [as_trajectory(disturbed(poses, own, *noise), rate_hz) for own, poses in both]
+    return [
+        as_trajectory(disturbed(poses, own, *noise), rate_hz) for own, poses in both
+    ]
 
 
 def write_pair(folder, parent, child):
@@ -115,4 +127,6 @@ def geodetic(positions, origin):
 
 def read_trajectory_file(path, format="tum", **options):
     """A file as the command line reads it: with what was repaired and guessed."""
-    return read_trajectory_files([(Path(path), FileOptions(format=format, **options))])[0]
+    return read_trajectory_files([(Path(path), FileOptions(format=format, **options))])[
+        0
+    ]

@@ -30,7 +30,9 @@ def calibration(**changes):
     root = random.normal(size=(6, 6)) * 1e-3
     covariance = root @ root.T
     covariance[2, 2] = np.inf
-    sigmas = np.where([name == "z" for name in NAMES], np.inf, random.uniform(1e-7, 1e-2, 6))
+    sigmas = np.where(
+        [name == "z" for name in NAMES], np.inf, random.uniform(1e-7, 1e-2, 6)
+    )
     values = {
         "T_parent_child": se3.exp(random.normal(size=6)),
         "covariance_measured": covariance,
@@ -59,13 +61,20 @@ SHIFTED_FROM = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
 
 def shifted(shift=(0,) * 6, hidden="", sigmas=SIGMAS, seed=None, **fields):
     """A result whose axes along and about the parent's are off by a shift, and by noise."""
-    noise = np.zeros(6) if seed is None else np.random.default_rng(seed).normal(size=6) * sigmas
+    noise = (
+        np.zeros(6)
+        if seed is None
+        else np.random.default_rng(seed).normal(size=6) * sigmas
+    )
     off = np.asarray(shift, dtype=float) + noise
     T = SHIFTED_FROM.copy()
     T[:3, :3] = se3.rotation_exp(off[3:]) @ T[:3, :3]
     T[:3, 3] += off[:3]
     to_child = np.kron(np.eye(2), T[:3, :3].T)
-    fields = {"status": SolveStatus.OK, "observability_measured": dofs(sigmas, [hidden])} | fields
+    fields = {
+        "status": SolveStatus.OK,
+        "observability_measured": dofs(sigmas, [hidden]),
+    } | fields
     covariance = to_child @ np.diag(sigmas**2) @ to_child.T
     return calibration(T_parent_child=T, covariance_measured=covariance, **fields)
 
@@ -93,4 +102,6 @@ def seen(motion_s, rotation_deg=(40.0, 30.0, 60.0)):
 def written_finding(code, severity, what, advice="convert them", **fields):
     """Return a finding with these sentences, as from a document without values."""
     values = {"what": what, "advice": advice, "cause": ""}
-    return Finding(code=code, key=AS_WRITTEN, severity=severity, values=values, **fields)
+    return Finding(
+        code=code, key=AS_WRITTEN, severity=severity, values=values, **fields
+    )

@@ -41,7 +41,9 @@ POSE_KINDS = (Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped
 START_NS = 1_700_000_000_000_000_000
 
 LATCHED = QoSProfile(
-    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 RELIABLE_INPUTS = [
     f"-p qos_overrides./{stream}_odom.subscription.reliability:=reliable"
@@ -60,7 +62,9 @@ def values_of(status):
 def free_domain():
     """A domain id whose first participant's port nobody listens on."""
     for candidate in itertools.islice(_domains, 100):
-        domain = 1 + candidate % 100  # above 101, the ports run into those of Linux for clients
+        domain = (
+            1 + candidate % 100
+        )  # above 101, the ports run into those of Linux for clients
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             try:
                 probe.bind(("", 7410 + 250 * domain))
@@ -77,7 +81,11 @@ def drive(n_poses=120, period_ns=100_000_000, start_ns=START_NS, sigma_rad=5e-5)
     be one stream computed from the other.
     """
     s = np.arange(n_poses) * period_ns * 1e-9
-    turns = np.sin(np.outer(s, [0.7, 0.9, 0.4]) + np.array([0.0, 1.0, 0.0])) * [0.5, 0.4, 0.8]
+    turns = np.sin(np.outer(s, [0.7, 0.9, 0.4]) + np.array([0.0, 1.0, 0.0])) * [
+        0.5,
+        0.4,
+        0.8,
+    ]
     places = np.stack([s, 2.0 * np.sin(0.5 * s), 0.5 * np.cos(0.8 * s)], axis=1)
     Ts_pw_p = se3.from_rotation_translation(se3.rotation_exp(turns), places)
     T_cw_pw = se3.exp(np.array([5.0, -3.0, 1.0, 0.3, 0.1, 2.0]))
@@ -179,14 +187,21 @@ class NodeProcess:
     def __init__(self, domain, log_file, ros_arguments, before="", fresh=False):
         self._log_file = log_file
         if not any("report:=" in str(argument) for argument in ros_arguments):
-            ros_arguments = [*ros_arguments, "-p report:=false"]  # it takes a processor for seconds
-        words = [word for argument in ros_arguments for word in str(argument).split(" ", 1)]
+            ros_arguments = [
+                *ros_arguments,
+                "-p report:=false",
+            ]  # it takes a processor for seconds
+        words = [
+            word for argument in ros_arguments for word in str(argument).split(" ", 1)
+        ]
         arguments = ["calibrator", "--ros-args", *words]
         source = str(Path(hand_eye_calib.__file__).parents[1])
         environment = os.environ | {
             "ROS_DOMAIN_ID": str(domain),
             "PYTHONUNBUFFERED": "1",
-            "PYTHONPATH": os.pathsep.join(filter(None, [source, os.environ.get("PYTHONPATH")])),
+            "PYTHONPATH": os.pathsep.join(
+                filter(None, [source, os.environ.get("PYTHONPATH")])
+            ),
         }
         log_file.touch()
         if not fresh:
@@ -273,7 +288,9 @@ class Peer:
 
     def publishers(self, kind=Odometry, child_kind=None):
         """Publishers on both inputs of the node."""
-        return self.publisher(kind, "parent_odom"), self.publisher(child_kind or kind, "child_odom")
+        return self.publisher(kind, "parent_odom"), self.publisher(
+            child_kind or kind, "child_odom"
+        )
 
     def wait_matched(self, *publishers):
         self.spin_until(
@@ -284,21 +301,31 @@ class Peer:
     def wait_left(self, *publishers):
         """Wait until a node that has ended is forgotten: what is published before that is lost."""
         self.spin_until(
-            lambda: not any(publisher.get_subscription_count() for publisher in publishers),
+            lambda: (
+                not any(publisher.get_subscription_count() for publisher in publishers)
+            ),
             "the node to leave",
         )
 
     def feed(self, publishers, stamps_ns, Ts_pw_p, Ts_cw_c, frames=("lidar", "camera")):
         """Publish both trajectories, interleaved."""
         self.wait_matched(*publishers)
-        for stamp_ns, poses in zip(stamps_ns, zip(Ts_pw_p, Ts_cw_c, strict=True), strict=True):
-            for publisher, T_world_sensor, frame in zip(publishers, poses, frames, strict=True):
-                publisher.publish(message(publisher.msg_type, stamp_ns, T_world_sensor, frame))
+        for stamp_ns, poses in zip(
+            stamps_ns, zip(Ts_pw_p, Ts_cw_c, strict=True), strict=True
+        ):
+            for publisher, T_world_sensor, frame in zip(
+                publishers, poses, frames, strict=True
+            ):
+                publisher.publish(
+                    message(publisher.msg_type, stamp_ns, T_world_sensor, frame)
+                )
 
     def listen(self, kind, name):
         """List that fills with the node's messages on a latched topic."""
         heard = []
-        self.node.create_subscription(kind, f"{self.target}/{name}", heard.append, LATCHED)
+        self.node.create_subscription(
+            kind, f"{self.target}/{name}", heard.append, LATCHED
+        )
         return heard
 
     def diagnostics(self):
@@ -364,7 +391,9 @@ class Peer:
             """The answer that comes again and again, if it forbids to publish a result."""
             newest = [answer.message for answer in answers[-3:]]
             is_settled = len(newest) == 3 and len(set(newest)) == 1
-            return newest[0] if is_settled and newest[0].startswith("DO NOT USE") else ""
+            return (
+                newest[0] if is_settled and newest[0].startswith("DO NOT USE") else ""
+            )
 
         self.spin_until(solved, "a result with the last pose", refused)
         return answers[-1], extrinsics[-1]
@@ -375,7 +404,9 @@ class Peer:
     def set_parameter(self, name, value):
         parameter = Parameter(name, value=value).to_parameter_msg()
         (result,) = self.call(
-            SetParameters, "set_parameters", SetParameters.Request(parameters=[parameter])
+            SetParameters,
+            "set_parameters",
+            SetParameters.Request(parameters=[parameter]),
         ).results
         return result
 
@@ -387,5 +418,7 @@ class Peer:
 
     def describe(self, name):
         request = DescribeParameters.Request(names=[name])
-        (descriptor,) = self.call(DescribeParameters, "describe_parameters", request).descriptors
+        (descriptor,) = self.call(
+            DescribeParameters, "describe_parameters", request
+        ).descriptors
         return descriptor

@@ -20,5 +20,7 @@ def assert_errors_over_sigmas(ratios, low, high):
 
 def _assert_within(average, low, high, quantity):
     size = "large" if average < low else "small"
-    text = f"sigmas are too {size}: {quantity} {average:.2f}, expected {low:g} to {high:g}"
+    text = (
+        f"sigmas are too {size}: {quantity} {average:.2f}, expected {low:g} to {high:g}"
+    )
     assert low < average < high, text

@@ -21,10 +21,16 @@ def imports_of(path, package_root):
         elif isinstance(node, ast.ImportFrom):
             base = node.module or ""
             if node.level:
-                parents = (PACKAGE, *path.relative_to(package_root).parts)[: -node.level]
+                parents = (PACKAGE, *path.relative_to(package_root).parts)[
+                    : -node.level
+                ]
                 base = ".".join((*parents, base)).rstrip(".")
             names += [f"{base}.{alias.name}" for alias in node.names]
-        elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+        elif (
+            isinstance(node, ast.Call)
+            and node.args
+            and isinstance(node.args[0], ast.Constant)
+        ):
             called = getattr(node.func, "attr", getattr(node.func, "id", ""))
             if called in ("import_module", "__import__"):
                 names.append(str(node.args[0].value))

@@ -73,13 +73,19 @@ def failures(rows, ratios, known):
     found = []
     for name, ratio in known.items():
         if name in ratios and ratios[name] < ratio * TOLERATED_RATIO:
-            found.append(f"{name}: {ratios[name]:.3g}, below a third of the baseline's {ratio:.3g}")
+            found.append(
+                f"{name}: {ratios[name]:.3g}, below a third of the baseline's {ratio:.3g}"
+            )
         elif name not in ratios and (has_opencv or "opencv" not in name):
             found.append(f"{name}: ratio is missing")
     by_key = {row.key: row for row in rows}
     for key, row in by_key.items():
         slow = by_key.get(key.replace(" fast", " ipopt"))
-        if " fast" in key and slow and row.objective > slow.objective * (1 + TOLERATED_EXCESS):
+        if (
+            " fast" in key
+            and slow
+            and row.objective > slow.objective * (1 + TOLERATED_EXCESS)
+        ):
             found.append(
                 f"{key}: objective {row.objective:.9g} is above ipopt's {slow.objective:.9g}"
             )
@@ -106,5 +112,7 @@ def aims(rows, memory):
         if size in memory:
             peak = memory[size][1]
             text = f"{peak / 1e9:.2f} GB"
-            found.append((f"peak memory, {size}", f"below {most / 1e9:g} GB", text, peak < most))
+            found.append(
+                (f"peak memory, {size}", f"below {most / 1e9:g} GB", text, peak < most)
+            )
     return [[*line, "yes" if is_met else "no"] for *line, is_met in found]

@@ -47,7 +47,9 @@ class Drive:
     def trajectories(self):
         """Parent and child as Trajectory."""
         stamps_ns = self.poses.stamps_ns
-        return Trajectory(stamps_ns, self.poses.Ts_pw_p), Trajectory(stamps_ns, self.poses.Ts_cw_c)
+        return Trajectory(stamps_ns, self.poses.Ts_pw_p), Trajectory(
+            stamps_ns, self.poses.Ts_cw_c
+        )
 
 
 def drives(sizes):
@@ -72,16 +74,22 @@ def messages(first, count, rate_hz):
     numbers = first + np.arange(count)
     s = numbers / rate_hz
     turns = np.stack(
-        [0.3 * np.sin(0.7 * s), 0.2 * np.sin(0.9 * s + 1.0), 1.2 * np.sin(0.1 * s)], axis=1
+        [0.3 * np.sin(0.7 * s), 0.2 * np.sin(0.9 * s + 1.0), 1.2 * np.sin(0.1 * s)],
+        axis=1,
     )
-    places = np.stack([20 * np.sin(0.05 * s), 20 * np.sin(0.07 * s), 0.5 * np.cos(0.8 * s)], axis=1)
+    places = np.stack(
+        [20 * np.sin(0.05 * s), 20 * np.sin(0.07 * s), 0.5 * np.cos(0.8 * s)], axis=1
+    )
     Ts_pw_p = se3.from_rotation_translation(se3.rotation_exp(turns), places)
     noise = np.random.default_rng(first).normal(size=(2, count, 6)) * _SIGMA_OF_MESSAGES
     stamps_ns = START_NS + numbers * round(1e9 / rate_hz)
     return (
         Trajectory(stamps_ns, Ts_pw_p @ se3.exp(noise[0]), "parent_sensor", "world"),
         Trajectory(
-            stamps_ns, Ts_pw_p @ T_PARENT_CHILD @ se3.exp(noise[1]), "child_sensor", "world"
+            stamps_ns,
+            Ts_pw_p @ T_PARENT_CHILD @ se3.exp(noise[1]),
+            "child_sensor",
+            "world",
         ),
     )
 
@@ -96,7 +104,9 @@ def parts(first, count, rate_hz):
             trajectory.poses[:, :3, 3].tolist(),
             se3.to_quat_xyzw(trajectory.poses).tolist(),
         )
-        for stream, trajectory in zip(STREAMS, messages(first, count, rate_hz), strict=True)
+        for stream, trajectory in zip(
+            STREAMS, messages(first, count, rate_hz), strict=True
+        )
     }
 
 
@@ -120,7 +130,11 @@ def simulated_drive(n_poses, seed=0):
             np.stack([roll, pitch, np.zeros_like(yaw)], axis=1)
         )
         places = place + np.cumsum(rotations[:, :, 0], axis=0)
-        jumps = random.normal(size=places.shape) * 0.5 * (random.random((len(places), 1)) < 0.02)
+        jumps = (
+            random.normal(size=places.shape)
+            * 0.5
+            * (random.random((len(places), 1)) < 0.02)
+        )
         shifts = shift + np.cumsum(jumps, axis=0)
         place = places[-1]
         shift = shifts[-1]

@@ -86,10 +86,15 @@ def measure_in_turn(size, slow, fast, clock=time.process_time):
         end = clock() + seconds / 10
         while clock() < end:
             fast_s.append(timed(fast[1])[0])
-    return (row_of(slow[0], size, slow_s), of_slow), (row_of(fast[0], size, fast_s), of_fast)
+    return (row_of(slow[0], size, slow_s), of_slow), (
+        row_of(fast[0], size, fast_s),
+        of_fast,
+    )
 
 
 def row_of(name, size, times):
     """Row for times that have been taken elsewhere, in seconds."""
     median = float(np.median(times))
-    return Row(name, size, median, float(max(times) - min(times)) / (2 * median), len(times))
+    return Row(
+        name, size, median, float(max(times) - min(times)) / (2 * median), len(times)
+    )

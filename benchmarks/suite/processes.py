@@ -54,17 +54,26 @@ def process_rows(drives):
             write_trajectory(file, trajectory)
         bag = Path(folder, "bag")
         write_messages(bag, MESSAGES)
-        sources = [word for pair in zip(_TOPIC_OPTIONS, TOPICS, strict=True) for word in pair]
+        sources = [
+            word for pair in zip(_TOPIC_OPTIONS, TOPICS, strict=True) for word in pair
+        ]
         commands = {
             (NUMPY, 0): [sys.executable, "-c", "import numpy"],
             ("calibrate --help", 0): [*calibrate, "--help"],
             ("replay --help", 0): [*calibrate[:-1], "replay", "--help"],
             ("files to result", LONG + 5): [*calibrate, *files],
-            ("files to result, reference B5", LONG + 5): [*calibrate, *files, "--reference", "B5"],
+            ("files to result, reference B5", LONG + 5): [
+                *calibrate,
+                *files,
+                "--reference",
+                "B5",
+            ],
             ("bag to result", MESSAGES): [*calibrate, str(bag), *sources],
         }
         for (name, size), command in commands.items():
-            wall, processor = zip(*(_run(command) for _ in range(_REPEATS)), strict=True)
+            wall, processor = zip(
+                *(_run(command) for _ in range(_REPEATS)), strict=True
+            )
             yield row_of(name, size, processor)
             if name == "files to result":
                 yield row_of(f"{name}, wall", size, wall)
@@ -74,13 +83,17 @@ def _run(command):
     """Wall and processor time of a process, in seconds."""
     with tempfile.TemporaryFile("w+") as said:
         start = time.perf_counter()
-        process = subprocess.Popen(command, cwd=PROJECT, stdout=subprocess.DEVNULL, stderr=said)
+        process = subprocess.Popen(
+            command, cwd=PROJECT, stdout=subprocess.DEVNULL, stderr=said
+        )
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
         wall = time.perf_counter() - start
         if process.returncode not in (0, 3):  # 3: an axis is not observable
             said.seek(0)
-            raise RuntimeError(f"{command} ended with {process.returncode}: {said.read()}")
+            raise RuntimeError(
+                f"{command} ended with {process.returncode}: {said.read()}"
+            )
     return wall, usage.ru_utime + usage.ru_stime
 
 

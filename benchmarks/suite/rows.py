@@ -58,7 +58,9 @@ def solver_rows(drive, is_full):
     def extrinsic(result):
         return result.T_parent_child
 
-    yield row(FLOOR, lambda: pairs.Ts_parenti_parentj.sum() + pairs.Ts_childi_childj.sum())
+    yield row(
+        FLOOR, lambda: pairs.Ts_parenti_parentj.sum() + pairs.Ts_childi_childj.sum()
+    )
     yield row("pairs", lambda: motion_pairs(poses.Ts_pw_p, poses.Ts_cw_c, REFERENCE))
     yield row("condense", lambda: quadratic_form.condense(pairs))
     for method in ("dnl", "dnlo"):
@@ -78,7 +80,9 @@ def solver_rows(drive, is_full):
         yield row(
             "jackknife and covariance",
             lambda: assess(
-                pairs, solution, lambda left_out: method.solve_without(pairs, solution, left_out)
+                pairs,
+                solution,
+                lambda left_out: method.solve_without(pairs, solution, left_out),
             ),
         )
     if size <= most["adaptive"]:
@@ -110,12 +114,16 @@ def opencv_rows(drives):
                     cv2, method, poses.Ts_pw_p, poses.Ts_cw_c
                 ),
             )
-            metres, radians = absolute_errors(T_parent_child, drives[size].T_parent_child)
+            metres, radians = absolute_errors(
+                T_parent_child, drives[size].T_parent_child
+            )
             found.append(replace(row, error_m=metres, error_rad=radians))
         yield from found
         quickest = min(found, key=lambda row: row.seconds)
         yield replace(quickest, name=OPENCV)
-        methods = [method for method in methods if quickest.name == f"opencv {method.lower()}"]
+        methods = [
+            method for method in methods if quickest.name == f"opencv {method.lower()}"
+        ]
 
 
 def opencv(cv2, method, Ts_pw_p, Ts_cw_c):
@@ -158,7 +166,9 @@ def bag_rows(n_messages):
     """
     for storage in ("mcap", "sqlite3", "rosbag1"):
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder, "recording.bag" if storage == "rosbag1" else "recording")
+            path = Path(
+                folder, "recording.bag" if storage == "rosbag1" else "recording"
+            )
             write_messages(path, n_messages, storage)
             for name, work in (("rosbags alone", _by_rosbags), ("bag: read", _by_us)):
                 yield measure(f"{name}, {storage}", n_messages, lambda: work(path))[0]  # noqa: B023
@@ -172,7 +182,9 @@ def write_messages(path, n_messages, storage="mcap"):
 
 
 def _by_rosbags(path):
-    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+    with AnyReader(
+        [path], default_typestore=get_typestore(Stores.ROS2_JAZZY)
+    ) as reader:
         for connection, _, data in reader.messages(reader.connections):
             reader.deserialize(data, connection.msgtype)
 

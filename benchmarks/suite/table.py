@@ -28,7 +28,9 @@ def tables(source, rows, memory):
     """Everything that was measured, a list of Table."""
     sizes = {row.size for row in rows if row.name == FLOOR}
     of_pairs = [row for row in rows if row.size in sizes]
-    found = [_growth(source, [row for row in of_pairs if not row.name.startswith("opencv")])]
+    found = [
+        _growth(source, [row for row in of_pairs if not row.name.startswith("opencv")])
+    ]
     for size, name in ((SHORT, "short"), (LONG, "long")):
         found.append(
             _side_by_side(
@@ -58,9 +60,14 @@ def write(found, page, note):
     _, _, after = rest.partition(_END)
     parts = [_BEGIN, note]
     for each in found:
-        lines = [["", *each.headings], ["---", *["---:"] * len(each.headings)], *each.rows]
+        lines = [
+            ["", *each.headings],
+            ["---", *["---:"] * len(each.headings)],
+            *each.rows,
+        ]
         parts.append(
-            f"### {each.title}\n\n" + "".join(f"| {' | '.join(line)} |\n" for line in lines)
+            f"### {each.title}\n\n"
+            + "".join(f"| {' | '.join(line)} |\n" for line in lines)
         )
     page.write_text(before + "\n".join([*parts, _END]) + after, encoding="utf-8")
 
@@ -84,7 +91,10 @@ def _growth(source, rows):
         f"Processor time by number of motion pairs ({REFERENCE}; {SHORT} and {LONG:,} "
         f"{source}, others simulated)",
         [f"{size:,}" for size in sizes],
-        [[name, *(found.get(size, "") for size in sizes)] for name, found in cells.items()],
+        [
+            [name, *(found.get(size, "") for size in sizes)]
+            for name, found in cells.items()
+        ],
     )
 
 
@@ -107,8 +117,12 @@ def _side_by_side(title, rows):
 
 
 def _others(rows, memory):
-    lines = [[row.name, f"{row.size:,}" if row.size else "", _cell(row)] for row in rows]
+    lines = [
+        [row.name, f"{row.size:,}" if row.size else "", _cell(row)] for row in rows
+    ]
     for size, (before, peak, data) in memory.items():
         of_what = f"of which {before / 1e6:.0f} before the solve, {data / 1e6:.0f} for the pairs"
-        lines.append(["peak memory of dnlo fast", f"{size:,}", f"{peak / 1e6:.0f} MB, {of_what}"])
+        lines.append(
+            ["peak memory of dnlo fast", f"{size:,}", f"{peak / 1e6:.0f} MB, {of_what}"]
+        )
     return Table("Processes, bags, messages", ["size", "measured"], lines)

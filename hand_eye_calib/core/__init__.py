@@ -17,7 +17,8 @@ def register() -> None:
     KINDS["poses"] = _poses
     MEASURES["poses"] = Measure("poses")
     MEASURES["positions"] = Measure(
-        "positions", "positions determine a lever arm only beside poses of the other sensor"
+        "positions",
+        "positions determine a lever arm only beside poses of the other sensor",
     )
     MEASURES["rotations"] = Measure("rotations")
     MEASURES["rates"] = Measure("rotations")

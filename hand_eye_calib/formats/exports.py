@@ -30,8 +30,28 @@ from hand_eye_calib.formats.results import launch_text, xacro_text
 _ROLES = {
     "base": ("base", "ego", "vehicle", "chassis", "rig", "hand", "tool", "flange"),
     "imu": ("imu", "body", "gyro", "ins", "novatel", "xsens"),
-    "lidar": ("lidar", "velo", "ouster", "livox", "laser", "hesai", "pandar", "rslidar", "scan"),
-    "camera": ("cam", "image", "optical", "rgb", "stereo", "realsense", "zed", "vio", "vision"),
+    "lidar": (
+        "lidar",
+        "velo",
+        "ouster",
+        "livox",
+        "laser",
+        "hesai",
+        "pandar",
+        "rslidar",
+        "scan",
+    ),
+    "camera": (
+        "cam",
+        "image",
+        "optical",
+        "rgb",
+        "stereo",
+        "realsense",
+        "zed",
+        "vio",
+        "vision",
+    ),
     "gnss": ("gnss", "gps", "antenna", "rtk"),
 }
 # Place of each kind in this order.
@@ -99,7 +119,10 @@ def formats() -> dict[str, list[Layout]]:
     """Return the layouts of each format."""
     text = Path(__file__).with_name("layouts.yaml").read_text(encoding="utf-8")
     document = yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-    return {name: [Layout(**fields) for fields in layouts] for name, layouts in document.items()}
+    return {
+        name: [Layout(**fields) for fields in layouts]
+        for name, layouts in document.items()
+    }
 
 
 def role_of(frame: str) -> str:
@@ -116,7 +139,9 @@ def role_of(frame: str) -> str:
     return roles[0] if roles else ""
 
 
-def arranged(layouts: Sequence[Layout], parent_frame: str, child_frame: str) -> Arrangement:
+def arranged(
+    layouts: Sequence[Layout], parent_frame: str, child_frame: str
+) -> Arrangement:
     """Return the layout and the direction that fit the sensors best.
 
     The criteria are, in this order: most kinds of sensors that match the layout, fewest kinds that
@@ -125,7 +150,9 @@ def arranged(layouts: Sequence[Layout], parent_frame: str, child_frame: str) -> 
     roles = (role_of(parent_frame), role_of(child_frame))
     best_score: tuple[Any, ...] = ()
     for index, layout in enumerate(layouts):
-        directions = (False, True) if layout.is_inverted is None else (layout.is_inverted,)
+        directions = (
+            (False, True) if layout.is_inverted is None else (layout.is_inverted,)
+        )
         for is_inverted in directions:
             # Kinds of the parent and of the child in this direction; empty for any kind.
             kinds = (layout.target, layout.source)
@@ -138,7 +165,9 @@ def arranged(layouts: Sequence[Layout], parent_frame: str, child_frame: str) -> 
             score = (n_matches, -n_contradictions, -index, is_usual_order)
             if score > best_score:
                 best_score = score
-                best = Arrangement(layout, is_inverted, is_certain=n_contradictions == 0)
+                best = Arrangement(
+                    layout, is_inverted, is_certain=n_contradictions == 0
+                )
     return best
 
 
@@ -243,7 +272,9 @@ def _remarks(
     if not arrangement.is_certain:
         kinds = ((target, layout.target), (source, layout.source))
         assumed = ", ".join(f"{frame} is the {kind}" for frame, kind in kinds if kind)
-        lines.append(f"Assumed, because the names of the frames do not contain it: {assumed}.")
+        lines.append(
+            f"Assumed, because the names of the frames do not contain it: {assumed}."
+        )
     if layout.axes_note:
         lines.append(layout.axes_note % {"target": target, "source": source})
     return lines

@@ -156,7 +156,9 @@ def open_regular(path: str | Path) -> BufferedReader:
     # A path with a zero byte raises a ValueError.
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise InputError(f"cannot read {printable(str(path))}: {reason}{similar(path)}") from None
+        raise InputError(
+            f"cannot read {printable(str(path))}: {reason}{similar(path)}"
+        ) from None
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         return file
     file.close()
@@ -223,7 +225,8 @@ def write_atomically(contents: Mapping[Path, str | bytes]) -> None:
         file cannot be written. If one cannot be renamed, the files before it are already replaced.
     """
     temporaries = {
-        path: path.with_name(f".{path.name[:100]}.{os.urandom(8).hex()}") for path in contents
+        path: path.with_name(f".{path.name[:100]}.{os.urandom(8).hex()}")
+        for path in contents
     }
     path = Path()
     try:

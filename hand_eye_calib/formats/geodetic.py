@@ -32,7 +32,9 @@ class LocalOrigin:
     def __init__(self) -> None:
         self.geodetic: tuple[float, float, float] | None = None
 
-    def local(self, lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArray) -> FloatArray:
+    def local(
+        self, lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArray
+    ) -> FloatArray:
         """Return positions (N, 3), m, in the axes east, north and up at the origin.
 
         The first call sets the origin to its first position.
@@ -75,7 +77,9 @@ def rotations_to_first(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:
     return axes[0].T @ axes
 
 
-def _earth_centred(lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArray) -> FloatArray:
+def _earth_centred(
+    lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArray
+) -> FloatArray:
     """Return positions (N, 3), m, in ECEF: the formulas of this module."""
     sin_lat = np.sin(lat_rad)
     cos_lat = np.cos(lat_rad)
@@ -83,7 +87,9 @@ def _earth_centred(lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArra
     normal = _RADIUS_M / np.sqrt(1.0 - _ECCENTRICITY_2 * sin_lat**2)
     from_axis = (normal + height_m) * cos_lat
     along_axis = ((1.0 - _ECCENTRICITY_2) * normal + height_m) * sin_lat
-    return np.stack([from_axis * np.cos(lon_rad), from_axis * np.sin(lon_rad), along_axis], axis=1)
+    return np.stack(
+        [from_axis * np.cos(lon_rad), from_axis * np.sin(lon_rad), along_axis], axis=1
+    )
 
 
 def _axes(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:

@@ -17,7 +17,12 @@ from hand_eye_calib.core.base.config import EXPORT_FORMATS
 from hand_eye_calib.core.base.errors import ConfigError, InputError, located
 from hand_eye_calib.core.base.text import frame_name, parse_pose, shown_value
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.frames import Extrinsic, FrameTree, numbers_of, pose_of
+from hand_eye_calib.core.geometry.frames import (
+    Extrinsic,
+    FrameTree,
+    numbers_of,
+    pose_of,
+)
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.records import AXES, ROTATIONS, TRANSLATIONS
 from hand_eye_calib.formats.exports import Layout, arranged, formats
@@ -89,7 +94,9 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
             return partial(_of_result, load_result(path), path)
         find = partial(_find, document)
     elif path.is_file() and path.suffix not in _BAGS:
-        raise InputError(f"{path}: unknown kind of file; expected {_EXPECTED}, or a bag")
+        raise InputError(
+            f"{path}: unknown kind of file; expected {_EXPECTED}, or a bag"
+        )
     else:
         find = frames_of_bag(path).pose
     return partial(stated, find, str(path))
@@ -106,7 +113,10 @@ def _only_pose(path: Path) -> FloatArray:
 
 
 def stated(
-    find: Callable[[str, str], FloatArray], origin: str, parent_frame: str, child_frame: str
+    find: Callable[[str, str], FloatArray],
+    origin: str,
+    parent_frame: str,
+    child_frame: str,
 ) -> Extrinsic:
     """Return the installed pose of the child sensor in the parent sensor's frame.
 
@@ -135,7 +145,9 @@ def frames_of_bag(path: str | Path) -> FrameTree:
         return bag.static_frames
 
 
-def _of_result(result: Calibration, path: Path, parent_frame: str, child_frame: str) -> Extrinsic:
+def _of_result(
+    result: Calibration, path: Path, parent_frame: str, child_frame: str
+) -> Extrinsic:
     """Return the pose in an earlier result of this package, inverted if the sensors are exchanged.
 
     Raises
@@ -154,7 +166,10 @@ def _of_result(result: Calibration, path: Path, parent_frame: str, child_frame: 
             f"{child_frame} in {parent_frame}"
         )
     return Extrinsic(
-        result.T_parent_child, str(path), result.covariance_measured, is_calibration=True
+        result.T_parent_child,
+        str(path),
+        result.covariance_measured,
+        is_calibration=True,
     )
 
 
@@ -240,7 +255,9 @@ def _named_transform(path: tuple[str, ...], node: Mapping[str, Any]) -> tuple[An
     # easy_handeye2: the robot's frame is its base or its hand.
     if isinstance(parameters, Mapping) and "transform" in node:
         is_fixed = parameters.get("calibration_type") == "eye_on_base"
-        robot = parameters.get("robot_base_frame" if is_fixed else "robot_effector_frame")
+        robot = parameters.get(
+            "robot_base_frame" if is_fixed else "robot_effector_frame"
+        )
         return robot, parameters.get("tracking_base_frame"), node["transform"]
     return ()
 
@@ -314,13 +331,17 @@ def _frames(data: bytes) -> FrameTree:
         raise InputError(f"expected a URDF file, found <{root.tag}>")
     joints = root.findall("joint")
     values = np.array([_origin(joint) for joint in joints]).reshape(-1, 6)
-    poses = se3.from_rotation_translation(se3.rotation_from_rpy(values[:, 3:]), values[:, :3])
+    poses = se3.from_rotation_translation(
+        se3.rotation_from_rpy(values[:, 3:]), values[:, :3]
+    )
     frames = FrameTree("the robot description")
     for joint, T_parent_child in zip(joints, poses, strict=True):
         elements = [*joint.findall("parent"), *joint.findall("child")]
         links = [element.get("link", "") for element in elements]
         if len(links) != 2 or not all(links):
-            raise InputError(f"joint {joint.get('name', '')!r} has no parent or no child")
+            raise InputError(
+                f"joint {joint.get('name', '')!r} has no parent or no child"
+            )
         frames.add(links[0], links[1], T_parent_child, joint.get("type") == "fixed")
     return frames
 

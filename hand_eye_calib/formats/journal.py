@@ -81,7 +81,9 @@ class JournalWriter:
             self._parent_poses = int((resumed.streams == "parent").sum())
             self._about |= resumed.about
             whole_bytes = resumed.whole_bytes
-        self._pending: dict[str, list[str]] = {stream: [] for stream in {**about, **self._about}}
+        self._pending: dict[str, list[str]] = {
+            stream: [] for stream in {**about, **self._about}
+        }
         self._files: dict[str, FileIO] = {}
         for stream in self._pending:
             # Without a buffer, data that was written survives a crash of this process.
@@ -89,10 +91,16 @@ class JournalWriter:
             self._files[stream] = open(path, "ab", buffering=0, opener=_open_no_link)  # noqa: SIM115
             self._files[stream].truncate(whole_bytes.get(stream, 0))
         head = {"format": _FORMAT, "version": _VERSION}
-        self.describe({stream: head | {"stream": stream} | {**about[stream]} for stream in about})
+        self.describe(
+            {stream: head | {"stream": stream} | {**about[stream]} for stream in about}
+        )
 
     def add_pose(
-        self, stream: str, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float]
+        self,
+        stream: str,
+        stamp_ns: int,
+        position: Sequence[float],
+        quat_xyzw: Sequence[float],
     ) -> None:
         """Add a pose. The next :meth:`flush` writes it."""
         self._pending[stream].append(tum_line(stamp_ns, (*position, *quat_xyzw)))
@@ -103,7 +111,9 @@ class JournalWriter:
         for stream, description in about.items():
             written = self._about.get(stream, {})
             changes = {
-                key: value for key, value in description.items() if written.get(key) != value
+                key: value
+                for key, value in description.items()
+                if written.get(key) != value
             }
             if changes:
                 self._write(stream, [f"# {json.dumps(changes)}"])
@@ -172,7 +182,9 @@ def read_journal(directory: str | Path) -> Journal:
         If the directory has no session, or the session cannot be read.
     """
     paths = {stream: Path(directory, f"{stream}.tum") for stream in _STREAMS}
-    files = {stream: _read(path) for stream, path in paths.items() if os.path.lexists(path)}
+    files = {
+        stream: _read(path) for stream, path in paths.items() if os.path.lexists(path)
+    }
     # Check this after reading, because a node may have renamed the directory in the meantime.
     if "parent" not in files:
         raise InputError(f"no session journal in {directory}")
@@ -227,7 +239,9 @@ def _read(path: Path) -> _StreamFile:
                 values.extend(row)
             whole_bytes += len(line)
     if about.get("format") != _FORMAT:
-        raise InputError(f"the session journal {path} is damaged from its first byte; {_ADVICE}")
+        raise InputError(
+            f"the session journal {path} is damaged from its first byte; {_ADVICE}"
+        )
     if about.get("version") != _VERSION:
         raise InputError(
             f"the session journal {path} is of format version {about.get('version')}, this program "
@@ -250,7 +264,9 @@ def _is_own(path: Path) -> bool:
         return False
     with open_regular(path) as file:
         beginning = file.read(LONGEST_LINE)
-    return not beginning or (beginning.startswith(b"# {") and _FORMAT.encode() in beginning)
+    return not beginning or (
+        beginning.startswith(b"# {") and _FORMAT.encode() in beginning
+    )
 
 
 def _open_no_link(path: str, flags: int) -> int:

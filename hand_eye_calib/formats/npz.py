@@ -30,7 +30,9 @@ _NO_ARRAYS = (
 )
 
 
-def read_arrays(path: str | Path, largest: int = LARGEST_ARRAYS) -> dict[str, np.ndarray]:
+def read_arrays(
+    path: str | Path, largest: int = LARGEST_ARRAYS
+) -> dict[str, np.ndarray]:
     """Return the arrays of an ``.npz`` file by their names.
 
     Raises
@@ -43,7 +45,9 @@ def read_arrays(path: str | Path, largest: int = LARGEST_ARRAYS) -> dict[str, np
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
             sizes = {member.filename: member.file_size for member in archive.infolist()}
             if sum(sizes.values()) > largest:
-                raise InputError(f"cannot read {path}: its arrays take more than {largest} bytes")
+                raise InputError(
+                    f"cannot read {path}: its arrays take more than {largest} bytes"
+                )
             for name, size in sizes.items():
                 with archive.open(name) as member:
                     _check_array_size(member, size)

@@ -49,7 +49,9 @@ def expanded(pattern: str) -> list[str]:
     Raises the errors of :func:`local_copies`.
     """
     with _reached(pattern) as (system, path):
-        return sorted(system.unstrip_protocol(name) for name in system.glob(path.rstrip("/")))
+        return sorted(
+            system.unstrip_protocol(name) for name in system.glob(path.rstrip("/"))
+        )
 
 
 @contextmanager
@@ -101,11 +103,15 @@ def _copied(url: str, folder: Path) -> Path:
     folder.mkdir()
     with _reached(url) as (system, path):
         is_file = _name(path).endswith(_SUFFIXES)
-        entries = _entries_of_file(system, path) if is_file else system.ls(path, detail=True)
+        entries = (
+            _entries_of_file(system, path) if is_file else system.ls(path, detail=True)
+        )
         suffixes = (*_SUFFIXES, *_JOURNALS)
         files = [entry for entry in entries if _name(entry["name"]).endswith(suffixes)]
         if not files:
-            raise InputError(f"no bag there: expected files that end in {', '.join(_SUFFIXES)}")
+            raise InputError(
+                f"no bag there: expected files that end in {', '.join(_SUFFIXES)}"
+            )
         # Use at most half of the free space, because other processes may copy bags, too.
         largest = shutil.disk_usage(folder).free // 2
         if sum(entry.get("size") or 0 for entry in files) > largest:

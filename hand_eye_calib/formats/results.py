@@ -19,7 +19,11 @@ from hand_eye_calib.core.base.registry import RESULT_METHODS
 from hand_eye_calib.core.base.spelling import Road
 from hand_eye_calib.core.base.version import version_of
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
-from hand_eye_calib.core.results.document import transform_arguments, usable_angles, usable_numbers
+from hand_eye_calib.core.results.document import (
+    transform_arguments,
+    usable_angles,
+    usable_numbers,
+)
 from hand_eye_calib.core.results.parts import all_parts, part
 from hand_eye_calib.core.results.records import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.core.results.verdict import Judged
@@ -44,7 +48,9 @@ _MARKS = (b"hand_eye_calib", b'"headline"')
 
 
 def save_result(
-    calibration: Calibration, directory: str | Path, inputs: Mapping[str, Any] | None = None
+    calibration: Calibration,
+    directory: str | Path,
+    inputs: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write ``extrinsic.yaml``, ``extrinsic.urdf.xacro`` and ``static_transform.launch.py``.
 
@@ -91,7 +97,9 @@ def _names_of_parts() -> list[str]:
 
 
 def save(
-    calibration: Calibration, directory: str | Path, inputs: Mapping[str, Any] | None = None
+    calibration: Calibration,
+    directory: str | Path,
+    inputs: Mapping[str, Any] | None = None,
 ) -> Path:
     """Save a result and its report; earlier files are kept in the folder ``previous``.
 
@@ -135,14 +143,19 @@ def save_rig(
     folders = {RIG_NAME, LAUNCH_NAME, REPORT_NAME}
     for calibration in calibrations:
         # Replace characters of the frame's name that the name of a folder should not contain.
-        name = re.sub(r"[^\w.-]", "_", calibration.child_frame.strip("/")).lstrip(".") or "sensor"
+        name = (
+            re.sub(r"[^\w.-]", "_", calibration.child_frame.strip("/")).lstrip(".")
+            or "sensor"
+        )
         while name in folders:
             name += "_2"
         folders.add(name)
         keep_earlier_results(Path(directory, name))
         save_result(calibration, Path(directory, name), inputs)
     usable = [
-        calibration for calibration in calibrations if calibration.verdict is not Verdict.DO_NOT_USE
+        calibration
+        for calibration in calibrations
+        if calibration.verdict is not Verdict.DO_NOT_USE
     ]
     launch = launch_text(usable) if usable else None
     texts = {LAUNCH_NAME: launch, RIG_NAME: _yaml_text(document, inputs)}
@@ -166,7 +179,9 @@ def _written(directory: Path, texts: Mapping[str, str | None]) -> Path:
     ``texts`` are the contents by file name; a file with None is removed. If a file cannot be
     written, no file changes.
     """
-    contents = {directory / name: text for name, text in texts.items() if text is not None}
+    contents = {
+        directory / name: text for name, text in texts.items() if text is not None
+    }
     paths = [directory / name for name in texts]
     with writing(directory):
         directory.mkdir(parents=True, exist_ok=True)
@@ -212,7 +227,10 @@ def _keep_foreign(path: Path) -> None:
 
 def _free_name(path: Path) -> Path:
     """Return the first unused path among ``path.kept``, ``path.kept2`` and so on."""
-    names = (path.with_name(f"{path.name}.kept{number}") for number in ("", *range(2, 10_000)))
+    names = (
+        path.with_name(f"{path.name}.kept{number}")
+        for number in ("", *range(2, 10_000))
+    )
     return next(name for name in names if not os.path.lexists(name))
 
 
@@ -230,7 +248,10 @@ def keep_earlier_results(directory: str | Path) -> str:
         If a file cannot be copied.
     """
     previous = Path(directory, "previous")
-    paths = [Path(directory, name) for name in (*_NAMES, *_names_of_parts(), RIG_NAME, REPORT_NAME)]
+    paths = [
+        Path(directory, name)
+        for name in (*_NAMES, *_names_of_parts(), RIG_NAME, REPORT_NAME)
+    ]
     copies = {previous / path.name: read_bytes(path) for path in paths if path.exists()}
     if not copies:
         return ""
@@ -254,7 +275,9 @@ def recording_of(path: str | Path) -> frozenset[str]:
     path = Path(path, FILE_NAME) if Path(path).is_dir() else Path(path)
     provenance = read_yaml(path).get("provenance") or {}
     files = (provenance.get("inputs") or {}).get("files") or []
-    return frozenset(str(file.get("sha256")) for file in files if isinstance(file, Mapping))
+    return frozenset(
+        str(file.get("sha256")) for file in files if isinstance(file, Mapping)
+    )
 
 
 def load_result(path: str | Path) -> Calibration:
@@ -275,9 +298,13 @@ def load_result(path: str | Path) -> Calibration:
     if path.is_dir():
         if (path / RIG_NAME).exists() and not (path / FILE_NAME).exists():
             sensors = sorted(str(file.parent) for file in path.glob(f"*/{FILE_NAME}"))
-            raise InputError(f"{path} is of a rig; name one of its sensors: {', '.join(sensors)}")
+            raise InputError(
+                f"{path} is of a rig; name one of its sensors: {', '.join(sensors)}"
+            )
         if not (path / FILE_NAME).exists():
-            raise InputError(f"{path} has no {FILE_NAME}: name the folder of a result (--out)")
+            raise InputError(
+                f"{path} has no {FILE_NAME}: name the folder of a result (--out)"
+            )
         path = path / FILE_NAME
     if path.suffix in (".urdf", ".xacro"):
         raise InputError(
@@ -339,7 +366,10 @@ def _remarks(calibration: Judged) -> list[str]:
     child = calibration.child_frame
     remarks = [
         calibration.headline,
-        *(f"{reason.sentence}: {reason.advice_on(Road.NODE)}" for reason in calibration.reasons),
+        *(
+            f"{reason.sentence}: {reason.advice_on(Road.NODE)}"
+            for reason in calibration.reasons
+        ),
         f"Pose of {child} in {parent}: maps coordinates of {child} into {parent}.",
         f"Made by hand_eye_calib {version_of()}; {FILE_NAME} beside this file "
         "contains the covariance and the origin.",

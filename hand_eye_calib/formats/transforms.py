@@ -81,7 +81,9 @@ class TfStream:
         Edges that are known before the first transform arrives.
     """
 
-    def __init__(self, source: TfSource, max_gap_s: float, tree: FrameTree | None = None) -> None:
+    def __init__(
+        self, source: TfSource, max_gap_s: float, tree: FrameTree | None = None
+    ) -> None:
         self.source = source
         self.max_gap_s = max_gap_s
         self._tree = tree or FrameTree("/tf and /tf_static")
@@ -95,7 +97,9 @@ class TfStream:
         Raises the errors of :meth:`edges_at`.
         """
         for stamp_ns, rows in self.edges_at(transform, is_static):
-            T_world_sensor = self.composed({name: np.array(row) for name, row in rows.items()})
+            T_world_sensor = self.composed(
+                {name: np.array(row) for name, row in rows.items()}
+            )
             x, y, z, *quat_xyzw = _row(T_world_sensor)
             yield PoseFields(stamp_ns, *self.source, (x, y, z), quat_xyzw)
 
@@ -154,12 +158,16 @@ class TfStream:
         frames = []
         with suppress(InputError):
             up, down = self._tree.route(*self.source)
-            frames = [frame for frame in up + down if not self._tree.edges[frame].is_static]
+            frames = [
+                frame for frame in up + down if not self._tree.edges[frame].is_static
+            ]
         self._moving = {
             frame: self._moving.get(frame, deque(maxlen=_MOST_KEPT)) for frame in frames
         }
 
-    def _move(self, frame: str, stamp_ns: int, row: _Row) -> Iterator[tuple[int, dict[str, _Row]]]:
+    def _move(
+        self, frame: str, stamp_ns: int, row: _Row
+    ) -> Iterator[tuple[int, dict[str, _Row]]]:
         """Add a pose of a moving edge; yield as :meth:`edges_at`."""
         last_ns = self._last_ns.get(frame, stamp_ns - 1)
         if last_ns - _JUMP_BACK_NS <= stamp_ns <= last_ns:
@@ -183,8 +191,12 @@ class TfStream:
         Stamps at which an edge cannot be interpolated are skipped.
         """
         slowest = self._moving[self._slowest]
-        others = {name: edge for name, edge in self._moving.items() if edge is not slowest}
-        while slowest and all(edge and edge[-1][0] >= slowest[0][0] for edge in others.values()):
+        others = {
+            name: edge for name, edge in self._moving.items() if edge is not slowest
+        }
+        while slowest and all(
+            edge and edge[-1][0] >= slowest[0][0] for edge in others.values()
+        ):
             at_ns, slowest_row = slowest.popleft()
             rows = {self._slowest: slowest_row}
             for name, edge in others.items():

@@ -30,7 +30,9 @@ _TAGS = ("null", "bool", "int", "float", "str", "seq", "map")
 
 # The loader of libyaml is several times faster. Most builds of the package yaml contain it.
 _Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_dump = partial(yaml.dump, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False)
+_dump = partial(
+    yaml.dump, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False
+)
 
 
 class _Loader(_Base):
@@ -38,7 +40,11 @@ class _Loader(_Base):
 
     # Read dates as text: an impossible date such as 2024-13-45 would otherwise be an error.
     yaml_implicit_resolvers: ClassVar = {
-        first: [(tag, pattern) for tag, pattern in resolvers if not tag.endswith(":timestamp")]
+        first: [
+            (tag, pattern)
+            for tag, pattern in resolvers
+            if not tag.endswith(":timestamp")
+        ]
         for first, resolvers in _Base.yaml_implicit_resolvers.items()
     }
     yaml_constructors: ClassVar = {
@@ -66,7 +72,9 @@ def _whole_number(loader: Any, node: Any) -> int:
     is_short = len(node.value) <= _LONGEST_INT
     number = int(loader.construct_yaml_int(node)) if is_short else LARGEST_INT
     if abs(number) >= LARGEST_INT:
-        raise ValueError(f"a whole number is too large, line {node.start_mark.line + 1}")
+        raise ValueError(
+            f"a whole number is too large, line {node.start_mark.line + 1}"
+        )
     return number
 
 
@@ -107,7 +115,9 @@ def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
 
 def yaml_text(document: Any) -> str:
     """Convert a document of any values to YAML that is easy to read."""
-    return str(_dump(plain(document), default_flow_style=None, width=120, allow_unicode=True))
+    return str(
+        _dump(plain(document), default_flow_style=None, width=120, allow_unicode=True)
+    )
 
 
 def _check_events(text: str) -> None:

@@ -3,7 +3,12 @@
 from pathlib import Path
 from typing import Any
 
-from hand_eye_calib.core.base.registry import COMMANDS, RESULT_METHODS, SESSION_PAGES, Command
+from hand_eye_calib.core.base.registry import (
+    COMMANDS,
+    RESULT_METHODS,
+    SESSION_PAGES,
+    Command,
+)
 
 
 def register() -> None:
@@ -14,7 +19,9 @@ def register() -> None:
     COMMANDS["replay"] = Command("the same for bags and journals alone", _calibrate)
     COMMANDS["check"] = Command("check two pose streams before any solve", _check)
     COMMANDS["info"] = Command("show a saved result", _info)
-    COMMANDS["export"] = Command("print a saved result as the file of another program", _export)
+    COMMANDS["export"] = Command(
+        "print a saved result as the file of another program", _export
+    )
     RESULT_METHODS["plot"] = _plot
     RESULT_METHODS["report"] = _report
     RESULT_METHODS["html"] = _html

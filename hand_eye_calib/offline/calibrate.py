@@ -145,7 +145,9 @@ def calibrate(
     """
     values = {name: value for name, value in locals().items() if value is not None}
     _check_settings(progress, checks, ground, is_bag=child is None)
-    first, second = _read_both(parent, child, {"parent": parent_topic, "child": child_topic})
+    first, second = _read_both(
+        parent, child, {"parent": parent_topic, "child": child_topic}
+    )
     values |= prior_fields({} if prior is None else prior)
     options = {
         option_name(field): values[field.name]
@@ -160,7 +162,9 @@ def calibrate(
         for text in notes:
             warnings.warn(text, UserWarning, stacklevel=2)
     result = run(snapshot, checks=checks, progress=progress)
-    in_python = tuple(spelled(text, Road.PYTHON) for text in result.calibration.warnings)
+    in_python = tuple(
+        spelled(text, Road.PYTHON) for text in result.calibration.warnings
+    )
     return replace(result.calibration, warnings=in_python, recording=result.snapshot)
 
 
@@ -173,22 +177,30 @@ def _check_settings(progress: Any, checks: Any, ground: Any, is_bag: bool) -> No
     if ground not in (None, "auto", "off"):
         raise ConfigError(f"ground must be 'auto' or 'off'; got {shown_value(ground)}")
     if ground is not None and not is_bag:
-        raise ConfigError("ground applies to a bag; for trajectories, call calibrate_on_ground")
+        raise ConfigError(
+            "ground applies to a bag; for trajectories, call calibrate_on_ground"
+        )
 
 
 def _read_both(
-    parent: TrajectoryLike, child: TrajectoryLike | None, topics: Mapping[str, str | None]
+    parent: TrajectoryLike,
+    child: TrajectoryLike | None,
+    topics: Mapping[str, str | None],
 ) -> Sequence[Trajectory]:
     """Return the trajectories of parent and child; without a child, ``parent`` is a bag."""
     if parent is None:
         raise InputError("the parent must be a trajectory, a file or a bag; got None")
     if child is None and not isinstance(parent, str | PathLike):
-        raise InputError("a child is missing: pass two trajectories, or the path of a bag")
+        raise InputError(
+            "a child is missing: pass two trajectories, or the path of a bag"
+        )
     if child is None:
         return _read_bag(path_of("a bag without a child", parent), topics)
     for stream, topic in topics.items():
         if topic is not None:
-            raise ConfigError(f"{stream}_topic is a topic of a bag: pass only the bag, no child")
+            raise ConfigError(
+                f"{stream}_topic is a topic of a bag: pass only the bag, no child"
+            )
     if isinstance(parent, Trajectory) and isinstance(child, Trajectory):
         return parent, child
     from hand_eye_calib.formats.trajectory_files.reading import read_trajectories
@@ -217,8 +229,12 @@ def _read_bag(path: Path, topics: Mapping[str, str | None]) -> Sequence[Trajecto
         try:
             sources = bag.select(named.get("parent"), named.get("child"))
         except UnclearStreamsError as error:
-            options = ", ".join(f"{name}={topic!r}" for name, topic in error.options.items())
-            raise InputError(f"{error}. Set {options}" if options else str(error)) from None
+            options = ", ".join(
+                f"{name}={topic!r}" for name, topic in error.options.items()
+            )
+            raise InputError(
+                f"{error}. Set {options}" if options else str(error)
+            ) from None
         if len(named) < len(sources):
             notes.append(f"parent is {sources[0]}, child is {sources[1]}")
         for source in sources:
@@ -270,7 +286,9 @@ def prior_fields(prior: Prior) -> dict[str, str]:
     for axis, value in prior.items():
         if axis not in AXIS_UNITS:
             raise ConfigError(f"prior takes {', '.join(AXIS_UNITS)}; got {axis!r}")
-        options[f"prior_{axis}"] = value if isinstance(value, str) else _prior_text(axis, value)
+        options[f"prior_{axis}"] = (
+            value if isinstance(value, str) else _prior_text(axis, value)
+        )
     return options
 
 
@@ -326,7 +344,9 @@ def cross_check(
     snapshot = whole_snapshot(parent, child, {"method": calibration.method})
     config = config or snapshot.config
     config.require_poses("a cross-check")
-    settled = replace(snapshot, config=replace(config, time_offset=calibration.time_offset_s))
+    settled = replace(
+        snapshot, config=replace(config, time_offset=calibration.time_offset_s)
+    )
     settled.require_pairs()
     others = answers_of_whole(calibration, settled.pose_pairs)
     halves = answers_of_halves(calibration, settled.pose_pairs)

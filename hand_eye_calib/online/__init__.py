@@ -9,7 +9,9 @@ def register() -> None:
     """Register the commands ``calibrator`` and ``watch``, and the part ``goal`` of a result."""
     RESULT_PARTS["goal"] = _goal
     COMMANDS["calibrator"] = Command("run the ROS 2 node", _calibrator)
-    COMMANDS["watch"] = Command("display the live node on the terminal, or in a browser", _watch)
+    COMMANDS["watch"] = Command(
+        "display the live node on the terminal, or in a browser", _watch
+    )
 
 
 def _calibrator() -> Any:

@@ -34,7 +34,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("--methods", nargs="+", choices=METHODS, default=METHODS, help="default: both")
     add("--tables", nargs="+", choices=TABLES, default=TABLES, help="default: all")
     add("--seeds", type=int, default=10, help="recordings per class. Default: 10")
-    add("--seed", type=int, help="of the first of them. Default: another one at every run")
+    add(
+        "--seed",
+        type=int,
+        help="of the first of them. Default: another one at every run",
+    )
     add("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
     add("--rows", metavar="FILE", type=Path, help="write all rows there (CSV)")
     arguments = parser.parse_args(argv)
@@ -59,7 +63,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             names = ("table", "name", "method")
             named = [{name: getattr(row, name) for name in names} for row in rows]
             values = [{kind: row.value(kind) for kind in KINDS} for row in rows]
-            write_csv(arguments.rows, [{**a, **b} for a, b in zip(named, values, strict=True)])
+            write_csv(
+                arguments.rows, [{**a, **b} for a, b in zip(named, values, strict=True)]
+            )
         return 0
 
     return exit_code_of(run)
@@ -69,34 +75,53 @@ def measure(tasks: Sequence[_Task], methods: Sequence[str], jobs: int) -> list[R
     """Rows of every class, level, rig and cycle, then the pooled ones."""
     rows: list[Row] = [*in_parallel(call, [task[1:] for task in tasks], jobs)]
     rows += [
-        pooled(table, name, method, rows) for method in methods for table, name in POOLED.items()
+        pooled(table, name, method, rows)
+        for method in methods
+        for table, name in POOLED.items()
     ]
     return [row for row in rows if any(row.cases.values())]
 
 
-def tasks_of(method: str, seeds: range, rigs: Sequence[Rig], folder: Path | None) -> list[_Task]:
+def tasks_of(
+    method: str, seeds: range, rigs: Sequence[Rig], folder: Path | None
+) -> list[_Task]:
     """What is to be measured of a method."""
-    tasks: list[_Task] = [("simulated", scores.class_row, name, method, seeds) for name in CLASSES]
+    tasks: list[_Task] = [
+        ("simulated", scores.class_row, name, method, seeds) for name in CLASSES
+    ]
     if folder is not None and (folder / "valimaki2023").is_dir():
         tasks += [
-            ("levels", scores.level_row, folder / "valimaki2023", dataset, level, method)
+            (
+                "levels",
+                scores.level_row,
+                folder / "valimaki2023",
+                dataset,
+                level,
+                method,
+            )
             for dataset in SIMULATED
             for level in LEVELS[dataset]
         ]
     for rig in rigs:
         names = list(rig.recordings)
         if rig.is_refused:
-            tasks += [("refused", scores.refused_row, rig, name, method) for name in names]
+            tasks += [
+                ("refused", scores.refused_row, rig, name, method) for name in names
+            ]
             continue
         if rig.truth is not None:
-            tasks += [("known answer", scores.truth_row, rig, name, method) for name in names]
+            tasks += [
+                ("known answer", scores.truth_row, rig, name, method) for name in names
+            ]
         if len(names) > 1:
             tasks.append(("rig", scores.scatter_row, rig, method))
         if rig.is_cut:
             tasks += [("parts", scores.parts_row, rig, name, method) for name in names]
     by_name = {rig.name: rig for rig in rigs}
     if set(CYCLE) <= set(by_name):
-        tasks.append(("cycle", scores.cycle_row, {name: by_name[name] for name in CYCLE}, method))
+        tasks.append(
+            ("cycle", scores.cycle_row, {name: by_name[name] for name in CYCLE}, method)
+        )
     return tasks
 
 

@@ -14,7 +14,12 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry import se3
-from reproduction.coverage.sensor_errors import DrawnErrors, SensorErrors, directions, scale_columns
+from reproduction.coverage.sensor_errors import (
+    DrawnErrors,
+    SensorErrors,
+    directions,
+    scale_columns,
+)
 
 # Variances below this (m^2 or rad^2) count as this: a component without error has no inverse.
 _LEAST_VARIANCE = 1e-18
@@ -94,8 +99,12 @@ def normal_equations(
     """Information on xi, behind it on the pose of the worlds if odometry does not drift, and the
     right-hand side as last column if z is given.
     """
-    white = sum((s.to_error @ s.drawn.white @ s.to_error.T for s in sides), np.zeros((6, 6)))
-    walk = sum((s.to_error @ s.drawn.walk @ s.to_error.T for s in sides), np.zeros((6, 6)))
+    white = sum(
+        (s.to_error @ s.drawn.white @ s.to_error.T for s in sides), np.zeros((6, 6))
+    )
+    walk = sum(
+        (s.to_error @ s.drawn.walk @ s.to_error.T for s in sides), np.zeros((6, 6))
+    )
     latents = [latent for side in sides for latent in _latents(side, dt)]
     columns = [np.tile(np.eye(6), (len(child), 1, 1))]
     if walk.any():
@@ -115,14 +124,21 @@ def _latents(side: Side, dt: float) -> list[_Latent]:
     G = side.to_error
     nowhere = np.zeros((len(Ts) - 1, 6, 6))
     latents = [
-        _Latent(_phi(dt, process.tau_s), process.sigma**2, G @ directions(process, Ts), nowhere)
+        _Latent(
+            _phi(dt, process.tau_s),
+            process.sigma**2,
+            G @ directions(process, Ts),
+            nowhere,
+        )
         for process in errors.slow
     ]
     if errors.scale is not None:
         sigma, tau_s = errors.scale
         columns = scale_columns(se3.inverse(Ts[:-1]) @ Ts[1:]) @ G.T
         nowhere = np.zeros((len(Ts), 6, 1))
-        latents.append(_Latent(_phi(dt, tau_s), np.array([sigma**2]), nowhere, columns[:, :, None]))
+        latents.append(
+            _Latent(_phi(dt, tau_s), np.array([sigma**2]), nowhere, columns[:, :, None])
+        )
     return latents
 
 
@@ -157,10 +173,14 @@ def _drifting(
 def _stationary(count: int, latents: list[_Latent]) -> _StateSpace:
     """States (latents) alone, none of them in the increments."""
     nothing = np.zeros(0)
-    phi = np.concatenate([nothing, *(0.0 * latent.variances + latent.phi for latent in latents)])
+    phi = np.concatenate(
+        [nothing, *(0.0 * latent.variances + latent.phi for latent in latents)]
+    )
     variances = np.concatenate([nothing, *(latent.variances for latent in latents)])
     return _StateSpace(
-        np.concatenate([np.zeros((count, 6, 0)), *(latent.in_pose for latent in latents)], axis=2),
+        np.concatenate(
+            [np.zeros((count, 6, 0)), *(latent.in_pose for latent in latents)], axis=2
+        ),
         np.tile(np.diag(phi), (count - 1, 1, 1)),
         np.tile(_inverse((1.0 - phi**2) * variances), (count - 1, 1, 1)),
         _inverse(variances),
@@ -175,7 +195,9 @@ def _inverse(variances: FloatArray) -> FloatArray:
     return np.diag(1.0 / np.maximum(variances, _LEAST_VARIANCE))
 
 
-def _eliminated(weights: FloatArray, columns: FloatArray, space: _StateSpace) -> FloatArray:
+def _eliminated(
+    weights: FloatArray, columns: FloatArray, space: _StateSpace
+) -> FloatArray:
     """Gram matrix (p, p) of columns (N, 6, p) after eliminating the states."""
     gram = np.einsum("nji,njk,nkl->il", columns, weights, columns, optimize=True)
     if not space.H.shape[2]:
@@ -198,5 +220,7 @@ def _banded(diagonal: FloatArray, below: FloatArray) -> FloatArray:
         for row in range(size):
             if row >= column:
                 bands[row - column, column::size] = diagonal[:, row, column]
-            bands[size + row - column, column : (count - 1) * size : size] = below[:, row, column]
+            bands[size + row - column, column : (count - 1) * size : size] = below[
+                :, row, column
+            ]
     return bands

@@ -12,7 +12,13 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from reproduction.coverage import motions
 from reproduction.coverage.bound import Side, cramer_rao_bound
-from reproduction.coverage.sensor_errors import GaussMarkov, SensorErrors, Tail, draw, sigmas
+from reproduction.coverage.sensor_errors import (
+    GaussMarkov,
+    SensorErrors,
+    Tail,
+    draw,
+    sigmas,
+)
 
 _START_NS = 1_700_000_000_000_000_000
 
@@ -64,7 +70,9 @@ def simulate(
     if noise_seed is not None:
         parent_rng, child_rng = np.random.default_rng(noise_seed).spawn(2)
     dt = 1.0 / kind.rate_hz
-    times_s: FloatArray = dt * np.arange(round(kind.duration_s * kind.rate_hz), dtype=np.float64)
+    times_s: FloatArray = dt * np.arange(
+        round(kind.duration_s * kind.rate_hz), dtype=np.float64
+    )
     motion = kind.motion(motion_rng, kind.duration_s)
     drawn = _mount(mount_rng, kind.lever_m)
     X = drawn if T_parent_child is None else T_parent_child
@@ -100,7 +108,9 @@ def _mount(rng: np.random.Generator, lever_m: float) -> FloatArray:
     """Any rotation, and a translation of this length, mostly level."""
     direction = rng.standard_normal(3) * [1.0, 1.0, 0.5]
     rotation = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
-    return se3.from_rotation_translation(rotation, lever_m * direction / np.linalg.norm(direction))
+    return se3.from_rotation_translation(
+        rotation, lever_m * direction / np.linalg.norm(direction)
+    )
 
 
 def _world(rng: np.random.Generator) -> FloatArray:
@@ -109,7 +119,11 @@ def _world(rng: np.random.Generator) -> FloatArray:
 
 
 def _slow(
-    errors: SensorErrors, tau_s: float, metres: float, degrees: float, in_world: bool = False
+    errors: SensorErrors,
+    tau_s: float,
+    metres: float,
+    degrees: float,
+    in_world: bool = False,
 ) -> SensorErrors:
     process = GaussMarkov(tau_s, sigmas(metres, degrees), in_world)
     return replace(errors, slow=(*errors.slow, process))
@@ -130,7 +144,9 @@ _HAND = _white(0.003, 0.2)
 _INS = _slow(_white(0.003, 0.01), 25.0, 0.12, 0.05, in_world=True)
 LIDAR_ODOMETRY = replace(_white(0.01, 0.03), walk_by_metre=sigmas(0.006, 0.012))
 VIO = replace(_white(0.0008, 0.03), walk=sigmas(0.004, 0.06))
-_FLICKER = tuple(GaussMarkov(tau, sigmas(0.002, 0.12)) for tau in (0.1, 0.4, 1.6, 6.4, 25.6))
+_FLICKER = tuple(
+    GaussMarkov(tau, sigmas(0.002, 0.12)) for tau in (0.1, 0.4, 1.6, 6.4, 25.6)
+)
 
 _hand = partial(RecordingClass, motion=motions.hand_held, lever_m=0.4)
 _car = partial(RecordingClass, motion=motions.car, lever_m=1.5)
@@ -148,13 +164,17 @@ CLASSES = {
     "hand_gm_03s_white": _hand(
         80.0, 20.0, _slow(_HAND, 0.3, 0.003, 0.2), _slow(_HAND, 0.3, 0.006, 0.4)
     ),
-    "hand_flicker": _hand(80.0, 15.0, _MOCAP, replace(_white(0.001, 0.06), slow=_FLICKER)),
+    "hand_flicker": _hand(
+        80.0, 15.0, _MOCAP, replace(_white(0.001, 0.06), slow=_FLICKER)
+    ),
     "car_ins_lidar": _car(240.0, 10.0, _INS, LIDAR_ODOMETRY),
     "car_vo_scale": _car(
         240.0,
         10.0,
         _INS,
-        replace(_white(0.004, 0.02), walk_by_metre=sigmas(0.004, 0.01), scale=(0.01, 40.0)),
+        replace(
+            _white(0.004, 0.02), walk_by_metre=sigmas(0.004, 0.01), scale=(0.01, 40.0)
+        ),
         lever_m=1.2,
     ),
     "car_jitter": _car(
@@ -185,10 +205,17 @@ CLASSES = {
         _slow(_white(0.005, 0.05), 20.0, 0.015, 0.08, in_world=True),
     ),
     "drone_gnss_vio": _drone(
-        150.0, 20.0, _slow(_white(0.004, 0.05), 15.0, 0.15, 0.2, in_world=True), VIO, lever_m=0.2
+        150.0,
+        20.0,
+        _slow(_white(0.004, 0.05), 15.0, 0.15, 0.2, in_world=True),
+        VIO,
+        lever_m=0.2,
     ),
     "drone_rotation_1deg": _drone(
-        100.0, 20.0, _white(0.002, 1.0), replace(_white(0.003, 0.3), walk=sigmas(0.002, 0.02))
+        100.0,
+        20.0,
+        _white(0.002, 1.0),
+        replace(_white(0.003, 0.3), walk=sigmas(0.002, 0.02)),
     ),
     "arm_target": _arm(
         150.0,
@@ -196,7 +223,9 @@ CLASSES = {
         _slow(_white(0.0001, 0.005), 5.0, 0.0003, 0.02),
         _slow(
             SensorErrors(
-                white=sigmas(np.array([0.0008, 0.0008, 0.003]), np.array([0.3, 0.3, 0.06]))
+                white=sigmas(
+                    np.array([0.0008, 0.0008, 0.003]), np.array([0.3, 0.3, 0.06])
+                )
             ),
             1.0,
             0.0005,
@@ -224,7 +253,9 @@ CLASSES = {
     "drone_anisotropic": _drone(
         120.0,
         20.0,
-        SensorErrors(white=sigmas(np.array([0.002, 0.002, 0.012]), np.array([0.3, 0.1, 0.1]))),
+        SensorErrors(
+            white=sigmas(np.array([0.002, 0.002, 0.012]), np.array([0.3, 0.1, 0.1]))
+        ),
         SensorErrors(
             white=sigmas(np.array([0.015, 0.003, 0.003]), np.array([0.1, 0.1, 0.5])),
             walk=sigmas(np.array([0.004, 0.001, 0.001]), np.array([0.01, 0.01, 0.04])),
@@ -235,7 +266,10 @@ CLASSES = {
         30.0,
         _white(0.001, 0.08),
         _slow(
-            replace(_white(0.002, 0.1), walk=sigmas(0.003, 0.05), jumps_per_s=0.2), 2.0, 0.002, 0.1
+            replace(_white(0.002, 0.1), walk=sigmas(0.003, 0.05), jumps_per_s=0.2),
+            2.0,
+            0.002,
+            0.1,
         ),
     ),
     "drone_two_vios": _drone(

@@ -31,7 +31,9 @@ def _root_of_median(median: float) -> _Statistic:
     """Geometric mean over the groups of the root of the median over what is expected."""
 
     def statistic(groups: list[FloatArray]) -> float:
-        return float(np.exp(np.mean([0.5 * np.log(np.median(g) / median) for g in groups])))
+        return float(
+            np.exp(np.mean([0.5 * np.log(np.median(g) / median) for g in groups]))
+        )
 
     return statistic
 

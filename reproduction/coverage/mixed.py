@@ -21,7 +21,11 @@ _KINDS = {
 }
 MIXED = tuple(_KINDS)
 
-_TAILS = (Tail("student", factor=4.0), Tail("spikes", 0.03, 15.0), Tail("bursts", 0.1, 8.0))
+_TAILS = (
+    Tail("student", factor=4.0),
+    Tail("spikes", 0.03, 15.0),
+    Tail("bursts", 0.1, 8.0),
+)
 _RATES_HZ = (5.0, 10.0, 15.0, 20.0, 30.0)
 _MOST_POSES = 2500
 
@@ -51,7 +55,9 @@ def drawn_class(name: str, rng: np.random.Generator) -> RecordingClass:
     )
 
 
-def _drawn_errors(rng: np.random.Generator, size: float, by_metre: bool) -> SensorErrors:
+def _drawn_errors(
+    rng: np.random.Generator, size: float, by_metre: bool
+) -> SensorErrors:
     errors = SensorErrors(
         white=sigmas(
             _between(rng, 0.0005, 0.006) * size * _by_axis(rng),
@@ -65,7 +71,9 @@ def _drawn_errors(rng: np.random.Generator, size: float, by_metre: bool) -> Sens
     if rng.random() < 0.4:
         errors = _slow(errors, rng, (2.0, 40.0), (0.005 * size, 0.05 * size), True)
     if rng.random() < 0.2:
-        errors = replace(errors, scale=(_between(rng, 0.002, 0.015), _between(rng, 5.0, 60.0)))
+        errors = replace(
+            errors, scale=(_between(rng, 0.002, 0.015), _between(rng, 5.0, 60.0))
+        )
     if rng.random() < 0.15:
         errors = replace(errors, jitter_s=_between(rng, 0.0005, 0.004))
     if rng.random() < 0.25:

@@ -40,7 +40,9 @@ RAMP_PERIOD_S = 31.0
 
 
 def _grid(duration_s: float) -> FloatArray:
-    return np.arange(round((duration_s + 2 * _MARGIN_S) * _RATE) + 1) / _RATE - _MARGIN_S
+    return (
+        np.arange(round((duration_s + 2 * _MARGIN_S) * _RATE) + 1) / _RATE - _MARGIN_S
+    )
 
 
 def _waves(
@@ -67,7 +69,9 @@ def _smooth_steps(
     smooth_s: float,
 ) -> FloatArray:
     """A level (N,) drawn anew every hold_s or so, smoothed."""
-    ends = np.cumsum(rng.uniform(0.5, 1.5, int(np.ptp(times) / hold_s * 2) + 4) * hold_s)
+    ends = np.cumsum(
+        rng.uniform(0.5, 1.5, int(np.ptp(times) / hold_s * 2) + 4) * hold_s
+    )
     drawn = levels(len(ends) + 1)
     values = drawn[np.searchsorted(ends, times - times[0])]
     return gaussian_filter1d(values, smooth_s * _RATE, mode="nearest")
@@ -99,12 +103,20 @@ def _ground_vehicle(
     """A vehicle that moves along its own x axis; bumps (N, 3): extra roll, pitch (rad), heave."""
     heading = np.cumsum(yaw_rate) / _RATE
     velocity = speed[:, None] * np.stack(
-        [np.cos(heading) * np.cos(slope), np.sin(heading) * np.cos(slope), np.sin(slope)], axis=-1
+        [
+            np.cos(heading) * np.cos(slope),
+            np.sin(heading) * np.cos(slope),
+            np.sin(slope),
+        ],
+        axis=-1,
     )
     positions = np.cumsum(velocity, axis=0) / _RATE
     positions[:, 2] += bumps[:, 2]
     return Motion(
-        _from_euler(np.column_stack([heading, bumps[:, 1] - slope, bank + bumps[:, 0]]), positions)
+        _from_euler(
+            np.column_stack([heading, bumps[:, 1] - slope, bank + bumps[:, 0]]),
+            positions,
+        )
     )
 
 
@@ -115,9 +127,13 @@ def car(rng: np.random.Generator, duration_s: float) -> Motion:
     """
     times = _grid(duration_s)
     speed = np.clip(9.0 + 3.5 * _waves(rng, times, 1, (0.01, 0.06))[:, 0], 2.0, 18.0)
-    bends = _smooth_steps(rng, times, 6.0, lambda size: rng.normal(0.0, 0.18, size), 0.8)
+    bends = _smooth_steps(
+        rng, times, 6.0, lambda size: rng.normal(0.0, 0.18, size), 0.8
+    )
     junctions = rng.choice([-0.45, 0.0, 0.0, 0.45], size=int(duration_s / 4) + 4)
-    turns = _smooth_steps(rng, times, 5.0, lambda size: rng.choice(junctions, size), 0.6)
+    turns = _smooth_steps(
+        rng, times, 5.0, lambda size: rng.choice(junctions, size), 0.6
+    )
     slope = np.radians(2.5) * _waves(rng, times, 1, (0.02, 0.1))[:, 0]
     bank = np.radians(1.2) * _waves(rng, times, 1, (0.03, 0.15))[:, 0]
     bumps = np.array([0.006, 0.005, 0.015]) * _waves(rng, times, 3, (0.5, 1.5))
@@ -130,8 +146,12 @@ def agv(rng: np.random.Generator, duration_s: float, ramps: bool = True) -> Moti
     Without ``ramps`` the floor is flat and has no bumps.
     """
     times = _grid(duration_s)
-    speed = _smooth_steps(rng, times, 8.0, lambda size: rng.uniform(0.4, 1.4, size), 0.7)
-    yaw_rate = _smooth_steps(rng, times, 5.0, lambda size: rng.normal(0.0, 0.35, size), 0.5)
+    speed = _smooth_steps(
+        rng, times, 8.0, lambda size: rng.uniform(0.4, 1.4, size), 0.7
+    )
+    yaw_rate = _smooth_steps(
+        rng, times, 5.0, lambda size: rng.normal(0.0, 0.35, size), 0.5
+    )
     flat = np.zeros_like(times)
     slope = flat
     if ramps:
@@ -143,7 +163,9 @@ def agv(rng: np.random.Generator, duration_s: float, ramps: bool = True) -> Moti
     return _ground_vehicle(times, speed, yaw_rate, slope, flat, bumps)
 
 
-def _bumps_of_agv(rng: np.random.Generator, times: FloatArray, slope: FloatArray) -> FloatArray:
+def _bumps_of_agv(
+    rng: np.random.Generator, times: FloatArray, slope: FloatArray
+) -> FloatArray:
     """Extra roll, pitch (rad) and heave (N, 3) on a slope (N,) (rad) that is not quite straight."""
     bumps = np.zeros((len(times), 3))
     bumps[:, :2] = np.radians(0.25) * _waves(rng, times, 2, (0.3, 1.0))
@@ -151,14 +173,20 @@ def _bumps_of_agv(rng: np.random.Generator, times: FloatArray, slope: FloatArray
     return bumps
 
 
-def agv_on_request(rng: np.random.Generator, duration_s: float, flat_s: float = 0.0) -> Motion:
+def agv_on_request(
+    rng: np.random.Generator, duration_s: float, flat_s: float = 0.0
+) -> Motion:
     """An automated guided vehicle that drives what the node asks for: curves, and a ramp at times.
 
     A ramp of 7 deg takes 8 s, up and down in turn. Before ``flat_s``, there are no ramps.
     """
     times = _grid(duration_s)
-    speed = _smooth_steps(rng, times, 8.0, lambda size: rng.uniform(0.6, 1.4, size), 0.7)
-    yaw_rate = _smooth_steps(rng, times, 5.0, lambda size: rng.normal(0.0, 0.35, size), 0.5)
+    speed = _smooth_steps(
+        rng, times, 8.0, lambda size: rng.uniform(0.6, 1.4, size), 0.7
+    )
+    yaw_rate = _smooth_steps(
+        rng, times, 5.0, lambda size: rng.normal(0.0, 0.35, size), 0.5
+    )
     ramps, since_s = np.divmod(times + rng.uniform(0.0, RAMP_PERIOD_S), RAMP_PERIOD_S)
     share = np.clip(np.minimum(since_s, 8.0 - since_s), 0.0, 1.0)
     slope = np.radians(7.0) * share * np.where(ramps % 2, 1.0, -1.0)
@@ -175,15 +203,23 @@ def flat_agv(rng: np.random.Generator, duration_s: float) -> Motion:
 def excavator(rng: np.random.Generator, duration_s: float) -> Motion:
     """The cab of an excavator: it slews to and fro, rocks, and now and then drives a little."""
     times = _grid(duration_s)
-    slewing = _smooth_steps(rng, times, 4.0, lambda size: rng.normal(0.0, 0.5, size), 0.5)
+    slewing = _smooth_steps(
+        rng, times, 4.0, lambda size: rng.normal(0.0, 0.5, size), 0.5
+    )
     tilt = np.radians(2.0) * _waves(rng, times, 2, (0.1, 0.6))
     tilt += np.radians(4.0) * _waves(rng, times, 2, (0.01, 0.05), 3)
     speeds = [0.0, 0.0, 0.0, 0.6, -0.6]
     speed = _smooth_steps(rng, times, 6.0, lambda size: rng.choice(speeds, size), 0.6)
-    steering = _smooth_steps(rng, times, 6.0, lambda size: rng.normal(0.0, 0.8, size), 0.5)
+    steering = _smooth_steps(
+        rng, times, 6.0, lambda size: rng.normal(0.0, 0.8, size), 0.5
+    )
     heading = np.cumsum(0.15 * (speed != 0) * steering) / _RATE
-    velocity = np.stack([speed * np.cos(heading), speed * np.sin(heading), 0.02 * speed], axis=-1)
-    positions = np.cumsum(velocity, axis=0) / _RATE + 0.01 * _waves(rng, times, 3, (0.3, 1.0))
+    velocity = np.stack(
+        [speed * np.cos(heading), speed * np.sin(heading), 0.02 * speed], axis=-1
+    )
+    positions = np.cumsum(velocity, axis=0) / _RATE + 0.01 * _waves(
+        rng, times, 3, (0.3, 1.0)
+    )
     yaw = heading + np.cumsum(slewing) / _RATE
     return Motion(_from_euler(np.column_stack([yaw, tilt]), positions))
 

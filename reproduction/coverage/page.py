@@ -36,7 +36,9 @@ _ABOUT = {
 }
 _PERCENT = ("covers", "covers_floor", "covers_truth", "refused")
 # Of the levels of noise, outliers and drift the strongest are shown.
-_LEVELS_SHOWN = {" ".join(path_to(dataset, LEVELS[dataset][-1])) for dataset in SIMULATED}
+_LEVELS_SHOWN = {
+    " ".join(path_to(dataset, LEVELS[dataset][-1])) for dataset in SIMULATED
+}
 
 
 class Goal(NamedTuple):
@@ -52,17 +54,27 @@ class Goal(NamedTuple):
 
 _EACH = "(?!all )"
 GOALS = (
-    Goal("error over bound, geometric mean at most 1.05", "simulated", "bound", 0, 1.05),
+    Goal(
+        "error over bound, geometric mean at most 1.05", "simulated", "bound", 0, 1.05
+    ),
     Goal("no class above 1.4", "simulated", "bound", 0, 1.4, _EACH),
     Goal("median NEES 4.5 to 6.0", "simulated", "nees", 4.5, 6.0),
     Goal("90 % intervals cover 0.88 to 0.92", "simulated", "covers", 0.88, 0.92),
     Goal("0.82 to 0.97 in every class", "simulated", "covers", 0.82, 0.97, _EACH),
     Goal("flat_agv is refused", "simulated", "refused", 1.0, 1.0, "flat_agv"),
-    Goal("real, with the floor: 0.87 to 0.93", "known answer", "covers_floor", 0.87, 0.93),
+    Goal(
+        "real, with the floor: 0.87 to 0.93", "known answer", "covers_floor", 0.87, 0.93
+    ),
     Goal("without it at least 0.80", "known answer", "covers", 0.8, 1.0),
     Goal("scatter of rigs over sigma 0.8 to 1.25", "rig", "scatter", 0.8, 1.25),
     Goal("of each rig 0.6 to 1.5", "rig", "scatter", 0.6, 1.5, _EACH),
-    Goal("scatter of halves and thirds over sigma 0.8 to 1.25", "parts", "scatter", 0.8, 1.25),
+    Goal(
+        "scatter of halves and thirds over sigma 0.8 to 1.25",
+        "parts",
+        "scatter",
+        0.8,
+        1.25,
+    ),
     Goal("three devices close to 0.10 deg", "cycle", "deg", 0, 0.1, "tango"),
     Goal("chi2 of that is below 12.6", "cycle", "chi2", 0, 12.6, "tango"),
     Goal("what leaves something open is refused", "refused", "refused", 1.0, 1.0),
@@ -83,7 +95,8 @@ def page(rows: Sequence[Row], absent: Sequence[str], seeds: range) -> str:
         "## Goals",
         "Missed goals are bold.",
         markdown_table(
-            {"goal": goal.text} | {method: reached(goal, rows, method) for method in methods}
+            {"goal": goal.text}
+            | {method: reached(goal, rows, method) for method in methods}
             for goal in GOALS
         ),
     ]
@@ -91,7 +104,8 @@ def page(rows: Sequence[Row], absent: Sequence[str], seeds: range) -> str:
         chosen = [
             row
             for row in rows
-            if row.table == table and (row.name == POOLED.get(table) or _is_shown(row, methods[0]))
+            if row.table == table
+            and (row.name == POOLED.get(table) or _is_shown(row, methods[0]))
         ]
         if chosen:
             shown = (_shown(row, columns, methods[0]) for row in chosen)
@@ -110,12 +124,15 @@ def reached(goal: Goal, rows: Sequence[Row], method: str) -> str:
     values = {
         row.name: row.value(goal.kind)
         for row in rows
-        if (row.table, row.method) == (goal.table, method) and re.match(goal.names, row.name)
+        if (row.table, row.method) == (goal.table, method)
+        and re.match(goal.names, row.name)
     }
     values = {name: value for name, value in values.items() if np.isfinite(value)}
     if not values:
         return ""
-    name = max(values, key=lambda name: max(goal.low - values[name], values[name] - goal.high))
+    name = max(
+        values, key=lambda name: max(goal.low - values[name], values[name] - goal.high)
+    )
     text = f"{values[name]:.3g}" + (f" ({name})" if len(values) > 1 else "")
     return text if goal.low <= values[name] <= goal.high else f"**{text}**"
 
@@ -132,4 +149,10 @@ def cell(row: Row, kind: str) -> str:
         return ""
     if kind in _PERCENT:
         return f"{100.0 * value:.0f} %"
-    return f"{value:.3f}" if kind == "deg" else f"{value:.2f}" if value < 100 else f"{value:.0f}"
+    return (
+        f"{value:.3f}"
+        if kind == "deg"
+        else f"{value:.2f}"
+        if value < 100
+        else f"{value:.0f}"
+    )

@@ -31,7 +31,9 @@ METHODS = {
 }
 
 
-def answer(parent: Trajectory, child: Trajectory, options: Mapping[str, Any]) -> Calibration | None:
+def answer(
+    parent: Trajectory, child: Trajectory, options: Mapping[str, Any]
+) -> Calibration | None:
     """A calibration, None if it fails."""
     try:
         return calibrate(parent, child, **options)
@@ -48,7 +50,9 @@ def _name_of(rig: Rig, name: str) -> str:
     return f"{rig.name} {name}".removesuffix(" whole")
 
 
-def _row(table: str, name: str, method: str, cases: Mapping[str, Mapping[str, float]]) -> Row:
+def _row(
+    table: str, name: str, method: str, cases: Mapping[str, Mapping[str, float]]
+) -> Row:
     """A row from the measures of each case."""
     by_kind: dict[str, dict[str, float]] = {}
     for case, measures in cases.items():
@@ -137,7 +141,9 @@ def truth_cases(result: Calibration, truth: Truth) -> dict[str, dict[str, float]
         "z": {"": float(np.max(apart / sigmas))},
         "covers": _by_axis(apart < _REACH * sigmas, is_comparable),
         "covers_floor": _by_axis(apart < _REACH * with_floor, is_comparable),
-        "covers_truth": _by_axis(apart < _REACH * np.hypot(sigmas, of_truth), is_comparable),
+        "covers_truth": _by_axis(
+            apart < _REACH * np.hypot(sigmas, of_truth), is_comparable
+        ),
     }
     if is_comparable[3:].any():
         cases["deg"] = {"": float(np.degrees(np.linalg.norm(apart[3:])))}
@@ -162,7 +168,9 @@ def refused_row(rig: Rig, name: str, method: str) -> Row:
     """Whether a recording that leaves something open is refused: no answer, or not an OK one."""
     result = _of_rig(rig, name, method)
     is_refused = result is None or result.status is not SolveStatus.OK
-    return Row("refused", _name_of(rig, name), method, {"refused": {"": float(is_refused)}})
+    return Row(
+        "refused", _name_of(rig, name), method, {"refused": {"": float(is_refused)}}
+    )
 
 
 def scatter_row(rig: Rig, method: str) -> Row:
@@ -179,8 +187,12 @@ def parts_row(rig: Rig, name: str, method: str) -> Row:
         assert whole is not None
         parts = rig.recordings[name].parts(count, whole.time_offset_s)
         options = {**rig.options, **METHODS[method]}
-        answers = [answer(recording.parent, recording.child, options) for recording in parts]
-        cases |= {f"{label} {key}": value for key, value in _scatter_cases(answers).items()}
+        answers = [
+            answer(recording.parent, recording.child, options) for recording in parts
+        ]
+        cases |= {
+            f"{label} {key}": value for key, value in _scatter_cases(answers).items()
+        }
     return Row("parts", _name_of(rig, name), method, {"scatter": cases})
 
 
@@ -193,7 +205,9 @@ def _scatter_cases(answers: Sequence[Calibration | None]) -> dict[str, float]:
         return {}
     is_comparable = np.logical_and.reduce([_knows(result) for result in good])
     sigmas = np.array([result.sigmas_measured for result in good])
-    off = np.array([deviation(result.T_parent_child, good[0].T_parent_child) for result in good])
+    off = np.array(
+        [deviation(result.T_parent_child, good[0].T_parent_child) for result in good]
+    )
     stated = (np.where(is_comparable, sigmas, 1.0) ** 2).mean(axis=0)
     ratios = off.var(axis=0, ddof=1) / stated
     return {
@@ -214,7 +228,8 @@ def cycle_row(rigs: Mapping[str, Rig], method: str) -> Row:
     metres, radians = (float(np.linalg.norm(axes)) for axes in (xi[:3], xi[3:]))
     sizes = {"mm": 1e3 * metres, "deg": float(np.degrees(radians))}
     cases = {
-        kind: {"": value} for kind, value in (sizes | {"chi2": _squared(xi, covariance)}).items()
+        kind: {"": value}
+        for kind, value in (sizes | {"chi2": _squared(xi, covariance)}).items()
     }
     return Row("cycle", "tango", method, cases)
 

@@ -15,7 +15,9 @@ from hand_eye_calib.core.geometry import se3
 
 def sigmas(metres: float | FloatArray, degrees: float | FloatArray) -> FloatArray:
     """Standard deviations (6,) of (rho, phi), in m and rad."""
-    return np.concatenate([np.full(3, 1.0) * metres, np.radians(np.full(3, 1.0) * degrees)])
+    return np.concatenate(
+        [np.full(3, 1.0) * metres, np.radians(np.full(3, 1.0) * degrees)]
+    )
 
 
 def _no_error() -> FloatArray:
@@ -60,7 +62,9 @@ class Tail:
         return 1.0
 
 
-def _bursts(rng: np.random.Generator, count: int, share: float, length: float) -> BoolArray:
+def _bursts(
+    rng: np.random.Generator, count: int, share: float, length: float
+) -> BoolArray:
     """Whether each pose (N,) lies in a burst; bursts last ``length`` poses on average."""
     inside = False
     flags = np.empty(count, dtype=bool)
@@ -123,7 +127,11 @@ class DrawnErrors:
 
 
 def draw(
-    errors: SensorErrors, Ts: FloatArray, twists: FloatArray, dt: float, rng: np.random.Generator
+    errors: SensorErrors,
+    Ts: FloatArray,
+    twists: FloatArray,
+    dt: float,
+    rng: np.random.Generator,
 ) -> DrawnErrors:
     """Measure the poses of a sensor once.
 
@@ -170,7 +178,9 @@ def _white(
     drawn = factors[:, None] * errors.white * rng.standard_normal((len(twists), 6))
     drawn += errors.jitter_s * twists * rng.standard_normal((len(twists), 1))
     covariances = factors_known[:, None, None] * np.diag(errors.white**2)
-    return drawn, covariances + errors.jitter_s**2 * twists[:, :, None] * twists[:, None, :]
+    return drawn, covariances + errors.jitter_s**2 * twists[:, :, None] * twists[
+        :, None, :
+    ]
 
 
 def _walk_variances(
@@ -190,7 +200,9 @@ def _scale_errors(
     if errors.scale is None:
         return np.zeros((len(steps), 6))
     sigma, tau_s = errors.scale
-    return scale_columns(steps) * (sigma * _markov(len(steps), 1, np.exp(-dt / tau_s), rng))
+    return scale_columns(steps) * (
+        sigma * _markov(len(steps), 1, np.exp(-dt / tau_s), rng)
+    )
 
 
 def scale_columns(steps: FloatArray) -> FloatArray:
@@ -207,7 +219,9 @@ def _integrated(start: FloatArray, steps: FloatArray) -> FloatArray:
     return poses
 
 
-def _markov(count: int, columns: int, phi: float, rng: np.random.Generator) -> FloatArray:
+def _markov(
+    count: int, columns: int, phi: float, rng: np.random.Generator
+) -> FloatArray:
     """Stationary first-order processes (N, columns) of variance 1."""
     values = rng.standard_normal((count, columns))
     values[1:] *= np.sqrt(1.0 - phi**2)
@@ -216,7 +230,9 @@ def _markov(count: int, columns: int, phi: float, rng: np.random.Generator) -> F
     return values
 
 
-def _slow(process: GaussMarkov, Ts: FloatArray, dt: float, rng: np.random.Generator) -> FloatArray:
+def _slow(
+    process: GaussMarkov, Ts: FloatArray, dt: float, rng: np.random.Generator
+) -> FloatArray:
     values = process.sigma * _markov(len(Ts), 6, np.exp(-dt / process.tau_s), rng)
     return np.einsum("nij,nj->ni", directions(process, Ts), values)
 

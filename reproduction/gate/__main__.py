@@ -43,13 +43,38 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the gate; returns the exit code."""
     parser = study_parser("reproduction.gate", __doc__)
     add = parser.add_argument
-    add("--quick", action="store_true", help="fewer recordings, simulated ones only: one minute")
+    add(
+        "--quick",
+        action="store_true",
+        help="fewer recordings, simulated ones only: one minute",
+    )
     add("--update", action="store_true", help="store the scores as the new baseline")
-    add("--baseline", metavar="FILE", type=Path, default=BASELINE, help="default: the stored one")
-    add("--jobs", type=int, default=os.cpu_count() or 1, help="processes. Default: all cores")
+    add(
+        "--baseline",
+        metavar="FILE",
+        type=Path,
+        default=BASELINE,
+        help="default: the stored one",
+    )
+    add(
+        "--jobs",
+        type=int,
+        default=os.cpu_count() or 1,
+        help="processes. Default: all cores",
+    )
     add("--against", metavar="FOLDER", type=Path, help="folder with another version")
-    add("--pieces", type=int, default=_PIECES, help="with --against: of each real recording")
-    add("--repeats", type=int, default=4, help="with --against: recordings of each platform")
+    add(
+        "--pieces",
+        type=int,
+        default=_PIECES,
+        help="with --against: of each real recording",
+    )
+    add(
+        "--repeats",
+        type=int,
+        default=4,
+        help="with --against: recordings of each platform",
+    )
     add("--seed", type=int, help="with --update or --against: draw other recordings")
     return exit_code_of(lambda: _run(parser.parse_args(argv)))
 
@@ -60,7 +85,9 @@ def _run(arguments: Namespace) -> int:
     if arguments.update:
         return _update(arguments)
     if arguments.seed is not None:
-        raise ConfigError("--seed goes with --update or --against: the baseline has a seed")
+        raise ConfigError(
+            "--seed goes with --update or --against: the baseline has a seed"
+        )
     return _check(arguments)
 
 
@@ -79,16 +106,24 @@ def _check(arguments: Namespace) -> int:
     comparisons = compare(scores, baseline)
     if not arguments.quick:
         new_scores = measure(seed_of(None), _NEW_DRAW, None, arguments.jobs)
-        old_scores = [score for score in baseline.scores.values() if score.family in MIXED]
+        old_scores = [
+            score for score in baseline.scores.values() if score.family in MIXED
+        ]
         comparisons.append(compare_new_draw(new_scores, old_scores))
     show(arguments.page, {"baseline": _report(comparisons, baseline)})
     return 1 if any(comparison.failures for comparison in comparisons) else 0
 
 
 def _report(comparisons: Sequence[Comparison], baseline: Baseline) -> str:
-    failures = [failure for comparison in comparisons for failure in comparison.failures]
+    failures = [
+        failure for comparison in comparisons for failure in comparison.failures
+    ]
     table = markdown_table([comparison.row for comparison in comparisons])
-    lines = [table, "", f"In brackets: the baseline, seed {baseline.seed}, {baseline.versions}."]
+    lines = [
+        table,
+        "",
+        f"In brackets: the baseline, seed {baseline.seed}, {baseline.versions}.",
+    ]
     if failures:
         lines += [f"Worse than the baseline ({versions()}):"]
         lines += [f"- {failure}" for failure in failures]
@@ -118,9 +153,13 @@ def _update(arguments: Namespace) -> int:
     return 0
 
 
-def measure(seed: int, numbers: Mapping[str, int], folder: Path | None, jobs: int) -> list[Score]:
+def measure(
+    seed: int, numbers: Mapping[str, int], folder: Path | None, jobs: int
+) -> list[Score]:
     """Score simulated recordings, then real ones if there is a folder of them."""
-    draws = [(family, seed, k) for family, count in numbers.items() for k in range(count)]
+    draws = [
+        (family, seed, k) for family, count in numbers.items() for k in range(count)
+    ]
     scores = [*in_parallel(score_simulated, draws, jobs)]
     if folder is not None:
         cases = real_cases(folder, _PIECES, np.random.default_rng(seed))

@@ -46,9 +46,14 @@ _90_PERCENT = 1.645
 def solved(cases: list[Case], package: Path, options: dict[str, Any]) -> list[Any]:
     """Answers of the version of the package in a folder."""
     with tempfile.TemporaryDirectory() as folder:
-        cases_file, answers_file = (str(Path(folder) / name) for name in ("given", "found"))
+        cases_file, answers_file = (
+            str(Path(folder) / name) for name in ("given", "found")
+        )
         asked = [
-            ([(stream.stamps_ns, stream.poses) for stream in case.streams], case.options | options)
+            (
+                [(stream.stamps_ns, stream.poses) for stream in case.streams],
+                case.options | options,
+            )
             for case in cases
         ]
         Path(cases_file).write_bytes(pickle.dumps(asked))
@@ -62,7 +67,9 @@ def _sizes(case: Case, answer: Any, is_determined: BoolArray) -> FloatArray:
     """Errors of translation and rotation; half of what the truth is not known to counts."""
     is_determined = is_determined & np.isfinite(case.sigmas)
     squares = np.where(
-        is_determined, deviation(answer[0], case.T_parent_child) ** 2 + 0.25 * case.sigmas**2, 0.0
+        is_determined,
+        deviation(answer[0], case.T_parent_child) ** 2 + 0.25 * case.sigmas**2,
+        0.0,
     )
     parts = slice(0, 3), slice(3, 6)
     return np.array(
@@ -70,7 +77,9 @@ def _sizes(case: Case, answer: Any, is_determined: BoolArray) -> FloatArray:
     )
 
 
-def row(cases: list[Case], own_answers: list[Any], others: dict[str, list[Any]]) -> dict[str, str]:
+def row(
+    cases: list[Case], own_answers: list[Any], others: dict[str, list[Any]]
+) -> dict[str, str]:
     """Figures of the recordings of one family."""
     cells = {"recordings": str(len(cases))}
     for name, answers in others.items():
@@ -92,7 +101,9 @@ def row(cases: list[Case], own_answers: list[Any], others: dict[str, list[Any]])
         is_comparable = answer[3] & np.isfinite(case.sigmas)
         for index, covariance in enumerate(answer[1:3]):
             variances = np.diag(to_parent @ covariance @ to_parent.T) + case.sigmas**2
-            inside[index] += [*(np.abs(off) < _90_PERCENT * np.sqrt(variances))[is_comparable]]
+            inside[index] += [
+                *(np.abs(off) < _90_PERCENT * np.sqrt(variances))[is_comparable]
+            ]
         if case.bound is not None and answer[3].all():
             xi = to_parent.T @ off
             squares.append(xi @ np.linalg.solve(case.bound, xi))
@@ -127,5 +138,8 @@ def table(cases: list[Case], package: Path, against: Path) -> str:
         )
     columns = [*dict.fromkeys(name for cells_of_row in rows for name in cells_of_row)]
     return markdown_table(
-        [{name: cells_of_row.get(name, "") for name in columns} for cells_of_row in rows]
+        [
+            {name: cells_of_row.get(name, "") for name in columns}
+            for cells_of_row in rows
+        ]
     )

@@ -66,7 +66,9 @@ class Baseline:
             content = json.loads(path.read_text(encoding="utf-8"))
             scores = [_score_of(values) for values in content["scores"]]
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{path} is no baseline: {error}. Write one with --update") from error
+            raise InputError(
+                f"{path} is no baseline: {error}. Write one with --update"
+            ) from error
         by_name = {score.name: score for score in scores}
         return cls(content["seed"], content["versions"], by_name)
 
@@ -75,13 +77,17 @@ class Baseline:
         lines = [json.dumps(_values_of(score)) for score in self.scores.values()]
         scores = ",\n".join(lines)
         head = f'"seed": {self.seed},\n"versions": {json.dumps(self.versions)}'
-        path.write_text(f'{{\n{head},\n"scores": [\n{scores}\n]\n}}\n', encoding="utf-8")
+        path.write_text(
+            f'{{\n{head},\n"scores": [\n{scores}\n]\n}}\n', encoding="utf-8"
+        )
 
 
 def _values_of(score: Score) -> dict[str, Any]:
     """Values that differ from those of a recording without an answer, rounded."""
     empty = asdict(Score(family="", name="", verdict=""))
-    values = {name: value for name, value in asdict(score).items() if value != empty[name]}
+    values = {
+        name: value for name, value in asdict(score).items() if value != empty[name]
+    }
     for name in ("over_bound", "nees"):
         if name in values:
             values[name] = float(f"{values[name]:.4g}")
@@ -94,7 +100,9 @@ def _values_of(score: Score) -> dict[str, Any]:
 def _score_of(values: dict[str, Any]) -> Score:
     errors = tuple(values.get("errors", ()))
     robust_errors = tuple(values.get("robust_errors", ()))
-    return Score(**{"verdict": "", **values, "errors": errors, "robust_errors": robust_errors})
+    return Score(
+        **{"verdict": "", **values, "errors": errors, "robust_errors": robust_errors}
+    )
 
 
 @dataclass(frozen=True)
@@ -121,12 +129,17 @@ def compare(scores: Sequence[Score], baseline: Baseline) -> list[Comparison]:
 
 
 def _comparison(
-    family: str, now: Sequence[Score], before: Sequence[Score], tolerances: Tolerances | None
+    family: str,
+    now: Sequence[Score],
+    before: Sequence[Score],
+    tolerances: Tolerances | None,
 ) -> Comparison:
     figures = _figures(now)
     old_figures = _figures(before)
     figures["error / baseline"] = error_ratio(now, before)
-    figures["stricter"] = float(sum(_is_stricter(*pair) for pair in zip(now, before, strict=True)))
+    figures["stricter"] = float(
+        sum(_is_stricter(*pair) for pair in zip(now, before, strict=True))
+    )
     row: dict[str, object] = {"family": family, "recordings": len(now)}
     for name, value in figures.items():
         text = _FORMATS[name].format(value)
@@ -134,7 +147,11 @@ def _comparison(
         if not np.isnan(old_value):
             text += f" ({_FORMATS[name].format(old_value)})"
         row[name] = "" if np.isnan(value) else text
-    failures = [] if tolerances is None else [*_failures(figures, old_figures, tolerances, now)]
+    failures = (
+        []
+        if tolerances is None
+        else [*_failures(figures, old_figures, tolerances, now)]
+    )
     row["result"] = _result(failures) if tolerances else ""
     return Comparison(row, [f"{family}: {failure}" for failure in failures])
 
@@ -197,7 +214,9 @@ def error_ratio(now: Sequence[Score], before: Sequence[Score]) -> float:
         pairs = [
             (new.errors, old.errors)
             for new, old in zip(now, before, strict=True)
-            if old.family == family and old.errors and len(new.errors) == len(old.errors)
+            if old.family == family
+            and old.errors
+            and len(new.errors) == len(old.errors)
         ]
         if pairs:
             errors = np.array(pairs)
@@ -244,7 +263,9 @@ def _failures(
         yield f"{figures['stricter']:.0f} verdicts are stricter"
 
 
-def compare_new_draw(scores: Sequence[Score], old_scores: Sequence[Score]) -> Comparison:
+def compare_new_draw(
+    scores: Sequence[Score], old_scores: Sequence[Score]
+) -> Comparison:
     """Compare figures of recordings drawn anew with those of others of the same families.
 
     The seed of the baseline can be tuned on, a new one cannot. Differences count beyond
@@ -254,11 +275,16 @@ def compare_new_draw(scores: Sequence[Score], old_scores: Sequence[Score]) -> Co
     old_figures = _figures(old_scores)
     failures = []
     if _excess([_log_errors(scores), _log_errors(old_scores)]) > _CHANCE:
-        failures.append("new draw: errors over their bound are larger than in the baseline")
+        failures.append(
+            "new draw: errors over their bound are larger than in the baseline"
+        )
     shares = [_shares_outside(scores), _shares_outside(old_scores)]
     if _excess(shares) > _CHANCE:
         failures.append("new draw: 90 % intervals cover less than in the baseline")
-    row: dict[str, object] = {"family": "platforms drawn anew", "recordings": len(scores)}
+    row: dict[str, object] = {
+        "family": "platforms drawn anew",
+        "recordings": len(scores),
+    }
     for name, form in _FORMATS.items():
         is_known = name in figures
         text = f"{form} ({form})"

@@ -65,11 +65,15 @@ def real_cases(
     for rig in real_rigs(folder)[0]:
         if rig.truth is None or rig.is_refused or rig.name == "boreas":
             continue
-        options = {name: value for name, value in rig.options.items() if name in option_names}
+        options = {
+            name: value for name, value in rig.options.items() if name in option_names
+        }
         family = rig.name if "kitti" in rig.name else rig.name.split("_")[0]
         for name, recording in rig.recordings.items():
             streams = recording.parent, recording.child
-            for number, streams_of_case in enumerate([streams, *_pieces(recording, pieces, rng)]):
+            for number, streams_of_case in enumerate(
+                [streams, *_pieces(recording, pieces, rng)]
+            ):
                 yield Case(
                     family=family,
                     name=f"{rig.name} {name} {number}",

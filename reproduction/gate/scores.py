@@ -57,7 +57,10 @@ def score(case: Case) -> Score:
     is_use = result.verdict is Verdict.USE
     if case.is_refused:
         return Score(
-            family=case.family, name=case.name, verdict=result.verdict.value, is_wrong=is_use
+            family=case.family,
+            name=case.name,
+            verdict=result.verdict.value,
+            is_wrong=is_use,
         )
     errors = deviation(result.T_parent_child, case.T_parent_child)
     is_observed = np.isfinite(result.sigmas)
@@ -72,7 +75,9 @@ def score(case: Case) -> Score:
         covariance = to_parent @ result.covariance_measured @ to_parent.T
         over_bound = _squared(errors, to_parent @ case.bound @ to_parent.T)
         nees = _squared(errors, covariance)
-    robust = answer(*case.streams, {**case.options, "method": "robust", "checks": False})
+    robust = answer(
+        *case.streams, {**case.options, "method": "robust", "checks": False}
+    )
     return Score(
         family=case.family,
         name=case.name,
@@ -88,7 +93,9 @@ def score(case: Case) -> Score:
     )
 
 
-def _errors_of(case: Case, result: Calibration, is_observed: BoolArray) -> tuple[float, ...]:
+def _errors_of(
+    case: Case, result: Calibration, is_observed: BoolArray
+) -> tuple[float, ...]:
     """Errors of translation and rotation, over the bound if there is one, otherwise in mm and deg.
 
     Axes that the answer to be scored does not observe do not count in real recordings. A simulated
@@ -103,7 +110,8 @@ def _errors_of(case: Case, result: Calibration, is_observed: BoolArray) -> tuple
     to_parent = _to_parent(result)
     bound = to_parent @ case.bound @ to_parent.T
     return tuple(
-        float(np.sqrt(_squared(errors[axes], bound[axes, axes]) / MEDIAN_3)) for axes in _PARTS
+        float(np.sqrt(_squared(errors[axes], bound[axes, axes]) / MEDIAN_3))
+        for axes in _PARTS
     )
 
 

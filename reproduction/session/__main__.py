@@ -23,10 +23,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("study", choices=tuple(STUDIES))
     out = Path("reproduced")
     about = "where results are kept; they are not solved again"
-    add("--rows", metavar="DIR", type=Path, default=out, help=f"{about}. Default: {out}")
+    add(
+        "--rows", metavar="DIR", type=Path, default=out, help=f"{about}. Default: {out}"
+    )
     add("--seeds", type=int, default=4, help="recordings of a class. Default: 4")
     add("--first-seed", type=int, default=0, help="fresh recordings. Default: 0")
-    add("--hours", type=float, default=5.0, help="simulated hours of a class. Default: 5")
+    add(
+        "--hours",
+        type=float,
+        default=5.0,
+        help="simulated hours of a class. Default: 5",
+    )
     add("--jobs", type=int, default=1, help="processes. Default: 1")
     return int(exit_code_of(lambda: run(parser.parse_args(argv))))
 
@@ -75,14 +82,26 @@ def _ramps(arguments: argparse.Namespace) -> str:
 
 def _together(arguments: argparse.Namespace) -> str:
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
-    tasks = {f"{name} {seed}": (name, seed) for name in together.SIMULATED for seed in seeds}
+    tasks = {
+        f"{name} {seed}": (name, seed) for name in together.SIMULATED for seed in seeds
+    }
     path = arguments.rows / "together_simulated.jsonl"
     jobs = arguments.jobs
     simulated = kept(path, together.simulated, tasks, jobs)
-    rigs = [rig for rig in _rigs(arguments) if not rig.is_refused and len(rig.recordings) > 1]
-    recorded = {f"{rig.name} {name}": (rig, name) for rig in rigs for name in rig.recordings}
-    rigs_solved = kept(arguments.rows / "together_real.jsonl", together.real, recorded, jobs)
-    return together.tables([*together.rigs_of(simulated, rigs, rigs_solved)], arguments.first_seed)
+    rigs = [
+        rig
+        for rig in _rigs(arguments)
+        if not rig.is_refused and len(rig.recordings) > 1
+    ]
+    recorded = {
+        f"{rig.name} {name}": (rig, name) for rig in rigs for name in rig.recordings
+    }
+    rigs_solved = kept(
+        arguments.rows / "together_real.jsonl", together.real, recorded, jobs
+    )
+    return together.tables(
+        [*together.rigs_of(simulated, rigs, rigs_solved)], arguments.first_seed
+    )
 
 
 def _alarms(arguments: argparse.Namespace) -> str:
@@ -93,7 +112,9 @@ def _alarms(arguments: argparse.Namespace) -> str:
 def _delays(arguments: argparse.Namespace) -> str:
     tasks = [(kind, seed) for kind in mount.SHIFTED for seed in range(arguments.seeds)]
     delays_of_tasks = in_parallel(mount.delays, tasks, arguments.jobs)
-    return mount.delay_table([delay for several in delays_of_tasks for delay in several])
+    return mount.delay_table(
+        [delay for several in delays_of_tasks for delay in several]
+    )
 
 
 STUDIES: dict[str, Callable[[argparse.Namespace], str]] = {

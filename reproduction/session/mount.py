@@ -20,14 +20,21 @@ from reproduction.writing import markdown_table, triple
 
 PIECE_S = 600.0
 # Not the flat floor, which hides the height, and not the recordings with a jump every five seconds.
-WATCHED = tuple(name for name in CLASSES if name not in ("flat_agv", "hand_mixture_30s"))
+WATCHED = tuple(
+    name for name in CLASSES if name not in ("flat_agv", "hand_mixture_30s")
+)
 
 SHIFTED = {
     "hand-held": ("hand_gm_1s", "hand_vio_walk"),
     "AGV": ("agv_ramps", "agv_long"),
     "car": ("car_ins_lidar", "car_two_slams"),
 }
-SHIFTS = {"0.5 deg": np.radians(0.5), "2 deg": np.radians(2.0), "1 cm": 0.01, "5 cm": 0.05}
+SHIFTS = {
+    "0.5 deg": np.radians(0.5),
+    "2 deg": np.radians(2.0),
+    "1 cm": 0.01,
+    "5 cm": 0.05,
+}
 _BEFORE_S = 900.0
 _AFTER_S = 1800.0
 
@@ -62,12 +69,18 @@ class Delay:
     announced: float
 
 
-def _pieces(name: str, seed: int, X: FloatArray, duration_s: float) -> Iterator[PosePairs]:
+def _pieces(
+    name: str, seed: int, X: FloatArray, duration_s: float
+) -> Iterator[PosePairs]:
     """Synchronised poses of a class that follow each other, with this extrinsic."""
     rate_hz = min(CLASSES[name].rate_hz, _RATE_HZ)
-    kind = dataclasses.replace(CLASSES[name], duration_s=min(duration_s, PIECE_S), rate_hz=rate_hz)
+    kind = dataclasses.replace(
+        CLASSES[name], duration_s=min(duration_s, PIECE_S), rate_hz=rate_hz
+    )
     for number in range(round(duration_s / kind.duration_s)):
-        made = simulate(kind, (_MOUNT_SEED, seed, number, sorted(CLASSES).index(name)), X)
+        made = simulate(
+            kind, (_MOUNT_SEED, seed, number, sorted(CLASSES).index(name)), X
+        )
         pairs = synchronise(made.parent, made.child, 0.5)
         # Half a minute between the pieces: nothing runs across.
         later_ns = round(number * (kind.duration_s + 30.0)) * _SECOND_NS
@@ -144,7 +157,9 @@ def delays(kind: str, seed: int) -> list[Delay]:
     return delays_of_kind
 
 
-def _seconds_until_seen(monitor: MountMonitor, parts: list[PosePairs], xi: FloatArray) -> float:
+def _seconds_until_seen(
+    monitor: MountMonitor, parts: list[PosePairs], xi: FloatArray
+) -> float:
     before = monitor.seconds
     for pairs in parts:
         moved = PosePairs(pairs.stamps_ns, pairs.Ts_pw_p, pairs.Ts_cw_c @ se3.exp(xi))
@@ -157,17 +172,28 @@ def _seconds_until_seen(monitor: MountMonitor, parts: list[PosePairs], xi: Float
 def delay_table(delays_measured: Sequence[Delay]) -> str:
     """A row for every motion and shift."""
     rows = []
-    for kind, size in dict.fromkeys((delay.kind, delay.size) for delay in delays_measured):
-        some = [delay for delay in delays_measured if (delay.kind, delay.size) == (kind, size)]
+    for kind, size in dict.fromkeys(
+        (delay.kind, delay.size) for delay in delays_measured
+    ):
+        some = [
+            delay
+            for delay in delays_measured
+            if (delay.kind, delay.size) == (kind, size)
+        ]
         # A value of at most 1: the monitor said beforehand that ten minutes show this shift.
         announced, others = (
-            np.array([delay.seconds for delay in some if (delay.announced <= 1.0) == is_said])
+            np.array(
+                [delay.seconds for delay in some if (delay.announced <= 1.0) == is_said]
+            )
             for is_said in (True, False)
         )
         words = ["-", "-"]
         if len(announced):
             quantiles = np.quantile(announced, [0.5, 0.9], method="higher")
-            words = [f"{value:.0f}" if np.isfinite(value) else "> 1800" for value in quantiles]
+            words = [
+                f"{value:.0f}" if np.isfinite(value) else "> 1800"
+                for value in quantiles
+            ]
         rows.append(
             {
                 "motion": kind,

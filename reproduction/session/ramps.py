@@ -106,7 +106,9 @@ def _end_of_node(steps: Sequence[Step], newest: Sequence[Excitation]) -> End:
         if progress.done:
             ratios = np.array([left_s / (motion_s - at_s) for at_s, left_s in times])
             n_good_times = int(((ratios >= 0.5) & (ratios <= 2.0)).sum())
-            row = End("", n_times=len(times), n_good_times=n_good_times, change_s=change_s)
+            row = End(
+                "", n_times=len(times), n_good_times=n_good_times, change_s=change_s
+            )
             return _with_error(row, steps, index)
         if progress.will_not_get_there and index:
             change_s += motion_s - steps[index - 1].seen.motion_s

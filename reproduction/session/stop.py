@@ -67,7 +67,9 @@ class Rule(NamedTuple):
         confirmation = f"for {shortest}"
         if self.of_motion:
             confirmation = f"for {self.of_motion:.0%} of the motion, {shortest}"
-            confirmation += f" to {self.longest_s:g} s" if self.longest_s < np.inf else " or more"
+            confirmation += (
+                f" to {self.longest_s:g} s" if self.longest_s < np.inf else " or more"
+            )
         return f"{self.of_target:g} of the target, {confirmation}"
 
 
@@ -140,7 +142,11 @@ def simulated(seeds: int) -> Iterator[Recorded]:
                 made = simulate(replace(CLASSES[name], duration_s=duration_s), key)
                 truth = Truth.within(made.T_parent_child, 0.0, 0.0)
                 yield Recorded(
-                    f"{name} {seed}", kind, Recording(made.parent, made.child), truth, {}
+                    f"{name} {seed}",
+                    kind,
+                    Recording(made.parent, made.child),
+                    truth,
+                    {},
                 )
 
 
@@ -149,13 +155,17 @@ def real(rigs: Sequence[Rig]) -> Iterator[Recorded]:
     for rig in rigs:
         if rig.truth is not None:
             for name, recording in rig.recordings.items():
-                yield Recorded(f"{rig.name} {name}", rig.name, recording, rig.truth, rig.options)
+                yield Recorded(
+                    f"{rig.name} {name}", rig.name, recording, rig.truth, rig.options
+                )
 
 
 def stops(recorded: Recorded) -> list[dict[str, Any]]:
     """Plain values of a :class:`Stop` for every factor of the target, and for every rule."""
     steps = list(_steps(recorded))
-    return [vars(stop) for factor in FACTORS for stop in _stops(recorded, steps, factor)]
+    return [
+        vars(stop) for factor in FACTORS for stop in _stops(recorded, steps, factor)
+    ]
 
 
 def _ends_s(duration_s: float) -> list[float]:
@@ -185,7 +195,9 @@ def _steps(recorded: Recorded) -> Iterator[Step]:
         share = end_s / duration_s
         parts = [
             until(stream, start_ns + round(share * (end_ns - start_ns)))
-            for stream, (start_ns, end_ns) in zip(streams, (of_parent, of_child), strict=True)
+            for stream, (start_ns, end_ns) in zip(
+                streams, (of_parent, of_child), strict=True
+            )
         ]
         try:
             snapshot = whole_snapshot(parts[0], parts[1], options).resolved
@@ -199,7 +211,9 @@ def _steps(recorded: Recorded) -> Iterator[Step]:
 
 def until(trajectory: Trajectory, stamp_ns: int) -> Trajectory:
     """The poses up to a stamp (ns), three at least."""
-    return trajectory[: max(int(np.searchsorted(trajectory.stamps_ns, stamp_ns, side="right")), 3)]
+    return trajectory[
+        : max(int(np.searchsorted(trajectory.stamps_ns, stamp_ns, side="right")), 3)
+    ]
 
 
 def _stops(recorded: Recorded, steps: Sequence[Step], factor: float) -> Iterator[Stop]:
@@ -252,7 +266,9 @@ def _stop(
     """The end of a session after a part; None for a session that goes on."""
     if end is None:
         return Stop(recorded.kind, rule, factor, is_stuck=False)
-    worst = [_worst(step.error, recorded.truth.sigmas, factor) for step in steps[: end + 1]]
+    worst = [
+        _worst(step.error, recorded.truth.sigmas, factor) for step in steps[: end + 1]
+    ]
     # From here on all errors stay within their targets.
     first = max((i + 1 for i, ratio in enumerate(worst) if ratio > 1.0), default=0)
     return Stop(
@@ -281,7 +297,9 @@ def table(stops: Sequence[Stop], which: str) -> str:
     rows = []
     for factor in FACTORS:
         of_factor = [stop for stop in stops if stop.factor == factor and not stop.rule]
-        kinds = {stop.kind for stop in of_factor if factor == 1.0 and which == "simulated"}
+        kinds = {
+            stop.kind for stop in of_factor if factor == 1.0 and which == "simulated"
+        }
         for kind in (kind for kind in KINDS if kind in kinds):
             rows.append(_row(kind, factor, [s for s in of_factor if s.kind == kind]))
         rows.append(_row("**all**", factor, of_factor))
@@ -294,12 +312,16 @@ def rules_table(stops: Sequence[Stop]) -> str:
     for rule in dict.fromkeys(stop.rule for stop in stops):
         row: dict[str, object] = {"rule": rule or "**of the node**"}
         for factor in FACTORS:
-            of_rule = [stop for stop in stops if stop.rule == rule and stop.factor == factor]
+            of_rule = [
+                stop for stop in stops if stop.rule == rule and stop.factor == factor
+            ]
             columns = _row("", factor, of_rule)
             ended = f"{columns['told to stop']} of {len(of_rule)}"
             text = f"{ended}, {columns['worst axis within target']}"
             text += f", {columns['largest error / target']}"
-            row[str(columns["target"])] = f"{text}, {columns['seconds beyond earliest']} s"
+            row[str(columns["target"])] = (
+                f"{text}, {columns['seconds beyond earliest']} s"
+            )
         rows.append(row)
     return markdown_table(rows)
 

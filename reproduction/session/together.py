@@ -56,7 +56,9 @@ def simulated(name: str, seed: int) -> dict[str, Any]:
         made = simulate(kind, (33, seed, number, sorted(CLASSES).index(name)), X)
         result = calibrate(made.parent, made.child, checks=False)
         moved = se3.exp(scatter * rng.standard_normal(6))
-        result = dataclasses.replace(result, T_parent_child=result.T_parent_child @ moved)
+        result = dataclasses.replace(
+            result, T_parent_child=result.T_parent_child @ moved
+        )
         results[str(number)] = result.to_dict()
         own[str(number)] = (X @ moved).tolist()
     return {"results": results, "truth": X.tolist(), "own": own}
@@ -65,25 +67,33 @@ def simulated(name: str, seed: int) -> dict[str, Any]:
 def real(rig: Rig, name: str) -> dict[str, Any]:
     """Plain result of a recording."""
     recording = rig.recordings[name]
-    return calibrate(recording.parent, recording.child, method="auto", **rig.options).to_dict()
+    return calibrate(
+        recording.parent, recording.child, method="auto", **rig.options
+    ).to_dict()
 
 
 def rigs_of(
-    solved: Mapping[str, Mapping[str, Any]], rigs: Iterable[Rig], records: Mapping[str, Any]
+    solved: Mapping[str, Mapping[str, Any]],
+    rigs: Iterable[Rig],
+    records: Mapping[str, Any],
 ) -> Iterator[Recorded]:
     """The rigs from what was solved: simulated ones by their names, recordings by ``RIG NAME``."""
     for name, plain in solved.items():
         results = {
-            key: Calibration.from_dict(document) for key, document in plain["results"].items()
+            key: Calibration.from_dict(document)
+            for key, document in plain["results"].items()
         }
         exact = Truth.within(np.array(plain["truth"]), 0.0, 0.0)
-        own = {key: Truth.within(np.array(T), 0.0, 0.0) for key, T in plain["own"].items()}
+        own = {
+            key: Truth.within(np.array(T), 0.0, 0.0) for key, T in plain["own"].items()
+        }
         yield Recorded(f"simulated {name.split()[0]}", results, exact, own)
     euroc: dict[str, Calibration] = {}
     truth = None
     for rig in rigs:
         results = {
-            name: Calibration.from_dict(records[f"{rig.name} {name}"]) for name in rig.recordings
+            name: Calibration.from_dict(records[f"{rig.name} {name}"])
+            for name in rig.recordings
         }
         yield Recorded(rig.name, results, rig.truth)
         if rig.name.startswith("euroc"):
@@ -121,8 +131,12 @@ def tables(rigs: Sequence[Recorded], seed: int) -> str:
     )
 
 
-def _subsets(results: Mapping[str, Calibration], count: int) -> list[dict[str, Calibration]]:
-    return [{name: results[name] for name in some} for some in combinations(results, count)]
+def _subsets(
+    results: Mapping[str, Calibration], count: int
+) -> list[dict[str, Calibration]]:
+    return [
+        {name: results[name] for name in some} for some in combinations(results, count)
+    ]
 
 
 def _row(kind: str, rigs: Sequence[Recorded]) -> dict[str, object]:
@@ -134,7 +148,9 @@ def _row(kind: str, rigs: Sequence[Recorded]) -> dict[str, object]:
             assert rig.truth is not None
             for some in _subsets(rig.results, count):
                 joint = together(some) if count > 1 else next(iter(some.values()))
-                is_comparable = np.isfinite(rig.truth.sigmas) & np.isfinite(joint.sigmas_measured)
+                is_comparable = np.isfinite(rig.truth.sigmas) & np.isfinite(
+                    joint.sigmas_measured
+                )
                 error = deviation(joint.T_parent_child, rig.truth.T_parent_child)
                 # One recording shows its own mount only: its interval is of that.
                 of = rig.own.get(min(some), rig.truth) if count == 1 else rig.truth
@@ -166,4 +182,6 @@ def _knocked(result: Calibration, rng: np.random.Generator) -> Calibration:
     directions: FloatArray = rng.standard_normal((2, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     xi = np.concatenate([_KNOCK_M * directions[0], _KNOCK_RAD * directions[1]])
-    return dataclasses.replace(result, T_parent_child=result.T_parent_child @ se3.exp(xi))
+    return dataclasses.replace(
+        result, T_parent_child=result.T_parent_child @ se3.exp(xi)
+    )

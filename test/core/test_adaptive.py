@@ -8,7 +8,14 @@ from functools import cache
 import numpy as np
 import pytest
 import real_data
-from motions import T_PARENT_CHILD, child_of, disturbed, planar_poses, walked, wandering_poses
+from motions import (
+    T_PARENT_CHILD,
+    child_of,
+    disturbed,
+    planar_poses,
+    walked,
+    wandering_poses,
+)
 from sigmas import assert_nees, nees
 
 import hand_eye_calib as hec
@@ -42,7 +49,9 @@ def late(poses, seconds, interval_s=0.1):
     velocity between its neighbours.
     """
     velocities = se3.log(se3.inverse(poses[:-2]) @ poses[2:]) / (2 * interval_s)
-    return poses @ se3.exp(-seconds * np.concatenate([velocities[:1], velocities, velocities[-1:]]))
+    return poses @ se3.exp(
+        -seconds * np.concatenate([velocities[:1], velocities, velocities[-1:]])
+    )
 
 
 def biased(poses, bias):
@@ -51,7 +60,9 @@ def biased(poses, bias):
     # the estimator takes the bias out per metre of the disturbed path
     disturbed_steps = true_steps = steps[:, :3, 3].copy()
     for _ in range(50):
-        disturbed_steps = true_steps + bias * np.linalg.norm(disturbed_steps, axis=1, keepdims=True)
+        disturbed_steps = true_steps + bias * np.linalg.norm(
+            disturbed_steps, axis=1, keepdims=True
+        )
     steps[:, :3, 3] = disturbed_steps
     return walked(steps, poses[0])
 
@@ -73,7 +84,9 @@ def systematic(parent, nuisance, parameters):
 def with_noise(streams, seed):
     """Both streams with white noise of a millimetre and a milliradian."""
     parent, child = streams
-    return disturbed(parent, seed + 100, 1e-3, 1e-3), disturbed(child, seed + 200, 1e-3, 1e-3)
+    return disturbed(parent, seed + 100, 1e-3, 1e-3), disturbed(
+        child, seed + 200, 1e-3, 1e-3
+    )
 
 
 NO_SYSTEMATIC_ERROR = np.zeros(increments.N_SYSTEMATIC)
@@ -82,7 +95,11 @@ NO_SYSTEMATIC_ERROR = np.zeros(increments.N_SYSTEMATIC)
 def linearised(streams, T_parent_child=T_PARENT_CHILD, parameters=NO_SYSTEMATIC_ERROR):
     course = increments.course_of(streams, T_PARENT_CHILD)
     return increments.linearise(
-        streams, course, T_parent_child, parameters, list(range(increments.N_SYSTEMATIC))
+        streams,
+        course,
+        T_parent_child,
+        parameters,
+        list(range(increments.N_SYSTEMATIC)),
     )
 
 
@@ -103,8 +120,12 @@ def test_derivatives_are_the_numerical_ones():
     for column in range(6 + increments.N_SYSTEMATIC):
         change = np.zeros(6 + increments.N_SYSTEMATIC)
         change[column] = step
-        ahead = inner_residuals(streams, T_PARENT_CHILD @ se3.exp(change[:6]), change[6:])
-        behind = inner_residuals(streams, T_PARENT_CHILD @ se3.exp(-change[:6]), -change[6:])
+        ahead = inner_residuals(
+            streams, T_PARENT_CHILD @ se3.exp(change[:6]), change[6:]
+        )
+        behind = inner_residuals(
+            streams, T_PARENT_CHILD @ se3.exp(-change[:6]), -change[6:]
+        )
         numerical = (ahead - behind) / (2 * step)
         tolerance = 2e-8
         if column == SCALE_COLUMN:
@@ -128,9 +149,13 @@ def noisy_drive(seed, n_poses=150, white=(0.004, 0.006), drift=(0.0, 0.0)):
     parent = wandering_poses(n_poses, seed)
     child = child_of(parent)
     steps = se3.inverse(child[:-1]) @ child[1:]
-    wander = np.random.default_rng(1000 + seed).normal(size=(n_poses - 1, 6)) * np.repeat(drift, 3)
+    wander = np.random.default_rng(1000 + seed).normal(
+        size=(n_poses - 1, 6)
+    ) * np.repeat(drift, 3)
     poses = walked(steps @ se3.exp(wander), child[0])
-    return disturbed(parent, 2 * seed + 5, *white), disturbed(poses, 2 * seed + 6, *white)
+    return disturbed(parent, 2 * seed + 5, *white), disturbed(
+        poses, 2 * seed + 6, *white
+    )
 
 
 def drift_of(noise):
@@ -146,7 +171,9 @@ def test_the_noise_levels_are_recovered(white, drift):
     for seed in range(5):
         parent, child = noisy_drive(seed, white=white, drift=drift)
         noise = estimator.solve(stamps(150), parent, child, systematic=()).noise
-        levels.append([noise.translation_white_m, noise.rotation_white_rad, *drift_of(noise)])
+        levels.append(
+            [noise.translation_white_m, noise.rotation_white_rad, *drift_of(noise)]
+        )
     median = np.median(levels, axis=0)
     expected = np.r_[np.sqrt(2) * np.array(white), drift]
     strong = expected > 0.5 * expected.max()
@@ -214,7 +241,9 @@ def solved_with_lasting(kind, seed):
     errors = lasting(100 + seed, 600, [added.sigma, 0.002], added.tau_poses)
     parent, child = added.disturb(parent, child, errors)
     solution = estimator.solve(stamps(600), parent, child)
-    processes = [process for process in solution.noise.lasting if process.part == added.part]
+    processes = [
+        process for process in solution.noise.lasting if process.part == added.part
+    ]
     strongest = max(processes, key=lambda process: process.sigma)
     # Rotations fixed to the body are no process: the scatter of the tenths has to state them.
     assessment = assess_adaptive(PosePairs(stamps(600), parent, child), solution)
@@ -236,7 +265,9 @@ def test_errors_that_last_are_found_and_told_apart(kind):
 def test_flicker_is_stated_beyond_what_was_found():
     """Errors that last on all scales: the longest cannot be found, and X takes their mean."""
     parent = wandering_poses(500)
-    error = sum(lasting(seed, 500, [0.004, 0.004], tau) for seed, tau in enumerate((3, 30, 300)))
+    error = sum(
+        lasting(seed, 500, [0.004, 0.004], tau) for seed, tau in enumerate((3, 30, 300))
+    )
     child = child_of(parent) @ se3.exp(error)
     stated = estimator.solve(stamps(500), parent, child)
     without = replace(TUNING, undetected_share=0.0)
@@ -253,7 +284,9 @@ def test_noise_as_large_as_the_motion_does_not_draw_the_answer():
     for seed in range(8):
         parent = wandering_poses(800, seed, step_m=0.02, step_rad=0.01)
         child = disturbed(child_of(parent), 300 + seed, 0.002, 0.015)
-        solution = estimator.solve(stamps(800), disturbed(parent, seed, 0.002, 0.015), child)
+        solution = estimator.solve(
+            stamps(800), disturbed(parent, seed, 0.002, 0.015), child
+        )
         values.append(nees_of(solution))
     assert_nees(values, 0.0, 25.0, np.median)
 
@@ -293,9 +326,13 @@ def parameters_of(nuisance):
 def test_the_right_systematic_error_is_chosen_and_measured(nuisance):
     solutions = [noisy_and_solved(nuisance, seed)[1] for seed in range(4)]
     chosen = [solution.systematic for solution in solutions]
-    parameters = [solution.parameters[parameters_of(nuisance)] for solution in solutions]
+    parameters = [
+        solution.parameters[parameters_of(nuisance)] for solution in solutions
+    ]
     assert chosen.count(nuisance) >= 3
-    np.testing.assert_allclose(np.median(parameters, axis=0), VALUES[nuisance], atol=3e-3)
+    np.testing.assert_allclose(
+        np.median(parameters, axis=0), VALUES[nuisance], atol=3e-3
+    )
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -303,7 +340,9 @@ def test_a_lag_is_measured_and_stated(seed):
     _, solution = noisy_and_solved("time", seed)
     assert solution.time_offset_s == pytest.approx(-0.02, abs=1e-3)
     words = " ".join(solution.describe(stamps(300)).in_words)
-    assert re.search(r"the child's stamps are (19|20|21)\.\d \+/- 0\.\d+ ms late", words)
+    assert re.search(
+        r"the child's stamps are (19|20|21)\.\d \+/- 0\.\d+ ms late", words
+    )
 
 
 @pytest.mark.statistics
@@ -331,13 +370,17 @@ def test_on_flat_ground_no_sideways_slip_is_assumed():
 def test_poses_wrong_by_themselves_are_bridged():
     parent, child = noisy_drive(4, white=(0.002, 0.002))
     spikes = np.array([20, 41, 42, 80, 120])
-    child[spikes] = child[spikes] @ se3.exp(np.random.default_rng(5).normal(0, 0.2, (5, 6)))
+    child[spikes] = child[spikes] @ se3.exp(
+        np.random.default_rng(5).normal(0, 0.2, (5, 6))
+    )
     child[100:, :3, 3] += [0.3, -0.2, 0.1]
     solution = estimator.solve(stamps(150), parent, child)
     np.testing.assert_array_equal(np.flatnonzero(solution.spikes), spikes)
     np.testing.assert_array_equal(np.flatnonzero(solution.jumps), [99])
     undisturbed = estimator.solve(stamps(150), *noisy_drive(4, white=(0.002, 0.002)))
-    np.testing.assert_allclose(solution.T_parent_child, undisturbed.T_parent_child, atol=2e-3)
+    np.testing.assert_allclose(
+        solution.T_parent_child, undisturbed.T_parent_child, atol=2e-3
+    )
     words = " ".join(solution.describe(stamps(150)).in_words)
     assert "5 outlier poses, left out, at 2.000, 4.100, 4.200, 8.000, 12.000 s" in words
     assert "1 jump of a trajectory, just before 10.000 s" in words
@@ -350,14 +393,20 @@ def test_heavy_tails_leave_the_answer_near():
     for seed in range(6):
         parent = wandering_poses(200, seed)
         tails = np.sqrt(3 / random.chisquare(3, (2, 200, 1)))
-        noise = se3.exp(random.normal(size=(2, 200, 6)) * tails * np.repeat([0.003, 0.004], 3))
-        solution = estimator.solve(stamps(200), parent @ noise[0], child_of(parent) @ noise[1])
+        noise = se3.exp(
+            random.normal(size=(2, 200, 6)) * tails * np.repeat([0.003, 0.004], 3)
+        )
+        solution = estimator.solve(
+            stamps(200), parent @ noise[0], child_of(parent) @ noise[1]
+        )
         values.append(nees_of(solution))
     assert_nees(values, 0.0, 10.0, np.median)
 
 
 def test_a_long_recording_is_solved_in_parts(monkeypatch):
-    parent, child = fixed_to_body(*noisy_drive(6, 900), lasting(7, 900, [0.02, 0.0], 20))
+    parent, child = fixed_to_body(
+        *noisy_drive(6, 900), lasting(7, 900, [0.02, 0.0], 20)
+    )
     child[300:, :3, 3] += [0.5, -0.3, 0.2]
     whole = estimator.solve(stamps(900), parent, child)
     for module in (partwise, stages):
@@ -368,7 +417,11 @@ def test_a_long_recording_is_solved_in_parts(monkeypatch):
     assert 0.0 < np.max(np.abs(difference) / sigmas) < 0.5
     ratios = np.sqrt(np.diag(in_parts.cov_parent_child_in_child)) / sigmas
     assert np.all((ratios > 0.95) & (ratios < 1.1))
-    assert np.flatnonzero(in_parts.jumps).tolist() == np.flatnonzero(whole.jumps).tolist() == [299]
+    assert (
+        np.flatnonzero(in_parts.jumps).tolist()
+        == np.flatnonzero(whole.jumps).tolist()
+        == [299]
+    )
     assert ("body", "translation") in whole.model.processes
     assert in_parts.model.processes == whole.model.processes
     assert in_parts.converged
@@ -377,7 +430,9 @@ def test_a_long_recording_is_solved_in_parts(monkeypatch):
 def target_seen_by(camera, seed):
     """Poses of parent and child, one of which is a camera that sees a target."""
     parent = wandering_poses(200, seed)
-    child = child_of(parent, T_cw_pw=se3.exp(np.array([1.0, -1.0, 0.5, 0.5, 0.2, -2.0])))
+    child = child_of(
+        parent, T_cw_pw=se3.exp(np.array([1.0, -1.0, 0.5, 0.5, 0.2, -2.0]))
+    )
     parent = se3.exp(np.array([-1.0, 0.4, 0.8, 0.1, 0.7, -0.4])) @ parent
     if camera == "child":
         return parent, disturbed_about_origin(child, 300 + seed, 0.003, 0.004)
@@ -406,12 +461,19 @@ def test_jumps_of_either_sensor_are_found_at_their_places():
 @pytest.mark.parametrize("level", [0.0, 1e-3])
 def test_flat_ground_hides_the_height_and_only_that(level):
     parent = planar_poses(200)
-    parent, child = disturbed(parent, 1, level, level), disturbed(child_of(parent), 2, level, level)
+    parent, child = (
+        disturbed(parent, 1, level, level),
+        disturbed(child_of(parent), 2, level, level),
+    )
     solution = estimator.solve(stamps(200), parent, child)
     assessment = assess_adaptive(PosePairs(stamps(200), parent, child), solution)
     verdicts = {dof.name: dof.verdict for dof in assessment.observability}
-    assert [axis for axis in verdicts if verdicts[axis] is DofVerdict.UNOBSERVABLE] == ["z"]
-    np.testing.assert_allclose(solution.T_parent_child[:2, 3], T_PARENT_CHILD[:2, 3], atol=0.01)
+    assert [axis for axis in verdicts if verdicts[axis] is DofVerdict.UNOBSERVABLE] == [
+        "z"
+    ]
+    np.testing.assert_allclose(
+        solution.T_parent_child[:2, 3], T_PARENT_CHILD[:2, 3], atol=0.01
+    )
 
 
 def test_no_motion_at_all_is_no_number():

@@ -36,7 +36,9 @@ def solve_and_assess(parent, child, reference="B1", method=DNL):
     pairs = motion_pairs(parent, child, reference)
     solution = method.solve(pairs)
     return solution, uncertainty.assess(
-        pairs, solution, lambda left_out: method.solve_without(pairs, solution, left_out)
+        pairs,
+        solution,
+        lambda left_out: method.solve_without(pairs, solution, left_out),
     )
 
 
@@ -51,7 +53,9 @@ def errors_and_covariances(n_runs, estimate):
             motions.disturbed(parent, 2 * run, 0.005, 0.005),
             motions.disturbed(child, 2 * run + 1, 0.005, 0.005),
         )
-        errors.append(se3.log(se3.inverse(solution.T_parent_child) @ motions.T_PARENT_CHILD))
+        errors.append(
+            se3.log(se3.inverse(solution.T_parent_child) @ motions.T_PARENT_CHILD)
+        )
         covariances.append(covariance)
     return np.array(errors), np.array(covariances)
 
@@ -74,13 +78,17 @@ def with_white_noise(poses, seed):
 
 def drifting(poses, seed):
     steps = se3.inverse(poses[:-1]) @ poses[1:]
-    steps = steps @ se3.exp(np.random.default_rng(seed).normal(0.0, 0.003, (len(steps), 6)))
+    steps = steps @ se3.exp(
+        np.random.default_rng(seed).normal(0.0, 0.003, (len(steps), 6))
+    )
     return motions.walked(steps, poses[0])
 
 
 @pytest.mark.statistics
 @pytest.mark.parametrize("disturb", [with_white_noise, drifting])
-def test_the_jackknife_of_the_adaptive_estimator_is_the_size_of_a_model_that_is_right(disturb):
+def test_the_jackknife_of_the_adaptive_estimator_is_the_size_of_a_model_that_is_right(
+    disturb,
+):
     ratios = []
     for run in range(12):
         parent = motions.wandering_poses(150, seed=run)
@@ -95,7 +103,9 @@ def test_the_jackknife_of_the_adaptive_estimator_is_the_size_of_a_model_that_is_
         ratios.append(np.trace(np.linalg.solve(model, resampled)) / 6)
     # Cutting the trajectory around what is left out would give 2 and more under white noise.
     ratio = np.mean(ratios)
-    assert 0.7 < ratio < 1.4, f"variance of the jackknife over that of the model: {ratio:.2f}"
+    assert 0.7 < ratio < 1.4, (
+        f"variance of the jackknife over that of the model: {ratio:.2f}"
+    )
 
 
 @pytest.mark.parametrize(
@@ -145,26 +155,36 @@ class TestFloor:
         fixed = common_mode.common_mode_floor()
         np.testing.assert_allclose(np.diag(fixed)[:3], common_mode.FLOOR_TRANSLATION**2)
         np.testing.assert_allclose(np.diag(fixed)[3:], common_mode.FLOOR_ROTATION**2)
-        for variance, expected in ((1e6, 0.02), (0.01**2, 0.02 / np.sqrt(2)), (0.0, 0.0)):
+        for variance, expected in (
+            (1e6, 0.02),
+            (0.01**2, 0.02 / np.sqrt(2)),
+            (0.0, 0.0),
+        ):
             floor = common_mode.open_scale_floor(by_scale, variance)
             assert np.sqrt(floor[0, 0]) == pytest.approx(expected, rel=1e-3)
 
     def test_what_is_far_away_moves_the_centre_of_a_fast_odometry(self):
         sigmas = np.sqrt(np.diag(common_mode.common_mode_floor(speed_m_s=2.4)))
         np.testing.assert_allclose(sigmas[:3], 0.013)
-        fast = hec.calibrate(*(stream.scaled(20.0) for stream in streams()), checks=False)
+        fast = hec.calibrate(
+            *(stream.scaled(20.0) for stream in streams()), checks=False
+        )
         assert fast.allowance[:3].min() > 2 * common_mode.FLOOR_TRANSLATION
 
     def test_neither_stops_nor_jumps_count_for_the_usual_speed(self):
         stamps_ns = np.arange(600) * 100_000_000
-        x = 0.2 * np.clip(np.arange(600) - 300, 0, None)  # half of the time at rest, then 2 m/s
+        x = 0.2 * np.clip(
+            np.arange(600) - 300, 0, None
+        )  # half of the time at rest, then 2 m/s
         x[500:] += 40.0
         positions = np.column_stack([x, 0.0 * x, 0.0 * x])
         assert common_mode.usual_speed(stamps_ns, positions) == pytest.approx(2.0)
         assert common_mode.usual_speed(stamps_ns, 0.0 * positions) == 0.0
 
     def test_exact_poses_have_none(self):
-        both = hec.calibrate(*streams(), parent_kind="exact", child_kind="exact", checks=False)
+        both = hec.calibrate(
+            *streams(), parent_kind="exact", child_kind="exact", checks=False
+        )
         exact_child = hec.calibrate(*streams(), child_kind="exact", checks=False)
         odometry = hec.calibrate(*streams(), child_kind="odometry", checks=False)
         assert not both.allowance.any()
@@ -174,7 +194,9 @@ class TestFloor:
     @pytest.mark.parametrize("method", ["auto", "adaptive", "dnlo", "park"])
     def test_every_result_has_it_beside_the_covariance(self, method):
         result = hec.calibrate(*streams(), method=method, checks=False)
-        np.testing.assert_allclose(result.allowance[3:], common_mode.FLOOR_ROTATION, rtol=1e-3)
+        np.testing.assert_allclose(
+            result.allowance[3:], common_mode.FLOOR_ROTATION, rtol=1e-3
+        )
         assert 0.999 * common_mode.FLOOR_TRANSLATION < result.allowance[:3].max() < 0.01
         assert result.sigmas_measured[3:].max() < common_mode.FLOOR_ROTATION
         np.testing.assert_allclose(
@@ -193,7 +215,10 @@ class TestBlocks:
         products = np.tile(np.eye(7), (20, 1, 1))
         products[:, 6, :6] = np.random.default_rng(4).standard_normal((20, 6)) * scatter
         products[:, :6, 6] = products[:, 6, :6]
-        model = np.eye(6) / 20, SimpleNamespace(jumps=np.zeros(100), part_products=products)
+        model = (
+            np.eye(6) / 20,
+            SimpleNamespace(jumps=np.zeros(100), part_products=products),
+        )
         return 20 * np.diag(uncertainty.widened_by_blocks(*model, slice(0, 6)))
 
     def test_all_directions_have_one_factor(self):
@@ -202,7 +227,9 @@ class TestBlocks:
 
     def test_rotations_have_a_larger_one_if_they_scatter_more(self):
         of_translation, of_rotation = self.variances([1, 1, 1, 4, 4, 4]).reshape(2, 3)
-        np.testing.assert_allclose([*np.ptp([of_translation, of_rotation], axis=1)], 0.0, atol=1e-9)
+        np.testing.assert_allclose(
+            [*np.ptp([of_translation, of_rotation], axis=1)], 0.0, atol=1e-9
+        )
         assert 5.0 < of_translation[0] < of_rotation[0] / 1.5
 
     def test_parts_that_agree_leave_the_model(self):
@@ -222,25 +249,36 @@ class TestWhichAnswerStands:
         result = hec.calibrate(*streams, method="auto", checks=False)
         model = hec.calibrate(*streams, method="adaptive", checks=False)
         np.testing.assert_array_equal(result.T_parent_child, model.T_parent_child)
-        np.testing.assert_array_equal(result.covariance_measured, model.covariance_measured)
+        np.testing.assert_array_equal(
+            result.covariance_measured, model.covariance_measured
+        )
         assert (result.method, result.reference) == ("adaptive", "increments")
-        assert result.method_reason == "auto: adaptive, because its noise model works here"
+        assert (
+            result.method_reason == "auto: adaptive, because its noise model works here"
+        )
         assert result.noise == model.noise
         assert model.method_reason == ""
 
     @pytest.mark.parametrize(
         ("changes", "why"),
         [
-            ({"is_noise_dominated": True}, "single poses are noisier than the motion between them"),
+            (
+                {"is_noise_dominated": True},
+                "single poses are noisier than the motion between them",
+            ),
             ({"converged": False}, "the adaptive estimator did not converge"),
         ],
     )
-    def test_that_of_dnlo_if_the_noise_model_cannot_work(self, changes, why, monkeypatch):
+    def test_that_of_dnlo_if_the_noise_model_cannot_work(
+        self, changes, why, monkeypatch
+    ):
         solve = estimator.solve
         monkeypatch.setattr(
             estimation.adaptive_estimator,
             "solve",
-            lambda *poses, **options: dataclasses.replace(solve(*poses, **options), **changes),
+            lambda *poses, **options: dataclasses.replace(
+                solve(*poses, **options), **changes
+            ),
         )
         streams = noisy_streams()
         result = hec.calibrate(*streams, method="auto", checks=False)
@@ -248,9 +286,14 @@ class TestWhichAnswerStands:
         dnlo = hec.calibrate(*streams, method="dnlo", reference=reference, checks=False)
         np.testing.assert_array_equal(result.T_parent_child, dnlo.T_parent_child)
         assert (result.method, result.noise) == ("dnlo", None)
-        assert result.method_reason == f"auto: dnlo on reference {reference}, because {why}"
+        assert (
+            result.method_reason
+            == f"auto: dnlo on reference {reference}, because {why}"
+        )
 
-    def test_dnlo_instead_of_the_noise_model_has_the_excess_of_second_opinions(self, monkeypatch):
+    def test_dnlo_instead_of_the_noise_model_has_the_excess_of_second_opinions(
+        self, monkeypatch
+    ):
         solve = estimator.solve
         monkeypatch.setattr(
             estimation.adaptive_estimator,
@@ -267,7 +310,9 @@ class TestWhichAnswerStands:
         )
         streams = noisy_streams()
         result = hec.calibrate(*streams, method="auto", checks=False)
-        dnlo = hec.calibrate(*streams, method="dnlo", reference=result.reference, checks=False)
+        dnlo = hec.calibrate(
+            *streams, method="dnlo", reference=result.reference, checks=False
+        )
         added = result.covariance_measured - dnlo.covariance_measured
         np.testing.assert_allclose(np.diag(added), 1e-4, rtol=1e-3)
 
@@ -355,8 +400,16 @@ class TestOption:
             ("prior_x", "5.1+/-0.02", r"write 5.1cm\+/-0.02cm or 5.1m\+/-0.02m"),
             ("prior_y", "220.0+/-20.0", "may be m, cm or mm"),
             ("prior_z", "8+/-2cm", r"write 8cm\+/-2cm or 8m\+/-2cm"),
-            ("prior_z", "-22cm+/-2", "standard deviation 2 needs a unit: write 2cm or 2m"),
-            ("prior_yaw", "-90deg+/-2", "standard deviation 2 needs a unit: write 2deg or 2rad"),
+            (
+                "prior_z",
+                "-22cm+/-2",
+                "standard deviation 2 needs a unit: write 2cm or 2m",
+            ),
+            (
+                "prior_yaw",
+                "-90deg+/-2",
+                "standard deviation 2 needs a unit: write 2deg or 2rad",
+            ),
         ],
     )
     def test_what_does_not_say_enough_is_refused(self, name, text, message):
@@ -368,7 +421,9 @@ class TestFlatGround:
     def test_a_prior_alone_has_no_allowance_and_can_be_used(self):
         sigmas_m = {}
         for sigma_m in (0.02, 0.005):
-            result = calibrate(*flat_drive(), prior={"z": (1.85, sigma_m)}, checks=False)
+            result = calibrate(
+                *flat_drive(), prior={"z": (1.85, sigma_m)}, checks=False
+            )
             sigmas_m[sigma_m] = result.sigmas[2]
             assert result.observability[2].verdict is DofVerdict.PRIOR
             assert result.allowance[2] < 0.0005
@@ -376,25 +431,34 @@ class TestFlatGround:
         assert sigmas_m == pytest.approx({0.02: 0.02, 0.005: 0.005}, rel=0.02)
         assert sigmas_m[0.02] <= 0.02
 
-    def test_a_prior_beside_a_better_estimate_keeps_the_allowance_of_that(self, wandering):
+    def test_a_prior_beside_a_better_estimate_keeps_the_allowance_of_that(
+        self, wandering
+    ):
         streams, plain = wandering
-        vague = calibrate(*streams, reference="B10", prior={"z": (0.0, 100.0)}, checks=False)
+        vague = calibrate(
+            *streams, reference="B10", prior={"z": (0.0, 100.0)}, checks=False
+        )
         np.testing.assert_allclose(vague.allowance, plain.allowance, rtol=1e-3)
 
     def test_prior_fills_in_what_is_unknown(self):
         result = calibrate(*flat_drive(), reference="B10", prior={"z": (1.85, 0.02)})
         assert result.status is SolveStatus.OK
         assert result.unobservable() == []
-        np.testing.assert_allclose(result.T_parent_child[:3, 3], MOUNT[:3, 3], atol=0.03)
+        np.testing.assert_allclose(
+            result.T_parent_child[:3, 3], MOUNT[:3, 3], atol=0.03
+        )
         verdicts = {dof.name: dof.verdict for dof in result.observability}
         assert verdicts["z"] is DofVerdict.PRIOR
         assert verdicts["yaw"] is DofVerdict.OBSERVED
         assert sigmas(result)["z"] == pytest.approx(0.02, rel=0.05)
         assert any(
-            "z of the child sensor: mostly from the prior" in warning for warning in result.warnings
+            "z of the child sensor: mostly from the prior" in warning
+            for warning in result.warnings
         )
 
-    @pytest.mark.parametrize("method", ["dnlo", "dnl", "park", "taylor", "zhuang", "ali"])
+    @pytest.mark.parametrize(
+        "method", ["dnlo", "dnl", "park", "taylor", "zhuang", "ali"]
+    )
     def test_every_method_takes_it(self, method):
         # Zhuang's starts at no rotation and this mount is nearly half a turn.
         mount = se3.from_rotation_translation(
@@ -403,7 +467,12 @@ class TestFlatGround:
         # Rotations alone do not show where x points on flat ground: the paper's two-stage methods
         # need the yaw too.
         prior = {"z": (1.85, 0.02), "yaw": (0.4, 0.001)}
-        options = {"method": method, "reference": "B10", "prior": prior, "checks": False}
+        options = {
+            "method": method,
+            "reference": "B10",
+            "prior": prior,
+            "checks": False,
+        }
         result = calibrate(*flat_drive(noise=0.0005, mount=mount), **options)
         assert result.T_parent_child[2, 3] == pytest.approx(1.85, abs=0.03)
 
@@ -411,24 +480,37 @@ class TestFlatGround:
 @pytest.fixture(scope="module")
 def wandering():
     """Two streams of full motion, and their calibration without a prior."""
-    streams = motions.noisy_pair(motions.wandering_poses(300), 1, 0.01, 0.005, mount=MOUNT)
+    streams = motions.noisy_pair(
+        motions.wandering_poses(300), 1, 0.01, 0.005, mount=MOUNT
+    )
     return streams, calibrate(*streams, reference="B10")
 
 
 class TestFullMotion:
     def test_a_vague_prior_changes_nothing(self, wandering):
         streams, plain = wandering
-        vague = calibrate(*streams, reference="B10", prior={"z": (0.0, 100.0)}, checks=False)
-        np.testing.assert_allclose(vague.T_parent_child, plain.T_parent_child, atol=1e-5)
+        vague = calibrate(
+            *streams, reference="B10", prior={"z": (0.0, 100.0)}, checks=False
+        )
+        np.testing.assert_allclose(
+            vague.T_parent_child, plain.T_parent_child, atol=1e-5
+        )
         assert [dof.verdict for dof in vague.observability] == [
             dof.verdict for dof in plain.observability
         ]
 
     @pytest.mark.parametrize(
         ("axis", "prior"),
-        [("x", (-0.6, 0.001)), ("x", "100m+/-1e-9m"), ("z", "15m+/-0.05m"), ("yaw", (0.2, 0.01))],
+        [
+            ("x", (-0.6, 0.001)),
+            ("x", "100m+/-1e-9m"),
+            ("z", "15m+/-0.05m"),
+            ("yaw", (0.2, 0.01)),
+        ],
     )
-    def test_a_contradiction_is_refused_and_the_prior_left_out(self, wandering, axis, prior):
+    def test_a_contradiction_is_refused_and_the_prior_left_out(
+        self, wandering, axis, prior
+    ):
         streams, plain = wandering
         result = calibrate(*streams, reference="B10", prior={axis: prior})
         assert result.status is SolveStatus.CONTRADICTED
@@ -437,11 +519,15 @@ class TestFullMotion:
         assert result.reasons[0].sentence.startswith(f"the prior on {axis} is ")
         assert result.reasons[0].advice == f"check value, unit and sign of prior.{axis}"
         np.testing.assert_array_equal(result.T_parent_child, plain.T_parent_child)
-        np.testing.assert_array_equal(result.covariance_measured, plain.covariance_measured)
+        np.testing.assert_array_equal(
+            result.covariance_measured, plain.covariance_measured
+        )
 
 
 @pytest.mark.parametrize("road", ["Python", "command", "YAML", "page"])
-def test_centimetres_that_were_typed_without_a_unit_are_asked_about(road, tmp_path, capsys):
+def test_centimetres_that_were_typed_without_a_unit_are_asked_about(
+    road, tmp_path, capsys
+):
     paths = motions.write_pair(tmp_path, *flat_drive())
     expected = "prior.z needs a unit: -22"
     if road == "Python":
@@ -467,7 +553,9 @@ def test_centimetres_that_were_typed_without_a_unit_are_asked_about(road, tmp_pa
         status = usage.code
     assert status == 2
     error = capsys.readouterr().err
-    assert "needs a unit: -22 may be m, cm or mm; write -22cm+/-2cm or -22m+/-2m" in error
+    assert (
+        "needs a unit: -22 may be m, cm or mm; write -22cm+/-2cm or -22m+/-2m" in error
+    )
     assert not (tmp_path / "out").exists()
 
 
@@ -476,7 +564,9 @@ def test_along_an_unobservable_axis_only_an_impossible_distance_contradicts():
     long = calibrate(*flat_drive(), reference="B10", prior={"z": "15m+/-0.05m"})
     assert long.status is SolveStatus.OK
     assert long.T_parent_child[2, 3] == pytest.approx(15.0, abs=0.05)
-    in_millimetres = calibrate(*flat_drive(), reference="B10", prior={"z": "1850m+/-20m"})
+    in_millimetres = calibrate(
+        *flat_drive(), reference="B10", prior={"z": "1850m+/-20m"}
+    )
     assert in_millimetres.status is SolveStatus.CONTRADICTED
     assert in_millimetres.unobservable() == ["z"]
 
@@ -484,7 +574,15 @@ def test_along_an_unobservable_axis_only_an_impossible_distance_contradicts():
 def test_the_command_refuses_a_contradiction(tmp_path, capsys):
     paths = motions.write_pair(tmp_path, *flat_drive())
     frames = ["--parent-frame", "lidar", "--child-frame", "camera"]
-    command = ["calibrate", *paths, *frames, "--reference", "B10", "--out", str(tmp_path / "out")]
+    command = [
+        "calibrate",
+        *paths,
+        *frames,
+        "--reference",
+        "B10",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     assert main([*command, "--prior", "x=100m+/-1e-9m"]) == 1
     captured = capsys.readouterr()
     assert "the prior on x is " in captured.err

@@ -64,7 +64,8 @@ SUMS = {
     "merged": (
         lambda blocks: blocks.merged(2).sums,
         lambda rows: [
-            products(np.concatenate(chunk)) for chunk in (split(rows)[:2], split(rows)[2:])
+            products(np.concatenate(chunk))
+            for chunk in (split(rows)[:2], split(rows)[2:])
         ],
     ),
 }
@@ -78,14 +79,18 @@ def test_sums_are_those_of_loops_over_rows(rows, name):
 
 
 def test_values_are_gathered_by_the_block_of_each():
-    blocks = Blocks.gathered(np.array([[1.0], [2.0], [4.0], [8.0]]), np.array([2, 0, 2, 2]), 4)
+    blocks = Blocks.gathered(
+        np.array([[1.0], [2.0], [4.0], [8.0]]), np.array([2, 0, 2, 2]), 4
+    )
     assert blocks.sums.tolist() == [[2.0], [0.0], [13.0], [0.0]]
 
 
 @pytest.mark.parametrize("columns", [[0, 1, 2, 3], [2], [3, 0]])
 def test_answers_are_those_of_least_squares(rows, columns):
     blocks = Blocks.of_rows(rows, N_BLOCKS)
-    assert blocks.solve(columns) == pytest.approx(least_squares(rows, columns), rel=1e-6, abs=1e-9)
+    assert blocks.solve(columns) == pytest.approx(
+        least_squares(rows, columns), rel=1e-6, abs=1e-9
+    )
 
 
 def test_a_column_is_fitted_by_others(rows):
@@ -101,11 +106,15 @@ def test_an_unknown_without_evidence_stays_zero(rows):
 
 
 def test_the_jackknife_is_the_scatter_of_the_answers_without_each_block(rows):
-    answers = [least_squares(without(rows, block), [0, 1, 2]) for block in range(N_BLOCKS)]
+    answers = [
+        least_squares(without(rows, block), [0, 1, 2]) for block in range(N_BLOCKS)
+    ]
     expected = (N_BLOCKS - 1) ** 2 / N_BLOCKS * np.cov(np.transpose(answers))
     actual = Blocks.of_rows(rows, N_BLOCKS).jackknife([0, 1, 2])
     np.testing.assert_allclose(actual, expected, rtol=1e-5)
-    np.testing.assert_allclose(jackknife_covariance(np.array(answers)), expected, rtol=1e-12)
+    np.testing.assert_allclose(
+        jackknife_covariance(np.array(answers)), expected, rtol=1e-12
+    )
 
 
 def test_the_jackknife_gives_the_variance_of_a_mean():
@@ -129,17 +138,23 @@ def test_the_evidence_of_a_shift_is_that_of_the_difference_of_both_answers(rows)
     blocks = Blocks.of_rows(rows, N_BLOCKS)
     shifts = blocks.shift_since(CUTS, np.zeros((4, 4)))
     for cut, shift in zip(CUTS, shifts, strict=True):
-        parts = [np.concatenate(chunk) for chunk in (split(rows)[:cut], split(rows)[cut:])]
+        parts = [
+            np.concatenate(chunk) for chunk in (split(rows)[:cut], split(rows)[cut:])
+        ]
         answers = [least_squares(chunk, [0, 1, 2, 3]) for chunk in parts]
         covariance = sum(np.linalg.inv(products(chunk)[:4, :4]) for chunk in parts)
         units = np.sqrt(np.diag(covariance))
         expected = answer_evidence(answers[1] - answers[0], covariance)
         scale = units[:, None] * np.append(units, 1.0)
-        np.testing.assert_allclose(scale * shift, scale * expected, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(
+            scale * shift, scale * expected, rtol=1e-6, atol=1e-6
+        )
 
 
 def test_a_shift_from_values_known_exactly_is_the_answer_since():
-    table = np.array([[4.0, 0.0, 8.0], [0.0, 0.0, 0.0]])  # 4 (x - 2) = 0, nothing about y
+    table = np.array(
+        [[4.0, 0.0, 8.0], [0.0, 0.0, 0.0]]
+    )  # 4 (x - 2) = 0, nothing about y
     shift = shift_evidence(table, np.array([0.5, 7.0]), np.zeros((2, 2)))
     assert shift.tolist() == [[4.0, 0.0, 6.0], [0.0, 0.0, 0.0]]
 

@@ -42,7 +42,9 @@ def test_python_function_finds_the_truth_at_different_rates():
     assert result.status is SolveStatus.OK
     assert (result.method, result.reference, result.backend) == ("dnlo", "B3", "fast")
     assert result.n_pairs == result.n_poses - 3 == result.n_inliers
-    np.testing.assert_allclose(result.T_parent_child @ result.T_child_parent, np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(
+        result.T_parent_child @ result.T_child_parent, np.eye(4), atol=1e-12
+    )
 
 
 def test_the_engine_and_the_function_agree_to_the_last_bit():
@@ -52,11 +54,14 @@ def test_the_engine_and_the_function_agree_to_the_last_bit():
     feed(calibrator, "parent", parent)
     fed = calibrator.estimate()
     through_quaternions = [
-        Trajectory.from_quat_xyzw(t.stamps_ns, t.poses[:, :3, 3], se3.to_quat_xyzw(t.poses))
+        Trajectory.from_quat_xyzw(
+            t.stamps_ns, t.poses[:, :3, 3], se3.to_quat_xyzw(t.poses)
+        )
         for t in (parent, child)
     ]
     assert np.array_equal(
-        fed.T_parent_child, calibrate(*through_quaternions, reference="B3").T_parent_child
+        fed.T_parent_child,
+        calibrate(*through_quaternions, reference="B3").T_parent_child,
     )
 
 
@@ -98,7 +103,11 @@ class TestRefusals:
         ("position", "quat", "message"),
         [
             ((0, np.nan, 0), (0, 0, 0, 1), "not finite"),
-            ((1.7e308, 1.7e308, 0), (0, 0, 0, 1), r"is more than 1e\+10 m from the origin"),
+            (
+                (1.7e308, 1.7e308, 0),
+                (0, 0, 0, 1),
+                r"is more than 1e\+10 m from the origin",
+            ),
             ((0, 0, 0), (0, 0, 0, 0), "of length 0, expected 1"),
             ((0, 0, 0), (0.5, 0.5, 0.5, 0.6), "of length 1.05"),
             ((0, 0, 0), (0, 0, np.nan, 1), "not finite"),
@@ -125,14 +134,23 @@ class TestRefusals:
         named.set_frame("child", "")
         named.set_frame("child", "base_link")
         snapshot = named.snapshot()
-        assert (snapshot.parent_frame, snapshot.child_frame) == ("parent_sensor", "camera")
+        assert (snapshot.parent_frame, snapshot.child_frame) == (
+            "parent_sensor",
+            "camera",
+        )
         assert "parent stream does not name" in snapshot.frame_warnings[0]
 
 
 @pytest.mark.parametrize(
     ("n_poses", "parent_s", "child_s", "options", "message"),
     [
-        (12, 0.0, 0.0, {"reference": "B50"}, "too few common poses for the chosen reference"),
+        (
+            12,
+            0.0,
+            0.0,
+            {"reference": "B50"},
+            "too few common poses for the chosen reference",
+        ),
         (40, 0.005, 0.0, {"max_gap": 0.01}, "raise max_gap"),
     ],
 )
@@ -146,7 +164,9 @@ def test_missing_data_is_named(n_poses, parent_s, child_s, options, message):
 
 def test_a_stream_on_its_own_does_not_fill_the_memory():
     parent, child = drive(400)
-    calibrator = Calibrator(CalibratorConfig(reference="B3"), BufferLimits(capacity=100))
+    calibrator = Calibrator(
+        CalibratorConfig(reference="B3"), BufferLimits(capacity=100)
+    )
     feed(calibrator, "parent", parent)
     assert calibrator.statistics("parent").dropped_unpaired > 0
     assert len(calibrator.snapshot().unpaired[0]) <= 100
@@ -168,7 +188,9 @@ def test_a_snapshot_does_not_change_when_poses_come_in():
 
 # 10 s at 10 Hz, so that a short drive outgrows the buffers many times; half a second for late
 # arrivals.
-SMALL = BufferLimits(capacity=500, pairing_starts=100, batch=16, batch_every=4, late_ns=500_000_000)
+SMALL = BufferLimits(
+    capacity=500, pairing_starts=100, batch=16, batch_every=4, late_ns=500_000_000
+)
 
 
 def play(sequence, limits=SMALL, **options):
@@ -194,8 +216,12 @@ def test_every_pose_is_paired_once_and_memory_stays_small(child_every):
     calibrator = play(by_stamp(parent, child), max_gap=1.0)
     assert np.array_equal(calibrator.snapshot().pose_pairs.stamps_ns, child.stamps_ns)
     assert len(calibrator.snapshot().unpaired[0]) < 150
-    np.testing.assert_allclose(calibrator.estimate().T_parent_child, T_PARENT_CHILD, atol=1e-6)
-    assert not calibrator.add_pose("parent", parent.stamps_ns[0] + 1, [0.0] * 3, [0.0, 0, 0, 1])
+    np.testing.assert_allclose(
+        calibrator.estimate().T_parent_child, T_PARENT_CHILD, atol=1e-6
+    )
+    assert not calibrator.add_pose(
+        "parent", parent.stamps_ns[0] + 1, [0.0] * 3, [0.0, 0, 0, 1]
+    )
     assert calibrator.statistics("parent").refused_late == 1
 
 
@@ -229,7 +255,9 @@ def test_late_and_swapped_messages_within_the_horizon_change_nothing(seed):
     arrival = [message[1] + random.uniform(0, 0.4e9) for message in sequence]
     late = [sequence[k] for k in np.argsort(arrival)]
     calibrator = play(late)
-    refused = [calibrator.statistics(stream).refused_late for stream in ("parent", "child")]
+    refused = [
+        calibrator.statistics(stream).refused_late for stream in ("parent", "child")
+    ]
     assert refused == [0, 0]
     assert np.array_equal(
         calibrator.estimate().T_parent_child, play(sequence).estimate().T_parent_child
@@ -258,23 +286,31 @@ def test_the_informative_pairs_are_kept_not_the_newest():
     turning = wandering_poses(1200)
     straight = turning[-1] @ se3.exp(np.outer(np.arange(1, 7001), [0.1, 0, 0, 0, 0, 0]))
     parent = as_trajectory(np.concatenate([turning, straight]))
-    child = dataclasses.replace(parent, poses=disturbed(child_of(parent.poses), 1, 1e-4, 1e-4))
+    child = dataclasses.replace(
+        parent, poses=disturbed(child_of(parent.poses), 1, 1e-4, 1e-4)
+    )
     calibrator = play(by_stamp(parent, child), max_pairs=1500)
     stamps_ns = calibrator.snapshot().pose_pairs.stamps_ns
     assert len(stamps_ns) <= 1500
     assert (stamps_ns <= parent.stamps_ns[1199]).sum() > 900
     result = calibrator.estimate()
-    np.testing.assert_allclose(result.T_parent_child[:3, 3], T_PARENT_CHILD[:3, 3], atol=2e-3)
+    np.testing.assert_allclose(
+        result.T_parent_child[:3, 3], T_PARENT_CHILD[:3, 3], atol=2e-3
+    )
 
 
 def test_the_time_offset_a_snapshot_found_is_taken_over(monkeypatch):
     parent, child = long_drive(400)
-    calibrator = Calibrator(CalibratorConfig(reference="B3", time_offset="estimate"), SMALL)
+    calibrator = Calibrator(
+        CalibratorConfig(reference="B3", time_offset="estimate"), SMALL
+    )
     feed(calibrator, "parent", parent)
     feed(calibrator, "child", child)
     snapshot = calibrator.snapshot().resolved
     calibrator.adopt(snapshot.time_offset)
-    monkeypatch.setattr("hand_eye_calib.core.engine.snapshot.estimated_time_offset", None)
+    monkeypatch.setattr(
+        "hand_eye_calib.core.engine.snapshot.estimated_time_offset", None
+    )
     extra = as_trajectory(wandering_poses(900))[400:]
     feed(calibrator, "parent", extra)
     assert calibrator.estimate().time_offset_s == snapshot.time_offset.seconds
@@ -288,6 +324,8 @@ def test_the_whole_session_is_checked_not_only_its_end(max_pairs):
     sound = play(by_stamp(parent, child), max_pairs=max_pairs).snapshot()
     assert check(sound).findings == ()
     assert len(sound.unpaired[0]) < 150 < 250 < len(sound.streams[0])
-    late = play(by_stamp(parent, reordered(child)), max_pairs=max_pairs, time_offset=0.5).snapshot()
+    late = play(
+        by_stamp(parent, reordered(child)), max_pairs=max_pairs, time_offset=0.5
+    ).snapshot()
     assert check(late).findings[0].code == "quaternion_order"
     assert late.streams[1].stamps_ns[0] in child.stamps_ns

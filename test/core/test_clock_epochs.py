@@ -2,7 +2,14 @@
 
 import numpy as np
 import pytest
-from motions import as_trajectory, child_of, disturbed, walked, wandering_poses, write_pair
+from motions import (
+    as_trajectory,
+    child_of,
+    disturbed,
+    walked,
+    wandering_poses,
+    write_pair,
+)
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import CalibratorConfig
@@ -35,12 +42,16 @@ def pair(offset_s):
 
 
 @pytest.mark.parametrize("offset_s", EPOCHS.values(), ids=EPOCHS)
-@pytest.mark.parametrize("options", [{"time_offset": "estimate"}, {}], ids=["estimate", "nothing"])
+@pytest.mark.parametrize(
+    "options", [{"time_offset": "estimate"}, {}], ids=["estimate", "nothing"]
+)
 def test_the_offset_of_any_two_epochs_is_estimated(offset_s, options):
     result = hec.calibrate(*pair(offset_s), **options)
     assert result.time_offset_s == pytest.approx(offset_s, abs=2e-3)
     same_clock = hec.calibrate(*pair(0.0))
-    np.testing.assert_allclose(result.T_parent_child, same_clock.T_parent_child, atol=2e-3)
+    np.testing.assert_allclose(
+        result.T_parent_child, same_clock.T_parent_child, atol=2e-3
+    )
     codes = {finding.code for finding in result.findings}
     assert codes == (set() if options else {"time_offset"})
     expected = "USE" if options else "USE WITH CARE"
@@ -53,7 +64,9 @@ def test_an_offset_of_another_epoch_is_obeyed_and_read_back(tmp_path, capsys):
     out = tmp_path / "out"
     options = ["--time-offset", str(offset_s), "--out", str(out)]
     assert main(["calibrate", *map(str, files), *options]) == 0
-    assert load_result(out / "extrinsic.yaml").time_offset_s == pytest.approx(offset_s, abs=1e-4)
+    assert load_result(out / "extrinsic.yaml").time_offset_s == pytest.approx(
+        offset_s, abs=1e-4
+    )
 
 
 def test_an_offset_that_is_twelve_seconds_off_names_the_way_on():
@@ -89,7 +102,9 @@ def test_a_stream_that_froze_does_not_hide_the_offset(frozen):
     offset_s = EPOCHS["unix and start of the computer"]
     poses = figures_of_eight()
     parent = as_trajectory(disturbed(poses, 1, 0.002, 0.001))
-    child = as_trajectory(disturbed(child_of(poses), 2, 0.002, 0.001)).shifted(-offset_s)
+    child = as_trajectory(disturbed(child_of(poses), 2, 0.002, 0.001)).shifted(
+        -offset_s
+    )
     streams = {"parent": parent, "child": child}
     held = streams[frozen].poses.copy()
     held[200:255] = held[200]
@@ -98,4 +113,6 @@ def test_a_stream_that_froze_does_not_hide_the_offset(frozen):
     assert result.time_offset_s == pytest.approx(offset_s, abs=0.02)
     assert result.verdict.value == "DO NOT USE"
     freezes = [finding for finding in result.findings if finding.code == "frozen"]
-    assert [(finding.stream, finding.severity.value) for finding in freezes] == [(frozen, "error")]
+    assert [(finding.stream, finding.severity.value) for finding in freezes] == [
+        (frozen, "error")
+    ]

@@ -46,7 +46,9 @@ def answers():
 def assessed(calibration):
     """Assessment of a result."""
     T = calibration.T_parent_child
-    return Assessment(T, calibration.covariance_measured, calibration.observability_measured)
+    return Assessment(
+        T, calibration.covariance_measured, calibration.observability_measured
+    )
 
 
 def column(cross_check, name):
@@ -58,7 +60,9 @@ def contradictions(calibration, *answers):
     """Sentences of the reasons that other answers give."""
     cross_check = compare_answers(calibration, *answers)
     reasons = dataclasses.replace(calibration, cross_check=cross_check).reasons
-    return [reason.sentence for reason in reasons if reason.rule.partition("_")[0] in KINDS]
+    return [
+        reason.sentence for reason in reasons if reason.rule.partition("_")[0] in KINDS
+    ]
 
 
 def moved(answer, metres):
@@ -74,7 +78,9 @@ def test_answers_to_good_data_agree_and_few_or_odd_ones_do_not_count(answers):
     assert (column(cross_check, "of_methods") < 4 * column(cross_check, "sigma")).all()
     assert (column(cross_check, "of_halves") < 4 * column(cross_check, "sigma")).all()
     assert (column(cross_check, "of_methods") > 0).all()
-    assert np.isnan(column(compare_answers(calibration, others[:2]), "of_methods")).all()
+    assert np.isnan(
+        column(compare_answers(calibration, others[:2]), "of_methods")
+    ).all()
     assert contradictions(calibration, [*others, moved(others[0], 5.0)]) == []
     kept = dataclasses.replace(calibration, cross_check=cross_check)
     document = json.loads(json.dumps(kept.to_dict()))
@@ -85,7 +91,9 @@ def test_other_methods_that_lie_elsewhere_are_named_with_axis_and_distance(answe
     calibration, others, _ = answers
     (sentence,) = contradictions(calibration, [moved(other, 0.3) for other in others])
     # 0.3 m is the median: 0.44 m for a normal variable.
-    assert sentence.startswith("robust least squares disagrees about x by 44 cm; without this ")
+    assert sentence.startswith(
+        "robust least squares disagrees about x by 44 cm; without this "
+    )
 
 
 def test_halves_that_lie_apart_are_named(answers):
@@ -99,7 +107,9 @@ def test_halves_that_lie_apart_are_named(answers):
 
 @pytest.mark.parametrize("blind", [0, 1])
 @pytest.mark.parametrize("axis", range(6))
-def test_halves_are_not_compared_on_an_axis_that_one_of_them_hardly_sees(answers, axis, blind):
+def test_halves_are_not_compared_on_an_axis_that_one_of_them_hardly_sees(
+    answers, axis, blind
+):
     calibration, others, halves = answers
     differences = {}
     for times in (1.0, 20.0):
@@ -108,7 +118,9 @@ def test_halves_are_not_compared_on_an_axis_that_one_of_them_hardly_sees(answers
         dofs[axis] = dataclasses.replace(dofs[axis], sigma=worse)
         pair = [*halves]
         pair[blind] = dataclasses.replace(halves[blind], observability=tuple(dofs))
-        differences[times] = column(compare_answers(calibration, others, pair), "of_halves")
+        differences[times] = column(
+            compare_answers(calibration, others, pair), "of_halves"
+        )
     assert np.isfinite(differences[1.0]).all()
     assert np.flatnonzero(np.isnan(differences[20.0])).tolist() == [axis]
 
@@ -119,7 +131,9 @@ def drifting(poses, seed):
     keep = np.exp(-0.1 / 30.0)
     errors = [random.normal(size=6)]
     for _ in range(len(poses) - 2):
-        errors.append(keep * errors[-1] + np.sqrt(1.0 - keep**2) * random.normal(size=6))
+        errors.append(
+            keep * errors[-1] + np.sqrt(1.0 - keep**2) * random.normal(size=6)
+        )
     errors = 0.1 * np.array(errors) * np.r_[np.full(3, 0.03), np.full(3, 0.006)]
     noisy = disturbed(poses, seed + 1, 0.002, 0.0007)
     steps = se3.inverse(noisy[:-1]) @ noisy[1:] @ se3.exp(errors)
@@ -140,7 +154,9 @@ def straight_start(seed):
         se3.rotation_exp(np.array([0.1, -0.2, 1.5])), [1, -0.5, 1]
     )
     child = child_of(parent, mount)
-    return as_trajectory(drifting(parent, seed)), as_trajectory(drifting(child, seed + 50))
+    return as_trajectory(drifting(parent, seed)), as_trajectory(
+        drifting(child, seed + 50)
+    )
 
 
 @pytest.mark.parametrize("seed", [100, 700])
@@ -148,7 +164,12 @@ def test_a_straight_start_is_no_mount_that_turned_about_the_direction_of_travel(
     result = calibrate(*straight_start(seed), checks=True)
     assert result.cross_check["yaw"].of_halves is not None
     assert result.cross_check["roll"].of_halves is None
-    accused = {axis for reason in result.reasons if reason.rule == "halves" for axis in reason.axes}
+    accused = {
+        axis
+        for reason in result.reasons
+        if reason.rule == "halves"
+        for axis in reason.axes
+    }
     assert "roll" not in accused
 
 
@@ -161,10 +182,14 @@ def gentle_ramps(degrees):
     rotation = se3.rotation_from_rpy(np.c_[rolled, pitched, turned])
     position = np.cumsum(0.5 * rotation[:, :, 0], axis=0)
     parent = se3.from_rotation_translation(rotation, position)
-    mount = se3.from_rotation_translation(se3.rotation_exp(np.array([0, 0, 0.4])), [0.6, -0.3, 0.3])
+    mount = se3.from_rotation_translation(
+        se3.rotation_exp(np.array([0, 0, 0.4])), [0.6, -0.3, 0.3]
+    )
     child = child_of(parent, mount)
     noise = 0.005, 0.0005
-    return as_trajectory(disturbed(parent, 21, *noise)), as_trajectory(disturbed(child, 11, *noise))
+    return as_trajectory(disturbed(parent, 21, *noise)), as_trajectory(
+        disturbed(child, 11, *noise)
+    )
 
 
 def test_an_axis_that_no_other_reference_reveals_is_weak_and_used_with_care():
@@ -188,12 +213,18 @@ def test_an_axis_that_no_other_reference_reveals_is_weak_and_used_with_care():
 def scattered(axis="z", **columns):
     """A good result whose cross-check has these values for an axis, and nothing for the others."""
     nothing = AxisScatter(sigma=0.003, of_methods=None, of_halves=None)
-    rows = dict.fromkeys(AXES, nothing) | {axis: dataclasses.replace(nothing, **columns)}
+    rows = dict.fromkeys(AXES, nothing) | {
+        axis: dataclasses.replace(nothing, **columns)
+    }
     return good_calibration(cross_check=rows)
 
 
-@pytest.mark.parametrize(("excess_over_own", "rules"), [(18.0, ["methods"]), (2.5, []), (None, [])])
-def test_two_answers_that_contradict_count_without_a_scatter_of_three(excess_over_own, rules):
+@pytest.mark.parametrize(
+    ("excess_over_own", "rules"), [(18.0, ["methods"]), (2.5, []), (None, [])]
+)
+def test_two_answers_that_contradict_count_without_a_scatter_of_three(
+    excess_over_own, rules
+):
     result = scattered(excess_over_own=excess_over_own)
     assert [reason.rule for reason in result.reasons] == rules
     if rules:
@@ -218,9 +249,14 @@ def on_springs(seed, degrees_per_m_s2):
     velocity = speed[:, None] * np.c_[np.cos(heading), np.sin(heading), 0.0 * t]
     position = np.cumsum(0.1 * velocity, axis=0)
     parent = se3.from_rotation_translation(se3.rotation_from_rpy(angles), position)
-    mount = se3.from_rotation_translation(se3.rotation_exp(np.array([0, 0, 0.4])), [0.6, -0.3, 0.3])
+    mount = se3.from_rotation_translation(
+        se3.rotation_exp(np.array([0, 0, 0.4])), [0.6, -0.3, 0.3]
+    )
     noise = 0.003, 0.0002
-    pair = disturbed(parent, seed, *noise), disturbed(child_of(parent, mount), seed + 50, *noise)
+    pair = (
+        disturbed(parent, seed, *noise),
+        disturbed(child_of(parent, mount), seed + 50, *noise),
+    )
     return [as_trajectory(poses) for poses in pair]
 
 
@@ -230,7 +266,9 @@ def test_a_body_that_rocks_on_its_springs_reveals_no_height(method):
         rocking = calibrate(*on_springs(seed, 0.2), method=method)
         assert "z" in rocking.unobservable()
         assert np.isinf(rocking.sigmas[2])
-        np.testing.assert_allclose(rocking.T_parent_child[:2, 3], [0.6, -0.3], atol=0.05)
+        np.testing.assert_allclose(
+            rocking.T_parent_child[:2, 3], [0.6, -0.3], atol=0.05
+        )
 
 
 def test_ramps_reveal_the_height_of_a_body_on_springs():
@@ -266,7 +304,9 @@ def mounts():
     return as_trajectory(parent), as_trajectory(child), as_trajectory(loosened)
 
 
-def test_every_solve_is_checked_and_one_from_python_for_a_sound_and_a_loose_mount(mounts):
+def test_every_solve_is_checked_and_one_from_python_for_a_sound_and_a_loose_mount(
+    mounts,
+):
     for of_child, apart in ((mounts[1], False), (mounts[2], True)):
         streams = mounts[0], of_child
         result = calibrate(*streams, method="dnlo" if apart else "auto")

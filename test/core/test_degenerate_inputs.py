@@ -48,7 +48,9 @@ MOTIONS = {
     "on the spot": lambda: steady([0.0, 0.0, 0.0, 0.0, 0.0, 0.05]),
     "half turns": lambda: steady([0.1, 0.0, 0.0, 0.0, 0.0, np.pi]),
     "without rotation": shifted_only,
-    "two poses in turn": lambda: np.tile(wandering_poses(20)[[0, 19]], (N_POSES // 2, 1, 1)),
+    "two poses in turn": lambda: np.tile(
+        wandering_poses(20)[[0, 19]], (N_POSES // 2, 1, 1)
+    ),
 }
 
 

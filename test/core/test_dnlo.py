@@ -32,7 +32,9 @@ def test_truncation_is_the_optimum_over_the_weights(fraction):
     for row in range(4):
         assert weights[row].sum() >= fraction * 15 - 1e-9
         np.testing.assert_allclose(
-            objectives[row], brute_force_objective(costs[row], 0.01, fraction * 15), rtol=1e-9
+            objectives[row],
+            brute_force_objective(costs[row], 0.01, fraction * 15),
+            rtol=1e-9,
         )
 
 
@@ -53,7 +55,10 @@ def test_outliers_are_rejected_and_reported(jumpy_pairs):
     assert np.array_equal(solution.weights > 0.5, costs < 0.01)
     assert solution.converged
     # the same data without rejection is far off, so the test above is not idle
-    assert np.abs(all_pairs.solve_dnl(jumpy_pairs).T_parent_child - T_PARENT_CHILD).max() > 0.1
+    assert (
+        np.abs(all_pairs.solve_dnl(jumpy_pairs).T_parent_child - T_PARENT_CHILD).max()
+        > 0.1
+    )
 
 
 def test_many_pairs_are_sampled_for_the_search_only():
@@ -70,7 +75,9 @@ def test_leaving_pairs_out_agrees_with_solving_without_them(jumpy_pairs):
     left_out = np.arange(len(jumpy_pairs))[None] // 20 == np.arange(4)[:, None]
     answers = method.solve_without(jumpy_pairs, solution, left_out)
     for row, answer in zip(left_out, answers, strict=True):
-        assert answer == pytest.approx(method.solve(jumpy_pairs[~row]).T_parent_child, abs=1e-5)
+        assert answer == pytest.approx(
+            method.solve(jumpy_pairs[~row]).T_parent_child, abs=1e-5
+        )
 
 
 @pytest.mark.parametrize("method", ["dnl", "dnlo"])
@@ -88,7 +95,11 @@ def pairs():
 
 
 def test_condensed_costs_are_the_matrix_costs(pairs):
-    for T in (np.eye(4), T_PARENT_CHILD, se3.exp(np.array([30.0, -4.0, 2.0, 2.0, 1.0, -1.0]))):
+    for T in (
+        np.eye(4),
+        T_PARENT_CHILD,
+        se3.exp(np.array([30.0, -4.0, 2.0, 2.0, 1.0, -1.0])),
+    ):
         condensed_costs = quadratic_form.condense(pairs) @ quadratic_form.monomials(T)
         np.testing.assert_allclose(
             condensed_costs, all_pairs.pair_costs(pairs, T), rtol=1e-12, atol=1e-12
@@ -119,19 +130,25 @@ def test_gauss_newton_steps_reach_the_minimum(pairs):
     np.testing.assert_allclose(stepped, T, atol=1e-8)
 
 
-HALF_TURNS = np.array([np.diag(signs) for signs in ([1, -1, -1], [-1, 1, -1], [-1, -1, 1])])
+HALF_TURNS = np.array(
+    [np.diag(signs) for signs in ([1, -1, -1], [-1, 1, -1], [-1, -1, 1])]
+)
 
 
 def noisy_pairs(seed, sigma=0.02, poses=60):
     rng = np.random.default_rng(seed)
     T_parent_child = se3.exp(rng.normal(size=6))
     Ts_pw_p = wandering_poses(poses, seed)
-    Ts_cw_c = child_of(Ts_pw_p, T_parent_child) @ se3.exp(sigma * rng.normal(size=(poses, 6)))
+    Ts_cw_c = child_of(Ts_pw_p, T_parent_child) @ se3.exp(
+        sigma * rng.normal(size=(poses, 6))
+    )
     return motion_pairs(Ts_pw_p, Ts_cw_c, "B5")
 
 
 def form_of(pairs, solution):
-    return quadratic_form.weighted_sum(quadratic_form.coefficients(pairs), solution.weights)
+    return quadratic_form.weighted_sum(
+        quadratic_form.coefficients(pairs), solution.weights
+    )
 
 
 def false_minimum(Q, T_parent_child):
@@ -160,7 +177,9 @@ def test_the_false_minima_of_the_published_results_are_caught(name):
     dataset, *level, run = case_name.split("/")
     (case,) = [
         case
-        for case in published_data.simulated([dataset], [float(level[0])] if level else None)
+        for case in published_data.simulated(
+            [dataset], [float(level[0])] if level else None
+        )
         if case.run == run
     ]
     pairs = motion_pairs(case.parent.poses, case.child.poses, reference)

@@ -16,14 +16,20 @@ from hand_eye_calib.offline.calibrate import calibrate
 
 
 def seen_in(poses):
-    return excitation.excitation(PosePairs(np.arange(len(poses)), poses, child_of(poses)))
+    return excitation.excitation(
+        PosePairs(np.arange(len(poses)), poses, child_of(poses))
+    )
 
 
 def turning(amplitudes_rad, n_poses=300):
     """Poses that swing about each axis in turn, by so much to either side."""
     s = np.linspace(0, 2 * np.pi, n_poses)
-    turns = np.stack([a * np.sin(k * s) for k, a in enumerate(amplitudes_rad, 1)], axis=1)
-    return se3.from_rotation_translation(se3.rotation_exp(turns), np.c_[s, 0 * s, 0 * s])
+    turns = np.stack(
+        [a * np.sin(k * s) for k, a in enumerate(amplitudes_rad, 1)], axis=1
+    )
+    return se3.from_rotation_translation(
+        se3.rotation_exp(turns), np.c_[s, 0 * s, 0 * s]
+    )
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -51,7 +57,9 @@ def test_it_does_not_depend_on_the_world_and_hardly_on_the_number_of_poses():
 
 @pytest.mark.parametrize("n_poses", [0, 1, 20])
 def test_standing_still_is_said(n_poses):
-    text = excitation.what_is_missing(seen_in(np.repeat(np.eye(4)[None], n_poses, axis=0)))
+    text = excitation.what_is_missing(
+        seen_in(np.repeat(np.eye(4)[None], n_poses, axis=0))
+    )
     assert text == (
         "x, y and z cannot be determined from the motion so far: move in curves, to both sides"
     )
@@ -60,7 +68,9 @@ def test_standing_still_is_said(n_poses):
 def test_after_turns_about_all_axes_only_what_a_result_says_is_missing():
     poses = wandering_poses(200)
     assert excitation.what_is_missing(seen_in(poses)) == ""
-    result = calibrate(as_trajectory(poses), as_trajectory(child_of(poses)), reference="B5")
+    result = calibrate(
+        as_trajectory(poses), as_trajectory(child_of(poses)), reference="B5"
+    )
     assert excitation.what_is_missing(seen_in(poses), result) == ""
     weak = dataclasses.replace(
         result,
@@ -69,7 +79,9 @@ def test_after_turns_about_all_axes_only_what_a_result_says_is_missing():
             *result.observability_measured[1:],
         ),
     )
-    assert excitation.what_is_missing(seen_in(poses), weak).startswith("x needs more motion: ")
+    assert excitation.what_is_missing(seen_in(poses), weak).startswith(
+        "x needs more motion: "
+    )
     hidden = DofObservability("yaw", DofVerdict.UNOBSERVABLE, np.inf)
     hiding = dataclasses.replace(
         result, observability_measured=(*result.observability_measured[:5], hidden)
@@ -91,8 +103,12 @@ def test_an_arm_is_not_told_to_drive():
         "it by hand"
     )
     assert excitation.helpful_motion(["x"], seen) == "rotations about y help most"
-    still = seen_in(se3.from_rotation_translation(np.tile(np.eye(3), (400, 1, 1)), path))
-    assert excitation.what_is_missing(still).endswith("rotate the sensors, about all axes")
+    still = seen_in(
+        se3.from_rotation_translation(np.tile(np.eye(3), (400, 1, 1)), path)
+    )
+    assert excitation.what_is_missing(still).endswith(
+        "rotate the sensors, about all axes"
+    )
 
 
 def test_a_vehicle_is_told_to_drive_over_a_ramp():
@@ -105,7 +121,9 @@ def test_a_vehicle_is_told_to_drive_over_a_ramp():
     assert excitation.what_is_missing(seen) == advice
     # Only a recording may contain clouds.
     poses = planar_poses(300)
-    recorded = calibrate(as_trajectory(poses), as_trajectory(child_of(poses)), reference="B5")
+    recorded = calibrate(
+        as_trajectory(poses), as_trajectory(child_of(poses)), reference="B5"
+    )
     assert excitation.what_is_missing(seen, recorded) == (
         f"{advice}, or record the clouds of two lidars and run calibrate on the bag"
     )
@@ -126,7 +144,9 @@ def test_the_axis_of_all_rotations_is_hidden():
         assert hidden_axes(lever_arm_products(chords(about_z_and_x(share)))) == hidden
 
 
-@pytest.mark.parametrize(("pitch_rad", "hidden"), [(0.0, True), (0.004, True), (0.15, False)])
+@pytest.mark.parametrize(
+    ("pitch_rad", "hidden"), [(0.0, True), (0.004, True), (0.15, False)]
+)
 def test_verdict_finding_and_hint_agree(pitch_rad, hidden):
     n = 600
     yaw = np.cumsum(np.random.default_rng(3).normal(0, 0.08, n))

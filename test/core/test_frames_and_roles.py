@@ -99,15 +99,25 @@ OBSERVED = {
 
 @pytest.mark.parametrize("storage", STORAGES)
 @pytest.mark.parametrize("kind", OBSERVED)
-def test_a_camera_that_observes_a_fixed_marker_is_the_child(tmp_path, capsys, storage, kind):
+def test_a_camera_that_observes_a_fixed_marker_is_the_child(
+    tmp_path, capsys, storage, kind
+):
     parent = ("/tf", TF, "/base_link", "/tool0", POSES)
     topic = "/tf" if kind == TF else "/child"
     child = (topic, kind, "/camera", "/aruco_marker", INVERSE)
     path = bag_of(bag_path(tmp_path, storage), parent, child, storage)
-    options = ["--parent-topic", "base_link:tool0", *OBSERVED[kind], "--child-invert", "poses"]
+    options = [
+        "--parent-topic",
+        "base_link:tool0",
+        *OBSERVED[kind],
+        "--child-invert",
+        "poses",
+    ]
     document, _ = calibrated(capsys, path, *options)
     assert frames_of(document) == ("tool0", "camera")
-    np.testing.assert_allclose(document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6)
+    np.testing.assert_allclose(
+        document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6
+    )
     beginning = "the child sensor is now camera, because"
     assert [text for text in document["warnings"] if text.startswith(beginning)]
 
@@ -119,9 +129,16 @@ def test_the_repair_that_inverts_a_stream_names_the_result_and_its_files_by_the_
     parent = ("/tf", TF, "base_link", "tool0", POSES @ se3.exp(rows[0]))
     child = ("/tf", TF, "camera", "aruco_marker", se3.inverse(CHILD @ se3.exp(rows[1])))
     path = bag_of(tmp_path / "bag", parent, child)
-    sources = ["--parent-topic", "base_link:tool0", "--child-topic", "camera:aruco_marker"]
+    sources = [
+        "--parent-topic",
+        "base_link:tool0",
+        "--child-topic",
+        "camera:aruco_marker",
+    ]
     out = tmp_path / "result"
-    assert main(["calibrate", str(path), *sources, "--out", str(out), "--no-report"]) in (0, 3)
+    assert main(
+        ["calibrate", str(path), *sources, "--out", str(out), "--no-report"]
+    ) in (0, 3)
     text = capsys.readouterr().out
     assert "--child-invert poses" in text
     assert "camera in tool0: maps coordinates of camera into tool0" in text
@@ -129,7 +146,9 @@ def test_the_repair_that_inverts_a_stream_names_the_result_and_its_files_by_the_
     saved = yaml.safe_load((out / "extrinsic.yaml").read_text())
     assert frames_of(saved) == ("tool0", "camera")
     result = hec.load(out)
-    assert "--frame-id tool0 --child-frame-id camera" in result.static_transform_command()
+    assert (
+        "--frame-id tool0 --child-frame-id camera" in result.static_transform_command()
+    )
     urdf = (out / "extrinsic.urdf.xacro").read_text()
     assert "aruco" not in urdf
     assert "camera" in urdf
@@ -142,7 +161,9 @@ def test_a_camera_beside_an_arm_that_sees_a_marker_on_the_hand_is_named_by_both_
     seen = Trajectory(STAMPS_NS, CHILD, "aruco_marker", "camera")
     options = {"reference": "B5", "checks": False}
     as_it_is = hec.calibrate(base, seen, **options)
-    inverse = hec.calibrate(base, seen, parent_invert="poses", child_invert="poses", **options)
+    inverse = hec.calibrate(
+        base, seen, parent_invert="poses", child_invert="poses", **options
+    )
     assert (as_it_is.parent_frame, as_it_is.child_frame) == ("tool0", "aruco_marker")
     assert (inverse.parent_frame, inverse.child_frame) == ("base_link", "camera")
     np.testing.assert_allclose(as_it_is.T_parent_child, T_PARENT_CHILD, atol=1e-6)
@@ -159,7 +180,9 @@ def test_a_live_session_and_its_journal_name_the_camera_too(tmp_path, kind):
     for stream, (message_type, world, sensor, poses) in fed.items():
         reader = MessageReader(message_type, "poses")
         for stamp_ns, pose in zip(STAMPS_NS, poses, strict=True):
-            make = pose_message(message_type, stamp_ns, se3.to_rows(pose), world, sensor)
+            make = pose_message(
+                message_type, stamp_ns, se3.to_rows(pose), world, sensor
+            )
             data = bytes(JAZZY.serialize_cdr(make(JAZZY), message_type))
             fields = reader(data)
             if fields.sensor_frame is not None:
@@ -187,7 +210,10 @@ def test_frames_given_the_other_way_round_choose_the_topics(tmp_path, capsys):
     topics = ["--parent-topic", "/lidar/odometry", "--child-topic", "/camera/odometry"]
     assert main(["calibrate", str(path), *topics, *names]) == 1
     error = capsys.readouterr().err
-    assert "the parent stream is of lidar, the child stream of camera; exchange the two" in error
+    assert (
+        "the parent stream is of lidar, the child stream of camera; exchange the two"
+        in error
+    )
 
 
 def test_a_name_of_the_other_stream_is_refused_everywhere():
@@ -237,10 +263,26 @@ def test_two_streams_of_one_frame_are_told_apart_by_names():
 @pytest.mark.parametrize(
     ("topics", "frames", "expected"),
     [
-        (("/camera/pose", "/lidar/pose"), ("camera", "lidar"), ("/camera/pose", "/lidar/pose")),
-        (("/camera/pose", "/lidar/pose"), ("lidar", "camera"), ("/lidar/pose", "/camera/pose")),
-        (("/cam0/pose", "/velodyne/pose"), ("camera", ""), ("/cam0/pose", "/velodyne/pose")),
-        (("/front/vio", "/rear/vio"), ("rear_camera", "front_camera"), ("/rear/vio", "/front/vio")),
+        (
+            ("/camera/pose", "/lidar/pose"),
+            ("camera", "lidar"),
+            ("/camera/pose", "/lidar/pose"),
+        ),
+        (
+            ("/camera/pose", "/lidar/pose"),
+            ("lidar", "camera"),
+            ("/lidar/pose", "/camera/pose"),
+        ),
+        (
+            ("/cam0/pose", "/velodyne/pose"),
+            ("camera", ""),
+            ("/cam0/pose", "/velodyne/pose"),
+        ),
+        (
+            ("/front/vio", "/rear/vio"),
+            ("rear_camera", "front_camera"),
+            ("/rear/vio", "/front/vio"),
+        ),
         (("/child", "/parent"), ("left", "right"), ("/parent", "/child")),
     ],
 )
@@ -261,7 +303,10 @@ def test_a_topic_whose_messages_name_another_frame_is_not_taken(tmp_path):
     path = bag_of(tmp_path / "bag", first, second)
     with PoseBag(path) as bag:
         assert bag.select(frames={"parent": "camera", "child": ""}) == ("/b", "/a")
-        assert bag.select(frames={"parent": "base_link", "child": "camera"}) == ("/a", "/b")
+        assert bag.select(frames={"parent": "base_link", "child": "camera"}) == (
+            "/a",
+            "/b",
+        )
         assert bag.select() == ("/a", "/b")
 
 
@@ -282,7 +327,9 @@ def test_topics_are_not_guessed_against_nothing(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("storage", STORAGES)
-def test_frames_of_ros1_lose_their_slash_wherever_they_are_printed(tmp_path, capsys, storage):
+def test_frames_of_ros1_lose_their_slash_wherever_they_are_printed(
+    tmp_path, capsys, storage
+):
     parent = ("/a", ODOMETRY, "/odom", "/base_link", POSES)
     child = ("/b", ODOMETRY, "/map", "/robot/camera", CHILD)
     path = bag_of(bag_path(tmp_path, storage), parent, child, storage)
@@ -333,7 +380,9 @@ def test_a_journal_keeps_the_world_of_a_stream(tmp_path):
     }
     writer = JournalWriter(tmp_path, about)
     for stream, poses in (("parent", POSES), ("child", INVERSE)):
-        for stamp_ns, row in zip(STAMPS_NS.tolist(), se3.to_rows(poses).tolist(), strict=True):
+        for stamp_ns, row in zip(
+            STAMPS_NS.tolist(), se3.to_rows(poses).tolist(), strict=True
+        ):
             writer.add_pose(stream, stamp_ns, row[:3], row[3:])
     writer.close()
     engine = Calibrator(CalibratorConfig(child_invert="poses"))

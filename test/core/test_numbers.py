@@ -14,7 +14,9 @@ def test_they_are_those_of_numpy(size):
     values = np.random.default_rng(size).normal(size=(size, 1))
     assert median(values) == np.median(values)
     for share in (0.0, 0.3, 0.9, 1.0):
-        assert quantile(values, share) == pytest.approx(np.quantile(values, share), rel=1e-14)
+        assert quantile(values, share) == pytest.approx(
+            np.quantile(values, share), rel=1e-14
+        )
     assert np.isnan(median([]))
 
 
@@ -24,7 +26,9 @@ def test_the_numbers_are_those_of_scipy():
     assert pytest.approx(norm.isf(0.005 / 2 / 6), abs=1e-6) == stats.LARGEST_OF_SIX
     assert pytest.approx(norm.isf(0.1), abs=1e-6) == stats.NINE_TIMES_OUT_OF_TEN
     for tail, table in stats.CHI2.items():
-        assert {dof: pytest.approx(chi2.isf(tail, dof), abs=1e-2) for dof in table} == table
+        assert {
+            dof: pytest.approx(chi2.isf(tail, dof), abs=1e-2) for dof in table
+        } == table
 
 
 @pytest.mark.parametrize(
@@ -39,8 +43,12 @@ def test_the_numbers_are_those_of_scipy():
 def test_a_weight_is_the_slope_of_its_loss_over_the_residual(kind, loss):
     lengths = np.array([0.1, 0.5, 0.9, 1.1, 3.0, 20.0])
     step = 1e-6
-    slopes = [(loss(length + step) - loss(length - step)) / (2 * step) for length in lengths]
-    assert stats.robust_weights(kind, lengths**2) == pytest.approx(slopes / lengths, rel=1e-6)
+    slopes = [
+        (loss(length + step) - loss(length - step)) / (2 * step) for length in lengths
+    ]
+    assert stats.robust_weights(kind, lengths**2) == pytest.approx(
+        slopes / lengths, rel=1e-6
+    )
 
 
 @pytest.mark.parametrize(("kind", "within"), [("huber", 1e-3), ("cauchy", 1e-3)])
@@ -59,7 +67,9 @@ def test_a_fifth_of_wrong_rows_hardly_changes_a_robust_regression(kind, within):
 
 def test_a_robust_regression_without_evidence_for_a_value_leaves_it_zero():
     rows = np.array([[[1.0, 0.0]], [[2.0, 0.0]]])
-    slopes, lengths = stats.robust_regression("cauchy", rows, np.array([[3.0], [6.0]]), 3, median)
+    slopes, lengths = stats.robust_regression(
+        "cauchy", rows, np.array([[3.0], [6.0]]), 3, median
+    )
     assert slopes == pytest.approx([3.0, 0.0])
     assert lengths == pytest.approx([0.0, 0.0], abs=1e-12)
 
@@ -72,7 +82,9 @@ def test_student_weights_of_many_degrees_of_freedom_are_those_of_normal_errors()
 
 @pytest.mark.parametrize("tail", [1e-30, 1e-9, 1e-3, 0.05, 0.5, 0.99])
 def test_the_quantile_of_chi_square_is_that_of_scipy(tail):
-    assert stats.chi_square_quantile(tail) == pytest.approx(chi2.isf(tail, 6), rel=1e-12)
+    assert stats.chi_square_quantile(tail) == pytest.approx(
+        chi2.isf(tail, 6), rel=1e-12
+    )
 
 
 @pytest.mark.parametrize(

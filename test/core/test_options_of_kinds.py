@@ -63,9 +63,11 @@ _OF_WHEELS = {"nominal_radius", "nominal_separation"}
 _OF_WHOLE_POSES = {"method", "reference", "backend", "threshold", "min_inlier_fraction"}
 REFUSED = {
     "poses": set(),
-    "positions": {"parent_measures", "child_invert", "child_quaternion"} | _OF_WHOLE_POSES,
+    "positions": {"parent_measures", "child_invert", "child_quaternion"}
+    | _OF_WHOLE_POSES,
     "rotations": {"scale", "parent_scale"} | _OF_WHOLE_POSES,
-    "rates": {"scale", "parent_scale", "child_invert", "child_quaternion"} | _OF_WHOLE_POSES,
+    "rates": {"scale", "parent_scale", "child_invert", "child_quaternion"}
+    | _OF_WHOLE_POSES,
     "stops": {"max_pairs", "max_gap", "time_offset"}
     | {"keyframe.min_translation", "keyframe.min_rotation", "keyframe.min_interval"}
     | {"parent_kind", "child_kind"}
@@ -99,7 +101,9 @@ def streams(kind):
     if kind == "rates":
         steps = se3.inverse(child.poses[:-1]) @ child.poses[1:]
         seconds = np.diff(child.stamps_ns)[:, None] * 1e-9
-        return parent, Trajectory.from_rates(child.stamps_ns[1:], se3.log(steps)[:, 3:] / seconds)
+        return parent, Trajectory.from_rates(
+            child.stamps_ns[1:], se3.log(steps)[:, 3:] / seconds
+        )
     return parent, child
 
 
@@ -107,7 +111,9 @@ def streams(kind):
 def stops():
     """Poses of both sensors at 40 stops."""
     poses = wandering_poses(240)[::6]
-    return disturbed(poses, 4, 0.002, 0.001), disturbed(child_of(poses), 1, 0.002, 0.001)
+    return disturbed(poses, 4, 0.002, 0.001), disturbed(
+        child_of(poses), 1, 0.002, 0.001
+    )
 
 
 @cache

@@ -51,7 +51,9 @@ def test_every_motion_pair_fulfils_ax_xb():
         T_PARENT_CHILD @ pairs.Ts_childi_childj,
         atol=1e-12,
     )
-    assert parent[pairs.i] @ pairs.Ts_parenti_parentj == pytest.approx(parent[pairs.j], abs=1e-12)
+    assert parent[pairs.i] @ pairs.Ts_parenti_parentj == pytest.approx(
+        parent[pairs.j], abs=1e-12
+    )
 
 
 def test_map_coordinates_of_a_million_metres_cost_no_digits_of_a_motion():
@@ -59,7 +61,9 @@ def test_map_coordinates_of_a_million_metres_cost_no_digits_of_a_motion():
     far = near.copy()
     far[:, :3, 3] += np.array([456_789.0, 4_567_890.0, 120.0])
     near_motion = motion_pairs(near, near, "B1").Ts_parenti_parentj
-    assert motion_pairs(far, far, "B1").Ts_parenti_parentj == pytest.approx(near_motion, abs=4e-9)
+    assert motion_pairs(far, far, "B1").Ts_parenti_parentj == pytest.approx(
+        near_motion, abs=4e-9
+    )
 
 
 def test_the_slower_stream_gives_the_stamps():
@@ -69,10 +73,13 @@ def test_the_slower_stream_gives_the_stamps():
     assert slower_stream(fast.stamps_ns, slow.stamps_ns) == "child"
     assert slower_stream(slow.stamps_ns, slow.stamps_ns) == "child"
     assert np.array_equal(
-        synchronise(slow, fast, 0.5).stamps_ns, slow.stamps_ns[slow.stamps_ns <= fast.stamps_ns[-1]]
+        synchronise(slow, fast, 0.5).stamps_ns,
+        slow.stamps_ns[slow.stamps_ns <= fast.stamps_ns[-1]],
     )
     paired = synchronise(fast, slow, 0.5)
-    assert np.array_equal(paired.stamps_ns, slow.stamps_ns[slow.stamps_ns <= fast.stamps_ns[-1]])
+    assert np.array_equal(
+        paired.stamps_ns, slow.stamps_ns[slow.stamps_ns <= fast.stamps_ns[-1]]
+    )
     assert np.array_equal(paired.Ts_cw_c, slow.poses[: len(paired)])
 
 
@@ -110,8 +117,13 @@ class TestKeyframes:
             ((0.199, 0.399, 0.4), [0, 4, 8]),
         ],
     )
-    def test_moving_or_turning_is_enough_but_the_interval_must_pass(self, thresholds, expected):
-        assert select_keyframes(self.straight_then_turning(), *thresholds).tolist() == expected
+    def test_moving_or_turning_is_enough_but_the_interval_must_pass(
+        self, thresholds, expected
+    ):
+        assert (
+            select_keyframes(self.straight_then_turning(), *thresholds).tolist()
+            == expected
+        )
 
     def test_selection_goes_on_where_it_stopped(self):
         poses = self.straight_then_turning()

@@ -66,7 +66,9 @@ def test_relative_errors_of_a_pair_worked_out_by_hand():
 
 @pytest.mark.parametrize("angle", [1e-12, 1e-7, 1e-3, 1.0, np.pi - 1e-7, np.pi])
 def test_absolute_errors_keep_their_digits_at_any_angle(angle):
-    turned = TRUTH @ se3.exp(np.array([0.0, 0.0, 0.0, *(angle * np.array([0.6, 0.0, 0.8]))]))
+    turned = TRUTH @ se3.exp(
+        np.array([0.0, 0.0, 0.0, *(angle * np.array([0.6, 0.0, 0.8]))])
+    )
     turned[:3, 3] += [3e-9, 0.0, -4e-9]
     e_at, e_aR = absolute_errors(turned, TRUTH)
     assert e_at == pytest.approx(5e-9, rel=1e-6)
@@ -75,11 +77,14 @@ def test_absolute_errors_keep_their_digits_at_any_angle(angle):
 
 def test_park_aligns_the_rotation_vectors(noisy):
     rotvecs = [
-        se3.rotation_log(T[:, :3, :3]) for T in (noisy.Ts_parenti_parentj, noisy.Ts_childi_childj)
+        se3.rotation_log(T[:, :3, :3])
+        for T in (noisy.Ts_parenti_parentj, noisy.Ts_childi_childj)
     ]
     expected, _ = Rotation.align_vectors(*rotvecs)
     np.testing.assert_allclose(
-        all_pairs.solve_park(noisy).T_parent_child[:3, :3], expected.as_matrix(), atol=1e-12
+        all_pairs.solve_park(noisy).T_parent_child[:3, :3],
+        expected.as_matrix(),
+        atol=1e-12,
     )
 
 
@@ -88,7 +93,9 @@ def test_rotation_is_never_a_reflection():
     twists = [[0.3, 0.1, 0.2, 0.5, 0.0, 0.0], [0.1, -0.3, 0.4, 0.0, 0.4, 0.0]]
     motions = se3.exp(np.array([*twists, [0.2, 0.2, 0.1, 0.3, 0.3, 0.0]]))
     pairs = pairs_of(motions, se3.inverse(TRUTH) @ motions @ TRUTH)
-    np.testing.assert_allclose(all_pairs.solve_park(pairs).T_parent_child, TRUTH, atol=1e-12)
+    np.testing.assert_allclose(
+        all_pairs.solve_park(pairs).T_parent_child, TRUTH, atol=1e-12
+    )
 
 
 def test_zhuang_ends_where_the_written_out_cost_is_lowest(noisy):
@@ -113,12 +120,16 @@ def test_zhuang_ends_where_the_written_out_cost_is_lowest(noisy):
     rotvec = se3.rotation_log(rotation)
     angle = np.linalg.norm(rotvec)
     parameters = np.r_[np.tan(angle / 2) * rotvec / angle, translation]
-    np.testing.assert_allclose(minimize(cost, parameters, tol=1e-10).x, parameters, atol=1e-5)
+    np.testing.assert_allclose(
+        minimize(cost, parameters, tol=1e-10).x, parameters, atol=1e-5
+    )
 
 
 def test_ali_minimises_the_translation_residual_over_rotations(noisy):
     def cost(parameters):
-        return squared_translation_residual(noisy, se3.rotation_exp(parameters[:3]), parameters[3:])
+        return squared_translation_residual(
+            noisy, se3.rotation_exp(parameters[:3]), parameters[3:]
+        )
 
     solution = all_pairs.solve_ali(noisy)
     rotation, translation = split(solution.T_parent_child)
@@ -128,7 +139,9 @@ def test_ali_minimises_the_translation_residual_over_rotations(noisy):
     )
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     random = np.random.default_rng(1)
-    minima = [minimize(cost, random.uniform(-1.5, 1.5, 6), tol=1e-12).fun for _ in range(5)]
+    minima = [
+        minimize(cost, random.uniform(-1.5, 1.5, 6), tol=1e-12).fun for _ in range(5)
+    ]
     assert solution.objective <= min(minima) * (1 + 1e-9)
     assert solution.objective == pytest.approx(min(minima), rel=1e-6)
 
@@ -137,9 +150,13 @@ def test_ali_is_blind_to_the_rotation_of_the_child(noisy):
     turned = noisy.Ts_childi_childj.copy()
     turned[:, :3, :3] = np.eye(3)
     same = all_pairs.solve_ali(pairs_of(noisy.Ts_parenti_parentj, turned))
-    assert same.objective == pytest.approx(all_pairs.solve_ali(noisy).objective, rel=1e-9)
+    assert same.objective == pytest.approx(
+        all_pairs.solve_ali(noisy).objective, rel=1e-9
+    )
     assert all_pairs.solve_park(noisy).objective > same.objective
 
 
 def test_ali_as_published_fits_a_matrix_that_is_no_rotation(noisy):
-    assert ali_as_published.solve(noisy).objective > all_pairs.solve_ali(noisy).objective
+    assert (
+        ali_as_published.solve(noisy).objective > all_pairs.solve_ali(noisy).objective
+    )

@@ -10,7 +10,9 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory
 from reproduction.part_faults import PLATFORMS
 from reproduction.pose_faults import FAULTS, clean, computed, faulty
 
-OF_ONE_STREAM = [fault for fault, (_, codes) in FAULTS.items() if "not_independent" not in codes]
+OF_ONE_STREAM = [
+    fault for fault, (_, codes) in FAULTS.items() if "not_independent" not in codes
+]
 
 
 def codes_of(stream):
@@ -57,7 +59,10 @@ def test_a_copy_with_noise_of_its_own_never_drifts(platform):
     sound = clean(platform, 7)
     copy = computed(0.003)(sound, np.random.default_rng(1))
     findings = [
-        {finding.code for finding in check_streams(streams.parent, streams.child).findings}
+        {
+            finding.code
+            for finding in check_streams(streams.parent, streams.child).findings
+        }
         for streams in (sound, copy)
     ]
     assert findings == [set(), {"not_independent"}]

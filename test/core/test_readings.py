@@ -93,7 +93,9 @@ class TestDecision:
             (500.0, 0.1, 0.1, True, 0),
         ],
     )
-    def test_the_noise_is_believed_first(self, difference, shape, paths, is_small, index):
+    def test_the_noise_is_believed_first(
+        self, difference, shape, paths, is_small, index
+    ):
         readings = Readings(
             hypotheses=(PLAIN, INVERSE), shape=shape, paths=paths, is_small=is_small
         )
@@ -102,7 +104,9 @@ class TestDecision:
     def test_of_two_inverted_readings_the_shape_decides_in_a_small_space_too(self):
         of_child = Hypothesis((), ("inverse",))
         of_parent = Hypothesis(("inverse",), ())
-        readings = Readings(hypotheses=(of_child, of_parent), shape=0.6, paths=0.1, is_small=True)
+        readings = Readings(
+            hypotheses=(of_child, of_parent), shape=0.6, paths=0.1, is_small=True
+        )
         assert decide(readings, 0.0) == 1
         assert decide(replace(readings, shape=-0.6), 0.0) == 0
         assert decide(replace(readings, shape=0.3), 0.0) is None
@@ -115,7 +119,9 @@ class TestDecision:
 class TestInverse:
     @pytest.mark.parametrize("method", ["auto", "dnlo"])
     def test_both_streams_are_repaired(self, hand, method):
-        result = hec.calibrate(inverted(hand.parent), inverted(hand.child), method=method)
+        result = hec.calibrate(
+            inverted(hand.parent), inverted(hand.child), method=method
+        )
         metres, degrees = errors(result, hand)
         assert metres < 0.05
         assert degrees < 0.5
@@ -169,7 +175,9 @@ class TestUnclear:
         assert is_right == (options == BOTH)
 
 
-@pytest.mark.parametrize("name", ["hand_vio_walk", "car_lever", "drone_gnss_vio", "arm_target"])
+@pytest.mark.parametrize(
+    "name", ["hand_vio_walk", "car_lever", "drone_gnss_vio", "arm_target"]
+)
 def test_right_streams_are_not_solved_twice(name, monkeypatch):
     drive = make(name, 71)
     monkeypatch.setattr(
@@ -214,7 +222,9 @@ def test_a_lever_arm_of_nearly_zero_is_no_evidence_about_inverse_poses(lever_m, 
     """Inverse poses of two sensors in one world look like one sensor, up to noise."""
     Ts_pw_p = wandering_poses(200)
     mount = se3.from_rotation_translation(np.eye(3), [lever_m, 0.0, 0.0])
-    streams = StreamPair(as_trajectory(Ts_pw_p), as_trajectory(child_of(Ts_pw_p, mount)), 1.0)
+    streams = StreamPair(
+        as_trajectory(Ts_pw_p), as_trajectory(child_of(Ts_pw_p, mount)), 1.0
+    )
     explanation = hypotheses.explain(streams, thorough=False)
     _, arms = shape.evidence_for_inverse(streams, explanation.fit)
     assert (arms != 0.0) == counts

@@ -15,7 +15,10 @@ from motions import (
 from sigmas import assert_nees, nees
 
 import hand_eye_calib as hec
-from hand_eye_calib.core.assessment.second_opinion import excess_covariance, second_opinions
+from hand_eye_calib.core.assessment.second_opinion import (
+    excess_covariance,
+    second_opinions,
+)
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.core.solvers.robust import solve, solve_best_stride
@@ -49,7 +52,9 @@ class TestSolver:
         is_outlier = rng.random(len(motions)) < share
         motions[is_outlier] = se3.exp(rng.normal(size=(is_outlier.sum(), 6)))
         spoilt = solve(type(pairs)(**{**vars(pairs), "Ts_childi_childj": motions}))
-        moved = np.abs(se3.log(se3.inverse(clean.T_parent_child) @ spoilt.T_parent_child))
+        moved = np.abs(
+            se3.log(se3.inverse(clean.T_parent_child) @ spoilt.T_parent_child)
+        )
         sigmas = np.sqrt(np.diag(clean.cov_parent_child_in_child))
         assert (moved < 3.0 * sigmas).all()
 
@@ -66,7 +71,9 @@ class TestSolver:
         parent = planar_poses(200)
         mount = se3.from_rotation_translation(np.eye(3), [0.4, -0.2, 0.7])
         solution = solve(motion_pairs(parent, child_of(parent, mount), "B3"))
-        np.testing.assert_allclose(np.abs(solution.unseen[:, 0]), [0, 0, 1, 0, 0, 0], atol=1e-6)
+        np.testing.assert_allclose(
+            np.abs(solution.unseen[:, 0]), [0, 0, 1, 0, 0, 0], atol=1e-6
+        )
         np.testing.assert_allclose(solution.T_parent_child[:2], mount[:2], atol=1e-6)
 
     def test_the_stride_with_the_smallest_covariance_is_taken(self):
@@ -98,7 +105,9 @@ class TestSecondOpinions:
         answer, opinions = answer_and_opinions(seed=2)
         step = np.zeros(6)
         step[axis] = 0.1
-        far = replace(answer, T_parent_child=shifted_in_parent(answer.T_parent_child, step))
+        far = replace(
+            answer, T_parent_child=shifted_in_parent(answer.T_parent_child, step)
+        )
         expected = np.zeros(6)
         expected[axis] = 0.1
         np.testing.assert_allclose(added_sigmas(far, opinions), expected, atol=0.01)

@@ -36,7 +36,9 @@ def test_a_clock_offset_that_is_certain_is_used_and_said(streams):
     assert result.time_offset_s == pytest.approx(0.3, abs=0.01)
     assert result.time_offset_sigma_s > 0
     np.testing.assert_allclose(result.T_parent_child, expected, atol=0.02)
-    (warning,) = (text for text in result.warnings if 'solved with time_offset="estimate"' in text)
+    (warning,) = (
+        text for text in result.warnings if 'solved with time_offset="estimate"' in text
+    )
     assert "the child's clock is 0.3" in warning
 
 
@@ -79,7 +81,9 @@ REPAIRS += [{"quaternion": "wxyz", "invert": "poses"}, {"quaternion": "yzwx"}]
 
 @pytest.mark.parametrize("convention", REPAIRS, ids=str)
 @pytest.mark.parametrize("stream", ["parent", "child"])
-def test_a_stream_in_another_convention_is_repaired_and_that_is_said(streams, stream, convention):
+def test_a_stream_in_another_convention_is_repaired_and_that_is_said(
+    streams, stream, convention
+):
     trajectories = dict(zip(("parent", "child"), streams, strict=False))
     trajectories[stream] = written_otherwise(trajectories[stream], convention)
     result = hec.calibrate(**trajectories, reference="B5")
@@ -92,7 +96,9 @@ def test_a_stream_in_another_convention_is_repaired_and_that_is_said(streams, st
         ", ".join(f'{name}="{value}"' for name, value in options.items())
         for options in (done, usual)
     )
-    sentence = f"Solved with {solved}: USE; as the streams are: DO NOT USE (undo with {undo})"
+    sentence = (
+        f"Solved with {solved}: USE; as the streams are: DO NOT USE (undo with {undo})"
+    )
     assert sentence in warning
 
 
@@ -109,11 +115,16 @@ def test_inverse_poses_on_a_clock_an_hour_off_and_in_feet(streams, scale):
 
 def test_what_was_given_is_kept_spoils_the_verdict_and_the_advice_undoes_it(streams):
     parent, child, _expected = streams
-    as_it_is = hec.calibrate(parent, written_otherwise(child, REPAIRS[0]), child_invert="none")
+    as_it_is = hec.calibrate(
+        parent, written_otherwise(child, REPAIRS[0]), child_invert="none"
+    )
     assert as_it_is.verdict is Verdict.DO_NOT_USE
     assert as_it_is.reasons[0].options == {"child_invert": "poses"}
     wrong = hec.calibrate(parent, child, child_invert="poses", reference="B5")
-    assert (wrong.verdict, wrong.reasons[0].options) == (as_it_is.verdict, {"child_invert": "none"})
+    assert (wrong.verdict, wrong.reasons[0].options) == (
+        as_it_is.verdict,
+        {"child_invert": "none"},
+    )
     unit = hec.calibrate(parent, child.scaled(1000.0), reference="B5", scale="none")
     assert (unit.scale, unit.verdict) == (1.0, as_it_is.verdict)
     assert unit.reasons[0].options == {"scale": 0.001}
@@ -150,10 +161,14 @@ def test_a_scale_that_was_given_is_left_by_the_noise_model_too(streams):
 
 
 def test_a_clock_that_was_given_as_right_is_left_by_the_noise_model_too(late):
-    shifted = replace(late, buffered_child=late.buffered_child.shifted(0.04))  # 0.01 s remain
+    shifted = replace(
+        late, buffered_child=late.buffered_child.shifted(0.04)
+    )  # 0.01 s remain
     estimated = hec.calibrate(late.buffered_parent, shifted.buffered_child)
     assert estimated.time_offset_s == pytest.approx(0.01, abs=0.003)
-    result = hec.calibrate(late.buffered_parent, shifted.buffered_child, time_offset=0.0)
+    result = hec.calibrate(
+        late.buffered_parent, shifted.buffered_child, time_offset=0.0
+    )
     assert (result.time_offset_s, result.time_offset_sigma_s) == (0.0, 0.0)
 
 
@@ -161,7 +176,9 @@ def test_options_that_are_passed_are_given_even_if_they_are_the_defaults():
     assert CalibratorConfig().given == set()
     config = CalibratorConfig.from_options({"time_offset": 0.0, "prior.z": ""})
     assert config.given == {"time_offset", "prior_z"}
-    assert replace(config, scale="estimate", time_offset="estimate").given == config.given
+    assert (
+        replace(config, scale="estimate", time_offset="estimate").given == config.given
+    )
     assert pickle.loads(pickle.dumps(config)).given == config.given
     assert config.is_known("time_offset")
     assert not config.is_known("scale")
@@ -187,7 +204,9 @@ def test_good_streams_are_left_alone(streams):
         (True, 0.3, 1.0, 3),
     ],
 )
-def test_number_of_solves(streams, monkeypatch, is_inverse, offset_s, factor, n_expected):
+def test_number_of_solves(
+    streams, monkeypatch, is_inverse, offset_s, factor, n_expected
+):
     """The look at the clocks solves only what may be the result."""
     parent, child, _ = streams
     if is_inverse:
@@ -213,10 +232,12 @@ def test_a_given_reference_solves_nothing_else_unless_cross_checks_are_asked_for
     parent, child, _ = streams
     solved = []
     monkeypatch.setattr(
-        "hand_eye_calib.core.noise.estimator.solve", lambda *_, **__: solved.append("adaptive")
+        "hand_eye_calib.core.noise.estimator.solve",
+        lambda *_, **__: solved.append("adaptive"),
     )
     monkeypatch.setattr(
-        "hand_eye_calib.core.engine.run.check", lambda *_: solved.append("check") or CheckResult(())
+        "hand_eye_calib.core.engine.run.check",
+        lambda *_: solved.append("check") or CheckResult(()),
     )
     result = hec.calibrate(parent, child, method="dnlo", reference="B5", checks=checks)
     assert solved == ([] if checks is False else ["check"])
@@ -244,7 +265,9 @@ def late():
     return whole_snapshot(parent, child, {})
 
 
-@pytest.mark.parametrize("options", [{"time_offset": 0.0}, {"method": "dnlo", "time_offset": 0.05}])
+@pytest.mark.parametrize(
+    "options", [{"time_offset": 0.0}, {"method": "dnlo", "time_offset": 0.05}]
+)
 def test_a_clock_that_the_user_set_stays(late, options):
     other = replace(late, config=replace(late.config, given=options, **options))
     assert run(other).snapshot is other
@@ -263,9 +286,14 @@ def test_a_large_offset_that_nobody_asked_for_is_used_with_care(late):
 
 @pytest.mark.parametrize(
     ("kind", "span_s", "code"),
-    [("car_lever", 1.0, "position_clock"), ("car_ins_lidar", 0.7, "smoothed_positions")],
+    [
+        ("car_lever", 1.0, "position_clock"),
+        ("car_ins_lidar", 0.7, "smoothed_positions"),
+    ],
 )
-def test_a_model_that_fits_does_not_rule_out_smoothing_without_a_delay(kind, span_s, code):
+def test_a_model_that_fits_does_not_rule_out_smoothing_without_a_delay(
+    kind, span_s, code
+):
     drive = make(kind, 932)
     poses = drive.child.poses.copy()
     poses[:, :3, 3] = uniform_filter1d(
@@ -300,7 +328,9 @@ def test_a_scale_that_the_noise_model_finds_unasked_is_stated(factor, severity, 
         assert "lengths" not in result.headline
         return
     assert findings["model_scale"].severity is severity
-    assert findings["model_scale"].evidence["scale"] == pytest.approx(1.0 / factor, abs=0.002)
+    assert findings["model_scale"].evidence["scale"] == pytest.approx(
+        1.0 / factor, abs=0.002
+    )
     assert f"% {words} than the parent's" in result.headline
     is_care = severity is Severity.WARNING
     assert result.verdict is (Verdict.USE_WITH_CARE if is_care else Verdict.USE)

@@ -59,7 +59,12 @@ def test_standard_deviation_is_of_the_size_of_the_errors():
 
 @pytest.mark.parametrize("method", ["dnlo", "dnl", "park", "taylor", "zhuang", "ali"])
 def test_every_method_takes_it(method):
-    options = {"method": method, "reference": "B10", "scale": "estimate", "checks": False}
+    options = {
+        "method": method,
+        "reference": "B10",
+        "scale": "estimate",
+        "checks": False,
+    }
     result = calibrate(*streams(scale=2.0, noise=0.0005), **options)
     assert result.scale == pytest.approx(2.0, rel=0.005)
     assert 0 < result.scale_sigma < 0.01
@@ -79,13 +84,17 @@ def test_uncertainty_of_the_scale_enters_that_of_the_extrinsic():
     options = {"reference": "B10", "checks": False}
     estimated = calibrate(parent, child, scale="estimate", **options)
     with_scale = calibrate(parent, child, scale=estimated.scale, **options)
-    assert np.trace(estimated.covariance_measured) > np.trace(with_scale.covariance_measured)
+    assert np.trace(estimated.covariance_measured) > np.trace(
+        with_scale.covariance_measured
+    )
 
 
 def test_a_scale_that_explains_nothing_is_refused():
     parent, _ = streams(seed=1)
     _, other = streams(seed=9)
-    with pytest.raises(NotEnoughDataError, match="scale cannot be estimated: even with a scale"):
+    with pytest.raises(
+        NotEnoughDataError, match="scale cannot be estimated: even with a scale"
+    ):
         calibrate(parent, other, reference="B10", scale="estimate")
     assert calibrate(parent, other, reference="B10", scale="auto").scale == 1.0
 
@@ -93,7 +102,14 @@ def test_a_scale_that_explains_nothing_is_refused():
 RATES_HZ = 20.0, 33.0
 
 
-def drive(seed=0, seconds=60, hz=RATES_HZ, shift_s=0.0, noise=0.0, wander=motions.wandering_poses):
+def drive(
+    seed=0,
+    seconds=60,
+    hz=RATES_HZ,
+    shift_s=0.0,
+    noise=0.0,
+    wander=motions.wandering_poses,
+):
     """Both sensors at rates of their own; the child's clock is ``shift_s`` behind, so that this is
     the offset to find.
     """
@@ -134,11 +150,17 @@ def test_a_body_that_rotates_about_one_of_its_sensors():
 
 @pytest.mark.statistics
 @pytest.mark.parametrize(("hz", "jitter_s"), [(RATES_HZ, 0.0), ((50.0, 10.0), 0.006)])
-def test_offset_without_bias_and_its_standard_deviation_of_the_size_of_the_errors(hz, jitter_s):
+def test_offset_without_bias_and_its_standard_deviation_of_the_size_of_the_errors(
+    hz, jitter_s
+):
     ratios = []
     for seed in range(12):
         parent, child = drive(seed, hz=hz, shift_s=1.5, noise=0.003)
-        late_ns = np.random.default_rng(seed).normal(0.0, jitter_s * 1e9, len(child)).astype(int)
+        late_ns = (
+            np.random.default_rng(seed)
+            .normal(0.0, jitter_s * 1e9, len(child))
+            .astype(int)
+        )
         jittered = dataclasses.replace(child, stamps_ns=child.stamps_ns + late_ns)
         offset = estimate_time_offset(parent, jittered)
         ratios.append((offset.seconds - 1.5) / offset.sigma_s)
@@ -151,7 +173,9 @@ def test_jumps_do_no_harm():
     poses = child.poses.copy()
     random = np.random.default_rng(3)
     jumping = random.random(len(child)) < 0.05
-    poses[jumping] = poses[jumping] @ se3.exp(random.normal(size=(int(jumping.sum()), 6)) * 0.5)
+    poses[jumping] = poses[jumping] @ se3.exp(
+        random.normal(size=(int(jumping.sum()), 6)) * 0.5
+    )
     offset = estimate_time_offset(parent, dataclasses.replace(child, poses=poses))
     assert offset.seconds == pytest.approx(41.0, abs=0.01)
 
@@ -161,10 +185,14 @@ def test_angular_rates_do_not_depend_on_conventions():
     plain = correlate_rates(parent, child).offset_s
     inverse = dataclasses.replace(child, poses=se3.inverse(child.poses))
     reordered = Trajectory.from_quat_xyzw(
-        child.stamps_ns, child.poses[:, :3, 3], np.roll(se3.to_quat_xyzw(child.poses), 1, axis=1)
+        child.stamps_ns,
+        child.poses[:, :3, 3],
+        np.roll(se3.to_quat_xyzw(child.poses), 1, axis=1),
     )
     for stream in (inverse, reordered):
-        assert correlate_rates(parent, stream).offset_s == pytest.approx(plain, abs=1e-6)
+        assert correlate_rates(parent, stream).offset_s == pytest.approx(
+            plain, abs=1e-6
+        )
 
 
 class TestWeakEvidenceIsRefused:
@@ -195,7 +223,9 @@ class TestClockRate:
         result = calibrate(parent, slow)
         plain = calibrate(parent, child, checks=False)
         assert result.clock_rate.is_used
-        assert abs(result.clock_rate.ppm - 75.0) < min(5.0, 5.0 * result.clock_rate.sigma_ppm)
+        assert abs(result.clock_rate.ppm - 75.0) < min(
+            5.0, 5.0 * result.clock_rate.sigma_ppm
+        )
         assert 'ppm slow: solved with time_offset="estimate"' in result.warnings[0]
         away = se3.log(se3.inverse(plain.T_parent_child) @ result.T_parent_child)
         assert np.abs(away / np.sqrt(np.diag(plain.covariance_measured))).max() < 0.3
@@ -219,12 +249,18 @@ class TestInTheEngine:
         fixed = calibrate(parent, child, time_offset=estimated.time_offset_s, **options)
         np.testing.assert_array_equal(fixed.T_parent_child, estimated.T_parent_child)
         assert fixed.time_offset_sigma_s == 0.0
-        assert np.linalg.eigvalsh(estimated.covariance_measured - fixed.covariance_measured)[-1] > 0
+        assert (
+            np.linalg.eigvalsh(
+                estimated.covariance_measured - fixed.covariance_measured
+            )[-1]
+            > 0
+        )
 
     def test_long_sessions_settle_it_when_a_buffer_is_full(self):
         parent, child = drive(seconds=120, shift_s=0.2)
         calibrator = Calibrator(
-            CalibratorConfig(time_offset="estimate", reference="B5"), BufferLimits(capacity=900)
+            CalibratorConfig(time_offset="estimate", reference="B5"),
+            BufferLimits(capacity=900),
         )
         for eighth in range(8):
             for stream, trajectory in (("parent", parent), ("child", child)):
@@ -235,7 +271,9 @@ class TestInTheEngine:
         assert snapshot.time_offset.seconds == pytest.approx(0.2, abs=0.002)
         result = snapshot.estimate()
         assert result.time_offset_s == snapshot.time_offset.seconds
-        np.testing.assert_allclose(result.T_parent_child, motions.T_PARENT_CHILD, atol=0.02)
+        np.testing.assert_allclose(
+            result.T_parent_child, motions.T_PARENT_CHILD, atol=0.02
+        )
 
     def test_streams_that_cannot_be_aligned_do_not_fill_the_memory(self):
         calibrator = Calibrator(

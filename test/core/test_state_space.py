@@ -36,18 +36,27 @@ def space_of(seed=1, cut=(4,)):
     h0[:, :, 15] = random.standard_normal((n, 6))
     lever = random.standard_normal((3, 6))
     twists = random.standard_normal((N_POSES, 6))
-    bases = np.diag([1.0, 1, 1, 0, 0, 0]), np.diag([0, 0, 0, 1.0, 1, 1]) + lever.T @ lever
+    bases = (
+        np.diag([1.0, 1, 1, 0, 0, 0]),
+        np.diag([0, 0, 0, 1.0, 1, 1]) + lever.T @ lever,
+    )
     flags = np.zeros(n, dtype=bool)
     flags[list(cut)] = True
     residuals = random.standard_normal((n, 6, 1))
-    columns = np.concatenate([random.standard_normal((n, 6, N_PARAMETERS)), residuals], axis=2)
+    columns = np.concatenate(
+        [random.standard_normal((n, 6, N_PARAMETERS)), residuals], axis=2
+    )
     return StateSpace(
         intervals_s=intervals_s,
         walk_factors=intervals_s / 0.1,
         columns=columns,
         h1_processes=h1_processes,
         h0=h0,
-        white_bases=(bases[0][None], bases[1][None], twists[:, :, None] * twists[:, None]),
+        white_bases=(
+            bases[0][None],
+            bases[1][None],
+            twists[:, :, None] * twists[:, None],
+        ),
         walk_bases=bases,
         group_sizes=SIZES,
         weights=random.uniform(0.3, 2.0, N_POSES),
@@ -72,15 +81,22 @@ def dense_covariance(space, levels):
     prior = np.zeros((N_POSES, d, N_POSES, d))
     for pose in range(N_POSES):
         bases = [basis[pose if len(basis) > 1 else 0] for basis in space.white_bases]
-        white = sum(variance * basis for variance, basis in zip(variances, bases, strict=False))
+        white = sum(
+            variance * basis for variance, basis in zip(variances, bases, strict=False)
+        )
         prior[pose, :6, pose, :6] = white / space.weights[pose]
     times = np.r_[0.0, np.cumsum(space.intervals_s)]
     for state, group in enumerate(np.repeat(range(len(SIZES)), SIZES), start=6):
         variance, tau_s = variances[5 + 2 * group : 7 + 2 * group]
-        prior[:, state, :, state] = variance * np.exp(-np.abs(times[:, None] - times) / tau_s)
+        prior[:, state, :, state] = variance * np.exp(
+            -np.abs(times[:, None] - times) / tau_s
+        )
     entries = np.zeros((n, 6, N_POSES, d))
     for i in range(n):
-        entries[i, :, i + 1, :6], entries[i, :, i + 1, 6:] = np.eye(6), space.h1_processes[i]
+        entries[i, :, i + 1, :6], entries[i, :, i + 1, 6:] = (
+            np.eye(6),
+            space.h1_processes[i],
+        )
         entries[i, :, i] = -space.h0[i]
     entries = entries.reshape(6 * n, -1)
     walk = variances[3] * space.walk_bases[0] + variances[4] * space.walk_bases[1]
@@ -129,7 +145,10 @@ def test_a_parameter_without_information_changes_no_derivative():
     step = 1e-5
     gradient, _ = reml.derivatives(Posterior(space, LEVELS))
     numerical = [
-        (Posterior(space, LEVELS + change).loss - Posterior(space, LEVELS - change).loss)
+        (
+            Posterior(space, LEVELS + change).loss
+            - Posterior(space, LEVELS - change).loss
+        )
         / (2 * step)
         for change in step * np.eye(N_LEVELS)
     ]
@@ -162,7 +181,8 @@ def test_derivatives_of_the_likelihood_are_the_numerical_ones():
     step = 1e-5
     gradient, information = reml.derivatives(Posterior(space, LEVELS))
     numerical = [
-        (dense_loss(space, LEVELS + change)[0] - dense_loss(space, LEVELS - change)[0]) / (2 * step)
+        (dense_loss(space, LEVELS + change)[0] - dense_loss(space, LEVELS - change)[0])
+        / (2 * step)
         for change in step * np.eye(N_LEVELS)
     ]
     np.testing.assert_allclose(gradient, numerical, atol=1e-7)
@@ -172,7 +192,10 @@ def test_derivatives_of_the_likelihood_are_the_numerical_ones():
     inverse = np.linalg.inv(dense_covariance(space, LEVELS)[np.ix_(rows, rows)])
     P = inverse - inverse @ J @ np.linalg.inv(J.T @ inverse @ J) @ J.T @ inverse
     slopes = [
-        (dense_covariance(space, LEVELS + change) - dense_covariance(space, LEVELS - change))
+        (
+            dense_covariance(space, LEVELS + change)
+            - dense_covariance(space, LEVELS - change)
+        )
         / (2 * step)
         for change in step * np.eye(N_LEVELS)
     ]
@@ -182,7 +205,9 @@ def test_derivatives_of_the_likelihood_are_the_numerical_ones():
 
 def test_surprises_are_what_leaving_one_out_makes_of_it():
     space = space_of(cut=())
-    of_walk, _ = innovation_chi_squares(Posterior(space, LEVELS), np.zeros(N_POSES, dtype=bool))
+    of_walk, _ = innovation_chi_squares(
+        Posterior(space, LEVELS), np.zeros(N_POSES, dtype=bool)
+    )
     V = dense_covariance(space, LEVELS)
     J, r = parameters_and_residuals(space)
     inverse = np.linalg.inv(V)
@@ -193,7 +218,9 @@ def test_surprises_are_what_leaving_one_out_makes_of_it():
         assert surprise == pytest.approx(u[i] @ np.linalg.solve(own, u[i]), rel=1e-5)
     # An increment that is no evidence is judged by the same number.
     without = space_of(cut=(6,))
-    again, _ = innovation_chi_squares(Posterior(without, LEVELS), np.zeros(N_POSES, dtype=bool))
+    again, _ = innovation_chi_squares(
+        Posterior(without, LEVELS), np.zeros(N_POSES, dtype=bool)
+    )
     assert again[6] == pytest.approx(of_walk[6], rel=1e-5)
 
 
@@ -265,14 +292,27 @@ def test_chi_squares_of_jitter_along_one_velocity_are_finite():
 
 def test_parts_have_the_posterior_of_a_trajectory_that_is_cut_between_them(monkeypatch):
     monkeypatch.setattr(partwise, "MAX_POSES", 5)
-    whole = replace(space_of(cut=(4, 9)), group_sizes=(), prior=np.eye(N_PARAMETERS + 1))
-    whole = replace(whole, h1_processes=whole.h1_processes[:, :, :0], h0=whole.h0[:, :, :6])
+    whole = replace(
+        space_of(cut=(4, 9)), group_sizes=(), prior=np.eye(N_PARAMETERS + 1)
+    )
+    whole = replace(
+        whole, h1_processes=whole.h1_processes[:, :, :0], h0=whole.h0[:, :, :6]
+    )
 
     def space_of_part(poses):
         increments = poses[:-1]
-        bases = tuple(basis if len(basis) == 1 else basis[poses] for basis in whole.white_bases)
+        bases = tuple(
+            basis if len(basis) == 1 else basis[poses] for basis in whole.white_bases
+        )
         fields = {"white_bases": bases, "weights": whole.weights[poses]}
-        for name in ("intervals_s", "walk_factors", "columns", "h1_processes", "h0", "cut"):
+        for name in (
+            "intervals_s",
+            "walk_factors",
+            "columns",
+            "h1_processes",
+            "h0",
+            "cut",
+        ):
             fields[name] = getattr(whole, name)[increments]
         return replace(whole, **fields)
 
@@ -283,8 +323,12 @@ def test_parts_have_the_posterior_of_a_trajectory_that_is_cut_between_them(monke
     assert posterior.loss == pytest.approx(expected.loss, rel=1e-11)
     np.testing.assert_allclose(posterior.products, expected.products, atol=1e-9)
     step = posterior.normal.step
-    np.testing.assert_allclose(posterior.states_after(step), expected.states_after(step), atol=1e-9)
-    np.testing.assert_allclose(posterior.part_products().sum(axis=0), expected.products, atol=1e-9)
+    np.testing.assert_allclose(
+        posterior.states_after(step), expected.states_after(step), atol=1e-9
+    )
+    np.testing.assert_allclose(
+        posterior.part_products().sum(axis=0), expected.products, atol=1e-9
+    )
     no_spikes = np.zeros(N_POSES, dtype=bool)
     of_walk, of_white = innovation_chi_squares(posterior, no_spikes)
     whole_walk, whole_white = innovation_chi_squares(expected, no_spikes)

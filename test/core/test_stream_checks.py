@@ -20,7 +20,11 @@ from hand_eye_calib.core.checks.streams import check_frozen, check_stream, froze
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.extras.simulation.drive import simulate, simulate_drive
-from hand_eye_calib.extras.simulation.options import MIXTURE, PUBLISHED_DRIVE, NoiseConfig
+from hand_eye_calib.extras.simulation.options import (
+    MIXTURE,
+    PUBLISHED_DRIVE,
+    NoiseConfig,
+)
 from hand_eye_calib.offline.cli.main import main
 from hand_eye_calib.offline.report.evidence import summarise
 
@@ -48,7 +52,11 @@ def with_stop(stream, duration_s, drift):
     n_poses = round(10 * duration_s)
     shares = np.arange(1, n_poses + 1)[:, None] / n_poses
     standing = stream.poses[_STOP_AT] @ se3.exp(shares * drift)
-    onward = standing[-1] @ se3.inverse(stream.poses[_STOP_AT]) @ stream.poses[_STOP_AT + 1 :]
+    onward = (
+        standing[-1]
+        @ se3.inverse(stream.poses[_STOP_AT])
+        @ stream.poses[_STOP_AT + 1 :]
+    )
     poses = np.concatenate([stream.poses[: _STOP_AT + 1], standing, onward])
     return motions.as_trajectory(poses)
 
@@ -89,7 +97,9 @@ def test_a_body_that_rotates_about_one_of_its_sensors(centred):
     rotating[:, :3, 3] = 0.0
     streams = [rotating, motions.child_of(rotating, T_cw_pw=np.eye(4))]
     parent, child = (
-        motions.as_trajectory(motions.disturbed(se3.inverse(poses[0]) @ poses, seed, 0.005, 0.001))
+        motions.as_trajectory(
+            motions.disturbed(se3.inverse(poses[0]) @ poses, seed, 0.005, 0.001)
+        )
         for seed, poses in enumerate(streams if centred == "parent" else streams[::-1])
     )
     assert grave(check_streams(parent, child)) == []
@@ -115,7 +125,11 @@ class TestTwoSensorsInOneStream:
 
 def test_one_world_for_both_streams_is_no_sign_of_inverse_poses():
     seconds = np.arange(400) * 0.05
-    turns = np.sin(np.outer(seconds, [0.7, 0.9, 0.1]) + np.array([0.0, 1.0, 0.0])) * [0.3, 0.2, 1.2]
+    turns = np.sin(np.outer(seconds, [0.7, 0.9, 0.1]) + np.array([0.0, 1.0, 0.0])) * [
+        0.3,
+        0.2,
+        1.2,
+    ]
     places = np.outer(seconds, [0.05, 0.07, 0.8]) + np.array([0.0, 0.0, np.pi / 2])
     places = np.sin(places) * [20.0, 20.0, 0.5]
     poses = se3.from_rotation_translation(se3.rotation_exp(turns), places)
@@ -123,7 +137,9 @@ def test_one_world_for_both_streams_is_no_sign_of_inverse_poses():
     parent = motions.as_trajectory(poses, 20)
     child = motions.as_trajectory(noisy, 20)
     assert grave(check_streams(parent, child)) == []
-    assert grave(check_streams(inverted(parent), inverted(child))) == [("inverse_both", "both")]
+    assert grave(check_streams(inverted(parent), inverted(child))) == [
+        ("inverse_both", "both")
+    ]
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -134,7 +150,9 @@ def test_every_fault_is_named(fault):
     assert [pair for pair, _ in grave(agreement)] == [code]
 
 
-@pytest.mark.parametrize("noise", [MIXTURE, NoiseConfig(gaussian=0.01, outliers=0.1, drift=0.05)])
+@pytest.mark.parametrize(
+    "noise", [MIXTURE, NoiseConfig(gaussian=0.01, outliers=0.1, drift=0.05)]
+)
 def test_strong_noise_is_no_fault_of_the_rig(noise):
     simulated = simulate_drive((1, 0), PUBLISHED_DRIVE, noise)
     result = check_streams(simulated.parent, simulated.child)
@@ -166,15 +184,21 @@ class TestWhichStreamAndWhatToDo:
     def test_offset_and_scale_come_as_options(self):
         parent, child = drive()
         findings = {
-            f.code: f for f in check_streams(parent, child.shifted(-7.25).scaled(0.5)).findings
+            f.code: f
+            for f in check_streams(parent, child.shifted(-7.25).scaled(0.5)).findings
         }
-        assert findings["time_offset"].options["time_offset"] == pytest.approx(7.25, abs=0.002)
+        assert findings["time_offset"].options["time_offset"] == pytest.approx(
+            7.25, abs=0.002
+        )
         assert findings["scale"].options["scale"] == pytest.approx(2.0, rel=0.005)
         result = check_streams(
             parent, child.shifted(-7.25).scaled(0.5), time_offset_s=7.25, scale=2.0
         )
         assert grave(result) == []
-        tiny = [finding.options for finding in check_streams(parent, child.scaled(2e5)).findings]
+        tiny = [
+            finding.options
+            for finding in check_streams(parent, child.scaled(2e5)).findings
+        ]
         assert {"scale": pytest.approx(5e-6, rel=0.005)} in tiny
         # The solve may have found a scale of its own beside the unit.
         result = check_streams(parent.scaled(1000.0), child, scale=1.17)
@@ -189,8 +213,12 @@ class TestWhichStreamAndWhatToDo:
 
     def test_left_handed_axes_and_two_mistakes_at_once(self):
         parent, child = drive()
-        assert grave(check_streams(parent, mirrored(child))) == [("left_handed", "child")]
-        findings = grave(check_streams(parent, reordered(child).shifted(-33.0).scaled(1000.0)))
+        assert grave(check_streams(parent, mirrored(child))) == [
+            ("left_handed", "child")
+        ]
+        findings = grave(
+            check_streams(parent, reordered(child).shifted(-33.0).scaled(1000.0))
+        )
         codes = "quaternion_order", "time_offset", "units"
         assert sorted(findings) == [(code, "child") for code in codes]
 
@@ -199,9 +227,13 @@ class TestWhichStreamAndWhatToDo:
             se3.rotation_exp(np.array([np.pi / 2, 0, 0])), np.zeros(3)
         )
         parent, child = drive(wander=motions.planar_poses)
-        note = check_streams(motions.as_trajectory(parent.poses @ lying), child).findings[0]
+        note = check_streams(
+            motions.as_trajectory(parent.poses @ lying), child
+        ).findings[0]
         assert (note.code, note.severity) == ("one_axis", Severity.NOTE)
-        assert note.what == "y cannot be determined from this motion, and will be unknown"
+        assert (
+            note.what == "y cannot be determined from this motion, and will be unknown"
+        )
         assert note.options == {"prior.y": "VALUE+/-SIGMA"}
 
 
@@ -228,13 +260,17 @@ class TestOneStream:
 
     def test_frozen_only_while_the_other_moves(self):
         parent, child = drive()
-        assert frozen_share(frozen(child, 0.75), parent) == pytest.approx(0.25, abs=0.01)
+        assert frozen_share(frozen(child, 0.75), parent) == pytest.approx(
+            0.25, abs=0.01
+        )
         assert frozen_share(child, parent) == 0.0
         assert frozen_share(frozen(child, 0.75), frozen(parent, 0.75)) == 0.0
 
     @pytest.mark.parametrize("repeating", ["parent", "child"])
     @pytest.mark.parametrize("duration_s", [4.0, 42.0, 120.0])
-    def test_drift_of_one_odometry_at_traffic_lights_is_no_motion(self, repeating, duration_s):
+    def test_drift_of_one_odometry_at_traffic_lights_is_no_motion(
+        self, repeating, duration_s
+    ):
         streams = dict(zip(("parent", "child"), driving_car(), strict=True))
         drift = np.r_[0.05, -0.03, 0.01, 0.01, 0.0, 0.04]
         for name, stream in streams.items():
@@ -259,7 +295,9 @@ class TestOneStream:
     @pytest.mark.parametrize("frozen_stream", ["parent", "child"])
     @pytest.mark.parametrize("duration_s", [2.0, 3.5, 6.0])
     @pytest.mark.parametrize("of", ["car", "hand"])
-    def test_a_freeze_of_seconds_during_motion_is_found(self, frozen_stream, duration_s, of):
+    def test_a_freeze_of_seconds_during_motion_is_found(
+        self, frozen_stream, duration_s, of
+    ):
         pair = driving_car() if of == "car" else drive(n_poses=600)
         streams = dict(zip(("parent", "child"), pair, strict=True))
         stream = streams[frozen_stream]
@@ -295,7 +333,11 @@ class TestOneStream:
         summarise(far)
         assert tracemalloc.get_traced_memory()[1] < 50e6
         tracemalloc.stop()
-        assert (finding.code, finding.stream, finding.severity) == ("leap", "child", Severity.ERROR)
+        assert (finding.code, finding.stream, finding.severity) == (
+            "leap",
+            "child",
+            Severity.ERROR,
+        )
         assert f"leap by 1,095 days after pose {at} of 500" in finding.what
         assert finding.advice == f"repair the stamps, or remove {few} of its poses"
         with pytest.raises(InputError, match="leap by 1,095 days"):
@@ -327,9 +369,14 @@ class TestCommand:
         assert main(["check", *files(parent, child.shifted(-2.0))]) == 1
         out, err = capsys.readouterr()
         assert "ERROR    time_offset" in out
-        assert out.startswith("DO NOT USE as they are: calibrate with --time-offset estimate.\n")
+        assert out.startswith(
+            "DO NOT USE as they are: calibrate with --time-offset estimate.\n"
+        )
         assert len(err.splitlines()) == 1
-        assert main(["check", *files(parent, child.shifted(-2.0)), "--time-offset", "2"]) == 0
+        assert (
+            main(["check", *files(parent, child.shifted(-2.0)), "--time-offset", "2"])
+            == 0
+        )
 
     def test_a_finding_that_the_options_answer_is_a_note(self, files, capsys):
         parent, child = drive()
@@ -354,7 +401,8 @@ class TestSlowStreams:
     @pytest.mark.parametrize("interval_s", [1.0, 20.0])
     def test_equal_stamps_have_motions_in_common(self, interval_s):
         parent, child = (
-            motions.as_trajectory(stream.poses[::5], 1 / interval_s) for stream in drive()
+            motions.as_trajectory(stream.poses[::5], 1 / interval_s)
+            for stream in drive()
         )
         assert grave(check_streams(parent, child)) == []
 
@@ -363,9 +411,9 @@ class TestSlowStreams:
             motions.as_trajectory(stream.poses, 1.0)
             for stream in drive(wander=motions.planar_poses)
         )
-        assert [code for code, _ in grave(check_streams(parent, child.shifted(-3.0)))] == [
-            "time_offset"
-        ]
+        assert [
+            code for code, _ in grave(check_streams(parent, child.shifted(-3.0)))
+        ] == ["time_offset"]
 
 
 def around_a_target(n_poses, seed):
@@ -374,7 +422,9 @@ def around_a_target(n_poses, seed):
     angles = random.uniform([-0.9, 0.3, -0.5], [0.9, 1.2, 0.5], (n_poses, 3))
     azimuth, elevation, roll = angles.T
     ahead = -np.c_[
-        np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
+        np.cos(elevation) * np.cos(azimuth),
+        np.cos(elevation) * np.sin(azimuth),
+        np.sin(elevation),
     ]
     right = np.cross([0.0, 0.0, 1.0], ahead)
     right /= np.linalg.norm(right, axis=1, keepdims=True)
@@ -400,11 +450,24 @@ def test_a_camera_around_its_target_is_no_sign_of_inverse_poses(seed):
 def test_a_short_lever_arm_is_zero_only_if_it_cannot_be_longer_than_2_mm():
     poses = motions.wandering_poses(600, 5, 0.02)
     severities = []
-    for length_m, noise in ((0.0005, 1e-4), (0.004, 1e-4), (0.016, 0.004), (0.016, 0.02)):
-        X = se3.from_rotation_translation(se3.rotation_exp([0.4, -0.8, 0.3]), [length_m, 0.0, 0.0])
-        findings = check_streams(*motions.noisy_pair(poses, 1, noise, noise, mount=X)).findings
+    for length_m, noise in (
+        (0.0005, 1e-4),
+        (0.004, 1e-4),
+        (0.016, 0.004),
+        (0.016, 0.02),
+    ):
+        X = se3.from_rotation_translation(
+            se3.rotation_exp([0.4, -0.8, 0.3]), [length_m, 0.0, 0.0]
+        )
+        findings = check_streams(
+            *motions.noisy_pair(poses, 1, noise, noise, mount=X)
+        ).findings
         severities.append(
-            {finding.severity for finding in findings if finding.code == "same_position"}
+            {
+                finding.severity
+                for finding in findings
+                if finding.code == "same_position"
+            }
         )
     assert severities == [{Severity.ERROR}, {Severity.WARNING}, set(), set()]
 

@@ -5,11 +5,22 @@ import functools
 
 import numpy as np
 import pytest
-from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, noisy_pair, wandering_poses
+from motions import (
+    T_PARENT_CHILD,
+    as_trajectory,
+    child_of,
+    disturbed,
+    noisy_pair,
+    wandering_poses,
+)
 from scipy.ndimage import gaussian_filter1d
 
 import hand_eye_calib as hec
-from hand_eye_calib.core.assessment.moved import SIGNIFICANT, find_change, possible_shift
+from hand_eye_calib.core.assessment.moved import (
+    SIGNIFICANT,
+    find_change,
+    possible_shift,
+)
 from hand_eye_calib.core.checks.check import check_streams
 from hand_eye_calib.core.checks.findings import Severity
 from hand_eye_calib.core.checks.open_delay import faulty_variance
@@ -40,7 +51,9 @@ def drive(seed=0):
 def test_every_fault_is_named(fault):
     severity = fault.severities[STRONGEST.get(fault.code, -1)]
     sound = drive()
-    streams = fault.damage(sound.parent, sound.child, severity, np.random.default_rng(0))
+    streams = fault.damage(
+        sound.parent, sound.child, severity, np.random.default_rng(0)
+    )
     findings = check_streams(*streams).findings
     assert {finding.code for finding in findings} & fault.named
     for finding in findings:
@@ -50,21 +63,29 @@ def test_every_fault_is_named(fault):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_sound_drive_has_no_finding(seed):
-    assert [finding.code for finding in check_streams(*_streams(drive(seed))).findings] == []
+    assert [
+        finding.code for finding in check_streams(*_streams(drive(seed))).findings
+    ] == []
 
 
 @functools.cache
 def late_parent(delay_s):
     """Streams of the drive whose parent has late positions, and their result."""
     sound = drive()
-    late = LATE_POSITIONS.damage(sound.parent, sound.child, delay_s, np.random.default_rng(0))
+    late = LATE_POSITIONS.damage(
+        sound.parent, sound.child, delay_s, np.random.default_rng(0)
+    )
     return late, hec.calibrate(*late)
 
 
 def test_sigma_contains_a_delay_of_positions_below_the_limit_of_a_finding():
     _, result = late_parent(0.02)
     (note,) = result.findings
-    assert (note.code, note.stream, note.severity) == ("position_clock", "parent", Severity.NOTE)
+    assert (note.code, note.stream, note.severity) == (
+        "position_clock",
+        "parent",
+        Severity.NOTE,
+    )
     error = se3.deviation(result.T_parent_child, drive().T_parent_child)
     assert abs(error[0]) > 0.025  # m: 20 ms at 1.5 m/s
     assert (np.abs(error) < 2.0 * result.sigmas).all()
@@ -92,9 +113,13 @@ def test_an_uncertain_delay_does_not_change_its_prior():
 @pytest.mark.parametrize(
     ("platform", "seed", "share"), [("agv", 674704, 0.3), ("car", 674702, 0.3)]
 )
-def test_exchanged_streams_on_flat_ground_are_named_by_their_displacements(platform, seed, share):
+def test_exchanged_streams_on_flat_ground_are_named_by_their_displacements(
+    platform, seed, share
+):
     streams = pose_faults.clean(platform, seed)
-    exchanged = EXCHANGED.damage(streams.parent, streams.child, share, np.random.default_rng(0))
+    exchanged = EXCHANGED.damage(
+        streams.parent, streams.child, share, np.random.default_rng(0)
+    )
     found = check_streams(*exchanged, earlier=None).findings
     assert "exchanged" in {finding.code for finding in found if finding.makes_unusable}
 
@@ -102,8 +127,12 @@ def test_exchanged_streams_on_flat_ground_are_named_by_their_displacements(platf
 @pytest.mark.parametrize("seed", range(3))
 def test_a_drift_on_a_flat_floor_is_no_scale_of_heights(seed):
     noise = dataclasses.replace(REALISTIC, drift=0.01)
-    flat = simulate_drive(seed, dataclasses.replace(HILLY_DRIVE, terrain_height=0.0), noise)
-    assert "axis_scale" not in {finding.code for finding in check_streams(*_streams(flat)).findings}
+    flat = simulate_drive(
+        seed, dataclasses.replace(HILLY_DRIVE, terrain_height=0.0), noise
+    )
+    assert "axis_scale" not in {
+        finding.code for finding in check_streams(*_streams(flat)).findings
+    }
 
 
 def _streams(simulated):
@@ -115,7 +144,9 @@ def test_the_time_of_a_loose_mount_does_not_depend_on_noise(level):
     sound = simulate_drive(4, HILLY_DRIVE, NoiseConfig(gaussian=level))
     loosened = next(fault for fault in FAULTS if fault.code == "S8")
     streams = loosened.damage(sound.parent, sound.child, 5.0, np.random.default_rng(1))
-    (finding,) = (f for f in check_streams(*streams).findings if f.code == "mount_moved")
+    (finding,) = (
+        f for f in check_streams(*streams).findings if f.code == "mount_moved"
+    )
     assert finding.evidence["at_s"] == pytest.approx(60.0, abs=3.0)
     assert "60 s after the start" in finding.what or "5" in finding.what
 
@@ -125,7 +156,9 @@ def rounded_pair(step_m, in_mm):
     a step.
     """
     poses = wandering_poses(900, 3, step_m=0.004, step_rad=0.04)
-    streams = dict(zip(("parent", "child"), noisy_pair(poses, 1, 3e-4, 5e-4), strict=True))
+    streams = dict(
+        zip(("parent", "child"), noisy_pair(poses, 1, 3e-4, 5e-4), strict=True)
+    )
     for name, stream in streams.items():
         if in_mm in (name, "both"):
             poses = stream.poses.copy()
@@ -164,13 +197,20 @@ class TestGrid:
     @pytest.mark.parametrize(
         ("step_m", "severity"), [(0.008, Severity.WARNING), (0.05, Severity.ERROR)]
     )
-    def test_coarse_millimetres_are_named_by_their_step_in_metres(self, stream, step_m, severity):
+    def test_coarse_millimetres_are_named_by_their_step_in_metres(
+        self, stream, step_m, severity
+    ):
         option = {"parent": "parent_scale", "child": "scale"}[stream]
         streams = rounded_pair(step_m=step_m, in_mm=stream)
         result = hec.calibrate(*streams, **{option: 0.001})
-        (finding,) = (finding for finding in result.findings if finding.code == "coarse_positions")
+        (finding,) = (
+            finding for finding in result.findings if finding.code == "coarse_positions"
+        )
         assert (finding.stream, finding.severity) == (stream, severity)
-        assert finding.what == f"the {stream} stream's positions are multiples of {step_m:g} m"
+        assert (
+            finding.what
+            == f"the {stream} stream's positions are multiples of {step_m:g} m"
+        )
 
     def test_steady_motion_is_no_grid(self):
         poses = np.tile(np.eye(4), (300, 1, 1))
@@ -214,26 +254,38 @@ class TestOneStreamComputedFromTheOther:
         parent = drive().parent
         n_poses = int((parent.duration_s - 0.1) * rate_hz)
         start_ns = int(parent.stamps_ns[0]) + 7_300_000
-        stamps_ns = as_trajectory(np.tile(np.eye(4), (n_poses, 1, 1)), rate_hz, start_ns).stamps_ns
+        stamps_ns = as_trajectory(
+            np.tile(np.eye(4), (n_poses, 1, 1)), rate_hz, start_ns
+        ).stamps_ns
         child = Trajectory(stamps_ns, child_of(straight_at(parent, stamps_ns)))
         assert self.found(parent, child) == [self.SENTENCE]
 
     @pytest.mark.parametrize("delay_s", [0.0, 0.05])
     def test_in_a_text_file_of_six_digits_and_with_a_delay(self, delay_s):
         parent = drive().parent
-        child = Trajectory(parent.stamps_ns, rounded(child_of(parent.poses), 6)).shifted(-delay_s)
+        child = Trajectory(
+            parent.stamps_ns, rounded(child_of(parent.poses), 6)
+        ).shifted(-delay_s)
         parent = Trajectory(parent.stamps_ns, rounded(parent.poses, 6))
         assert self.SENTENCE in self.found(parent, child)
 
-    @pytest.mark.parametrize(("error_m", "width"), [(0.0, 0.01), (0.05, 0.01), (0.005, 1.0)])
+    @pytest.mark.parametrize(
+        ("error_m", "width"), [(0.0, 0.01), (0.05, 0.01), (0.005, 1.0)]
+    )
     def test_with_a_little_noise_and_slow_errors_of_its_own(self, error_m, width):
         stamps_ns = drive().parent.stamps_ns
         poses = gaussian_filter1d(drive().parent.poses, width, axis=0)
         poses[:, :3, :3] = se3.nearest_rotation(poses[:, :3, :3])
-        slow = error_m * np.sin(np.outer(np.arange(len(poses)) / 40, [1, 0, 0, 0, 0.2, 0]))
-        own = disturbed(child_of(poses) @ se3.exp(slow), 1, *(width < 1) * np.array([1e-4, 3e-5]))
+        slow = error_m * np.sin(
+            np.outer(np.arange(len(poses)) / 40, [1, 0, 0, 0, 0.2, 0])
+        )
+        own = disturbed(
+            child_of(poses) @ se3.exp(slow), 1, *(width < 1) * np.array([1e-4, 3e-5])
+        )
         sentences = self.found(Trajectory(stamps_ns, poses), Trajectory(stamps_ns, own))
-        assert sentences == [f"the noise of both streams is unusually alike{self.QUESTION}"]
+        assert sentences == [
+            f"the noise of both streams is unusually alike{self.QUESTION}"
+        ]
 
     def test_orientations_alone(self):
         parent, child = _streams(drive())
@@ -241,13 +293,19 @@ class TestOneStreamComputedFromTheOther:
         inner = parent[1:-1]
         world = child.at(inner.stamps_ns[:1]) @ se3.inverse(inner.poses[:1] @ X)
         poses = child.at(inner.stamps_ns)
-        wrong = se3.from_rotation_translation(se3.rotation_exp([0.2, -0.1, 0.3]), np.zeros(3))
+        wrong = se3.from_rotation_translation(
+            se3.rotation_exp([0.2, -0.1, 0.3]), np.zeros(3)
+        )
         poses[:, :3, :3] = (world @ inner.poses @ X @ wrong)[:, :3, :3]
-        assert self.found(parent, Trajectory(inner.stamps_ns, poses))[0] == self.SENTENCE
+        assert (
+            self.found(parent, Trajectory(inner.stamps_ns, poses))[0] == self.SENTENCE
+        )
 
     def test_never_use(self):
         parent = drive().parent
-        result = hec.calibrate(parent, Trajectory(parent.stamps_ns, child_of(parent.poses)))
+        result = hec.calibrate(
+            parent, Trajectory(parent.stamps_ns, child_of(parent.poses))
+        )
         assert result.verdict is Verdict.DO_NOT_USE
         assert result.reasons[0].sentence == self.SENTENCE
 
@@ -263,7 +321,9 @@ class TestOneStreamComputedFromTheOther:
     @pytest.mark.parametrize("noise", [2e-5, 5e-5, 2e-4, 5e-4, 2e-3])
     def test_two_precise_sensors_are_no_copies(self, rate_hz, noise):
         poses = wandering_poses(600, 4, 1.0 / rate_hz, 0.8 / rate_hz)
-        findings = check_streams(*noisy_pair(poses, 1, noise, noise, rate_hz=rate_hz)).findings
+        findings = check_streams(
+            *noisy_pair(poses, 1, noise, noise, rate_hz=rate_hz)
+        ).findings
         assert [finding.what for finding in findings] == []
 
 
@@ -291,7 +351,9 @@ class TestParentFusedFromTheChild:
     def test_short_motions_show_another_mount_than_long_ones(self, kind, tau_s):
         truth = make(kind, 901)
         inside = slice(2, -2)
-        parent = fused(truth.parent[inside], truth.child, truth.T_parent_child @ self.WRONG, tau_s)
+        parent = fused(
+            truth.parent[inside], truth.child, truth.T_parent_child @ self.WRONG, tau_s
+        )
         result = hec.calibrate(parent, truth.child)
         assert result.verdict is not Verdict.USE
         codes = {finding.code for finding in result.findings}
@@ -322,7 +384,9 @@ class TestParentFusedFromTheChild:
     def test_a_wrong_lever_arm_alone_is_questioned(self):
         truth = make("hand_vio_walk", 902)
         shift = se3.from_rotation_translation(np.eye(3), np.array([0.05, -0.05, 0.04]))
-        parent = fused(truth.parent[2:-2], truth.child, truth.T_parent_child @ shift, 0.1)
+        parent = fused(
+            truth.parent[2:-2], truth.child, truth.T_parent_child @ shift, 0.1
+        )
         (finding,) = check_streams(parent, truth.child).findings
         assert (finding.code, finding.severity) == ("not_independent", Severity.WARNING)
         assert finding.evidence["shift_m"] == pytest.approx(0.081, rel=0.2)
@@ -330,7 +394,9 @@ class TestParentFusedFromTheChild:
     @pytest.mark.parametrize("seed", [61, 62])
     def test_rotations_about_one_axis_show_no_other_mount(self, seed):
         flat = make("flat_agv", seed)
-        codes = [finding.code for finding in check_streams(flat.parent, flat.child).findings]
+        codes = [
+            finding.code for finding in check_streams(flat.parent, flat.child).findings
+        ]
         assert codes == ["one_axis"]
 
     @pytest.mark.parametrize("kind", ["car_ins_lidar", "agv_long"])
@@ -442,11 +508,19 @@ class TestGraveAgain:
     @staticmethod
     def errors(code, severity):
         sound = drive()
-        fault = next(fault for fault in (*FAULTS, *LATER, *SILENT) if fault.code == code)
+        fault = next(
+            fault for fault in (*FAULTS, *LATER, *SILENT) if fault.code == code
+        )
         random = np.random.default_rng(5)
-        parent, child = fault.damage(sound.parent, sound.child, fault.severities[severity], random)
+        parent, child = fault.damage(
+            sound.parent, sound.child, fault.severities[severity], random
+        )
         result = hec.calibrate(parent, child, max_pairs=400, **fault.options)
-        return [finding.code for finding in result.findings if finding.severity.value == "error"]
+        return [
+            finding.code
+            for finding in result.findings
+            if finding.severity.value == "error"
+        ]
 
     @pytest.mark.parametrize(
         ("code", "severity", "name"),
@@ -462,7 +536,9 @@ class TestGraveAgain:
 
     @pytest.mark.parametrize("axis", [0, 1, 2])
     @pytest.mark.parametrize("share", [0.5, 0.4])
-    def test_a_child_that_starts_anew_with_left_handed_axes_is_an_error(self, axis, share):
+    def test_a_child_that_starts_anew_with_left_handed_axes_is_an_error(
+        self, axis, share
+    ):
         sound = drive(1)
         poses = sound.child.poses.copy()
         first = int(share * len(poses))

@@ -49,9 +49,21 @@ FAR[2, 2, 3] = 1.0
             np.where(np.arange(3)[:, None, None] == 1, np.nan, POSES),
             "pose 1 has a value that is not finite",
         ),
-        (STAMPS, POSES * np.array([1, 1, 2])[:, None, None], "pose 2 is not a rigid transform"),
-        (STAMPS, POSES @ np.diag([1.0, 1.0, -1.0, 1.0]), "pose 0 is not a rigid transform"),
-        (STAMPS, POSES + 1e154 * FAR, r"pose 2: position \(.*1e\+154\) is more than 1e\+10 m"),
+        (
+            STAMPS,
+            POSES * np.array([1, 1, 2])[:, None, None],
+            "pose 2 is not a rigid transform",
+        ),
+        (
+            STAMPS,
+            POSES @ np.diag([1.0, 1.0, -1.0, 1.0]),
+            "pose 0 is not a rigid transform",
+        ),
+        (
+            STAMPS,
+            POSES + 1e154 * FAR,
+            r"pose 2: position \(.*1e\+154\) is more than 1e\+10 m",
+        ),
     ],
 )
 def test_unusable_input_names_the_first_offender(stamps, poses, message):
@@ -70,9 +82,16 @@ def test_shift_and_scale_keep_everything_else():
 
 
 def test_equal_trajectories_have_the_same_poses_stamps_and_frames():
-    trajectory, other = (Trajectory(STAMPS, poses, "lidar") for poses in (POSES, POSES.copy()))
+    trajectory, other = (
+        Trajectory(STAMPS, poses, "lidar") for poses in (POSES, POSES.copy())
+    )
     assert trajectory == other
-    changed = other.shifted(1.0), other.scaled(2.0), other[:2], replace(other, sensor_frame="")
+    changed = (
+        other.shifted(1.0),
+        other.scaled(2.0),
+        other[:2],
+        replace(other, sensor_frame=""),
+    )
     assert trajectory not in [*changed, "lidar"]
 
 
@@ -104,7 +123,9 @@ def test_a_shake_is_cut_far_less_than_by_a_constant_twist(hz, share):
     trajectory = as_trajectory(shaking(hz, np.arange(200) / HZ), HZ)
     stamps_ns = middles(trajectory)[REACH:-REACH]
     truth = shaking(hz, (stamps_ns - trajectory.stamps_ns[0]) * 1e-9)
-    bent, straight = (errors(trajectory, truth, stamps_ns, way) for way in (False, True))
+    bent, straight = (
+        errors(trajectory, truth, stamps_ns, way) for way in (False, True)
+    )
     assert bent.mean() < share * straight.mean()
 
 

@@ -21,7 +21,9 @@ def stamps(n_poses):
     random = np.random.default_rng(1)
     gaps_s = np.full(n_poses, 0.1)
     gaps_s[n_poses // 2] = 30.0
-    return np.cumsum(gaps_s * 1e9).astype(np.int64) + random.integers(0, 2_000_000, n_poses)
+    return np.cumsum(gaps_s * 1e9).astype(np.int64) + random.integers(
+        0, 2_000_000, n_poses
+    )
 
 
 def lasting_errors(seed, n_poses, sigma, tau_poses):
@@ -124,7 +126,9 @@ def numbers_of(case, tuning):
         times_ns = stamps(N_POSES)
         solution = positions.solve(times_ns, odometry, measured, with_scale, tuning)
         answer = solution.lever_arm, solution.covariance
-    return np.concatenate([np.ravel(array) for array in (*answer, solution.levels)]).tolist()
+    return np.concatenate(
+        [np.ravel(array) for array in (*answer, solution.levels)]
+    ).tolist()
 
 
 # Another value of each number, and a case that it changes.
@@ -181,7 +185,9 @@ def test_every_number_is_in_the_table():
 def test_a_number_that_is_passed_changes_the_solution(name):
     value, case = CHANGES[name]
     assert value != getattr(TUNING, name)
-    assert numbers_of(case, replace(TUNING, **{name: value})) != numbers_of(case, TUNING)
+    assert numbers_of(case, replace(TUNING, **{name: value})) != numbers_of(
+        case, TUNING
+    )
 
 
 def test_the_same_numbers_give_the_same_solution():
@@ -198,7 +204,9 @@ def names_of_the_default(tree):
         if isinstance(node, ast.AnnAssign):
             is_default.add(id(node.value))
     names = [node for node in ast.walk(tree) if isinstance(node, ast.Name)]
-    return [node for node in names if node.id == "TUNING" and id(node) not in is_default]
+    return [
+        node for node in names if node.id == "TUNING" and id(node) not in is_default
+    ]
 
 
 def test_no_search_reads_the_default_instead_of_what_was_passed():

@@ -36,7 +36,9 @@ def expected(hand):
 def moving_at(speed_m_s):
     """Ten seconds along a line that bends."""
     times_s = 0.1 * np.arange(100)
-    places = speed_m_s * np.stack([times_s, np.sin(0.3 * times_s), 0.0 * times_s], axis=1)
+    places = speed_m_s * np.stack(
+        [times_s, np.sin(0.3 * times_s), 0.0 * times_s], axis=1
+    )
     return Trajectory.from_positions(np.round(1e9 * times_s).astype(np.int64), places)
 
 
@@ -71,7 +73,10 @@ class TestRatio:
     def test_a_ratio_near_a_unit_is_a_question(self, off, is_exact):
         streams = moving_at(2.0), moving_at(0.6)
         finding = in_other_units(off / 0.3048, 0.001 / 0.3048, *streams)
-        assert (finding.code, finding.evidence["is_exact"]) == ("unit_or_scale", is_exact)
+        assert (finding.code, finding.evidence["is_exact"]) == (
+            "unit_or_scale",
+            is_exact,
+        )
 
     @pytest.mark.parametrize("unit", ["millimetres", "centimetres"])
     def test_a_parent_faster_than_sound_in_metres_is_in_that_unit(self, unit):
@@ -84,12 +89,24 @@ class TestRatio:
 
     @pytest.mark.parametrize("scale", [1.05, 3.09, 3.48, 2.0, 10.0, 0.1, 0.28, 0.32])
     def test_a_scale_near_no_unit_is_a_scale(self, scale):
-        assert in_other_units(scale, 0.005, moving_at(1.0), moving_at(1.0 / scale)) is None
+        assert (
+            in_other_units(scale, 0.005, moving_at(1.0), moving_at(1.0 / scale)) is None
+        )
 
     def test_speeds_of_sensors(self):
         speeds = [0.004, 0.05, 30.0, 500.0]
-        assert [is_too_slow(moving_at(speed)) for speed in speeds] == [True, False, False, False]
-        assert [is_too_fast(moving_at(speed)) for speed in speeds] == [False, False, False, True]
+        assert [is_too_slow(moving_at(speed)) for speed in speeds] == [
+            True,
+            False,
+            False,
+            False,
+        ]
+        assert [is_too_fast(moving_at(speed)) for speed in speeds] == [
+            False,
+            False,
+            False,
+            True,
+        ]
 
 
 class TestResult:
@@ -125,7 +142,9 @@ class TestResult:
         assert not any(finding.makes_unusable for finding in scaled.findings)
 
     @pytest.mark.parametrize("scale", [3.24, 3.32, 39.0, 98.0, 1030.0])
-    def test_a_camera_without_a_unit_leaves_the_parent_in_metres(self, hand, expected, scale):
+    def test_a_camera_without_a_unit_leaves_the_parent_in_metres(
+        self, hand, expected, scale
+    ):
         parent, child = hand
         result = hec.calibrate(parent, child.scaled(1.0 / scale), reference="B5")
         assert result.scale == pytest.approx(scale, rel=0.005)
@@ -139,13 +158,17 @@ class TestResult:
     def test_no_platform_is_wrong_without_a_word(self, name, unit):
         drive = make(name, 31)
         result = hec.calibrate(drive.parent.scaled(1.0 / UNITS[unit]), drive.child)
-        error_m = np.abs(deviation(result.T_parent_child, drive.T_parent_child))[:3].max()
+        error_m = np.abs(deviation(result.T_parent_child, drive.T_parent_child))[
+            :3
+        ].max()
         assert error_m < 0.2 or result.verdict is hec.Verdict.DO_NOT_USE
 
 
 def test_positions_are_asked_about_as_poses_are():
     drive = simulate_drive(5, HILLY_DRIVE, NoiseConfig(gaussian=0.001))
-    antenna = Trajectory.from_positions(drive.child.stamps_ns, drive.child.poses[:, :3, 3])
+    antenna = Trajectory.from_positions(
+        drive.child.stamps_ns, drive.child.poses[:, :3, 3]
+    )
     feet = hec.calibrate(drive.parent.scaled(1.0 / 0.3048), antenna)
     assert feet.verdict is hec.Verdict.DO_NOT_USE
     # Nothing that drives changes its velocity so fast.
@@ -185,10 +208,16 @@ class TestNoisyChild:
 
 @pytest.mark.parametrize(
     ("kind", "name", "seed"),
-    [(classes, "arm_target", 2002), (classes, "arm_target", 7003), (mixed, "mixed_arm", 2002)],
+    [
+        (classes, "arm_target", 2002),
+        (classes, "arm_target", 7003),
+        (mixed, "mixed_arm", 2002),
+    ],
     ids=["target", "small bias", "mixed"],
 )
-def test_a_parent_in_feet_is_asked_about_where_noise_shrinks_the_scale(kind, name, seed):
+def test_a_parent_in_feet_is_asked_about_where_noise_shrinks_the_scale(
+    kind, name, seed
+):
     drive = kind.make(name, seed)
     result = hec.calibrate(drive.parent.scaled(1.0 / 0.3048), drive.child)
     assert result.verdict is hec.Verdict.DO_NOT_USE
@@ -197,11 +226,19 @@ def test_a_parent_in_feet_is_asked_about_where_noise_shrinks_the_scale(kind, nam
     }
 
 
-PLATFORMS = ("hand_vio_walk", "car_ins_lidar", "agv_ramps", "drone_gnss_vio", "arm_target")
+PLATFORMS = (
+    "hand_vio_walk",
+    "car_ins_lidar",
+    "agv_ramps",
+    "drone_gnss_vio",
+    "arm_target",
+)
 
 
 @pytest.mark.parametrize("measures", ["poses", "positions"])
-@pytest.mark.parametrize(("unit", "factor"), [("millimetres", 1e-3), ("centimetres", 1e-2)])
+@pytest.mark.parametrize(
+    ("unit", "factor"), [("millimetres", 1e-3), ("centimetres", 1e-2)]
+)
 @pytest.mark.parametrize("platform", PLATFORMS)
 def test_both_streams_in_a_small_unit_are_named_first(platform, unit, factor, measures):
     drive = make(platform, 1701)
@@ -212,7 +249,9 @@ def test_both_streams_in_a_small_unit_are_named_first(platform, unit, factor, me
     first = result.findings[0]
     assert (first.code, first.stream) == ("lengths", "both")
     assert unit in first.what
-    right = hec.calibrate(parent, child, child_measures=measures, parent_scale=factor, scale=factor)
+    right = hec.calibrate(
+        parent, child, child_measures=measures, parent_scale=factor, scale=factor
+    )
     assert "lengths" not in {finding.code for finding in right.findings}
 
 
@@ -231,8 +270,12 @@ class TestSmallUnit:
         (finding,) = check_lengths(parent.scaled(1000.0), child)
         assert (finding.stream, [*finding.options]) == ("parent", ["parent_scale"])
 
-    @pytest.mark.parametrize(("n_poses", "step_m"), [(360, 0.1), (360, 0.17), (180, 0.17)])
-    def test_noisy_poses_in_millimetres_are_not_taken_for_inverse(self, n_poses, step_m):
+    @pytest.mark.parametrize(
+        ("n_poses", "step_m"), [(360, 0.1), (360, 0.17), (180, 0.17)]
+    )
+    def test_noisy_poses_in_millimetres_are_not_taken_for_inverse(
+        self, n_poses, step_m
+    ):
         poses = wandering_poses(n_poses, step_m=step_m)
         X = se3.exp(np.array([0.1, -0.05, 0.03, -1.5, 0.1, -1.6]))
         parent = as_trajectory(disturbed(poses, 10, 0.01, 0.002)).scaled(1000.0)

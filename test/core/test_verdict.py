@@ -25,7 +25,9 @@ TABLE = re.compile(r"(?<=<!-- rules: begin -->\n)(.*\n)*(?=<!-- rules: end -->)"
 
 
 def table():
-    rows = [f"| `{rule.name}` | {rule.when} | `{rule.verdict.value}` |\n" for rule in RULES]
+    rows = [
+        f"| `{rule.name}` | {rule.when} | `{rule.verdict.value}` |\n" for rule in RULES
+    ]
     return "".join(["\n| Rule | If | Verdict |\n| --- | --- | --- |\n", *rows, "\n"])
 
 
@@ -38,17 +40,25 @@ def test_the_page_has_the_rules_of_the_code():
 def observed(sigma_m=0.003, sigma_rad=0.001, **changes):
     """Verdicts of six axes; ``changes`` names axes with another sigma (inf: unobservable)."""
     sigmas = dict(zip(NAMES, np.repeat([sigma_m, sigma_rad], 3), strict=True)) | changes
-    return dofs(sigmas.values(), [name for name, sigma in sigmas.items() if sigma == np.inf])
+    return dofs(
+        sigmas.values(), [name for name, sigma in sigmas.items() if sigma == np.inf]
+    )
 
 
 def checked(axis, scatter, excess, kind):
     nothing = AxisScatter(sigma=0.003, of_methods=None, of_halves=None)
     columns = {f"of_{kind}": scatter, f"excess_of_{kind}": excess}
-    return dict.fromkeys(NAMES, nothing) | {axis: dataclasses.replace(nothing, **columns)}
+    return dict.fromkeys(NAMES, nothing) | {
+        axis: dataclasses.replace(nothing, **columns)
+    }
 
 
 FINDING = written_finding(
-    "units", Severity.ERROR, "lengths are in mm", "convert them", options={"scale": 0.001}
+    "units",
+    Severity.ERROR,
+    "lengths are in mm",
+    "convert them",
+    options={"scale": 0.001},
 )
 FLOOR = np.diag([0.03, 0, 0, 0, 0, 0]) ** 2
 
@@ -73,14 +83,24 @@ CASES = {
     "nothing_known": dict(observability_measured=observed(np.inf, np.inf)),
     "recordings_differ": dict(parts={"together": several("differ")}),
     "unobservable": dict(observability_measured=observed(z=np.inf)),
-    "warning_finding": dict(findings=(dataclasses.replace(FINDING, severity=Severity.WARNING),)),
-    "ground": dict(parts={"ground": GroundResult("ground", "ground", False, (GROUND_AXIS,))}),
+    "warning_finding": dict(
+        findings=(dataclasses.replace(FINDING, severity=Severity.WARNING),)
+    ),
+    "ground": dict(
+        parts={"ground": GroundResult("ground", "ground", False, (GROUND_AXIS,))}
+    ),
     "recordings": dict(parts={"together": several("one off")}),
     "halves": dict(cross_check=checked("x", 0.02, 3.5, "halves")),
     "methods": dict(cross_check=checked("yaw", 0.01, 3.5, "methods")),
     "unconfirmed": dict(
-        cross_check=dict.fromkeys(NAMES, AxisScatter(sigma=0.003, of_methods=None, of_halves=None))
-        | {"z": AxisScatter(sigma=0.01, of_methods=None, of_halves=None, is_confirmed=False)}
+        cross_check=dict.fromkeys(
+            NAMES, AxisScatter(sigma=0.003, of_methods=None, of_halves=None)
+        )
+        | {
+            "z": AxisScatter(
+                sigma=0.01, of_methods=None, of_halves=None, is_confirmed=False
+            )
+        }
     ),
     "undetectable": dict(parts={"detectability": NOTHING_SHOWS}),
     "outliers": dict(n_pairs=100, n_inliers=65),
@@ -132,9 +152,15 @@ def test_sentences_name_axes_values_and_targets(rule, sentence):
 
 @pytest.mark.parametrize("more", [{}, {"roll": 0.02}])
 def test_a_longer_recording_is_no_advice_where_constant_errors_exceed_the_target(more):
-    (reason,) = good(**CASES["floor"], observability_measured=observed(x=0.04, **more)).reasons
+    (reason,) = good(
+        **CASES["floor"], observability_measured=observed(x=0.04, **more)
+    ).reasons
     assert reason.rule == "target"
-    begins = "record longer, with more " if more else "constant odometry errors alone leave x"
+    begins = (
+        "record longer, with more "
+        if more
+        else "constant odometry errors alone leave x"
+    )
     assert reason.what_to_do.startswith(begins)
     assert ("the rotation about x 1.1 deg" in reason.sentence) == bool(more)
     assert "alone leave x 3 cm: set the target" in reason.what_to_do
@@ -189,7 +215,11 @@ def test_what_does_not_count(changes):
 
 def test_the_gravest_reason_comes_first_and_decides():
     result = good(**CASES["target"] | CASES["error_finding"] | CASES["outliers"])
-    assert [reason.rule for reason in result.reasons] == ["error_finding", "outliers", "target"]
+    assert [reason.rule for reason in result.reasons] == [
+        "error_finding",
+        "outliers",
+        "target",
+    ]
     assert result.headline == "DO NOT USE: lengths are in mm"
     assert [reason.rule for reason in rules.shown(result.reasons)] == ["error_finding"]
     assert len(rules.shown(good(**CASES["target"] | CASES["outliers"]).reasons)) == 2
@@ -224,14 +254,24 @@ def test_a_file_keeps_what_the_verdict_comes_from():
 
 
 if __name__ == "__main__":
-    PAGE.write_text(TABLE.sub(lambda _: table(), PAGE.read_text("utf-8")), encoding="utf-8")
+    PAGE.write_text(
+        TABLE.sub(lambda _: table(), PAGE.read_text("utf-8")), encoding="utf-8"
+    )
 
 
 @pytest.mark.parametrize(
     ("sigma", "allowance", "begins"),
     [
-        (0.004, 0.0199, "x is good to 2.03 cm; the target is 2 cm. Most of it is an allowance"),
-        (0.0199, 0.004, "x is good to 2.03 cm; the target is 2 cm. Part of it is an allowance"),
+        (
+            0.004,
+            0.0199,
+            "x is good to 2.03 cm; the target is 2 cm. Most of it is an allowance",
+        ),
+        (
+            0.0199,
+            0.004,
+            "x is good to 2.03 cm; the target is 2 cm. Part of it is an allowance",
+        ),
         (0.0004, 0.0200001, "x is good to 2.0004 cm; the target is 2 cm. Most of it"),
     ],
 )
@@ -262,14 +302,16 @@ def test_several_axes_and_targets_are_named_together():
 
 def scaled(severity):
     text = (
-        "the child's lengths are 2.1 +/- 0.1 % longer than the parent's; the result allows for it"
+        "the child's lengths are 2.1 +/- 0.1 % longer than the "
+        "parent's; the result allows for it"
     )
     return written_finding("model_scale", severity, text)
 
 
 def test_a_scale_that_the_model_found_is_in_the_headline_and_a_large_one_is_a_reason():
     small, large = (
-        good(findings=(scaled(severity),)) for severity in (Severity.NOTE, Severity.WARNING)
+        good(findings=(scaled(severity),))
+        for severity in (Severity.NOTE, Severity.WARNING)
     )
     assert (small.verdict, small.reasons) == (Verdict.USE, ())
     assert small.headline.endswith("; " + scaled(Severity.NOTE).what)

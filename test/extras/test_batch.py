@@ -84,12 +84,19 @@ def assert_is_result_of_the_fleet(code, out, err):
             assert row["calibration"]["reference"] == "B5"
 
 
-def test_a_batch_on_all_cores_goes_on_where_it_stopped(run, fleet, tmp_path, monkeypatch):
+def test_a_batch_on_all_cores_goes_on_where_it_stopped(
+    run, fleet, tmp_path, monkeypatch
+):
     out_dir = tmp_path / "out"
     code, out, err = run(*fleet, "--out", out_dir, "--json", "--jobs", "2")
     assert_is_result_of_the_fleet(code, out, err)
-    assert "note: 3 recordings are not compared with each other: set --vehicle to the" in err
-    assert re.search(r"note: [1-4] of 4: drive[0-2]: USE", err)  # a line for each in a pipe
+    assert (
+        "note: 3 recordings are not compared with each other: set --vehicle to the"
+        in err
+    )
+    assert re.search(
+        r"note: [1-4] of 4: drive[0-2]: USE", err
+    )  # a line for each in a pipe
     saved = load_result(out_dir / "drive1")
     np.testing.assert_allclose(saved.T_parent_child, T_PARENT_CHILD, atol=1e-3)
     assert (out_dir / "drive1" / "static_transform.launch.py").exists()
@@ -100,7 +107,9 @@ def test_a_batch_on_all_cores_goes_on_where_it_stopped(run, fleet, tmp_path, mon
         ("gone", 0), ("drive0", 1), ("drive1", 1), ("drive2", 1)
     ]  # fmt: skip
     done = []
-    monkeypatch.setattr(batch_run, "outcomes", lambda tasks, jobs, dask: here(tasks, done))
+    monkeypatch.setattr(
+        batch_run, "outcomes", lambda tasks, jobs, dask: here(tasks, done)
+    )
     code, out, err = run(*fleet, "--out", out_dir, "--json")
     assert_is_result_of_the_fleet(code, out, err)
     assert done == ["gone"]
@@ -133,12 +142,15 @@ def here(tasks, done):
 
 def test_a_batch_on_a_dask_cluster(run, fleet):
     distributed = pytest.importorskip(
-        "dask.distributed", reason="dask.distributed is not installed: pip install '.[cluster]'"
+        "dask.distributed",
+        reason="dask.distributed is not installed: pip install '.[cluster]'",
     )
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None
     ) as cluster:
-        assert_is_result_of_the_fleet(*run(*fleet, "--json", "--dask", cluster.scheduler_address))
+        assert_is_result_of_the_fleet(
+            *run(*fleet, "--json", "--dask", cluster.scheduler_address)
+        )
 
 
 def test_without_dask_its_option_says_what_to_install(run, fleet, monkeypatch):
@@ -173,7 +185,10 @@ def test_a_recording_fails_as_it_does_alone(monkeypatch, severity, code, error):
     ("bags", "names"),
     [
         (["monday/bag", "other", "other"], ["monday_bag", "other", "other_2"]),
-        (["a/monday/bag", "b/monday/bag", "b/tuesday/bag"], ["a_monday", "b_monday", "b_tuesday"]),
+        (
+            ["a/monday/bag", "b/monday/bag", "b/tuesday/bag"],
+            ["a_monday", "b_monday", "b_tuesday"],
+        ),
         (["s3://fleet/t1/run.mcap?sig=a/b", "s3://fleet/t2/run.mcap"], ["t1", "t2"]),
         (["a/vehicles", "a/."], ["vehicles_2", "a"]),
     ],
@@ -191,7 +206,8 @@ def some_tasks(*names, **options):
 
 def done_by(tasks, work, **where):
     return {
-        task.name: outcome.row["error"] for task, outcome in outcomes(tasks, 2, do=work, **where)
+        task.name: outcome.row["error"]
+        for task, outcome in outcomes(tasks, 2, do=work, **where)
     }
 
 
@@ -218,7 +234,9 @@ def ended(pidfd, within_s=120):
     return bool(select.select([pidfd], [], [], within_s)[0])
 
 
-@pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="processes are awaited by Linux's pidfd")
+@pytest.mark.skipif(
+    not hasattr(os, "pidfd_open"), reason="processes are awaited by Linux's pidfd"
+)
 def test_no_worker_outlives_a_batch_that_is_killed(tmp_path):
     code = (
         "from fleet_making import never_ends; from hand_eye_calib.extras.fleet.work import Task\n"
@@ -252,7 +270,9 @@ def test_no_worker_outlives_a_batch_that_is_killed(tmp_path):
 
 
 @pytest.mark.usefixtures("no_processes")
-def test_rows_and_page_have_every_recording_and_the_vehicle(run, fleet, tmp_path, monkeypatch):
+def test_rows_and_page_have_every_recording_and_the_vehicle(
+    run, fleet, tmp_path, monkeypatch
+):
     more = ("--vehicle", "truck", "--no-report", "--jobs", "1")
     assert run(*fleet, *more, "--out", tmp_path / "1")[0] == 1
     rows = list(csv.DictReader((tmp_path / "1" / "rows.csv").read_text().splitlines()))
@@ -264,7 +284,9 @@ def test_rows_and_page_have_every_recording_and_the_vehicle(run, fleet, tmp_path
     assert not any(row[4] for row in rows_of(page))
     assert "The 3 recordings agree within their standard deviations" in page
     assert (tmp_path / "1" / "vehicles" / "truck" / "extrinsic.yaml").exists()
-    monkeypatch.setattr(batch_run, "together", lambda results: 1 / 0)  # is not called again
+    monkeypatch.setattr(
+        batch_run, "together", lambda results: 1 / 0
+    )  # is not called again
     assert run(*fleet, *more, "--out", tmp_path / "1")[0] == 1
     assert (tmp_path / "1" / "index.html").read_text(encoding="utf-8") == page
 
@@ -278,7 +300,14 @@ def test_a_vehicle_whose_recordings_differ_is_no_good_exit(run, tmp_path, monkey
         return dataclasses.replace(good_calibration(), status=SolveStatus.NOT_CONVERGED)
 
     monkeypatch.setattr(batch_run, "together", differing)
-    bags = ["--batch", f"{tmp_path}/bags/drive*", *STREAMS, "--reference", "B5", "--no-report"]
+    bags = [
+        "--batch",
+        f"{tmp_path}/bags/drive*",
+        *STREAMS,
+        "--reference",
+        "B5",
+        "--no-report",
+    ]
     code, out, _ = run(*bags, "--vehicle", "truck", "--jobs", "1")
     assert code == exit_code(differing(None))
     assert code != 0
@@ -319,7 +348,9 @@ def memory(tmp_path):
     store = fsspec.filesystem("memory")
     for number in range(2):
         write_drive(tmp_path / f"drive{number}", 60, number)
-        store.put(f"{tmp_path}/drive{number}/", f"/fleet/run{number}/drive", recursive=True)
+        store.put(
+            f"{tmp_path}/drive{number}/", f"/fleet/run{number}/drive", recursive=True
+        )
     yield store
     store.rm("/fleet", recursive=True)
 
@@ -331,7 +362,11 @@ def test_bags_in_a_store_give_what_they_give_here(tmp_path, memory):
     for here, stored, task in zip(local, remotely, tasks, strict=True):
         assert stored["error"] is None
         assert stored["calibration"] == here["calibration"]
-        assert stored["inputs"]["bag"] == task.bags[0] == f"memory:///fleet/{task.name}/drive"
+        assert (
+            stored["inputs"]["bag"]
+            == task.bags[0]
+            == f"memory:///fleet/{task.name}/drive"
+        )
         files = [file["file"] for file in stored["inputs"]["files"]]
         assert all(file.startswith(task.bags[0] + "/") for file in files)
 
@@ -353,7 +388,9 @@ def test_a_bag_at_a_url_is_replayed_alone(run, tmp_path, memory, monkeypatch):
 
 
 def test_a_remote_bag_may_not_fill_the_disk(tmp_path, memory, monkeypatch):
-    monkeypatch.setattr(remote.shutil, "disk_usage", lambda _: types.SimpleNamespace(free=20_000))
+    monkeypatch.setattr(
+        remote.shutil, "disk_usage", lambda _: types.SimpleNamespace(free=20_000)
+    )
     _, (row,) = outcomes_of("memory://fleet/run0/drive")
     assert row["error"] == (
         "cannot read memory://fleet/run0/drive: it is larger than 1e-05 GB, half of the free space "
@@ -378,7 +415,9 @@ def test_what_a_store_calls_its_files_does_not_leave_the_folder(monkeypatch):
 def test_without_fsspec_one_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "fsspec.core", None)
     _, (row,) = outcomes_of("s3://fleet/run.mcap")
-    assert row["error"].startswith("s3://fleet/run.mcap needs a package that is not installed")
+    assert row["error"].startswith(
+        "s3://fleet/run.mcap needs a package that is not installed"
+    )
     assert "pip install '.[fleet]'" in row["error"]
 
 
@@ -402,7 +441,8 @@ def fleet_outcomes(vehicle, count, seed, shift=(), by=0.02):
     for index in shift:
         Ts[index] = se3.exp(np.array([0, 0, 0, 0, 0, by])) @ Ts[index]
     return [
-        outcome(f"{vehicle}_{day}", vehicle, Ts[day], covariances[day], day) for day in range(count)
+        outcome(f"{vehicle}_{day}", vehicle, Ts[day], covariances[day], day)
+        for day in range(count)
     ]
 
 
@@ -413,7 +453,9 @@ def test_the_index_page_shows_each_vehicle(tmp_path):
     outcomes.append(Outcome.of(Task(name="lost", bags=()), "no <bag>"))
     rows = [outcome.row for outcome in outcomes]
     vehicles = {
-        name: together({outcome.row["name"]: outcome.calibration for outcome in outcomes[members]})
+        name: together(
+            {outcome.row["name"]: outcome.calibration for outcome in outcomes[members]}
+        )
         for name, members in (("<b>", slice(0, 6)), ("a", slice(6, 8)))
     }
     with_report = {row["name"] for row in rows[:-1]}
@@ -435,7 +477,9 @@ def test_the_page_of_ten_thousand_recordings_stays_below_2_mb():
     from hand_eye_calib.extras.fleet.batch_page import render_batch
 
     (outcome,) = fleet_outcomes("truck_17", 1, 1)
-    rows = [{**outcome.row, "name": f"truck_017_2026-11-23T{n:05}"} for n in range(10_000)]
+    rows = [
+        {**outcome.row, "name": f"truck_017_2026-11-23T{n:05}"} for n in range(10_000)
+    ]
     page = render_batch("of/fleet/**", rows, {}, {row["name"] for row in rows})
     assert len(page.encode()) < 1_790_000  # and 50 kB of each figure of 50 recordings
     assert (len(rows_of(page)), page.count('<p class="muted">fleet: ')) == (10_000, 1)
@@ -449,14 +493,20 @@ def test_vehicles_are_named_by_their_place_in_the_path(tmp_path):
             (tmp_path / "fleet" / place / "a.mcap").touch()
     groups = [[bag] for bag in matching(f"{tmp_path}/fleet/**")]
     assert groups == [[bag] for bag in matching(f"{tmp_path}/fleet")]
-    assert matching(f"{tmp_path}/fleet/truck_2/monday") == [f"{tmp_path}/fleet/truck_2/monday"]
-    assert [(task.name, task.vehicle) for task in tasks_of(groups, "fleet/{vehicle}/*")] == [
+    assert matching(f"{tmp_path}/fleet/truck_2/monday") == [
+        f"{tmp_path}/fleet/truck_2/monday"
+    ]
+    assert [
+        (task.name, task.vehicle) for task in tasks_of(groups, "fleet/{vehicle}/*")
+    ] == [
         ("truck_1_monday", "truck_1"),
         ("truck_1_tuesday", "truck_1"),
         ("truck_2_monday", "truck_2"),
     ]
     assert {task.vehicle for task in tasks_of(groups, "other/{vehicle}/*")} == {""}
-    assert {task.vehicle for task in tasks_of([["/x/../bag"]], "/x/{vehicle}/bag")} == {""}
+    assert {task.vehicle for task in tasks_of([["/x/../bag"]], "/x/{vehicle}/bag")} == {
+        ""
+    }
     for path in ("none/**", "fleet/notes"):
         with pytest.raises(ConfigError, match="no bag matches"):
             matching(f"{tmp_path}/{path}")

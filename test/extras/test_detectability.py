@@ -63,8 +63,12 @@ def test_an_error_of_the_scale_is_linear_in_the_evidence(result, pose_pairs):
     assert abs(after - before)[7] == pytest.approx(0.01, rel=0.15)
 
 
-@pytest.mark.parametrize(("axis", "factor"), [("x", 1.3), ("yaw", -1.3), ("z", 0.3), ("roll", 0.3)])
-def test_calibrate_reports_a_shift_from_the_smallest_size_on(drive, result, axis, factor):
+@pytest.mark.parametrize(
+    ("axis", "factor"), [("x", 1.3), ("yaw", -1.3), ("z", 0.3), ("roll", 0.3)]
+)
+def test_calibrate_reports_a_shift_from_the_smallest_size_on(
+    drive, result, axis, factor
+):
     in_parent = np.zeros(6)
     in_parent[AXES.index(axis)] = factor * result.detectability.shifts[axis]
     xi = np.kron(np.eye(2), result.T_parent_child[:3, :3].T) @ in_parent
@@ -122,10 +126,14 @@ def flat_drive():
     """Streams of two sensors that turn about z only."""
     seconds = np.arange(900) / 10.0
     turns = np.outer(np.sin(0.5 * seconds), [0.0, 0.0, 0.8])
-    places = np.stack([seconds, 2.0 * np.sin(0.4 * seconds), np.zeros_like(seconds)], axis=1)
+    places = np.stack(
+        [seconds, 2.0 * np.sin(0.4 * seconds), np.zeros_like(seconds)], axis=1
+    )
     Ts = se3.from_rotation_translation(se3.rotation_exp(turns), places)
     X = se3.exp(np.array([0.4, -0.3, 0.2, 0.0, 0.0, 0.5]))
-    errors = np.random.default_rng(3).normal(size=(2, 900, 6)) * np.repeat([0.003, 0.0005], 3)
+    errors = np.random.default_rng(3).normal(size=(2, 900, 6)) * np.repeat(
+        [0.003, 0.0005], 3
+    )
     stamps_ns = (seconds * 1e9).astype(np.int64)
     parent = Trajectory(stamps_ns, Ts @ se3.exp(errors[0]))
     return parent, Trajectory(stamps_ns, Ts @ X @ se3.exp(errors[1]))
@@ -142,7 +150,9 @@ def test_a_sigma_that_the_blocks_contradict_needs_care(result):
     assert [reason.rule for reason in result.reasons] == []
     wide = replace(
         result.detectability,
-        errors={axis: 100.0 * size for axis, size in result.detectability.errors.items()},
+        errors={
+            axis: 100.0 * size for axis, size in result.detectability.errors.items()
+        },
     )
     (reason,) = result.with_part("detectability", wide).reasons
     assert reason.rule == "undetectable"
@@ -153,7 +163,14 @@ def test_a_sigma_that_the_blocks_contradict_needs_care(result):
 
 
 def test_details_and_report_state_it(capsys, tmp_path):
-    arguments = ["calibrate", "sample:lidar.tum", "sample:camera.tum", "-v", "--out", str(tmp_path)]
+    arguments = [
+        "calibrate",
+        "sample:lidar.tum",
+        "sample:camera.tum",
+        "-v",
+        "--out",
+        str(tmp_path),
+    ]
     assert main(arguments) == 0
     printed = " ".join(capsys.readouterr().out.split())
     report = " ".join((tmp_path / "report.html").read_text("utf-8").split())
@@ -161,4 +178,7 @@ def test_details_and_report_state_it(capsys, tmp_path):
         for fact in facts_of(hec.load(tmp_path)):
             assert fact in text
         assert "deg about y" in text
-        assert "half of the recording contradicts such an error in nine of ten trials" in text
+        assert (
+            "half of the recording contradicts such an error in nine of ten trials"
+            in text
+        )

@@ -58,7 +58,9 @@ def test_two_lidars_on_a_flat_yard_get_all_six_axes():
     drive, clouds = machine()
     alone = hec.calibrate(drive.parent, drive.child)
     assert alone.hidden == ["z"]
-    result = hec.calibrate_on_ground(drive.parent, drive.child, *tracks_of_lidars(drive, clouds))
+    result = hec.calibrate_on_ground(
+        drive.parent, drive.child, *tracks_of_lidars(drive, clouds)
+    )
     errors = errors_of(result, drive)
     assert result.hidden == []
     assert result.verdict.value == "USE"
@@ -72,7 +74,9 @@ def test_two_lidars_on_a_flat_yard_get_all_six_axes():
 
 def test_without_noise_the_ground_is_exact():
     drive, clouds = machine(noise=0.0)
-    result = hec.calibrate_on_ground(drive.parent, drive.child, *tracks_of_lidars(drive, clouds))
+    result = hec.calibrate_on_ground(
+        drive.parent, drive.child, *tracks_of_lidars(drive, clouds)
+    )
     assert errors_of(result, drive)[2:5].max() < 2e-3
 
 
@@ -90,7 +94,9 @@ def test_a_slope_does_not_turn_the_mount_of_a_lidar_and_an_imu(place):
 
 def test_on_a_ramp_the_ground_agrees_with_the_motion():
     drive, clouds = machine("ramp")
-    result = hec.calibrate_on_ground(drive.parent, drive.child, *tracks_of_lidars(drive, clouds))
+    result = hec.calibrate_on_ground(
+        drive.parent, drive.child, *tracks_of_lidars(drive, clouds)
+    )
     assert result.ground.is_joined
     z = result.ground.axes[2]
     assert z.motion_sigma < 0.05
@@ -132,7 +138,9 @@ def test_a_loading_edge_beside_a_ramp_is_not_joined():
     on_edge = replace(child, heights_m=child.heights_m - 1.2)
     result = hec.calibrate_on_ground(drive.parent, drive.child, parent, on_edge)
     assert not result.ground.is_joined
-    assert [reason.axes for reason in result.reasons if reason.rule == "ground"] == [("z",)]
+    assert [reason.axes for reason in result.reasons if reason.rule == "ground"] == [
+        ("z",)
+    ]
 
 
 def test_scans_of_a_loading_edge_are_outliers():
@@ -152,7 +160,9 @@ def test_walls_and_ceilings_are_no_ground():
     up, ahead = turning_axis(drive.parent), driving_direction(drive.parent)
     plane = ground_of(clouds[0][0][1], up, ahead, 4.0)
     assert plane.height_m == pytest.approx(drive.T_base_parent[2, 3], abs=0.05)
-    grid = np.stack(np.meshgrid(np.linspace(-8, 8, 60), np.linspace(-8, 8, 60)), -1).reshape(-1, 2)
+    grid = np.stack(
+        np.meshgrid(np.linspace(-8, 8, 60), np.linspace(-8, 8, 60)), -1
+    ).reshape(-1, 2)
     ceiling = np.column_stack([grid, np.full(len(grid), 3.0)])
     wall = np.column_stack([np.full(len(grid), 3.0), grid])
     assert ground_of(ceiling, up, ahead, 4.0) is None
@@ -182,7 +192,9 @@ def test_tall_grass_on_one_side_widens_sigma():
 
 def test_too_few_scans_with_ground_are_an_error():
     drive, clouds = machine()
-    high = [(stamp_ns, np.add(points, [0.0, 0.0, 30.0])) for stamp_ns, points in clouds[0]]
+    high = [
+        (stamp_ns, np.add(points, [0.0, 0.0, 30.0])) for stamp_ns, points in clouds[0]
+    ]
     with pytest.raises(NotEnoughDataError, match="0 of 70 scans contain the ground"):
         hec.ground_from_clouds(high, drive.parent)
 
@@ -208,7 +220,9 @@ def test_a_real_imu_without_gravity_is_refused():
 def test_a_straight_drive_has_no_vertical():
     stamps_ns = START_NS + np.arange(200) * 10**8
     straight = hec.Trajectory.from_quat_xyzw(
-        stamps_ns, np.column_stack([np.arange(200), np.zeros((200, 2))]), [[0, 0, 0, 1.0]] * 200
+        stamps_ns,
+        np.column_stack([np.arange(200), np.zeros((200, 2))]),
+        [[0, 0, 0, 1.0]] * 200,
     )
     with pytest.raises(NotEnoughDataError, match="does not turn"):
         hec.ground_from_clouds([], straight)
@@ -225,7 +239,10 @@ def test_arguments_of_a_wrong_type_are_an_error():
 
 def cloud_message(typestore, stamp_ns, points, frame, names="xyz"):
     field = typestore.types["sensor_msgs/msg/PointField"]
-    fields = [field(name=name, offset=4 * at, datatype=7, count=1) for at, name in enumerate(names)]
+    fields = [
+        field(name=name, offset=4 * at, datatype=7, count=1)
+        for at, name in enumerate(names)
+    ]
     rows = np.ascontiguousarray(points, dtype="<f4")
     return typestore.types[POINTS](
         header=header(typestore, stamp_ns, frame),
@@ -241,7 +258,9 @@ def cloud_message(typestore, stamp_ns, points, frame, names="xyz"):
 
 
 def layout(names, formats, offsets, itemsize):
-    return np.dtype(dict(names=names, formats=formats, offsets=offsets, itemsize=itemsize))
+    return np.dtype(
+        dict(names=names, formats=formats, offsets=offsets, itemsize=itemsize)
+    )
 
 
 def with_layout(message, dtype, rows=1, unused=0):
@@ -284,7 +303,9 @@ LAYOUTS = {
     "organised, rows with unused bytes": (SMALL, 16, 20),
     "big-endian": (layout(["x", "y", "z"], [">f4"] * 3, [0, 4, 8], 12),),
     "float64": (layout(["x", "y", "z"], ["<f8"] * 3, [0, 8, 16], 24),),
-    "unused bytes": (layout(["x", "y", "z", "ring"], ["<f4"] * 3 + ["<u2"], [4, 8, 12, 20], 32),),
+    "unused bytes": (
+        layout(["x", "y", "z", "ring"], ["<f4"] * 3 + ["<u2"], [4, 8, 12, 20], 32),
+    ),
     "z first": (layout(["z", "x", "y"], ["<f4"] * 3, [0, 8, 16], 22),),
 }
 
@@ -297,7 +318,9 @@ def test_clouds_in_any_layout_have_the_same_points(name):
     read = rows_of_points(with_layout(plain, *LAYOUTS[name]))
     for axis in "xyz":
         values = read[axis].astype(float)
-        np.testing.assert_allclose(values[np.isfinite(values)], expected[axis], rtol=1e-6)
+        np.testing.assert_allclose(
+            values[np.isfinite(values)], expected[axis], rtol=1e-6
+        )
 
 
 def test_fields_with_the_same_name_are_no_damage():
@@ -345,7 +368,9 @@ def rings(count):
     return rays
 
 
-REFUSED = "scans contain the ground: it must be visible between 5 and 12 m, and the z axis"
+REFUSED = (
+    "scans contain the ground: it must be visible between 5 and 12 m, and the z axis"
+)
 # Rays, height of the lidar (m), whether it hangs upside down, and the message if it is refused.
 LIDARS = {
     "livox": (livox, 1.4, False, ""),
@@ -361,7 +386,8 @@ def test_lidars_of_all_kinds_are_right_or_refused(name):
     rays, height_m, is_upside_down, message = LIDARS[name]
     drive, _ = machine()
     mount = se3.from_rotation_translation(
-        se3.rotation_from_rpy(np.radians([3.0, -4.0, 2.0])), np.array([0.8, 0.0, height_m])
+        se3.rotation_from_rpy(np.radians([3.0, -4.0, 2.0])),
+        np.array([0.8, 0.0, height_m]),
     )
     if is_upside_down:
         mount[:3, :3] = mount[:3, :3] @ np.diag([1.0, -1.0, -1.0])
@@ -386,7 +412,9 @@ def test_empty_clouds_are_scans_without_ground():
     track = hec.ground_from_clouds(some, drive.parent)
     assert len(track) == 56
     with pytest.raises(NotEnoughDataError, match="0 of 70 scans contain the ground"):
-        hec.ground_from_clouds([(stamp_ns, points[:0]) for stamp_ns, points in some], drive.parent)
+        hec.ground_from_clouds(
+            [(stamp_ns, points[:0]) for stamp_ns, points in some], drive.parent
+        )
 
 
 def test_a_deck_that_hides_the_ground_is_no_ground():
@@ -432,7 +460,10 @@ def odometry_messages(trajectory, topic):
 def write_drive(path, child_frame="rear", with_imu=False, names="xyz"):
     """Write a bag of two lidars, or of a lidar and an IMU, with their odometry."""
     drive, clouds = machine()
-    messages = [*odometry_messages(drive.parent, "/a"), *odometry_messages(drive.child, "/b")]
+    messages = [
+        *odometry_messages(drive.parent, "/a"),
+        *odometry_messages(drive.child, "/b"),
+    ]
     third = replace(drive.child, sensor_frame="camera")
     messages += odometry_messages(third, "/c")
     for topic, frame, scans in (
@@ -441,8 +472,12 @@ def write_drive(path, child_frame="rear", with_imu=False, names="xyz"):
     ):
         if topic == "/b/points" and with_imu:
             stamps_ns, forces = drive.accelerations(drive.T_base_child)
-            for stamp_ns, force in zip(stamps_ns[::4].tolist(), forces[::4], strict=True):
-                make = partial(imu_message, stamp_ns=stamp_ns, force=force, frame=child_frame)
+            for stamp_ns, force in zip(
+                stamps_ns[::4].tolist(), forces[::4], strict=True
+            ):
+                make = partial(
+                    imu_message, stamp_ns=stamp_ns, force=force, frame=child_frame
+                )
                 messages.append((stamp_ns, "/b/imu", IMU, make))
             continue
         frame = child_frame if frame == "rear" else frame
@@ -456,7 +491,9 @@ def write_drive(path, child_frame="rear", with_imu=False, names="xyz"):
 
 def calibrated(folder, bag, capsys, *options):
     topics = ["--parent-topic", "/a", "--child-topic", "/b"]
-    code = main(["calibrate", str(bag), *topics, "--out", str(folder / "out"), *options])
+    code = main(
+        ["calibrate", str(bag), *topics, "--out", str(folder / "out"), *options]
+    )
     return code, hec.load(folder / "out"), capsys.readouterr()
 
 
@@ -475,7 +512,9 @@ def test_a_bag_uses_the_ground_by_itself(tmp_path, capsys, no_figures, with_imu)
 
 def test_ground_off_uses_the_motion_alone(tmp_path, capsys, no_figures):
     write_drive(tmp_path / "bag")
-    code, result, printed = calibrated(tmp_path, tmp_path / "bag", capsys, "--ground", "off")
+    code, result, printed = calibrated(
+        tmp_path, tmp_path / "bag", capsys, "--ground", "off"
+    )
     assert (code, result.ground, result.hidden) == (3, None, ["z"])
     assert "are used" not in printed.err
 
@@ -527,14 +566,36 @@ def by_command(*words):
 
 
 def by_batch(bag, out, ground):
-    main(["batch", str(bag), *TOPICS, "--out", str(out), "--ground", ground, "--no-report"])
+    main(
+        [
+            "batch",
+            str(bag),
+            *TOPICS,
+            "--out",
+            str(out),
+            "--ground",
+            ground,
+            "--no-report",
+        ]
+    )
     return hec.load(out / bag.name)
 
 
 def by_recordings(bag, out, ground):
     again = out.parent / "again"
     shutil.copytree(bag, again)
-    main(["calibrate", str(bag), str(again), *TOPICS, "--out", str(out), "--ground", ground])
+    main(
+        [
+            "calibrate",
+            str(bag),
+            str(again),
+            *TOPICS,
+            "--out",
+            str(out),
+            "--ground",
+            ground,
+        ]
+    )
     return hec.load(out)
 
 
@@ -569,19 +630,26 @@ def bag_of_lidars(tmp_path_factory):
 @pytest.mark.filterwarnings("ignore:ground from")
 @pytest.mark.parametrize("ground", ["auto", "off"])
 @pytest.mark.parametrize("road", ROADS)
-def test_every_road_uses_the_ground_of_a_bag(road, ground, bag_of_lidars, tmp_path, no_figures):
+def test_every_road_uses_the_ground_of_a_bag(
+    road, ground, bag_of_lidars, tmp_path, no_figures
+):
     result = ROADS[road](bag_of_lidars, tmp_path / "out", ground)
     assert result.hidden == ([] if ground == "auto" else ["z"])
 
 
 def test_python_names_what_it_uses(bag_of_lidars):
-    with pytest.warns(UserWarning, match="ground from /a/points and ground from /b/points are"):
+    with pytest.warns(
+        UserWarning, match="ground from /a/points and ground from /b/points are"
+    ):
         hec.calibrate(bag_of_lidars, parent_topic="/a", child_topic="/b", checks=False)
 
 
 @pytest.mark.parametrize(
     ("ground", "child", "message"),
-    [("none", None, "must be 'auto' or 'off'"), ("auto", "b.tum", "call calibrate_on_ground")],
+    [
+        ("none", None, "must be 'auto' or 'off'"),
+        ("auto", "b.tum", "call calibrate_on_ground"),
+    ],
 )
 def test_python_refuses_the_ground_of_trajectories(ground, child, message):
     with pytest.raises(ConfigError, match=message):
@@ -593,5 +661,11 @@ def test_the_list_names_ground_and_gravity(tmp_path, capsys):
     main(["calibrate", str(tmp_path / "bag"), "--list", "--json"])
     rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)["topics"]}
     assert rows["/a"]["measures"] == ""
-    assert (rows["/a/points"]["measures"], rows["/a/points"]["frames"]) == ("ground", ["lidar"])
-    assert (rows["/b/imu"]["measures"], rows["/b/imu"]["frames"]) == ("gravity", ["rear"])
+    assert (rows["/a/points"]["measures"], rows["/a/points"]["frames"]) == (
+        "ground",
+        ["lidar"],
+    )
+    assert (rows["/b/imu"]["measures"], rows["/b/imu"]["frames"]) == (
+        "gravity",
+        ["rear"],
+    )

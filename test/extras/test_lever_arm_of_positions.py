@@ -28,17 +28,23 @@ WORLD = se3.exp(np.array([50.0, -20.0, 3.0, 0.1, -0.2, 2.0]))
 def antenna_of(poses, noise_m, seed=5):
     """Positions of the antenna in another world."""
     positions = (WORLD @ poses)[:, :3, :3] @ LEVER_ARM + (WORLD @ poses)[:, :3, 3]
-    return positions + noise_m * np.random.default_rng(seed).standard_normal(positions.shape)
+    return positions + noise_m * np.random.default_rng(seed).standard_normal(
+        positions.shape
+    )
 
 
 def recorded(n_poses=300, noise_m=0.005, drift_rad=2e-4, seed=2, poses=None):
     """Odometry that drifts, and positions beside it."""
     poses = wandering_poses(n_poses, seed) if poses is None else poses
     random = np.random.default_rng(seed)
-    drift = np.c_[np.zeros((len(poses), 3)), drift_rad * random.normal(size=(len(poses), 3))]
+    drift = np.c_[
+        np.zeros((len(poses), 3)), drift_rad * random.normal(size=(len(poses), 3))
+    ]
     motions = se3.inverse(poses[:-1]) @ poses[1:] @ se3.exp(drift[1:])
     stamps_ns = START_NS + STEP_NS * np.arange(len(poses))
-    child = Trajectory.from_positions(stamps_ns, antenna_of(poses, noise_m), "antenna", "map")
+    child = Trajectory.from_positions(
+        stamps_ns, antenna_of(poses, noise_m), "antenna", "map"
+    )
     return Trajectory(stamps_ns, walked(motions), "lidar", "odom"), child
 
 
@@ -75,14 +81,18 @@ class TestLeverArm:
 
     def test_positions_of_the_parent_give_the_opposite(self, streams, result):
         inverse = hec.calibrate(*streams[::-1], checks=False)
-        assert inverse.T_parent_child[:3, 3] == pytest.approx(-result.T_parent_child[:3, 3])
+        assert inverse.T_parent_child[:3, 3] == pytest.approx(
+            -result.T_parent_child[:3, 3]
+        )
         assert inverse.time_offset_s == pytest.approx(-result.time_offset_s)
 
     def test_poses_declared_as_positions_give_the_same(self, streams, result):
         parent, child = streams
         turned = child.poses @ se3.exp(np.r_[0, 0, 0, 0.5, 1.0, -0.3])
         whole = Trajectory(child.stamps_ns, turned, "antenna")
-        declared = hec.calibrate(parent, whole, child_measures="positions", checks=False)
+        declared = hec.calibrate(
+            parent, whole, child_measures="positions", checks=False
+        )
         assert declared.T_parent_child[:3, 3] == pytest.approx(
             result.T_parent_child[:3, 3], abs=1e-9
         )
@@ -101,12 +111,17 @@ class TestLeverArm:
         away_rad = 0.6 * times_s[:, None] * [1.0, 1.37, 0.0]
         path = 4.0 * np.sin(away_rad) * [1.0, 1.0, 0.0]
         pulls = -np.square([0.6, 0.6 * 1.37, 0.0]) * path
-        tilt = np.stack([-pulls[:, 1], pulls[:, 0], 3.0 * np.sin(0.1 * times_s)], axis=1) / 9.81
+        tilt = (
+            np.stack([-pulls[:, 1], pulls[:, 0], 3.0 * np.sin(0.1 * times_s)], axis=1)
+            / 9.81
+        )
         truth = se3.from_rotation_translation(se3.rotation_exp(tilt), path)
         stamps_ns = START_NS + STEP_NS * np.arange(len(truth))
         antenna = antenna_of(truth, 0.0)
         bent = np.gradient(np.gradient(antenna, 0.1, axis=0), 0.1, axis=0)
-        positions = antenna + 0.005 * bent + 0.003 * random.standard_normal(antenna.shape)
+        positions = (
+            antenna + 0.005 * bent + 0.003 * random.standard_normal(antenna.shape)
+        )
         noise = 0.001 * random.standard_normal((len(truth), 6))
         smoothed = hec.calibrate(
             Trajectory(stamps_ns, truth @ se3.exp(noise), "lidar"),
@@ -115,9 +130,14 @@ class TestLeverArm:
         )
         assert abs(smoothed.T_parent_child[2, 3] - LEVER_ARM[2]) > 0.02
         assert np.abs(distances(smoothed)).max() < 3.0
-        assert any("acceleration shifts the positions" in text for text in smoothed.noise.in_words)
+        assert any(
+            "acceleration shifts the positions" in text
+            for text in smoothed.noise.in_words
+        )
 
-    def test_the_expected_scale_of_a_tuning_is_taken_out_of_a_finding(self, monkeypatch):
+    def test_the_expected_scale_of_a_tuning_is_taken_out_of_a_finding(
+        self, monkeypatch
+    ):
         sigmas = list(TUNING.of_positions)
         sigmas[3] = 0.0015
         tuning = replace(TUNING, of_positions=tuple(sigmas))
@@ -140,21 +160,31 @@ class TestLeverArm:
         parent, child, lever_arm = simulated_positions("car", seed=3)
         result = hec.calibrate(parent, child, checks=False)
         assert (
-            np.abs((result.T_parent_child[:3, 3] - lever_arm) / result.sigmas_measured[:3]).max()
+            np.abs(
+                (result.T_parent_child[:3, 3] - lever_arm) / result.sigmas_measured[:3]
+            ).max()
             < 4.0
         )
 
-    def test_positions_that_are_worse_for_a_time_are_as_if_they_were_missing(self, streams):
+    def test_positions_that_are_worse_for_a_time_are_as_if_they_were_missing(
+        self, streams
+    ):
         parent, child = streams
         positions = child.poses[:, :3, 3].copy()
-        positions[120:180] += np.cumsum(np.random.default_rng(3).normal(0.0, 0.2, (60, 3)), axis=0)
+        positions[120:180] += np.cumsum(
+            np.random.default_rng(3).normal(0.0, 0.2, (60, 3)), axis=0
+        )
         mixed = Trajectory.from_positions(child.stamps_ns, positions, "antenna")
         result = hec.calibrate(parent, mixed, checks=False)
         good = np.r_[0:115, 185:300]
-        apart = Trajectory.from_positions(child.stamps_ns[good], positions[good], "antenna")
+        apart = Trajectory.from_positions(
+            child.stamps_ns[good], positions[good], "antenna"
+        )
         apart = hec.calibrate(parent, apart, checks=False)
         left_out = next(
-            sentence for sentence in result.noise.in_words if "far less precise" in sentence
+            sentence
+            for sentence in result.noise.in_words
+            if "far less precise" in sentence
         )
         assert 20 < int(left_out.partition("%")[0]) < 30
         difference = result.T_parent_child[:3, 3] - apart.T_parent_child[:3, 3]
@@ -167,7 +197,9 @@ class TestLeverArm:
         positions[100:160] += 0.3 + 0.05 * random.standard_normal((60, 3))
         positions[250:] += [0.4, -0.3, 0.2]
         kept = (np.arange(len(child)) % 50) > 8
-        worse = Trajectory.from_positions(child.stamps_ns[kept], positions[kept], "antenna")
+        worse = Trajectory.from_positions(
+            child.stamps_ns[kept], positions[kept], "antenna"
+        )
         result = hec.calibrate(parent, worse)
         assert result.T_parent_child[:3, 3] == pytest.approx(LEVER_ARM, abs=0.03)
         assert np.abs(distances(result)).max() < 4.0
@@ -183,11 +215,18 @@ class TestLeverArm:
         assert result.status is hec.SolveStatus.UNOBSERVABLE
         assert "z cannot be determined from this motion" in result.reasons[0].sentence
         assert np.abs(distances(result)[:2]).max() < 4.0
-        with_prior = hec.calibrate(parent, child, prior={"z": (1.2, 0.01)}, checks=False)
+        with_prior = hec.calibrate(
+            parent, child, prior={"z": (1.2, 0.01)}, checks=False
+        )
         assert with_prior.status is hec.SolveStatus.OK
-        assert "z of the child sensor: mostly from the prior, not the motion" in with_prior.warnings
+        assert (
+            "z of the child sensor: mostly from the prior, not the motion"
+            in with_prior.warnings
+        )
 
-    @pytest.mark.parametrize(("kind", "travel_s"), [("odometry", 0.005), ("exact", 0.0)])
+    @pytest.mark.parametrize(
+        ("kind", "travel_s"), [("odometry", 0.005), ("exact", 0.0)]
+    )
     def test_the_allowance_grows_with_the_speed_of_an_odometry(self, kind, travel_s):
         parent, child, _ = simulated_positions("car", seed=4)
         result = hec.calibrate(parent, child, parent_kind=kind, checks=False)
@@ -207,7 +246,9 @@ class TestLeverArm:
         assert result.T_parent_child[:3, 3] == pytest.approx(LEVER_ARM, abs=0.01)
         assert result.verdict is not hec.Verdict.DO_NOT_USE
 
-    def test_longitudes_without_the_cosine_of_the_latitude_are_not_used_in_silence(self):
+    def test_longitudes_without_the_cosine_of_the_latitude_are_not_used_in_silence(
+        self,
+    ):
         odometry, antenna = recorded()
         for factor, severity in ((1.4, "warning"), (2.0, "error")):
             positions = antenna.poses[:, :3, 3] * [factor, 1.0, 1.0]
@@ -223,20 +264,27 @@ class TestLeverArm:
 
         def codes(parent, child):
             snapshot = whole_snapshot(parent, child, {})
-            return [finding.code for finding in check(snapshot, snapshot.estimate()).findings]
+            return [
+                finding.code
+                for finding in check(snapshot, snapshot.estimate()).findings
+            ]
 
         assert codes(parent, child.scaled(1000.0)) == ["units"]
         assert codes(parent, recorded(n_poses=320, seed=8)[1]) == ["unrelated"]
         two = child.poses[:, :3, 3] + [0.5, 0.0, 0.0] * (np.arange(320) % 2)[:, None]
         both = Trajectory.from_positions(child.stamps_ns, two)
         assert codes(parent, both) == ["interleaved", "unrelated"]
-        north_east = Trajectory.from_positions(child.stamps_ns, child.poses[:, [1, 0, 2], 3])
+        north_east = Trajectory.from_positions(
+            child.stamps_ns, child.poses[:, [1, 0, 2], 3]
+        )
         assert codes(parent, north_east) == ["unrelated", "left_handed"]
         from_pole_to_pole = [0.0, 0.0, 6.4e6] * (-1.0) ** np.arange(320)[:, None]
         poles = Trajectory.from_positions(child.stamps_ns, from_pole_to_pole)
         assert "unrelated" in codes(parent, poles)
         kept = np.r_[0:30, 60:80]
-        fixes = Trajectory.from_positions(child.stamps_ns[kept], child.poses[kept, :3, 3])
+        fixes = Trajectory.from_positions(
+            child.stamps_ns[kept], child.poses[kept, :3, 3]
+        )
         assert "gaps" in codes(parent, fixes)
         flat = recorded(drift_rad=0.0, poses=planar_poses(200, seed=3))
         assert codes(*flat) == ["unchecked", "one_axis"]
@@ -248,7 +296,9 @@ def test_the_command_with_latitude_and_longitude(streams, result, tmp_path, caps
     places = zip(child.stamps_ns.tolist(), lat, lon, height, strict=True)
     rows = [f"{stamp},{a:.11f},{b:.11f},{c:.5f}" for stamp, a, b, c in places]
     hec.write_trajectory(tmp_path / "lidar.tum", parent)
-    (tmp_path / "gnss.csv").write_text("\n".join(["t_ns,latitude,longitude,altitude", *rows]))
+    (tmp_path / "gnss.csv").write_text(
+        "\n".join(["t_ns,latitude,longitude,altitude", *rows])
+    )
     code = main(["calibrate", str(tmp_path / "lidar.tum"), str(tmp_path / "gnss.csv")])
     printed = capsys.readouterr()
     assert code == 0

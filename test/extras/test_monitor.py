@@ -13,14 +13,22 @@ EXACT = np.zeros((6, 6))
 SECOND_NS = 1_000_000_000
 
 
-def motion(duration_s, seed=0, flat=False, sigma=(0.003, 0.002), start_s=0.0, rate_hz=10.0):
+def motion(
+    duration_s, seed=0, flat=False, sigma=(0.003, 0.002), start_s=0.0, rate_hz=10.0
+):
     """Pose pairs with white errors, that turn about all axes or about z only."""
     s = start_s + np.arange(round(duration_s * rate_hz)) / rate_hz
-    turns = np.sin(np.outer(s, [0.7, 0.9, 0.4]) + np.array([0.0, 1.0, 0.0])) * [0.5, 0.4, 0.8]
+    turns = np.sin(np.outer(s, [0.7, 0.9, 0.4]) + np.array([0.0, 1.0, 0.0])) * [
+        0.5,
+        0.4,
+        0.8,
+    ]
     turns *= [0, 0, 1] if flat else [1, 1, 1]
     places = np.stack([s, 2.0 * np.sin(0.5 * s), np.zeros_like(s)], axis=1)
     Ts = se3.from_rotation_translation(se3.rotation_exp(turns), places)
-    errors = np.random.default_rng(seed).normal(size=(2, len(s), 6)) * np.repeat(sigma, 3)
+    errors = np.random.default_rng(seed).normal(size=(2, len(s), 6)) * np.repeat(
+        sigma, 3
+    )
     stamps_ns = (s * SECOND_NS).astype(np.int64)
     return PosePairs(stamps_ns, Ts @ se3.exp(errors[0]), Ts @ X @ se3.exp(errors[1]))
 
@@ -36,7 +44,10 @@ def shifted(pairs, from_s, axis, size):
 
 def fed(pairs, covariance=EXACT, T=X, chunk=370):
     monitor = MountMonitor(T, covariance)
-    alarms = [monitor.add(pairs[first : first + chunk]) for first in range(0, len(pairs), chunk)]
+    alarms = [
+        monitor.add(pairs[first : first + chunk])
+        for first in range(0, len(pairs), chunk)
+    ]
     return monitor, [alarm for alarm in alarms if alarm is not None]
 
 
@@ -55,14 +66,18 @@ def test_the_size_of_the_chunks_changes_nothing():
     assert first.raised_ns == other.raised_ns
 
 
-@pytest.mark.parametrize(("axis", "size"), [(0, 0.03), (2, -0.03), (4, 0.02), (5, -0.02)])
+@pytest.mark.parametrize(
+    ("axis", "size"), [(0, 0.03), (2, -0.03), (4, 0.02), (5, -0.02)]
+)
 def test_a_shift_is_found_with_its_axis_size_and_time(axis, size):
     monitor, alarms = fed(shifted(motion(400.0), 250.0, axis, size))
     assert len(alarms) == 1
     assert 250.0 <= alarms[0].raised_ns / SECOND_NS < 300.0
     assert abs(monitor.alarm.since_ns / SECOND_NS - 250.0) < 30.0
     axes = monitor.alarm.shift.axes.values()
-    values, sigmas = np.array([(axis_shift.difference, axis_shift.sigma) for axis_shift in axes]).T
+    values, sigmas = np.array(
+        [(axis_shift.difference, axis_shift.sigma) for axis_shift in axes]
+    ).T
     assert np.abs((values - np.eye(6)[axis] * size) / sigmas).max() < 4.0
     assert np.argmax(np.abs(values) / sigmas) == axis
 
@@ -75,7 +90,9 @@ def test_a_shift_that_was_there_from_the_beginning_is_found_after_learning():
 def test_what_is_installed_may_be_off_by_its_own_standard_deviation():
     covariance = np.diag(np.repeat([0.02, 0.02], 3) ** 2)
     off = X @ se3.exp(np.array([0.02, -0.01, 0.015, 0.02, -0.03, 0.01]))
-    assert [len(fed(motion(600.0), stated, off)[1]) for stated in (covariance, EXACT)] == [0, 1]
+    assert [
+        len(fed(motion(600.0), stated, off)[1]) for stated in (covariance, EXACT)
+    ] == [0, 1]
 
 
 def test_what_cannot_be_seen_is_said_before():
@@ -87,7 +104,9 @@ def test_what_cannot_be_seen_is_said_before():
 
 def test_standing_still_and_gaps_add_nothing():
     pairs = motion(200.0)
-    errors = np.random.default_rng(1).normal(size=(2, 20_000, 6)) * np.repeat([0.003, 0.002], 3)
+    errors = np.random.default_rng(1).normal(size=(2, 20_000, 6)) * np.repeat(
+        [0.003, 0.002], 3
+    )
     still = PosePairs(
         pairs.stamps_ns[-1] + SECOND_NS + np.arange(20_000) * 100_000_000,
         pairs.Ts_pw_p[-1] @ se3.exp(errors[0]),
@@ -125,7 +144,9 @@ def car(duration_s, seed=0):
     steps = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(s)], axis=1)
     rotations = se3.rotation_exp(yaw[:, None] * [0, 0, 1])
     Ts = se3.from_rotation_translation(rotations, 0.8 * np.cumsum(steps, axis=0))
-    errors = np.random.default_rng(seed).normal(size=(2, len(s), 6)) * np.repeat([3e-3, 5e-4], 3)
+    errors = np.random.default_rng(seed).normal(size=(2, len(s), 6)) * np.repeat(
+        [3e-3, 5e-4], 3
+    )
     stamps_ns = (s * SECOND_NS).astype(np.int64)
     return PosePairs(stamps_ns, Ts @ se3.exp(errors[0]), Ts @ X @ se3.exp(errors[1]))
 
@@ -133,7 +154,11 @@ def car(duration_s, seed=0):
 def scale_drifting(pairs, sigma=0.01, tau_s=40.0, seed=0):
     """The child's path with a scale that drifts, as that of visual odometry."""
     kept = np.exp(-0.1 / tau_s)
-    draws = np.random.default_rng(seed).normal(size=len(pairs)) * sigma * np.sqrt(1 - kept**2)
+    draws = (
+        np.random.default_rng(seed).normal(size=len(pairs))
+        * sigma
+        * np.sqrt(1 - kept**2)
+    )
     scale = 1.0 + lfilter([1.0], [1.0, -kept], draws)
     child = pairs.Ts_cw_c.copy()
     steps = np.diff(child[:, :3, 3], axis=0) * scale[1:, None]

@@ -34,8 +34,14 @@ def forklift(duration_s, seed, rate_hz=5.0, mount=MOUNT):
         axis=1,
     )
     yaw = turns[:, 2]
-    steps = 1.2 / rate_hz * np.stack([np.cos(yaw), np.sin(yaw), 0.02 * np.sin(0.2 * s)], axis=1)
-    parent = se3.from_rotation_translation(se3.rotation_exp(turns), np.cumsum(steps, axis=0))
+    steps = (
+        1.2
+        / rate_hz
+        * np.stack([np.cos(yaw), np.sin(yaw), 0.02 * np.sin(0.2 * s)], axis=1)
+    )
+    parent = se3.from_rotation_translation(
+        se3.rotation_exp(turns), np.cumsum(steps, axis=0)
+    )
     noise = rng.normal(size=(2, len(s), 6)) * np.repeat([0.003, 0.0008], 3)
     parent_measured = parent @ se3.exp(noise[0])
     child = parent @ mount @ se3.exp(noise[1])
@@ -132,7 +138,9 @@ def test_sessions_of_the_monitor_itself_show_when_the_mount_moved():
     assert find_changes(digests[:4]) == []
     (changepoint,) = find_changes(digests)
     assert changepoint.index == 4
-    assert changepoint.shift.axes["yaw"].difference == pytest.approx(np.radians(0.5), abs=0.002)
+    assert changepoint.shift.axes["yaw"].difference == pytest.approx(
+        np.radians(0.5), abs=0.002
+    )
 
 
 def test_two_changes_are_found(session):
@@ -148,7 +156,9 @@ def test_compare_prints_the_history_of_a_folder(session, tmp_path, capsys):
     code = compare_digests(arguments(tmp_path))
     lines = capsys.readouterr().out.splitlines()
     assert code == 4
-    assert lines[0].startswith("Mount of camera on lidar: moved before 2023-12-26 22:13: ")
+    assert lines[0].startswith(
+        "Mount of camera on lidar: moved before 2023-12-26 22:13: "
+    )
     assert "(10 sessions)" in lines[0]
     assert len([line for line in lines if line.startswith("  -- moved before")]) == 1
     assert len(lines) == 1 + 1 + 10 + 1
@@ -160,9 +170,14 @@ def test_compare_prints_the_history_of_a_folder(session, tmp_path, capsys):
         compare_digests(arguments(tmp_path, installed="robot.urdf"))
 
 
-def test_an_alarm_within_a_session_is_printed_and_is_no_good_exit(session, tmp_path, capsys):
+def test_an_alarm_within_a_session_is_printed_and_is_no_good_exit(
+    session, tmp_path, capsys
+):
     *others, last = weeks(session, 5, np.zeros(6), since=6, n_weeks=4)
-    for digest in (*others, dataclasses.replace(last, alarm="moved about z by 1.5 deg")):
+    for digest in (
+        *others,
+        dataclasses.replace(last, alarm="moved about z by 1.5 deg"),
+    ):
         write_digest(tmp_path, digest)
     assert compare_digests(arguments(tmp_path)) == 4
     lines = capsys.readouterr().out.splitlines()
@@ -173,7 +188,9 @@ def test_an_alarm_within_a_session_is_printed_and_is_no_good_exit(session, tmp_p
     assert alarms == {last.day: "moved about z by 1.5 deg"}
 
 
-def test_other_files_are_left_to_compare_and_unusable_digests_are_named(session, tmp_path):
+def test_other_files_are_left_to_compare_and_unusable_digests_are_named(
+    session, tmp_path
+):
     other = tmp_path / "extrinsic.yaml"
     other.write_text("a: 1\n")
     assert compare_digests(arguments(other)) is None
@@ -181,20 +198,30 @@ def test_other_files_are_left_to_compare_and_unusable_digests_are_named(session,
     path.write_text(path.read_text().replace('"seconds"', '"minutes"'))
     with pytest.raises(InputError, match="is no usable digest"):
         read_digest(path)
-    moved = dataclasses.replace(session, installed=np.eye(4), start_ns=START_NS + WEEK_NS)
+    moved = dataclasses.replace(
+        session, installed=np.eye(4), start_ns=START_NS + WEEK_NS
+    )
     write_digest(tmp_path / "b", session)
     write_digest(tmp_path / "b", moved)
-    with pytest.raises(InputError, match="the installed transform changed before 2023-11-21"):
+    with pytest.raises(
+        InputError, match="the installed transform changed before 2023-11-21"
+    ):
         read_digests([tmp_path / "b"])
 
 
 def write_fleet(session, folder):
     """Write the digests of three forklifts: one moved in week 60, one had an alarm, one is well."""
-    shifts = {"forklift_1": None, "forklift_2": about_parent("z", 0.3), "forklift_3": None}
+    shifts = {
+        "forklift_1": None,
+        "forklift_2": about_parent("z", 0.3),
+        "forklift_3": None,
+    }
     for seed, (vehicle, shift) in enumerate(shifts.items(), start=910):
         digests = weeks(session, seed, shift)
         if vehicle == "forklift_3":
-            digests[-1] = dataclasses.replace(digests[-1], alarm="moved about z by 1.5 deg")
+            digests[-1] = dataclasses.replace(
+                digests[-1], alarm="moved about z by 1.5 deg"
+            )
         for digest in digests:
             write_digest(folder / vehicle, digest)
     return [folder / vehicle for vehicle in shifts]
@@ -233,6 +260,10 @@ def test_the_offset_of_a_mount_becomes_more_precise_until_a_change(session):
 def test_a_page_of_a_fleet_needs_digests_of_every_vehicle(session, tmp_path):
     write_digest(tmp_path / "a", session)
     (tmp_path / "b").mkdir()
-    with pytest.raises(ConfigError, match="needs digests, which the monitor writes.*b has none"):
-        compare_digests(arguments(tmp_path / "a", tmp_path / "b", fleet=tmp_path / "page.html"))
+    with pytest.raises(
+        ConfigError, match="needs digests, which the monitor writes.*b has none"
+    ):
+        compare_digests(
+            arguments(tmp_path / "a", tmp_path / "b", fleet=tmp_path / "page.html")
+        )
     assert not (tmp_path / "page.html").exists()

@@ -24,7 +24,11 @@ def solved(kind, fault, platform):
 
 
 def codes(result, severity="error"):
-    return [finding.code for finding in result.findings if finding.severity.value == severity]
+    return [
+        finding.code
+        for finding in result.findings
+        if finding.severity.value == severity
+    ]
 
 
 # Kind, fault, and the finding that names it.
@@ -44,7 +48,9 @@ NAMED = [
 
 
 @pytest.mark.parametrize(("kind", "fault", "code"), NAMED)
-def test_a_fault_of_a_part_of_the_poses_is_named_and_never_to_be_used(kind, fault, code):
+def test_a_fault_of_a_part_of_the_poses_is_named_and_never_to_be_used(
+    kind, fault, code
+):
     result = solved(kind, fault, "drone")
     assert code in codes(result)
     assert result.verdict is hec.Verdict.DO_NOT_USE
@@ -62,9 +68,15 @@ OF_THE_PATH = [
 
 @pytest.mark.parametrize(
     ("fault", "code", "platform"),
-    [(fault, code, platform) for fault, code, names in OF_THE_PATH for platform in names],
+    [
+        (fault, code, platform)
+        for fault, code, names in OF_THE_PATH
+        for platform in names
+    ],
 )
-def test_a_fault_of_the_path_is_named_and_its_error_is_within_sigma(fault, code, platform):
+def test_a_fault_of_the_path_is_named_and_its_error_is_within_sigma(
+    fault, code, platform
+):
     result = solved("positions", fault, platform)
     assert code in [*codes(result), *codes(result, "warning")]
     assert result.verdict is not hec.Verdict.USE
@@ -98,7 +110,9 @@ def test_the_covariance_contains_smoothing_that_is_too_weak_for_a_finding():
     recording = part_faults.positions("drone_slam", "clean", SEED)
     path = recording.child.poses[:, :3, 3]
     smoothed = gaussian_filter1d(path, 2.0, axis=0, mode="nearest")  # 0.1 s, 5e-3 s^2
-    child = Trajectory.from_positions(recording.child.stamps_ns, smoothed, "antenna", "map")
+    child = Trajectory.from_positions(
+        recording.child.stamps_ns, smoothed, "antenna", "map"
+    )
     result = hec.calibrate(recording.parent, child, **part_faults.WIDE)
     assert codes(result) == []
     assert part_faults.largest_ratio("positions", result, recording.truth) < 2.5
@@ -137,7 +151,9 @@ OF_ROTATIONS = [
         for platform in names
     ],
 )
-def test_a_fault_of_rotations_is_named_and_its_error_is_within_sigma(kind, fault, code, platform):
+def test_a_fault_of_rotations_is_named_and_its_error_is_within_sigma(
+    kind, fault, code, platform
+):
     result = solved(kind, fault, platform)
     assert code in [*codes(result), *codes(result, "warning")]
     assert result.verdict is not hec.Verdict.USE
@@ -167,7 +183,9 @@ def test_clean_rotations_have_no_finding_and_may_be_used(kind, platform):
 def test_a_fault_names_the_stream_that_has_positions(stream):
     recording = part_faults.positions("drone", "height in feet", SEED)
     streams = (recording.parent, recording.child)
-    result = hec.calibrate(*(streams if stream == "child" else streams[::-1]), **part_faults.WIDE)
+    result = hec.calibrate(
+        *(streams if stream == "child" else streams[::-1]), **part_faults.WIDE
+    )
     (finding,) = [item for item in result.findings if item.code == "axis_scale"]
     assert finding.stream == stream
     assert f"the {stream} stream's z coordinates" in finding.what
@@ -176,21 +194,27 @@ def test_a_fault_names_the_stream_that_has_positions(stream):
 @pytest.mark.parametrize("scale", ["none", 1.0 / 1.05])
 def test_a_scale_that_was_given_is_no_error(scale):
     recording = part_faults.positions("drone", "scale 1.05", SEED)
-    result = hec.calibrate(recording.parent, recording.child, scale=scale, **part_faults.WIDE)
+    result = hec.calibrate(
+        recording.parent, recording.child, scale=scale, **part_faults.WIDE
+    )
     assert "scale" not in codes(result)
 
 
 @pytest.mark.parametrize("scale", ["estimate", "auto"])
 def test_a_scale_that_was_asked_for_is_obeyed(scale):
     recording = part_faults.positions("drone", "scale 1.05", SEED)
-    result = hec.calibrate(recording.parent, recording.child, scale=scale, **part_faults.WIDE)
+    result = hec.calibrate(
+        recording.parent, recording.child, scale=scale, **part_faults.WIDE
+    )
     assert abs(result.scale - 1.0 / 1.05) < 4.0 * result.scale_sigma < 0.01
     assert "scale" not in codes(result)
 
 
 def test_auto_leaves_a_scale_that_is_one():
     recording = part_faults.positions("drone", "clean", SEED)
-    result = hec.calibrate(recording.parent, recording.child, scale="auto", **part_faults.WIDE)
+    result = hec.calibrate(
+        recording.parent, recording.child, scale="auto", **part_faults.WIDE
+    )
     assert result.scale == pytest.approx(1.0, abs=0.005)
 
 
@@ -201,7 +225,9 @@ def test_parallel_axes_and_an_antenna_at_the_origin_may_be_said_by_priors():
     assert codes(result) == []
     positions = part_faults.positions("drone", "copied with noise", SEED)
     here = dict.fromkeys("xyz", (0.0, 0.02))
-    result = hec.calibrate(positions.parent, positions.child, prior=here, **part_faults.WIDE)
+    result = hec.calibrate(
+        positions.parent, positions.child, prior=here, **part_faults.WIDE
+    )
     assert "same_position" not in codes(result)
 
 
@@ -213,12 +239,16 @@ def test_parallel_axes_and_an_antenna_at_the_origin_may_be_said_by_priors():
         (0.0, 0.002, "same_frame", "warning"),
     ],
 )
-def test_orientations_alone_of_the_parent_itself_are_named(turned_rad, noise_rad, code, severity):
+def test_orientations_alone_of_the_parent_itself_are_named(
+    turned_rad, noise_rad, code, severity
+):
     parent = part_faults.rates("drone", "clean", SEED).parent
     noise = noise_rad * np.random.default_rng(2).standard_normal((len(parent), 3))
     turns = se3.rotation_exp(noise) @ se3.rotation_exp([0.0, turned_rad, 0.0])
     poses = parent.poses @ se3.from_rotation_translation(turns, np.zeros(3))
-    own = dataclasses.replace(parent, poses=poses, measures="rotations", sensor_frame="imu")
+    own = dataclasses.replace(
+        parent, poses=poses, measures="rotations", sensor_frame="imu"
+    )
     result = hec.calibrate(parent, own, **part_faults.WIDE)
     assert code in codes(result, severity)
     assert result.verdict is not hec.Verdict.USE
@@ -231,8 +261,12 @@ def test_rotations_about_one_axis_are_not_mirrored_by_the_noise_of_the_others():
     noise = 0.002 * random.standard_normal((1200, 3))
     turns = se3.rotation_exp(np.column_stack([noise[:, :2], yaw]))
     opposite = se3.rotation_exp(np.column_stack([noise[:, 0], -noise[:, 1], yaw]))
-    parent = Trajectory(stamps_ns, se3.from_rotation_translation(turns, np.zeros(3)), "ins")
-    child = Trajectory(stamps_ns, se3.from_rotation_translation(opposite, np.zeros(3)), "imu")
+    parent = Trajectory(
+        stamps_ns, se3.from_rotation_translation(turns, np.zeros(3)), "ins"
+    )
+    child = Trajectory(
+        stamps_ns, se3.from_rotation_translation(opposite, np.zeros(3)), "imu"
+    )
     result = hec.calibrate(parent, dataclasses.replace(child, measures="rotations"))
     assert "left_handed" not in codes(result)
 
@@ -242,7 +276,9 @@ def test_positions_of_a_short_recording_do_not_end_in_a_traceback():
     turns = np.random.default_rng(0).standard_normal((40, 6)) * 0.3
     poses = se3.exp(turns)
     parent = Trajectory(stamps_ns, poses, "lidar")
-    child = Trajectory.from_positions(stamps_ns, poses[:, :3, :3] @ [0.3, 0.1, 0.2], "antenna")
+    child = Trajectory.from_positions(
+        stamps_ns, poses[:, :3, :3] @ [0.3, 0.1, 0.2], "antenna"
+    )
     result = hec.calibrate(parent, child)
     assert result.verdict is not hec.Verdict.USE
 

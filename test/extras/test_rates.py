@@ -6,7 +6,13 @@ import json
 import numpy as np
 import pytest
 from bag_making import JAZZY, fix, imu
-from motions import T_PARENT_CHILD, child_of, planar_poses, read_trajectory_file, wandering_poses
+from motions import (
+    T_PARENT_CHILD,
+    child_of,
+    planar_poses,
+    read_trajectory_file,
+    wandering_poses,
+)
 from rosbags.rosbag2 import Writer
 
 import hand_eye_calib as hec
@@ -90,14 +96,21 @@ class TestRates:
         assert inverse.time_offset_s == pytest.approx(-OFFSET_S, abs=1e-3)
 
     def test_a_prior_gives_the_translation(self, streams):
-        prior = {axis: (value, 0.01) for axis, value in zip("xyz", (0.4, -0.2, 0.7), strict=True)}
+        prior = {
+            axis: (value, 0.01)
+            for axis, value in zip("xyz", (0.4, -0.2, 0.7), strict=True)
+        }
         with_prior = hec.calibrate(*streams, prior=prior, checks=False)
         assert with_prior.out_of_reach == ()
-        assert with_prior.T_parent_child[:3, 3] == pytest.approx([0.4, -0.2, 0.7], abs=1e-3)
+        assert with_prior.T_parent_child[:3, 3] == pytest.approx(
+            [0.4, -0.2, 0.7], abs=1e-3
+        )
 
     def test_rotations_alone_need_no_bias(self, streams):
         parent, _ = streams
-        child = Trajectory(parent.stamps_ns, child_of(parent.poses), measures="rotations")
+        child = Trajectory(
+            parent.stamps_ns, child_of(parent.poses), measures="rotations"
+        )
         result = hec.calibrate(parent, child, checks=False)
         assert result.rate_bias is None
         assert angle_to(T_PARENT_CHILD[:3, :3], result) < np.radians(0.1)
@@ -123,7 +136,12 @@ class TestRates:
 
     @pytest.mark.parametrize(
         "options",
-        [{"method": "dnlo"}, {"reference": "B5"}, {"backend": "ipopt"}, {"scale": "estimate"}],
+        [
+            {"method": "dnlo"},
+            {"reference": "B5"},
+            {"backend": "ipopt"},
+            {"scale": "estimate"},
+        ],
     )
     def test_options_that_mean_nothing_here_are_refused(self, streams, options):
         with pytest.raises(ConfigError, match="needs poses of both sensors"):
@@ -133,7 +151,8 @@ class TestRates:
         parent, child = streams
         with pytest.raises(ConfigError, match="beside poses"):
             hec.calibrate(
-                Trajectory.from_positions(parent.stamps_ns, parent.poses[:, :3, 3]), child
+                Trajectory.from_positions(parent.stamps_ns, parent.poses[:, :3, 3]),
+                child,
             )
 
 
@@ -157,25 +176,35 @@ class TestFiles:
     @pytest.mark.parametrize(
         ("text", "largest"),
         [
-            ("#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1]", 1),
+            (
+                "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1]",
+                1,
+            ),
             ("t,gyro_x_dps,gyro_y_dps,gyro_z_dps", np.pi / 180),
             ("t wx wy wz", 1),
         ],
     )
     def test_columns_of_rates(self, tmp_path, text, largest):
         separator = "," if "," in text else " "
-        rows = [separator.join(map(str, (1_700_000_000 + k, 0.0, 0.0, 1.0))) for k in range(3)]
+        rows = [
+            separator.join(map(str, (1_700_000_000 + k, 0.0, 0.0, 1.0)))
+            for k in range(3)
+        ]
         path = tmp_path / "imu.csv"
         path.write_text("\n".join([text, *rows]))
         trajectory = read_trajectory_file(path, "auto", stamp_unit="s").trajectory
         assert trajectory.measures == "rates"
-        assert np.abs(se3.rotation_log(trajectory.poses[1, :3, :3])).max() == pytest.approx(largest)
+        assert np.abs(
+            se3.rotation_log(trajectory.poses[1, :3, :3])
+        ).max() == pytest.approx(largest)
 
     def test_large_rates_without_a_unit_are_degrees_and_that_is_said(self, tmp_path):
         path = tmp_path / "imu.csv"
         path.write_text("t,wx,wy,wz\n1,90,0,0\n2,90,0,0\n")
         reading = read_trajectory_file(path, "auto")
-        assert se3.rotation_log(reading.trajectory.poses[1, :3, :3])[0] == pytest.approx(np.pi / 2)
+        assert se3.rotation_log(reading.trajectory.poses[1, :3, :3])[
+            0
+        ] == pytest.approx(np.pi / 2)
         assert any("deg/s" in text for text in reading.guesses)
 
     def test_four_columns_without_names_need_to_be_told(self, tmp_path):
@@ -201,7 +230,9 @@ class TestFiles:
         assert main(["check", *files]) == 0
         out = capsys.readouterr().out
         assert out.startswith("USE: no fault found")
-        assert "none" in next(line for line in out.splitlines() if line.startswith("child  "))
+        assert "none" in next(
+            line for line in out.splitlines() if line.startswith("child  ")
+        )
 
 
 class TestCheck:
@@ -210,7 +241,8 @@ class TestCheck:
         snapshot = whole_snapshot(parent, child, options)
         findings = check(snapshot, snapshot.estimate()).findings
         return [
-            (finding.code, finding.severity.value, dict(finding.options)) for finding in findings
+            (finding.code, finding.severity.value, dict(finding.options))
+            for finding in findings
         ]
 
     def test_an_offset_that_a_solve_finds_is_none_and_a_long_one_an_error(self):
@@ -244,7 +276,9 @@ class TestCheck:
         quiet = BIAS + 2e-4 * random.normal(size=(len(fine_ns), 3))
         streams = (
             Trajectory(np.r_[rest, parent.stamps_ns], poses, "lidar"),
-            Trajectory.from_rates(np.r_[fine_ns, stamps_ns], np.r_[quiet, rates], "imu"),
+            Trajectory.from_rates(
+                np.r_[fine_ns, stamps_ns], np.r_[quiet, rates], "imu"
+            ),
         )
         result = whole_snapshot(*streams, {}).estimate()
         assert result.findings == ()
@@ -258,7 +292,9 @@ class TestCheck:
             Trajectory(stamps_ns, se3.exp(turns) @ se3.exp(errors)) for errors in noise
         )
         child = dataclasses.replace(child, measures="rotations")
-        assert self.codes(parent, child) == [("one_axis", "note", {"prior.yaw": "VALUE+/-SIGMA"})]
+        assert self.codes(parent, child) == [
+            ("one_axis", "note", {"prior.yaw": "VALUE+/-SIGMA"})
+        ]
         still, also = (Trajectory(stamps_ns, se3.exp(errors)) for errors in noise)
         (finding,) = self.codes(still, dataclasses.replace(also, measures="rotations"))
         assert finding[:2] == ("unrelated", "error")
@@ -292,7 +328,14 @@ def test_a_bag_with_an_imu(tmp_path, capsys):
     assert document["inputs"]["options"]["child_measures"] == "rates"
     assert main(["replay", *parts, *topics, "--child-measures", "positions"]) == 2
     assert "/imu has messages of type" in capsys.readouterr().err
-    with_itself = ["--parent-topic", "/imu", "--child-topic", "/imu_again", "--child-frame", "b"]
+    with_itself = [
+        "--parent-topic",
+        "/imu",
+        "--child-topic",
+        "/imu_again",
+        "--child-frame",
+        "b",
+    ]
     assert main(["check", parts[1], *with_itself, "--json"]) == 1
     document = json.loads(capsys.readouterr().out)
     assert [finding["code"] for finding in document["findings"]] == ["same_frame"]
@@ -304,11 +347,16 @@ def test_a_bag_with_an_imu(tmp_path, capsys):
 class TestMessages:
     def test_values_that_a_message_says_it_does_not_have_are_not_numbers(self):
         of_imu = unpack_poses([imu((0.1, 0.2, 0.3))], "sensor_msgs/msg/Imu", False)
-        assert (of_imu.stamps_ns[0], of_imu.world_frames[0]) == (12_000_000_005, "imu_link")
+        assert (of_imu.stamps_ns[0], of_imu.world_frames[0]) == (
+            12_000_000_005,
+            "imu_link",
+        )
         assert of_imu.poses.tolist() == [[0.1, 0.2, 0.3, 0.0, 0.0, 0.6, 0.8]]
         without = unpack_poses([imu((0, 0, 0), -1.0)], "sensor_msgs/msg/Imu", False)
         assert np.isnan(without.poses[0, :3]).all()
-        fixes = unpack_poses([fix(2), fix(-1)], "sensor_msgs/msg/NavSatFix", False).poses
+        fixes = unpack_poses(
+            [fix(2), fix(-1)], "sensor_msgs/msg/NavSatFix", False
+        ).poses
         np.testing.assert_array_equal(fixes, [[60.0, 25.0, 30.0], [np.nan] * 3])
 
     def test_without_a_fix_a_message_is_left_out(self):

@@ -48,7 +48,9 @@ def test_extrinsics_and_closure(rig, calibrated):
     assert calibrated.verdict is not hec.Verdict.DO_NOT_USE
     for sensor, calibration in enumerate(calibrated.calibrations, start=1):
         error = se3.log(se3.inverse(rig.Xs[sensor]) @ calibration.T_parent_child)
-        assert error @ np.linalg.solve(calibration.covariance_measured, error) < 18.5  # one in 200
+        assert (
+            error @ np.linalg.solve(calibration.covariance_measured, error) < 18.5
+        )  # one in 200
         assert (calibration.parent_frame, calibration.n_poses) == ("lidar", 500)
     chain = (
         calibrated.T("lidar", "front")
@@ -70,14 +72,18 @@ def test_extrinsics_and_closure(rig, calibrated):
 
 def test_a_sensor_of_inverse_poses_is_named_and_closes(rig):
     lidar, front, rear = trajectories_of(rig).values()
-    observed = hec.Trajectory(front.stamps_ns, se3.inverse(front.poses), "tag", "front_camera")
+    observed = hec.Trajectory(
+        front.stamps_ns, se3.inverse(front.poses), "tag", "front_camera"
+    )
     calibrated = hec.calibrate_rig({"/lidar": lidar, "tag": observed, "rear": rear})
     assert calibrated.sensors == ("lidar", "front_camera", "rear")
     assert [calibration.child_frame for calibration in calibrated.calibrations] == [
         "front_camera",
         "rear",
     ]
-    np.testing.assert_allclose(calibrated.T("lidar", "front_camera"), rig.Xs[1], atol=0.05)
+    np.testing.assert_allclose(
+        calibrated.T("lidar", "front_camera"), rig.Xs[1], atol=0.05
+    )
     (closure,) = calibrated.closures
     assert closure.closes
 
@@ -90,7 +96,9 @@ def test_two_good_sensors_do_not_suffer_from_a_bad_first_one():
     apart = se3.log(se3.inverse(direct) @ calibrated.T("front", "rear"))
     sigmas = np.sqrt(np.diag(calibrated.neighbours[0].covariance_measured))
     assert (np.abs(apart) < 0.5 * sigmas).all()
-    own, with_first = (calibrated.covariance_measured(name, "rear") for name in ("front", "lidar"))
+    own, with_first = (
+        calibrated.covariance_measured(name, "rear") for name in ("front", "lidar")
+    )
     assert np.trace(own) < 0.5 * np.trace(with_first)
 
 
@@ -100,22 +108,30 @@ def turned_neighbour(calibrated):
     (neighbour,) = calibrated.neighbours
     error = np.zeros(6)
     error[3] = 20.0 * np.sqrt(neighbour.covariance_measured[3, 3])
-    return dataclasses.replace(neighbour, T_parent_child=neighbour.T_parent_child @ se3.exp(error))
+    return dataclasses.replace(
+        neighbour, T_parent_child=neighbour.T_parent_child @ se3.exp(error)
+    )
 
 
 def test_both_results_of_a_loop_that_does_not_close_are_used_with_care(
     calibrated, turned_neighbour
 ):
     assert calibrated.verdict is hec.Verdict.USE
-    opened = RigCalibration.of(calibrated.sensors, calibrated.calibrations, [turned_neighbour])
+    opened = RigCalibration.of(
+        calibrated.sensors, calibrated.calibrations, [turned_neighbour]
+    )
     assert not opened.closures[0].closes
     assert opened.verdict is hec.Verdict.USE_WITH_CARE
     for result in opened.calibrations:
-        warnings = [found for found in result.findings if found.severity is not Severity.NOTE]
+        warnings = [
+            found for found in result.findings if found.severity is not Severity.NOTE
+        ]
         assert [found.code for found in warnings] == ["not_closed"]
         assert result.verdict is hec.Verdict.USE_WITH_CARE
     text = "\n".join(as_lines(opened))
-    assert text.count("lidar, front and rear, two at a time, differ around the loop") == 2
+    assert (
+        text.count("lidar, front and rear, two at a time, differ around the loop") == 2
+    )
 
 
 def test_a_bad_result_of_a_loop_does_not_lower_the_verdict_of_the_other(
@@ -133,10 +149,16 @@ def test_what_is_of_two_sensors_is_refused(rig):
     trajectories = trajectories_of(rig)
     with pytest.raises(InputError, match="at least three"):
         hec.calibrate_rig({name: trajectories[name] for name in ("lidar", "front")})
-    for options in ({"prior.z": "1.0 +/- 0.1"}, {"time_offset": 0.1}, {"parent_frame": "a"}):
+    for options in (
+        {"prior.z": "1.0 +/- 0.1"},
+        {"time_offset": 0.1},
+        {"parent_frame": "a"},
+    ):
         with pytest.raises(ConfigError, match=next(iter(options))):
             hec.calibrate_rig(trajectories, options)
-    trajectories["rear"] = dataclasses.replace(trajectories["rear"], measures="positions")
+    trajectories["rear"] = dataclasses.replace(
+        trajectories["rear"], measures="positions"
+    )
     with pytest.raises(InputError, match="rear measures positions only"):
         hec.calibrate_rig(trajectories)
 
@@ -181,7 +203,9 @@ def test_a_person_sees_all_sensors_and_whether_pairs_close(calibrated):
         "front in lidar",
         "rear in lidar",
     ]
-    assert any(line.startswith("  lidar - front - rear closes: off by") for line in lines)
+    assert any(
+        line.startswith("  lidar - front - rear closes: off by") for line in lines
+    )
 
 
 def test_a_sensor_of_any_name_stays_below_the_directory(calibrated, tmp_path):
@@ -198,14 +222,18 @@ def test_a_sensor_of_any_name_stays_below_the_directory(calibrated, tmp_path):
     saved = sorted(path.name for path in (tmp_path / "rig").iterdir() if path.is_dir())
     assert saved == ["__x__a", "__x__a_2"]
     assert "../$x$/a" in render_rig(odd, ["a.txt"])
-    with pytest.raises(InputError, match=r"of a rig; name one of its sensors: .*__x__a_2"):
+    with pytest.raises(
+        InputError, match=r"of a rig; name one of its sensors: .*__x__a_2"
+    ):
         hec.load(tmp_path / "rig")
 
 
 def test_topics_of_a_bag(rig, tmp_path, capsys):
     streams = {}
     for name, trajectory in trajectories_of(rig).items():
-        named = dataclasses.replace(trajectory, sensor_frame=f"{name}_link", world_frame="odom")
+        named = dataclasses.replace(
+            trajectory, sensor_frame=f"{name}_link", world_frame="odom"
+        )
         streams[f"/{name}/odometry"] = named, "nav_msgs/msg/Odometry"
     bag = str(tmp_path / "bag")
     write_bag(bag, streams)
@@ -224,7 +252,10 @@ def test_topics_of_a_bag(rig, tmp_path, capsys):
     [
         (["rear.txt", "--parent-format", "tum"], "--parent-format is for two files"),
         (["front.txt"], "front.txt appears twice"),
-        (["rear.txt", "--installed", "0 0 0 0 0 0"], "--installed and --base-frame apply to two"),
+        (
+            ["rear.txt", "--installed", "0 0 0 0 0 0"],
+            "--installed and --base-frame apply to two",
+        ),
     ],
 )
 def test_the_command_refuses_options_of_two_files(files, run, words, message):
@@ -245,11 +276,15 @@ JUMPS = written_finding("jumps", Severity.ERROR, "every step is a jump")
 
 
 @pytest.mark.parametrize(("findings", "code"), [((), 1), ((JUMPS,), 3)])
-def test_the_exit_code_is_that_of_two_sensors(files, calibrated, run, monkeypatch, findings, code):
+def test_the_exit_code_is_that_of_two_sensors(
+    files, calibrated, run, monkeypatch, findings, code
+):
     failed = not_converged(calibrated, findings)
     monkeypatch.setattr(of_rig, "calibrated", lambda *_: failed)
     exit_code, _, err = run("calibrate", *files)
-    assert exit_code == code == gravest_code(map(present.exit_code, failed.calibrations))
+    assert (
+        exit_code == code == gravest_code(map(present.exit_code, failed.calibrations))
+    )
     advice = "front: the solver did not converge; do not use this result, record more varied motion"
     assert (advice in err) == (code == 1)
 
@@ -274,7 +309,9 @@ def test_labels_details_and_warnings_of_files_are_obeyed_as_with_two_sensors(
     assert out.count("ros2 run tf2_ros static_transform_publisher") == 2
 
 
-def test_the_files_of_an_earlier_run_are_kept(files, calibrated, run, monkeypatch, tmp_path):
+def test_the_files_of_an_earlier_run_are_kept(
+    files, calibrated, run, monkeypatch, tmp_path
+):
     monkeypatch.setattr(of_rig, "calibrate_rig", lambda *_: calibrated)
     run("calibrate", *files, "--out", "rig")
     earlier = (tmp_path / "rig/rig.yaml").read_bytes()

@@ -37,13 +37,17 @@ def ranges(origins, directions):
     """Of rays (N, 3) that begin in the room."""
     with np.errstate(divide="ignore"):
         inverse = 1.0 / directions
-    distances = np.maximum(*((corner - origins) * inverse for corner in ROOM)).min(axis=1)
+    distances = np.maximum(*((corner - origins) * inverse for corner in ROOM)).min(
+        axis=1
+    )
     for lower, upper in BOXES:
         first = (lower - origins) * inverse
         second = (upper - origins) * inverse
         near = np.minimum(first, second).max(axis=1)
         far = np.maximum(first, second).min(axis=1)
-        distances = np.where((near < far) & (near > 0.0), np.minimum(distances, near), distances)
+        distances = np.where(
+            (near < far) & (near > 0.0), np.minimum(distances, near), distances
+        )
     return distances
 
 
@@ -60,7 +64,9 @@ class Body:
         self.turn = RotationSpline(knots, turns)
 
     def poses(self, times):
-        return se3.from_rotation_translation(self.turn(times).as_matrix(), self.place(times))
+        return se3.from_rotation_translation(
+            self.turn(times).as_matrix(), self.place(times)
+        )
 
 
 def scans(body, T_body_lidar, too_far, count, rng):
@@ -75,7 +81,9 @@ def scans(body, T_body_lidar, too_far, count, rng):
         Ts = body.poses(number / RATE + since) @ T_body_lidar
         directions = np.einsum("cij,crj->cri", Ts[:, :3, :3], rays).reshape(-1, 3)
         distances = ranges(np.repeat(Ts[:, :3, 3], 16, axis=0), directions)
-        distances += 0.01 * rng.standard_normal(len(distances)) + np.tile(too_far, COLUMNS)
+        distances += 0.01 * rng.standard_normal(len(distances)) + np.tile(
+            too_far, COLUMNS
+        )
         yield distances[:, None] * rays.reshape(-1, 3), np.repeat(since, 16)
 
 
@@ -115,14 +123,23 @@ def test_two_lidars_from_their_points(tmp_path, capsys, no_figures):
     X = se3.exp([0.6, -0.3, 0.2, 0.1, -0.2, 0.9])
     messages = []
     too_far = 0.005 * rng.standard_normal((2, len(ELEVATIONS)))
-    for k, (topic, T, of_time) in enumerate((("/front", np.eye(4), "time"), ("/rear", X, "t"))):
+    for k, (topic, T, of_time) in enumerate(
+        (("/front", np.eye(4), "time"), ("/rear", X, "t"))
+    ):
         for number, scan in enumerate(scans(body, T, too_far[k], count, rng)):
             stamp_ns = START_NS + round(number / RATE * 1e9)
             make = partial(cloud, stamp_ns=stamp_ns, frame=topic[1:], of_time=of_time)
             make = partial(make, points=scan[0], times=scan[1])
             messages.append((stamp_ns, topic, POINTS, make))
     bag = write_messages(tmp_path / "drive", messages)
-    command = ["calibrate", str(bag), "--parent-topic", "/front", "--child-topic", "/rear"]
+    command = [
+        "calibrate",
+        str(bag),
+        "--parent-topic",
+        "/front",
+        "--child-topic",
+        "/rear",
+    ]
     assert main([*command, "--out", str(tmp_path / "out")]) == 0
     assert "odometry from 70 scans" in capsys.readouterr().err
     result = hec.load(tmp_path / "out")
@@ -136,11 +153,15 @@ def test_two_lidars_from_their_points(tmp_path, capsys, no_figures):
         kept = tmp_path / f"drive.{name}.odometry.npz"
         stored = np.load(kept)
         truth = body.poses(middle_s) @ T_body_lidar
-        np.testing.assert_allclose(stored["stamps_ns"], START_NS + middle_s * 1e9, atol=1e3)
+        np.testing.assert_allclose(
+            stored["stamps_ns"], START_NS + middle_s * 1e9, atol=1e3
+        )
         poses = se3.from_quat_xyzw(stored["poses"][:, :3], stored["poses"][:, 3:])
         turns = [se3.log(se3.inverse(T[:-1]) @ T[1:])[:, 3:] for T in (poses, truth)]
         assert np.degrees(np.sqrt(np.mean((turns[0] - turns[1]) ** 2))) < 0.0135
-        assert np.std(stored["too_far_m"][rings] - too_far[k]) < 0.6 * np.std(too_far[k])  # or 1
+        assert np.std(stored["too_far_m"][rings] - too_far[k]) < 0.6 * np.std(
+            too_far[k]
+        )  # or 1
     # The second time, what is kept is read.
     before = kept.stat().st_mtime_ns
     with PoseBag(bag) as opened:

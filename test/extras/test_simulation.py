@@ -38,7 +38,11 @@ def test_noise_free_sensors_move_as_one_body():
 
 def test_sensors_at_different_rates_are_on_one_body():
     config = dataclasses.replace(
-        options.DriveConfig(), parent_rate=200.0, child_rate=31.0, child_delay=0.0051, poses=400
+        options.DriveConfig(),
+        parent_rate=200.0,
+        child_rate=31.0,
+        child_delay=0.0051,
+        poses=400,
     )
     drive = simulate_drive(1, config)
     inside = drive.child.stamps_ns <= drive.parent.stamps_ns[-1]
@@ -46,7 +50,9 @@ def test_sensors_at_different_rates_are_on_one_body():
     world = Ts_pw_p @ drive.T_parent_child @ se3.inverse(drive.child.poses[inside])
     assert inside.sum() > 50
     # All that is left is what interpolation over 5 ms leaves.
-    np.testing.assert_allclose(world, np.tile(drive.T_pw_cw, (len(world), 1, 1)), atol=2e-3)
+    np.testing.assert_allclose(
+        world, np.tile(drive.T_pw_cw, (len(world), 1, 1)), atol=2e-3
+    )
     assert not set(drive.child.stamps_ns[:20]) & set(drive.parent.stamps_ns)
 
 
@@ -66,7 +72,9 @@ def test_vehicle_drives_at_its_speed_and_turns_within_its_limit():
     assert 0.9 < yaw_rates[::50].std() < 1.4  # uniform over +/-2: 1.155
     # It moves where it looks.
     heading = np.arctan2(np.diff(poses[:, 1, 3]), np.diff(poses[:, 0, 3]))
-    np.testing.assert_allclose(np.exp(1j * heading), np.exp(0.5j * (yaw[:-1] + yaw[1:])), atol=1e-9)
+    np.testing.assert_allclose(
+        np.exp(1j * heading), np.exp(0.5j * (yaw[:-1] + yaw[1:])), atol=1e-9
+    )
 
 
 # --- against the published trajectories -----------------------------------------------
@@ -101,7 +109,9 @@ def test_published_drives_lie_on_our_terrain_with_our_attitude(published_folder)
         # Circular arcs: a chord points half-way between the headings at its ends.
         chords = np.arctan2(np.diff(y), np.diff(x))
         half_way = yaw[:-1] + 0.5 * np.angle(np.exp(1j * np.diff(yaw)))
-        np.testing.assert_allclose(np.exp(1j * chords), np.exp(1j * half_way), atol=1e-9)
+        np.testing.assert_allclose(
+            np.exp(1j * chords), np.exp(1j * half_way), atol=1e-9
+        )
 
 
 clean_drive = functools.cache(simulate_drive)
@@ -149,9 +159,14 @@ def test_command_writes_the_published_layout(tmp_path, run):
     assert [path.name for path in folders] == ["run_01", "run_02", "run_03"]
     for number, folder in enumerate(folders):
         expected = simulate_drive(
-            (4, number), dataclasses.replace(options.PUBLISHED_DRIVE, poses=20), options.MIXTURE
+            (4, number),
+            dataclasses.replace(options.PUBLISHED_DRIVE, poses=20),
+            options.MIXTURE,
         )
-        for name, trajectory in (("T_S1_W1", expected.parent), ("T_S2_W2", expected.child)):
+        for name, trajectory in (
+            ("T_S1_W1", expected.parent),
+            ("T_S2_W2", expected.child),
+        ):
             written = read_trajectory(folder / f"{name}.txt")
             np.testing.assert_array_equal(written.stamps_ns, trajectory.stamps_ns)
             np.testing.assert_allclose(written.poses, trajectory.poses, atol=1e-12)
@@ -176,7 +191,10 @@ def test_command_writes_bags(tmp_path, run, storage, name):
     for stream, trajectory in (("parent", drive.parent), ("child", drive.child)):
         ours = poses[poses.streams == stream]
         assert ours.stamps_ns.tolist() == trajectory.stamps_ns.tolist()
-        assert ({*ours.sensor_frames}, {*ours.world_frames}) == ({stream}, {f"{stream}_odom"})
+        assert ({*ours.sensor_frames}, {*ours.world_frames}) == (
+            {stream},
+            {f"{stream}_odom"},
+        )
         np.testing.assert_array_equal(ours.poses[:, :3], trajectory.poses[:, :3, 3])
 
 

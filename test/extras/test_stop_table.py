@@ -43,10 +43,15 @@ def test_advice_for_turns_about_one_axis_is_to_turn_about_the_other_axes(setup, 
     table = calibrate_arm(robot, tracking, setup=setup).stops
 
     assert axis not in [stop.axis for stop in table.next[:2]]
-    assert [(abs(stop.angle_deg), stop.frame) for stop in table.next] == [(30, "hand")] * 3
+    assert [(abs(stop.angle_deg), stop.frame) for stop in table.next] == [
+        (30, "hand")
+    ] * 3
     assert f"from stop {table.start}, " in table.advice
     for stop in table.next:
-        assert f"turn hand by {stop.angle_deg:+d} deg about its {stop.axis}" in table.advice
+        assert (
+            f"turn hand by {stop.angle_deg:+d} deg about its {stop.axis}"
+            in table.advice
+        )
 
 
 @pytest.mark.parametrize("setup", SETUPS)
@@ -64,7 +69,9 @@ def test_advised_stops_reduce_sigma_more_than_other_stops(setup):
     sigmas = []
     for added in (advised, others):
         of_added = measured(added, setup, np.random.default_rng(3))
-        more = calibrate_arm(np.r_[robot, added], np.r_[tracking, of_added], setup=setup)
+        more = calibrate_arm(
+            np.r_[robot, added], np.r_[tracking, of_added], setup=setup
+        )
         sigmas.append(more.sigmas.max())
 
     assert sigmas[0] < 0.8 * sigmas[1]

@@ -37,7 +37,9 @@ def arm(random, n=25, is_in_hand=True, turn_rad=(0.5, 0.5, 0.5)):
 
 
 @pytest.mark.parametrize("is_in_hand", [True, False])
-def test_a_camera_in_the_hand_and_one_beside_the_robot_are_told_apart_and_kept(random, is_in_hand):
+def test_a_camera_in_the_hand_and_one_beside_the_robot_are_told_apart_and_kept(
+    random, is_in_hand
+):
     robot, tracking, X, Z = arm(random, is_in_hand=is_in_hand)
     result = calibrate_arm(robot, tracking, names={"camera": "eye"})
     frames = ("hand", "base") if is_in_hand else ("base", "hand")
@@ -55,8 +57,12 @@ def test_a_scara_is_told_what_is_unknown(random):
     robot, tracking, X, _ = arm(random, turn_rad=(0.0, 0.0, 1.0))
     result = calibrate_arm(robot, tracking)
     assert result.unobservable() == ["z"]
-    assert result.headline.startswith("DO NOT USE: z cannot be determined from these stops")
-    with_prior = calibrate_arm(robot, tracking, CalibratorConfig(prior_z=f"{X[2, 3]}+/-0.002"))
+    assert result.headline.startswith(
+        "DO NOT USE: z cannot be determined from these stops"
+    )
+    with_prior = calibrate_arm(
+        robot, tracking, CalibratorConfig(prior_z=f"{X[2, 3]}+/-0.002")
+    )
     assert with_prior.verdict is hec.Verdict.USE
 
 
@@ -90,7 +96,9 @@ def test_samples_of_others(file, parent, position, within_m):
     assert {finding.severity for finding in result.findings} <= {Severity.NOTE}
     assert result.verdict is not hec.Verdict.DO_NOT_USE
     if position:
-        np.testing.assert_allclose(result.T_parent_child[:3, 3], position, atol=within_m)
+        np.testing.assert_allclose(
+            result.T_parent_child[:3, 3], position, atol=within_m
+        )
 
 
 class TestCommand:
@@ -99,7 +107,9 @@ class TestCommand:
         pairs = [[a.tolist(), b.tolist()] for a, b in zip(robot, tracking, strict=True)]
         (tmp_path / "samples.json").write_text(json.dumps(pairs))
         out = tmp_path / "out"
-        assert main(["calibrate", str(tmp_path / "samples.json"), "--out", str(out)]) == 0
+        assert (
+            main(["calibrate", str(tmp_path / "samples.json"), "--out", str(out)]) == 0
+        )
         assert "camera in hand: maps coordinates" in (output := capsys.readouterr().out)
         assert "target in base" in output
         np.testing.assert_allclose(hec.load(out).T_parent_child, X, atol=5e-3)
@@ -108,7 +118,9 @@ class TestCommand:
         robot, tracking, X, _ = arm(random)
         for name, poses in (("hand", robot), ("eye", se3.inverse(tracking))):
             stamps_ns = np.arange(len(poses)) * 10**9
-            hec.write_trajectory(tmp_path / f"{name}.tum", hec.Trajectory(stamps_ns, poses))
+            hec.write_trajectory(
+                tmp_path / f"{name}.tum", hec.Trajectory(stamps_ns, poses)
+            )
         files = [str(tmp_path / "hand.tum"), str(tmp_path / "eye.tum")]
         assert main(["calibrate", *files, "--order", "none", "--json"]) == 0
         document = json.loads(capsys.readouterr().out)
@@ -167,7 +179,9 @@ def moveit_yaml(both_poses):
 
 
 def moveit_json(both_poses):
-    return json.dumps([[a.tolist(), b.tolist()] for a, b in zip(*both_poses, strict=True)])
+    return json.dumps(
+        [[a.tolist(), b.tolist()] for a, b in zip(*both_poses, strict=True)]
+    )
 
 
 @pytest.mark.parametrize("written", [opencv, easy_handeye2, moveit_yaml, moveit_json])
@@ -184,7 +198,10 @@ def test_files_of_other_tools(written, both_poses, tmp_path):
 def test_the_report_of_an_arm_states_the_error_of_a_near_object(tmp_path):
     assert main(["calibrate", "sample:arm.yaml", "--out", str(tmp_path / "arm")]) == 0
     page = (tmp_path / "arm" / "report.html").read_text()
-    assert "The position of an object 0.5 m from camera has a standard deviation of" in page
+    assert (
+        "The position of an object 0.5 m from camera has a standard deviation of"
+        in page
+    )
 
 
 # ---- angles of robots
@@ -235,7 +252,9 @@ def test_the_file_of_a_hand_has_the_angles_of_its_robot(both_poses, tmp_path, ca
     command = ["calibrate", str(hand), str(camera), "--order", "none"]
     assert main([*command, "--parent-angles", "kuka", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
-    np.testing.assert_allclose(result["T_parent_child"]["matrix"], T_hand_camera, atol=1e-6)
+    np.testing.assert_allclose(
+        result["T_parent_child"]["matrix"], T_hand_camera, atol=1e-6
+    )
 
 
 def test_angles_of_a_robot_are_refused_for_samples(tmp_path, capsys):
@@ -251,7 +270,9 @@ def write_visp(folder, stop, robot, target):
     for name, T in (("fPe", robot), ("cPo", target)):
         values = [*T[:3, 3], *se3.rotation_log(T[:3, :3])]
         rows = "".join(f"  - [{value:.12g}]\n" for value in values)
-        (folder / f"pose_{name}_{stop}.yaml").write_text(f"rows: 6\ncols: 1\ndata: \n{rows}")
+        (folder / f"pose_{name}_{stop}.yaml").write_text(
+            f"rows: 6\ncols: 1\ndata: \n{rows}"
+        )
 
 
 def write_zivid(folder, stop, robot, target):
@@ -259,7 +280,8 @@ def write_zivid(folder, stop, robot, target):
         (folder / name).mkdir(exist_ok=True)
         numbers = ", ".join(repr(float(value)) for value in T.ravel())
         text = (
-            f"PoseState: !!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: d\n   data: [{numbers}]\n"
+            "PoseState: !!opencv-matrix\n   rows: 4\n   cols: 4\n "
+            f"  dt: d\n   data: [{numbers}]\n"
         )
         (folder / name / f"pos{stop:02d}.yaml").write_text(f"%YAML:1.0\n---\n{text}")
 
@@ -320,18 +342,29 @@ def a_matrix_for_each_stop(name, stack):
 
 
 def a_name_for_each_stop(name, stack):
-    items = [f"{name}_{stop}: {opencv_matrix(values)}\n" for stop, values in enumerate(stack)]
+    items = [
+        f"{name}_{stop}: {opencv_matrix(values)}\n" for stop, values in enumerate(stack)
+    ]
     return "".join(items)
 
 
 @pytest.mark.parametrize("are_vectors", [False, True])
-@pytest.mark.parametrize("write", [one_matrix, a_matrix_for_each_stop, a_name_for_each_stop])
-def test_arguments_of_opencv_in_a_file_storage(write, are_vectors, both_poses, tmp_path):
+@pytest.mark.parametrize(
+    "write", [one_matrix, a_matrix_for_each_stop, a_name_for_each_stop]
+)
+def test_arguments_of_opencv_in_a_file_storage(
+    write, are_vectors, both_poses, tmp_path
+):
     stacks = []
     for Ts in both_poses:
         rotations = Ts[:, :3, :3]
-        stacks += [se3.rotation_log(rotations) if are_vectors else rotations, Ts[:, :3, 3]]
-    text = "".join(write(name, stack) for name, stack in zip(ARGUMENTS, stacks, strict=True))
+        stacks += [
+            se3.rotation_log(rotations) if are_vectors else rotations,
+            Ts[:, :3, 3],
+        ]
+    text = "".join(
+        write(name, stack) for name, stack in zip(ARGUMENTS, stacks, strict=True)
+    )
     path = tmp_path / "samples.yaml"
     path.write_text(f"%YAML:1.0\n---\n{text}")
     read = read_arm_samples(path)
@@ -342,7 +375,9 @@ def test_a_file_storage_with_too_few_numbers_is_refused(tmp_path):
     path = tmp_path / "samples.yaml"
     text = "".join(one_matrix(name, np.eye(3)[:1]) for name in ARGUMENTS)
     path.write_text(text.replace("1.0, 0.0, 0.0]", "1.0, 0.0]"))
-    with pytest.raises(InputError, match="rotations of 2 numbers and translations of 2"):
+    with pytest.raises(
+        InputError, match="rotations of 2 numbers and translations of 2"
+    ):
         read_arm_samples(path)
 
 
@@ -355,7 +390,10 @@ def test_a_file_storage_with_too_few_numbers_is_refused(tmp_path):
         ("[[1, 2]]", "sample 1: expected a pose"),
         ("[{x: 1, y: 2}]", "expected samples of an arm"),
         ("[{robot: {}, tracking: {}}]", "translation and rotation"),
-        (json.dumps([[np.eye(4).tolist(), (2 * np.eye(4)).tolist()]]), "not a rotation matrix"),
+        (
+            json.dumps([[np.eye(4).tolist(), (2 * np.eye(4)).tolist()]]),
+            "not a rotation matrix",
+        ),
         (json.dumps([[[0] * 7, [0] * 7]]), "a quaternion of length 0"),
         ("[[" + "[.nan" + ", 1" * 15 + "], [.nan]]]", "not finite"),
     ],
@@ -372,7 +410,9 @@ def test_what_is_wrong_is_said_in_one_line(text, message, tmp_path):
 @pytest.mark.parametrize("as_rows", [False, True])
 def test_two_stacks_in_an_npz(as_rows, both_poses, tmp_path):
     stacks = (
-        [np.c_[Ts[:, :3, 3], se3.to_quat_xyzw(Ts)] for Ts in both_poses] if as_rows else both_poses
+        [np.c_[Ts[:, :3, 3], se3.to_quat_xyzw(Ts)] for Ts in both_poses]
+        if as_rows
+        else both_poses
     )
     file = tmp_path / "arm.npz"
     np.savez(file, robot=stacks[0], tracking=stacks[1])
@@ -421,7 +461,10 @@ def test_exact_stops_are_solved_exactly(random, n):
 
 def errors_m(fits, Xs):
     return np.array(
-        [np.linalg.norm(off(fit.T_parent_child, X)[:3]) for fit, X in zip(fits, Xs, strict=True)]
+        [
+            np.linalg.norm(off(fit.T_parent_child, X)[:3])
+            for fit, X in zip(fits, Xs, strict=True)
+        ]
     )
 
 
@@ -433,7 +476,9 @@ def seen_by_a_camera(random, n):
     sight = position / np.linalg.norm(position, axis=1, keepdims=True)
     position = position + 0.01 * random.normal(size=(n, 1)) * sight
     turns = se3.rotation_exp(0.01 * random.normal(size=(n, 3)))
-    measured = se3.from_rotation_translation(se3.rotation_of(measured) @ turns, position)
+    measured = se3.from_rotation_translation(
+        se3.rotation_of(measured) @ turns, position
+    )
     return X, Z, Stops(stops.Ts_world_parent, se3.inverse(measured))
 
 
@@ -476,10 +521,14 @@ def test_covariance_is_that_of_the_errors(random, outliers, size, n, lowest_nees
 def test_covariance_is_that_of_errors_that_last(random):
     values = []
     n = 40
-    lasting = np.linalg.cholesky(0.7 ** np.abs(np.subtract.outer(np.arange(n), np.arange(n))))
+    lasting = np.linalg.cholesky(
+        0.7 ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    )
     for _ in range(30):
         waves = np.sin(np.linspace(0.0, 6.0, n)[:, None] * random.uniform(0.5, 2.0, 6))
-        X, Z, stops = recorded(random, n, noise=0.0, Ts_world_parent=se3.exp(0.5 * waves))
+        X, Z, stops = recorded(
+            random, n, noise=0.0, Ts_world_parent=se3.exp(0.5 * waves)
+        )
         errors = se3.exp(lasting @ random.normal(size=(n, 6)) * LEVELS)
         fit = solve(Stops(stops.Ts_world_parent, stops.Ts_world_child @ errors))
         values.append(nees_of(fit, X, Z))
@@ -532,7 +581,9 @@ class TestUndetermined:
         assert solve(recorded(random, 15)[2]).undetermined().shape == (6, 0)
 
     @pytest.mark.parametrize("seed", range(10))
-    @pytest.mark.parametrize("motion", ["one_axis", "no_rotation", "one_axis_unmoved", "two"])
+    @pytest.mark.parametrize(
+        "motion", ["one_axis", "no_rotation", "one_axis_unmoved", "two"]
+    )
     def test_degenerate_stops_are_refused_by_axis(self, motion, seed):
         random = np.random.default_rng(seed)
         axis = se3.nearest_rotation(random.normal(size=(3, 3)))[0]
@@ -564,7 +615,9 @@ def test_three_stops_do_not_say_where_the_camera_is(random, is_in_hand):
     assert "fit these stops equally well" in result.findings[0].what
 
 
-@pytest.mark.parametrize("convert", [lambda Ts: Ts, se3.inverse], ids=["same", "inverse"])
+@pytest.mark.parametrize(
+    "convert", [lambda Ts: Ts, se3.inverse], ids=["same", "inverse"]
+)
 def test_a_target_with_the_poses_of_the_robot_is_a_copy(random, convert):
     robot, *_ = arm(random)
 

@@ -100,7 +100,11 @@ REPAIRED = {
         "seem to be inverted",
     ),
     "millimetres, robot": (lambda Ts: scaled(Ts, 1e3), same, "lengths are millimetres"),
-    "millimetres, target": (same, lambda Ts: scaled(Ts, 1e3), "lengths are millimetres"),
+    "millimetres, target": (
+        same,
+        lambda Ts: scaled(Ts, 1e3),
+        "lengths are millimetres",
+    ),
     "millimetres, both": (
         lambda Ts: scaled(Ts, 1e3),
         lambda Ts: scaled(Ts, 1e3),
@@ -162,7 +166,9 @@ def test_what_is_certain_is_repaired_and_said(name, place):
 
 @pytest.mark.parametrize("place", [ON_HAND, BESIDE])
 @pytest.mark.parametrize("factor", [0.9, 1.1, 2.0])
-def test_a_target_of_another_size_is_refused_with_its_scale_and_the_option(factor, place):
+def test_a_target_of_another_size_is_refused_with_its_scale_and_the_option(
+    factor, place
+):
     robot, tracking, truth = arm(place)
     result = calibrate_arm(robot, scaled(tracking, factor))
     assert result.verdict is hec.Verdict.DO_NOT_USE
@@ -170,7 +176,9 @@ def test_a_target_of_another_size_is_refused_with_its_scale_and_the_option(facto
     assert result.findings[0].options == {"scale": "estimate"}
     error = se3.log(se3.inverse(result.T_parent_child) @ truth)
     assert np.linalg.norm(error[:3]) < WITHIN_M
-    asked = calibrate_arm(robot, scaled(tracking, factor), CalibratorConfig(scale="estimate"))
+    asked = calibrate_arm(
+        robot, scaled(tracking, factor), CalibratorConfig(scale="estimate")
+    )
     assert "scale" not in [finding.code for finding in asked.findings]
     assert asked.verdict is not hec.Verdict.DO_NOT_USE
 
@@ -246,8 +254,12 @@ def test_what_contradicts_is_refused_with_its_cause(name, place):
 
 
 @pytest.mark.parametrize("place", [ON_HAND, BESIDE])
-@pytest.mark.parametrize("name", ["reversed", "robot that never moved", "shifted by one"])
-def test_a_refused_arm_has_its_cause_alone_and_exit_code_3(name, place, tmp_path, capsys):
+@pytest.mark.parametrize(
+    "name", ["reversed", "robot that never moved", "shifted by one"]
+)
+def test_a_refused_arm_has_its_cause_alone_and_exit_code_3(
+    name, place, tmp_path, capsys
+):
     of_robot, of_target, code = REFUSED[name]
     robot, tracking, _ = arm(place, seed=9, n=40)
     samples = tmp_path / "samples.npz"
@@ -258,7 +270,9 @@ def test_a_refused_arm_has_its_cause_alone_and_exit_code_3(name, place, tmp_path
     out, err = capsys.readouterr()
     document = json.loads(out)
     decisive = [
-        reason["rule"] for reason in document["reasons"] if reason["verdict"] == "DO_NOT_USE"
+        reason["rule"]
+        for reason in document["reasons"]
+        if reason["verdict"] == "DO_NOT_USE"
     ]
     assert decisive == ["error_finding"]
     assert document["findings"][0]["code"] == code
@@ -287,8 +301,12 @@ def moved(Ts_camera_target, part, row, shift_m):
 
 @pytest.mark.parametrize("place", [ON_HAND, BESIDE])
 @pytest.mark.parametrize("part", ["camera", "target"])
-@pytest.mark.parametrize(("row", "shift_m", "noise_m"), [(16, 0.08, 0.01), (22, 0.03, 0.001)])
-def test_what_moved_is_refused_by_name_with_its_size(place, part, row, shift_m, noise_m):
+@pytest.mark.parametrize(
+    ("row", "shift_m", "noise_m"), [(16, 0.08, 0.01), (22, 0.03, 0.001)]
+)
+def test_what_moved_is_refused_by_name_with_its_size(
+    place, part, row, shift_m, noise_m
+):
     robot, tracking, _ = arm(place, seed=row, n=32, noise_m=noise_m)
     result = calibrate_arm(robot, moved(tracking, part, row, shift_m))
     assert result.verdict is hec.Verdict.DO_NOT_USE
@@ -306,7 +324,9 @@ def test_movement_is_not_blamed_for_other_mistakes():
 
 
 @pytest.mark.parametrize("place", [ON_HAND, BESIDE])
-@pytest.mark.parametrize(("n", "noise_m"), [(10, 0.0005), (30, 0.002), (60, 0.0001), (40, 0.004)])
+@pytest.mark.parametrize(
+    ("n", "noise_m"), [(10, 0.0005), (30, 0.002), (60, 0.0001), (40, 0.004)]
+)
 def test_clean_stops_have_no_findings(place, n, noise_m):
     robot, tracking, truth = arm(place, seed=n, n=n, noise_m=noise_m)
     result = calibrate_arm(robot, tracking)
@@ -320,11 +340,18 @@ def test_clean_stops_have_no_findings(place, n, noise_m):
 class TestOptions:
     @pytest.mark.parametrize(
         ("option", "value"),
-        [("method", "dnlo"), ("reference", "B1"), ("time_offset", 1.0), ("max_gap", 2.0)],
+        [
+            ("method", "dnlo"),
+            ("reference", "B1"),
+            ("time_offset", 1.0),
+            ("max_gap", 2.0),
+        ],
     )
     def test_what_means_nothing_for_stops_is_refused(self, option, value):
         robot, tracking, _ = arm(ON_HAND)
-        with pytest.raises(ConfigError, match=f"{option} {value} has no meaning for stops"):
+        with pytest.raises(
+            ConfigError, match=f"{option} {value} has no meaning for stops"
+        ):
             calibrate_arm(robot, tracking, CalibratorConfig(**{option: value}))
 
     @pytest.mark.parametrize(
@@ -332,7 +359,11 @@ class TestOptions:
         [
             (scalar_first, same, {"parent_quaternion": "wxyz"}),
             (same, transposed_rotations, {"child_invert": "orientations"}),
-            (se3.inverse, se3.inverse, {"parent_invert": "poses", "child_invert": "poses"}),
+            (
+                se3.inverse,
+                se3.inverse,
+                {"parent_invert": "poses", "child_invert": "poses"},
+            ),
             (lambda Ts: scaled(Ts, 1e3), same, {"parent_scale": 0.001}),
             (same, lambda Ts: scaled(Ts, 2.0), {"scale": 0.5}),
             (same, lambda Ts: scaled(Ts, 2.0), {"scale": "estimate"}),
@@ -349,13 +380,20 @@ class TestOptions:
     @pytest.mark.parametrize(
         ("of_robot", "of_target", "options", "code"),
         [
-            (scalar_first, scalar_first, {"parent_quaternion": "xyzw"}, "quaternion_order"),
+            (
+                scalar_first,
+                scalar_first,
+                {"parent_quaternion": "xyzw"},
+                "quaternion_order",
+            ),
             (lambda Ts: scaled(Ts, 1e3), same, {"parent_scale": 1.0}, "units"),
             (same, lambda Ts: scaled(Ts, 2.0), {"scale": "none"}, "scale"),
             (same, same, {"scale": 2.0}, "scale"),
         ],
     )
-    def test_what_the_user_has_settled_is_not_repaired(self, of_robot, of_target, options, code):
+    def test_what_the_user_has_settled_is_not_repaired(
+        self, of_robot, of_target, options, code
+    ):
         robot, tracking, _ = arm(ON_HAND)
         config = CalibratorConfig(**options)
         result = calibrate_arm(of_robot(robot), of_target(tracking), config)
@@ -368,7 +406,9 @@ class TestInput:
         robot, tracking, _ = arm(ON_HAND)
         expected = calibrate_arm(robot, tracking).T_parent_child
         of_opencv = [(Ts[:, :3, :3], Ts[:, :3, 3:]) for Ts in (robot, tracking)]
-        vectors = [(se3.rotation_log(Ts[:, :3, :3]), Ts[:, :3, 3]) for Ts in (robot, tracking)]
+        vectors = [
+            (se3.rotation_log(Ts[:, :3, :3]), Ts[:, :3, 3]) for Ts in (robot, tracking)
+        ]
         rows = [se3.to_rows(Ts) for Ts in (robot, tracking)]
         lists = [[T.tolist() for T in Ts] for Ts in (robot, tracking)]
         for first, second in (of_opencv, vectors, rows, lists):
@@ -407,7 +447,10 @@ class TestInput:
             "the matrix is transposed": (np.swapaxes(robot, 1, 2), tracking),
             r"expected poses as \(N, 4, 4\)": (robot[:, :2], tracking),
             "rows of different shapes": ([[1.0, 2.0], [3.0]], tracking),
-            "20 rotations, 18 translations": ((robot[:, :3, :3], robot[:18, :3, 3]), tracking),
+            "20 rotations, 18 translations": (
+                (robot[:, :3, :3], robot[:18, :3, 3]),
+                tracking,
+            ),
         }
         for message, (first, second) in cases.items():
             with pytest.raises(InputError, match=message) as raised:
@@ -429,11 +472,15 @@ def test_two_files_need_no_stamps(tmp_path, capsys):
     for name, Ts in (("hand", robot), ("camera", se3.inverse(tracking))):
         vectors = np.c_[Ts[:, :3, 3], se3.rotation_log(Ts[:, :3, :3])]
         files.append(str(tmp_path / f"{name}.csv"))
-        np.savetxt(files[-1], vectors, delimiter=",", header="x,y,z,rx,ry,rz", comments="")
+        np.savetxt(
+            files[-1], vectors, delimiter=",", header="x,y,z,rx,ry,rz", comments=""
+        )
     assert main(["calibrate", *files, "--order", "none", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     np.testing.assert_allclose(
-        np.array(document["T_parent_child"]["matrix"])[:3, 3], truth[:3, 3], atol=WITHIN_M
+        np.array(document["T_parent_child"]["matrix"])[:3, 3],
+        truth[:3, 3],
+        atol=WITHIN_M,
     )
 
 
@@ -469,7 +516,9 @@ def test_pairing_by_time_is_refused_for_stops(n_files, tmp_path, capsys):
     np.savez(tmp_path / "arm.npz", robot=robot, tracking=tracking)
     for name, Ts in (("hand", robot), ("camera", tracking)):
         np.save(tmp_path / f"{name}.npy", Ts)
-    names = ["arm.npz"] if n_files == 1 else ["hand.npy", "camera.npy", "--order", "none"]
+    names = (
+        ["arm.npz"] if n_files == 1 else ["hand.npy", "camera.npy", "--order", "none"]
+    )
     words = [str(tmp_path / name) if "." in name else name for name in names]
     assert main(["calibrate", *words, "--pair-by", "time"]) == 2
     assert "--pair-by time has no meaning for stops" in capsys.readouterr().err
@@ -500,7 +549,9 @@ def test_the_options_that_a_finding_names_lead_to_the_right_answer(name, size, p
     assert np.linalg.norm(error[:3]) < WITHIN_M
     assert result.verdict is not hec.Verdict.DO_NOT_USE
     automatic = calibrate_arm(*sides, CalibratorConfig(scale="auto"))
-    np.testing.assert_allclose(automatic.T_parent_child, result.T_parent_child, atol=1e-9)
+    np.testing.assert_allclose(
+        automatic.T_parent_child, result.T_parent_child, atol=1e-9
+    )
     assert automatic.verdict is result.verdict
 
 
@@ -508,7 +559,9 @@ SETUPS = {"hand": ON_HAND, "beside": BESIDE}
 
 
 @pytest.mark.parametrize("setup", SETUPS)
-def test_the_first_line_has_the_place_of_the_camera_but_no_setup_that_the_stops_refuse(setup):
+def test_the_first_line_has_the_place_of_the_camera_but_no_setup_that_the_stops_refuse(
+    setup,
+):
     robot, tracking, _ = arm(SETUPS[setup])
 
     result = calibrate_arm(robot, tracking)
@@ -530,12 +583,17 @@ def test_a_setup_that_the_stops_contradict_is_refused_alone(setup):
     assert obeyed.findings == ()
     assert obeyed.warnings == ()
     assert [finding.code for finding in refused.findings] == ["setup"]
-    assert f"the stops fit a camera {SETUPS[setup]}, not one {SETUPS[other]}" in refused.headline
+    assert (
+        f"the stops fit a camera {SETUPS[setup]}, not one {SETUPS[other]}"
+        in refused.headline
+    )
 
 
 def test_a_setup_decides_where_the_stops_do_not():
     robot, tracking, _ = arm(ON_HAND, n=3)
-    assert [finding.code for finding in calibrate_arm(robot, tracking).findings] == ["ambiguous"]
+    assert [finding.code for finding in calibrate_arm(robot, tracking).findings] == [
+        "ambiguous"
+    ]
     for setup in SETUPS:
         result = calibrate_arm(robot, tracking, setup=setup)
         assert result.setup == setup
@@ -576,7 +634,9 @@ def test_setup_is_an_option_of_arms_alone(tmp_path, capsys):
     ],
 )
 @pytest.mark.parametrize("place", [ON_HAND, BESIDE])
-def test_stops_that_were_left_out_are_counted_and_named(place, count, severity, verdict):
+def test_stops_that_were_left_out_are_counted_and_named(
+    place, count, severity, verdict
+):
     robot, tracking, truth = arm(place, seed=9, n=40)
 
     result = calibrate_arm(robot, with_outliers(tracking, count))
@@ -610,7 +670,9 @@ def test_targets_detected_mirrored_at_half_of_the_stops_are_left_out():
     is_wrong = random.permutation(30) < 14
     tilts = se3.rotation_exp(0.4 * random.normal(size=(30, 3)))
     wrong = np.where(
-        is_wrong[:, None, None], with_rotations(target, target[:, :3, :3] @ tilts), target
+        is_wrong[:, None, None],
+        with_rotations(target, target[:, :3, :3] @ tilts),
+        target,
     )
     result = calibrate_arm(robot, wrong)
     assert result.verdict is hec.Verdict.USE_WITH_CARE

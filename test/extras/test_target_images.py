@@ -41,7 +41,9 @@ def rendered(picture, T_camera_picture, rng):
     """A grey image of a flat picture, whose pixels are in metres along x and down along y."""
     to_metres = np.diag([1 / PIXELS_PER_M, 1 / PIXELS_PER_M, 1.0])
     to_metres[:2, 2] = 0.5 / PIXELS_PER_M
-    to_fine = np.array([[SUPER, 0, (SUPER - 1) / 2], [0, SUPER, (SUPER - 1) / 2], [0, 0, 1.0]])
+    to_fine = np.array(
+        [[SUPER, 0, (SUPER - 1) / 2], [0, SUPER, (SUPER - 1) / 2], [0, 0, 1.0]]
+    )
     homography = to_fine @ MATRIX @ T_camera_picture[:3, [0, 1, 3]] @ to_metres
     height, width = picture.shape
     corners = homography @ [[0, width, 0, width], [0, 0, height, height], [1, 1, 1, 1]]
@@ -76,7 +78,9 @@ def aprilgrid_picture(columns, rows, size, gap):
     picture = np.full((rows * step, columns * step), 255, dtype=np.uint8)
     for number in range(columns * rows):
         # OpenCV draws the tags of this family upside down.
-        tag = cv2.aruco.generateImageMarker(dictionary, number, side, borderBits=2)[::-1, ::-1]
+        tag = cv2.aruco.generateImageMarker(dictionary, number, side, borderBits=2)[
+            ::-1, ::-1
+        ]
         left = number % columns * step
         bottom = picture.shape[0] - number // columns * step
         picture[bottom - side : bottom, left : left + side] = tag
@@ -119,7 +123,12 @@ def test_thirty_images_calibrate_a_hand(tmp_path, capsys, no_figures):
     folder.mkdir()
     for number, T in enumerate(Ts_camera_target):
         cv2.imwrite(str(folder / f"{number}.png"), rendered(picture, T, rng))
-    paths = [str(tmp_path / "hand.tum"), str(folder), "--camera", str(tmp_path / "camera.yaml")]
+    paths = [
+        str(tmp_path / "hand.tum"),
+        str(folder),
+        "--camera",
+        str(tmp_path / "camera.yaml"),
+    ]
     target = ["--target", "charuco:7x5:0.05:0.037:5X5_100"]
     assert main(["calibrate", *paths, *target, "--out", str(tmp_path / "out")]) == 0
     assert "visible in 30 of 30 images" in capsys.readouterr().err
@@ -141,12 +150,16 @@ def test_aprilgrid_has_the_frame_of_kalibr():
     gap = 0.009
     picture = aprilgrid_picture(columns, rows, size, gap)
     height_m = picture.shape[0] / PIXELS_PER_M
-    T_picture_target = se3.from_rotation_translation(np.diag([1.0, -1.0, -1.0]), [0, height_m, 0])
+    T_picture_target = se3.from_rotation_translation(
+        np.diag([1.0, -1.0, -1.0]), [0, height_m, 0]
+    )
     Ts = views(3, [0.1, 0.07, 0.0], rng)
     target = Target.parse(f"aprilgrid:{columns}x{rows}:{size}:{gap}")
     images = [rendered(picture, T, rng) for T in Ts]
     tracking = poses_of_target(images, target, Camera(MATRIX, np.zeros(5), False))
-    off = se3.log(Ts[tracking.images] @ T_picture_target @ se3.inverse(tracking.Ts_camera_target))
+    off = se3.log(
+        Ts[tracking.images] @ T_picture_target @ se3.inverse(tracking.Ts_camera_target)
+    )
     assert tracking.images == [0, 1, 2]
     assert np.abs(off[:, :3]).max() < 5e-3
     assert np.degrees(np.abs(off[:, 3:]).max()) < 0.4
@@ -167,7 +180,12 @@ def image_messages(stamp_ns, image):
     lens = "plumb_bob", np.zeros(5), MATRIX.ravel(), np.eye(3).ravel(), P, 0, 0, region
     info = types["sensor_msgs/msg/CameraInfo"](head, height, width, *lens)
     for topic, message in (("image_raw", raw), ("image_raw/compressed", compressed)):
-        yield stamp_ns, f"/eye/{topic}", message.__msgtype__, lambda _, made=message: made
+        yield (
+            stamp_ns,
+            f"/eye/{topic}",
+            message.__msgtype__,
+            lambda _, made=message: made,
+        )
     yield stamp_ns, "/eye/camera_info", info.__msgtype__, lambda _: info
 
 
@@ -176,14 +194,21 @@ def test_the_images_of_a_bag_are_poses_of_the_camera(tmp_path, capsys, no_figure
     count = 16
     times = np.arange(count) / 6
     stamps_ns = 1_700_000_000_000_000_000 + np.int64(1e9 / 6 * np.arange(count))
-    turns = 0.45 * np.stack([np.sin(1.3 * times), np.sin(1.9 * times + 1), np.sin(times)], axis=1)
+    turns = 0.45 * np.stack(
+        [np.sin(1.3 * times), np.sin(1.9 * times + 1), np.sin(times)], axis=1
+    )
     Rs = Rotation.from_rotvec(turns).as_matrix()
     far = [0.0, 0.0, 0.62]
     Ts = se3.from_rotation_translation(Rs, far - Rs @ [0.175, 0.125, 0.0])
     X = se3.exp([0.03, -0.05, 0.08, 0.2, -0.4, 1.2])
     hand = Trajectory(stamps_ns, se3.inverse(Ts) @ se3.inverse(X), "hand", "base")
     messages = [
-        (stamp_ns, "/hand", "geometry_msgs/msg/PoseStamped", lambda _, made=message: made)
+        (
+            stamp_ns,
+            "/hand",
+            "geometry_msgs/msg/PoseStamped",
+            lambda _, made=message: made,
+        )
         for stamp_ns, message in stamped_messages(
             JAZZY.types, hand, "geometry_msgs/msg/PoseStamped", is_ros1=False
         )
@@ -204,14 +229,23 @@ def test_the_images_of_a_bag_are_poses_of_the_camera(tmp_path, capsys, no_figure
     (tmp_path / "camera.yaml").write_text(CAMERA_INFO)
     with PoseBag(bag) as opened:
         of_file = f"/eye/image_raw/compressed?{board}@{tmp_path / 'camera.yaml'}"
-        np.testing.assert_array_equal(opened.trajectory(of_file)[0].poses, trajectory.poses)
+        np.testing.assert_array_equal(
+            opened.trajectory(of_file)[0].poses, trajectory.poses
+        )
         for topic, message in (
             ("/eye/image_raw", "name the target in the images"),
             (f"/hand?{board}", "contains no images"),
         ):
             with pytest.raises(InputError, match=message):
                 opened.trajectory(topic)
-    topics = ["--parent-topic", "/hand", "--child-topic", "/eye/image_raw", "--target", board]
+    topics = [
+        "--parent-topic",
+        "/hand",
+        "--child-topic",
+        "/eye/image_raw",
+        "--target",
+        board,
+    ]
     assert main(["calibrate", str(bag), *topics, "--out", str(tmp_path / "out")]) == 0
     error = se3.log(se3.inverse(X) @ hec.load(tmp_path / "out").T_parent_child)
     assert np.abs(error[:3]).max() < 3e-3
@@ -224,7 +258,9 @@ def test_images_without_the_target_are_left_out():
     empty = np.full((960, 1280), 200, dtype=np.uint8)
     target = Target.parse("charuco:7x5:0.05:0.037:5X5_100")
     camera = Camera(MATRIX, np.zeros(5), False)
-    tracking = poses_of_target([empty, rendered(charuco_picture(), T, rng)], target, camera)
+    tracking = poses_of_target(
+        [empty, rendered(charuco_picture(), T, rng)], target, camera
+    )
     assert tracking.images == [1]
     with pytest.raises(InputError, match="none of 1 images"):
         poses_of_target([empty], target, camera)
@@ -232,7 +268,10 @@ def test_images_without_the_target_are_left_out():
 
 @pytest.mark.parametrize(
     "text",
-    [CAMERA_INFO, "cam0: {intrinsics: [900, 900, 640, 480], distortion_coeffs: [0, 0, 0, 0]}"],
+    [
+        CAMERA_INFO,
+        "cam0: {intrinsics: [900, 900, 640, 480], distortion_coeffs: [0, 0, 0, 0]}",
+    ],
 )
 def test_intrinsics_of_ros_and_kalibr(tmp_path, text):
     (tmp_path / "camera.yaml").write_text(text)
@@ -267,16 +306,26 @@ def test_a_folder_with_images_and_a_file_for_each_pose(tmp_path, capsys, no_figu
     for number, (T_camera_target, T_base_hand) in enumerate(
         zip(Ts_camera_target, hand, strict=True), start=1
     ):
-        cv2.imwrite(str(folder / f"image-{number}.png"), rendered(picture, T_camera_target, rng))
+        cv2.imwrite(
+            str(folder / f"image-{number}.png"), rendered(picture, T_camera_target, rng)
+        )
         np.savetxt(folder / f"franka_pose_rPe_{number}.txt", T_base_hand)
     (folder / "camera.xml").write_text(VISP_CAMERA.replace("-0.1", "0"))
-    arguments = ["--target", "charuco:7x5:0.05:0.037:5X5_100", "--out", str(tmp_path / "out")]
+    arguments = [
+        "--target",
+        "charuco:7x5:0.05:0.037:5X5_100",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     main(["arm", str(folder), "--camera", str(folder / "camera.xml"), *arguments])
     assert "visible in 10 of 10 images" in capsys.readouterr().err
     off = se3.log(se3.inverse(X) @ hec.load(tmp_path / "out").T_parent_child)
     assert np.linalg.norm(off[:3]) < 2e-3
     (folder / "franka_pose_rPe_3.txt").unlink()
-    assert main(["arm", str(folder), "--camera", str(folder / "camera.xml"), *arguments]) == 1
+    assert (
+        main(["arm", str(folder), "--camera", str(folder / "camera.xml"), *arguments])
+        == 1
+    )
     assert "9 poses and" in capsys.readouterr().err
 
 
@@ -349,7 +398,9 @@ BOARDS = {
 }
 MARKERS = {
     "marker:7:0.16:5X5_50": partial(marker_picture, "5X5_50", 7, 0.16),
-    "marker:26:0.16:APRILTAG_36h11": partial(marker_picture, "APRILTAG_36h11", 26, 0.16),
+    "marker:26:0.16:APRILTAG_36h11": partial(
+        marker_picture, "APRILTAG_36h11", 26, 0.16
+    ),
 }
 
 
@@ -377,14 +428,20 @@ def test_only_the_marker_of_the_target_is_used():
     image = rendered(marker_picture("5X5_50", 7, 0.16), T, np.random.default_rng(10))
     camera = Camera(MATRIX, np.zeros(5), is_fisheye=False)
     for number in (6, 8):
-        with pytest.raises(InputError, match=f"4 corners of the target marker {number} of 5X5_50"):
-            poses_of_target([image], Target.parse(f"marker:{number}:0.16:5X5_50"), camera)
+        with pytest.raises(
+            InputError, match=f"4 corners of the target marker {number} of 5X5_50"
+        ):
+            poses_of_target(
+                [image], Target.parse(f"marker:{number}:0.16:5X5_50"), camera
+            )
     with pytest.raises(ConfigError, match="no marker 50; the last is 49"):
         TargetFinder(Target.parse("marker:50:0.16:5X5_50"), camera)
 
 
 def test_a_chessboard_that_looks_the_same_after_half_a_turn_is_refused():
-    with pytest.raises(ConfigError, match="7x5 inner corners looks the same after half a turn"):
+    with pytest.raises(
+        ConfigError, match="7x5 inner corners looks the same after half a turn"
+    ):
         Target.parse("chessboard:7x5:0.03")
 
 

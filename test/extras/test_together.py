@@ -56,12 +56,16 @@ def test_more_recordings_know_more_and_the_interval_is_honest():
         assert joint.together.kind == "agree"
     assert np.median(errors_m[6]) < 0.75 * np.median(errors_m[1])
     share = np.mean(is_inside)
-    assert share > 0.85, f"sigmas are too small: {share:.0%} of errors are in 90 % intervals"
+    assert share > 0.85, (
+        f"sigmas are too small: {share:.0%} of errors are in 90 % intervals"
+    )
 
 
 def test_an_axis_that_one_recording_hides_comes_from_another():
     flat = result(shift("z", -0.4), hidden="z", status=SolveStatus.UNOBSERVABLE)
-    hidden = flat.covariance_measured + 9.0 * np.outer(*2 * [np.r_[X[2, :3], np.zeros(3)]])
+    hidden = flat.covariance_measured + 9.0 * np.outer(
+        *2 * [np.r_[X[2, :3], np.zeros(3)]]
+    )
     flat = dataclasses.replace(flat, covariance_measured=hidden)
     joint = together(named(flat, flat, result()))
     assert joint.status is SolveStatus.OK
@@ -74,11 +78,17 @@ def test_an_axis_that_one_recording_hides_comes_from_another():
 
 def test_what_all_have_from_one_measurement_by_hand_is_no_better_together():
     axes = tuple(
-        dataclasses.replace(dof, verdict=DofVerdict.PRIOR, sigma=0.1) if dof.name == "z" else dof
+        dataclasses.replace(dof, verdict=DofVerdict.PRIOR, sigma=0.1)
+        if dof.name == "z"
+        else dof
         for dof in result().observability_measured
     )
-    wide = result().covariance_measured + 0.01 * np.outer(*2 * [np.r_[X[2, :3], np.zeros(3)]])
-    same = dataclasses.replace(result(), observability_measured=axes, covariance_measured=wide)
+    wide = result().covariance_measured + 0.01 * np.outer(
+        *2 * [np.r_[X[2, :3], np.zeros(3)]]
+    )
+    same = dataclasses.replace(
+        result(), observability_measured=axes, covariance_measured=wide
+    )
     joint = together(named(same, same, same))
     assert joint.observability[2].verdict is DofVerdict.PRIOR
     assert joint.sigmas_measured[2] == pytest.approx(0.1, rel=0.05)
@@ -93,10 +103,17 @@ def test_what_all_have_from_one_measurement_by_hand_is_no_better_together():
         ((0, 0, 0, 0), "agree", set(), hec.Verdict.USE),
     ],
 )
-def test_what_does_not_belong_is_named_and_left_out(shifts, kind, left_out, verdict, tmp_path):
+def test_what_does_not_belong_is_named_and_left_out(
+    shifts, kind, left_out, verdict, tmp_path
+):
     moved = shift("yaw", np.radians(2.0)) + shift("x", 0.05)
     joint = together(
-        named(*(result(displacement * moved, seed=i) for i, displacement in enumerate(shifts)))
+        named(
+            *(
+                result(displacement * moved, seed=i)
+                for i, displacement in enumerate(shifts)
+            )
+        )
     )
     assert joint.together.kind == kind
     assert {
@@ -115,8 +132,13 @@ def test_what_does_not_belong_is_named_and_left_out(shifts, kind, left_out, verd
 def test_recordings_that_nobody_may_use_are_left_out():
     failed = result(status=SolveStatus.NOT_CONVERGED)
     joint = together(named(result(), failed))
-    assert [bool(recording.left_out) for recording in joint.together.recordings] == [False, True]
-    with pytest.raises(InputError, match="no recording can be used: drive 1: DO NOT USE"):
+    assert [bool(recording.left_out) for recording in joint.together.recordings] == [
+        False,
+        True,
+    ]
+    with pytest.raises(
+        InputError, match="no recording can be used: drive 1: DO NOT USE"
+    ):
         together(named(failed))
     with pytest.raises(InputError, match="of one pair of frames"):
         together(named(result(), result(parent_frame="imu")))
@@ -126,7 +148,9 @@ def test_the_common_result_has_the_gravest_findings_and_all_warnings():
     small = written_finding("jumps", Severity.NOTE, "few jumps", stream="child")
     large = written_finding("jumps", Severity.WARNING, "many jumps", stream="child")
     other = written_finding("jumps", Severity.NOTE, "a jump", stream="parent")
-    first = dataclasses.replace(result(0), findings=(large, other), warnings=("m", "repaired"))
+    first = dataclasses.replace(
+        result(0), findings=(large, other), warnings=("m", "repaired")
+    )
     second = dataclasses.replace(result(1), findings=(small,), warnings=("m",))
     joint = together(named(first, second))
     assert joint.findings == (large, other)
@@ -135,9 +159,14 @@ def test_the_common_result_has_the_gravest_findings_and_all_warnings():
 
 def test_python_takes_pairs_of_trajectories():
     pairs = [pair(seed) for seed in range(2)]
-    joint = hec.calibrate_together(pairs, ["monday", "tuesday"], method="park", checks=False)
+    joint = hec.calibrate_together(
+        pairs, ["monday", "tuesday"], method="park", checks=False
+    )
     np.testing.assert_allclose(joint.T_parent_child, T_PARENT_CHILD, atol=3e-3)
-    assert [recording.name for recording in joint.together.recordings] == ["monday", "tuesday"]
+    assert [recording.name for recording in joint.together.recordings] == [
+        "monday",
+        "tuesday",
+    ]
     assert (joint.parent_frame, joint.child_frame) == ("lidar", "camera")
     named = {"a": pairs[0], "b": pairs[1], "c": (pairs[0][0][:5], pairs[0][1][:5])}
     table = hec.calibrate_many(named, checks=False)
@@ -170,8 +199,12 @@ def test_honest_results_agree_with_the_chance_that_is_stated(count, unknown_z):
     alarms = [agreement.kind for agreement in agreements if agreement.kind != "agree"]
     assert len(alarms) <= 4  # 0.8 expected, 5 or more once in 800
     p_value = np.mean([agreement.p_value for agreement in agreements])
-    assert p_value > 0.35, f"sigmas are too small: p is {p_value:.2f} on average, expected 0.5"
-    assert p_value < 0.65, f"sigmas are too large: p is {p_value:.2f} on average, expected 0.5"
+    assert p_value > 0.35, (
+        f"sigmas are too small: p is {p_value:.2f} on average, expected 0.5"
+    )
+    assert p_value < 0.65, (
+        f"sigmas are too large: p is {p_value:.2f} on average, expected 0.5"
+    )
     axes = 5 if unknown_z else 6
     assert {agreement.dof for agreement in agreements} == {axes * (count - 1)}
 
@@ -192,12 +225,18 @@ def test_which_one_is_off_and_since_when(apart, kind, unknown_z):
 
 
 def test_results_that_all_scatter_more_than_stated_accuse_none():
-    agreements = [agreement_of(*results_of(seed, 12, factor=0.25)) for seed in range(20)]
-    excesses = [agreement.excess for agreement in agreements if agreement.kind == "scatter"]
+    agreements = [
+        agreement_of(*results_of(seed, 12, factor=0.25)) for seed in range(20)
+    ]
+    excesses = [
+        agreement.excess for agreement in agreements if agreement.kind == "scatter"
+    ]
     assert len(excesses) >= 19
     assert min(excesses) > 1.5
     assert max(excesses) < 2.5
-    assert agreement_of(*results_of(0, 12, factor=0.001)).kind == "differ"  # of no one mount
+    assert (
+        agreement_of(*results_of(0, 12, factor=0.001)).kind == "differ"
+    )  # of no one mount
 
 
 def test_a_single_result_and_one_that_knows_nothing():
@@ -227,7 +266,10 @@ def test_results_that_scatter_by_their_sigmas_are_the_same_and_the_power_is_told
     comparison = compare([result(seed=1), result(seed=2), result(seed=3)])
     assert (comparison.verdict, comparison.moved) == ("same", ())
     pair_difference = comparison.differences[0]
-    assert pair_difference.sentence == "same: a change of 5.4 cm or 0.8 deg would have been seen"
+    assert (
+        pair_difference.sentence
+        == "same: a change of 5.4 cm or 0.8 deg would have been seen"
+    )
     np.testing.assert_allclose(
         values(pair_difference),
         deviation(result(seed=2).T_parent_child, result(seed=1).T_parent_child),
@@ -236,7 +278,8 @@ def test_results_that_scatter_by_their_sigmas_are_the_same_and_the_power_is_told
 
 def test_chance_makes_a_change_less_than_once_in_a_hundred():
     moved = [
-        compare([result(seed=2 * i), result(seed=2 * i + 1)]).verdict == "moved" for i in range(150)
+        compare([result(seed=2 * i), result(seed=2 * i + 1)]).verdict == "moved"
+        for i in range(150)
     ]
     assert sum(moved) <= 2
 
@@ -245,7 +288,9 @@ def test_chance_makes_a_change_less_than_once_in_a_hundred():
 def test_a_change_of_the_size_that_is_said_to_be_seen_is_seen(axis):
     seen = compare([result(), result()]).differences[0].axes[axis].visible
     differences = [
-        compare([result(seed=i), result(shift(axis, seen), seed=100 + i)]).differences[0]
+        compare([result(seed=i), result(shift(axis, seen), seed=100 + i)]).differences[
+            0
+        ]
         for i in range(20)
     ]
     named = [difference.axes[axis].verdict == "moved" for difference in differences]
@@ -269,7 +314,9 @@ def test_what_no_recording_shows_counts_against_a_drawing_not_against_a_recordin
     second = result(shift("yaw", np.radians(0.6)), covariance_allowance=floor)
     assert compare([second], Extrinsic(X, "drawing")).verdict == "same"
     assert compare([first, second]).verdict == "moved"
-    stated = Extrinsic(X, "earlier result", first.covariance_measured, is_calibration=True)
+    stated = Extrinsic(
+        X, "earlier result", first.covariance_measured, is_calibration=True
+    )
     assert axes(compare([second], stated).differences[0], "moved") == ["yaw"]
 
 
@@ -277,7 +324,9 @@ def test_what_a_flight_alone_is_off_by_is_no_move():
     """Its truth is 15 mm off in y: of other flights of the same rig it is not."""
     flight = real_data.euroc("vio_stereo", "v2_01")
     published = Extrinsic(real_data.EUROC_TRUTH, "published")
-    difference = compare([hec.calibrate(flight.parent, flight.child)], published).differences[0]
+    difference = compare(
+        [hec.calibrate(flight.parent, flight.child)], published
+    ).differences[0]
     assert difference.axes["y"].difference == pytest.approx(0.015, abs=0.002)
     assert difference.verdict == "same"
 
@@ -290,7 +339,9 @@ def test_a_mount_that_moved_by_3_cm_and_1_deg_is_found(sigma_z, axis):
     floor = np.diag(np.r_[np.full(3, 0.005**2), np.full(3, np.radians(0.15) ** 2)])
     for seed in range(5):
         first = result(sigmas=sigmas, seed=seed, covariance_allowance=floor)
-        second = result(moved, sigmas=sigmas, seed=100 + seed, covariance_allowance=floor)
+        second = result(
+            moved, sigmas=sigmas, seed=100 + seed, covariance_allowance=floor
+        )
         assert AXES[axis + 3] in axes(compare([first, second]).differences[0], "moved")
         against = compare([second], Extrinsic(X, "drawing")).differences[0]
         assert AXES[axis + 3] in axes(against, "moved")
@@ -307,15 +358,26 @@ def test_an_axis_is_the_same_by_its_own_target():
 @pytest.mark.parametrize(
     ("have_moved", "named", "sentence"),
     [
-        ("010", ("drive 2",), "moved: drive 2 differs from the others: the rotation about y by "),
+        (
+            "010",
+            ("drive 2",),
+            "moved: drive 2 differs from the others: the rotation about y by ",
+        ),
         ("0011", ("drive 3", "drive 4"), "moved: The mount has moved before drive 3: "),
-        ("01", (), "moved: drive 1 and drive 2 differ; they do not show which of them has moved"),
+        (
+            "01",
+            (),
+            "moved: drive 1 and drive 2 differ; they do not show which of them has moved",
+        ),
     ],
 )
 def test_which_one_moved(have_moved, named, sentence):
     moved = shift("pitch", np.radians(0.6))
     comparison = compare(
-        [result(int(has_moved) * moved, seed=i) for i, has_moved in enumerate(have_moved)],
+        [
+            result(int(has_moved) * moved, seed=i)
+            for i, has_moved in enumerate(have_moved)
+        ],
         names=[f"drive {i + 1}" for i in range(len(have_moved))],
     )
     assert comparison.moved == named
@@ -338,7 +400,9 @@ def test_files_and_python_speak_of_the_same(tmp_path):
 # ---- ``compare`` and the options about what is installed, as a person types them
 
 
-NUMBERS = " ".join(f"{value:.6f}" for value in (*X[:3, 3], *se3.rotation_to_rpy(X[:3, :3])))
+NUMBERS = " ".join(
+    f"{value:.6f}" for value in (*X[:3, 3], *se3.rotation_to_rpy(X[:3, :3]))
+)
 
 
 def urdf_of(T):
@@ -369,11 +433,19 @@ def saved(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "code", "text"),
     [
-        (["first", "--with", NUMBERS], 0, "Mount of camera on lidar: same: a change of "),
+        (
+            ["first", "--with", NUMBERS],
+            0,
+            "Mount of camera on lidar: same: a change of ",
+        ),
         (["third", "--with", "robot.urdf"], 4, "moved: y by "),
         (["flat", "--with", "first"], 3, "cannot tell about x, y and z; roll, pitch"),
         (["first", "second"], 0, "same: both agree"),
-        (["first", "second", "third"], 4, "moved: third differs from the others: y by "),
+        (
+            ["first", "second", "third"],
+            4,
+            "moved: third differs from the others: y by ",
+        ),
         (["first", "third", "--with", "second"], 4, "moved: third of 2"),
     ],
 )
@@ -398,8 +470,16 @@ def test_json_has_it_all(saved, run):
         (["first", "first"], 1, "first appears twice: name each result once"),
         (["first", "--with", "absent.urdf"], 2, "no file 'absent.urdf'"),
         (["absent", "first"], 1, "cannot read absent"),
-        (["first", "--with", "1e400 0 0 0 0 0"], 2, "must be at most 1e+06 m; got '1e400'"),
-        (["first", "--with", "0 0 0 0 1e300 0"], 2, "must be at most 1e+06 rad; got '1e300'"),
+        (
+            ["first", "--with", "1e400 0 0 0 0 0"],
+            2,
+            "must be at most 1e+06 m; got '1e400'",
+        ),
+        (
+            ["first", "--with", "0 0 0 0 1e300 0"],
+            2,
+            "must be at most 1e+06 rad; got '1e300'",
+        ),
         (["first", "--with", "x" * 5000], 2, "xxx..."),
         (["first", "n" * 256], 1, "n...: File name too long; choose another"),
     ],
@@ -431,5 +511,8 @@ def test_a_calibration_is_compared_and_stated_in_the_base_frame(saved, run):
     saved_result = hec.Calibration.from_dict(document)
     hec.save(saved_result, "in_base")
     np.testing.assert_allclose(hec.load("in_base").T_base_child, in_base, atol=1e-6)
-    assert '<parent link="base"/>' in (saved / "in_base" / "extrinsic.urdf.xacro").read_text()
+    assert (
+        '<parent link="base"/>'
+        in (saved / "in_base" / "extrinsic.urdf.xacro").read_text()
+    )
     assert "--frame-id base --child-frame-id camera" in run("info", "in_base")[1]

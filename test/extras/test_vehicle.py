@@ -21,7 +21,12 @@ from reproduction.machines import simulate_machine
 # Half of what three minutes of figures of eight reach by far: x, y (m), rotations (rad).
 POSE_TOLERANCES = [0.01, 0.01, np.radians(0.15), np.radians(0.15), np.radians(0.1)]
 # Share of each parameter, rad of a steering offset.
-PARAMETER_TOLERANCE = {"wheels": 0.004, "steering": 0.002, "tricycle": 0.002, "omni": 0.005}
+PARAMETER_TOLERANCE = {
+    "wheels": 0.004,
+    "steering": 0.002,
+    "tricycle": 0.002,
+    "omni": 0.005,
+}
 
 
 @cache
@@ -47,8 +52,13 @@ def test_pose_wheels_and_clock_of_a_machine(measures):
     assert (errors < 3.3 * result.sigmas[[0, 1, 3, 4, 5]]).all()
     assert result.time_offset_s == pytest.approx(drive.clock_s, abs=0.008)
     values = np.array([parameter.value for parameter in result.wheels.parameters])
-    sizes = np.array([1.0 if value == drive.parameters[2] else value for value in drive.parameters])
-    assert np.abs((values - drive.parameters) / sizes).max() < PARAMETER_TOLERANCE[measures]
+    sizes = np.array(
+        [1.0 if value == drive.parameters[2] else value for value in drive.parameters]
+    )
+    assert (
+        np.abs((values - drive.parameters) / sizes).max()
+        < PARAMETER_TOLERANCE[measures]
+    )
 
 
 def test_without_noise_the_answer_is_exact():
@@ -101,7 +111,9 @@ def test_spinning_on_the_spot_is_refused(model):
 
 
 @pytest.mark.parametrize("course", ["eights", "wide"])
-@pytest.mark.parametrize(("model", "wrong"), [("steering", "tricycle"), ("tricycle", "steering")])
+@pytest.mark.parametrize(
+    ("model", "wrong"), [("steering", "tricycle"), ("tricycle", "steering")]
+)
 def test_a_speed_of_the_other_wheel_is_refused(model, wrong, course):
     drive = machine(model, course)
     result = hec.calibrate_vehicle(drive.sensor, drive.wheels, parent_measures=wrong)
@@ -109,7 +121,9 @@ def test_a_speed_of_the_other_wheel_is_refused(model, wrong, course):
     assert [found.code for found in result.findings] == [f"speed_of_{model}"]
 
 
-@pytest.mark.parametrize("change", [lambda values: values[:, ::-1], lambda values: -values])
+@pytest.mark.parametrize(
+    "change", [lambda values: values[:, ::-1], lambda values: -values]
+)
 def test_wheels_that_turn_the_other_way_need_care(change):
     drive = machine()
     wheels = hec.wheel_trajectory(drive.stamps_ns, change(drive.values), "wheels")
@@ -126,7 +140,9 @@ def test_much_slip_needs_care():
     drive = simulate_machine(11, duration_s=120.0, slip=2.0)
     result = hec.calibrate_vehicle(drive.sensor, drive.wheels)
     assert result.verdict.value == "USE WITH CARE"
-    assert any("the wheels or the vehicle slip" in reason.sentence for reason in result.reasons)
+    assert any(
+        "the wheels or the vehicle slip" in reason.sentence for reason in result.reasons
+    )
     assert np.abs(pose_errors(result, drive.T_base_sensor))[:2].max() < 0.01
 
 
@@ -158,7 +174,9 @@ def test_wheels_of_another_drive_are_doubted():
 
 def test_a_wheel_that_turns_backwards_is_refused():
     drive = machine()
-    backwards = hec.wheel_trajectory(drive.stamps_ns, drive.values * [1.0, -1.0], "wheels")
+    backwards = hec.wheel_trajectory(
+        drive.stamps_ns, drive.values * [1.0, -1.0], "wheels"
+    )
     result = hec.calibrate_vehicle(drive.sensor, backwards)
     assert [found.code for found in result.findings] == ["unrelated"]
     assert result.verdict.value == "DO NOT USE"
@@ -169,7 +187,9 @@ def test_a_mount_that_moved_is_a_warning():
     half = len(drive.sensor) // 2
     poses = drive.sensor.poses.copy()
     poses[half:] = poses[half:] @ se3.exp(np.array([0.1, 0.1, 0, 0, 0, 0.05]))
-    result = hec.calibrate_vehicle(hec.Trajectory(drive.sensor.stamps_ns, poses), drive.wheels)
+    result = hec.calibrate_vehicle(
+        hec.Trajectory(drive.sensor.stamps_ns, poses), drive.wheels
+    )
     assert result.verdict.value != "USE"
 
 
@@ -199,9 +219,13 @@ def test_odometry_of_two_wheels_gets_multipliers():
     result = hec.calibrate_vehicle(drive.sensor, odometry)
     radius = (drive.parameters[0] + drive.parameters[1]) / 2.0
     wheels = result.wheels
-    assert wheels["wheel_radius_multiplier"].value == pytest.approx(radius / 0.1, rel=0.004)
+    assert wheels["wheel_radius_multiplier"].value == pytest.approx(
+        radius / 0.1, rel=0.004
+    )
     track = drive.parameters[2] / 0.5
-    assert wheels["wheel_separation_multiplier"].value == pytest.approx(track, rel=0.006)
+    assert wheels["wheel_separation_multiplier"].value == pytest.approx(
+        track, rel=0.006
+    )
 
 
 @pytest.mark.parametrize(
@@ -214,12 +238,16 @@ def test_odometry_of_two_wheels_gets_multipliers():
 )
 def test_wheel_data_of_another_shape_are_refused(measures, n_columns, error, match):
     with pytest.raises(error, match=match):
-        hec.wheel_trajectory(np.arange(3) * 20_000_000, np.ones((3, n_columns)), measures)
+        hec.wheel_trajectory(
+            np.arange(3) * 20_000_000, np.ones((3, n_columns)), measures
+        )
 
 
 def test_wheels_as_child_are_answered_with_the_other_order():
     drive = machine()
-    with pytest.raises(ConfigError, match="exchange the streams, the one with wheels first"):
+    with pytest.raises(
+        ConfigError, match="exchange the streams, the one with wheels first"
+    ):
         hec.calibrate(drive.sensor, drive.wheels)
 
 
@@ -280,7 +308,9 @@ REFUSED = {
 def document_with(**options):
     drive = machine()
     try:
-        return str(hec.calibrate_vehicle(drive.sensor, drive.wheels, **options).to_dict())
+        return str(
+            hec.calibrate_vehicle(drive.sensor, drive.wheels, **options).to_dict()
+        )
     except NotEnoughDataError as error:
         return str(error)
 
@@ -319,7 +349,14 @@ def write_files(folder, measures):
         values = values * [1.0, np.degrees(1.0)]
     rows = np.column_stack([drive.stamps_ns * 1e-9, values])
     header = HEADERS[measures]
-    np.savetxt(folder / "wheels.csv", rows, fmt="%.6f", delimiter=",", header=header, comments="")
+    np.savetxt(
+        folder / "wheels.csv",
+        rows,
+        fmt="%.6f",
+        delimiter=",",
+        header=header,
+        comments="",
+    )
     hec.write_trajectory(folder / "lidar.tum", drive.sensor)
     return str(folder / "wheels.csv"), str(folder / "lidar.tum")
 
@@ -371,9 +408,13 @@ def test_odometry_of_a_bag(tmp_path):
     base = hec.Trajectory(odometry.stamps_ns, odometry.poses, "base_footprint", "odom")
     lidar = hec.Trajectory(drive.sensor.stamps_ns, drive.sensor.poses, "lidar", "map")
     bag = tmp_path / "bag"
-    with rosbag2.Writer(bag, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+    with rosbag2.Writer(
+        bag, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP
+    ) as writer:
         type_ = "nav_msgs/msg/Odometry"
-        write_streams(writer, {"/odom": (base, type_), "/lidar": (lidar, type_)}, "mcap")
+        write_streams(
+            writer, {"/odom": (base, type_), "/lidar": (lidar, type_)}, "mcap"
+        )
     arguments = ["--parent-topic", "/odom", "--child-topic", "/lidar"]
     arguments += ["--parent-measures", "wheel_odometry", "--out", str(tmp_path / "out")]
     assert main(["calibrate", str(bag), *arguments]) == 0
@@ -385,7 +426,9 @@ def test_odometry_of_a_bag(tmp_path):
 def write_wheel_bag(path, type_, topic, messages, drive):
     """Write messages at the stamps of the wheels, and the odometry of the lidar."""
     lidar = hec.Trajectory(drive.sensor.stamps_ns, drive.sensor.poses, "lidar", "map")
-    with rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+    with rosbag2.Writer(
+        path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP
+    ) as writer:
         write_streams(writer, {"/lidar": (lidar, "nav_msgs/msg/Odometry")}, "mcap")
         connection = writer.add_connection(topic, type_, typestore=JAZZY)
         for stamp_ns, message in zip(drive.stamps_ns.tolist(), messages, strict=True):
@@ -404,7 +447,9 @@ def joint_states(drive, names, has_velocity):
     # Drivers integrate the rates.
     positions = np.cumsum(rates, axis=0) * 0.02
     nothing = np.zeros(0)
-    for stamp_ns, rate, position in zip(drive.stamps_ns.tolist(), rates, positions, strict=True):
+    for stamp_ns, rate, position in zip(
+        drive.stamps_ns.tolist(), rates, positions, strict=True
+    ):
         velocity = rate if has_velocity else nothing
         yield kind(header(stamp_ns), [*names], position, velocity, nothing)
 
@@ -415,7 +460,12 @@ def joint_states(drive, names, has_velocity):
         (["wheel_left_joint", "wheel_right_joint"], "", True),
         (["wheel_left_joint", "wheel_right_joint"], "", False),
         (
-            ["front_left_wheel", "rear_left_wheel", "front_right_wheel", "rear_right_wheel"],
+            [
+                "front_left_wheel",
+                "rear_left_wheel",
+                "front_right_wheel",
+                "rear_right_wheel",
+            ],
             "",
             True,
         ),
@@ -428,7 +478,9 @@ def test_joint_states_of_a_bag(tmp_path, capsys, names, fields, has_velocity):
     messages = joint_states(drive, names, has_velocity)
     write_wheel_bag(bag, "sensor_msgs/msg/JointState", "/joint_states", messages, drive)
     arguments = ["--parent-topic", f"/joint_states{fields}", "--child-topic", "/lidar"]
-    assert main(["calibrate", str(bag), *arguments, "--out", str(tmp_path / "out")]) == 0
+    assert (
+        main(["calibrate", str(bag), *arguments, "--out", str(tmp_path / "out")]) == 0
+    )
     assert names[0] in capsys.readouterr().err
     result = hec.load(tmp_path / "out")
     assert np.abs(pose_errors(result, drive.T_base_sensor))[:2].max() < 0.01
@@ -451,7 +503,9 @@ def car_states(drive, wheel_names, steering_names):
     names = [*wheel_names, *steering_names]
     n_steered = len(steering_names)
     sides = [0.0] if n_steered == 1 else [-0.4, 0.4]
-    for stamp_ns, (speed, angle) in zip(drive.stamps_ns.tolist(), drive.values, strict=True):
+    for stamp_ns, (speed, angle) in zip(
+        drive.stamps_ns.tolist(), drive.values, strict=True
+    ):
         tangent = np.tan(angle)
         angles = [float(np.arctan(tangent / (1.0 + side * tangent))) for side in sides]
         positions = np.array([0.0] * len(wheel_names) + angles)
@@ -462,12 +516,19 @@ def car_states(drive, wheel_names, steering_names):
 @pytest.mark.parametrize(
     ("measures", "wheels", "steering", "fields"),
     [
-        ("steering", ["rear_left_wheel", "rear_right_wheel"], ["left_steer", "right_steer"], ""),
+        (
+            "steering",
+            ["rear_left_wheel", "rear_right_wheel"],
+            ["left_steer", "right_steer"],
+            "",
+        ),
         ("steering", ["a", "b"], ["c", "d"], "?a+b,c+d"),
         ("tricycle", ["front_drive_wheel"], ["front_steering_joint"], ""),
     ],
 )
-def test_joint_states_of_a_steered_vehicle(tmp_path, measures, wheels, steering, fields):
+def test_joint_states_of_a_steered_vehicle(
+    tmp_path, measures, wheels, steering, fields
+):
     drive = machine(measures)
     bag = tmp_path / "bag"
     messages = car_states(drive, wheels, steering)
@@ -477,7 +538,9 @@ def test_joint_states_of_a_steered_vehicle(tmp_path, measures, wheels, steering,
     assert main(["calibrate", str(bag), *arguments]) == 0
     result = hec.load(tmp_path / "out")
     assert np.abs(pose_errors(result, drive.T_base_sensor))[:2].max() < 0.01
-    assert result.wheels["wheelbase"].value == pytest.approx(drive.parameters[1], rel=0.004)
+    assert result.wheels["wheelbase"].value == pytest.approx(
+        drive.parameters[1], rel=0.004
+    )
 
 
 def test_joint_states_of_a_steered_vehicle_need_the_kind(tmp_path, capsys):
@@ -487,7 +550,10 @@ def test_joint_states_of_a_steered_vehicle_need_the_kind(tmp_path, capsys):
     write_wheel_bag(bag, "sensor_msgs/msg/JointState", "/joint_states", messages, drive)
     arguments = ["--parent-topic", "/joint_states", "--child-topic", "/lidar"]
     assert main(["calibrate", str(bag), *arguments]) == 1
-    assert "has steering joints, steer: set --parent-measures to" in capsys.readouterr().err
+    assert (
+        "has steering joints, steer: set --parent-measures to"
+        in capsys.readouterr().err
+    )
 
 
 def test_angles_of_a_steered_axle():
@@ -567,7 +633,16 @@ def test_twists_of_a_bag(tmp_path):
     messages = [*twists(drive)]
     bag = tmp_path / "bag"
     write_wheel_bag(bag, "geometry_msgs/msg/TwistStamped", "/twist", messages, drive)
-    arguments = ["--parent-topic", "/twist", "--child-topic", "/lidar", "--parent-measures", "omni"]
-    assert main(["calibrate", str(bag), *arguments, "--out", str(tmp_path / "out")]) == 0
+    arguments = [
+        "--parent-topic",
+        "/twist",
+        "--child-topic",
+        "/lidar",
+        "--parent-measures",
+        "omni",
+    ]
+    assert (
+        main(["calibrate", str(bag), *arguments, "--out", str(tmp_path / "out")]) == 0
+    )
     result = hec.load(tmp_path / "out")
     assert np.abs(pose_errors(result, drive.T_base_sensor))[:2].max() < 0.01

@@ -48,7 +48,9 @@ def wheels_of(measures, values, **nominal):
     return VehicleParameters(tuple(parameters), 0.0, measures, **nominal)
 
 
-@pytest.mark.parametrize("nominal", [{}, {"nominal_radius_m": 0.1, "nominal_separation_m": 0.5}])
+@pytest.mark.parametrize(
+    "nominal", [{}, {"nominal_radius_m": 0.1, "nominal_separation_m": 0.5}]
+)
 @pytest.mark.parametrize("measures", CONTROLLER)
 def test_parameters_have_the_names_of_the_controller(measures, nominal):
     wheels = wheels_of(measures, [0.1, 0.1, 0.5], **nominal)
@@ -110,7 +112,9 @@ def exact_wheels(measures, parameters, speed, yaw_rate):
     first, second, last = parameters
     if measures == "wheels":
         half_turn = yaw_rate * last / 2
-        return np.column_stack([(speed - half_turn) / first, (speed + half_turn) / second])
+        return np.column_stack(
+            [(speed - half_turn) / first, (speed + half_turn) / second]
+        )
     angle = np.arctan2(second * yaw_rate, speed)
     rolled = np.hypot(speed, second * yaw_rate) if measures == "tricycle" else speed
     # The speeds of these machines are in m/s: turn them to rates of wheels of 0.3 m.
@@ -125,7 +129,9 @@ def test_a_controller_with_these_parameters_drives_the_true_path(tmp_path, measu
     wheels = hec.wheel_trajectory(drive.stamps_ns, drive.values * unit, measures)
     result = hec.calibrate_vehicle(drive.sensor, wheels)
     hec.save(result, tmp_path)
-    (node,) = yaml.safe_load((tmp_path / "controller_parameters.yaml").read_text()).values()
+    (node,) = yaml.safe_load(
+        (tmp_path / "controller_parameters.yaml").read_text()
+    ).values()
     times_s = np.arange(0.0, 120.0, 0.02)
     speed = 0.8 + 0.2 * np.sin(times_s / 5.0)
     yaw_rate = 0.4 * np.sin(times_s / 3.0) + 0.05
@@ -148,7 +154,9 @@ def test_a_bend_of_the_odometry_becomes_a_multiplier_of_each_wheel():
     left, right, track = 0.098, 0.102, 0.5
     odometry = (0.1, 0.5)  # nominal radius and track, m
     curvature = 2.0 * (right - left) / ((right + left) * track)
-    wheels = wheels_of("wheel_odometry", [1.0, 1.0, curvature], nominal_separation_m=track)
+    wheels = wheels_of(
+        "wheel_odometry", [1.0, 1.0, curvature], nominal_separation_m=track
+    )
     values = controller_of(wheels).values
     nominal = {"wheel_radius": odometry[0], "wheel_separation": odometry[1]}
     rates = np.array([[3.0, 5.0], [4.0, 4.0], [5.0, -5.0]])
@@ -192,7 +200,9 @@ def result_of(factor=1.0, **options):
 def test_the_radius_is_in_the_headline():
     result = result_of(nominal_radius=0.1)
     assert f"wheel radius {np.mean(DRIVE.parameters[:2]):.3f}" in result.headline
-    assert not {"unusual_radius", "radius_not_nominal"} & {item.code for item in result.findings}
+    assert not {"unusual_radius", "radius_not_nominal"} & {
+        item.code for item in result.findings
+    }
 
 
 def test_revolutions_per_minute_are_doubted():
@@ -203,7 +213,9 @@ def test_revolutions_per_minute_are_doubted():
     assert not confirmed.findings
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(30.0 / np.pi, "rpm"), (0.5, "gear ratio")])
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(30.0 / np.pi, "rpm"), (0.5, "gear ratio")]
+)
 def test_a_radius_that_is_not_nominal_is_doubted(factor, unit):
     result = result_of(factor, nominal_radius=0.1)
     (doubt,) = result.findings
@@ -214,7 +226,10 @@ def test_a_radius_that_is_not_nominal_is_doubted(factor, unit):
 
 def test_odometry_in_another_unit_is_doubted():
     left, right = 0.1 * DRIVE.values.T
-    nominal = np.column_stack([(left + right) / 2.0, (right - left) / 0.5]) * [1e-3, 1.0]
+    nominal = np.column_stack([(left + right) / 2.0, (right - left) / 0.5]) * [
+        1e-3,
+        1.0,
+    ]
     odometry = hec.wheel_trajectory(DRIVE.stamps_ns, nominal, "wheel_odometry")
     result = hec.calibrate_vehicle(DRIVE.sensor, odometry)
     assert [item.code for item in result.findings] == ["unusual_multiplier"]

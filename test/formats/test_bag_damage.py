@@ -39,7 +39,10 @@ MOST_MIB = 1000
 PLACES = 100
 POSES = wandering_poses(60)
 STREAMS = {
-    "/a": (as_trajectory(POSES, sensor_frame="lidar", world_frame="map"), bag_making.ODOMETRY),
+    "/a": (
+        as_trajectory(POSES, sensor_frame="lidar", world_frame="map"),
+        bag_making.ODOMETRY,
+    ),
     "/b": (
         as_trajectory(child_of(POSES), sensor_frame="camera", world_frame="odom"),
         bag_making.POSE_STAMPED,
@@ -116,7 +119,9 @@ def test_cut_off_anywhere(bag, capsys):
             if document["verdict"] != "DO_NOT_USE":
                 matrix = document["T_parent_child"]["matrix"]
                 np.testing.assert_allclose(matrix, T_PARENT_CHILD, atol=1e-6)
-    assert outcomes == ({"refused", "recovered"} if path.suffix == ".mcap" else {"refused"})
+    assert outcomes == (
+        {"refused", "recovered"} if path.suffix == ".mcap" else {"refused"}
+    )
 
 
 def test_a_bit_flipped_anywhere(bag, capsys):
@@ -138,7 +143,9 @@ def test_a_bit_flipped_anywhere(bag, capsys):
         document = replay(path, capsys)
         if document is not None and not document["warnings"]:
             matrix = document["T_parent_child"]["matrix"]
-            np.testing.assert_allclose(matrix, T_PARENT_CHILD, atol=UNNOTICED, err_msg=str(place))
+            np.testing.assert_allclose(
+                matrix, T_PARENT_CHILD, atol=UNNOTICED, err_msg=str(place)
+            )
     assert harmed >= 10
 
 
@@ -167,7 +174,9 @@ def test_a_bag_cut_off_gives_what_came_before(tmp_path, kind):
         assert max(share - 0.1, 0) < len(recovered) / len(whole) < share + 0.1
         assert recovered == whole[: len(recovered)]
         assert re.search(r"truncated or damaged .* lost", warning)
-        assert re.search(rf"{len(recovered)} messages over [0-9.]+ s were recovered$", warning)
+        assert re.search(
+            rf"{len(recovered)} messages over [0-9.]+ s were recovered$", warning
+        )
 
 
 def test_a_damaged_chunk_is_refused(tmp_path):
@@ -185,7 +194,11 @@ def test_a_damaged_chunk_is_refused(tmp_path):
 @pytest.mark.parametrize(
     "options",
     [
-        {"index_types": IndexType.NONE, "use_statistics": False, "repeat_channels": False},
+        {
+            "index_types": IndexType.NONE,
+            "use_statistics": False,
+            "repeat_channels": False,
+        },
         {"index_types": IndexType.CHUNK, "compression": CompressionType.LZ4},
         {"use_chunking": False},
     ],
@@ -240,7 +253,9 @@ def test_paths_that_are_no_bag(tmp_path):
         (tmp_path / f"empty.{suffix}").touch()
         (tmp_path / f"text.{suffix}").write_text("this is not a bag\n" * 100)
         for kind in ("empty", "text"):
-            message = f"{kind}.{suffix}: it is truncated, damaged or of an unsupported kind"
+            message = (
+                f"{kind}.{suffix}: it is truncated, damaged or of an unsupported kind"
+            )
             messages[f"{kind}.{suffix}"] = message
     for name, message in messages.items():
         assert re.search(message, *read(tmp_path / name)[1]), name
@@ -254,7 +269,9 @@ def test_a_message_that_is_too_short_or_strangely_encoded_is_named(tmp_path, dat
         bag_making.all_poses(tmp_path / "bag")
 
 
-@pytest.mark.parametrize("name", ["run#1.db3", "run%41.db3", "what?.db3", "a?mode=rw&b.db3"])
+@pytest.mark.parametrize(
+    "name", ["run#1.db3", "run%41.db3", "what?.db3", "a?mode=rw&b.db3"]
+)
 def test_a_path_is_not_read_as_an_address(tmp_path, name):
     write_bag(tmp_path / "bag", STREAMS, "sqlite3")
     bag_making.storage_file(tmp_path / "bag").rename(tmp_path / name)
@@ -299,14 +316,20 @@ def rosbag1_bomb(path):
             connection for connection in writer.connections if connection.topic == "/a"
         )
         last_ns = int(STREAMS["/a"][0].stamps_ns[-1])
-        writer.write(connection, last_ns + 1, memoryview(np.zeros(700 * MIB, dtype=np.uint8)))
+        writer.write(
+            connection, last_ns + 1, memoryview(np.zeros(700 * MIB, dtype=np.uint8))
+        )
     return path
 
 
 @pytest.mark.parametrize("kind", bag_making.STORAGES)
 def test_a_command_ends_in_one_line_and_within_its_memory(tmp_path, kind):
     is_ros1 = kind == "rosbag1"
-    path = rosbag1_bomb(tmp_path) if is_ros1 else with_message(tmp_path / "bag", kind, BOMB)
+    path = (
+        rosbag1_bomb(tmp_path)
+        if is_ros1
+        else with_message(tmp_path / "bag", kind, BOMB)
+    )
     command = [sys.executable, "-c", REPLAY, str(path), *TOPICS]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     code, mib = map(int, done.stdout.split())
@@ -332,12 +355,16 @@ def test_readings_in_several_threads_leave_no_limit_behind(monkeypatch):
 def test_a_compressed_file_unpacks_to_a_multiple_of_its_size(tmp_path):
     path = tmp_path / "bag.mcap.zstd"
     path.write_bytes(zstd.compress(bytes(300 * MIB)))
-    with pytest.raises(InputError, match="unpacks to more than 256 times .* is damaged"):
+    with pytest.raises(
+        InputError, match="unpacks to more than 256 times .* is damaged"
+    ):
         PoseBag(path)
 
 
 @pytest.mark.parametrize("time", ["1e300", "-1e300", "9.3e18", "'text'"])
-def test_a_time_that_is_none_costs_its_message_or_gives_one_line(tmp_path, capsys, time):
+def test_a_time_that_is_none_costs_its_message_or_gives_one_line(
+    tmp_path, capsys, time
+):
     write_bag(tmp_path / "bag", STREAMS, storage="sqlite3")
     with sqlite3.connect(bag_making.storage_file(tmp_path / "bag")) as database:
         database.execute(f"UPDATE messages SET timestamp = {time} WHERE id = 41")

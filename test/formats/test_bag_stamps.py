@@ -69,7 +69,9 @@ def test_header_stamps_of_0_are_named_and_the_recorders_times_are_taken_if_asked
 ):
     path = bag_of(bag_path(tmp_path, storage), storage, kind, zeros)
     source = "odom:camera" if kind == TF else "/b"
-    with pytest.raises(InputError, match=r"300 of 300 header stamps are 0. .*`child_stamps` rec"):
+    with pytest.raises(
+        InputError, match=r"300 of 300 header stamps are 0. .*`child_stamps` rec"
+    ):
         read(path, source)
     rows, warnings = read(path, source, stamps={"child": "receive"})
     assert rows.stamps_ns.tolist() == STAMPS_NS.tolist()
@@ -121,7 +123,9 @@ def test_the_command_takes_the_recorders_times_if_asked(tmp_path, capsys, option
     assert "--child-stamps receive" in capsys.readouterr().err
     main(["calibrate", str(path), *TOPICS, option, "receive", "--json"])
     document = json.loads(capsys.readouterr().out)
-    np.testing.assert_allclose(document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6)
+    np.testing.assert_allclose(
+        document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6
+    )
     assert main(["check", str(path), *TOPICS[:4], option, "receive"]) in (0, 1)
     assert "header stamps" not in capsys.readouterr().err
 

@@ -30,7 +30,11 @@ from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.formats.bags.reader import PoseBag
-from hand_eye_calib.formats.bags.writer import stamped_messages, write_bag, write_streams
+from hand_eye_calib.formats.bags.writer import (
+    stamped_messages,
+    write_bag,
+    write_streams,
+)
 
 SECOND = 10**9
 POSES = wandering_poses(120)
@@ -57,9 +61,13 @@ def assert_same_motion(trajectory, stamps_ns, poses, atol=1e-12):
 
 
 @pytest.mark.parametrize("storage", STORAGES)
-def test_poses_come_back_in_the_order_of_time_with_exact_stamps_and_frames(new_bag, storage):
+def test_poses_come_back_in_the_order_of_time_with_exact_stamps_and_frames(
+    new_bag, storage
+):
     poses = all_poses(new_bag(storage))
-    assert [pose.stamp_ns for pose in poses] == sorted([*PARENT.stamps_ns, *CHILD.stamps_ns])
+    assert [pose.stamp_ns for pose in poses] == sorted(
+        [*PARENT.stamps_ns, *CHILD.stamps_ns]
+    )
     for stream, source, frames in (
         ("parent", PARENT, ("map", "lidar")),
         ("child", CHILD, ("odom", None)),
@@ -77,7 +85,9 @@ def test_poses_come_back_in_the_order_of_time_with_exact_stamps_and_frames(new_b
 
 def with_others(path, *others):
     """A bag of both streams and a message of each other topic: name, type and how to make it."""
-    with rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+    with rosbag2.Writer(
+        path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP
+    ) as writer:
         write_streams(writer, STREAMS, "mcap")
         for topic, message_type, make in others:
             connection = writer.add_connection(topic, message_type, typestore=JAZZY)
@@ -86,7 +96,11 @@ def with_others(path, *others):
     return path
 
 
-LOG = ("/log", "std_msgs/msg/String", lambda types: types.types["std_msgs/msg/String"]("hello"))
+LOG = (
+    "/log",
+    "std_msgs/msg/String",
+    lambda types: types.types["std_msgs/msg/String"]("hello"),
+)
 
 
 def test_topics_are_listed_and_others_do_not_get_in_the_way(tmp_path, new_bag):
@@ -94,13 +108,20 @@ def test_topics_are_listed_and_others_do_not_get_in_the_way(tmp_path, new_bag):
     assert all_poses(path) == all_poses(new_bag())
     with PoseBag(path) as bag:
         assert bag.select() == ("/a", "/b")
-        assert [*bag.topics.values()][:2] == [("/a", ODOMETRY, 120), ("/b", POSE_STAMPED, 90)]
+        assert [*bag.topics.values()][:2] == [
+            ("/a", ODOMETRY, 120),
+            ("/b", POSE_STAMPED, 90),
+        ]
         assert str(bag.topics["/log"]) == "/log (std_msgs/msg/String, 1 messages)"
 
 
 @pytest.mark.parametrize(
     ("named", "selected"),
-    [(("/a", None), ("/a", "/b")), ((None, "/a"), ("/b", "/a")), ((None, None), ("/a", "/b"))],
+    [
+        (("/a", None), ("/a", "/b")),
+        ((None, "/a"), ("/b", "/a")),
+        ((None, None), ("/a", "/b")),
+    ],
 )
 def test_two_pose_topics_leave_no_choice(new_bag, named, selected):
     goal = {"/goal_pose": (PARENT[:1], POSE_STAMPED)}  # published once: no sensor
@@ -113,7 +134,10 @@ def test_two_pose_topics_leave_no_choice(new_bag, named, selected):
     ("named", "message"),
     [
         (("/odom", "/b"), "no topic /odom in "),
-        (("/a", "/log"), r"/log of .* has type std_msgs/msg/String, which cannot be read"),
+        (
+            ("/a", "/log"),
+            r"/log of .* has type std_msgs/msg/String, which cannot be read",
+        ),
         (("/a", "/a"), "parent and child topic are both /a"),
     ],
 )
@@ -140,23 +164,32 @@ def test_a_wrong_topic_is_answered_with_those_that_are_there(tmp_path, named, me
     ],
 )
 def test_without_names_there_must_be_an_obvious_pair_of_topics(new_bag, count, message):
-    path = new_bag(streams={f"/odom_{number}": STREAMS["/a"] for number in range(count)})
+    path = new_bag(
+        streams={f"/odom_{number}": STREAMS["/a"] for number in range(count)}
+    )
     with PoseBag(path) as bag, pytest.raises(InputError, match=message):
         bag.select()
 
 
 def test_several_publishers_and_types_on_one_topic(tmp_path):
     """Two connections of one type are one stream; of two types, the topic is refused."""
-    for name, second_type in (("one.bag", ODOMETRY), ("two.bag", "std_msgs/msg/String")):
+    for name, second_type in (
+        ("one.bag", ODOMETRY),
+        ("two.bag", "std_msgs/msg/String"),
+    ):
         with rosbag1.Writer(tmp_path / name) as writer:
             write_streams(writer, STREAMS, "rosbag1")
             about = {"typestore": NOETIC, "callerid": "/second"}
             connection = writer.add_connection("/a", second_type, **about)
             later = Trajectory(PARENT.stamps_ns[-1:] + 1, PARENT.poses[-1:])
-            stamp_ns, message = next(stamped_messages(NOETIC.types, later, ODOMETRY, True))
+            stamp_ns, message = next(
+                stamped_messages(NOETIC.types, later, ODOMETRY, True)
+            )
             text = NOETIC.types["std_msgs/msg/String"]("hello")
             message = message if second_type == ODOMETRY else text
-            writer.write(connection, stamp_ns, NOETIC.serialize_ros1(message, second_type))
+            writer.write(
+                connection, stamp_ns, NOETIC.serialize_ros1(message, second_type)
+            )
     poses = all_poses(tmp_path / "one.bag")
     assert sum(pose.stream == "parent" for pose in poses) == len(PARENT) + 1
     with (
@@ -178,7 +211,10 @@ def transforms(moving, static=()):
     ]
     edges = [(0, parent, child, matrix) for child, parent, matrix in static]
     before_ns = int(PARENT.stamps_ns[0]) - 1
-    return [*messages, *[(before_ns, "/tf_static", TF, tf_message(edges))][: len(edges)]]
+    return [
+        *messages,
+        *[(before_ns, "/tf_static", TF, tf_message(edges))][: len(edges)],
+    ]
 
 
 MOUNT = se3.exp(np.array([0.3, 0.1, -0.4, 0.2, 0.5, -0.9]))
@@ -195,10 +231,14 @@ def test_a_chain_of_moving_and_static_transforms(tmp_path, storage):
     )
     moving = [("odom", "map", slow), ("base", "odom", PARENT)]
     static = [("lidar", "base", MOUNT), ("rear", "base", T_PARENT_CHILD)]
-    path = write_messages(bag_path(tmp_path, storage), transforms(moving, static), storage)
+    path = write_messages(
+        bag_path(tmp_path, storage), transforms(moving, static), storage
+    )
     trajectory = hec.read_trajectory(path, topic="map:lidar")
     stamps_ns = slow.stamps_ns[slow.stamps_ns <= PARENT.stamps_ns[-1]]
-    expected = slow.poses[: len(stamps_ns)] @ PARENT.at(stamps_ns, straight=True) @ MOUNT
+    expected = (
+        slow.poses[: len(stamps_ns)] @ PARENT.at(stamps_ns, straight=True) @ MOUNT
+    )
     assert_same_motion(trajectory, stamps_ns, expected)
     assert (trajectory.world_frame, trajectory.sensor_frame) == ("map", "lidar")
     # Up and down again, through the common ancestor; and against the direction of the tree.
@@ -221,17 +261,31 @@ def test_old_transforms_with_slashes_and_of_the_old_type_count_once(tmp_path):
         for stamp_ns, matrix in zip(PARENT.stamps_ns, PARENT.poses, strict=True)
     ]
     path = write_messages(tmp_path / "old.bag", messages * 2, "rosbag1")
-    assert_same_motion(hec.read_trajectory(path, topic="odom:base"), PARENT.stamps_ns, PARENT.poses)
+    assert_same_motion(
+        hec.read_trajectory(path, topic="odom:base"), PARENT.stamps_ns, PARENT.poses
+    )
 
 
 @pytest.mark.parametrize(
     ("edges", "message"),
     [
         (["base odom"], r"no frame 'lidar' in the bag's transforms; it has odom:base"),
-        (["lidar base", "odom map"], "'odom' and 'lidar' are not connected; it has base:lidar, m"),
-        (["lidar odom", "lidar map"], "frame 'lidar' has two parents, 'odom' and 'map'"),
-        (["lidar odom", "odom lidar"], "the bag's transforms form a loop through frame"),
-        ([], r"no transforms in .*The bag has /a \(nav_msgs/msg/Odometry, 120 messages\)"),
+        (
+            ["lidar base", "odom map"],
+            "'odom' and 'lidar' are not connected; it has base:lidar, m",
+        ),
+        (
+            ["lidar odom", "lidar map"],
+            "frame 'lidar' has two parents, 'odom' and 'map'",
+        ),
+        (
+            ["lidar odom", "odom lidar"],
+            "the bag's transforms form a loop through frame",
+        ),
+        (
+            [],
+            r"no transforms in .*The bag has /a \(nav_msgs/msg/Odometry, 120 messages\)",
+        ),
     ],
 )
 def test_transforms_that_do_not_lead_there(tmp_path, new_bag, edges, message):
@@ -255,12 +309,16 @@ def test_a_growing_path_is_its_newest_message(tmp_path, storage):
         path = path_message(PARENT.stamps_ns[:end], corrected)
         messages.append((PARENT.stamps_ns[end - 1], "/path", PATH, path))
     path = write_messages(bag_path(tmp_path, storage), messages, storage)
-    assert_same_motion(hec.read_trajectory(path, topic="/path"), PARENT.stamps_ns, POSES)
+    assert_same_motion(
+        hec.read_trajectory(path, topic="/path"), PARENT.stamps_ns, POSES
+    )
 
 
 def test_a_path_whose_poses_have_no_stamps_is_refused(tmp_path):
     without = (SECOND, "/path", PATH, path_message(np.zeros(5, dtype=int), POSES[:5]))
-    path = write_messages(tmp_path / "bag", [without, (SECOND, "/p", PATH, path_message([], []))])
+    path = write_messages(
+        tmp_path / "bag", [without, (SECOND, "/p", PATH, path_message([], []))]
+    )
     with pytest.raises(InputError, match="the poses of path /path have no stamps"):
         hec.read_trajectory(path, topic="/path")
     with pytest.raises(InputError, match="no poses on /p of"):
@@ -280,7 +338,9 @@ def test_the_parts_of_a_drive_are_read_in_the_order_of_time(new_bag, storage):
         poses = poses_of(bag)
         assert [*bag.topics.values()] == [("/a", ODOMETRY, 120), ("/b", ODOMETRY, 120)]
         assert (bag.start_ns, bag.end_ns) == (PARENT.stamps_ns[0], PARENT.stamps_ns[-1])
-    assert [pose.stamp_ns for pose in poses if pose.stream == "parent"] == PARENT.stamps_ns.tolist()
+    assert [
+        pose.stamp_ns for pose in poses if pose.stream == "parent"
+    ] == PARENT.stamps_ns.tolist()
 
 
 def test_bags_of_one_sensor_each_are_read_side_by_side(new_bag):
@@ -288,7 +348,9 @@ def test_bags_of_one_sensor_each_are_read_side_by_side(new_bag):
     with PoseBag(lidar, new_bag("mcap", {"/b": STREAMS["/b"]}, "camera")) as bag:
         assert bag.select() == ("/a", "/b")
         poses = poses_of(bag)
-    assert [pose.bag_ns for pose in poses] == sorted([*PARENT.stamps_ns, *CHILD.stamps_ns])
+    assert [pose.bag_ns for pose in poses] == sorted(
+        [*PARENT.stamps_ns, *CHILD.stamps_ns]
+    )
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
@@ -320,7 +382,9 @@ def test_the_files_of_a_directory_are_read_whatever_its_metadata_says(new_bag):
     whole = all_poses(path)
     (path / "metadata.yaml").write_text("[" * 100_000)
     (storage,) = path.glob("*.mcap")
-    (path / f"{storage.name}.zstd").write_bytes(b"left beside what was unpacked from it")
+    (path / f"{storage.name}.zstd").write_bytes(
+        b"left beside what was unpacked from it"
+    )
     with PoseBag(path) as bag:
         assert poses_of(bag) == whole
         assert bag.warnings == []
@@ -336,10 +400,14 @@ def test_a_stamp_that_jumps_against_the_bags_own_time_is_left_out(tmp_path):
     messages = []
     for bag_ns, stamp_ns, matrix in poses:
         jumping = Trajectory(np.array([stamp_ns]), matrix[None])
-        ((_, message),) = stamped_messages(JAZZY.types, jumping, ODOMETRY, is_ros1=False)
+        ((_, message),) = stamped_messages(
+            JAZZY.types, jumping, ODOMETRY, is_ros1=False
+        )
         messages.append((bag_ns, "/a", ODOMETRY, lambda _, message=message: message))
     path = write_messages(tmp_path / "bag", messages)
-    with pytest.warns(UserWarning, match="/a: 1 poses were left out: their stamps jump away from"):
+    with pytest.warns(
+        UserWarning, match="/a: 1 poses were left out: their stamps jump away from"
+    ):
         trajectory = hec.read_trajectory(path, topic="/a")
     rest = np.arange(120) != 30
     assert_same_motion(trajectory, PARENT.stamps_ns[rest], PARENT.poses[rest])
@@ -361,7 +429,11 @@ def test_bags_of_other_programs_read_or_are_refused_in_one_line():
     """
     folder = data_folder() / "bags"
     suffixes = (".bag", ".mcap", ".db3")
-    paths = [p for p in folder.rglob("*") if p.suffix in suffixes or (p / "metadata.yaml").exists()]
+    paths = [
+        p
+        for p in folder.rglob("*")
+        if p.suffix in suffixes or (p / "metadata.yaml").exists()
+    ]
     refused = {}
     for path in paths:
         try:
@@ -375,6 +447,8 @@ def test_bags_of_other_programs_read_or_are_refused_in_one_line():
     assert not [message for message in refused.values() if "\n" in message]
     poses = all_poses(folder / "fuse" / "turtlebot3.bag", "/odom", None)
     assert len(poses) == 2741
-    assert {(pose.world_frame, pose.sensor_frame) for pose in poses} == {("odom", "base_footprint")}
+    assert {(pose.world_frame, pose.sensor_frame) for pose in poses} == {
+        ("odom", "base_footprint")
+    }
     lengths = np.linalg.norm([pose.pose[3:] for pose in poses], axis=1)
     np.testing.assert_allclose(lengths, 1.0, atol=1e-6)

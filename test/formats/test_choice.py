@@ -19,7 +19,9 @@ def topics(*rows):
 
 
 def chosen(rows, missing=BOTH, frames=None, edges=()):
-    return choose(topics(*rows), missing, lambda name: (frames or {}).get(name, ""), edges)
+    return choose(
+        topics(*rows), missing, lambda name: (frames or {}).get(name, ""), edges
+    )
 
 
 LIDAR = ("/lidar/odometry", ODOMETRY, 600)
@@ -34,7 +36,10 @@ CAMERA = ("/camera/odometry", ODOMETRY, 1800)
         (("/odometry/filtered", ODOMETRY, 900), {}),
         # Two topics of one sensor, by the name or by the frame.
         (("/lidar/pose", POSE, 500), {}),
-        (("/slam", ODOMETRY, 500), {"/slam": "velodyne", "/lidar/odometry": "velodyne"}),
+        (
+            ("/slam", ODOMETRY, 500),
+            {"/slam": "velodyne", "/lidar/odometry": "velodyne"},
+        ),
         # Odometry of the vehicle beside that of two sensors.
         (("/odom", ODOMETRY, 900), {"/odom": "base_link"}),
     ],
@@ -113,7 +118,9 @@ def test_the_stream_that_is_not_named_is_chosen_alone():
         ),
     ],
 )
-def test_without_an_obvious_pair_the_error_names_cause_and_options(rows, edges, message, options):
+def test_without_an_obvious_pair_the_error_names_cause_and_options(
+    rows, edges, message, options
+):
     with pytest.raises(UnclearStreamsError) as caught:
         chosen(rows, edges=edges)
     assert message in str(caught.value)

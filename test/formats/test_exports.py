@@ -62,12 +62,17 @@ def result(parent="imu", child="camera", **changes):
 
 def unknown(*axes):
     """What makes some axes unobservable."""
-    return {"status": SolveStatus.UNOBSERVABLE, "observability_measured": dofs([0.001] * 6, axes)}
+    return {
+        "status": SolveStatus.UNOBSERVABLE,
+        "observability_measured": dofs([0.001] * 6, axes),
+    }
 
 
 def document(text):
     """A file as any reader of YAML has it, without what only OpenCV understands."""
-    return yaml.safe_load(re.sub(r"^%YAML.*|!!opencv-matrix", "", text, flags=re.MULTILINE))
+    return yaml.safe_load(
+        re.sub(r"^%YAML.*|!!opencv-matrix", "", text, flags=re.MULTILINE)
+    )
 
 
 def matrix_of(name, text):
@@ -76,7 +81,9 @@ def matrix_of(name, text):
     if name == "autoware":
         ((_, children),) = fields.items()
         ((_, values),) = children.items()
-        rotation = Rotation.from_euler("xyz", [values[key] for key in ("roll", "pitch", "yaw")])
+        rotation = Rotation.from_euler(
+            "xyz", [values[key] for key in ("roll", "pitch", "yaw")]
+        )
         return [values[key] for key in "xyz"], rotation
     if name in ("fast_lio", "fast_livo2"):
         section = fields.get("mapping") or fields["extrin_calib"]
@@ -90,10 +97,14 @@ def matrix_of(name, text):
         return values["t"], values["R"]
     if name in ("kalibr", "openvins"):
         ((_, camera),) = fields.items()
-        T = np.array(next(matrix for key, matrix in camera.items() if key.startswith("T_")))
+        T = np.array(
+            next(matrix for key, matrix in camera.items() if key.startswith("T_"))
+        )
         return T[:3, 3], T[:3, :3].ravel()
     if name in ("vins", "orbslam3", "opencv"):
-        T = np.array(next(block["data"] for block in fields.values() if isinstance(block, dict)))
+        T = np.array(
+            next(block["data"] for block in fields.values() if isinstance(block, dict))
+        )
         return T.reshape(4, 4)[:3, 3], T.reshape(4, 4)[:3, :3].ravel()
     if name in ("apollo", "easy_handeye2"):
         pose = fields["transform"]
@@ -107,27 +118,39 @@ def matrix_of(name, text):
         return entry["value"][:3], Rotation.from_quat(entry["value"][3:])
     if name == "kitti":
         lines = dict(line.split(":", 1) for line in text.splitlines())
-        return [float(number) for number in lines["T"].split()], [*map(float, lines["R"].split())]
+        return [float(number) for number in lines["T"].split()], [
+            *map(float, lines["R"].split())
+        ]
     if name == "nuscenes":
         (record,) = json.loads(text)
-        return record["translation"], Rotation.from_quat(np.roll(record["rotation"], -1))
+        return record["translation"], Rotation.from_quat(
+            np.roll(record["rotation"], -1)
+        )
     if name == "colmap":
         camera = json.loads(text)[0]["cameras"][1]
         rotation = Rotation.from_quat(np.roll(camera["cam_from_rig_rotation"], -1))
         return camera["cam_from_rig_translation"], rotation
     if name == "driveworks":
         pose = json.loads(text)["rig"]["sensors"][0]["nominalSensor2Rig_FLU"]
-        return pose["t"], Rotation.from_euler("xyz", pose["roll-pitch-yaw"], degrees=True)
+        return pose["t"], Rotation.from_euler(
+            "xyz", pose["roll-pitch-yaw"], degrees=True
+        )
     T = np.loadtxt(text.splitlines())
     return T[:3, 3], T[:3, :3].ravel()
 
 
 @pytest.mark.parametrize(("name", "parent", "child", "is_direct"), CASES)
-def test_a_file_maps_a_point_as_it_says_and_reads_back(name, parent, child, is_direct, tmp_path):
+def test_a_file_maps_a_point_as_it_says_and_reads_back(
+    name, parent, child, is_direct, tmp_path
+):
     calibration = result(parent, child)
     text = calibration.export(name)
     t, rotation = matrix_of(name, text)
-    R = rotation.as_matrix() if isinstance(rotation, Rotation) else np.reshape(rotation, (3, 3))
+    R = (
+        rotation.as_matrix()
+        if isinstance(rotation, Rotation)
+        else np.reshape(rotation, (3, 3))
+    )
     T = calibration.T_parent_child if is_direct else calibration.T_child_parent
     np.testing.assert_allclose(R @ POINT[:3] + t, (T @ POINT)[:3], atol=1e-9)
 
@@ -138,10 +161,14 @@ def test_a_file_maps_a_point_as_it_says_and_reads_back(name, parent, child, is_d
 
     (tmp_path / "foreign.yaml").write_text(text)
     installed = open_installed(str(tmp_path / "foreign.yaml"))(parent, child)
-    np.testing.assert_allclose(installed.T_parent_child, calibration.T_parent_child, atol=1e-9)
+    np.testing.assert_allclose(
+        installed.T_parent_child, calibration.T_parent_child, atol=1e-9
+    )
     if name not in ("opencv", "numpy"):  # which name nothing
         installed = open_installed(str(tmp_path / "foreign.yaml"))(child, parent)
-        np.testing.assert_allclose(installed.T_parent_child, calibration.T_child_parent, atol=1e-9)
+        np.testing.assert_allclose(
+            installed.T_parent_child, calibration.T_child_parent, atol=1e-9
+        )
 
 
 def test_every_format_is_tried():
@@ -162,10 +189,18 @@ def test_every_format_is_tried():
         ("fast_livo2", "lidar", "imu", ("time_offset", "imu_time_offset"), -OFFSET_S),
         # t_lidar = t_image + offset
         ("fast_livo2", "lidar", "camera", ("time_offset", "img_time_offset"), OFFSET_S),
-        ("fast_livo2", "camera", "lidar", ("time_offset", "img_time_offset"), -OFFSET_S),
+        (
+            "fast_livo2",
+            "camera",
+            "lidar",
+            ("time_offset", "img_time_offset"),
+            -OFFSET_S,
+        ),
     ],
 )
-def test_the_sign_of_a_time_offset_is_that_of_the_program(name, parent, child, key, expected_s):
+def test_the_sign_of_a_time_offset_is_that_of_the_program(
+    name, parent, child, key, expected_s
+):
     value = document(result(parent, child).export(name))
     for name_of_level in key:
         value = value[name_of_level]
@@ -176,12 +211,16 @@ def test_px4_has_its_own_axes_and_a_delay():
     calibration = result("base_link", "vio")
     x, y, z = calibration.translation
     lines = dict(
-        line.split()[2:] for line in calibration.export("px4").splitlines() if line[0] == "p"
+        line.split()[2:]
+        for line in calibration.export("px4").splitlines()
+        if line[0] == "p"
     )
     values = [float(lines[f"EKF2_EV_POS_{axis}"]) for axis in "XYZ"]
     assert values == pytest.approx([x, -y, -z])
     assert "EKF2_EV_DELAY" not in lines  # the camera's clock is behind: no delay
-    late = good_calibration(parent_frame="base_link", child_frame="vio", time_offset_s=-0.05)
+    late = good_calibration(
+        parent_frame="base_link", child_frame="vio", time_offset_s=-0.05
+    )
     assert "param set EKF2_EV_DELAY 50.0\n" in late.export("px4")
     antenna = result("base_link", "gnss_antenna", **unknown("roll", "pitch", "yaw"))
     assert f"param set EKF2_GPS_POS_Y {-y:.12f}" in antenna.export("px4")
@@ -192,14 +231,17 @@ def test_an_axis_that_is_not_known_is_refused():
     for name in EXPORT_FORMATS:
         with pytest.raises(InputError, match="does not determine z; .* with a prior"):
             flat.export(name)
-    with pytest.raises(ConfigError, match="unknown format 'kalbir'; known are autoware"):
+    with pytest.raises(
+        ConfigError, match="unknown format 'kalbir'; known are autoware"
+    ):
         flat.export("kalbir")
 
 
 def test_what_the_names_do_not_say_is_assumed_and_said():
     text = result("a", "b").export("fast_lio")
     assumption = (
-        "Assumed, because the names of the frames do not contain it: a is the imu, b is the lidar."
+        "Assumed, because the names of the frames do not contain "
+        "it: a is the imu, b is the lidar."
     )
     assert assumption in text
     for frame in ("CAM_FRONT", "frontCamera", "camera_base_link"):
@@ -212,12 +254,21 @@ def test_what_the_names_do_not_say_is_assumed_and_said():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("mapping: {extrinsic_T: [1, 2], extrinsic_R: [1]}", "expected a pose: 12 or 16"),
-        ("cam0: {T_cam_imu: [[1,0,0,0],[0,2,0,0],[0,0,1,0],[0,0,0,1]]}", "not a rotation matrix"),
+        (
+            "mapping: {extrinsic_T: [1, 2], extrinsic_R: [1]}",
+            "expected a pose: 12 or 16",
+        ),
+        (
+            "cam0: {T_cam_imu: [[1,0,0,0],[0,2,0,0],[0,0,1,0],[0,0,0,1]]}",
+            "not a rotation matrix",
+        ),
         ("param set EKF2_EV_POS_X 0.1", "have a position but no rotation"),
         ("some: text", "expected a calibration: extrinsic.yaml"),
         ("[1, 2, 3]", "expected a calibration"),
-        ("base_link: {other: {x: 0, y: 0, z: 0, roll: 0, pitch: 0, yaw: 0}}", "no frame 'imu' in"),
+        (
+            "base_link: {other: {x: 0, y: 0, z: 0, roll: 0, pitch: 0, yaw: 0}}",
+            "no frame 'imu' in",
+        ),
     ],
 )
 def test_a_file_that_does_not_say_it_is_refused_in_one_line(text, message, tmp_path):
@@ -234,7 +285,9 @@ def test_of_several_cameras_the_named_one_is_read(tmp_path):
     moved = se3.from_rotation_translation(np.eye(3), [1, 2, 3])
     path = tmp_path / "camchain.yaml"
     path.write_text(
-        yaml.safe_dump({"cam0": {"T_cam_imu": identity}, "cam1": {"T_cam_imu": moved.tolist()}})
+        yaml.safe_dump(
+            {"cam0": {"T_cam_imu": identity}, "cam1": {"T_cam_imu": moved.tolist()}}
+        )
     )
     T_parent_child = open_installed(str(path))("imu", "cam1").T_parent_child
     np.testing.assert_allclose(T_parent_child, se3.inverse(moved))
@@ -270,7 +323,9 @@ def test_urdf_and_colmap_read_the_same(tmp_path):
     joint = (tmp_path / "extrinsic.urdf.xacro").read_text()
     links = '<link name="base_link"/><link name="camera"/>'
     path = tmp_path / "robot.urdf"
-    path.write_text(joint.replace("<robot", '<robot name="r"').replace("<joint", links + "<joint"))
+    path.write_text(
+        joint.replace("<robot", '<robot name="r"').replace("<joint", links + "<joint")
+    )
     T = yourdfpy.URDF.load(str(path)).get_transform("camera", "base_link")
     np.testing.assert_allclose(T, calibration.T_parent_child, atol=1e-9)
 
@@ -290,14 +345,23 @@ def test_info_prints_a_format_and_compare_reads_it(tmp_path, capsys):
     text = capsys.readouterr().out
     assert text == result("imu", "camera").export("kalibr")
     (tmp_path / "camchain.yaml").write_text(text)
-    command = ["compare", str(tmp_path / "result"), "--with", str(tmp_path / "camchain.yaml")]
+    command = [
+        "compare",
+        str(tmp_path / "result"),
+        "--with",
+        str(tmp_path / "camchain.yaml"),
+    ]
     assert main(command) == 0
     assert "same" in capsys.readouterr().out
 
 
 DOCS = ROOT / "docs" / "exports"
-CAMERA = se3.from_rotation_translation([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.12, 0.05, 0.3])
-LIDAR = se3.from_rotation_translation([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [0.12, 0.05, 0.3])
+CAMERA = se3.from_rotation_translation(
+    [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.12, 0.05, 0.3]
+)
+LIDAR = se3.from_rotation_translation(
+    [[0, -1, 0], [1, 0, 0], [0, 0, 1]], [0.12, 0.05, 0.3]
+)
 # Frames of each page's example.
 PAGES = {
     "autoware": ("sensor_kit_base_link", "velodyne_top", LIDAR),

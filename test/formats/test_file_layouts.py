@@ -33,7 +33,12 @@ def parts_of(poses):
     quats_wxyz = np.roll(quats_xyzw, 1, axis=1)
     flat = [
         matrices.reshape(N, -1)
-        for matrices in (rotations, np.swapaxes(rotations, 1, 2), poses, np.swapaxes(poses, 1, 2))
+        for matrices in (
+            rotations,
+            np.swapaxes(rotations, 1, 2),
+            poses,
+            np.swapaxes(poses, 1, 2),
+        )
     ]
     return poses[:, :3, 3], rotations, quats_xyzw, quats_wxyz, *flat
 
@@ -73,7 +78,9 @@ def text_of(*columns, head="", separator=" ", decimals="{:.12g}"):
             if isinstance(value, str | int):
                 row.append(str(value))
             else:
-                row += [decimals.format(number) for number in np.atleast_1d(value).ravel()]
+                row += [
+                    decimals.format(number) for number in np.atleast_1d(value).ravel()
+                ]
     return head + "".join(separator.join(row) + "\n" for row in cells)
 
 
@@ -108,7 +115,9 @@ ROS_NAMES = (
     + "\n"
 )
 QUOTED = '"t","x, east","pos_y","z","qx","qy","qz","qw"\n'
-PROSE = "Project:     demo\nProgram:     Version 8.90.2428\n\nDatum:       WGS84, ITRF\n\n"
+PROSE = (
+    "Project:     demo\nProgram:     Version 8.90.2428\n\nDatum:       WGS84, ITRF\n\n"
+)
 INS_NAMES = "Remarks: 2023 11 14\n\n   Time  Easting  Northing  H-Ell  qx  qy  qz  qw\n"
 WITH_UNITS = f"{INS_NAMES}  (sec)   (mm)   (mm)   (mm)   (-)   (-)   (-)   (-)\n"
 ZERO_BASED = [f"T_{row}{column}" for row in range(3) for column in range(4)]
@@ -237,7 +246,9 @@ ENCODINGS = ["utf-8", "utf-16", "latin-1"]
 def test_a_text_is_read_in_every_usual_encoding(tmp_path, encoding):
     head = "t,x,y,z,roll (°),pitch (°),yaw (°)\n"
     path = tmp_path / "poses.csv"
-    path.write_bytes(text_of(SECONDS, P, RPY_DEG, head=head, separator=",").encode(encoding))
+    path.write_bytes(
+        text_of(SECONDS, P, RPY_DEG, head=head, separator=",").encode(encoding)
+    )
     assert_is_the_truth(read(path).trajectory)
 
 
@@ -309,7 +320,9 @@ def test_a_week_of_gps_and_its_second_are_stamps(tmp_path, form):
 @pytest.mark.parametrize("name", ["itow", "tow_ms", "ms_of_week", ".navpvt.iTOW"])
 def test_milliseconds_of_a_week_are_stamps_without_the_week(tmp_path, name):
     head = f"{name},x,y,z,qx,qy,qz,qw\n"
-    path = written(tmp_path / "ins.csv", text_of(MS_OF_WEEK, P, Q, head=head, separator=","))
+    path = written(
+        tmp_path / "ins.csv", text_of(MS_OF_WEEK, P, Q, head=head, separator=",")
+    )
     week_ns = 604_800_000_000_000
     of_week_ns = (TRUTH.stamps_ns - 315_964_800_000_000_000) % week_ns
     np.testing.assert_array_equal(read(path).trajectory.stamps_ns, of_week_ns)
@@ -317,7 +330,9 @@ def test_milliseconds_of_a_week_are_stamps_without_the_week(tmp_path, name):
 
 def test_a_table_keeps_the_unit_of_the_second_of_a_week():
     pd = pytest.importorskip("pandas")
-    table = pd.DataFrame({"gps_week": WEEKS, "tow_ms": [int(text) for text in MS_OF_WEEK]})
+    table = pd.DataFrame(
+        {"gps_week": WEEKS, "tow_ms": [int(text) for text in MS_OF_WEEK]}
+    )
     for column, name in enumerate(("x", "y", "z")):
         table[name] = P[:, column]
     for column, name in enumerate(("qx", "qy", "qz", "qw")):
@@ -332,7 +347,9 @@ def test_stamps_go_on_where_a_week_or_a_day_begins_again(tmp_path, period_s, nam
     stamps = np.mod(period_s - 1.0 + since_start, period_s)
     text = text_of(stamps, P, Q, head=f"{name},{NAMES[2:]}", separator=",")
     trajectory = read(written(tmp_path / "ins.csv", text)).trajectory
-    assert np.diff(trajectory.stamps_ns).tolist() == pytest.approx([50_000_000] * (N - 1), abs=2)
+    assert np.diff(trajectory.stamps_ns).tolist() == pytest.approx(
+        [50_000_000] * (N - 1), abs=2
+    )
 
 
 def test_times_of_day_are_stamps_in_seconds_of_the_day(tmp_path):
@@ -364,7 +381,11 @@ def test_rows_without_a_pose_are_left_out_and_counted(tmp_path, kind, separator)
     lines = text_of(SECONDS, P, Q, separator=separator).splitlines()
     lost = (0, 7, 8)
     for row in lost:
-        cells = [SECONDS[row], *NO_POSE[kind].split(" ")] if NO_POSE[kind] else [SECONDS[row]]
+        cells = (
+            [SECONDS[row], *NO_POSE[kind].split(" ")]
+            if NO_POSE[kind]
+            else [SECONDS[row]]
+        )
         lines[row] = separator.join(cells[:8])
     head = "" if separator == " " else NAMES.replace(",", separator)
     path = written(tmp_path / "poses.txt", head + "\n".join(lines))
@@ -394,9 +415,12 @@ def test_many_rows_without_a_pose_are_warned_of(tmp_path, capsys):
 
 
 def test_a_file_without_any_pose_is_one_line(tmp_path):
-    path = written(tmp_path / "a.tum", "\n".join(f"{k} nan nan nan 0 0 0 1" for k in range(9)))
+    path = written(
+        tmp_path / "a.tum", "\n".join(f"{k} nan nan nan 0 0 0 1" for k in range(9))
+    )
     with pytest.raises(
-        InputError, match="the file contains no poses: all 9 rows are empty, zero or not fin"
+        InputError,
+        match="the file contains no poses: all 9 rows are empty, zero or not fin",
     ):
         read(path)
 
@@ -410,7 +434,9 @@ def test_rows_that_are_paired_are_left_out_of_both_files(tmp_path):
     ]
     lines[0][3] = "nan nan nan nan nan nan nan"
     lines[1][20] = "0 0 0 0 0 0 0"
-    files = [written(tmp_path / f"{k}.txt", "\n".join(rows)) for k, rows in enumerate(lines)]
+    files = [
+        written(tmp_path / f"{k}.txt", "\n".join(rows)) for k, rows in enumerate(lines)
+    ]
     options = FileOptions(format=AUTO, pair_by="row")
     readings = read_trajectory_files([(file, options) for file in files])
     first, second = (reading.trajectory for reading in readings)
@@ -424,7 +450,9 @@ def test_arrays_with_nan_and_transposed_matrices():
     times = TRUTH.stamps_ns / 1e9
     with pytest.warns(UserWarning, match="1 of 60 poses"):
         trajectory = hec.read_trajectory(poses, times=times)
-    np.testing.assert_allclose(trajectory.poses, np.delete(TRUTH.poses, 5, axis=0), atol=1e-12)
+    np.testing.assert_allclose(
+        trajectory.poses, np.delete(TRUTH.poses, 5, axis=0), atol=1e-12
+    )
     with pytest.warns(UserWarning, match="matrices are transposed"):
         trajectory = hec.read_trajectory(np.swapaxes(TRUTH.poses, 1, 2), times=times)
     np.testing.assert_allclose(trajectory.poses, TRUTH.poses, atol=1e-12)
@@ -448,15 +476,21 @@ COARSE = {
 def test_stamps_without_their_last_digits_are_refused(tmp_path, form):
     stamps = [form % (stamp_ns * 1e-9) for stamp_ns in STAMPS_NS]
     path = written(tmp_path / "sci.tum", text_of(stamps, P, Q))
-    with pytest.raises(InputError, match=f"sci.tum: the timestamps {COARSE[form]}") as caught:
+    with pytest.raises(
+        InputError, match=f"sci.tum: the timestamps {COARSE[form]}"
+    ) as caught:
         read(path)
     assert "write all digits" in str(caught.value)
 
 
 def test_whole_seconds_of_a_slow_stream_and_repeated_lines_are_right(tmp_path):
     slow = [str(START_NS // 10**9 + k) for k in range(N)]
-    assert len(read(written(tmp_path / "slow.tum", text_of(slow, P, Q))).trajectory) == N
-    twice = "".join(line + line for line in text_of(SECONDS, P, Q).splitlines(keepends=True))
+    assert (
+        len(read(written(tmp_path / "slow.tum", text_of(slow, P, Q))).trajectory) == N
+    )
+    twice = "".join(
+        line + line for line in text_of(SECONDS, P, Q).splitlines(keepends=True)
+    )
     reading = read(written(tmp_path / "twice.tum", twice))
     assert_is_the_truth(reading.trajectory)
     assert "dropped 60 with a repeated stamp" in reading.repairs[0]
@@ -546,7 +580,9 @@ def test_a_stamp_is_preferred_to_milliseconds_of_a_week_of_gps(tmp_path):
 
 def test_a_license_is_no_trajectory(tmp_path):
     path = tmp_path / "LICENSE"
-    path.write_text("1. Definitions.\nLicense means the terms\nand conditions for use\n")
+    path.write_text(
+        "1. Definitions.\nLicense means the terms\nand conditions for use\n"
+    )
 
     with pytest.raises(InputError, match="does not name the columns"):
         hec.read_trajectory(path, "auto")

@@ -24,7 +24,9 @@ from hand_eye_calib.formats.trajectory_files.file_options import AUTO
 from hand_eye_calib.offline.cli.main import main
 
 N = 40
-TRUTH = as_trajectory(wandering_poses(N), rate_hz=10.0, start_ns=1_700_000_000_000_000_000)
+TRUTH = as_trajectory(
+    wandering_poses(N), rate_hz=10.0, start_ns=1_700_000_000_000_000_000
+)
 SECONDS = TRUTH.stamps_ns / 1e9
 P = TRUTH.poses[:, :3, 3]
 Q = se3.to_quat_xyzw(TRUTH.poses)
@@ -43,11 +45,15 @@ def joined(rows, separator=" "):
 
 def of_nmea(damaged=3):
     """After a logger's own stamps, one sentence with a wrong checksum."""
-    lat, lon = ([100 * (angle // 1) + angle % 1 * 60 for angle in deg] for deg in (LAT, LON))
+    lat, lon = (
+        [100 * (angle // 1) + angle % 1 * 60 for angle in deg] for deg in (LAT, LON)
+    )
     texts = [
         f"GPRMC,{clock[:-4]},A,,,,,,,{day},,|GNGGA,{clock[:-4]},{lat[k]:014.9f},N,"
         f"{lon[k]:015.9f},E,4,12,0.8,{HEIGHT[k] - 45.0:.6f},M,45.0,M,,"
-        for k, (clock, day) in enumerate(zip(dates("%H%M%S.%f"), dates("%d%m%y"), strict=True))
+        for k, (clock, day) in enumerate(
+            zip(dates("%H%M%S.%f"), dates("%d%m%y"), strict=True)
+        )
     ]
     texts.insert(damaged, texts[damaged].replace(".", ".9"))
     lines = [sentence for text in texts for sentence in text.split("|")]
@@ -60,7 +66,9 @@ def of_nmea(damaged=3):
 def of_gpx():
     points = "".join(
         f'<trkpt lat="{lat:.12f}" lon="{lon:.12f}"><ele>{h:.6f}</ele><time>{t}Z</time></trkpt>\n'
-        for t, lat, lon, h in zip(dates("%Y-%m-%dT%H:%M:%S.%f"), LAT, LON, HEIGHT, strict=True)
+        for t, lat, lon, h in zip(
+            dates("%Y-%m-%dT%H:%M:%S.%f"), LAT, LON, HEIGHT, strict=True
+        )
     )
     space = 'xmlns="http://www.topografix.com/GPX/1/1"'
     track = f"<trk><trkseg>{points}</trkseg></trk>"
@@ -80,7 +88,9 @@ def of_rtklib(weeks=False):
 
 def of_colmap():
     rows = se3.to_rows(se3.inverse(TRUTH.poses))[::-1, [6, 3, 4, 5, 0, 1, 2]]
-    names = [f"cam 0/{stamp}.png\n1.5 2.5 -1 3.5 4.5 7" for stamp in TRUTH.stamps_ns[::-1]]
+    names = [
+        f"cam 0/{stamp}.png\n1.5 2.5 -1 3.5 4.5 7" for stamp in TRUTH.stamps_ns[::-1]
+    ]
     head = (
         "# Image list with two lines of data per image:\n"
         "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n"
@@ -91,7 +101,10 @@ def of_colmap():
 
 def of_nerfstudio(names=TRUTH.stamps_ns, poses=TRUTH.poses):
     frames = [
-        {"file_path": f"images/{name}.png", "transform_matrix": (pose @ OPENGL).tolist()}
+        {
+            "file_path": f"images/{name}.png",
+            "transform_matrix": (pose @ OPENGL).tolist(),
+        }
         for name, pose in zip(names, poses, strict=True)
     ]
     return json.dumps({"camera_model": "OPENCV", "frames": frames})
@@ -129,9 +142,17 @@ def of_novatel(short=False):
     if not short:
         head = "#INSPVAXA,COM1,0,7.5,FINESTEERING,{0},{1:.3f},0,4e77,4;INS_SOLUTION_GOOD,INS_PSRSP,"
         body = "{:.12f},{:.12f},{:.9f},45.0,1,2,3,"
-    angles = Rotation.from_quat(Q).as_euler("ZYX", degrees=True) * [-1, -1, 1] + [90, 0, 0]
-    for second, lat, lon, height, turn in zip(SECONDS, LAT, LON, HEIGHT, angles, strict=True):
-        log += head.format(*divmod(second - 315_964_800, 604_800)).replace(".0,", ",", 1)
+    angles = Rotation.from_quat(Q).as_euler("ZYX", degrees=True) * [-1, -1, 1] + [
+        90,
+        0,
+        0,
+    ]
+    for second, lat, lon, height, turn in zip(
+        SECONDS, LAT, LON, HEIGHT, angles, strict=True
+    ):
+        log += head.format(*divmod(second - 315_964_800, 604_800)).replace(
+            ".0,", ",", 1
+        )
         log += body.format(lat, lon, height - (0 if short else 45.0))
         log += "{2:.9f},{1:.9f},{0:.9f},3*e877c178\n#TIMEA,COM1;VALID*1\n".format(*turn)
     return log
@@ -148,20 +169,29 @@ def of_lio_sam():
 def of_rows(header, *values, separator=","):
     """Numbers below a header, each value (N, ...) one or several columns."""
     columns = [np.reshape(array, (N, -1)).tolist() for array in values]
-    rows = ([cell for cells in row for cell in cells] for row in zip(*columns, strict=True))
+    rows = (
+        [cell for cells in row for cell in cells] for row in zip(*columns, strict=True)
+    )
     return header + joined(rows, separator)
 
 
 def of_echo(frames="odom,base"):
     """As ros2 topic echo --csv writes TransformStamped, or PoseStamped."""
-    stamps = (f"{stamp_ns // 10**9},{stamp_ns % 10**9}" for stamp_ns in TRUTH.stamps_ns.tolist())
-    return joined(([stamp, frames, *p, *q] for stamp, p, q in zip(stamps, P, Q, strict=True)), ",")
+    stamps = (
+        f"{stamp_ns // 10**9},{stamp_ns % 10**9}"
+        for stamp_ns in TRUTH.stamps_ns.tolist()
+    )
+    return joined(
+        ([stamp, frames, *p, *q] for stamp, p, q in zip(stamps, P, Q, strict=True)), ","
+    )
 
 
 def of_nuscenes():
     values = zip((STAMPS // 1000).tolist(), WXYZ.tolist(), P.tolist(), strict=True)
     keys = ("timestamp", "rotation", "translation")
-    return json.dumps([dict(zip(keys, row, strict=True)) for row in values][::-1], indent=1)
+    return json.dumps(
+        [dict(zip(keys, row, strict=True)) for row in values][::-1], indent=1
+    )
 
 
 STAMPS = TRUTH.stamps_ns
@@ -170,7 +200,9 @@ POSE = "tx,ty,tz,qx,qy,qz,qw\n"
 DATES = [f"{date}Z" for date in dates("%Y-%m-%dT%H:%M:%S.%f")]
 MATRICES = TRUTH.poses.reshape(N, 16)
 WITH_UNITS = "# by hand\n# time [{0}],x [{1}],y [{1}],z [{1}],q_w,q_x,q_y,q_z\n"
-EUROC = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y,p_RS_R_z,q_RS_w [],q_RS_x,q_RS_y,q_RS_z\n"
+EUROC = (
+    "#timestamp [ns],p_RS_R_x [m],p_RS_R_y,p_RS_R_z,q_RS_w [],q_RS_x,q_RS_y,q_RS_z\n"
+)
 ROT = "Stamp [ns],Pos_X [m],Pos_Y,Pos_Z,rot_w,rot_x,rot_y,rot_z\n"
 OKVIS = "timestamp, p_WS_W_x, p_WS_W_y, p_WS_W_z, q_WS_x, q_WS_y, q_WS_z, q_WS_w, v_WS_W_x\n"
 ULOG2CSV = "timestamp,position[0],position[1],position[2],q[0],q[1],q[2],q[3]\n"
@@ -182,34 +214,75 @@ HEADER = f"__time,/odom/header/stamp,{POSE}".replace(",t", ",/odom/pose/pose/pos
 TCP = " ".join(["timestamp", *(f"actual_TCP_pose_{k}" for k in range(6))])
 UNITS = "Device Time,Easting,Northing,H-Ell,qw,qx,qy,qz\n(ns),(mm),(mm),(mm),,,,\n"
 GNSS_POSES = (
-    "# frame_id (timestamp in ns), translation (t_x, t_y, t_z), rotation (q_x, q_y, q_z, q_w)"
+    "# frame_id (timestamp in ns), translation (t_x, t_y, "
+    "t_z), rotation (q_x, q_y, q_z, q_w)"
 )
 FORMATS = {
-    "tum": (of_rows("# of a program of eight words or so\n", SECONDS, P, Q, separator=" "), ""),
+    "tum": (
+        of_rows("# of a program of eight words or so\n", SECONDS, P, Q, separator=" "),
+        "",
+    ),
     "ids": (
-        of_rows(f"id timestamp {POSE}".replace(",", " "), range(N), SECONDS, P, Q, separator=" "),
+        of_rows(
+            f"id timestamp {POSE}".replace(",", " "),
+            range(N),
+            SECONDS,
+            P,
+            Q,
+            separator=" ",
+        ),
         "",
     ),
     "comments": (of_rows(f"// of Xsens\nt,{POSE}", SECONDS, P, Q), ""),
-    "seconds_and_nanoseconds": (of_rows(f"#sec,nsec,{POSE}", *divmod(STAMPS, 10**9), P, Q), ""),
+    "seconds_and_nanoseconds": (
+        of_rows(f"#sec,nsec,{POSE}", *divmod(STAMPS, 10**9), P, Q),
+        "",
+    ),
     "units_below": (of_rows(UNITS, STAMPS, P * 1e3, WXYZ), ""),
-    "order_in_words": (of_rows("# as: t x y z qw qx qy qz\n", SECONDS, P, WXYZ, separator=" "), ""),
-    "order_in_a_comment": (of_rows(f"{GNSS_POSES}\n", STAMPS, P, Q), "is read as format csv"),
+    "order_in_words": (
+        of_rows("# as: t x y z qw qx qy qz\n", SECONDS, P, WXYZ, separator=" "),
+        "",
+    ),
+    "order_in_a_comment": (
+        of_rows(f"{GNSS_POSES}\n", STAMPS, P, Q),
+        "is read as format csv",
+    ),
     "lio_sam": (of_lio_sam(), "read in rad"),
     "iso": (of_rows(f"time,{POSE}", DATES, P, Q), ""),
-    "decimal_comma": (of_rows(f"t,{POSE}", SECONDS, P, Q).replace(",", ";").replace(".", ","), ""),
-    "csv_mm_ms": (of_rows(WITH_UNITS.format("ms", "mm"), STAMPS // 10**6, P * 1e3, WXYZ), ""),
-    "csv_cm_us": (of_rows(WITH_UNITS.format("us", "cm"), STAMPS // 10**3, P * 1e2, WXYZ), ""),
-    "rotation_vectors_and_feet": (of_rows(ARM, SECONDS, P / 0.3048, VECTORS), "read in rad"),
-    "universal_robots": (of_rows(f"{TCP}\n", SECONDS, P, VECTORS, separator=" "), "read in rad"),
+    "decimal_comma": (
+        of_rows(f"t,{POSE}", SECONDS, P, Q).replace(",", ";").replace(".", ","),
+        "",
+    ),
+    "csv_mm_ms": (
+        of_rows(WITH_UNITS.format("ms", "mm"), STAMPS // 10**6, P * 1e3, WXYZ),
+        "",
+    ),
+    "csv_cm_us": (
+        of_rows(WITH_UNITS.format("us", "cm"), STAMPS // 10**3, P * 1e2, WXYZ),
+        "",
+    ),
+    "rotation_vectors_and_feet": (
+        of_rows(ARM, SECONDS, P / 0.3048, VECTORS),
+        "read in rad",
+    ),
+    "universal_robots": (
+        of_rows(f"{TCP}\n", SECONDS, P, VECTORS, separator=" "),
+        "read in rad",
+    ),
     "aria": (of_rows(f"{ARIA}\n", ["ea72"] * N, STAMPS // 1000, STAMPS + 9, P, Q), ""),
     "stamp_of_the_header": (of_rows(HEADER, SECONDS + 0.1, SECONDS, P, Q), ""),
     "ulog2csv": (of_rows(ULOG2CSV, STAMPS // 1000, P, WXYZ), ""),
     "okvis": (of_rows(OKVIS, STAMPS, P, Q, P[:, :1], separator=", "), ""),
     "euroc_names": (of_rows(EUROC, STAMPS, P, WXYZ), "is read as format csv"),
     "rot": (of_rows(ROT, STAMPS, P, WXYZ), ""),
-    "euroc_scalar_last": (of_rows("", STAMPS, P, Q), "the scalar last, t x y z qx qy qz qw"),
-    "euroc": (of_rows("", STAMPS, P, WXYZ, P, separator=", "), "is read as format euroc"),
+    "euroc_scalar_last": (
+        of_rows("", STAMPS, P, Q),
+        "the scalar last, t x y z qx qy qz qw",
+    ),
+    "euroc": (
+        of_rows("", STAMPS, P, WXYZ, P, separator=", "),
+        "is read as format euroc",
+    ),
     "kitti": (of_rows("", MATRICES[:, :12], separator=" "), "stamps read from"),
     "stamp_and_rows": (of_rows("", STAMPS, MATRICES[:, :12]), "is read as format csv"),
     "stamp_and_matrix": (of_rows("", SECONDS, MATRICES, separator=" "), ""),
@@ -231,7 +304,9 @@ MOUNT = se3.exp(np.array([0.3, -0.2, 0.1, 0.5, -1.0, 0.7]))
 
 
 def calibrated(parent, child):
-    return hec.calibrate(parent, child, method="dnlo", reference="B5", checks=False).T_parent_child
+    return hec.calibrate(
+        parent, child, method="dnlo", reference="B5", checks=False
+    ).T_parent_child
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -243,7 +318,9 @@ def test_every_format_and_unit_gives_the_same_poses_and_the_same_answer(tmp_path
     file = read_trajectory_file(path, AUTO)
     trajectory = file.trajectory
     start_ns = TRUTH.stamps_ns[0] if name.startswith("vicon") else 0
-    np.testing.assert_allclose(trajectory.stamps_ns, TRUTH.stamps_ns - start_ns, atol=2000, rtol=0)
+    np.testing.assert_allclose(
+        trajectory.stamps_ns, TRUTH.stamps_ns - start_ns, atol=2000, rtol=0
+    )
     expected = TRUTH.poses.copy()
     if trajectory.measures == "positions":
         expected[:, :3, :3] = np.eye(3)
@@ -267,10 +344,14 @@ def test_arrays_and_graphs(tmp_path):
     assert "numbers of its vertices are used as seconds" in file.guesses[0]
 
 
-def test_poses_without_stamps_are_paired_by_row_or_by_the_names_of_images(tmp_path, capsys):
+def test_poses_without_stamps_are_paired_by_row_or_by_the_names_of_images(
+    tmp_path, capsys
+):
     names = [f"{chr(97 + k // 26)}{chr(97 + k % 26)}" for k in range(N)]
     (tmp_path / "a.json").write_text(of_nerfstudio(names))
-    (tmp_path / "b.json").write_text(of_nerfstudio(names[:4:-1], (TRUTH.poses @ MOUNT)[:4:-1]))
+    (tmp_path / "b.json").write_text(
+        of_nerfstudio(names[:4:-1], (TRUTH.poses @ MOUNT)[:4:-1])
+    )
     for name, poses in (("a", TRUTH.poses), ("b", TRUTH.poses @ MOUNT)):
         rows = {"kitti": poses[:, :3].reshape(-1, 12), "all": poses.reshape(-1, 16)}
         for kind, values in (rows | {"seven": se3.to_rows(poses)}).items():
@@ -282,14 +363,27 @@ def test_poses_without_stamps_are_paired_by_row_or_by_the_names_of_images(tmp_pa
         assert main([*command, "--pair-by", by, "--json"]) in (0, 3)
         document = json.loads(capsys.readouterr().out)
         assert (document["parent_frame"], document["child_frame"]) == ("a", "b")
-        np.testing.assert_allclose(document["T_parent_child"]["matrix"], MOUNT, atol=1e-6)
+        np.testing.assert_allclose(
+            document["T_parent_child"]["matrix"], MOUNT, atol=1e-6
+        )
         assert main(command) == 1
         assert "the poses have no stamps" in capsys.readouterr().err
-    mixed = ["calibrate", str(tmp_path / "a.json"), str(tmp_path / "b.json"), "--pair-by", "row"]
+    mixed = [
+        "calibrate",
+        str(tmp_path / "a.json"),
+        str(tmp_path / "b.json"),
+        "--pair-by",
+        "row",
+    ]
     assert main(mixed) == 1
     err = capsys.readouterr().err
     assert re.search(r"found 40 in \S+ and 35 in \S+: write a row", err)
-    kitti = ["calibrate", *(str(tmp_path / f"{name}.kitti") for name in "ab"), "--pair-by", "name"]
+    kitti = [
+        "calibrate",
+        *(str(tmp_path / f"{name}.kitti") for name in "ab"),
+        "--pair-by",
+        "name",
+    ]
     assert main(kitti) == 1
     assert "no image has a name that is in all files" in capsys.readouterr().err
 
@@ -326,7 +420,9 @@ def of_ulog(*topics):
                 "vehicle_local_position": ("??3f", (k > 0, True, *place)),
                 "vehicle_attitude": ("4f", turn),
             }[name]
-            log += message("D", struct.pack(f"<HQQ{form}", number, stamp + 900, stamp, *values))
+            log += message(
+                "D", struct.pack(f"<HQQ{form}", number, stamp + 900, stamp, *values)
+            )
     return log
 
 
@@ -348,7 +444,10 @@ def test_a_log_of_px4(tmp_path, topics):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"\x89HDF\r\n\x1a\n" + bytes(40), "not a text file.* save the poses of .*HDF5"),
+        (
+            b"\x89HDF\r\n\x1a\n" + bytes(40),
+            "not a text file.* save the poses of .*HDF5",
+        ),
         (b"PAR1" + bytes(40), "not a text file"),
         (b"\x93NUMPY\x01\x00" + bytes(10), "cannot read"),
         (b"<gpx><trkpt lat='1' lon='2'/></gpx>", "has no time"),
@@ -364,19 +463,43 @@ def test_a_log_of_px4(tmp_path, topics):
         (b"FMT, 128, 89, FMT, BBnNZ, Type\n", "a log of ArduPilot; export"),
         (b"#BESTPOSA,COM1,0,9.5,FINE,1,2,0,0,0;SOL_COMPUTED,1,2*1\n", "neither INSPVA"),
         (b"header {\n  stamp {\n", "messages as text; record"),
-        (b"3.04           OBSERVATION DATA    RINEX VERSION / TYPE\n", "positions with RTKLIB"),
+        (
+            b"3.04           OBSERVATION DATA    RINEX VERSION / TYPE\n",
+            "positions with RTKLIB",
+        ),
         (b"SQLite format 3\0", "a bag must end in .db3"),
-        (b"# Frame list\n#   FRAME_ID, RIG_ID, RIG_FROM_WORLD\n1 1 1 0 0 0 0 0\n", "images.txt"),
-        (b"# Cameras\n# Number\n#   CAMERA_ID, MODEL, WIDTH\n1 PINHOLE 9\n", "images.txt"),
-        (b"ply\nformat ascii 1.0\nelement vertex 1\n", "points, no trajectory; record the odom"),
-        (b"# .PCD v0.7\nFIELDS x y z\nSIZE 4\nDATA ascii\n1 2 3\n", "points, no trajectory"),
+        (
+            b"# Frame list\n#   FRAME_ID, RIG_ID, RIG_FROM_WORLD\n1 1 1 0 0 0 0 0\n",
+            "images.txt",
+        ),
+        (
+            b"# Cameras\n# Number\n#   CAMERA_ID, MODEL, WIDTH\n1 PINHOLE 9\n",
+            "images.txt",
+        ),
+        (
+            b"ply\nformat ascii 1.0\nelement vertex 1\n",
+            "points, no trajectory; record the odom",
+        ),
+        (
+            b"# .PCD v0.7\nFIELDS x y z\nSIZE 4\nDATA ascii\n1 2 3\n",
+            "points, no trajectory",
+        ),
         (b"header:\n  stamp:\n    sec: 1\n", "YAML without a trajectory; record"),
         (of_echo("a,b,c").encode(), "--csv without poses"),
         (b"$GPRMC,123519,A,,,,,,,230394,,*6A\n", "expected GGA sentences with a fix"),
-        (re.sub(r"\*..", "", of_nmea()).replace("RMC", "ZDA").encode(), "the date in RMC"),
-        (b"%  GPST  latitude(d'\") longitude(d'\")\n1 2 3\n", "set out-solformat to llh, degrees"),
+        (
+            re.sub(r"\*..", "", of_nmea()).replace("RMC", "ZDA").encode(),
+            "the date in RMC",
+        ),
+        (
+            b"%  GPST  latitude(d'\") longitude(d'\")\n1 2 3\n",
+            "set out-solformat to llh, degrees",
+        ),
         (of_motive().replace("X,Y,Z,W", "X,Y,Z,").encode(), "rotation type Quaternion"),
-        (b"Trajectories\n100\n,,a:b\nFrame,Sub Frame,X,Y,Z\n,,mm,mm,mm\n", "not markers"),
+        (
+            b"Trajectories\n100\n,,a:b\nFrame,Sub Frame,X,Y,Z\n,,mm,mm,mm\n",
+            "not markers",
+        ),
         (b'{"frames":' * 100_000, "JSON of an unsupported kind"),
         (b"Format Version,1\nTime (Seconds)\n", "Motive|list index"),
     ],
@@ -396,14 +519,20 @@ def test_poses_of_an_ins_turn_with_the_heading(tmp_path, is_short):
     trajectory = read_trajectory_file(tmp_path / "log", AUTO).trajectory
     np.testing.assert_allclose(trajectory.stamps_ns, STAMPS, atol=1_000_000)
     np.testing.assert_allclose(trajectory.poses[:, :3, 3], P - P[0], atol=1e-4)
-    np.testing.assert_allclose(trajectory.poses[:, :3, :3], TRUTH.poses[:, :3, :3], atol=1e-4)
+    np.testing.assert_allclose(
+        trajectory.poses[:, :3, :3], TRUTH.poses[:, :3, :3], atol=1e-4
+    )
 
 
 def test_of_several_bodies_one_is_named(tmp_path):
     (tmp_path / "vicon.csv").write_text(of_vicon(bodies=("drone:drone", "cart:cart")))
-    with pytest.raises(InputError, match="several segments: drone:drone, cart:cart; name one"):
+    with pytest.raises(
+        InputError, match="several segments: drone:drone, cart:cart; name one"
+    ):
         read_trajectory_file(tmp_path / "vicon.csv", AUTO)
-    trajectory = read_trajectory_file(tmp_path / "vicon.csv", AUTO, columns="cart:cart").trajectory
+    trajectory = read_trajectory_file(
+        tmp_path / "vicon.csv", AUTO, columns="cart:cart"
+    ).trajectory
     np.testing.assert_allclose(trajectory.poses[:, :3, 3], 2 * P, atol=1e-9)
 
 
@@ -412,7 +541,9 @@ def test_a_take_of_many_markers_needs_memory_for_its_poses_alone(tmp_path):
     lines = of_motive().splitlines()
     markers = ",".join(["0.123456"] * 300)
     path = tmp_path / "take.csv"
-    path.write_text("\n".join([*lines, *(f"{lines[-1]},{markers}" for _ in range(3_000))]))
+    path.write_text(
+        "\n".join([*lines, *(f"{lines[-1]},{markers}" for _ in range(3_000))])
+    )
     size = path.stat().st_size
     tracemalloc.start()
     try:

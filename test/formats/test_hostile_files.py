@@ -35,7 +35,10 @@ def one_line(error):
 
 
 HOSTILE_YAML = {
-    "aliases": ("a: &a [x]\nb: *a", "aliases are not supported: write the value of 'a'"),
+    "aliases": (
+        "a: &a [x]\nb: *a",
+        "aliases are not supported: write the value of 'a'",
+    ),
     "deep flow": ("[" * 100_000, "nest"),
     "deep blocks": ("\n".join(" " * k + "a:" for k in range(500)), "nested more than"),
     "long integer": ("n: " + "9" * 5000, "is not readable YAML"),
@@ -60,7 +63,9 @@ def test_yaml_that_is_hostile_is_refused_in_one_line(run, tmp_path, kind):
     path = tmp_path / "file.yaml"
     path.write_text(text)
     is_result = kind == "aliases"
-    code, out, err = run(*(["info", path] if is_result else ["replay", ".", "--config", path]))
+    code, out, err = run(
+        *(["info", path] if is_result else ["replay", ".", "--config", path])
+    )
     assert (code in (1, 2), out) == (True, "")
     (line,) = err.splitlines()
     assert message in line
@@ -98,7 +103,10 @@ def saved(tmp_path_factory):
         {"covariance_allowance": {"matrix": [[None] * 6] * 6}},
         {"covariance": {"matrix": [[1e18, *[0.0] * 5], *[[0.0] * 6] * 5]}},
         {"covariance": {"matrix": [[0.0, 5.0, *[0.0] * 4], *[[0.0] * 6] * 5]}},
-        *({"cross_check": {"x": SCATTER | {"of_halves": value}}} for value in (INF, NAN)),
+        *(
+            {"cross_check": {"x": SCATTER | {"of_halves": value}}}
+            for value in (INF, NAN)
+        ),
         {"observability": AXES[::-1]},
         {"observability": [AXES[0] | {"name": "up"}, *AXES[1:]]},
         {"observability": [AXES[0] | {"sigma": NAN}, *AXES[1:]]},
@@ -110,7 +118,10 @@ def test_altered_results_are_refused_or_shown(run, tmp_path, saved, change):
     if "consistency" in change:  # the older name
         del document["cross_check"]
     (tmp_path / "extrinsic.yaml").write_text(yaml.safe_dump(document | change))
-    for command in (["info", tmp_path], ["compare", saved, "--with", tmp_path, "--json"]):
+    for command in (
+        ["info", tmp_path],
+        ["compare", saved, "--with", tmp_path, "--json"],
+    ):
         code, out, err = run(*command)
         assert code in (0, 1, 3)
         assert (code == 1) == (len(err.splitlines()) == 1 and not out)
@@ -126,7 +137,9 @@ def test_a_name_that_is_too_long_for_a_file_is_one_line(run, tmp_path, command):
     assert len(err) < 200
 
 
-@pytest.mark.parametrize("state", ["5", "[" * 100_000, '{"key": 1}\n{}', '{"key": "K"}\n{}'])
+@pytest.mark.parametrize(
+    "state", ["5", "[" * 100_000, '{"key": 1}\n{}', '{"key": "K"}\n{}']
+)
 def test_a_damaged_state_of_a_batch_is_done_again(tmp_path, state):
     task = Task(name="a", bags=("absent",))
     (tmp_path / "a").mkdir()
@@ -145,7 +158,9 @@ def test_a_pipe_is_refused_rather_than_waited_for(tmp_path):
         load_result(path)
 
 
-def test_a_pose_takes_little_more_memory_than_its_line_and_its_matrix_and_few_blocks(tmp_path):
+def test_a_pose_takes_little_more_memory_than_its_line_and_its_matrix_and_few_blocks(
+    tmp_path,
+):
     both = motions.noisy_pair(motions.wandering_poses(5_000), 0, 1e-3, 1e-3)
     write_trajectory(tmp_path / "poses.tum", both[0])
     tracemalloc.start()
@@ -199,13 +214,17 @@ def test_a_pose_out_of_this_world_is_named(tmp_path, format, row, value):
     lines = ["t,x,y,z,qx,qy,qz,qw"] if format == "csv" else []
     of_one = {True: "1", False: "0.7071067811865476"}["{x}" in row or format == "kitti"]
     for t in range(1, 9):
-        lines.append(row.format(t=t, x=value if t == 3 else t, w=value if t == 3 else of_one))
+        lines.append(
+            row.format(t=t, x=value if t == 3 else t, w=value if t == 3 else of_one)
+        )
     path = tmp_path / "parent"
     times = tmp_path / "times"
     path.write_text("\n".join(lines))
     times.write_text("\n".join(map(str, range(1, 9))))
     options = {"times": times} if format == "kitti" else {}
-    with pytest.raises(InputError, match=f"parent, line {3 + (format == 'csv')}: ") as caught:
+    with pytest.raises(
+        InputError, match=f"parent, line {3 + (format == 'csv')}: "
+    ) as caught:
         motions.read_trajectory_file(path, format, **options)
     one_line(caught)
 
@@ -215,11 +234,18 @@ def calibrate(run, tmp_path):
     """Runs calibrate into the folder ``out``."""
     files = motions.write_pair(tmp_path, PARENT, CHILD)
     (tmp_path / "out").mkdir()
-    return lambda: run("calibrate", *files, "--method", "park", "--out", tmp_path / "out")[0]
+    return lambda: run(
+        "calibrate", *files, "--method", "park", "--out", tmp_path / "out"
+    )[0]
 
 
 def test_links_are_replaced_and_not_followed(calibrate, tmp_path, no_figures):
-    names = ("extrinsic.yaml", "extrinsic.urdf.xacro", "static_transform.launch.py", "report.html")
+    names = (
+        "extrinsic.yaml",
+        "extrinsic.urdf.xacro",
+        "static_transform.launch.py",
+        "report.html",
+    )
     for name in names:
         (tmp_path / f"mine_{name}").write_text("mine")
         (tmp_path / "out" / name).symlink_to(tmp_path / f"mine_{name}")
@@ -231,13 +257,22 @@ def test_links_are_replaced_and_not_followed(calibrate, tmp_path, no_figures):
     assert {path.name for path in (tmp_path / "out").iterdir()} == {*names, "previous"}
 
 
-def test_files_of_somebody_else_are_kept_however_often_results_are_written(calibrate, tmp_path):
-    names = ("extrinsic.yaml", "extrinsic.urdf.xacro", "static_transform.launch.py", "report.html")
+def test_files_of_somebody_else_are_kept_however_often_results_are_written(
+    calibrate, tmp_path
+):
+    names = (
+        "extrinsic.yaml",
+        "extrinsic.urdf.xacro",
+        "static_transform.launch.py",
+        "report.html",
+    )
     for name in names:
         (tmp_path / "out" / name).write_text(f"my own {name}")
     for _ in range(3):
         assert calibrate() == 0
-    contents = [path.read_text() for path in (tmp_path / "out").rglob("*") if path.is_file()]
+    contents = [
+        path.read_text() for path in (tmp_path / "out").rglob("*") if path.is_file()
+    ]
     for name in names:
         assert contents.count(f"my own {name}") == 1
         assert "hand_eye_calib" in (tmp_path / "out" / name).read_text()
@@ -248,12 +283,25 @@ def test_a_result_that_is_saved_from_python_keeps_files_of_somebody_else(tmp_pat
     (tmp_path / "static_transform.launch.py").write_text("my launch file")
     for _ in range(2):
         save_result(calibration(), tmp_path)
-    assert (tmp_path / "static_transform.launch.py.kept").read_text() == "my launch file"
+    assert (
+        tmp_path / "static_transform.launch.py.kept"
+    ).read_text() == "my launch file"
     assert not (tmp_path / "static_transform.launch.py.kept2").exists()
 
 
 @pytest.mark.parametrize(
-    "frame", ["a--->b", "---", "-->", "a\x1b[2Jb", "a\nb", "a\x00b", "<&>\"'", "$(arg x)", "\u2028"]
+    "frame",
+    [
+        "a--->b",
+        "---",
+        "-->",
+        "a\x1b[2Jb",
+        "a\nb",
+        "a\x00b",
+        "<&>\"'",
+        "$(arg x)",
+        "\u2028",
+    ],
 )
 def test_saved_files_are_well_formed_for_any_name_of_a_frame(tmp_path, frame):
     save_result(calibration(parent_frame=frame, child_frame=frame + "x"), tmp_path)
@@ -267,10 +315,14 @@ def test_saved_files_are_well_formed_for_any_name_of_a_frame(tmp_path, frame):
     assert load_result(tmp_path).parent_frame == frame
 
 
-@pytest.mark.parametrize("number", ["0x" + "f" * 5000, "1" * 5000, "0b" + "1" * 5000, "9" * 20])
+@pytest.mark.parametrize(
+    "number", ["0x" + "f" * 5000, "1" * 5000, "0b" + "1" * 5000, "9" * 20]
+)
 def test_whole_numbers_of_yaml_are_of_64_bits(tmp_path, number):
     path = tmp_path / "config.yaml"
     path.write_text(f"# options\nmax_pairs: {number}\n")
-    with pytest.raises(InputError, match="config.yaml is not readable YAML: .*line 2") as caught:
+    with pytest.raises(
+        InputError, match="config.yaml is not readable YAML: .*line 2"
+    ) as caught:
         read_yaml(path)
     one_line(caught)

@@ -29,7 +29,9 @@ def killed_recording(folder, journal_mode, kept_in_file):
     database.execute("VACUUM")
     database.execute(f"PRAGMA journal_mode={journal_mode}")
     database.execute("PRAGMA wal_autocheckpoint=0")
-    if journal_mode == "DELETE":  # in the middle of a transaction that has reached the disk
+    if (
+        journal_mode == "DELETE"
+    ):  # in the middle of a transaction that has reached the disk
         database.execute("PRAGMA cache_size=1")
         database.execute("BEGIN")
     else:
@@ -37,7 +39,9 @@ def killed_recording(folder, journal_mode, kept_in_file):
     for row in rows:
         marks = ", ".join("?" * len(row))
         if journal_mode == "DELETE":
-            database.execute("UPDATE messages SET data = zeroblob(60000) WHERE id = ?", row[:1])
+            database.execute(
+                "UPDATE messages SET data = zeroblob(60000) WHERE id = ?", row[:1]
+            )
         else:
             database.execute(f"INSERT INTO messages VALUES ({marks})", row)
     killed = folder / "killed"
@@ -52,14 +56,19 @@ def killed_recording(folder, journal_mode, kept_in_file):
 def state_of(folder):
     """Return name, content and time of every file."""
     return {
-        path.name: (hashlib.sha256(path.read_bytes()).hexdigest(), path.stat().st_mtime_ns)
+        path.name: (
+            hashlib.sha256(path.read_bytes()).hexdigest(),
+            path.stat().st_mtime_ns,
+        )
         for path in folder.iterdir()
     }
 
 
 @pytest.mark.parametrize("kept_in_file", [40, 0])
 @pytest.mark.parametrize("as_file", [True, False])
-def test_messages_in_the_wal_of_a_killed_recorder_are_read(tmp_path, kept_in_file, as_file):
+def test_messages_in_the_wal_of_a_killed_recorder_are_read(
+    tmp_path, kept_in_file, as_file
+):
     killed = killed_recording(tmp_path, "WAL", kept_in_file)
     assert [path.name[-4:] for path in sorted(killed.iterdir())] == [".db3", "-wal"]
     before = state_of(killed)
@@ -101,7 +110,9 @@ def test_no_room_for_the_copy_is_said_in_a_line(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(shutil, "copyfile", full)
-    with pytest.raises(InputError, match=r"newest messages are in .*-wal.*No space.*set TMPDIR"):
+    with pytest.raises(
+        InputError, match=r"newest messages are in .*-wal.*No space.*set TMPDIR"
+    ):
         PoseBag(killed)
 
 
@@ -136,9 +147,14 @@ def split_bag(folder, storage, with_counts, prefix=""):
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 @pytest.mark.parametrize(
     ("with_counts", "prefix", "lost"),
-    [(True, "", "120 of 360 messages (33%)"), (False, "split/", "240 of 480 messages (50%)")],
+    [
+        (True, "", "120 of 360 messages (33%)"),
+        (False, "split/", "240 of 480 messages (50%)"),
+    ],
 )
-def test_a_missing_split_is_named_with_its_share(tmp_path, storage, with_counts, prefix, lost):
+def test_a_missing_split_is_named_with_its_share(
+    tmp_path, storage, with_counts, prefix, lost
+):
     path, missing = split_bag(tmp_path, storage, with_counts, prefix)
     with PoseBag(path) as bag:
         n_poses = len(bag.poses("/a", "/b"))
@@ -153,7 +169,9 @@ def test_a_missing_split_is_named_with_its_share(tmp_path, storage, with_counts,
 def test_a_bag_of_which_only_the_metadata_was_copied_names_its_files(tmp_path):
     path, _ = split_bag(tmp_path, "mcap", with_counts=True)
     storage_file(path).unlink()
-    with pytest.raises(InputError, match=r"lists split\.mcap and split_1\.mcap, and no such file"):
+    with pytest.raises(
+        InputError, match=r"lists split\.mcap and split_1\.mcap, and no such file"
+    ):
         PoseBag(path)
 
 

@@ -50,7 +50,9 @@ def resumed(directory, limits=None):
 
 @pytest.mark.parametrize("n_poses", [60, 600])
 def test_a_resumed_session_is_the_session(tmp_path, n_poses):
-    limits = BufferLimits(capacity=400, pairing_starts=200)  # pairs are made of 600 poses
+    limits = BufferLimits(
+        capacity=400, pairing_starts=200
+    )  # pairs are made of 600 poses
     calibrator = Calibrator(CONFIG, limits)
     writer = JournalWriter(tmp_path / "journal", BOTH)
     calibrator.set_frame("parent", "lidar")
@@ -63,11 +65,15 @@ def test_a_resumed_session_is_the_session(tmp_path, n_poses):
     assert again.statistics("child") == calibrator.statistics("child")
     for name, value in vars(calibrator.snapshot().pose_pairs).items():
         np.testing.assert_array_equal(vars(again.snapshot().pose_pairs)[name], value)
-    assert np.array_equal(again.estimate().T_parent_child, calibrator.estimate().T_parent_child)
+    assert np.array_equal(
+        again.estimate().T_parent_child, calibrator.estimate().T_parent_child
+    )
 
 
 def test_its_files_are_trajectories_that_every_program_reads(tmp_path):
-    writer = JournalWriter(tmp_path, {"parent": {"topic": "/lidar"}, "child": {"topic": "/camera"}})
+    writer = JournalWriter(
+        tmp_path, {"parent": {"topic": "/lidar"}, "child": {"topic": "/camera"}}
+    )
     calibrator = Calibrator(CONFIG)
     record(writer, calibrator, messages())
     writer.close()
@@ -103,12 +109,16 @@ def test_a_session_goes_on_after_the_last_whole_line(tmp_path):
     writer.close()
     with (tmp_path / "child.tum").open("a") as file:
         file.write("1.5000")
-    writer = JournalWriter(tmp_path, BOTH | {"child2": {}}, resumed=read_journal(tmp_path))
+    writer = JournalWriter(
+        tmp_path, BOTH | {"child2": {}}, resumed=read_journal(tmp_path)
+    )
     record(writer, calibrator, sequence[60:])
     writer.close()
     again, journal = resumed(tmp_path)
     assert journal.whole_bytes["child"] == (tmp_path / "child.tum").stat().st_size
-    assert np.array_equal(again.estimate().T_parent_child, calibrator.estimate().T_parent_child)
+    assert np.array_equal(
+        again.estimate().T_parent_child, calibrator.estimate().T_parent_child
+    )
 
 
 def test_whatever_byte_the_file_ends_at_the_whole_lines_before_it_are_read(tmp_path):
@@ -123,7 +133,9 @@ def test_whatever_byte_the_file_ends_at_the_whole_lines_before_it_are_read(tmp_p
         journal = read_journal(tmp_path)
         whole = max(offset for offset in ends if offset <= end)
         assert journal.whole_bytes["child"] == whole
-        expected = [line for line in data[:whole].splitlines() if not line.startswith(b"#")]
+        expected = [
+            line for line in data[:whole].splitlines() if not line.startswith(b"#")
+        ]
         assert (journal.streams == "child").sum() == len(expected)
 
 
@@ -147,7 +159,9 @@ def test_a_pose_that_the_engine_refuses_is_one_line(tmp_path):
     writer = JournalWriter(tmp_path, BOTH)
     writer.add_pose("parent", 1, (np.nan, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     writer.close()
-    with pytest.raises(InputError, match=r"cannot use the session journal .*not finite"):
+    with pytest.raises(
+        InputError, match=r"cannot use the session journal .*not finite"
+    ):
         resumed(tmp_path)
 
 
@@ -206,7 +220,9 @@ MINE = "0.0 1.0 2.0 3.0 0.0 0.0 0.0 1.0\n"
 def test_a_journal_empties_no_file_of_somebody_else(tmp_path, stream):
     mine = tmp_path / f"{stream}.tum"
     mine.write_text(MINE)
-    with pytest.raises(OSError, match=f"{stream}.tum is no session journal; move it away"):
+    with pytest.raises(
+        OSError, match=f"{stream}.tum is no session journal; move it away"
+    ):
         JournalWriter(tmp_path, BOTH)
     assert mine.read_text() == MINE
 

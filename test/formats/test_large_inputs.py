@@ -54,12 +54,20 @@ def array_file(header):
     ("content", "reason"),
     [
         (b"no array", "magic string"),
-        (array_file("{'descr': '<f8', 'fortran_order': False, 'shape': (10**12,)}"), "ormed"),
         (
-            array_file("{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,)}"),
+            array_file("{'descr': '<f8', 'fortran_order': False, 'shape': (10**12,)}"),
+            "ormed",
+        ),
+        (
+            array_file(
+                "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,)}"
+            ),
             "truncated",
         ),
-        (array_file("{'descr': '|O', 'fortran_order': False, 'shape': (1,)}"), "truncated|pickle"),
+        (
+            array_file("{'descr': '|O', 'fortran_order': False, 'shape': (1,)}"),
+            "truncated|pickle",
+        ),
         (b"\x93NUMPY\x09\x00", "version"),
         (b"", "magic|EOF"),
     ],
@@ -68,7 +76,9 @@ def test_what_is_no_array_gives_one_line(tmp_path, content, reason):
     path = tmp_path / "stops.npz"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("robot.npy", content)
-    with pytest.raises(InputError, match=f"cannot read .*stops.npz: .*({reason})") as caught:
+    with pytest.raises(
+        InputError, match=f"cannot read .*stops.npz: .*({reason})"
+    ) as caught:
         read_arrays(path)
     assert "\n" not in str(caught.value)
 
@@ -78,7 +88,10 @@ def png(width, height):
 
     def chunk(kind, data):
         return (
-            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+            struct.pack(">I", len(data))
+            + kind
+            + data
+            + struct.pack(">I", zlib.crc32(kind + data))
         )
 
     packer = zlib.compressobj()
@@ -96,7 +109,13 @@ def test_an_image_of_too_many_pixels_is_refused(tmp_path):
     (tmp_path / "small.png").write_bytes(png(30, 20))
     (tmp_path / "large.png").write_bytes(png(20_000, 10_000))
     # In a process of its own: OpenCV reads its limit when it is imported.
-    command = [sys.executable, "-c", READ_IMAGES, tmp_path / "small.png", tmp_path / "large.png"]
+    command = [
+        sys.executable,
+        "-c",
+        READ_IMAGES,
+        tmp_path / "small.png",
+        tmp_path / "large.png",
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     small, large = done.stdout.splitlines()
     assert small == "(20, 30)"
@@ -125,9 +144,13 @@ def test_compressed_points_are_refused_with_the_command_that_unpacks_them(tmp_pa
     path = tmp_path / "transformations.pcd"
     names = "x y z intensity roll pitch yaw time"
     head = f"# .PCD v0.7\nVERSION 0.7\nFIELDS {names}\nSIZE 4 4 4 4 4 4 4 8\nTYPE F F F F F F F F\n"
-    head += "COUNT 1 1 1 1 1 1 1 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA binary_compressed\n"
+    head += (
+        "COUNT 1 1 1 1 1 1 1 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA binary_compressed\n"
+    )
     path.write_bytes(head.encode() + bytes(range(80)))
-    with pytest.raises(InputError, match="compressed; unpack them: pcl_convert_pcd_ascii_binary"):
+    with pytest.raises(
+        InputError, match="compressed; unpack them: pcl_convert_pcd_ascii_binary"
+    ):
         read_trajectory(path)
 
 

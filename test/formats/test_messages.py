@@ -40,11 +40,20 @@ def message_of(typestore, message_type, stamp_ns, world, sensor, values):
     with_covariance = make("PoseWithCovariance", pose, covariance)
     twist = make("Twist", make("Vector3", *zero), make("Vector3", *zero))
     parts = {
-        ODOMETRY: (sensor, with_covariance, make("TwistWithCovariance", twist, covariance)),
-        TRANSFORM: (sensor, make("Transform", make("Vector3", *values[:3]), quaternion)),
+        ODOMETRY: (
+            sensor,
+            with_covariance,
+            make("TwistWithCovariance", twist, covariance),
+        ),
+        TRANSFORM: (
+            sensor,
+            make("Transform", make("Vector3", *values[:3]), quaternion),
+        ),
         POSE_STAMPED: (pose,),
     }
-    return typestore.types[message_type](head, *parts.get(message_type, (with_covariance,)))
+    return typestore.types[message_type](
+        head, *parts.get(message_type, (with_covariance,))
+    )
 
 
 def serialized(encoding, message_type, make):
@@ -55,7 +64,9 @@ def serialized(encoding, message_type, make):
 
 
 def encoded(encoding, message_type, pose):
-    return serialized(encoding, message_type, lambda types: message_of(types, message_type, *pose))
+    return serialized(
+        encoding, message_type, lambda types: message_of(types, message_type, *pose)
+    )
 
 
 def assert_unpacked(columns, drawn, message_type):
@@ -63,25 +74,39 @@ def assert_unpacked(columns, drawn, message_type):
     assert columns.stamps_ns.tolist() == [stamp_ns for stamp_ns, _, _, _ in drawn]
     worlds = [printable(world.lstrip("/")) for _, world, _, _ in drawn]
     assert columns.world_frames.tolist() == worlds
-    sensors = [printable(sensor.lstrip("/")) if has_frame else None for _, _, sensor, _ in drawn]
+    sensors = [
+        printable(sensor.lstrip("/")) if has_frame else None
+        for _, _, sensor, _ in drawn
+    ]
     assert columns.sensor_frames.tolist() == sensors
     np.testing.assert_array_equal(columns.poses, [values for _, _, _, values in drawn])
 
 
 # Of few frames, so that many messages are alike.
-alike = st.tuples(stamps_ns, st.sampled_from(["a", "bc", "de"]), st.sampled_from("st"), numbers)
+alike = st.tuples(
+    stamps_ns, st.sampled_from(["a", "bc", "de"]), st.sampled_from("st"), numbers
+)
 
 
 @pytest.mark.parametrize("message_type", POSE_TYPES)
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @settings(max_examples=30)
-@given(drawn=st.lists(alike, min_size=1, max_size=8) | st.lists(poses, min_size=1, max_size=2))
-def test_poses_at_once_whether_their_frames_are_alike_or_not(encoding, message_type, drawn):
+@given(
+    drawn=st.lists(alike, min_size=1, max_size=8)
+    | st.lists(poses, min_size=1, max_size=2)
+)
+def test_poses_at_once_whether_their_frames_are_alike_or_not(
+    encoding, message_type, drawn
+):
     """The length of the frames' names shifts what follows: alignment is where readers go wrong."""
     messages = [encoded(encoding, message_type, pose)[0] for pose in drawn]
     if encoding == "ros1":  # its sequence numbers differ
-        messages = [k.to_bytes(4, "little") + data[4:] for k, data in enumerate(messages)]
-    assert_unpacked(unpack_poses(messages, message_type, encoding == "ros1"), drawn, message_type)
+        messages = [
+            k.to_bytes(4, "little") + data[4:] for k, data in enumerate(messages)
+        ]
+    assert_unpacked(
+        unpack_poses(messages, message_type, encoding == "ros1"), drawn, message_type
+    )
     if encoding == "cdr":  # one by one, as the node does
         read = unpacking.MessageReader(message_type, "poses")
         stamps, worlds, sensors, *values = zip(*map(read, messages), strict=True)
@@ -116,7 +141,9 @@ def test_transforms_lose_the_leading_slash_of_old_frames(encoding, drawn):
     kind = MessageKind("/tf", TF, encoding, ("MSG", TF_DEFINITION))
     data, _ = serialized(encoding, TF, make)
     transforms = Run(kind, [data], np.zeros(1)).transforms()
-    for (_, fields), (stamp_ns, world, sensor, values) in zip(transforms, drawn, strict=True):
+    for (_, fields), (stamp_ns, world, sensor, values) in zip(
+        transforms, drawn, strict=True
+    ):
         frames = printable(world).lstrip("/"), printable(sensor).lstrip("/")
         assert fields[:3] == (stamp_ns, *frames)
         np.testing.assert_array_equal([*fields.position, *fields.quat_xyzw], values)

@@ -82,7 +82,9 @@ def from_the_centre(stream):
 
 
 def mirrored_about_the_vertical(stream):
-    return with_poses(stream, stream.poses[:, :3, :3], stream.poses[:, :3, 3] * [-1.0, -1.0, 1.0])
+    return with_poses(
+        stream, stream.poses[:, :3, :3], stream.poses[:, :3, 3] * [-1.0, -1.0, 1.0]
+    )
 
 
 MISREAD = {
@@ -138,11 +140,15 @@ def read(path):
 
 @pytest.mark.parametrize("by_columns", [False, True])
 @pytest.mark.parametrize("path", PATHS)
-def test_rotations_before_translations_are_read_by_rows_or_by_columns(tmp_path, by_columns, path):
+def test_rotations_before_translations_are_read_by_rows_or_by_columns(
+    tmp_path, by_columns, path
+):
     truth = as_trajectory(PATHS[path]() @ T_PARENT_CHILD)
     rotations = truth.poses[:, :3, :3]
     written = np.swapaxes(rotations, 1, 2) if by_columns else rotations
-    rows = np.c_[truth.stamps_ns / 1e9, written.reshape(-1, 9), truth.poses[:, :3, 3]].tolist()
+    rows = np.c_[
+        truth.stamps_ns / 1e9, written.reshape(-1, 9), truth.poses[:, :3, 3]
+    ].tolist()
     file = tmp_path / "poses.txt"
     file.write_text("\n".join(" ".join(map(repr, row)) for row in rows))
     trajectory, guesses = read(file)
@@ -152,7 +158,9 @@ def test_rotations_before_translations_are_read_by_rows_or_by_columns(tmp_path, 
     assert f"read {order}" in guesses
     expected = rotations if is_by_columns or not by_columns else written
     np.testing.assert_allclose(trajectory.poses[:, :3, :3], expected, atol=1e-9)
-    np.testing.assert_allclose(trajectory.poses[:, :3, 3], truth.poses[:, :3, 3], atol=1e-9)
+    np.testing.assert_allclose(
+        trajectory.poses[:, :3, 3], truth.poses[:, :3, 3], atol=1e-9
+    )
 
 
 FRAMES = {

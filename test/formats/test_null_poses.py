@@ -110,24 +110,45 @@ def test_null_poses_of_a_bag_are_left_out_and_counted(tmp_path, storage, kind, n
 
 
 def test_many_null_poses_ask_for_another_recording(tmp_path):
-    path = bag_of(tmp_path / "bag", "mcap", ODOMETRY, spoiled(CHILD, NULLS["all zero"], MANY))
+    path = bag_of(
+        tmp_path / "bag", "mcap", ODOMETRY, spoiled(CHILD, NULLS["all zero"], MANY)
+    )
     _, _, (warning,) = read(path, "/b")
     assert warning.startswith("/b: 40 of 200 poses (20%) were left out: ")
     assert warning.endswith("check whether the source loses track, and record again")
 
 
-def test_the_result_with_null_poses_is_the_truth_and_says_their_number(tmp_path, capsys):
-    path = bag_of(tmp_path / "bag", "sqlite3", POSE_STAMPED, spoiled(CHILD, NULLS["a NaN"], FEW))
-    options = ["--parent-topic", "/a", "--child-topic", "/b", "--reference", "B5", "--json"]
+def test_the_result_with_null_poses_is_the_truth_and_says_their_number(
+    tmp_path, capsys
+):
+    path = bag_of(
+        tmp_path / "bag", "sqlite3", POSE_STAMPED, spoiled(CHILD, NULLS["a NaN"], FEW)
+    )
+    options = [
+        "--parent-topic",
+        "/a",
+        "--child-topic",
+        "/b",
+        "--reference",
+        "B5",
+        "--json",
+    ]
     main(["calibrate", str(path), *options])
     document = json.loads(capsys.readouterr().out)
     assert [text for text in document["warnings"] if "6 of 200 poses (3.0%)" in text]
-    np.testing.assert_allclose(document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6)
+    np.testing.assert_allclose(
+        document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6
+    )
 
 
 def test_a_quaternion_that_is_neither_unit_nor_zero_is_still_refused(tmp_path, capsys):
-    path = bag_of(tmp_path / "bag", "mcap", ODOMETRY, spoiled(CHILD, [0, 0, 0, 0, 0, 0, 0.5], FEW))
-    assert main(["calibrate", str(path), "--parent-topic", "/a", "--child-topic", "/b"]) == 1
+    path = bag_of(
+        tmp_path / "bag", "mcap", ODOMETRY, spoiled(CHILD, [0, 0, 0, 0, 0, 0, 0.5], FEW)
+    )
+    assert (
+        main(["calibrate", str(path), "--parent-topic", "/a", "--child-topic", "/b"])
+        == 1
+    )
     assert "quaternion of length 0.5, expected 1" in capsys.readouterr().err
 
 
@@ -144,11 +165,15 @@ def test_null_poses_of_a_path_are_left_out(tmp_path):
         trajectory, _ = bag.trajectory("/path")
         warnings = bag.warnings
     assert trajectory.stamps_ns.tolist() == np.delete(STAMPS_NS, FEW).tolist()
-    assert [text.partition(" were")[0] for text in warnings] == ["/path: 6 of 200 poses (3.0%)"]
+    assert [text.partition(" were")[0] for text in warnings] == [
+        "/path: 6 of 200 poses (3.0%)"
+    ]
 
 
 def test_null_poses_of_fields_are_left_out(tmp_path):
-    path = bag_of(tmp_path / "bag", "mcap", POSE_STAMPED, spoiled(CHILD, NULLS["all zero"], FEW))
+    path = bag_of(
+        tmp_path / "bag", "mcap", POSE_STAMPED, spoiled(CHILD, NULLS["all zero"], FEW)
+    )
     place = ",".join(f"{axis}=pose.position.{axis}" for axis in "xyz")
     turn = ",".join(f"q{axis}=pose.orientation.{axis}" for axis in "xyzw")
     stamps_ns, _, warnings = read(path, f"/b?t=header.stamp,{place},{turn}")
@@ -157,7 +182,12 @@ def test_null_poses_of_fields_are_left_out(tmp_path):
 
 
 def test_orientations_alone_without_a_quaternion_are_left_out(tmp_path):
-    path = bag_of(tmp_path / "bag", "mcap", ODOMETRY, spoiled(CHILD, NULLS["zero quaternion"], FEW))
+    path = bag_of(
+        tmp_path / "bag",
+        "mcap",
+        ODOMETRY,
+        spoiled(CHILD, NULLS["zero quaternion"], FEW),
+    )
     with PoseBag(path) as bag:
         rotations, _ = bag.trajectory("/b", "rotations")
     with PoseBag(path) as bag:
@@ -190,7 +220,9 @@ def live_input():
 @pytest.mark.parametrize(("indices", "level"), [(FEW, Level.OK), (MANY, Level.WARN)])
 def test_null_poses_of_a_live_input_are_counted_and_are_no_error(null, indices, level):
     pose_input, session, lines = live_input()
-    for stamp_ns, row in zip(STAMPS_NS.tolist(), spoiled(CHILD, null, indices), strict=True):
+    for stamp_ns, row in zip(
+        STAMPS_NS.tolist(), spoiled(CHILD, null, indices), strict=True
+    ):
         frame = "camera" if row[3:].any() else ""
         fields = PoseFields(stamp_ns, "odom", frame, row[:3].tolist(), row[3:].tolist())
         pose_input.accept(stamp_ns, lambda fields=fields: fields)
@@ -205,7 +237,9 @@ def test_null_poses_of_a_live_input_are_counted_and_are_no_error(null, indices, 
 
 def test_a_null_message_is_read_live_as_in_a_bag():
     reader = MessageReader(ODOMETRY, "poses")
-    message = pose_message(ODOMETRY, STAMPS_NS[0], NULLS["all zero"], "odom", "camera")(JAZZY)
+    message = pose_message(ODOMETRY, STAMPS_NS[0], NULLS["all zero"], "odom", "camera")(
+        JAZZY
+    )
     fields = reader(bytes(JAZZY.serialize_cdr(message, ODOMETRY)))
     assert fields.quat_xyzw == (0.0, 0.0, 0.0, 0.0)
     assert header(JAZZY, STAMPS_NS[0], "odom").frame_id == fields.world_frame
@@ -215,7 +249,9 @@ def test_a_live_stream_with_whole_seconds_says_so():
     pose_input, _, _ = live_input()
     for stamp_ns, row in zip(STAMPS_NS.tolist(), CHILD, strict=True):
         whole_ns = stamp_ns // 10**9 * 10**9
-        fields = PoseFields(whole_ns, "odom", "camera", row[:3].tolist(), row[3:].tolist())
+        fields = PoseFields(
+            whole_ns, "odom", "camera", row[:3].tolist(), row[3:].tolist()
+        )
         pose_input.accept(whole_ns, lambda fields=fields: fields)
     state = pose_input.state(pose_input._arrived_s, may_rest=False)
     later = pose_input.state(pose_input._arrived_s + 11.0, may_rest=True)

@@ -31,9 +31,12 @@ ARRAY = "geometry_msgs/msg/PoseArray"
 GEO = "geographic_msgs/msg/GeoPoseStamped"
 INS = "novatel_oem7_msgs/msg/INSPVA"
 GPS = "gps_msgs/msg/GPSFix"
-MARKER, BODY, BODIES = (f"mocap4r2_msgs/msg/{x}" for x in ("Marker", "RigidBody", "RigidBodies"))
+MARKER, BODY, BODIES = (
+    f"mocap4r2_msgs/msg/{x}" for x in ("Marker", "RigidBody", "RigidBodies")
+)
 NAMED, NAMED_ARRAY = (
-    f"motion_capture_tracking_interfaces/msg/{x}" for x in ("NamedPose", "NamedPoseArray")
+    f"motion_capture_tracking_interfaces/msg/{x}"
+    for x in ("NamedPose", "NamedPoseArray")
 )
 POINT = "geographic_msgs/msg/GeoPoint"
 POSE = "geographic_msgs/msg/GeoPose"
@@ -60,7 +63,9 @@ for name, fields in {
 
 
 def made(name, *values, **more):
-    return JAZZY.types[name if "/" in name else f"geometry_msgs/msg/{name}"](*values, **more)
+    return JAZZY.types[name if "/" in name else f"geometry_msgs/msg/{name}"](
+        *values, **more
+    )
 
 
 def messages():
@@ -71,7 +76,14 @@ def messages():
     status = made("sensor_msgs/msg/NavSatStatus", 0, 1)
     rpy = np.degrees(se3.rotation_to_rpy(TRUTH.poses[:, :3, :3]))
     px4 = [*zip(P.astype("f4"), np.roll(Q, 1, axis=1).astype("f4"), strict=True)]
-    types = {"/twist": TWIST, "/fix": FIX, "/imu": IMU, "/px4": PX4, "/array": ARRAY, "/geo": GEO}
+    types = {
+        "/twist": TWIST,
+        "/fix": FIX,
+        "/imu": IMU,
+        "/px4": PX4,
+        "/array": ARRAY,
+        "/geo": GEO,
+    }
     types |= {"/ins": INS, "/twists": f"{TWIST[:-7]}WithCovarianceStamped"}
     types |= {"/bodies": BODIES, "/named": NAMED_ARRAY, "/gps": GPS}
     written = {key: [] for key in types.items()}
@@ -81,7 +93,9 @@ def messages():
     for k, stamp_ns in enumerate(TRUTH.stamps_ns.tolist()):
         head = header(JAZZY, stamp_ns, "sensor")
         quaternion = made("Quaternion", *Q[k])
-        twist = made("Twist", made("Vector3", *twists[k, :3]), made("Vector3", *twists[k, 3:]))
+        twist = made(
+            "Twist", made("Vector3", *twists[k, :3]), made("Vector3", *twists[k, 3:])
+        )
         pose = made("Pose", made("Point", *P[k]), quaternion)
         point = made(POINT, lat[k], lon[k], height[k])
         fields = {
@@ -95,7 +109,15 @@ def messages():
             ARRAY: (head, [pose, pose]),
             GEO: (head, made(POSE, point, quaternion)),
             GPS: (head, lat[k], lon[k], height[k]),
-            INS: (head, lat[k], lon[k], height[k], rpy[k, 0], -rpy[k, 1], 90.0 - rpy[k, 2]),
+            INS: (
+                head,
+                lat[k],
+                lon[k],
+                height[k],
+                rpy[k, 0],
+                -rpy[k, 1],
+                90.0 - rpy[k, 2],
+            ),
         }
         for key in written:
             written[key].append(made(key[1], *fields[key[1]]))
@@ -109,7 +131,9 @@ def bag(tmp_path_factory):
     with writer:
         for (topic, type_), all_messages in messages().items():
             connection = writer.add_connection(topic, type_, typestore=JAZZY)
-            for stamp_ns, message in zip(TRUTH.stamps_ns.tolist(), all_messages, strict=True):
+            for stamp_ns, message in zip(
+                TRUTH.stamps_ns.tolist(), all_messages, strict=True
+            ):
                 writer.write(connection, stamp_ns, JAZZY.serialize_cdr(message, type_))
     return path
 
@@ -149,14 +173,18 @@ def test_the_poses_are_those_of_the_truth(bag, source, within):
     trajectory = read_bag_trajectory(bag, source)
     assert trajectory.measures == "poses"
     np.testing.assert_allclose(trajectory.stamps_ns, TRUTH.stamps_ns, atol=1000, rtol=0)
-    np.testing.assert_allclose(from_start(trajectory.poses), from_start(TRUTH.poses), atol=within)
+    np.testing.assert_allclose(
+        from_start(trajectory.poses), from_start(TRUTH.poses), atol=within
+    )
 
 
 def foxglove(kind, k):
     """A message of Foxglove's as plain values."""
     lat, lon, height = (float(column[k]) for column in GEODETIC)
     sec, nsec = divmod(int(TRUTH.stamps_ns[k]), 10**9)
-    place, turn = (dict(zip("xyzw", array[k].tolist(), strict=False)) for array in (P, Q))
+    place, turn = (
+        dict(zip("xyzw", array[k].tolist(), strict=False)) for array in (P, Q)
+    )
     pose = {"position": place, "orientation": turn}
     frames = {"parent_frame_id": "map", "child_frame_id": "base"}
     moving = {"timestamp": {"sec": sec, "nsec": nsec}} | frames
@@ -187,14 +215,18 @@ def in_json(path, kind, changed=(b"", b"")):
 
 def in_protobuf(path, kind):
     """The same in Foxglove's own protobuf schemas, by the writer of mcap-protobuf-support."""
-    writing = pytest.importorskip("mcap_protobuf.writer", reason="needs mcap-protobuf-support")
+    writing = pytest.importorskip(
+        "mcap_protobuf.writer", reason="needs mcap-protobuf-support"
+    )
     name = f"foxglove_schemas_protobuf.{kind}_pb2"
     schema = pytest.importorskip(name, reason="needs foxglove-schemas-protobuf")
     json_format = pytest.importorskip("google.protobuf.json_format")
     to_date = re.compile(r'\{"sec": (\d+), "nsec": (\d+)\}')
     with path.open("wb") as file, writing.Writer(file) as writer:
         for k, stamp_ns in enumerate(TRUTH.stamps_ns.tolist()):
-            date = datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%S")
+            date = datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime(
+                "%Y-%m-%dT%H:%M:%S"
+            )
             stamp = f'"{date}.{stamp_ns % 10**9:09d}Z"'
             text = to_date.sub(stamp, json.dumps(foxglove(kind, k)))
             message = json_format.Parse(text, getattr(schema, kind)())
@@ -203,13 +235,16 @@ def in_protobuf(path, kind):
 
 @pytest.mark.parametrize("write", [in_json, in_protobuf])
 @pytest.mark.parametrize(
-    "kind", ["PoseInFrame", "PosesInFrame", "FrameTransform", "FrameTransforms", "LocationFix"]
+    "kind",
+    ["PoseInFrame", "PosesInFrame", "FrameTransform", "FrameTransforms", "LocationFix"],
 )
 def test_messages_of_foxglove(tmp_path, kind, write):
     write(tmp_path / "poses.mcap", kind)
     source = "map:base" if kind == "FrameTransforms" else "/pose"
     with PoseBag(tmp_path / "poses.mcap") as bag:
-        trajectory, _ = bag.trajectory(TfSource.parse(source) if ":" in source else source)
+        trajectory, _ = bag.trajectory(
+            TfSource.parse(source) if ":" in source else source
+        )
         assert bag.topics["/pose"].type == f"foxglove.{kind}"
     assert (trajectory.stamps_ns == TRUTH.stamps_ns).all()
     if kind == "LocationFix":
@@ -222,35 +257,65 @@ def test_messages_of_foxglove(tmp_path, kind, write):
 def test_json_without_what_its_type_has_is_named(tmp_path):
     path = tmp_path / "poses.mcap"
     in_json(path, "FrameTransforms", (b"rotation", b"turn"))
-    with PoseBag(path) as bag, pytest.raises(InputError, match="/pose: a message of type foxglove"):
+    with (
+        PoseBag(path) as bag,
+        pytest.raises(InputError, match="/pose: a message of type foxglove"),
+    ):
         bag.trajectory(TfSource.parse("map:base"))
 
 
 def test_values_that_are_not_finite_are_left_out(tmp_path):
-    in_json(tmp_path / "poses.mcap", "PoseInFrame", (b'"x": -', b'"x": -Infinity, "X": '))
+    in_json(
+        tmp_path / "poses.mcap", "PoseInFrame", (b'"x": -', b'"x": -Infinity, "X": ')
+    )
     with PoseBag(tmp_path / "poses.mcap") as opened:
         trajectory, _ = opened.trajectory("/pose")
-        assert f"{len(P) - len(trajectory)} of {len(P)} poses (79%) were left" in opened.warnings[0]
-    assert (trajectory.stamps_ns == TRUTH.stamps_ns[(P[:, 0] >= 0) & (Q[:, 0] >= 0)]).all()
+        assert (
+            f"{len(P) - len(trajectory)} of {len(P)} poses (79%) were left"
+            in opened.warnings[0]
+        )
+    assert (
+        trajectory.stamps_ns == TRUTH.stamps_ns[(P[:, 0] >= 0) & (Q[:, 0] >= 0)]
+    ).all()
 
 
 def test_fields_of_a_place_are_positions(bag):
-    fields = "t=header.stamp,x=poses.0.position.x,y=poses.0.position.y,z=poses.0.position.z"
+    fields = (
+        "t=header.stamp,x=poses.0.position.x,y=poses.0.position.y,z=poses.0.position.z"
+    )
     for source in (f"/array?{fields}", "/gps"):
         trajectory = read_bag_trajectory(bag, source)
         assert trajectory.measures == "positions"
-        np.testing.assert_allclose(from_start(trajectory.poses)[:, :3, 3], P - P[0], atol=1e-5)
+        np.testing.assert_allclose(
+            from_start(trajectory.poses)[:, :3, 3], P - P[0], atol=1e-5
+        )
 
 
 @pytest.mark.parametrize(
     ("source", "error", "message"),
     [
         ("/fix+/nothing", InputError, "no topic /nothing in"),
-        ("/imu+/fix", ConfigError, "measure rates or rotations; asked for are positions"),
-        ("/array?t=header.stamp,x=pose.position.x,y=a,z=b", InputError, "has no pose.position.x"),
+        (
+            "/imu+/fix",
+            ConfigError,
+            "measure rates or rotations; asked for are positions",
+        ),
+        (
+            "/array?t=header.stamp,x=pose.position.x,y=a,z=b",
+            InputError,
+            "has no pose.position.x",
+        ),
         ("/array?t", ConfigError, "fields must be NAME=PATH"),
-        ("/array?t=header.stamp,x=header.frame_id,y=header,z=header", InputError, "float"),
-        ("/px4?x=position.0,y=position.1,z=position.2", InputError, "of its fields is a stamp"),
+        (
+            "/array?t=header.stamp,x=header.frame_id,y=header,z=header",
+            InputError,
+            "float",
+        ),
+        (
+            "/px4?x=position.0,y=position.1,z=position.2",
+            InputError,
+            "of its fields is a stamp",
+        ),
     ],
 )
 def test_what_cannot_be_read_is_told_in_one_sentence(bag, source, error, message):
@@ -260,9 +325,20 @@ def test_what_cannot_be_read_is_told_in_one_sentence(bag, source, error, message
 
 
 def test_calibrate_takes_fields_and_two_topics(bag, tmp_path, capsys):
-    command = ["calibrate", str(bag), "--parent-topic", "/fix+/imu", "--child-topic", "/array"]
-    fields = "t=header.stamp,x=poses.0.position.x,y=poses.0.position.y,z=poses.0.position.z"
-    assert main([*command, "--child-fields", fields, "--child-measures", "positions"]) in (0, 1, 3)
+    command = [
+        "calibrate",
+        str(bag),
+        "--parent-topic",
+        "/fix+/imu",
+        "--child-topic",
+        "/array",
+    ]
+    fields = (
+        "t=header.stamp,x=poses.0.position.x,y=poses.0.position.y,z=poses.0.position.z"
+    )
+    assert main(
+        [*command, "--child-fields", fields, "--child-measures", "positions"]
+    ) in (0, 1, 3)
     assert "Traceback" not in capsys.readouterr().err
     with PoseBag(bag) as opened:
         assert {"/twist", "/geo", "/px4", "/array"} <= opened.topics.keys()

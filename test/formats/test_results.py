@@ -35,7 +35,9 @@ FILES = ["extrinsic.urdf.xacro", "extrinsic.yaml", "static_transform.launch.py"]
 def assert_same(found, expected):
     for field in dataclasses.fields(Calibration):
         np.testing.assert_array_equal(
-            getattr(found, field.name), getattr(expected, field.name), err_msg=field.name
+            getattr(found, field.name),
+            getattr(expected, field.name),
+            err_msg=field.name,
         )
 
 
@@ -51,7 +53,10 @@ def test_a_saved_calibration_loads_bit_by_bit_from_file_and_directory(tmp_path):
 
 def test_numbers_of_numpy_anywhere_are_plain_in_yaml_and_json():
     numbers = (np.float32(0.5), np.int64(3), np.bool_(True), np.str_("word"), None)
-    data = {"a": [*numbers, {"b": np.array([1.0, 2.0])}], "c": (SolveStatus.OK, Verdict.USE)}
+    data = {
+        "a": [*numbers, {"b": np.array([1.0, 2.0])}],
+        "c": (SolveStatus.OK, Verdict.USE),
+    }
     values = [0.5, 3, True, "word", None, {"b": [1.0, 2.0]}]
     expected = {"a": values, "c": [SolveStatus.OK.value, Verdict.USE.value]}
     assert plain(data) == expected
@@ -63,7 +68,9 @@ def test_a_result_with_findings_and_all_records_comes_back(tmp_path):
     noise = Noise(
         in_words=("words",),
         misfit=1.0,
-        lasting=(CorrelatedError(kind="body", part="rotation", sigma=1e-3, tau_s=20.0),),
+        lasting=(
+            CorrelatedError(kind="body", part="rotation", sigma=1e-3, tau_s=20.0),
+        ),
     )
     axis = AxisProgress(sigma=np.inf, target=0.02, seconds_left=9.0)
     written = calibration(
@@ -71,7 +78,9 @@ def test_a_result_with_findings_and_all_records_comes_back(tmp_path):
         noise=noise,
         parts={
             "goal": Progress(sentence="go on", axes={"x": axis}),
-            "rate_bias": RateBias(of="child", rad_per_s=(0.1, 0.2, 0.3), sigma=(0.0, 0.0, 0.0)),
+            "rate_bias": RateBias(
+                of="child", rad_per_s=(0.1, 0.2, 0.3), sigma=(0.0, 0.0, 0.0)
+            ),
         },
         contradictions={"x": 4.5},
         measured="rotations",
@@ -102,8 +111,12 @@ LATE = {"delay_s": 0.12, "sigma_s": 0.01, "shift_m": 0.2}
 @pytest.mark.parametrize(
     "finding",
     [
-        wording.finding("gaps", "parent", gaps=np.int64(3), longest_s=np.float64(2.5), share=0.1),
-        wording.finding("late", code="late", part="positions", others="orientations", **LATE),
+        wording.finding(
+            "gaps", "parent", gaps=np.int64(3), longest_s=np.float64(2.5), share=0.1
+        ),
+        wording.finding(
+            "late", code="late", part="positions", others="orientations", **LATE
+        ),
         wording.finding("unexplained", share=0.2),
         wording.finding("inverse", "child", options={"child_invert": "poses"}),
     ],
@@ -142,25 +155,35 @@ def test_an_axis_that_is_not_known_has_no_number_in_json_and_yaml(tmp_path):
         transform = document["T_parent_child"]
         x, y, _ = written.T_parent_child[:3, 3]
         assert transform["translation"] == [x, y, None]
-        assert [sigma is None for sigma in transform["sigma_translation"]] == [False, False, True]
+        assert [sigma is None for sigma in transform["sigma_translation"]] == [
+            False,
+            False,
+            True,
+        ]
         assert transform["matrix"] == written.T_parent_child.tolist()
         inverse = document["T_child_parent"]
         assert inverse["translation"] == inverse["sigma_translation"] == [None] * 3
     assert_same(load_result(path), written)
 
 
-def test_a_rotation_that_is_not_known_has_no_quaternion_and_no_number_for_a_robot(tmp_path):
+def test_a_rotation_that_is_not_known_has_no_quaternion_and_no_number_for_a_robot(
+    tmp_path,
+):
     written = calibration(
         T_parent_child=se3.exp(np.array([1.0, 2, 3, 0, 0, 0.3])),
         covariance_measured=np.diag([1e-4] * 5 + [1e4]),
         observability_measured=dofs([0.01] * 5 + [np.inf], ["yaw"]),
     )
-    transform = yaml.safe_load(save_result(written, tmp_path).read_text())["T_parent_child"]
+    transform = yaml.safe_load(save_result(written, tmp_path).read_text())[
+        "T_parent_child"
+    ]
     assert transform["quat_xyzw"] is None
     assert transform["rpy_deg"][2] is None
     np.testing.assert_allclose(transform["rpy_deg"][:2], [0, 0], atol=1e-9)
     assert_same(load_result(tmp_path), written)
-    xacro, launch = ((tmp_path / name).read_text(encoding="utf-8") for name in ROBOT_FILES)
+    xacro, launch = (
+        (tmp_path / name).read_text(encoding="utf-8") for name in ROBOT_FILES
+    )
     assert re.search(r'rpy="(.*?)"', xacro)[1].split()[2] == "MEASURE_YAW_BY_HAND"
     assert "'--yaw', 'MEASURE_YAW_BY_HAND'" in launch
     assert "--qx" not in launch
@@ -189,8 +212,13 @@ def test_the_file_says_where_it_came_from(tmp_path):
         save_result(calibration(), tmp_path, inputs).read_text(encoding="utf-8")
     )
     assert (document["format"], document["version"]) == ("hand_eye_calib/extrinsic", 2)
-    assert document["T_parent_child"]["maps"] == "coordinates of caméra: links into lidar"
-    product = np.array(document["T_parent_child"]["matrix"]) @ document["T_child_parent"]["matrix"]
+    assert (
+        document["T_parent_child"]["maps"] == "coordinates of caméra: links into lidar"
+    )
+    product = (
+        np.array(document["T_parent_child"]["matrix"])
+        @ document["T_child_parent"]["matrix"]
+    )
     np.testing.assert_allclose(product, np.eye(4), atol=1e-14)
     provenance = document["provenance"]
     assert provenance["inputs"] == {"bag": "drive", "messages": 7}
@@ -214,12 +242,16 @@ def test_the_xacro_file_is_a_fixed_joint_with_the_extrinsic(tmp_path):
     assert joint.find("parent").get("link").replace("$$", "$") == written.parent_frame
     assert joint.find("child").get("link") == written.child_frame
     xyz, rpy = (
-        np.array(joint.find("origin").get(name).split(), dtype=float) for name in ("xyz", "rpy")
+        np.array(joint.find("origin").get(name).split(), dtype=float)
+        for name in ("xyz", "rpy")
     )
     roll, pitch, yaw = (
-        se3.rotation_exp(angle * axis) for angle, axis in zip(rpy, np.eye(3), strict=True)
+        se3.rotation_exp(angle * axis)
+        for angle, axis in zip(rpy, np.eye(3), strict=True)
     )
-    assert yaw @ pitch @ roll == pytest.approx(written.T_parent_child[:3, :3], abs=1e-12)
+    assert yaw @ pitch @ roll == pytest.approx(
+        written.T_parent_child[:3, :3], abs=1e-12
+    )
     np.testing.assert_array_equal(xyz, written.T_parent_child[:3, 3])
 
 
@@ -229,13 +261,19 @@ def test_the_launch_file_compiles_and_publishes_the_extrinsic(tmp_path):
     text = (tmp_path / "static_transform.launch.py").read_text(encoding="utf-8")
     compile(text, "static_transform.launch.py", "exec")
     tree = ast.parse(text)
-    calls = {node.func.id: node for node in ast.walk(tree) if isinstance(node, ast.Call)}
+    calls = {
+        node.func.id: node for node in ast.walk(tree) if isinstance(node, ast.Call)
+    }
     assert set(calls) == {"LaunchDescription", "Node"}
     (transforms,) = (
-        ast.literal_eval(statement.value) for statement in tree.body if hasattr(statement, "value")
+        ast.literal_eval(statement.value)
+        for statement in tree.body
+        if hasattr(statement, "value")
     )
     assert f"# {written.headline}\n" in text
-    node = {keyword.arg: ast.unparse(keyword.value) for keyword in calls["Node"].keywords}
+    node = {
+        keyword.arg: ast.unparse(keyword.value) for keyword in calls["Node"].keywords
+    }
     program = {"package": "'tf2_ros'", "executable": "'static_transform_publisher'"}
     assert node == program | {"arguments": "each"}
     (arguments,) = transforms
@@ -244,7 +282,10 @@ def test_the_launch_file_compiles_and_publishes_the_extrinsic(tmp_path):
         written.parent_frame,
         written.child_frame,
     )
-    values = [float(options.pop(f"--{name}")) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    values = [
+        float(options.pop(f"--{name}"))
+        for name in ("x", "y", "z", "qx", "qy", "qz", "qw")
+    ]
     assert options == {}
     np.testing.assert_allclose(
         se3.from_quat_xyzw(values[:3], values[3:]), written.T_parent_child, atol=1e-11
@@ -260,8 +301,13 @@ ROBOT_FILES = ("extrinsic.urdf.xacro", "static_transform.launch.py")
 
 def test_an_unknown_axis_is_nothing_that_a_robot_takes(tmp_path):
     save_result(calibration(), tmp_path)
-    xacro, launch = ((tmp_path / name).read_text(encoding="utf-8") for name in ROBOT_FILES)
-    assert all("USE WITH CARE: all but z; measure z by hand" in text for text in (xacro, launch))
+    xacro, launch = (
+        (tmp_path / name).read_text(encoding="utf-8") for name in ROBOT_FILES
+    )
+    assert all(
+        "USE WITH CARE: all but z; measure z by hand" in text
+        for text in (xacro, launch)
+    )
     xyz = re.search(r'xyz="(.*?)"', xacro)[1].split()
     assert xyz[2] == "MEASURE_Z_BY_HAND"
     assert list(map(float, xyz[:2])) == calibration().T_parent_child[:2, 3].tolist()
@@ -322,7 +368,8 @@ def test_a_write_that_fails_keeps_the_old_file(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(
-        InputError, match=r"cannot write .*extrinsic\.urdf\.xacro: No space left on device"
+        InputError,
+        match=r"cannot write .*extrinsic\.urdf\.xacro: No space left on device",
     ):
         save_result(calibration(objective=2.0), tmp_path)
     assert path.read_bytes() == before
@@ -338,10 +385,16 @@ def edited(**changes):
     [
         ("", "not a saved result: expected format hand_eye_calib/extrinsic"),
         ("- 1", "not a saved result"),
-        (edited(version=3), "expected format .*, version 1 or 2; found version 3: read it"),
+        (
+            edited(version=3),
+            "expected format .*, version 1 or 2; found version 3: read it",
+        ),
         (edited(format="urdf"), "found format urdf"),
         (edited(T_parent_child={}), "the calibration has no 'matrix'"),
-        (edited(T_parent_child={"matrix": [[1.0, 0.0]]}), "was changed after it was written"),
+        (
+            edited(T_parent_child={"matrix": [[1.0, 0.0]]}),
+            "was changed after it was written",
+        ),
         (edited(status="splendid"), "was changed after it was written: 'splendid'"),
         (edited(warnings=None), "was changed after it was written"),
         ("a: [1", "is not readable YAML: .*; restore the file, or calibrate again"),
@@ -367,7 +420,9 @@ def test_files_that_cannot_be_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "changes", [{}, {"warnings": ()}, {"covariance_allowance": 1e-6 * np.eye(6)}], ids=str
+    "changes",
+    [{}, {"warnings": ()}, {"covariance_allowance": 1e-6 * np.eye(6)}],
+    ids=str,
 )
 def test_documents_follow_the_schema(changes, tmp_path):
     document = validated(calibration(**changes), tmp_path)
@@ -377,7 +432,9 @@ def test_documents_follow_the_schema(changes, tmp_path):
 def validated(result, folder):
     """The document of a result, as JSON and as its file; both must follow the schema."""
     jsonschema = pytest.importorskip("jsonschema")
-    schema = json.loads((ROOT / "docs" / "extrinsic.schema.json").read_text(encoding="utf-8"))
+    schema = json.loads(
+        (ROOT / "docs" / "extrinsic.schema.json").read_text(encoding="utf-8")
+    )
     path = save_result(result, folder)
     document = json.loads(json_text(result.to_dict()))
     for written in (document, yaml.safe_load(path.read_text())):
@@ -395,7 +452,9 @@ def test_documents_of_recordings_follow_the_schema(tmp_path):
     unnamed = replace(result.detectability, shifts={"x": 0.01})
     with pytest.raises(jsonschema.ValidationError, match="required property"):
         validated(result.with_part("detectability", unnamed), tmp_path)
-    no_axis = replace(result.detectability, errors=dict.fromkeys(sizes["errors"], np.inf))
+    no_axis = replace(
+        result.detectability, errors=dict.fromkeys(sizes["errors"], np.inf)
+    )
     hidden = validated(result.with_part("detectability", no_axis), tmp_path)
     assert hidden["detectability"]["errors"]["z"] is None
 
@@ -404,15 +463,21 @@ def test_every_sigma_of_a_document_has_the_allowance_and_its_parts_beside_it():
     document = calibration(covariance_allowance=1e-6 * np.eye(6)).to_dict()
     for name in ("translation", "rpy_deg"):
         measured, whole = (
-            document["T_parent_child"][f"{kind}_{name}"] for kind in ("sigma_measured", "sigma")
+            document["T_parent_child"][f"{kind}_{name}"]
+            for kind in ("sigma_measured", "sigma")
         )
-        assert all(b is None if a is None else b > a for a, b in zip(measured, whole, strict=True))
+        assert all(
+            b is None if a is None else b > a
+            for a, b in zip(measured, whole, strict=True)
+        )
     for row in document["observability"]:
         assert document["sigma"][row["name"]] == row["sigma"]
         if row["sigma"] is not None:
             parts = np.hypot(row["sigma_measured"], row["allowance"])
             assert row["sigma"] == pytest.approx(parts, rel=1e-12)
-    parts = (document[f"covariance_{name}"]["matrix"] for name in ("measured", "allowance"))
+    parts = (
+        document[f"covariance_{name}"]["matrix"] for name in ("measured", "allowance")
+    )
     finite = np.array(document["covariance"]["matrix"][0], dtype=float)
     np.testing.assert_allclose(
         finite, np.sum([columns[0] for columns in parts], axis=0), rtol=1e-12
@@ -455,14 +520,18 @@ def test_a_document_whose_sigma_is_not_that_of_its_parts_is_refused():
     document = calibration().to_dict()
     first, *others = document["observability"]
     changed = document | {"observability": [first | {"sigma": 0.5}, *others]}
-    with pytest.raises(InputError, match="sigma is not that of sigma_measured and the allowance"):
+    with pytest.raises(
+        InputError, match="sigma is not that of sigma_measured and the allowance"
+    ):
         Calibration.from_dict(changed)
 
 
 def test_a_document_whose_covariance_is_not_the_sum_of_its_parts_is_refused():
     document = calibration().to_dict()
     changed = document | {"covariance": {"matrix": (1e-4 * np.eye(6)).tolist()}}
-    with pytest.raises(InputError, match="covariance is not the sum of covariance_measured"):
+    with pytest.raises(
+        InputError, match="covariance is not the sum of covariance_measured"
+    ):
         Calibration.from_dict(changed)
 
 
@@ -475,7 +544,9 @@ def test_a_result_without_a_part_has_its_attributes_empty_and_no_others():
         _ = result.T_child_paren
 
 
-def test_a_result_saved_into_the_folder_of_a_rig_keeps_the_launch_file_of_the_rig(tmp_path):
+def test_a_result_saved_into_the_folder_of_a_rig_keeps_the_launch_file_of_the_rig(
+    tmp_path,
+):
     save_rig({"format": "rig"}, [calibration()], tmp_path)
     launch = tmp_path / "static_transform.launch.py"
     of_rig = launch.read_text()

@@ -28,7 +28,9 @@ def moving(parent, child, period_ms, n_poses, start_ms=0):
 
 
 def in_order(*edges):
-    return sorted((pose for edge in edges for pose in edge), key=lambda pose: pose[0].stamp_ns)
+    return sorted(
+        (pose for edge in edges for pose in edge), key=lambda pose: pose[0].stamp_ns
+    )
 
 
 def live(events, source, max_gap_s=0.5):
@@ -51,7 +53,9 @@ STEPS = wandering_poses(80)
 def test_a_moving_edge_and_a_mount(events, expected):
     _, poses = live(events, "odom:lidar")
     assert [pose.stamp_ns for pose in poses] == [10 * MS * k for k in range(80)]
-    Ts = se3.from_quat_xyzw([pose.position for pose in poses], [pose.quat_xyzw for pose in poses])
+    Ts = se3.from_quat_xyzw(
+        [pose.position for pose in poses], [pose.quat_xyzw for pose in poses]
+    )
     np.testing.assert_allclose(Ts, expected, atol=1e-12)
 
 
@@ -61,11 +65,16 @@ def test_two_moving_edges_at_the_stamps_of_the_slower():
     _, poses = live(STATIC + in_order(slow, fast), "map:lidar")
     # The tree is complete with the first slow one, and the last one still waits.
     stamps_ns = np.array([pose.stamp_ns for pose in poses])
-    assert stamps_ns.tolist() == [(100 * k + 3) * MS for k in range(1, 29)] or len(poses) == 29
+    assert (
+        stamps_ns.tolist() == [(100 * k + 3) * MS for k in range(1, 29)]
+        or len(poses) == 29
+    )
     odometry = Trajectory(10 * MS * np.arange(300), wandering_poses(300))
     k = (stamps_ns // MS - 3) // 100
     expected = wandering_poses(30)[k] @ odometry.at(stamps_ns, straight=True) @ MOUNT
-    np.testing.assert_allclose([pose.position for pose in poses], expected[:, :3, 3], atol=1e-12)
+    np.testing.assert_allclose(
+        [pose.position for pose in poses], expected[:, :3, 3], atol=1e-12
+    )
 
 
 def test_nothing_is_interpolated_across_a_gap():
@@ -97,15 +106,26 @@ def test_what_is_missing_is_said_with_what_is_there():
     [
         ((stamped("other", "lidar", 0, MOUNT), True), "frame 'lidar' has two parents"),
         (
-            (stamped("odom", "base", 0, MOUNT)._replace(quat_xyzw=(0.0, 0.0, 0.0, 0.0)), False),
+            (
+                stamped("odom", "base", 0, MOUNT)._replace(
+                    quat_xyzw=(0.0, 0.0, 0.0, 0.0)
+                ),
+                False,
+            ),
             "transform odom:base: .* quaternion",
         ),
         (
-            (stamped("odom", "base", 0, MOUNT)._replace(position=(0.0, 1e300, 0.0)), False),
+            (
+                stamped("odom", "base", 0, MOUNT)._replace(position=(0.0, 1e300, 0.0)),
+                False,
+            ),
             "transform odom:base: ",
         ),
         (
-            (stamped("odom", "base", 0, MOUNT)._replace(position=(0.0, np.nan, 0.0)), False),
+            (
+                stamped("odom", "base", 0, MOUNT)._replace(position=(0.0, np.nan, 0.0)),
+                False,
+            ),
             "transform odom:base: .* a value that is not finite",
         ),
     ],

@@ -65,11 +65,22 @@ def assert_is_the_trajectory(trajectory, stamps_ns=TRAJECTORY.stamps_ns):
     ],
 )
 def test_stamps_are_exactly_the_decimal_text(file, text, stamp_ns):
-    assert hec.read_trajectory(file([f"{text} {POSE}"])).stamps_ns.tolist() == [stamp_ns]
+    assert hec.read_trajectory(file([f"{text} {POSE}"])).stamps_ns.tolist() == [
+        stamp_ns
+    ]
 
 
 def test_comments_empty_lines_tabs_and_a_byte_order_mark_are_skipped(file):
-    path = file(["\ufeff# timestamp tx ty tz", "", f"  0\t{POSE}\r", "   ", "#1 2", f"1  {POSE}"])
+    path = file(
+        [
+            "\ufeff# timestamp tx ty tz",
+            "",
+            f"  0\t{POSE}\r",
+            "   ",
+            "#1 2",
+            f"1  {POSE}",
+        ]
+    )
     assert hec.read_trajectory(path).stamps_ns.tolist() == [0, 1_000_000_000]
     path.write_bytes(path.read_bytes().replace(b"\r\n", b"\r"))
     assert hec.read_trajectory(path).stamps_ns.tolist() == [0, 1_000_000_000]
@@ -91,17 +102,32 @@ def test_what_is_written_reads_back_to_the_last_bit_of_stamp_and_translation(tmp
     [
         ([], "the file contains no poses"),
         (["0 1 2 3 0 0 0 1 9"], "line 1: expected 8 numbers, .* found 9"),
-        ([f"0 {POSE}", "", "1 1 2 3"], "line 3: expected 8 numbers, .* found 4: '1 1 2 3'"),
+        (
+            [f"0 {POSE}", "", "1 1 2 3"],
+            "line 3: expected 8 numbers, .* found 4: '1 1 2 3'",
+        ),
         (["0 1 2 x 0 0 0 1"], "line 1: expected 8 numbers, .* 'x'"),
         ([f"now {POSE}"], "line 1: .* found 'now' for the timestamp"),
-        ([f"13173756256617361230 {POSE}"], "line 1: .* 1.31738e.19 is too large for ns; set its"),
-        ([f"{t} {POSE}" for t in (0, 33, 66)], "is unclear; read as s, the poses are 33 s apart"),
+        (
+            [f"13173756256617361230 {POSE}"],
+            "line 1: .* 1.31738e.19 is too large for ns; set its",
+        ),
+        (
+            [f"{t} {POSE}" for t in (0, 33, 66)],
+            "is unclear; read as s, the poses are 33 s apart",
+        ),
         (
             ["0 nan 2 3 0 0 0 1"],
             "the file contains no poses: all 1 rows are empty, zero or not finite, the f",
         ),
-        (["# x", f"0 {POSE}", "1 1 2 3 0 0 0 1.1"], "line 3: found a quaternion of length 1.1, ex"),
-        ([f"5 {POSE}", "#", f"5.0 {POSE}"], "line 3: timestamps must increase, found 5.0+ after"),
+        (
+            ["# x", f"0 {POSE}", "1 1 2 3 0 0 0 1.1"],
+            "line 3: found a quaternion of length 1.1, ex",
+        ),
+        (
+            [f"5 {POSE}", "#", f"5.0 {POSE}"],
+            "line 3: timestamps must increase, found 5.0+ after",
+        ),
     ],
 )
 def test_an_unusable_line_is_named(file, lines, message):
@@ -130,7 +156,9 @@ def test_files_that_cannot_be_read_or_written(tmp_path):
 
 
 def test_kitti_has_its_stamps_in_a_file_of_their_own(file):
-    lines = [" ".join(map(repr, pose[:3].ravel().tolist())) for pose in TRAJECTORY.poses]
+    lines = [
+        " ".join(map(repr, pose[:3].ravel().tolist())) for pose in TRAJECTORY.poses
+    ]
     poses = file(lines, "poses.txt")
     times = file([seconds(stamp) for stamp in TRAJECTORY.stamps_ns], "times.txt")
     assert_is_the_trajectory(hec.read_trajectory(poses, "kitti", times=times))
@@ -141,13 +169,21 @@ def test_kitti_has_its_stamps_in_a_file_of_their_own(file):
     short = file(["0.0", "0.1"], "short.txt")
     for path, other_times, message in (
         (poses, short, r"30 poses, but .*short\.txt has 2 stamps"),
-        (poses, file(["x"], "odd.txt"), r"odd\.txt, line 1: .* found 'x' for the timestamp"),
+        (
+            poses,
+            file(["x"], "odd.txt"),
+            r"odd\.txt, line 1: .* found 'x' for the timestamp",
+        ),
         (
             file([" ".join(["2"] * 12)], "s.txt"),
             one_stamp,
             "s.txt, line 1: the 3x3 part is not a rot",
         ),
-        (file(["1 2"], "pair.txt"), one_stamp, r"line 1: expected 12 numbers.* found 2"),
+        (
+            file(["1 2"], "pair.txt"),
+            one_stamp,
+            r"line 1: expected 12 numbers.* found 2",
+        ),
     ):
         with pytest.raises(InputError, match=message):
             hec.read_trajectory(path, "kitti", times=other_times)
@@ -160,8 +196,12 @@ def test_exports_of_messages_have_stamps_in_two_columns_and_quoted_tuples(file):
     lines = []
     for number, row in enumerate(rows(TRAJECTORY.stamps_ns)):
         stamp, _, pose = row.partition(",")
-        lines.append(f'7, {stamp[:-9]}, {stamp[-9:]}, "a, b", {pose}, "(0.0, {number})"')
-    assert_is_the_trajectory(hec.read_trajectory(file([", ".join(names), *lines]), "csv"))
+        lines.append(
+            f'7, {stamp[:-9]}, {stamp[-9:]}, "a, b", {pose}, "(0.0, {number})"'
+        )
+    assert_is_the_trajectory(
+        hec.read_trajectory(file([", ".join(names), *lines]), "csv")
+    )
 
 
 def test_without_a_header_the_columns_must_be_named(file):
@@ -172,19 +212,33 @@ def test_without_a_header_the_columns_must_be_named(file):
     assert_is_the_trajectory(hec.read_trajectory(path, "csv", columns=WXYZ))
     with pytest.raises(InputError, match=r"line 1: expected 9 columns: .*; found 8"):
         hec.read_trajectory(path, "csv", columns=f"{WXYZ},extra")
-    with pytest.raises(InputError, match="line 1: expected 8 numbers or more, timestamp, px"):
+    with pytest.raises(
+        InputError, match="line 1: expected 8 numbers or more, timestamp, px"
+    ):
         hec.read_trajectory(file(["1,2,3"]), "euroc")
 
 
 @pytest.mark.parametrize(
     ("header", "message"),
     [
-        ("t,x,y,z,roll,pitch,a,b", "no column for qx, qy, qz, qw among t, x, .*, b; name all col"),
+        (
+            "t,x,y,z,roll,pitch,a,b",
+            "no column for qx, qy, qz, qw among t, x, .*, b; name all col",
+        ),
         ("t,x,y,z,rx [deg],ry [deg],rz [deg],e", NO_QUATERNION),
-        ("t,ax,ay,az,gx,gy,gz,temperature", "gz, temperature .accelerations contain no pose.; na"),
+        (
+            "t,ax,ay,az,gx,gy,gz,temperature",
+            "gz, temperature .accelerations contain no pose.; na",
+        ),
         ("t,north,east,down,qx,qy,qz,qw", "no column for x, y, z among"),
-        (f"t,time,{XYZW[2:]}", "line 1: names 9 columns, but the rows have 8 cells; write one"),
-        ("t,time,x,y,z,qx,qy,qz", "columns t, time could all be t; name them|no column for qw"),
+        (
+            f"t,time,{XYZW[2:]}",
+            "line 1: names 9 columns, but the rows have 8 cells; write one",
+        ),
+        (
+            "t,time,x,y,z,qx,qy,qz",
+            "columns t, time could all be t; name them|no column for qw",
+        ),
     ],
 )
 def test_columns_that_are_missing_or_not_clear(file, header, message):
@@ -192,14 +246,17 @@ def test_columns_that_are_missing_or_not_clear(file, header, message):
         hec.read_trajectory(file([header, *rows(TRAJECTORY.stamps_ns)]), "csv")
 
 
-@pytest.mark.parametrize(("unit", "ns"), [("s", 10**9), ("ms", 10**6), ("us", 10**3), ("ns", 1)])
+@pytest.mark.parametrize(
+    ("unit", "ns"), [("s", 10**9), ("ms", 10**6), ("us", 10**3), ("ns", 1)]
+)
 def test_units_of_stamps_are_recognised_named_or_taken_from_the_header(file, unit, ns):
     stamps_ns = START_NS // 10**9 * 10**9 + 100_000_000 * np.arange(30)
     relative_ns = stamps_ns - stamps_ns[0]
 
     def in_unit(values_ns):
         return [
-            f"{value_ns // ns}" if ns < 10**9 else f"{value_ns / ns:.1f}" for value_ns in values_ns
+            f"{value_ns // ns}" if ns < 10**9 else f"{value_ns / ns:.1f}"
+            for value_ns in values_ns
         ]
 
     absolute = file(rows(in_unit(stamps_ns.tolist()), separator=" "))
@@ -231,10 +288,16 @@ def test_stamps_out_of_order_are_refused_or_repaired_with_a_warning(file):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"stamp_unit": "minutes"}, "unknown unit of stamps 'minutes'; known are s, ms, us"),
+        (
+            {"stamp_unit": "minutes"},
+            "unknown unit of stamps 'minutes'; known are s, ms, us",
+        ),
         ({"format": "bvh"}, "unknown trajectory format 'bvh'; known are tum"),
         ({"format": "kitti", "columns": "t"}, "columns can be set for format csv only"),
-        ({"format": "csv", "times": "t"}, "a file of times belongs to format kitti only"),
+        (
+            {"format": "csv", "times": "t"},
+            "a file of times belongs to format kitti only",
+        ),
     ],
 )
 def test_options_that_do_not_go_with_the_format(file, options, message):
@@ -247,11 +310,21 @@ def test_options_that_do_not_go_with_the_format(file, options, message):
 
 
 def test_calibrate_reads_each_file_in_its_own_format(tmp_path, file, capsys):
-    child = as_trajectory(disturbed(child_of(TRAJECTORY.poses), 1, 5e-5, 5e-5), start_ns=START_NS)
+    child = as_trajectory(
+        disturbed(child_of(TRAJECTORY.poses), 1, 5e-5, 5e-5), start_ns=START_NS
+    )
     write_trajectory(tmp_path / "child.tum", child)
     lines = rows(TRAJECTORY.stamps_ns, "wxyz")
     files = [str(file([*lines, lines[3]])), str(tmp_path / "child.tum")]
-    command = ["calibrate", *files, "--json", "--reference", "B5", "--parent-columns", WXYZ]
+    command = [
+        "calibrate",
+        *files,
+        "--json",
+        "--reference",
+        "B5",
+        "--parent-columns",
+        WXYZ,
+    ]
     for more in ([], ["--parent-format", "csv"]):
         assert main([*command, *more]) in (0, 3)
         out, err = capsys.readouterr()
@@ -260,6 +333,11 @@ def test_calibrate_reads_each_file_in_its_own_format(tmp_path, file, capsys):
             in err
         )
         document = json.loads(out)
-        np.testing.assert_allclose(document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-3)
+        np.testing.assert_allclose(
+            document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-3
+        )
     assert main([*command, "--format", "tum"]) == 2
-    assert "columns can be set for format csv only; the format is tum" in capsys.readouterr().err
+    assert (
+        "columns can be set for format csv only; the format is tum"
+        in capsys.readouterr().err
+    )

@@ -4,7 +4,13 @@ their units, latitude and longitude, repeated stamps.
 
 import numpy as np
 import pytest
-from motions import as_trajectory, geodetic, planar_poses, read_trajectory_file, wandering_poses
+from motions import (
+    as_trajectory,
+    geodetic,
+    planar_poses,
+    read_trajectory_file,
+    wandering_poses,
+)
 from published_data import data_folder
 
 import hand_eye_calib as hec
@@ -38,7 +44,9 @@ def driven(seed=0):
 
 def read(path, **options):
     reading = read_trajectory_file(path, AUTO, repair=True, **options)
-    return reading.trajectory, [text.removeprefix(str(path)) for text in reading.guesses]
+    return reading.trajectory, [
+        text.removeprefix(str(path)) for text in reading.guesses
+    ]
 
 
 @pytest.mark.parametrize(
@@ -57,20 +65,29 @@ def read(path, **options):
 def test_motion_or_start_tell_the_order(tmp_path, truth, sentence):
     for name, separator in (("poses.txt", " "), ("poses.csv", ",")):
         for order in (SCALAR_FIRST, SCALAR_LAST):
-            trajectory, guesses = read(write_unnamed(tmp_path / name, truth, order, separator))
+            trajectory, guesses = read(
+                write_unnamed(tmp_path / name, truth, order, separator)
+            )
             np.testing.assert_allclose(trajectory.poses, truth.poses, atol=1e-12)
             guesses = [text for text in guesses if "is read as format" not in text]
             assert len(guesses) == (order == SCALAR_FIRST)
             assert all(
-                "read with the scalar first" in text and sentence in text for text in guesses
+                "read with the scalar first" in text and sentence in text
+                for text in guesses
             )
 
 
 def test_an_order_that_nothing_tells_is_said(tmp_path):
-    truth = as_trajectory(se3.exp(np.array([1.0, 2.0, 3.0, 1.0, 0.5, -1.0])) @ wandering_poses(200))
-    sentence = "does not name its columns or the order of the quaternion; read with the scalar"
+    truth = as_trajectory(
+        se3.exp(np.array([1.0, 2.0, 3.0, 1.0, 0.5, -1.0])) @ wandering_poses(200)
+    )
+    sentence = (
+        "does not name its columns or the order of the quaternion; read with the scalar"
+    )
     for name, separator, is_said in (("a.csv", ",", 1), ("a.txt", " ", 0)):
-        trajectory, guesses = read(write_unnamed(tmp_path / name, truth, SCALAR_LAST, separator))
+        trajectory, guesses = read(
+            write_unnamed(tmp_path / name, truth, SCALAR_LAST, separator)
+        )
         np.testing.assert_allclose(trajectory.poses, truth.poses, atol=1e-12)
         assert sum(sentence in text for text in guesses) == is_said
 
@@ -86,7 +103,9 @@ def table(path, header, *columns):
     """A csv file with these columns, ten rows a second."""
     stamps = np.arange(len(columns[0])) / 10
     rows = np.c_[stamps, np.transpose(columns)].tolist()
-    path.write_text("\n".join([f"t,{header}", *(",".join(map(repr, row)) for row in rows), ""]))
+    path.write_text(
+        "\n".join([f"t,{header}", *(",".join(map(repr, row)) for row in rows), ""])
+    )
     return path
 
 
@@ -115,16 +134,26 @@ def test_roll_pitch_and_yaw_in_degrees_or_radians(tmp_path, header, unit, is_sai
     np.testing.assert_allclose(trajectory.poses, expected, atol=1e-12)
     word = "deg" if unit > 1 else "rad"
     sentences = [
-        text for text in guesses if f"roll, pitch, yaw read in {word}, the largest" in text
+        text
+        for text in guesses
+        if f"roll, pitch, yaw read in {word}, the largest" in text
     ]
     assert (len(sentences), len(guesses)) == (is_said, 1 + is_said)
 
 
 def test_small_angles_in_degrees_are_read_by_the_name_of_their_unit(tmp_path):
-    path = table(tmp_path / "a.csv", "x [mm],y [mm],yaw_deg", [0.0, 500.0], [0.0, 0.0], [1.0, 2.0])
+    path = table(
+        tmp_path / "a.csv",
+        "x [mm],y [mm],yaw_deg",
+        [0.0, 500.0],
+        [0.0, 0.0],
+        [1.0, 2.0],
+    )
     trajectory, guesses = read(path)
     np.testing.assert_allclose(trajectory.poses[1, :3, 3], [0.5, 0, 0])
-    np.testing.assert_allclose(se3.rotation_to_rpy(trajectory.poses[1, :3, :3])[2], np.radians(2))
+    np.testing.assert_allclose(
+        se3.rotation_to_rpy(trajectory.poses[1, :3, :3])[2], np.radians(2)
+    )
     assert [text for text in guesses if "no column" in text] == [
         ": no column of heights: 0 is assumed",
         ": no columns of roll and pitch: 0 is assumed",
@@ -144,7 +173,9 @@ def test_a_compass_heading_is_clockwise_from_north_and_nose_up_is_positive(tmp_p
         compass,
     )
     trajectory, guesses = read(path)
-    assert trajectory.poses[:, :3, :3] == pytest.approx(se3.rotation_from_rpy(rpy.T), abs=1e-12)
+    assert trajectory.poses[:, :3, :3] == pytest.approx(
+        se3.rotation_from_rpy(rpy.T), abs=1e-12
+    )
     assert guesses[1:] == [
         ": heading read as clockwise from north; axes of the sensor: x forward, y left, z up"
     ]
@@ -152,10 +183,17 @@ def test_a_compass_heading_is_clockwise_from_north_and_nose_up_is_positive(tmp_p
 
 def test_the_motion_tells_which_way_an_angle_is_counted(tmp_path):
     positions, (_, _, yaw) = angles()
-    for header, values in (("x,y,z,yaw_rad", np.pi / 2 - yaw), ("x,y,z,heading_rad", yaw)):
-        trajectory, guesses = read(table(tmp_path / "a.csv", header, *positions, values))
+    for header, values in (
+        ("x,y,z,yaw_rad", np.pi / 2 - yaw),
+        ("x,y,z,heading_rad", yaw),
+    ):
+        trajectory, guesses = read(
+            table(tmp_path / "a.csv", header, *positions, values)
+        )
         np.testing.assert_allclose(
-            np.cos(se3.rotation_to_rpy(trajectory.poses[:, :3, :3])[:, 2] - yaw), 1, atol=1e-12
+            np.cos(se3.rotation_to_rpy(trajectory.poses[:, :3, :3])[:, 2] - yaw),
+            1,
+            atol=1e-12,
         )
         assert "because the motion fits that and not the usual" in guesses[-1]
 
@@ -164,7 +202,9 @@ def test_files_with_the_same_columns_are_read_by_one_convention(tmp_path):
     """A sensor on a vehicle, and another that hangs upside down, turned by 0.8."""
     positions, (_, _, yaw) = angles()
     upright = se3.rotation_from_rpy(np.c_[np.zeros((len(yaw), 2)), yaw])
-    X = se3.from_rotation_translation(se3.rotation_from_rpy([np.pi, 0.0, 0.8]), np.zeros(3))
+    X = se3.from_rotation_translation(
+        se3.rotation_from_rpy([np.pi, 0.0, 0.8]), np.zeros(3)
+    )
     header = "easting,northing,altitude,roll_rad,pitch_rad,heading_rad"
     files = []
     for name, rotation in (("a.csv", upright), ("b.csv", upright @ X[:3, :3])):
@@ -176,16 +216,26 @@ def test_files_with_the_same_columns_are_read_by_one_convention(tmp_path):
     settings = [(file, FileOptions(format=AUTO)) for file in files]
     for order in (settings, settings[::-1]):
         for reading in read_trajectory_files(order):
-            assert "read as that of the world in the sensor's frame" in reading.guesses[-1]
-    first, second = (reading.trajectory.poses for reading in read_trajectory_files(settings))
+            assert (
+                "read as that of the world in the sensor's frame" in reading.guesses[-1]
+            )
+    first, second = (
+        reading.trajectory.poses for reading in read_trajectory_files(settings)
+    )
     turned = np.swapaxes(first[:, :3, :3], 1, 2) @ second[:, :3, :3]
-    np.testing.assert_allclose(turned, np.broadcast_to(X[:3, :3], turned.shape), atol=1e-9)
-    with pytest.warns(UserWarning, match="read as that of the world in the sensor's frame"):
+    np.testing.assert_allclose(
+        turned, np.broadcast_to(X[:3, :3], turned.shape), atol=1e-9
+    )
+    with pytest.warns(
+        UserWarning, match="read as that of the world in the sensor's frame"
+    ):
         result = hec.calibrate(*map(str, files), method="dnlo", checks=False)
     np.testing.assert_allclose(result.T_parent_child[:3, :3], X[:3, :3], atol=1e-5)
 
 
-def test_files_with_the_same_columns_that_no_convention_fits_are_refused(tmp_path, capsys):
+def test_files_with_the_same_columns_that_no_convention_fits_are_refused(
+    tmp_path, capsys
+):
     positions, (_, _, yaw) = angles()
     files = [
         str(table(tmp_path / name, "x,y,z,heading_rad", *positions, values))
@@ -194,7 +244,10 @@ def test_files_with_the_same_columns_that_no_convention_fits_are_refused(tmp_pat
     assert main(["calibrate", *files]) == 1
     error = capsys.readouterr().err.splitlines()[-1]
     assert "a.csv and " in error
-    assert "have the same columns, but no convention of their angles fits the motion" in error
+    assert (
+        "have the same columns, but no convention of their angles fits the motion"
+        in error
+    )
 
 
 @pytest.mark.parametrize(
@@ -205,19 +258,28 @@ def test_files_with_the_same_columns_that_no_convention_fits_are_refused(tmp_pat
         ("lat_rad,lon_rad,alt", np.pi / 180),
     ],
 )
-def test_latitude_and_longitude_become_metres_of_the_first_position(tmp_path, header, unit):
+def test_latitude_and_longitude_become_metres_of_the_first_position(
+    tmp_path, header, unit
+):
     positions, rpy = angles()
     positions = positions * [[100], [100], [1]] + [[0], [0], [5.0]]
     lat, lon, height = geodetic(positions.T, (60.17, 24.94, 20.0))
     path = table(
-        tmp_path / "a.csv", f"{header},roll,pitch,yaw", lat * unit, lon * unit, height, *rpy
+        tmp_path / "a.csv",
+        f"{header},roll,pitch,yaw",
+        lat * unit,
+        lon * unit,
+        height,
+        *rpy,
     )
     trajectory, guesses = read(path)
     expected = positions - positions[:, :1]
     assert np.ptp(expected[0]) > 500
     # The axes of the first position are tilted against those of the place by some 1e-5 rad.
     np.testing.assert_allclose(trajectory.poses[:, :3, 3].T, expected, atol=2e-2)
-    assert any("became metres east and north of the first position" in text for text in guesses)
+    assert any(
+        "became metres east and north of the first position" in text for text in guesses
+    )
     # East, north and up of the places turn against each other as the earth does.
     turned = se3.rotation_angle(
         trajectory.poses[:, :3, :3] @ np.swapaxes(se3.rotation_from_rpy(rpy.T), 1, 2)
@@ -253,7 +315,9 @@ def test_the_example_of_the_epsg_for_metres_east_north_and_up_of_a_place():
     origin = LocalOrigin()
     origin.geodetic = *np.radians([55.0, 5.0]), 200.0
     local = origin.local(np.array([lat]), np.array([lon]), np.array([73.0]))
-    np.testing.assert_allclose(local, [[-189013.869, -128642.040, -4220.171]], atol=1e-3)
+    np.testing.assert_allclose(
+        local, [[-189013.869, -128642.040, -4220.171]], atol=1e-3
+    )
 
 
 def test_published_files_need_no_options():
@@ -264,7 +328,9 @@ def test_published_files_need_no_options():
     for path in sorted(folder.glob("bag*/[ILV]*_FCPE.mat")):
         trajectory = read_trajectory_file(path, AUTO, repair=True).trajectory
         columns = "t,x,y,z,qw,qx,qy,qz"
-        named = read_trajectory_file(path, "csv", columns=columns, repair=True).trajectory
+        named = read_trajectory_file(
+            path, "csv", columns=columns, repair=True
+        ).trajectory
         np.testing.assert_array_equal(trajectory.poses, named.poses)
     ins, _ = read(folder / "raw_bag1" / "bag1-novatel_data-inspvax.csv")
     theirs = read_trajectory_file(folder / "bag1" / "INS_FCPE.mat", AUTO).trajectory

@@ -10,7 +10,11 @@ from motions import as_trajectory, child_of, wandering_poses
 from result_making import calibration
 
 import hand_eye_calib as hec
-from hand_eye_calib.core.base.errors import ConfigError, InputError, MissingDependencyError
+from hand_eye_calib.core.base.errors import (
+    ConfigError,
+    InputError,
+    MissingDependencyError,
+)
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.formats.bags.writer import write_bag
 
@@ -59,8 +63,18 @@ class TestReading:
         ("source", "options", "error", "message"),
         [
             (POSES, {}, InputError, "no stamps"),
-            (POSES, {"times": SECONDS[:-1]}, InputError, "one stamp per pose; found 29 stamps"),
-            (5, {"times": SECONDS}, InputError, r"expected a path, .* found an array \(\)"),
+            (
+                POSES,
+                {"times": SECONDS[:-1]},
+                InputError,
+                "one stamp per pose; found 29 stamps",
+            ),
+            (
+                5,
+                {"times": SECONDS},
+                InputError,
+                r"expected a path, .* found an array \(\)",
+            ),
             ({"a": 1}, {}, InputError, "expected a path, .* found dict"),
             (np.zeros((3, 5)), {}, InputError, r"of t, x, .*; found an array \(3, 5\)"),
             (POSES, {"times": SECONDS, "columns": "x"}, ConfigError, "to text files"),
@@ -72,7 +86,9 @@ class TestReading:
         ],
         ids=lambda value: value if isinstance(value, str) else "",
     )
-    def test_what_cannot_be_read_is_refused_in_words(self, source, options, error, message):
+    def test_what_cannot_be_read_is_refused_in_words(
+        self, source, options, error, message
+    ):
         with pytest.raises(error, match=message):
             hec.read_trajectory(source, **options)
 
@@ -80,8 +96,12 @@ class TestReading:
         order = np.r_[0, 2, 1, 2, 3:30]
         with pytest.raises(InputError, match="stamps must increase"):
             hec.read_trajectory(POSES[order], times=SECONDS[order])
-        with pytest.warns(UserWarning, match="were sorted; dropped 1 with a repeated stamp"):
-            assert_same(hec.read_trajectory(POSES[order], times=SECONDS[order], repair=True))
+        with pytest.warns(
+            UserWarning, match="were sorted; dropped 1 with a repeated stamp"
+        ):
+            assert_same(
+                hec.read_trajectory(POSES[order], times=SECONDS[order], repair=True)
+            )
 
 
 class TestTables:
@@ -110,14 +130,20 @@ class TestTables:
         with pytest.raises(MissingDependencyError, match=r"pip install '\.\[notebook"):
             calibration().to_frame()
 
-    def test_stamps_keep_their_digits_and_whole_numbers_are_in_the_unit_of_their_size(self):
+    def test_stamps_keep_their_digits_and_whole_numbers_are_in_the_unit_of_their_size(
+        self,
+    ):
         exact = Fraction(1_700_000_000.123456) * 10**9
-        stamp_ns = hec.read_trajectory(POSES[:1], times=[1_700_000_000.123456]).stamps_ns[0]
+        stamp_ns = hec.read_trajectory(
+            POSES[:1], times=[1_700_000_000.123456]
+        ).stamps_ns[0]
         assert abs(int(stamp_ns) - exact) <= Fraction(1, 2)
         for factor in (1, 10**3, 10**6, 10**9):
             trajectory = hec.read_trajectory(POSES[:1], times=[1_700_000_000 * factor])
             assert trajectory.stamps_ns == [1_700_000_000 * 10**9]
-        assert hec.read_trajectory(POSES[:1], times=[5], stamp_unit="ms").stamps_ns == [5_000_000]
+        assert hec.read_trajectory(POSES[:1], times=[5], stamp_unit="ms").stamps_ns == [
+            5_000_000
+        ]
 
 
 class TestShowing:
@@ -130,7 +156,9 @@ class TestShowing:
             seen = [(panel.get_xlabel(), panel.get_ylabel()) for panel in figure.axes]
             assert seen == [("x (m)", "y (m)"), ("x (m)", "z (m)"), ("y (m)", "z (m)")]
             (ellipse,) = figure.axes[0].patches
-            np.testing.assert_allclose(ellipse.get_center(), result.translation[:2], atol=1e-9)
+            np.testing.assert_allclose(
+                ellipse.get_center(), result.translation[:2], atol=1e-9
+            )
             assert figure._repr_png_().startswith(b"\x89PNG")
             panels = figure.subplots(1, 3)
             assert source.plot(ax=panels) is figure

@@ -38,7 +38,9 @@ def urdf(tmp_path):
 def test_frames_through_the_base(urdf):
     T_lidar_camera = read_urdf(urdf).pose("lidar", "camera")
     np.testing.assert_allclose(T_lidar_camera[:3, 3], [-0.5, 0, -1])
-    np.testing.assert_allclose(se3.rotation_to_rpy(T_lidar_camera[:3, :3]), [0, 0.1, 0], atol=1e-12)
+    np.testing.assert_allclose(
+        se3.rotation_to_rpy(T_lidar_camera[:3, :3]), [0, 0.1, 0], atol=1e-12
+    )
 
 
 def test_a_chain_of_thousands_of_joints_takes_no_time(tmp_path):
@@ -50,7 +52,9 @@ def test_a_chain_of_thousands_of_joints_takes_no_time(tmp_path):
     )
     (tmp_path / "long.urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
     began_s = time.process_time()
-    assert read_urdf(tmp_path / "long.urdf").pose("l0", "l5000")[0, 3] == pytest.approx(500.0)
+    assert read_urdf(tmp_path / "long.urdf").pose("l0", "l5000")[0, 3] == pytest.approx(
+        500.0
+    )
     assert time.process_time() - began_s < 3.0  # 0.3; quadratic: 30
 
 
@@ -58,11 +62,31 @@ def test_a_chain_of_thousands_of_joints_takes_no_time(tmp_path):
     ("old", "new", "frames", "text"),
     [
         ("", "", ("lidar", "arm"), "not fixed to each other: arm moves"),
-        ("", "", ("lidar", "radar"), "no frame 'radar' in the robot description; it has base_li"),
-        ('<link name="lidar"/>', "<xacro:lidar/>", ("lidar", "camera"), "has xacro macros"),
+        (
+            "",
+            "",
+            ("lidar", "radar"),
+            "no frame 'radar' in the robot description; it has base_li",
+        ),
+        (
+            '<link name="lidar"/>',
+            "<xacro:lidar/>",
+            ("lidar", "camera"),
+            "has xacro macros",
+        ),
         ('xyz="0.5 0 1"', 'xyz="${x} 0 1"', ("lidar", "camera"), "not six numbers"),
-        ('xyz="0.5 0 1"', 'xyz="0.5 0 1" quat_xyzw="0 0 0 1"', ("lidar", "camera"), "xyz and rpy"),
-        ('link="optical"', 'link="lidar"', ("lidar", "camera"), "'lidar' has two parents"),
+        (
+            'xyz="0.5 0 1"',
+            'xyz="0.5 0 1" quat_xyzw="0 0 0 1"',
+            ("lidar", "camera"),
+            "xyz and rpy",
+        ),
+        (
+            'link="optical"',
+            'link="lidar"',
+            ("lidar", "camera"),
+            "'lidar' has two parents",
+        ),
         ("</robot>", "", ("lidar", "camera"), "not XML"),
         ("robot", "sdf", ("lidar", "camera"), "found <sdf>"),
     ],
@@ -97,11 +121,16 @@ class TestBag:
     def test_its_last_static_transforms_count(self, tmp_path):
         T = se3.exp(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
         bag = self.bag(
-            tmp_path, ("base", "lidar", T), ("base", "camera", T), ("base", "camera", T @ T)
+            tmp_path,
+            ("base", "lidar", T),
+            ("base", "camera", T),
+            ("base", "camera", T @ T),
         )
         installed = open_installed(str(bag))("lidar", "camera")
         np.testing.assert_allclose(installed.T_parent_child, T, atol=1e-12)
-        with pytest.raises(InputError, match="no frame 'radar' in the bag's transforms"):
+        with pytest.raises(
+            InputError, match="no frame 'radar' in the bag's transforms"
+        ):
             open_installed(str(bag))("lidar", "radar")
 
     def test_a_transform_that_is_none_is_left_out(self, tmp_path):

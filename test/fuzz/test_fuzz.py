@@ -44,10 +44,14 @@ ODD = ("", "nan", "inf", "-inf", "1e400", "1e154", "-1e300", "0x10", "1_0", "1e-
 
 def text_of(format):
     """A file of PARENT, and of its stamps for format kitti."""
-    stamps = [f"{stamp // 10**9}.{stamp % 10**9:09d}" for stamp in PARENT.stamps_ns.tolist()]
+    stamps = [
+        f"{stamp // 10**9}.{stamp % 10**9:09d}" for stamp in PARENT.stamps_ns.tolist()
+    ]
     rows = np.c_[POSES[:, :3, 3], se3.to_quat_xyzw(POSES)].tolist()
     if format == "kitti":
-        return "\n".join(" ".join(map(repr, T[:3].ravel().tolist())) for T in POSES), stamps
+        return "\n".join(
+            " ".join(map(repr, T[:3].ravel().tolist())) for T in POSES
+        ), stamps
     if format == "euroc":
         stamps = PARENT.stamps_ns.tolist()
         rows = [[*row[:3], row[6], *row[3:6]] for row in rows]
@@ -94,7 +98,11 @@ def damaged(chance, data):
         piece = data[place : place + length]
         after = data[place + length :]
         flipped = bytes(byte ^ 1 << chance.randrange(8) for byte in piece)
-        data = before + chance.choice([flipped, flipped, b"", piece * 2, bytes(length)]) + after
+        data = (
+            before
+            + chance.choice([flipped, flipped, b"", piece * 2, bytes(length)])
+            + after
+        )
     return data[: chance.randrange(len(data) + 1)] if chance.random() < 0.3 else data
 
 
@@ -104,8 +112,13 @@ def rewritten(chance, data):
     rate = chance.choice([0.0003, 0.004, 0.05])
     for k, line in enumerate(lines):
         separator = "," if "," in line else " "
-        words = [chance.choice(ODD) if chance.random() < rate else w for w in line.split(separator)]
-        lines[k] = chance.choice(ODD) if chance.random() < rate else separator.join(words)
+        words = [
+            chance.choice(ODD) if chance.random() < rate else w
+            for w in line.split(separator)
+        ]
+        lines[k] = (
+            chance.choice(ODD) if chance.random() < rate else separator.join(words)
+        )
     if chance.random() < 0.2:
         chance.shuffle(lines)
     return chance.choice(["\n", "\n", "\r\n"]).join(lines).encode()
@@ -124,7 +137,14 @@ def exercise(run, format, seed, folder):
         files |= {"child": (folder / "child").read_bytes()}
         guess = [] if chance.random() < 0.5 else ["--parent-format", format]
         times = ["--parent-times", folder / "times"] if format == "kitti" else []
-        command = ["calibrate", folder / "parent", folder / "child", *guess, *times, *SOLVE]
+        command = [
+            "calibrate",
+            folder / "parent",
+            folder / "child",
+            *guess,
+            *times,
+            *SOLVE,
+        ]
     else:
         path = folder if format == "journal" else folder / next(iter(files))
         command = ["replay", path, *TOPICS * (not is_text), *SOLVE]
@@ -143,7 +163,9 @@ def exercise(run, format, seed, folder):
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_damaged_inputs_end_in_an_answer_or_in_one_line(run, tmp_path, monkeypatch, format):
+def test_damaged_inputs_end_in_an_answer_or_in_one_line(
+    run, tmp_path, monkeypatch, format
+):
     for name in ("HOME", "TMPDIR"):
         (tmp_path / name).mkdir()
         monkeypatch.setenv(name, str(tmp_path / name))
@@ -161,7 +183,9 @@ def test_damaged_inputs_end_in_an_answer_or_in_one_line(run, tmp_path, monkeypat
     finally:
         faulthandler.cancel_dump_traceback_later()
     assert not [*(tmp_path / "TMPDIR").iterdir()]
-    if N_INPUTS > 24:  # in a process of its own; not ru_maxrss, which is that of who started it
+    if (
+        N_INPUTS > 24
+    ):  # in a process of its own; not ru_maxrss, which is that of who started it
         peak = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
         assert int(peak[1]) / 1024 < LARGEST_MB
     assert {code in (0, 3) for code in codes} == {True, False}, codes

@@ -97,7 +97,11 @@ def refused(run):
     def call(*arguments, code=1):
         exit_code, out, err = run(*arguments)
         assert (exit_code, out) == (code, "")
-        lines = [line for line in err.splitlines() if not line.startswith("hand_eye_calib: note: ")]
+        lines = [
+            line
+            for line in err.splitlines()
+            if not line.startswith("hand_eye_calib: note: ")
+        ]
         assert len(lines) == 1, err
         assert lines[0].startswith("hand_eye_calib: error: ")
         return lines[0]
@@ -109,7 +113,9 @@ def refused(run):
 
 
 @pytest.mark.parametrize("storage", ["mcap", "rosbag1"])
-def test_replay_finds_the_extrinsic_and_says_it_in_both_directions(run, new_bag, storage):
+def test_replay_finds_the_extrinsic_and_says_it_in_both_directions(
+    run, new_bag, storage
+):
     code, out, err = run("calibrate", new_bag(storage=storage), *TOPICS, "-v")
     assert (code, err) == (0, "")
     assert out.startswith("USE: good to ")
@@ -125,11 +131,17 @@ def test_replay_finds_the_extrinsic_and_says_it_in_both_directions(run, new_bag,
 
 def test_json_is_one_document_on_stdout(run, new_bag):
     bag = new_bag()
-    code, out, err = run("replay", bag, *TOPICS, "--json", "--method", "dnl", "--reference", "B2")
+    code, out, err = run(
+        "replay", bag, *TOPICS, "--json", "--method", "dnl", "--reference", "B2"
+    )
     document = json.loads(out)
     assert (code, err) == (0, "")
     np.testing.assert_allclose(document["T_parent_child"]["matrix"], TRUTH, atol=1e-3)
-    assert (document["method"], document["reference"], document["status"]) == ("dnl", "B2", "ok")
+    assert (document["method"], document["reference"], document["status"]) == (
+        "dnl",
+        "B2",
+        "ok",
+    )
     assert (document["parent_frame"], document["child_frame"]) == ("lidar", "camera")
     assert document["inputs"]["bag"] == bag
     assert document["inputs"]["parent"] == {
@@ -142,7 +154,10 @@ def test_json_is_one_document_on_stdout(run, new_bag):
 
 def test_the_likelier_parent_is_chosen_by_its_name(run, tmp_path):
     first, second = drive()
-    write_bag(tmp_path / "named", {"/a": (second, ODOMETRY), "/base_link/odom": (first, ODOMETRY)})
+    write_bag(
+        tmp_path / "named",
+        {"/a": (second, ODOMETRY), "/base_link/odom": (first, ODOMETRY)},
+    )
     code, out, _err = run("check", tmp_path / "named")
     assert code == 0
     assert "parent is /base_link/odom\nchild is /a\n" in out
@@ -150,13 +165,23 @@ def test_the_likelier_parent_is_chosen_by_its_name(run, tmp_path):
 
 def test_calibrate_on_files_gives_what_replay_gives(run, new_bag, tmp_path):
     files = write_pair(tmp_path, *drive())
-    options = ["--json", "--reference", "B5", "--parent-frame", "lidar", "--child-frame", "camera"]
+    options = [
+        "--json",
+        "--reference",
+        "B5",
+        "--parent-frame",
+        "lidar",
+        "--child-frame",
+        "camera",
+    ]
     code, out, err = run("calibrate", *files, *options)
     assert (code, err) == (0, "")
     from_files = json.loads(out)
     from_bag = json.loads(run("replay", new_bag(), *TOPICS, *options)[1])
     np.testing.assert_allclose(
-        from_files["T_parent_child"]["matrix"], from_bag["T_parent_child"]["matrix"], atol=1e-12
+        from_files["T_parent_child"]["matrix"],
+        from_bag["T_parent_child"]["matrix"],
+        atol=1e-12,
     )
     stamps = {"first_stamp_ns": START_NS, "last_stamp_ns": START_NS + 11_900_000_000}
     assert from_files["inputs"]["child"] == {"file": files[1], "poses": 120, **stamps}
@@ -172,7 +197,12 @@ def test_out_saves_what_info_shows(run, new_bag, tmp_path):
     wrote = f"hand_eye_calib: note: wrote {out_dir}/"
     files = "extrinsic.yaml, extrinsic.urdf.xacro and static_transform.launch.py"
     assert (code, err) == (0, f"{wrote}{files}\n{wrote}report.html\n")
-    files = ["extrinsic.urdf.xacro", "extrinsic.yaml", "report.html", "static_transform.launch.py"]
+    files = [
+        "extrinsic.urdf.xacro",
+        "extrinsic.yaml",
+        "report.html",
+        "static_transform.launch.py",
+    ]
     assert sorted(path.name for path in out_dir.iterdir()) == files
     assert run("info", out_dir) == (0, text, "")
     document = json.loads(run("info", out_dir / "extrinsic.yaml", "--json")[1])
@@ -192,9 +222,14 @@ def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag):
     assert (code, err) == (3, "")
     assert re.search(r"^  z +unknown$", out, flags=re.MULTILINE)
     assert out.startswith("USE WITH CARE: all but z; measure z by hand\n")
-    command = next(line for line in out.splitlines() if "static_transform_publisher" in line)
+    command = next(
+        line for line in out.splitlines() if "static_transform_publisher" in line
+    )
     assert " --z MEASURE_Z_BY_HAND --qx " in command
-    assert "\nTo publish it (USE WITH CARE, after you have replaced MEASURE_Z_BY_HAND)\n" in out
+    assert (
+        "\nTo publish it (USE WITH CARE, after you have replaced MEASURE_Z_BY_HAND)\n"
+        in out
+    )
     (step,) = re.findall(r"^  hand_eye_calib (replay .*)$", out, flags=re.MULTILINE)
     again = step.replace("VALUE+/-SIGMA", "0.1±0.01")
     code, out, err = run(*shlex.split(again))
@@ -207,7 +242,12 @@ def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag):
 
 def test_each_reason_stands_above_what_to_do_about_it(run, new_bag, tmp_path):
     """The headline of planar motion names the second reason, too."""
-    assert run("replay", new_bag(*drive(planar=True)), *TOPICS, "--out", tmp_path / "out")[0] == 3
+    assert (
+        run("replay", new_bag(*drive(planar=True)), *TOPICS, "--out", tmp_path / "out")[
+            0
+        ]
+        == 3
+    )
     jumps = written_finding("jumps", Severity.WARNING, "many jumps", "find out why")
     calibration = dataclasses.replace(load_result(tmp_path / "out"), findings=(jumps,))
     lines = as_lines(calibration)
@@ -232,7 +272,9 @@ def some_calibration(**changes):
 def test_a_solve_that_did_not_converge_fails(run, new_bag, monkeypatch):
     from hand_eye_calib.core.engine.snapshot import Snapshot
 
-    calibration = some_calibration(status=SolveStatus.NOT_CONVERGED, warnings=("look here",))
+    calibration = some_calibration(
+        status=SolveStatus.NOT_CONVERGED, warnings=("look here",)
+    )
     assert "\n".join(as_lines(calibration)).startswith(
         "DO NOT USE: the solver did not converge\n  -> record more varied motion\nNote: look here\n"
     )
@@ -253,14 +295,23 @@ def child_with(**fields):
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"parent": drive(count=5)[0]}, "10 synchronised pose pairs are needed, found 5"),
-        ({"child": drive(30, first_ns=START_NS + 10**12)[1]}, "the streams do not overlap in time"),
+        (
+            {"parent": drive(count=5)[0]},
+            "10 synchronised pose pairs are needed, found 5",
+        ),
+        (
+            {"child": drive(30, first_ns=START_NS + 10**12)[1]},
+            "the streams do not overlap in time",
+        ),
         ({"child": drive()[1][:0]}, "no poses on the child stream"),
         (
             child_with(sensor_frame=""),
             f"{CHILD_TOPIC}, stamp 1700000000.000000000: the child stream's sensor frame is empty",
         ),
-        (child_with(sensor_frame="lidar"), "both streams name 'lidar' as their sensor frame"),
+        (
+            child_with(sensor_frame="lidar"),
+            "both streams name 'lidar' as their sensor frame",
+        ),
     ],
 )
 def test_streams_that_cannot_be_used(refused, new_bag, changed, message):
@@ -268,10 +319,16 @@ def test_streams_that_cannot_be_used(refused, new_bag, changed, message):
 
 
 def test_what_is_not_there_is_named_with_what_is(refused, new_bag, tmp_path):
-    assert f"no bag at {tmp_path / 'absent'}" in refused("replay", tmp_path / "absent", *TOPICS)
-    line = refused("replay", new_bag(), "--parent-topic", "/odom", "--child-topic", CHILD_TOPIC)
+    assert f"no bag at {tmp_path / 'absent'}" in refused(
+        "replay", tmp_path / "absent", *TOPICS
+    )
+    line = refused(
+        "replay", new_bag(), "--parent-topic", "/odom", "--child-topic", CHILD_TOPIC
+    )
     assert "no topic /odom in " in line
-    topics = [f"{topic} ({ODOMETRY}, 120 messages)" for topic in (CHILD_TOPIC, PARENT_TOPIC)]
+    topics = [
+        f"{topic} ({ODOMETRY}, 120 messages)" for topic in (CHILD_TOPIC, PARENT_TOPIC)
+    ]
     assert ", ".join(topics) in line
 
 
@@ -283,22 +340,30 @@ def test_a_misspelt_name_is_answered_with_a_similar_one(refused, new_bag, tmp_pa
     bag = Path(new_bag())
     line = refused("replay", bag.with_name(f"{bag.name}s"), *TOPICS)
     assert line.endswith(f"; did you mean {bag.name}?")
-    line = refused("replay", bag, "--parent-topic", "/lidar/odo", "--child-topic", CHILD_TOPIC)
+    line = refused(
+        "replay", bag, "--parent-topic", "/lidar/odo", "--child-topic", CHILD_TOPIC
+    )
     assert f"; did you mean {PARENT_TOPIC}? The bag has" in line
 
 
-def test_a_bag_without_an_obvious_pair_is_answered_with_a_command_that_runs(run, refused, tmp_path):
+def test_a_bag_without_an_obvious_pair_is_answered_with_a_command_that_runs(
+    run, refused, tmp_path
+):
     parent, child = drive()
     names = ("/lidar/odom", "/camera/odom", "/gnss/odom")
     streams = {
-        name: (poses, ODOMETRY) for name, poses in zip(names, (parent, child, child), strict=True)
+        name: (poses, ODOMETRY)
+        for name, poses in zip(names, (parent, child, child), strict=True)
     }
     streams["/gnss/odom"] = (dataclasses.replace(child, sensor_frame="gnss"), ODOMETRY)
     bag = tmp_path / "three bags"
     write_bag(bag, streams)
     line = refused("calibrate", bag)
     message, _, command = line.partition(". Run: ")
-    assert "error: 3 topics have poses: /lidar/odom (nav_msgs/msg/Odometry, 120 mess" in message
+    assert (
+        "error: 3 topics have poses: /lidar/odom (nav_msgs/msg/Odometry, 120 mess"
+        in message
+    )
     program, *arguments = shlex.split(command)
     assert program == "hand_eye_calib"
     assert arguments[:2] == ["calibrate", str(bag)]
@@ -307,7 +372,9 @@ def test_a_bag_without_an_obvious_pair_is_answered_with_a_command_that_runs(run,
     assert "camera in lidar" in out
 
 
-@pytest.mark.parametrize("command", [["calibrate"], ["check"], ["calibrate", "lidar.tum"]])
+@pytest.mark.parametrize(
+    "command", [["calibrate"], ["check"], ["calibrate", "lidar.tum"]]
+)
 def test_a_file_that_is_given_twice_is_refused(run, command):
     code, out, err = run(*command, "camera.tum", "camera.tum")
     assert (code, out) == (2, "")
@@ -335,7 +402,11 @@ def test_help_fits_a_screen_and_names_options_that_exist(run, command):
     _, whole, _ = run(command, "--help", "all")
     if brief != whole:
         assert f"all options: hand_eye_calib {command} --help all" in brief
-    named = set(re.findall(r"--[a-z][a-z-]+", brief)) - {"--help", "--ros-args", "--params-file"}
+    named = set(re.findall(r"--[a-z][a-z-]+", brief)) - {
+        "--help",
+        "--ros-args",
+        "--params-file",
+    }
     assert named <= set(re.findall(r"--[a-z][a-z-]+", whole))
 
 
@@ -353,7 +424,9 @@ def test_help_lists_every_option_with_its_default(run):
         entry = words[words.rindex(f" {name} ") :].replace("- ", "-")
         entry = entry[: entry.find(" --", 1)]
         assert field.metadata["doc"] in entry, name
-        assert f"Unit: {field.metadata['unit']}" in entry or not field.metadata["unit"], name
+        assert (
+            f"Unit: {field.metadata['unit']}" in entry or not field.metadata["unit"]
+        ), name
         assert f"Default: {field.default}." in entry or field.default == "", name
 
 
@@ -367,7 +440,10 @@ def test_help_lists_every_option_with_its_default(run):
             {"prior_z": "-1.85+/-0.02", "prior_yaw": "-90deg+/-2deg"},
         ),
         (["--scale", "none"], {}),
-        (["--min-pairs", "20", "--reference", "C5"], {"min_pairs": 20, "reference": "C5"}),
+        (
+            ["--min-pairs", "20", "--reference", "C5"],
+            {"min_pairs": 20, "reference": "C5"},
+        ),
     ],
 )
 def test_options_reach_the_engine(options, changed):
@@ -389,26 +465,44 @@ def parsed(options):
     ("arguments", "message"),
     [
         (["fly"], "invalid choice: 'fly'"),
-        (["calibrate", str(ROOT / "README.md")], "is one trajectory file: pass those of two"),
+        (
+            ["calibrate", str(ROOT / "README.md")],
+            "is one trajectory file: pass those of two",
+        ),
         (["calibrate", "a.tum", "b.mcap"], "b.mcap is a bag, and another path is not"),
         (["check", "a.mcap", "b.mcap"], "expected one bag or two trajectory files"),
-        (["replay", "bag", "--methd", "dnl"], "unknown '--methd'; did you mean --method?"),
-        (["replay", "bag", "--threshold", "-1"], "--threshold: must be at least 1e-12 m^2; got -1"),
+        (
+            ["replay", "bag", "--methd", "dnl"],
+            "unknown '--methd'; did you mean --method?",
+        ),
+        (
+            ["replay", "bag", "--threshold", "-1"],
+            "--threshold: must be at least 1e-12 m^2; got -1",
+        ),
         (
             ["replay", "bag", "--threshold", "big"],
             "--threshold: must be a number in m^2; got 'big'",
         ),
-        (["replay", "bag", "--reference", "D4"], "--reference: must be auto, A, B<n> such as B5"),
+        (
+            ["replay", "bag", "--reference", "D4"],
+            "--reference: must be auto, A, B<n> such as B5",
+        ),
         (["replay", "bag", "--method", "dnlp"], "got 'dnlp'; did you mean dnl"),
         (["info", "a", "b"], "unknown 'b'"),
         (["chek", "bag"], "did you mean check?"),
         (["info"], "the following arguments are required: RESULT"),
         (["replay", "bag", "--vehicle", "a"], "--dask and --vehicle need --batch"),
-        (["replay", "bag", "--batch", "fleet"], "--batch cannot be combined with PATH or --list"),
+        (
+            ["replay", "bag", "--batch", "fleet"],
+            "--batch cannot be combined with PATH or --list",
+        ),
         (["replay", "--batch", "none*"], "no bag matches none*"),
         (["watch", "--web", "high"], "expected PORT or HOST:PORT, got 'high'"),
         (["watch", "--web", "99999"], "expected PORT or HOST:PORT, got '99999'"),
-        (["replay"], "usage: hand_eye_calib replay [OPTION ...] PATH ...\n\nexamples:\n"),
+        (
+            ["replay"],
+            "usage: hand_eye_calib replay [OPTION ...] PATH ...\n\nexamples:\n",
+        ),
     ],
 )
 def test_wrong_usage(run, arguments, message):
@@ -448,7 +542,10 @@ def test_config_file_plain_or_for_ros(config_file, text):
 
 
 def test_the_config_file_of_the_package_holds_the_defaults(config_file, capsys):
-    assert parsed(["--config", str(ROOT / "config" / "calibrator.yaml")]) == CalibratorConfig()
+    assert (
+        parsed(["--config", str(ROOT / "config" / "calibrator.yaml")])
+        == CalibratorConfig()
+    )
     assert parsed(config_file("/**: {ros__parameters: }")) == CalibratorConfig()
     assert "only the node uses 'solve_period'" in capsys.readouterr().err
 
@@ -456,17 +553,31 @@ def test_the_config_file_of_the_package_holds_the_defaults(config_file, capsys):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{methd: dnl}", r"config\.yaml: unknown option 'methd'; did you mean 'method'\?"),
+        (
+            "{methd: dnl}",
+            r"config\.yaml: unknown option 'methd'; did you mean 'method'\?",
+        ),
         ("{threshold: -1.0}", r"config\.yaml: 'threshold' must be at least"),
-        ("[1, 2]", r"config\.yaml: expected a mapping of options to values; found list"),
-        ("/slam: {ros__parameters: {a: 1}}", "named calibrator; the file has those of /slam"),
-        ("/calibrator: {ros__parameters: [1]}", "unknown option '/calibrator.ros__parameters'"),
+        (
+            "[1, 2]",
+            r"config\.yaml: expected a mapping of options to values; found list",
+        ),
+        (
+            "/slam: {ros__parameters: {a: 1}}",
+            "named calibrator; the file has those of /slam",
+        ),
+        (
+            "/calibrator: {ros__parameters: [1]}",
+            "unknown option '/calibrator.ros__parameters'",
+        ),
         ("reference: B" + "9" * 3000, "reference"),
         ("max_gap: 2024-13-45", "max_gap"),
         ("5: 6", "unknown option '5'"),
     ],
 )
-def test_config_files_that_are_wrong_end_with_usage_error(refused, config_file, text, message):
+def test_config_files_that_are_wrong_end_with_usage_error(
+    refused, config_file, text, message
+):
     line = refused("calibrate", "a", "b", *config_file(text), code=2)
     assert re.search(message, line)
     assert len(line) < 1000
@@ -475,7 +586,9 @@ def test_config_files_that_are_wrong_end_with_usage_error(refused, config_file, 
 def test_the_sample_in_the_package_gives_its_true_extrinsic(capsys):
     assert main(["calibrate", "sample:lidar.tum", "sample:camera.tum", "--json"]) == 0
     matrix = json.loads(capsys.readouterr().out)["T_parent_child"]["matrix"]
-    truth = hec.read_trajectory(Path(hec.__file__).parent / "sample" / "truth.tum").poses[0]
+    truth = hec.read_trajectory(
+        Path(hec.__file__).parent / "sample" / "truth.tum"
+    ).poses[0]
     np.testing.assert_allclose(matrix, truth, atol=0.005)
 
 
@@ -484,7 +597,9 @@ def test_the_sample_in_the_package_gives_its_true_extrinsic(capsys):
 
 def test_the_node_gets_its_arguments_as_they_are(monkeypatch):
     seen = []
-    monkeypatch.setattr("hand_eye_calib.online.ros.node.main", lambda args: seen.append(args) or 5)
+    monkeypatch.setattr(
+        "hand_eye_calib.online.ros.node.main", lambda args: seen.append(args) or 5
+    )
     arguments = ["--ros-args", "-p", "method:=dnl", "-r", "parent_odom:=/lidar/odom"]
     assert main(["calibrator", *arguments]) == 5
     assert main(["calibrator"]) == 5
@@ -492,11 +607,16 @@ def test_the_node_gets_its_arguments_as_they_are(monkeypatch):
 
 
 def test_commands_that_need_ros_say_how_to_get_it(refused, monkeypatch):
-    for module in [name for name in sys.modules if name.startswith("hand_eye_calib.online.ros")]:
+    for module in [
+        name for name in sys.modules if name.startswith("hand_eye_calib.online.ros")
+    ]:
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, "rclpy", None)
     line = refused("watch")
-    assert "this needs ROS 2's Python packages (rclpy is missing): source the setup file" in line
+    assert (
+        "this needs ROS 2's Python packages (rclpy is missing): source the setup file"
+        in line
+    )
 
 
 def start(*arguments, stdout=subprocess.PIPE):
@@ -517,7 +637,9 @@ def test_a_process_ends_with_the_code(tmp_path):
 
 
 def test_interrupt_ends_quietly(tmp_path):
-    process = start("simulate", "--out", tmp_path / "runs", "--runs", 10_000, "--poses", 10)
+    process = start(
+        "simulate", "--out", tmp_path / "runs", "--runs", 10_000, "--poses", 10
+    )
     while not (tmp_path / "runs" / "run_00002").exists():
         assert process.poll() is None, process.communicate()
         time.sleep(0.01)
@@ -529,7 +651,9 @@ def test_interrupt_ends_quietly(tmp_path):
 def test_a_reader_that_goes_away_is_no_error_and_files_are_written(tmp_path, new_bag):
     readable, writable = os.pipe()
     os.close(readable)
-    process = start("replay", new_bag(), *TOPICS, "--out", tmp_path / "out", stdout=writable)
+    process = start(
+        "replay", new_bag(), *TOPICS, "--out", tmp_path / "out", stdout=writable
+    )
     lines = process.communicate()[1].splitlines()
     os.close(writable)
     assert (process.returncode, len(lines)) == (141, 2)
@@ -571,12 +695,17 @@ def test_messages_name_options_as_they_are_typed(capsys):
 
 def test_control_characters_in_names_do_not_reach_the_terminal(capsys):
     hostile = "cam\x1b[2Jera\nStatus: ok"
-    print_result(as_lines(some_calibration(child_frame=hostile, warnings=("w\x1b[31m",))))
+    print_result(
+        as_lines(some_calibration(child_frame=hostile, warnings=("w\x1b[31m",)))
+    )
     text = capsys.readouterr().out
     assert "\x1b" not in text
     assert "\ncam\\x1b[2Jera\\nStatus: ok in lidar" in text
     fail(hostile, 1)
-    assert capsys.readouterr().err == "hand_eye_calib: error: cam\\x1b[2Jera\\nStatus: ok\n"
+    assert (
+        capsys.readouterr().err
+        == "hand_eye_calib: error: cam\\x1b[2Jera\\nStatus: ok\n"
+    )
 
 
 def test_options_are_printed_as_they_are_typed():

@@ -7,7 +7,14 @@ import json
 import numpy as np
 import pytest
 from bag_making import TF, path_message, tf_message, write_messages
-from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, messages, wandering_poses
+from motions import (
+    T_PARENT_CHILD,
+    as_trajectory,
+    child_of,
+    disturbed,
+    messages,
+    wandering_poses,
+)
 
 from hand_eye_calib.formats.bags.writer import write_bag
 from hand_eye_calib.formats.journal import JournalWriter
@@ -18,7 +25,9 @@ STREAMS = ["--parent-topic", "/a", "--child-topic", "/b"]
 POSES = wandering_poses(100)
 PARENT = as_trajectory(POSES, sensor_frame="lidar", world_frame="map")
 CHILD = as_trajectory(
-    disturbed(child_of(POSES), 1, 0.002, 0.001), sensor_frame="camera", world_frame="odom"
+    disturbed(child_of(POSES), 1, 0.002, 0.001),
+    sensor_frame="camera",
+    world_frame="odom",
 )
 
 
@@ -42,7 +51,12 @@ def write_session(directory, options, *recorded):
     """The journal of a node that has heard both trajectories."""
     streams = {"parent": (PARENT, "/a"), "child": (CHILD, "/b")}
     about = {
-        stream: {"options": options, "given": recorded, "topic": topic, "frame": poses.sensor_frame}
+        stream: {
+            "options": options,
+            "given": recorded,
+            "topic": topic,
+            "frame": poses.sensor_frame,
+        }
         for stream, (poses, topic) in streams.items()
     }
     writer = JournalWriter(directory, about)
@@ -60,7 +74,10 @@ def test_a_journal_gives_what_a_bag_gives_with_the_options_of_its_session(
     code, out, err = run(tmp_path / folder, "--reference", "B5", "--json")
     document = json.loads(out)
     assert (code, err) == (0, "")
-    assert (document["method"], document["reference"]) == ("park", "B5")  # what is typed goes first
+    assert (document["method"], document["reference"]) == (
+        "park",
+        "B5",
+    )  # what is typed goes first
     assert document["inputs"]["child"]["topic"] == "/b"
     assert document["inputs"]["journal"] == str(tmp_path / "live" / "journal")
     of_bag = run(bag, *STREAMS, "--method", "park", "--reference", "B5", "--json")[1]
@@ -69,14 +86,18 @@ def test_a_journal_gives_what_a_bag_gives_with_the_options_of_its_session(
 
 def test_what_was_set_in_a_session_counts_as_set_in_its_replay(tmp_path):
     of_old = {"prior.transform": ""}  # an option that is no longer there
-    write_session(tmp_path, of_old | {"time_offset": 0.0, "scale": "none"}, "time_offset")
+    write_session(
+        tmp_path, of_old | {"time_offset": 0.0, "scale": "none"}, "time_offset"
+    )
     config = read_journal_of(tmp_path, {"reference": "B5"}).snapshot.config
     assert config.given == {"time_offset", "reference"}
 
 
 def test_journals_are_recordings_of_their_own(run, bag, tmp_path, no_processes):
     write_session(tmp_path / "live" / "journal", {"reference": "B5"})
-    code, out, err = run(tmp_path / "live", bag, "--reference", "B5", "--json", "--jobs", "1")
+    code, out, err = run(
+        tmp_path / "live", bag, "--reference", "B5", "--json", "--jobs", "1"
+    )
     assert "is a session of its own; they give one result" in err
     assert (code, len(json.loads(out)["together"]["recordings"])) == (0, 2)
 
@@ -94,7 +115,9 @@ def test_what_does_not_go_with_a_journal(run, tmp_path):
 
 def test_frames_stand_for_topics(run, bag, tmp_path):
     messages = []
-    for ns, parent, child in zip(PARENT.stamps_ns, PARENT.poses, CHILD.poses, strict=True):
+    for ns, parent, child in zip(
+        PARENT.stamps_ns, PARENT.poses, CHILD.poses, strict=True
+    ):
         both = [(ns, "map", "lidar", parent), (ns, "odom", "camera", child)]
         messages.append((ns, "/tf", TF, tf_message(both)))
     path = write_messages(tmp_path / "tf", messages)
@@ -105,10 +128,16 @@ def test_frames_stand_for_topics(run, bag, tmp_path):
     assert (code, err) == (0, "")
     assert (document["parent_frame"], document["child_frame"]) == ("lidar", "camera")
     assert document["inputs"]["child"]["topic"] == "transform odom:camera"
-    np.testing.assert_allclose(matrix(out), matrix(run(bag, *STREAMS, "--json")[1]), atol=1e-9)
-    code, out, err = run(path, "--parent-topic", "map:lidar", "--child-topic", "odom:radar")
+    np.testing.assert_allclose(
+        matrix(out), matrix(run(bag, *STREAMS, "--json")[1]), atol=1e-9
+    )
+    code, out, err = run(
+        path, "--parent-topic", "map:lidar", "--child-topic", "odom:radar"
+    )
     assert (code, out) == (1, "")
-    assert "no frame 'radar' in the bag's transforms; it has map:lidar, odom:camera" in err
+    assert (
+        "no frame 'radar' in the bag's transforms; it has map:lidar, odom:camera" in err
+    )
 
 
 def test_a_path_and_a_topic_of_two_bags_together(run, bag, tmp_path):
@@ -118,7 +147,9 @@ def test_a_path_and_a_topic_of_two_bags_together(run, bag, tmp_path):
     both = ["--parent-topic", "/path", "--child-topic", "/b", "--parent-frame", "lidar"]
     code, out, _ = run(bag, path, *both, "--json")
     assert code == 0
-    np.testing.assert_allclose(matrix(out), matrix(run(bag, *STREAMS, "--json")[1]), atol=1e-9)
+    np.testing.assert_allclose(
+        matrix(out), matrix(run(bag, *STREAMS, "--json")[1]), atol=1e-9
+    )
 
 
 def parts_of(tmp_path, slices, later_s=0.0):
@@ -129,7 +160,9 @@ def parts_of(tmp_path, slices, later_s=0.0):
         moved_ns = round(later_s * 1e9) * bool(number)
         streams = {
             topic: (
-                dataclasses.replace(trajectory, stamps_ns=trajectory.stamps_ns + moved_ns)[numbers],
+                dataclasses.replace(
+                    trajectory, stamps_ns=trajectory.stamps_ns + moved_ns
+                )[numbers],
                 ODOMETRY,
             )
             for topic, trajectory in (("/a", PARENT), ("/b", CHILD))
@@ -138,7 +171,9 @@ def parts_of(tmp_path, slices, later_s=0.0):
     return paths
 
 
-def test_parts_that_continue_each_other_are_one_recording_in_any_order(run, bag, tmp_path):
+def test_parts_that_continue_each_other_are_one_recording_in_any_order(
+    run, bag, tmp_path
+):
     parts = parts_of(tmp_path, [slice(0, 50), slice(50, 80), slice(80, 100)])
     whole = run(bag, *STREAMS, "--json")[1]
     for order in (parts, parts[::-1]):
@@ -149,7 +184,10 @@ def test_parts_that_continue_each_other_are_one_recording_in_any_order(run, bag,
 
 @pytest.mark.parametrize(
     ("later_s", "reason"),
-    [(0.03, "both cover the same 9.9 s"), (3600, "there is a pause of 3590 s between them")],
+    [
+        (0.03, "both cover the same 9.9 s"),
+        (3600, "there is a pause of 3590 s between them"),
+    ],
 )
 @pytest.mark.usefixtures("no_processes")
 def test_recordings_are_not_joined_but_give_one_result(run, tmp_path, later_s, reason):
@@ -180,7 +218,11 @@ def test_list_shows_topics_types_counts_rates_and_frames(run, tmp_path):
     document = json.loads(out)
     assert (code, err, document["warnings"]) == (0, "", [])
     assert document["duration_s"] == pytest.approx(9.9)
-    measured = {"count": 100, "rate_hz": pytest.approx(10), "frames": [PARENT.sensor_frame]}
+    measured = {
+        "count": 100,
+        "rate_hz": pytest.approx(10),
+        "frames": [PARENT.sensor_frame],
+    }
     measured["measures"] = ""
     named = {"name": "/a", "type": ODOMETRY, "is_usable": True}
     assert document["topics"][0] == measured | named

@@ -25,7 +25,10 @@ def saved(tmp_path_factory):
 
 def test_arm_is_calibrate_for_samples(run):
     alone = as_json(run, "arm", "sample:arm.yaml")
-    assert alone["T_parent_child"] == as_json(run, "calibrate", "sample:arm.yaml")["T_parent_child"]
+    assert (
+        alone["T_parent_child"]
+        == as_json(run, "calibrate", "sample:arm.yaml")["T_parent_child"]
+    )
 
 
 def test_arm_takes_two_files_as_stops(run, tmp_path):
@@ -44,7 +47,9 @@ def test_arm_takes_two_files_as_stops(run, tmp_path):
     assert placed["T_parent_child"] == alone["T_parent_child"]
 
 
-def test_files_of_an_arm_that_fit_two_places_of_the_camera_need_an_option(run, tmp_path):
+def test_files_of_an_arm_that_fit_two_places_of_the_camera_need_an_option(
+    run, tmp_path
+):
     samples = hec.read_arm_samples("sample:arm.yaml")
     files = [tmp_path / "hand.tum", tmp_path / "target.tum"]
     for file, poses in zip(files, (samples.robot, samples.tracking), strict=True):
@@ -64,7 +69,10 @@ def test_rig_is_calibrate_for_three_files(run, tmp_path):
     shutil.copy(local_path("sample:camera.tum"), rear)
     code, out, _ = run("rig", "sample:lidar.tum", "sample:camera.tum", rear)
     assert ": 3 sensors\n" in out
-    assert run("calibrate", "sample:lidar.tum", "sample:camera.tum", rear)[:2] == (code, out)
+    assert run("calibrate", "sample:lidar.tum", "sample:camera.tum", rear)[:2] == (
+        code,
+        out,
+    )
 
 
 def test_batch_is_calibrate_batch(run, tmp_path):
@@ -97,7 +105,10 @@ def test_files_of_a_robot_are_exported_as_they_are_saved(run, saved, name, file)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["arm"], "arm needs the samples of an arm, or the stops of its hand and camera"),
+        (
+            ["arm"],
+            "arm needs the samples of an arm, or the stops of its hand and camera",
+        ),
         (["rig", "a.tum", "b.tum"], "rig needs 3 sensors or more, got 2"),
         (["rig", "bag", "--topics", "/a", "/b"], "rig needs 3 sensors or more, got 2"),
         (["batch"], "batch needs bags, folders or patterns of bags"),

@@ -6,7 +6,11 @@ from result_making import calibration as made
 from result_making import dofs
 
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.se3 import inverse_covariance, sigmas_in_parent, sigmas_rpy
+from hand_eye_calib.core.geometry.se3 import (
+    inverse_covariance,
+    sigmas_in_parent,
+    sigmas_rpy,
+)
 from hand_eye_calib.core.results.calibration import SolveStatus
 from hand_eye_calib.core.results.document import printed_numbers, transforms_of
 from hand_eye_calib.offline.cli.present import as_lines
@@ -23,12 +27,20 @@ def transform(rotation, translation=(0.3, -0.2, 0.1)):
 def covariance_about_parent(rotation, sigmas_deg, sigmas_m=(0.01, 0.02, 0.03)):
     """Covariance in the child's frame of errors that are independent about the parent's axes."""
     to_child = np.kron(np.eye(2), rotation.T)
-    return to_child @ np.diag(np.square(np.r_[sigmas_m, np.radians(sigmas_deg)])) @ to_child.T
+    return (
+        to_child
+        @ np.diag(np.square(np.r_[sigmas_m, np.radians(sigmas_deg)]))
+        @ to_child.T
+    )
 
 
 @pytest.mark.parametrize(
     "rotation",
-    [LIDAR_CAMERA, se3.rotation_from_rpy([0.4, -0.9, 2.5]), se3.rotation_from_rpy([2.0, 0.9, 0.0])],
+    [
+        LIDAR_CAMERA,
+        se3.rotation_from_rpy([0.4, -0.9, 2.5]),
+        se3.rotation_from_rpy([2.0, 0.9, 0.0]),
+    ],
     ids=["lidar-camera", "oblique", "steep"],
 )
 def test_sigmas_are_the_spread_of_the_numbers_in_both_directions(rotation):
@@ -40,10 +52,14 @@ def test_sigmas_are_the_spread_of_the_numbers_in_both_directions(rotation):
     inverse = se3.inverse(T), se3.inverse(drawn), inverse_covariance(T, covariance)
     for of, samples, stated in ((T, drawn, covariance), inverse):
         along = samples[:, :3, 3].std(axis=0)
-        np.testing.assert_allclose(sigmas_in_parent(of[:3, :3], stated)[:3], along, rtol=0.03)
+        np.testing.assert_allclose(
+            sigmas_in_parent(of[:3, :3], stated)[:3], along, rtol=0.03
+        )
         sigmas = sigmas_rpy(of, stated)
         if np.isfinite(sigmas).all():  # the inverse of one is locked
-            off = se3.rotation_to_rpy(samples[:, :3, :3]) - se3.rotation_to_rpy(of[:3, :3])
+            off = se3.rotation_to_rpy(samples[:, :3, :3]) - se3.rotation_to_rpy(
+                of[:3, :3]
+            )
             spread = np.std((off + np.pi) % (2 * np.pi) - np.pi, axis=0)
             np.testing.assert_allclose(sigmas, spread, rtol=0.03)
 
@@ -58,12 +74,17 @@ def test_near_gimbal_lock_roll_and_yaw_are_printed_without_a_sigma():
     result = calibration(rotation, (0.3, 0.2, 0.1))
     document = result.to_dict()["T_parent_child"]
     assert document["sigma_rpy_deg"][0] is document["sigma_measured_rpy_deg"][2] is None
-    assert printed_numbers(transforms_of(result)["T_parent_child"], ())["roll"] == "20.00 deg"
+    assert (
+        printed_numbers(transforms_of(result)["T_parent_child"], ())["roll"]
+        == "20.00 deg"
+    )
 
 
 def test_an_unknown_rotation_has_no_sigma():
     covariance = np.diag([1e-4, 1e-4, 1e-4, 1e-6, 1e-6, np.pi**2])
-    assert sigmas_rpy(np.eye(4), covariance).tolist() == pytest.approx([1e-3, 1e-3, np.inf])
+    assert sigmas_rpy(np.eye(4), covariance).tolist() == pytest.approx(
+        [1e-3, 1e-3, np.inf]
+    )
     assert np.isinf(sigmas_rpy(np.eye(4), np.full((6, 6), np.inf))).all()
     assert np.isinf(sigmas_in_parent(np.eye(3), np.full((6, 6), np.inf))).all()
 
@@ -85,7 +106,9 @@ def test_a_result_has_the_sigmas_of_its_printed_numbers_in_both_directions():
     document = result.to_dict()
     transform = document["T_parent_child"]
     back = document["T_child_parent"]
-    np.testing.assert_allclose(transform["sigma_rpy_deg"], np.degrees(result.sigmas_rpy))
+    np.testing.assert_allclose(
+        transform["sigma_rpy_deg"], np.degrees(result.sigmas_rpy)
+    )
     assert transform["sigma_rpy_deg"][1] == pytest.approx(0.57)
     np.testing.assert_allclose(transform["sigma_translation"], [0.01, 0.02, 0.03])
     # An error of the rotation moves the parent, which is 0.37 m from the child.
@@ -107,7 +130,11 @@ def test_one_sigma_is_stated_on_the_terminal_in_python_and_in_documents():
     )
     whole_m = np.hypot(measured_m, allowance_m)
     document = result.to_dict()
-    in_python = [result.sigmas[0], result.sigmas_printed[0], result.covariance[0, 0] ** 0.5]
+    in_python = [
+        result.sigmas[0],
+        result.sigmas_printed[0],
+        result.covariance[0, 0] ** 0.5,
+    ]
     in_documents = [
         document["observability"][0]["sigma"],
         document["sigma"]["x"],
@@ -121,7 +148,9 @@ def test_one_sigma_is_stated_on_the_terminal_in_python_and_in_documents():
     assert "x 0.3000 +/- 0.0091 m" in repr(result)
     lines = as_lines(result)
     assert "  x        0.3000 +/- 0.0091 m  (4.3 mm measured, 8 mm allowance)" in lines
-    assert any("the allowance is for constant odometry errors" in line for line in lines)
+    assert any(
+        "the allowance is for constant odometry errors" in line for line in lines
+    )
     assert any("--parent-kind exact or --child-kind exact" in line for line in lines)
 
 

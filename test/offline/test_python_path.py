@@ -10,7 +10,14 @@ from source_code import SOURCE
 from hand_eye_calib.core.base.python_path import starting_trusted
 
 # Modules of the standard library that the commands and their processes import late.
-STRANGERS = ("queue.py", "bisect.py", "csv.py", "heapq.py", "multiprocessing.py", "numpy.py")
+STRANGERS = (
+    "queue.py",
+    "bisect.py",
+    "csv.py",
+    "heapq.py",
+    "multiprocessing.py",
+    "numpy.py",
+)
 # As pip installs it: Python looks for modules beside this file first.
 PROGRAM = """
 from hand_eye_calib.offline.cli.main import main
@@ -31,7 +38,9 @@ def hostile_folder(tmp_path):
     folder = tmp_path / "drive"
     folder.mkdir()
     for name in STRANGERS:
-        (folder / name).write_text("open('executed', 'a').write(__name__)\nraise SystemExit(99)\n")
+        (folder / name).write_text(
+            "open('executed', 'a').write(__name__)\nraise SystemExit(99)\n"
+        )
     return folder
 
 
@@ -40,7 +49,9 @@ def run(arguments, folder, **environment):
     root = str(SOURCE.parent)
     environment = {**os.environ, "PYTHONPATH": root, **environment}
     command = [sys.executable, *arguments]
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    return subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True
+    )
 
 
 @pytest.fixture
@@ -54,13 +65,23 @@ def program(tmp_path):
 
 @pytest.fixture
 def bags(tmp_path, program):
-    simulate = ["simulate", "--runs", "2", "--bag", "mcap", "--out", str(tmp_path / "drives")]
+    simulate = [
+        "simulate",
+        "--runs",
+        "2",
+        "--bag",
+        "mcap",
+        "--out",
+        str(tmp_path / "drives"),
+    ]
     done = run([program, *simulate], tmp_path)
     assert done.returncode == 0, done.stderr
     return sorted((tmp_path / "drives").rglob("*.mcap"))
 
 
-def test_workers_of_a_batch_run_no_file_of_the_current_folder(hostile_folder, bags, program):
+def test_workers_of_a_batch_run_no_file_of_the_current_folder(
+    hostile_folder, bags, program
+):
     out = hostile_folder.parent / "out"
     batch = ["calibrate", "--batch", *map(str, bags), "--jobs", "2", "--out", str(out)]
     done = run([program, *batch], hostile_folder)
@@ -68,7 +89,9 @@ def test_workers_of_a_batch_run_no_file_of_the_current_folder(hostile_folder, ba
     assert len((out / "rows.csv").read_text().splitlines()) == 3
 
 
-def test_the_solving_process_runs_no_file_of_the_current_folder(hostile_folder, tmp_path):
+def test_the_solving_process_runs_no_file_of_the_current_folder(
+    hostile_folder, tmp_path
+):
     solver = tmp_path / "solver.py"
     solver.write_text(SOLVER)
     done = run([str(solver)], hostile_folder)
@@ -76,7 +99,9 @@ def test_the_solving_process_runs_no_file_of_the_current_folder(hostile_folder, 
     assert not (hostile_folder / "executed").exists()
 
 
-def test_python_m_runs_no_file_of_the_current_folder_once_the_package_runs(hostile_folder, bags):
+def test_python_m_runs_no_file_of_the_current_folder_once_the_package_runs(
+    hostile_folder, bags
+):
     # Before that, `python -m` itself has the current folder first.
     for name in STRANGERS:
         if name != "numpy.py":

@@ -136,11 +136,18 @@ def test_every_section_and_figure_is_there_verdict_first(hilly):
     figures = [attributes["id"] for attributes in page.all("figure")]
     assert figures == [f"figure-{name}" for name in FIGURES]
     assert len(page.all("svg")) == len(FIGURES)
-    scrolled = [division for division in page.all("div") if division.get("class") == "scroll"]
-    described = [division["aria-label"] for division in scrolled if division.get("role") == "img"]
+    scrolled = [
+        division for division in page.all("div") if division.get("class") == "scroll"
+    ]
+    described = [
+        division["aria-label"] for division in scrolled if division.get("role") == "img"
+    ]
     assert len(described) == len(FIGURES)
     assert all(re.search(r"\d", label) for label in described)
-    assert [tag for tag, _ in page.elements if re.fullmatch("h[1-6]", tag)][:2] == ["h1", "h2"]
+    assert [tag for tag, _ in page.elements if re.fullmatch("h[1-6]", tag)][:2] == [
+        "h1",
+        "h2",
+    ]
     assert "prefers-color-scheme: dark" in text
     assert "@media print" in text
 
@@ -154,7 +161,9 @@ def test_numbers_are_the_calibrations(drive, request):
             assert f"{round(value, 4) + 0.0:.4f}" in page.text
         sigmas = [*transform["sigma_translation"], *transform["sigma_rpy_deg"]]
         values = [*transform["translation"], *transform["rpy_deg"]]
-        for value, sigma, decimals in zip(values, sigmas, (3, 3, 3, 2, 2, 2), strict=True):
+        for value, sigma, decimals in zip(
+            values, sigmas, (3, 3, 3, 2, 2, 2), strict=True
+        ):
             assert with_sigma(value, sigma, decimals).replace("+/-", "±") in page.text
     totals = calibration.sigmas.tolist()
     for dof, total in zip(calibration.observability, totals, strict=True):
@@ -189,7 +198,10 @@ def test_what_is_unobservable_is_said_first_with_what_to_do(planar):
     assert "USE WITH CARE All but z; measure z by hand" in verdict
     assert "z cannot be determined from this motion" in verdict
     assert re.search(r"Motion: .*z cannot be determined", verdict)
-    assert "To publish it (USE WITH CARE, after you have replaced MEASURE_Z_BY_HAND)" in page.text
+    assert (
+        "To publish it (USE WITH CARE, after you have replaced MEASURE_Z_BY_HAND)"
+        in page.text
+    )
     assert "--z MEASURE_Z_BY_HAND --qx" in page.text
     assert "z: unknown" in {a.get("aria-label") for a in page.all("div")}
 
@@ -220,7 +232,9 @@ def test_results_of_positions_and_rates_have_a_page_of_what_they_show(partial, n
         f"figure-{figure}" for figure in shown
     ]
     assert len(page.all("svg")) == len(shown)
-    word, unknown = ("Orientation", "x, y and z") if name == "rates" else ("Position", "roll")
+    word, unknown = (
+        ("Orientation", "x, y and z") if name == "rates" else ("Position", "roll")
+    )
     assert f"{word} of antenna in lidar" in page.text
     assert f"{word} of lidar in antenna" in page.text
     assert f"{unknown}" in page.text[page.text.index("not estimated") - 20 :]
@@ -276,7 +290,9 @@ def test_any_result_gets_a_page(tmp_path, motion, options):
     write_report(tmp_path, calibration, snapshot, {})
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert page.errors == []
-    assert [a["id"] for a in page.all("figure")] == [f"figure-{name}" for name in FIGURES]
+    assert [a["id"] for a in page.all("figure")] == [
+        f"figure-{name}" for name in FIGURES
+    ]
     assert "nan" not in re.findall(r"[a-z]+", page.text.lower())
     assert not re.search(r"\binf\b", page.text)
 
@@ -318,7 +334,11 @@ def test_streams_are_shown_on_one_clock_and_in_one_unit():
     drive = simulate_drive(3, dataclasses.replace(DRIVE, poses=200))
     seen = evidence.view_streams(drive.parent, drive.child, 0.5)
     (times_p, rates_p), (times_c, rates_c) = seen.rates
-    assert np.median(np.abs(np.interp(times_p, times_c, rates_c) - rates_p)) < 0.01 < rates_p.max()
+    assert (
+        np.median(np.abs(np.interp(times_p, times_c, rates_c) - rates_p))
+        < 0.01
+        < rates_p.max()
+    )
     assert [spans.shape for spans in seen.spans_s] == [(1, 2), (1, 2)]
     holed = evidence.view_streams(drive.parent, drive.child[np.r_[0:100, 150:400]], 0.5)
     assert [len(spans) for spans in holed.spans_s] == [1, 2]
@@ -334,13 +354,19 @@ def test_what_is_installed_is_compared_axis_by_axis_and_an_axis_may_have_its_own
     installed = Extrinsic(to_parent @ calibration.T_parent_child, "robot.urdf <b>")
     compared = with_comparison(calibration, installed)
     _text, page = page_of(snapshot, compared)
-    assert "installed" in [attributes["aria-labelledby"] for attributes in page.all("section")]
-    shown = page.text[page.text.index("axis of lidar difference") : page.text.rindex("Evidence")]
+    assert "installed" in [
+        attributes["aria-labelledby"] for attributes in page.all("section")
+    ]
+    shown = page.text[
+        page.text.index("axis of lidar difference") : page.text.rindex("Evidence")
+    ]
     (difference,) = hec.compare([calibration], installed).differences
     assert compared.comparison.sentence in page.text
     along_x = difference.axes["x"]
     visible = amount("x", along_x.visible)
-    assert f"along x {change('x', -0.5, along_x.sigma)} {visible} moved along y" in shown
+    assert (
+        f"along x {change('x', -0.5, along_x.sigma)} {visible} moved along y" in shown
+    )
     assert "along z unknown unknown cannot tell about x" in shown
     assert shown.count("deg same") == 3
     assert "robot.urdf <b>" in page.text
@@ -372,8 +398,13 @@ def test_no_page_names_folders(hilly):
     _, page = page_of(snapshot, calibration, inputs=inputs)
     assert folder not in page.text
     assert "100.0 Hz" in page.text
-    header = page.text[: page.text.index("Contents") if "Contents" in page.text else 600]
-    assert "Parent: lidar, from test_report.py; Child: camera, from /camera/odometry." in header
+    header = page.text[
+        : page.text.index("Contents") if "Contents" in page.text else 600
+    ]
+    assert (
+        "Parent: lidar, from test_report.py; Child: camera, from /camera/odometry."
+        in header
+    )
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -383,7 +414,9 @@ def test_labels_names_of_files_and_what_it_means_at_a_distance(hilly):
         calibration, parent_frame="parent_sensor", child_frame="child_sensor"
     )
     inputs = {"parent": {"file": "/a/roof.tum"}, "child": {"topic": "/camera/odometry"}}
-    _, page = page_of(snapshot, nameless, inputs=inputs | {"labels": {"vehicle": "7 <b>"}})
+    _, page = page_of(
+        snapshot, nameless, inputs=inputs | {"labels": {"vehicle": "7 <b>"}}
+    )
     assert "Pose of camera/odometry in roof" in page.text
     assert "Maps coordinates of camera/odometry into roof." in page.text
     assert "vehicle: 7 <b>" in page.text[: page.text.index("Verdict")]
@@ -406,16 +439,24 @@ AGAINST = (
 @pytest.mark.usefixtures("no_figures")
 def test_no_sentence_speaks_against_a_green_verdict():
     green = 0
-    for seed, options in enumerate(17 * [{}, *3 * [{"method": "dnlo", "reference": "B10"}]]):
+    for seed, options in enumerate(
+        17 * [{}, *3 * [{"method": "dnlo", "reference": "B10"}]]
+    ):
         snapshot, calibration = simulated(seed, 60 + 2 * seed, options=options)
         if calibration.verdict is Verdict.USE:
             green += 1
-            assert not re.findall(AGAINST, Page(render(calibration, snapshot)).text.lower())
+            assert not re.findall(
+                AGAINST, Page(render(calibration, snapshot)).text.lower()
+            )
     assert green >= 55
 
 
 def test_views_are_named_by_where_one_looks_from():
-    from_where = {"from above": [0, 0, 1], "from the side": [0, -1, 0], "from the front": [1, 0, 0]}
+    from_where = {
+        "from above": [0, 0, 1],
+        "from the side": [0, -1, 0],
+        "from the front": [1, 0, 0],
+    }
     for (across, up), name in VIEWS_OF_VEHICLE.items():
         axes = np.eye(3)[["xyz".index(across), "xyz".index(up)]]
         assert np.cross(*axes).tolist() == from_where[name]
@@ -526,7 +567,9 @@ def test_an_unknown_direction_between_axes_is_drawn_as_it_is():
         assert abs(along @ expected) == pytest.approx(1.0)
 
 
-def test_a_report_is_printed_on_two_pages_and_with_its_details_if_they_are_open(tmp_path):
+def test_a_report_is_printed_on_two_pages_and_with_its_details_if_they_are_open(
+    tmp_path,
+):
     program = next(filter(None, map(shutil.which, browser.PROGRAMS)), None)
     if program is None:
         pytest.skip("no browser")
@@ -543,5 +586,7 @@ def printed_pages(program, page, folder):
     pdf = folder / "printed.pdf"
     options = ("--headless", "--no-sandbox", "--disable-gpu", "--no-pdf-header-footer")
     arguments = [program, *options, f"--print-to-pdf={pdf}", page.as_uri()]
-    subprocess.run(arguments, check=True, capture_output=True, timeout=browser.PATIENCE_S)
+    subprocess.run(
+        arguments, check=True, capture_output=True, timeout=browser.PATIENCE_S
+    )
     return len(re.findall(rb"/Type /Page\b", pdf.read_bytes()))

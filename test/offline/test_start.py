@@ -30,7 +30,10 @@ for command in ((), *((each,) for each in COMMANDS)):
 
 def loaded_by(code, *arguments):
     done = subprocess.run(
-        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True
+        [sys.executable, "-c", code, *arguments],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     return set(done.stderr.split())
 
@@ -52,7 +55,9 @@ def test_engine_and_node_load_only_what_they_compute_with(code):
     allowed = {"numpy", "scipy"} | ({"rclpy", "yaml"} if ".ros." in code else set())
     assert not {name.partition(".")[0] for name in loaded} & (HEAVY - allowed)
     # Any part of scipy takes as long as all the rest, but for the wrapper of LAPACK alone.
-    assert {name for name in loaded if name.startswith("scipy")} <= {"scipy.linalg._flapack"}
+    assert {name for name in loaded if name.startswith("scipy")} <= {
+        "scipy.linalg._flapack"
+    }
 
 
 def test_calibrating_two_files_loads_no_writer_of_results(tmp_path):
@@ -63,9 +68,17 @@ def test_calibrating_two_files_loads_no_writer_of_results(tmp_path):
         "import sys; from hand_eye_calib.offline.cli.main import main; "
         "main(sys.argv[1:]); print('loaded', *sys.modules, file=sys.stderr)"
     )
-    loaded = loaded_by(code, "calibrate", str(tmp_path / "parent"), str(tmp_path / "child"))
+    loaded = loaded_by(
+        code, "calibrate", str(tmp_path / "parent"), str(tmp_path / "child")
+    )
     assert "loaded" in loaded
-    assert not loaded & {"yaml", "urllib.request", "importlib.metadata", "matplotlib", "casadi"}
+    assert not loaded & {
+        "yaml",
+        "urllib.request",
+        "importlib.metadata",
+        "matplotlib",
+        "casadi",
+    }
 
 
 def test_commands_use_one_thread_unless_told_otherwise(monkeypatch):

@@ -137,7 +137,9 @@ TABLE = """
 2 | simulate --out new --drive rocky | choose from 'published', 'hilly'
 2 | watch --port x | unknown '--port'
 """
-ROWS = [[cell.strip() for cell in row.split(" | ")] for row in TABLE.strip().splitlines()]
+ROWS = [
+    [cell.strip() for cell in row.split(" | ")] for row in TABLE.strip().splitlines()
+]
 
 TEXTS = {
     "empty.tum": "",
@@ -179,7 +181,9 @@ def inputs(tmp_path_factory):
     (folder / "image.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     (folder / "cut.mcap").write_bytes((folder / "drive.mcap").read_bytes()[:3000])
     (folder / "packed.gz").write_bytes(gzip.compress(b"0 0 0 0 0 0 0 1\n"))
-    lidar, camera = (hec.read_trajectory(f"sample:{name}.tum") for name in ("lidar", "camera"))
+    lidar, camera = (
+        hec.read_trajectory(f"sample:{name}.tum") for name in ("lidar", "camera")
+    )
     hec.save(hec.calibrate(lidar, camera), folder / "saved")
     write_poses(folder)
     return folder
@@ -213,12 +217,20 @@ def write_poses(folder):
     (folder / "cells.tum").write_text(text.replace("1", "abc", 1))
 
 
-@pytest.mark.parametrize(("code", "command", "message"), ROWS, ids=[row[1] for row in ROWS])
-def test_a_wrong_input_is_answered_in_one_line(run, inputs, monkeypatch, code, command, message):
+@pytest.mark.parametrize(
+    ("code", "command", "message"), ROWS, ids=[row[1] for row in ROWS]
+)
+def test_a_wrong_input_is_answered_in_one_line(
+    run, inputs, monkeypatch, code, command, message
+):
     monkeypatch.chdir(inputs)
     exit_code, out, err = run(*shlex.split(command))
     assert (exit_code, out) == (int(code), "")
-    lines = [line for line in err.splitlines() if not line.startswith("hand_eye_calib: note: ")]
+    lines = [
+        line
+        for line in err.splitlines()
+        if not line.startswith("hand_eye_calib: note: ")
+    ]
     assert len(lines) == 1
     assert lines[0].startswith("hand_eye_calib: error: ")
     assert message in lines[0]
@@ -232,7 +244,10 @@ def test_an_option_of_dnlo_has_a_note_with_another_method(run):
     paths = ("sample:lidar.tum", "sample:camera.tum")
     _, out, _ = run("calibrate", *paths, "--threshold", "0.5")
     words = " ".join(out.split())
-    assert "Note: the option threshold has no effect with method adaptive: only dnlo uses" in words
+    assert (
+        "Note: the option threshold has no effect with method adaptive: only dnlo uses"
+        in words
+    )
     _, out, _ = run("calibrate", *paths, "--threshold", "0.5", "--method", "dnlo")
     assert "has no effect" not in out
 
@@ -247,8 +262,14 @@ def test_a_folder_may_be_called_sample():
 SAMPLES = hec.read_arm_samples("sample:arm.yaml")
 LIDAR = hec.read_trajectory("sample:lidar.tum")
 IN_PYTHON = {
-    "no child": (lambda: hec.calibrate(LIDAR), "a child is missing: pass two trajectories"),
-    "no parent": (lambda: hec.calibrate(None, LIDAR), "the parent must be a trajectory"),
+    "no child": (
+        lambda: hec.calibrate(LIDAR),
+        "a child is missing: pass two trajectories",
+    ),
+    "no parent": (
+        lambda: hec.calibrate(None, LIDAR),
+        "the parent must be a trajectory",
+    ),
     "stamps in seconds": (
         lambda: hec.Trajectory(LIDAR.stamps_ns / 1e9, LIDAR.poses),
         "multiply seconds by 1e9 and round them",
@@ -265,14 +286,22 @@ IN_PYTHON = {
         lambda: hec.calibrate_arm(SAMPLES.robot, SAMPLES.tracking, names="abc"),
         "names must be of type Mapping; got str",
     ),
-    "words as poses": (lambda: hec.robot_poses("abc", "kuka"), "rows must be numbers; got str"),
-    "a misspelt robot": (lambda: hec.robot_poses([[0.0] * 6], "kuca"), "did you mean kuka?"),
+    "words as poses": (
+        lambda: hec.robot_poses("abc", "kuka"),
+        "rows must be numbers; got str",
+    ),
+    "a misspelt robot": (
+        lambda: hec.robot_poses([[0.0] * 6], "kuca"),
+        "did you mean kuka?",
+    ),
     "files as poses": (
         lambda: hec.calibrate_arm("hand.tum", "camera.tum"),
         "robot: expected poses, not a path; read_arm_samples",
     ),
     "one result": (
-        lambda: hec.compare([hec.calibrate(LIDAR, hec.read_trajectory("sample:camera.tum"))]),
+        lambda: hec.compare(
+            [hec.calibrate(LIDAR, hec.read_trajectory("sample:camera.tum"))]
+        ),
         "or one and the installed transform",
     ),
 }

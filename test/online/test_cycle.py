@@ -35,9 +35,16 @@ TARGETS = (0.02,) * 3 + (0.005,) * 3
 
 def result(sigmas_m=0.005, **fields):
     sigmas = np.r_[np.broadcast_to(sigmas_m, 3), np.full(3, 0.001)].tolist()
-    verdicts = [DofVerdict.OBSERVED if s < np.inf else DofVerdict.UNOBSERVABLE for s in sigmas]
+    verdicts = [
+        DofVerdict.OBSERVED if s < np.inf else DofVerdict.UNOBSERVABLE for s in sigmas
+    ]
     dofs = tuple(map(DofObservability, AXES, verdicts, sigmas))
-    fields = {"status": SolveStatus.OK, "noise": None, "warnings": (), "findings": ()} | fields
+    fields = {
+        "status": SolveStatus.OK,
+        "noise": None,
+        "warnings": (),
+        "findings": (),
+    } | fields
     return dataclasses.replace(calibration(), observability_measured=dofs, **fields)
 
 
@@ -53,10 +60,14 @@ def cycle(lines, monkeypatch):
     nothing = SimpleNamespace(submit=jobs.append, stop=lambda s: None, answers=list)
     monkeypatch.setattr(module, "SolvingProcess", lambda wake: nothing)
     levels = ("debug", "info", "warning", "error")
-    write = {level: lambda text, level=level: lines.append((level, text)) for level in levels}
+    write = {
+        level: lambda text, level=level: lines.append((level, text)) for level in levels
+    }
     log = NodeLog(SimpleNamespace(**write))
     session = LiveSession(log, CalibratorConfig())
-    made = SolveCycle(session, log, print, lambda calibration: calibration, print, TARGETS)
+    made = SolveCycle(
+        session, log, print, lambda calibration: calibration, print, TARGETS
+    )
     made.jobs = jobs
     made.ask(lambda good, text: None)
     return made
@@ -98,9 +109,13 @@ def test_what_is_kept_is_answered_and_says_why_it_is_not_the_newest(cycle, lines
     assert cycle.result.warnings == ()
 
 
-def test_what_somebody_asks_for_is_checked_and_other_solves_are_every_half_minute(cycle):
+def test_what_somebody_asks_for_is_checked_and_other_solves_are_every_half_minute(
+    cycle,
+):
     for is_asked in (False, False, True):
-        cycle._session.calibrator.add_pose("parent", len(cycle.jobs), [0, 0, 0], [0, 0, 0, 1])
+        cycle._session.calibrator.add_pose(
+            "parent", len(cycle.jobs), [0, 0, 0], [0, 0, 0, 1]
+        )
         cycle.is_solving = False
         cycle._waiting = {}
         cycle.ask(lambda good, text: None) if is_asked else cycle.start_if_due()
@@ -151,7 +166,10 @@ def test_a_solve_that_fails_says_so_and_changes_nothing(cycle):
     reach_goal(cycle)
     before = cycle.result
     good, text = answered(cycle, 46.0, status=SolveStatus.NOT_CONVERGED)
-    assert (good, text.startswith("DO NOT USE: the solver did not converge")) == (False, True)
+    assert (good, text.startswith("DO NOT USE: the solver did not converge")) == (
+        False,
+        True,
+    )
     assert cycle.result is before
 
 
@@ -174,7 +192,12 @@ def test_the_log_of_a_good_session_of_seven_minutes_is_short_and_asks_for_nothin
         now_s = 1e4 + 2.0 * k
         monkeypatch.setattr(module.time, "monotonic", lambda now_s=now_s: now_s)
         sigmas_m = 0.2 / np.sqrt(1.0 + k) * np.roll([1.0, 0.95, 0.9], k)
-        answered(cycle, 2.0 * k, tuple(np.where(k > 90, 0.005 * (1 + k % 2), sigmas_m)), 100 + k)
+        answered(
+            cycle,
+            2.0 * k,
+            tuple(np.where(k > 90, 0.005 * (1 + k % 2), sigmas_m)),
+            100 + k,
+        )
     assert cycle.goal.progress.done
     assert {level for level, _ in lines} <= {"info", "debug"}, lines
     shown = [text for level, text in lines if level != "debug"]
@@ -188,7 +211,11 @@ def test_a_reason_is_a_warning_once_and_again_in_a_new_session(cycle, lines):
     for session in range(2):
         for motion_s in (20.0, 40.0, 42.0):
             cycle.conclude(Answer(0, 0.1, seen(motion_s, flat), hidden))
-        warned = [text for level, text in lines if (level, "CARE: z" in text) == ("warning", True)]
+        warned = [
+            text
+            for level, text in lines
+            if (level, "CARE: z" in text) == ("warning", True)
+        ]
         assert len(warned) == 1 + session, warned
         cycle.restart()
         cycle._log.restart()
@@ -196,7 +223,13 @@ def test_a_reason_is_a_warning_once_and_again_in_a_new_session(cycle, lines):
 
 def shape(hint):
     """What JSON has for a value of this type, in words; ? where it may be null."""
-    words = {str: "text", bool: "true/false", int: "integer", float: "number", Level: "0/1/2"}
+    words = {
+        str: "text",
+        bool: "true/false",
+        int: "integer",
+        float: "number",
+        Level: "0/1/2",
+    }
     inner = typing.get_args(hint)
     if types.NoneType in inner:
         return f"{shape(inner[0])}?" if len(inner) == 2 else shape(hint.__origin__)
@@ -206,14 +239,19 @@ def shape(hint):
         return f"{{KEY: {shape(inner[1])}, ...}}"
     if dataclasses.is_dataclass(hint):
         hints = typing.get_type_hints(hint)
-        return f"{{{', '.join(f'{name}: {shape(item)}' for name, item in hints.items())}}}"
+        return (
+            f"{{{', '.join(f'{name}: {shape(item)}' for name, item in hints.items())}}}"
+        )
     if hint not in words and issubclass(hint, Enum):
         return "/".join(map(plain, hint))
     return words[hint]
 
 
 def test_the_keys_of_the_progress_topic_are_on_the_page_of_the_node():
-    lines = [f"{name}: {shape(item)}" for name, item in typing.get_type_hints(NodeState).items()]
+    lines = [
+        f"{name}: {shape(item)}"
+        for name, item in typing.get_type_hints(NodeState).items()
+    ]
     wrapped = [textwrap.fill(line, 98, subsequent_indent="  ") for line in lines]
     text = "\n".join(["```text", *wrapped, "```"])
     page = (ROOT / "docs" / "node.md").read_text()
@@ -223,7 +261,9 @@ def test_the_keys_of_the_progress_topic_are_on_the_page_of_the_node():
 def scatter(of_halves):
     """A cross-check in which both halves differ about the rotation about x."""
     row = AxisScatter(sigma=0.001, of_methods=0.0, of_halves=0.0, excess_of_halves=0.0)
-    apart = dataclasses.replace(row, of_halves=of_halves, excess_of_halves=1000.0 * of_halves)
+    apart = dataclasses.replace(
+        row, of_halves=of_halves, excess_of_halves=1000.0 * of_halves
+    )
     return dict.fromkeys(AXES, row) | {"roll": apart}
 
 
@@ -237,12 +277,16 @@ def test_what_the_halves_of_the_whole_drive_no_longer_say_is_taken_back(cycle, l
     _, text = answered(cycle, 60.0, (0.005, 0.01, 0.005), 200, cross_check=scatter(0.0))
     assert "the result of 100 poses is kept" in text
     assert cycle.result.verdict is Verdict.USE
-    taken_back = [(level, text) for level, text in lines if text.startswith("no longer found")]
+    taken_back = [
+        (level, text) for level, text in lines if text.startswith("no longer found")
+    ]
     assert [level for level, _ in taken_back] == ["info"]
     assert sentence in taken_back[0][1]
 
 
-def test_a_solve_on_a_busy_computer_is_named_and_its_pause_is_short(cycle, lines, monkeypatch):
+def test_a_solve_on_a_busy_computer_is_named_and_its_pause_is_short(
+    cycle, lines, monkeypatch
+):
     now_s = [100.0]
     monkeypatch.setattr(module.time, "monotonic", lambda: now_s[0])
     cycle.start_if_due()
@@ -262,7 +306,9 @@ def test_a_solve_on_a_busy_computer_is_named_and_its_pause_is_short(cycle, lines
 def test_the_next_solve_has_hurry_if_other_programs_have_held_up_the_last_one(cycle):
     hurries = [cycle.jobs[-1].has_hurry]
     for seconds, processor_s in ((60.0, 0.5), (1.0, 0.1), (15.0, 14.0), (15.0, 0.4)):
-        cycle.conclude(Answer(0, seconds, seen(30.0), result(), processor_s=processor_s))
+        cycle.conclude(
+            Answer(0, seconds, seen(30.0), result(), processor_s=processor_s)
+        )
         cycle._start()
         hurries.append(cycle.jobs[-1].has_hurry)
     assert hurries == [False, True, False, False, True]

@@ -13,7 +13,11 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
-from hand_eye_calib.core.results.calibration import DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.core.results.calibration import (
+    DofObservability,
+    DofVerdict,
+    SolveStatus,
+)
 from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.offline.cli.present import as_lines
 from hand_eye_calib.online.live.goal import Goal
@@ -50,8 +54,14 @@ def test_the_session_ends_once_more_motion_has_confirmed_the_targets():
     goal = Goal(TARGETS)
     goal.add(result(sigmas_m=0.0201), seen(30.0))
     within = goal.add(result(sigmas_m=0.0199), seen(40.0))
-    assert (within.done, within.limiting_axis, max(seconds_left(within))) == (False, "", 0.0)
-    assert within.sentence == "Confirming, 40 s: every axis is within its target. Go on."
+    assert (within.done, within.limiting_axis, max(seconds_left(within))) == (
+        False,
+        "",
+        0.0,
+    )
+    assert (
+        within.sentence == "Confirming, 40 s: every axis is within its target. Go on."
+    )
     assert within.seconds_left == 40.0
     assert goal.add(result(), seen(50.0)).seconds_left == 30.0
     done = goal.add(result(), seen(80.0))
@@ -66,8 +76,12 @@ def test_a_result_beyond_its_target_begins_the_confirmation_anew():
     assert goal.add(result(), seen(80.0)).done
 
 
-@pytest.mark.parametrize(("since_s", "least_s"), [(10.0, 30.0), (60.0, 120.0), (400.0, 480.0)])
-def test_the_confirmation_takes_as_long_as_the_motion_before_20_to_75_s(since_s, least_s):
+@pytest.mark.parametrize(
+    ("since_s", "least_s"), [(10.0, 30.0), (60.0, 120.0), (400.0, 480.0)]
+)
+def test_the_confirmation_takes_as_long_as_the_motion_before_20_to_75_s(
+    since_s, least_s
+):
     goal = Goal(TARGETS)
     for motion_s in np.arange(since_s, least_s, 10.0):
         assert not goal.add(result(), seen(motion_s)).done
@@ -97,7 +111,9 @@ def test_a_target_below_the_allowance_is_no_fault_of_the_motion():
 
 def test_every_axis_has_its_own_target():
     config = CalibratorConfig(target_axes="z=10cm, yaw=0.5deg")
-    assert config.targets == pytest.approx((0.02, 0.02, 0.1, 0.00524, 0.00524, np.radians(0.5)))
+    assert config.targets == pytest.approx(
+        (0.02, 0.02, 0.1, 0.00524, 0.00524, np.radians(0.5))
+    )
     goal = Goal(config.targets)
     rough_height = result(sigmas_m=(0.004, 0.004, 0.06))
     progress = progress_after(goal, *[rough_height] * 3)
@@ -110,7 +126,10 @@ def test_every_axis_has_its_own_target():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("height=10cm", "takes AXIS=TARGET of x, y, z, roll, pitch, yaw.*got 'height=10cm'"),
+        (
+            "height=10cm",
+            "takes AXIS=TARGET of x, y, z, roll, pitch, yaw.*got 'height=10cm'",
+        ),
         ("z", "z must be numbers in m or cm or mm"),
         ("z=1 z=2", "once each.*got 'z=2'"),
         ("z=0", "above 0"),
@@ -124,7 +143,9 @@ def test_targets_that_say_something_else_are_refused(text, message):
 
 
 def test_time_left_follows_from_the_variance_that_falls_with_time():
-    progress = Goal(TARGETS).add(result(sigmas_m=(0.004, 0.04, 0.004)), seen(40.0, FLAT))
+    progress = Goal(TARGETS).add(
+        result(sigmas_m=(0.004, 0.04, 0.004)), seen(40.0, FLAT)
+    )
     assert progress.limiting_axis == "y"
     np.testing.assert_allclose(seconds_left(progress), [0, 120, 0, 0, 0, 0])
     assert progress.sentence == (
@@ -149,7 +170,9 @@ def test_the_motion_of_the_last_minute_counts_if_it_is_better():
 def test_the_motion_is_not_to_be_changed_while_the_motion_asked_for_is_driven():
     goal = Goal(TARGETS)
     hidden = result(sigmas_m=(0.004, 0.004, np.inf), status=SolveStatus.UNOBSERVABLE)
-    assert goal.add(hidden, seen(60.0, FLAT), newest_motion=seen(60.0, FLAT)).will_not_get_there
+    assert goal.add(
+        hidden, seen(60.0, FLAT), newest_motion=seen(60.0, FLAT)
+    ).will_not_get_there
     ramp = seen(60.0, (0.5, 7.0, 90.0))
     on_ramp = goal.add(hidden, seen(64.0, FLAT), newest_motion=ramp)
     assert not on_ramp.will_not_get_there
@@ -161,7 +184,9 @@ def test_the_motion_is_not_to_be_changed_while_the_motion_asked_for_is_driven():
 def test_the_time_left_only_shrinks_by_two_steps_at_a_result():
     goal = Goal(TARGETS)
     times_s = []
-    for motion_s, sigma_m in enumerate((0.043, 0.0205, 0.04, 0.04, 0.03, 0.004, 0.021, 0.03), 40):
+    for motion_s, sigma_m in enumerate(
+        (0.043, 0.0205, 0.04, 0.04, 0.03, 0.004, 0.021, 0.03), 40
+    ):
         progress = goal.add(result(sigmas_m=(0.004, sigma_m, 0.004)), seen(motion_s))
         times_s.append(seconds_left(progress)[1])
     assert times_s == [180.0, 90.0, 90.0, 90.0, 60.0, 0.0, 15.0, 15.0]
@@ -177,7 +202,9 @@ def test_the_time_of_a_confirmation_does_not_follow_a_longer_estimate():
 
 def test_the_end_of_a_confirmation_is_reported_to_a_few_seconds():
     goal = Goal(TARGETS)
-    sentences = [goal.add(result(), seen(motion_s)).sentence for motion_s in (40.0, 73.0, 77.0)]
+    sentences = [
+        goal.add(result(), seen(motion_s)).sentence for motion_s in (40.0, 73.0, 77.0)
+    ]
     times = [sentence.partition(":")[0] for sentence in sentences]
     assert times == ["Confirming, 40 s", "Confirming, 8 s", "Confirming, 4 s"]
 
@@ -226,7 +253,9 @@ def test_the_newest_of_equally_good_results_is_kept():
         newest = result(sigmas_m=sigma_m)
         goal.add(newest, seen(motion_s))
         assert goal.best is newest
-    goal.add(result(sigmas_m=0.0055), seen(88.0))  # a quarter worse than the best there was
+    goal.add(
+        result(sigmas_m=0.0055), seen(88.0)
+    )  # a quarter worse than the best there was
     assert goal.best is newest
 
 
@@ -250,7 +279,10 @@ def test_an_axis_that_stays_unobservable():
     assert not goal.add(hidden, seen(20.0, FLAT)).will_not_get_there
     stuck = goal.add(hidden, seen(40.0, FLAT))
     assert (stuck.will_not_get_there, stuck.limiting_axis) == (True, "z")
-    assert stuck.sentence == f"This motion will not determine z well enough. {ON_A_FLAT_FLOOR}."
+    assert (
+        stuck.sentence
+        == f"This motion will not determine z well enough. {ON_A_FLAT_FLOOR}."
+    )
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,9 @@ def log_lines():
 @pytest.fixture
 def node(monkeypatch, log_lines):
     """Both inputs of a session on a clock of its own, and the state that the node would publish."""
-    nothing = SimpleNamespace(submit=lambda job: None, stop=lambda s: None, answers=list)
+    nothing = SimpleNamespace(
+        submit=lambda job: None, stop=lambda s: None, answers=list
+    )
     monkeypatch.setattr(cycle_module, "SolvingProcess", lambda wake: nothing)
     now = [1000.0]
     monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
@@ -44,7 +46,9 @@ def node(monkeypatch, log_lines):
     for source in inputs:
         source.publishers = ("/driver",)
     targets = CalibratorConfig().targets
-    cycle = SolveCycle(session, log, print, lambda calibration: calibration, print, targets)
+    cycle = SolveCycle(
+        session, log, print, lambda calibration: calibration, print, targets
+    )
     cycle.ask(lambda good, text: None)
     return SimpleNamespace(now=now, inputs=inputs, cycle=cycle)
 
@@ -65,7 +69,9 @@ def run(node, seconds, senders=("parent", "child"), stamps_stand=False):
 
 
 def state_of(node, may_rest=False):
-    inputs = {source.name: source.state(node.now[0], may_rest) for source in node.inputs}
+    inputs = {
+        source.name: source.state(node.now[0], may_rest) for source in node.inputs
+    }
     pause = pause_of(inputs, node.inputs[0].is_enabled)
     return NodeState(
         node="/calibrator",
@@ -95,7 +101,10 @@ def test_a_stream_that_stops_pauses_the_session_and_is_named(node):
     run(node, 2.5, senders=["parent"])
     state = state_of(node)
     view = view_of(state_of(node))
-    assert (state.inputs["child"].level, state.inputs["parent"].level) == (Level.WARN, Level.OK)
+    assert (state.inputs["child"].level, state.inputs["parent"].level) == (
+        Level.WARN,
+        Level.OK,
+    )
     assert state.inputs["child"].text == "/child_odom has been silent for 7 s"
     assert (state.progress.level, state.progress.is_paused) == (Level.WARN, True)
     assert state.progress.text == (
@@ -120,8 +129,9 @@ def test_messages_that_give_no_pose_are_no_sign_of_life(node, stream):
         source.accept(last_ns, lambda pose=pose: pose)
     state = state_of(node)
     assert state.inputs[stream].level is Level.WARN
-    assert "has messages, but no new pose for 8 s. Check the source: the stamps repeat" in (
-        state.inputs[stream].text
+    assert (
+        "has messages, but no new pose for 8 s. Check the source: the stamps repeat"
+        in (state.inputs[stream].text)
     )
     assert (state.progress.is_paused, view_of(state).word) == (True, "PAUSED")
 
@@ -201,13 +211,18 @@ def test_two_publishers_on_one_topic_are_a_warning_with_their_names(node):
     with_result(node)
     node.inputs[1].publishers = ("/vio", "/bag")
     state = state_of(node)
-    assert (state.inputs["child"].level, state.inputs["child"].publishers) == (Level.WARN, 2)
+    assert (state.inputs["child"].level, state.inputs["child"].publishers) == (
+        Level.WARN,
+        2,
+    )
     assert state.inputs["child"].text.startswith(
         "/child_odom has 2 publishers: /bag and /vio. Stop all but one, then reset"
     )
     view = view_of(state)
     assert (view.word, view.tone) == ("CHECK INPUT", Tone.ACT)
-    assert np.all([line.tone is Tone.ACT for line in view.health if line.name == "child input"])
+    assert np.all(
+        [line.tone is Tone.ACT for line in view.health if line.name == "child input"]
+    )
 
 
 def test_poses_of_two_publishers_stay_a_warning_until_a_reset(node):

@@ -47,13 +47,18 @@ def checked(parent, child, limits=QUICK):
             is_now = (stamps_ns - stamps_ns[0]) // 10**9 == second
             feed(calibrator, stream, trajectory[is_now])
     result = answer(Job(0, calibrator, check=True))
-    return calibrator, {finding.code for finding in result.check.findings if finding.makes_unusable}
+    return calibrator, {
+        finding.code for finding in result.check.findings if finding.makes_unusable
+    }
 
 
 @pytest.mark.parametrize(
-    ("levels_from_s", "codes"), [(np.inf, set()), (0.0, {"interleaved"}), (40.0, {"interleaved"})]
+    ("levels_from_s", "codes"),
+    [(np.inf, set()), (0.0, {"interleaved"}), (40.0, {"interleaved"})],
 )
-def test_two_sources_are_found_after_poses_were_paired_also_if_one_came_later(levels_from_s, codes):
+def test_two_sources_are_found_after_poses_were_paired_also_if_one_came_later(
+    levels_from_s, codes
+):
     calibrator, errors = checked(*streams(60.0, levels_from_s))
     assert len(calibrator.snapshot().kept) > 200
     assert errors == codes
@@ -87,9 +92,9 @@ def test_what_only_raw_poses_show_stays_until_a_reset(checks, fault, stays):
     for _ in range(3):
         checks.take(CheckResult(()))
     assert [finding.code for finding in checks.findings] == [fault.code] * stays
-    assert [fault.code in text or fault.what in text for text in checks.state().findings] == (
-        [True] * stays
-    )
+    assert [
+        fault.code in text or fault.what in text for text in checks.state().findings
+    ] == ([True] * stays)
     checks.restart()
     assert (checks.findings, checks.state().findings) == ((), ())
 
@@ -105,18 +110,26 @@ def test_a_fault_that_an_option_answers_does_not_stay(checks):
 
 
 @pytest.mark.parametrize("measured", ["poses", "positions", "rotations"])
-def test_a_lasting_fault_forbids_results_of_every_kind_of_streams(monkeypatch, measured):
-    nothing = SimpleNamespace(submit=lambda job: None, stop=lambda s: None, answers=list)
+def test_a_lasting_fault_forbids_results_of_every_kind_of_streams(
+    monkeypatch, measured
+):
+    nothing = SimpleNamespace(
+        submit=lambda job: None, stop=lambda s: None, answers=list
+    )
     monkeypatch.setattr(module, "SolvingProcess", lambda wake: nothing)
     silent = dict.fromkeys(("debug", "info", "warning", "error"), lambda text: None)
     log = NodeLog(SimpleNamespace(**silent))
     session = LiveSession(log, CalibratorConfig())
     targets = CalibratorConfig().targets
-    cycle = SolveCycle(session, log, print, lambda calibration: calibration, print, targets)
+    cycle = SolveCycle(
+        session, log, print, lambda calibration: calibration, print, targets
+    )
     cycle.ask(lambda good, text: None)
     good = good_calibration(measured=measured, warnings=())
     cycle.conclude(Answer(0, 0.1, seen(40.0), good, check=CheckResult((raw(),))))
     cycle.conclude(Answer(0, 0.1, seen(42.0), good, check=CheckResult(())))
     assert cycle.result.verdict is Verdict.DO_NOT_USE
     assert cycle.published is None
-    assert cycle.progress_state("").text.startswith("Stop: the streams are faulty: it alternates")
+    assert cycle.progress_state("").text.startswith(
+        "Stop: the streams are faulty: it alternates"
+    )

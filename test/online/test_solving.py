@@ -16,7 +16,13 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.engine.calibrator import BufferLimits, Calibrator
 from hand_eye_calib.core.engine.run import review
 from hand_eye_calib.online.live import solving
-from hand_eye_calib.online.live.solving import Answer, Failure, Job, SolvingProcess, answer
+from hand_eye_calib.online.live.solving import (
+    Answer,
+    Failure,
+    Job,
+    SolvingProcess,
+    answer,
+)
 
 PATIENCE_S = 120.0
 
@@ -116,7 +122,10 @@ def test_gives_the_same_bits_as_here_job_after_job(start):
         assert remote.motion.n_poses == here.motion.n_poses == 250
         assert (remote.time_offset is None) == ("time_offset" not in options)
         if remote.time_offset is not None:
-            assert remote.time_offset.seconds == work.snapshot().resolved.time_offset.seconds
+            assert (
+                remote.time_offset.seconds
+                == work.snapshot().resolved.time_offset.seconds
+            )
 
 
 def test_only_a_job_in_a_hurry_has_the_priority_of_the_node(start):
@@ -155,18 +164,24 @@ def test_killed_it_is_started_again_and_the_job_in_hand_has_failed(start):
         old = process._process.pid
         process.submit(Job(kill, poses()))
         os.kill(old, signal.SIGKILL)
-        failure = Failure("the solving process was ended by SIGKILL", "it was started again")
+        failure = Failure(
+            "the solving process was ended by SIGKILL", "it was started again"
+        )
         assert process.next() == Answer(kill, 0.0, failure=failure)
         assert process._process.pid != old
 
 
-def test_one_that_hangs_is_killed_started_again_and_the_job_has_failed(start, monkeypatch):
+def test_one_that_hangs_is_killed_started_again_and_the_job_has_failed(
+    start, monkeypatch
+):
     monkeypatch.setattr(solving, "HANGS_AFTER_S", 0.5)
     process = start(SLOW)
     old = process._process.pid
     process.submit(Job(7, poses(), check=True))
     text = "the solving process had no answer after 0.5 s and was killed"
-    assert process.next() == Answer(7, 0.0, failure=Failure(text, "it was started again"))
+    assert process.next() == Answer(
+        7, 0.0, failure=Failure(text, "it was started again")
+    )
     assert process._process.pid != old
     wait_gone(old)
 
@@ -194,7 +209,9 @@ if {command == "busy"}:
 print(process._process.pid, flush=True)
 time.sleep(3600.0)
 """
-    node = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    node = subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, text=True
+    )
     pid = int(node.stdout.readline())
     node.kill()
     node.wait()
@@ -222,7 +239,11 @@ def test_what_a_check_is_certain_of_is_solved_with_as_in_a_replay(pairing_starts
     again = answer(Job(1, calibrator, check=True, options=first.options))
     assert again.calibration.time_offset_s == pytest.approx(0.3, abs=0.01)
     for result in (first, again):
-        np.testing.assert_array_equal(result.calibration.T_parent_child, replayed.T_parent_child)
-        np.testing.assert_array_equal(result.calibration.covariance, replayed.covariance)
+        np.testing.assert_array_equal(
+            result.calibration.T_parent_child, replayed.T_parent_child
+        )
+        np.testing.assert_array_equal(
+            result.calibration.covariance, replayed.covariance
+        )
     assert (again.options, again.messages) == ({}, ())
     assert "time_offset" not in {finding.code for finding in again.check.findings}

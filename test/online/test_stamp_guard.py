@@ -51,7 +51,16 @@ INTERVALS_NS = np.random.default_rng(1).exponential(1e8, 1000).astype(int)
         stamps(10) + stamps(10, START_NS + 600 * 10**9),
         stamps(50) + stamps(50, START_NS + 50 * STEP_NS - NEAR_NS // 2),
     ],
-    ids=["overtaken", "irregular", "10 times", "twice", "half", "tenth", "pause", "back"],
+    ids=[
+        "overtaken",
+        "irregular",
+        "10 times",
+        "twice",
+        "half",
+        "tenth",
+        "pause",
+        "back",
+    ],
 )
 def test_nothing_is_lost_where_stamps_are_right(sequence):
     jumps, taken, dropped = run(StampGuard(), sequence)
@@ -95,7 +104,9 @@ def test_corrupt_stamps_change_nothing(corrupt):
 
 @pytest.mark.parametrize("offset_ns", [10**8, 3 * 10**9, TEN_YEARS_NS])
 @pytest.mark.parametrize(("sign", "times"), [(-1, 5), (1, 1), (1, 5)])
-def test_a_clock_that_is_wrong_for_up_to_five_messages_changes_nothing(offset_ns, sign, times):
+def test_a_clock_that_is_wrong_for_up_to_five_messages_changes_nothing(
+    offset_ns, sign, times
+):
     sequence = stamps(60)
     for index in range(30, 30 + times):
         sequence[index] += sign * offset_ns

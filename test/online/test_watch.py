@@ -59,7 +59,8 @@ BEHIND = AxisProgress(sigma=0.04, target=0.02, seconds_left=25.0)
 AT = Progress(
     sentence="Go on for about 25 s: z is behind.",
     limiting_axis="z",
-    axes=dict.fromkeys(AXIS_KEYS.values(), ROTATION) | {"x": KNOWN, "y": KNOWN, "z": BEHIND},
+    axes=dict.fromkeys(AXIS_KEYS.values(), ROTATION)
+    | {"x": KNOWN, "y": KNOWN, "z": BEHIND},
 )
 CHECKS = ChecksState(level=Level.OK, text="sound", age_s=3.0, findings=())
 MOUNT = MountState(level=Level.OK, text="it has not", seconds_of_motion=200)
@@ -74,7 +75,9 @@ def inputs(parent=Level.OK, child=Level.OK):
     figures = dict.fromkeys(("rate_hz", "longest_gap_s"), 0.0)
     figures |= dict.fromkeys(("messages", "poses_taken", "lost"), 0)
     return {
-        name: InputState(level=level, text=texts[level], topic="/odom", refused={}, **figures)
+        name: InputState(
+            level=level, text=texts[level], topic="/odom", refused={}, **figures
+        )
         for name, level in (("parent", parent), ("child", child))
     }
 
@@ -86,7 +89,9 @@ def state(node=NODE, at=None, axes=None, **parts):
     fields |= {name: parts.pop(name) for name in fields if name in parts}
     progress = ProgressState(text=at.sentence, progress=at, **fields)
     made = {"extrinsic": EXTRINSIC, "progress": progress}
-    return NodeState(node=node, **{"inputs": inputs(), "checks": CHECKS, **made, **parts})
+    return NodeState(
+        node=node, **{"inputs": inputs(), "checks": CHECKS, **made, **parts}
+    )
 
 
 def mount(**fields):
@@ -113,7 +118,13 @@ def test_evidence_is_displayed_at_the_end_alone():
 def test_a_state_survives_its_json_and_nothing_else_is_one():
     for document in (state(), mount()):
         assert from_plain(NodeState, plain(document)) == document
-    for wrong in ({}, {**plain(state()), "node": 7}, {**plain(state()), "inputs": [1]}, [], "x"):
+    for wrong in (
+        {},
+        {**plain(state()), "node": 7},
+        {**plain(state()), "inputs": [1]},
+        [],
+        "x",
+    ):
         with pytest.raises((TypeError, ValueError, KeyError)):
             from_plain(NodeState, wrong)
 
@@ -191,29 +202,60 @@ REACHED = {"done": True, "precision": "good to 4 mm"}
         (state(), 9.0, Tone.BAD, "SILENT", "No message from the node for 9 s."),
         (state(), 0.5, Tone.BUSY, "GO ON", "Go on for about 25 s"),
         (state(level=Level.WARN), 0.5, Tone.ACT, "CHANGE THE MOTION", "Go on"),
-        (state(extrinsic=replace(EXTRINSIC, result=None)), 0.5, Tone.BUSY, "START", "Go on"),
+        (
+            state(extrinsic=replace(EXTRINSIC, result=None)),
+            0.5,
+            Tone.BUSY,
+            "START",
+            "Go on",
+        ),
         (
             state(at={"done": True, "is_faulty": True, "sentence": "Stop: feet."}),
             *(0.5, Tone.ACT, "CHECK THE STREAMS", "Stop: "),
         ),
         (state(at=REACHED), 0.5, Tone.GOOD, "DONE", "Good to 4 mm."),
-        (state(inputs=inputs(child=Level.WARN)), 0.5, Tone.ACT, "CHECK INPUT", "/odom has been"),
-        (state(inputs=inputs(Level.WARN, Level.ERROR)), 0.5, Tone.BAD, "BAD INPUT", "/odom: bad"),
+        (
+            state(inputs=inputs(child=Level.WARN)),
+            0.5,
+            Tone.ACT,
+            "CHECK INPUT",
+            "/odom has been",
+        ),
+        (
+            state(inputs=inputs(Level.WARN, Level.ERROR)),
+            0.5,
+            Tone.BAD,
+            "BAD INPUT",
+            "/odom: bad",
+        ),
         (
             state(checks=replace(CHECKS, level=Level.WARN, text="lengths are feet")),
             *(0.5, Tone.ACT, "CHECK THE STREAMS", "Lengths are feet."),
         ),
         (
-            state(checks=replace(CHECKS, level=Level.WARN, text="a; b: c", gravest="a")),
+            state(
+                checks=replace(CHECKS, level=Level.WARN, text="a; b: c", gravest="a")
+            ),
             *(0.5, Tone.ACT, "CHECK THE STREAMS", "A."),
         ),
         (
-            state(checks=replace(CHECKS, level=Level.WARN, text="a; b: c", gravest="a " * 16)),
-            *(0.5, Tone.ACT, "CHECK THE STREAMS", "The streams have a fault: read the checks"),
+            state(
+                checks=replace(
+                    CHECKS, level=Level.WARN, text="a; b: c", gravest="a " * 16
+                )
+            ),
+            *(
+                0.5,
+                Tone.ACT,
+                "CHECK THE STREAMS",
+                "The streams have a fault: read the checks",
+            ),
         ),
         (
             state(
-                extrinsic=replace(EXTRINSIC, level=Level.WARN, text="a; b: c", contradicted=("z",))
+                extrinsic=replace(
+                    EXTRINSIC, level=Level.WARN, text="a; b: c", contradicted=("z",)
+                )
             ),
             *(
                 0.5,
@@ -229,7 +271,13 @@ REACHED = {"done": True, "precision": "good to 4 mm"}
         (mount(**ERROR, text="it moved"), 0.5, Tone.BAD, "MOUNT MOVED", "It moved."),
         (mount(), 0.5, Tone.GOOD, "WATCHING", "It has not."),
         (mount(is_learning=True), 0.5, Tone.BUSY, "LEARNING", "It has not."),
-        (mount(level=Level.WARN, text="no URDF"), 0.5, Tone.ACT, "NOT WATCHING", "No URDF."),
+        (
+            mount(level=Level.WARN, text="no URDF"),
+            0.5,
+            Tone.ACT,
+            "NOT WATCHING",
+            "No URDF.",
+        ),
         (state(journal=FULL), 0.5, Tone.BAD, "BROKEN", "Cannot write."),
         (
             state(journal=FULL, at=REACHED, saved=SAVED),
@@ -238,8 +286,20 @@ REACHED = {"done": True, "precision": "good to 4 mm"}
             "DONE",
             "Good to 4 mm. Saved",
         ),
-        (state(extrinsic=replace(EXTRINSIC, **ERROR)), 0.5, Tone.BAD, "BROKEN", "Known."),
-        (replace(state(), has_ended=True), 9.0, Tone.ACT, "ENDED", "The node has ended. The"),
+        (
+            state(extrinsic=replace(EXTRINSIC, **ERROR)),
+            0.5,
+            Tone.BAD,
+            "BROKEN",
+            "Known.",
+        ),
+        (
+            replace(state(), has_ended=True),
+            9.0,
+            Tone.ACT,
+            "ENDED",
+            "The node has ended. The",
+        ),
         (
             replace(mount(), has_ended=True),
             0.5,
@@ -253,7 +313,9 @@ REACHED = {"done": True, "precision": "good to 4 mm"}
         ),
     ],
 )
-def test_the_headline_is_what_a_person_should_do_first(document, now_s, tone, word, sentence):
+def test_the_headline_is_what_a_person_should_do_first(
+    document, now_s, tone, word, sentence
+):
     view = view_of(document, now_s=now_s)
     assert (view.tone, view.word) == (tone, word)
     assert view.sentence.startswith(sentence)
@@ -261,15 +323,27 @@ def test_the_headline_is_what_a_person_should_do_first(document, now_s, tone, wo
 
 def test_bars_show_the_share_of_the_information_and_the_time_left():
     bars = dict(zip(AXES, view_of(state()).bars, strict=True))
-    assert (bars["x"].share, bars["x"].tone, bars["x"].word) == (1.0, Tone.GOOD, "enough")
+    assert (bars["x"].share, bars["x"].tone, bars["x"].word) == (
+        1.0,
+        Tone.GOOD,
+        "enough",
+    )
     assert [bar.name for bar in bars.values()][2:4] == ["along z", "about x"]
     assert {bar.meaning for bar in bars.values()} == {""}
     on_wheels = view_of(state(extrinsic=replace(EXTRINSIC, has_vehicle_axes=True)))
     assert [bar.meaning for bar in on_wheels.bars][2:4] == ["up", "tilt to a side"]
-    assert ["sketch" in fragment(view) for view in (on_wheels, view_of(state()))] == [True, False]
-    assert bars["z"].share == pytest.approx(0.25)  # twice the target: a quarter of the information
+    assert ["sketch" in fragment(view) for view in (on_wheels, view_of(state()))] == [
+        True,
+        False,
+    ]
+    assert bars["z"].share == pytest.approx(
+        0.25
+    )  # twice the target: a quarter of the information
     assert (bars["z"].tone, bars["z"].word) == (Tone.ACT, "25 s left")
-    assert (bars["z"].sigma, bars["yaw"].sigma) == ("± 4 cm of 2 cm", "± 0.057 deg of 0.3 deg")
+    assert (bars["z"].sigma, bars["yaw"].sigma) == (
+        "± 4 cm of 2 cm",
+        "± 0.057 deg of 0.3 deg",
+    )
 
 
 @pytest.mark.parametrize(
@@ -296,18 +370,28 @@ def test_the_pose_has_the_angles_as_printed_with_their_own_standard_deviations()
     assert (values["x"], values["roll"]) == ("0.420 m ± 4 mm", "0.57 ± 0.57 deg")
     assert values["z"] == "? not observed"
     moved = replace(EXTRINSIC, motion_s=75.0)
-    assert view_of(state(extrinsic=moved)).facts == "3 m, 75 s of motion, result 1.0 s old"
+    assert (
+        view_of(state(extrinsic=moved)).facts == "3 m, 75 s of motion, result 1.0 s old"
+    )
     gone = view_of(state(extrinsic=replace(EXTRINSIC, result=None)))
     assert (gone.title, gone.values, gone.buttons) == ("", (), ("reset",))
 
 
 def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
-    differs = context.AxisDifference(difference=0.031, sigma=0.004, visible=0.01, verdict="moved")
-    axes = dict.fromkeys(AXIS_KEYS.values(), differs) | {"about_z": replace(differs, sigma=INF)}
-    difference = Difference(first="a", second="b", verdict="moved", sentence="", axes=axes)
+    differs = context.AxisDifference(
+        difference=0.031, sigma=0.004, visible=0.01, verdict="moved"
+    )
+    axes = dict.fromkeys(AXIS_KEYS.values(), differs) | {
+        "about_z": replace(differs, sigma=INF)
+    }
+    difference = Difference(
+        first="a", second="b", verdict="moved", sentence="", axes=axes
+    )
     difference = replace(difference, change="z by +3 cm +/- 4 mm")
     comparison = Comparison(
-        sentence="moved: z by +3 cm +/- 4 mm", verdict="moved", differences=(difference,)
+        sentence="moved: z by +3 cm +/- 4 mm",
+        verdict="moved",
+        differences=(difference,),
     )
     done = {"at": {"done": True, "precision": "known"}}
     careful = replace(EXTRINSIC, result=replace(RESULT, verdict="USE WITH CARE"))
@@ -320,11 +404,18 @@ def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
     saved = view_of(replace(state(**done), saved=SAVED))
     assert saved.text.startswith("Known. Saved at ")
     assert saved.text.endswith(" in /home/live.")
-    assert (saved.tone, saved.buttons[0], saved.saved_in) == (Tone.GOOD, "solve", "/home/live")
+    assert (saved.tone, saved.buttons[0], saved.saved_in) == (
+        Tone.GOOD,
+        "solve",
+        "/home/live",
+    )
     assert (saved.result[-1].name, saved.result[-1].tone) == ("saved", Tone.GOOD)
     assert (view.result[0].tone, view.result[0].text) == (Tone.ACT, "USE WITH CARE")
     assert view.reasons == ("a: b", "c: d")
-    assert (view.result[2].tone, view.result[2].text) == (Tone.ACT, "moved: z by +3 cm ± 4 mm")
+    assert (view.result[2].tone, view.result[2].text) == (
+        Tone.ACT,
+        "moved: z by +3 cm ± 4 mm",
+    )
     assert view.bars[2].difference == "+3.10 ± 0.40 cm"
     assert view.bars[5].difference == "unknown"
     assert [line.name for line in view_of(state()).result] == ["verdict", "note"]
@@ -335,7 +426,9 @@ def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
         extrinsic = replace(EXTRINSIC, tf_static=broadcast, tf_static_reason="why")
         # After the end of the node, late subscribers receive nothing.
         for has_ended, expected in ((False, tone), (True, Tone.ACT)):
-            line = view_of(replace(state(extrinsic=extrinsic), has_ended=has_ended)).result[2]
+            line = view_of(
+                replace(state(extrinsic=extrinsic), has_ended=has_ended)
+            ).result[2]
             assert (line.tone, line.name) == (expected, "on /tf_static")
             texts = "nothing" in line.text, f"{broadcast.value}: why" == line.text
             assert texts == (has_ended, not has_ended)
@@ -372,7 +465,9 @@ def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
     assert lines["along x"] == (Tone.GOOD, "not moved (detects 4 mm)")
     assert lines["along z"] == (Tone.UNKNOWN, "cannot be watched with this motion")
     assert (view.bars, view.result, view.word) == ((), (), "MOUNT MOVED")
-    assert view.text == "The mount has moved. Check it, then recalibrate or acknowledge."
+    assert (
+        view.text == "The mount has moved. Check it, then recalibrate or acknowledge."
+    )
     assert view.facts == "2 min ago; a reset ends the alarm"
     assert view.buttons[:2] == ("recalibrate", "acknowledge")
     assert "the mount, after ten minutes" in fragment(view)
@@ -451,9 +546,14 @@ def test_a_line_is_printed_when_something_else_is_said(capsys):
 
     with _display("") as show:
         assert printed(state(), 1.0) == ["▶ GO ON: Go on for about 25 s: z is behind."]
-        assert printed(state(at={"sentence": "Go on for about 20 s: z is behind."}), 2.0) == []
+        assert (
+            printed(state(at={"sentence": "Go on for about 20 s: z is behind."}), 2.0)
+            == []
+        )
         assert printed(state(at={"done": True}), 3.0)
-        learning = [mount(is_learning=True, text=f"{second} of 120 s") for second in (1, 2)]
+        learning = [
+            mount(is_learning=True, text=f"{second} of 120 s") for second in (1, 2)
+        ]
         assert [len(printed(document, 4.0)) for document in learning] == [1, 0]
         board.answer("save", True, "result saved", 5.0)
         assert printed(learning[0], 5.0) == ["✓ save: result saved"]
@@ -504,7 +604,9 @@ def test_keys_ask_and_a_reset_takes_two(typed):
 def test_the_fragment_is_well_formed_and_escapes_what_nodes_say():
     hostile = '<script>alert("1")</script>'
     result = replace(RESULT, reasons=(hostile,), parent_frame="<", child_frame="&")
-    document = state(at={"sentence": hostile}, extrinsic=replace(EXTRINSIC, result=result))
+    document = state(
+        at={"sentence": hostile}, extrinsic=replace(EXTRINSIC, result=result)
+    )
     text = fragment(view_of(document))
     assert "<script" not in text
     root = ElementTree.fromstring(f"<main>{text}</main>")
@@ -529,7 +631,9 @@ def server(monkeypatch, tmp_path):
 
 
 def fetch(server, method, path):
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=PATIENCE_S)
+    connection = http.client.HTTPConnection(
+        "127.0.0.1", server.server_port, timeout=PATIENCE_S
+    )
     connection.request(method, path)
     return connection.getresponse()
 
@@ -543,7 +647,12 @@ def test_the_page_needs_nothing_from_elsewhere(server):
     for name in ("/page.css", "/page.js"):
         answer = fetch(server, "GET", name)
         assert answer.status == 200
-        text = answer.read().decode().replace("// ", "").replace("http://www.w3.org/2000/svg", "")
+        text = (
+            answer.read()
+            .decode()
+            .replace("// ", "")
+            .replace("http://www.w3.org/2000/svg", "")
+        )
         assert "//" not in text
 
 
@@ -642,5 +751,7 @@ def test_a_busy_computer_is_named_beside_the_advice_that_waits_for_its_result():
     assert (view.word, view.advice) == ("GO ON", slow)
     start = view_of(state(extrinsic=replace(busy, result=None)))
     assert (start.word, start.advice) == ("START", slow)
-    done = view_of(state(extrinsic=busy, at={"done": True, "precision": "good to 1 cm"}))
+    done = view_of(
+        state(extrinsic=busy, at={"done": True, "precision": "good to 1 cm"})
+    )
     assert slow not in done.text

@@ -79,7 +79,9 @@ class Page:
 
     def get(self, selector, field):
         """Return a field of an element."""
-        return self.browser.evaluate(f"document.querySelector({json.dumps(selector)}).{field}")
+        return self.browser.evaluate(
+            f"document.querySelector({json.dumps(selector)}).{field}"
+        )
 
     def wait_for_count(self, name, number):
         self.browser.wait_for(f"document.documentElement.dataset.{name} === '{number}'")
@@ -146,7 +148,9 @@ class Elements(HTMLParser):
 def test_the_script_finds_what_it_looks_for():
     page = Elements(PAGE)
     assert set(re.findall(r'part\("([\w-]+)"\)', SCRIPT)) - {"state"} <= page.ids
-    assert set(re.findall(r'document\.querySelector(?:All)?\("(\w+)"\)', SCRIPT)) <= set(page.tags)
+    assert set(
+        re.findall(r'document\.querySelector(?:All)?\("(\w+)"\)', SCRIPT)
+    ) <= set(page.tags)
     assert page.data["data-file"] == list(web.SAVED)
     assert sorted(page.data["data-request"]) == sorted(view.KEYS)
     assert set(re.findall(r"button\.dataset\.(\w+)", SCRIPT)) == {"request", "sure"}
@@ -155,10 +159,17 @@ def test_the_script_finds_what_it_looks_for():
 
 def test_the_word_is_large_on_a_phone_and_larger_on_a_wide_screen(page):
     def height_px(width):
-        screen = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": width < 600}
+        screen = {
+            "width": width,
+            "height": 800,
+            "deviceScaleFactor": 1,
+            "mobile": width < 600,
+        }
         page.browser.call("Emulation.setDeviceMetricsOverride", **screen)
         return float(
-            page.browser.evaluate("getComputedStyle(document.querySelector('h1')).fontSize")[:-2]
+            page.browser.evaluate(
+                "getComputedStyle(document.querySelector('h1')).fontSize"
+            )[:-2]
         )
 
     assert height_px(390) >= 27
@@ -170,7 +181,9 @@ def test_the_word_is_large_on_a_phone_and_larger_on_a_wide_screen(page):
 
 def test_the_title_is_the_word_of_the_newest_view(page):
     assert page.browser.evaluate("document.title") == f"{Tone.BUSY.value} GO ON"
-    assert page.get("#announcement", "textContent").startswith(f"{Tone.BUSY.value} GO ON")
+    assert page.get("#announcement", "textContent").startswith(
+        f"{Tone.BUSY.value} GO ON"
+    )
     page.show(MOVED)
     assert page.browser.evaluate("document.title") == f"{Tone.BAD.value} MOUNT MOVED"
     assert page.wait_for_connection("✓") == "✓ connected"
@@ -192,7 +205,9 @@ def test_a_phone_shakes_at_a_new_sentence_but_not_at_new_numbers(page):
     page.show(replace(GO_ON, sentence="Go on for about 90 s: z takes longest."))
     page.wait_for_count("vibrations", 1)
     page.show(replace(GO_ON, sentence="Go on for about 2 min: z takes longest."))
-    page.show(replace(GO_ON, sentence="Confirming, 30 s: every axis is within its target."))
+    page.show(
+        replace(GO_ON, sentence="Confirming, 30 s: every axis is within its target.")
+    )
     page.wait_for_count("vibrations", 2)
 
 
@@ -209,7 +224,9 @@ def test_the_screen_stays_on_while_the_page_is_visible(page):
 def test_a_silent_connection_is_stated_and_opened_again(page):
     page.server.board.answers.clear()
     lost = page.wait_for_connection("✗")
-    assert re.fullmatch(r"✗ CONNECTION LOST at \d\d:\d\d(\W[AP]M)?, trying again \.\.\.", lost)
+    assert re.fullmatch(
+        r"✗ CONNECTION LOST at \d\d:\d\d(\W[AP]M)?, trying again \.\.\.", lost
+    )
     assert page.get("#connection", "className") == "lost"
     assert page.get("button[data-request=solve]", "disabled")
     page.server.board.answers.set()
@@ -240,8 +257,12 @@ def test_buttons_send_their_requests(page):
 
 
 def test_a_reset_is_confirmed_first(page):
-    assert page.browser.click("button[data-request=reset]", [False]) == ["Forget all poses?"]
-    assert page.browser.click("button[data-request=reset]", [True]) == ["Forget all poses?"]
+    assert page.browser.click("button[data-request=reset]", [False]) == [
+        "Forget all poses?"
+    ]
+    assert page.browser.click("button[data-request=reset]", [True]) == [
+        "Forget all poses?"
+    ]
     assert page.request() == "reset"
     assert page.server.requests.empty()
 
@@ -271,7 +292,9 @@ def test_saved_files_are_linked(page, tmp_path):
     assert page.get("a[data-file='report.html']", "hidden")
     (tmp_path / "report.html").write_text("<p>report")
     page.show(replace(GO_ON, word="DONE", saved_in=str(tmp_path)))
-    assert page.get("a[data-file='report.html']", "href").endswith("/report.html?key=word")
+    assert page.get("a[data-file='report.html']", "href").endswith(
+        "/report.html?key=word"
+    )
     assert not page.get("a[data-file='report.html']", "hidden")
     assert page.get("a[data-file='extrinsic.yaml']", "hidden")
 
@@ -312,9 +335,15 @@ def test_the_unit_and_the_button_to_remove_follow_the_axis(page):
     page.show(WITH_PRIOR)
     options = "[...axisByHand.options].map((option) => option.value)"
     assert page.browser.evaluate(options) == ["z", "yaw"]
-    assert (page.get("#unit", "textContent"), page.get("#forget", "hidden")) == ("m", False)
+    assert (page.get("#unit", "textContent"), page.get("#forget", "hidden")) == (
+        "m",
+        False,
+    )
     choose(page, "yaw")
-    assert (page.get("#unit", "textContent"), page.get("#forget", "hidden")) == ("deg", True)
+    assert (page.get("#unit", "textContent"), page.get("#forget", "hidden")) == (
+        "deg",
+        True,
+    )
 
 
 def test_a_chosen_axis_stays_when_the_axes_change(page):
@@ -333,5 +362,8 @@ def test_a_prior_is_removed(page):
 def test_a_reset_offers_to_remove_the_priors_too(page):
     page.show(replace(WITH_PRIOR, buttons=("solve", "forget", "reset")))
     messages = page.browser.click("button[data-request=reset]", [True, True])
-    assert messages == ["Forget all poses?", "Remove the prior, too? It is z = 1.5m+/-0.02m."]
+    assert messages == [
+        "Forget all poses?",
+        "Remove the prior, too? It is z = 1.5m+/-0.02m.",
+    ]
     assert {page.request(), page.request()} == {"forget", "reset"}

@@ -59,12 +59,16 @@ def contradicted():
 @pytest.fixture
 def session(monkeypatch):
     """The live session, its cycle and saver, with a prior on z, and without a solving process."""
-    nothing = SimpleNamespace(submit=lambda job: None, stop=lambda s: None, answers=list)
+    nothing = SimpleNamespace(
+        submit=lambda job: None, stop=lambda s: None, answers=list
+    )
     monkeypatch.setattr(module, "SolvingProcess", lambda wake: nothing)
     silent = dict.fromkeys(("debug", "info", "warning", "error"), lambda text: None)
     log = NodeLog(SimpleNamespace(**silent))
     live = LiveSession(log, CalibratorConfig(prior_z="1.5m+/-0.02m"))
-    cycle = SolveCycle(live, log, print, lambda calibration: calibration, print, TARGETS)
+    cycle = SolveCycle(
+        live, log, print, lambda calibration: calibration, print, TARGETS
+    )
     cycle.ask(lambda good, text: None)
     return SimpleNamespace(cycle=cycle, saver=Saver(live, cycle, log), live=live)
 
@@ -117,7 +121,11 @@ FAILURES = {
         "the solver did not converge; the result shown is",
     ),
     "too few poses": (
-        {"failure": Failure("10 synchronised pose pairs are needed, found 3", is_early=True)},
+        {
+            "failure": Failure(
+                "10 synchronised pose pairs are needed, found 3", is_early=True
+            )
+        },
         Standing.OUTDATED,
         "OLD RESULT",
         "10 synchronised pose pairs are needed, found 3; the result shown is",
@@ -129,7 +137,11 @@ FAILURES = {
         "both streams name 'imu' as their sensor frame; the result shown is",
     ),
     "dead process": (
-        {"failure": Failure("the solving process was ended by SIGKILL", "it was started again")},
+        {
+            "failure": Failure(
+                "the solving process was ended by SIGKILL", "it was started again"
+            )
+        },
         Standing.OUTDATED,
         "BROKEN",
         "the solving process was ended by SIGKILL",
@@ -148,14 +160,18 @@ def with_result(session, request):
 
 
 @pytest.mark.parametrize("failure", FAILURES)
-def test_every_surface_says_that_the_newest_solve_has_failed(with_result, failure, tmp_path):
+def test_every_surface_says_that_the_newest_solve_has_failed(
+    with_result, failure, tmp_path
+):
     session = with_result
     answer, standing, word, sentence = FAILURES[failure]
     before = session.cycle.result
     good, _ = conclude(session, 50.0, **answer)
     state = state_of(session)
     view = view_of(session)
-    saved, line = session.saver.save(NodeConfig(output_directory=str(tmp_path), report=False))
+    saved, line = session.saver.save(
+        NodeConfig(output_directory=str(tmp_path), report=False)
+    )
     file = load_result(tmp_path)
     # topics
     assert session.cycle.standing is standing
@@ -192,7 +208,9 @@ def test_an_outdated_result_says_how_long_solves_have_failed_and_how_old_it_is(
     start_s = module.time.monotonic()
     conclude(session, 40.0, result())
     for late_s in (10.0, 70.0):
-        monkeypatch.setattr(module.time, "monotonic", lambda late_s=late_s: start_s + late_s)
+        monkeypatch.setattr(
+            module.time, "monotonic", lambda late_s=late_s: start_s + late_s
+        )
         conclude(session, 40.0 + late_s, failure=Failure("no overlap"))
     text = state_of(session).progress.text
     assert text == (
@@ -211,7 +229,10 @@ def test_the_form_of_a_contradicted_prior_stays_until_it_is_removed(session):
     assert (view.by_hand, view.priors) == (("z",), (("z", "1.5m+/-0.02m"),))
     assert "forget" in view.buttons
     prior = next(line for line in view.result if line.name == "prior")
-    assert (prior.tone, prior.text) == (Tone.BAD, "z = 1.5m ± 0.02m: contradicts the motion")
+    assert (prior.tone, prior.text) == (
+        Tone.BAD,
+        "z = 1.5m ± 0.02m: contradicts the motion",
+    )
     assert {bar.word for bar in view.bars} == {"no usable result"}
     before = session.live.calibrator.config
     session.live.reconfigure(dataclasses.replace(before, prior_z=""))

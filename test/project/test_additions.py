@@ -66,7 +66,11 @@ REFERENCE = [
 # What a solver needs besides its own file.
 SOLVER = [
     ("core/solvers/registry.py", "    dnlo,\n", "    dnlo,\n    horaud,\n"),
-    ("core/solvers/registry.py", '    "ali":', '    "horaud": _Solver(horaud.solve),\n    "ali":'),
+    (
+        "core/solvers/registry.py",
+        '    "ali":',
+        '    "horaud": _Solver(horaud.solve),\n    "ali":',
+    ),
     ("core/base/config.py", '"zhuang", "ali")', '"zhuang", "ali", "horaud")'),
     ("offline/calibrate.py", '"ali", "adaptive"', '"ali", "horaud", "adaptive"'),
 ]

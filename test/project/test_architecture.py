@@ -41,9 +41,13 @@ def breaches(package_root):
             top, *rest = name.split(".")
             homes = CONFINED.get(top)
             if homes and not relative.startswith(homes):
-                messages.append(f"{relative}: {top} may be imported only in {', '.join(homes)}")
+                messages.append(
+                    f"{relative}: {top} may be imported only in {', '.join(homes)}"
+                )
             if top == PACKAGE and not (rest and (package_root / rest[0]).is_dir()):
-                messages.append(f"{relative}: the package must not import its own public API")
+                messages.append(
+                    f"{relative}: the package must not import its own public API"
+                )
     return messages
 
 
@@ -88,7 +92,11 @@ def modules_in_texts(path):
     tree = ast.parse(path.read_text(encoding="utf-8"))
     alone = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in alone:
+        if (
+            isinstance(node, ast.Constant)
+            and isinstance(node.value, str)
+            and id(node) not in alone
+        ):
             yield from re.findall(rf"{PACKAGE}\.({'|'.join(ORDER)})\b", node.value)
 
 
@@ -99,7 +107,9 @@ def test_no_text_names_a_module_of_a_layer_above():
         for layer in modules_in_texts(path)
     }
     assert ("online", "online") in pairs  # code of the solving process
-    assert [(own, layer) for own, layer in sorted(pairs) if layer not in BELOW[own]] == []
+    assert [
+        (own, layer) for own, layer in sorted(pairs) if layer not in BELOW[own]
+    ] == []
 
 
 def file_imports(package_root):
@@ -147,14 +157,18 @@ def repeated_defaults(package_root):
     for options in (CalibratorConfig, NodeConfig, NoiseConfig):
         for field in dataclasses.fields(options):
             defaults |= {field.name: field.default, f"{field.name}_s": field.default}
-    homes = {inspect.getsourcefile(options) for options in (CalibratorConfig, NoiseConfig)}
+    homes = {
+        inspect.getsourcefile(options) for options in (CalibratorConfig, NoiseConfig)
+    }
     repeated = []
     for path in sorted(package_root.rglob("*.py")):
         if str(path) in homes:
             continue
         for name, default, line in _written_defaults(path):
             if default and defaults.get(name) == default:
-                repeated.append(f"{path.relative_to(package_root)}:{line}: {name} = {default!r}")
+                repeated.append(
+                    f"{path.relative_to(package_root)}:{line}: {name} = {default!r}"
+                )
     return repeated
 
 
@@ -176,5 +190,7 @@ def _written_defaults(path):
 
 def test_defaults_of_options_stand_in_one_place(tmp_path):
     assert repeated_defaults(SOURCE) == []
-    (tmp_path / "late.py").write_text("def a(x, max_gap_s=0.5, time_offset_s=0.0): ...\n")
+    (tmp_path / "late.py").write_text(
+        "def a(x, max_gap_s=0.5, time_offset_s=0.0): ...\n"
+    )
     assert repeated_defaults(tmp_path) == ["late.py:1: max_gap_s = 0.5"]

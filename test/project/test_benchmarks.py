@@ -47,7 +47,10 @@ KNOWN = {
     ],
 )
 def test_a_row_that_falls_short_is_a_failure(measured, failures):
-    assert baseline.failures(measured, baseline.ratios(measured, MEMORY), KNOWN) == failures
+    assert (
+        baseline.failures(measured, baseline.ratios(measured, MEMORY), KNOWN)
+        == failures
+    )
 
 
 def test_baseline_covers_both_sources_with_equal_ratios():
@@ -69,5 +72,7 @@ def test_opencv_is_given_what_it_expects(method):
     cv2 = pytest.importorskip("cv2", reason="opencv-python-headless is not installed")
     Ts_pw_p = se3.exp(np.random.default_rng(3).normal(size=(12, 6)))
     T_cw_pw = se3.exp(np.array([3.0, -2.0, 1.0, 0.5, 0.2, -2.0]))
-    T_parent_child = rows.opencv(cv2, method, Ts_pw_p, T_cw_pw @ Ts_pw_p @ data.T_PARENT_CHILD)
+    T_parent_child = rows.opencv(
+        cv2, method, Ts_pw_p, T_cw_pw @ Ts_pw_p @ data.T_PARENT_CHILD
+    )
     np.testing.assert_allclose(T_parent_child, data.T_PARENT_CHILD, atol=1e-6)

@@ -9,7 +9,11 @@ from result_making import calibration
 from sigmas import assert_nees, nees
 
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.results.calibration import DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.core.results.calibration import (
+    DofObservability,
+    DofVerdict,
+    SolveStatus,
+)
 from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.extras.simulation.drive import simulate_drive
 from hand_eye_calib.extras.simulation.options import HILLY_DRIVE
@@ -28,7 +32,11 @@ SMALL = classes.RecordingClass(
     rate_hz=10.0,
     parent=sensor_errors.SensorErrors(
         white=sensor_errors.sigmas(0.0005, 0.02),
-        slow=(sensor_errors.GaussMarkov(2.0, sensor_errors.sigmas(0.002, 0.05), in_world=True),),
+        slow=(
+            sensor_errors.GaussMarkov(
+                2.0, sensor_errors.sigmas(0.002, 0.05), in_world=True
+            ),
+        ),
     ),
     child=sensor_errors.SensorErrors(
         white=sensor_errors.sigmas(0.0005, 0.02),
@@ -59,7 +67,9 @@ def test_ideal_weighted_estimator_scatters_by_the_bound():
     values = []
     for seed in range(40):
         recording = classes.simulate(SMALL, seed)
-        xi = ideal_estimate(recording.sides, recording.sides[1].Ts, recording.dt, shown(recording))
+        xi = ideal_estimate(
+            recording.sides, recording.sides[1].Ts, recording.dt, shown(recording)
+        )
         values.append(nees(xi, recording.bound()))
     # The mean of chi-squared with 6 degrees of freedom over 40 draws: 6 +/- 0.55.
     assert_nees(values, 4.4, 7.6)
@@ -69,7 +79,9 @@ def test_information_of_heavy_tails():
     assert sensor_errors.mixture_information(0.0, 10.0) == pytest.approx(1.0, abs=1e-6)
     # Spikes far out are seen for what they are, and lost.
     assert sensor_errors.mixture_information(0.1, 100.0) == pytest.approx(0.9, abs=0.01)
-    assert sensor_errors.Tail("student", factor=1e6).information() == pytest.approx(1.0, abs=1e-5)
+    assert sensor_errors.Tail("student", factor=1e6).information() == pytest.approx(
+        1.0, abs=1e-5
+    )
     tail = sensor_errors.Tail("student", factor=3.0)
     rng = np.random.default_rng(0)
     draws = np.array(tail.draw(rng, 20_000, 0.1))
@@ -103,7 +115,9 @@ def test_cycle_of_true_answers_closes_and_its_covariance_counts_each_answer():
     covariances = [np.diag(variances) for variances in rng.uniform(1e-6, 1e-4, (3, 6))]
     answers = [
         _calibration(T, covariance, scale)
-        for T, covariance, scale in zip((T_ab, T_bc, T_ca), covariances, scales, strict=True)
+        for T, covariance, scale in zip(
+            (T_ab, T_bc, T_ca), covariances, scales, strict=True
+        )
     ]
     xi, covariance = misclosure(answers)
     np.testing.assert_allclose(xi, 0.0, atol=1e-12)
@@ -114,7 +128,9 @@ def test_cycle_of_true_answers_closes_and_its_covariance_counts_each_answer():
     for _ in range(400):
         errors = [rng.multivariate_normal(np.zeros(6), c) for c in covariances]
         moved = [
-            dataclasses.replace(answer, T_parent_child=answer.T_parent_child @ se3.exp(error))
+            dataclasses.replace(
+                answer, T_parent_child=answer.T_parent_child @ se3.exp(error)
+            )
             for answer, error in zip(answers, errors, strict=True)
         ]
         xi, _ = misclosure(moved)
@@ -123,15 +139,23 @@ def test_cycle_of_true_answers_closes_and_its_covariance_counts_each_answer():
 
 
 def _calibration(T_parent_child, covariance, scale):
-    fields = {"T_parent_child": T_parent_child, "covariance_measured": covariance, "scale": scale}
+    fields = {
+        "T_parent_child": T_parent_child,
+        "covariance_measured": covariance,
+        "scale": scale,
+    }
     return calibration(**fields, status=SolveStatus.OK, observability_measured=())
 
 
 def test_coverage_with_the_floor_is_told_apart():
-    observability = tuple(DofObservability(axis, DofVerdict.OBSERVED, 0.001) for axis in AXES)
+    observability = tuple(
+        DofObservability(axis, DofVerdict.OBSERVED, 0.001) for axis in AXES
+    )
     result = _calibration(np.eye(4), 1e-6 * np.eye(6), 1.0)
     result = dataclasses.replace(
-        result, observability_measured=observability, covariance_allowance=1e-4 * np.eye(6)
+        result,
+        observability_measured=observability,
+        covariance_allowance=1e-4 * np.eye(6),
     )
     T_truth = np.eye(4)
     T_truth[0, 3] = 0.01
@@ -147,7 +171,10 @@ def test_one_class_from_end_to_end(tmp_path, monkeypatch, capsys):
     assert 0.3 < row_of["hand_white"].value("bound") < 3.0
     assert row_of["flat_agv"].value("refused") == 1.0
     assert set(row_of["all classes"].cases["bound"]) == {"hand_white/0", "hand_white/1"}
-    assert [*study.in_parallel(max, [(1, 2), (3, 4, 5)], 2)] == [2, 5]  # rows differ in arguments
+    assert [*study.in_parallel(max, [(1, 2), (3, 4, 5)], 2)] == [
+        2,
+        5,
+    ]  # rows differ in arguments
     monkeypatch.delenv("HAND_EYE_CALIB_DATA", raising=False)
     monkeypatch.setattr(study, "measure", lambda *_: rows)
     files = [tmp_path / name for name in ("page.md", "rows.csv")]
@@ -184,9 +211,15 @@ def test_the_page_names_what_is_wrong_in_confidence_and_wrong_findings():
     text = faults.report(
         [
             faults.Outcome(key="S5 0 hilly_1 auto", verdict="USE", findings=[], z=4.0),
-            faults.Outcome(key="S5 1 hilly_1 auto", verdict="USE WITH CARE", findings=[], z=9.0),
-            faults.Outcome(key="none 0 hilly_1 auto", verdict="USE", findings=[], z=1.0),
-            faults.Outcome(key="clean 0 hilly 50 auto", verdict="USE", findings=["note:jumps"]),
+            faults.Outcome(
+                key="S5 1 hilly_1 auto", verdict="USE WITH CARE", findings=[], z=9.0
+            ),
+            faults.Outcome(
+                key="none 0 hilly_1 auto", verdict="USE", findings=[], z=1.0
+            ),
+            faults.Outcome(
+                key="clean 0 hilly 50 auto", verdict="USE", findings=["note:jumps"]
+            ),
             faults.Outcome(
                 key="clean 0 hand_mixture_30s 50 auto",
                 verdict="USE WITH CARE",
@@ -196,7 +229,10 @@ def test_the_page_names_what_is_wrong_in_confidence_and_wrong_findings():
         ],
         None,
     )
-    assert "1 of them are more than 3.3 standard deviations off and called USE:\n- S5 0" in text
+    assert (
+        "1 of them are more than 3.3 standard deviations off and called USE:\n- S5 0"
+        in text
+    )
     assert "Wrong findings in 1 of 2 clean recordings" in text
     assert "| hand_mixture_30s | 1 | scale 1 |" in text
 
@@ -205,9 +241,13 @@ def test_the_page_names_what_is_wrong_in_confidence_and_wrong_findings():
 def test_faults_that_were_built_last_change_the_streams(fault):
     drive = simulate_drive(0, dataclasses.replace(HILLY_DRIVE, poses=400))
     for severity in fault.severities:
-        parent, child = fault.damage(drive.parent, drive.child, severity, np.random.default_rng(0))
+        parent, child = fault.damage(
+            drive.parent, drive.child, severity, np.random.default_rng(0)
+        )
         assert min(len(parent), len(child)) > 250
-        same = len(child) == len(drive.child) and np.array_equal(child.poses, drive.child.poses)
+        same = len(child) == len(drive.child) and np.array_equal(
+            child.poses, drive.child.poses
+        )
         same &= np.array_equal(child.stamps_ns, drive.child.stamps_ns)
         assert not same or not np.array_equal(parent.poses, drive.parent.poses)
 

@@ -13,9 +13,9 @@ from source_code import ROOT
 # Nodes of the syntax tree, nodes a line of code, and numeric constants: today's with 5 % of room.
 # Whoever makes one smaller lowers its limit. The aim is 132,000 nodes, 6.0 a line, 300 constants.
 LIMITS = {
-    "hand_eye_calib": (222_000, 6.5, 946),
-    "test": (178_500, 7.2, 315),
-    "reproduction": (51_200, 7.4, 205),
+    "hand_eye_calib": (222_000, 6.0, 946),
+    "test": (178_500, 6.3, 315),
+    "reproduction": (51_200, 6.6, 205),
 }
 
 _NOT_CODE = {
@@ -42,7 +42,10 @@ def n_code_lines(source, tree):
         if token.type not in _NOT_CODE:
             lines.update(range(token.start[0], token.end[0] + 1))
     for node in ast.walk(tree):
-        if isinstance(node, _DOCUMENTED) and ast.get_docstring(node, clean=False) is not None:
+        if (
+            isinstance(node, _DOCUMENTED)
+            and ast.get_docstring(node, clean=False) is not None
+        ):
             docstring = node.body[0]
             lines.difference_update(range(docstring.lineno, docstring.end_lineno + 1))
     return len(lines)
@@ -54,12 +57,22 @@ def n_constants(statement):
         return sum(isinstance(field, ast.AnnAssign) for field in statement.body)
     if not isinstance(statement, ast.Assign | ast.AnnAssign) or statement.value is None:
         return 0
-    targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
+    targets = (
+        statement.targets if isinstance(statement, ast.Assign) else [statement.target]
+    )
     nodes = [node for target in targets for node in ast.walk(target)]
     names = [node.id for node in nodes if isinstance(node, ast.Name)]
-    values = [node.value for node in ast.walk(statement.value) if isinstance(node, ast.Constant)]
+    values = [
+        node.value
+        for node in ast.walk(statement.value)
+        if isinstance(node, ast.Constant)
+    ]
     has_number = any(type(value) in (int, float) for value in values)
-    return len(names) if has_number and all(name.lstrip("_").isupper() for name in names) else 0
+    return (
+        len(names)
+        if has_number and all(name.lstrip("_").isupper() for name in names)
+        else 0
+    )
 
 
 def measured(folder):
@@ -81,7 +94,9 @@ def test_code_is_no_more_and_no_denser_than_it_was(name):
     most_nodes, most_a_line, most_constants = LIMITS[name]
     assert nodes <= most_nodes, "more code than before: can something go?"
     assert nodes_a_line <= most_a_line, "denser code than before: give each step a line"
-    assert constants <= most_constants, "more constants than before: can one be derived?"
+    assert constants <= most_constants, (
+        "more constants than before: can one be derived?"
+    )
 
 
 def test_what_is_counted(tmp_path):

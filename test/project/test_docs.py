@@ -37,13 +37,17 @@ def blocks(name):
     """Commands and Python of a page in their order."""
     text = (DOCS / name).read_text(encoding="utf-8")
     commands = []
-    for language, block in re.findall(r"^```(bash|python)\n(.*?)^```", text, re.DOTALL | re.M):
+    for language, block in re.findall(
+        r"^```(bash|python)\n(.*?)^```", text, re.DOTALL | re.M
+    ):
         if language == "python":
             commands += [("python", block)] if "import hand_eye_calib" in text else []
         else:
             lines = block.replace("\\\n", " ").splitlines()
             ours = (line for line in lines if line.startswith("hand_eye_calib "))
-            commands += [("command", line) for line in ours if not ELSEWHERE.search(line)]
+            commands += [
+                ("command", line) for line in ours if not ELSEWHERE.search(line)
+            ]
     return commands
 
 
@@ -87,7 +91,9 @@ def test_every_page_is_in_the_navigation_and_short_or_has_tables_of_studies():
     text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     site = yaml.safe_load(text)
     evidence = set(site["not_in_nav"].split())
-    navigation = set(re.findall(r"- (?:\w+: )?([\w/]+\.md)$", text.partition("\nnav:")[2], re.M))
+    navigation = set(
+        re.findall(r"- (?:\w+: )?([\w/]+\.md)$", text.partition("\nnav:")[2], re.M)
+    )
     every = {path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")}
     assert navigation >= every - evidence
     texts = [(DOCS / name).read_text(encoding="utf-8") for name in every - evidence]
@@ -100,17 +106,26 @@ def test_pages_say_bash_where_commands_are():
     """A command in a block of another language would not be run."""
     for path in DOCS.rglob("*.md"):
         text = path.read_text(encoding="utf-8")
-        for language, block in re.findall(r"^```(\w*)\n(.*?)^```", text, re.DOTALL | re.M):
+        for language, block in re.findall(
+            r"^```(\w*)\n(.*?)^```", text, re.DOTALL | re.M
+        ):
             if language != "bash":
-                assert not re.search(r"^hand_eye_calib [a-z]", block, re.M), (path, block)
+                assert not re.search(r"^hand_eye_calib [a-z]", block, re.M), (
+                    path,
+                    block,
+                )
 
 
 def test_every_public_name_is_on_the_reference_page():
     text = (DOCS / "python.md").read_text(encoding="utf-8")
     described = set(re.findall(r"^::: (\S+)$", text, re.MULTILINE))
     public = {getattr(hec, name) for name in hec.__all__}
-    homes = {f"{public_name.__module__}.{public_name.__name__}" for public_name in public}
-    missing = {home for home in homes - described if home.rpartition(".")[0] not in described}
+    homes = {
+        f"{public_name.__module__}.{public_name.__name__}" for public_name in public
+    }
+    missing = {
+        home for home in homes - described if home.rpartition(".")[0] not in described
+    }
     assert missing == set()
 
 
@@ -154,8 +169,12 @@ DARK = "#1e2129"  # background of Material's scheme slate
 
 def luminance(colour):
     """Relative luminance of a colour, WCAG 2.2."""
-    channels = np.array([int(colour[start : start + 2], 16) for start in (1, 3, 5)]) / 255
-    linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+    channels = (
+        np.array([int(colour[start : start + 2], 16) for start in (1, 3, 5)]) / 255
+    )
+    linear = np.where(
+        channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4
+    )
     return float(linear @ [0.2126, 0.7152, 0.0722])
 
 

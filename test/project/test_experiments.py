@@ -11,7 +11,14 @@ from hand_eye_calib.core.solvers.all_pairs import solve_park
 from reproduction import comparison, metrics, results, runner
 from reproduction.__main__ import EXPERIMENTS, GROUPS, main
 from reproduction.published import REFERENCES
-from reproduction.rows import ALI_AS_PUBLISHED, METRICS, PUBLISHED, Cell, solve_cell, table_of
+from reproduction.rows import (
+    ALI_AS_PUBLISHED,
+    METRICS,
+    PUBLISHED,
+    Cell,
+    solve_cell,
+    table_of,
+)
 from reproduction.sources import SimulatedSource
 from reproduction.writing import put_into_page
 
@@ -23,7 +30,13 @@ CELLS = [
 ]
 
 ERRORS = (0.01, 0.5, 0.02, 0.3)
-NAMES = {"dataset": "noise", "level": 0.002, "run": "run_01", "method": "dnl", "reference": "B1"}
+NAMES = {
+    "dataset": "noise",
+    "level": 0.002,
+    "run": "run_01",
+    "method": "dnl",
+    "reference": "B1",
+}
 A_ROW = (
     {**NAMES, "converged": True, "objective": 1.0, "published_objective": 1.0}
     | dict(zip(METRICS, ERRORS, strict=True))
@@ -45,7 +58,9 @@ def test_mean_has_students_confidence_interval():
     summary = results.mean_summary([1.0, 2.0, 3.0, 4.0])
     # t(0.975, 3) = 3.18245 and s = 1.290994
     assert (summary.centre, summary.n) == (2.5, 4)
-    np.testing.assert_allclose([summary.low, summary.high], [0.44574, 4.55426], atol=1e-5)
+    np.testing.assert_allclose(
+        [summary.low, summary.high], [0.44574, 4.55426], atol=1e-5
+    )
     # Quartiles and whiskers leave out what is far.
     summary = results.quartile_summary([1.0, 2.0, 3.0, 4.0, 100.0])
     assert (summary.low, summary.centre, summary.high) == (2.0, 3.0, 4.0)
@@ -57,12 +72,16 @@ def test_rows_hold_the_errors_of_what_was_solved(rows):
     row = next(row for row in rows if row.items() >= wanted.items())
     case = SOURCE.cases("noise", 0.004)[1]
     pairs = case.pairs("B5")
-    expected = metrics.errors(pairs, solve_park(pairs).T_parent_child, case.T_parent_child)
+    expected = metrics.errors(
+        pairs, solve_park(pairs).T_parent_child, case.T_parent_child
+    )
     np.testing.assert_allclose(
         [row[metric] for metric in METRICS],
         np.array(expected) * [1, 180 / np.pi, 1, 180 / np.pi],
     )
-    np.testing.assert_array_equal(row["T_parent_child"], solve_park(pairs).T_parent_child.ravel())
+    np.testing.assert_array_equal(
+        row["T_parent_child"], solve_park(pairs).T_parent_child.ravel()
+    )
     table = table_of([row])
     assert (table["case"][0], table["why"][0]) == ("noise/0.004/run_02", "")
     assert table["published_e_at"].isna().all()
@@ -70,12 +89,21 @@ def test_rows_hold_the_errors_of_what_was_solved(rows):
 
 def test_best_reference_is_by_mean_over_levels_and_by_median_in_the_mixture():
     def entries(dataset, level, reference, errors):
-        names = {"dataset": dataset, "level": level, "method": "dnl", "reference": reference}
-        return [names | dict.fromkeys(METRICS, 0.0) | {"e_at": error} for error in errors]
+        names = {
+            "dataset": dataset,
+            "level": level,
+            "method": "dnl",
+            "reference": reference,
+        }
+        return [
+            names | dict.fromkeys(METRICS, 0.0) | {"e_at": error} for error in errors
+        ]
 
     rows = []
     for reference in REFERENCES:
-        levels = ((1.0, 1.0), (5.0, 7.0)) if reference == "B10" else ((0.0, 0.0), (9.0, 9.0))
+        levels = (
+            ((1.0, 1.0), (5.0, 7.0)) if reference == "B10" else ((0.0, 0.0), (9.0, 9.0))
+        )
         mixture = [1.0, 1.0, 90.0] if reference == "C5" else [2.0, 2.0, 2.0]
         for level, errors in zip((0.0, 0.002), levels, strict=True):
             rows += entries("noise", level, reference, errors)
@@ -115,7 +143,9 @@ def test_comparison_counts_lists_and_explains(tmp_path):
     text = comparison.describe_rows(table)
     assert "1 of 2 (50.00 %)" in text
     assert "| noise/0.002/run_01 | DNL | B1 | 0.5, 30 | 0.02, 0.3 | 0.4, 1 |" in text
-    written = comparison.write_rows(tmp_path / "rows.csv", table).read_text().splitlines()
+    written = (
+        comparison.write_rows(tmp_path / "rows.csv", table).read_text().splitlines()
+    )
     assert len(written) == 3
     assert written[2].endswith(
         ",False,published answer is not the minimum: ours has the lower objective"
@@ -136,7 +166,11 @@ def test_what_is_kept_is_not_solved_again_and_processes_do_not_matter(tmp_path, 
     first, second = path.read_text().splitlines()[1:]
     path.write_text(f"\n{first.replace('run_01', 'kept')}\n{second[:-5]}")
     kept_rows = runner.kept(path, solve_cell, tasks_of(CELLS), 1)
-    marked = {name for name, some in kept_rows.items() if any(row["run"] == "kept" for row in some)}
+    marked = {
+        name
+        for name, some in kept_rows.items()
+        if any(row["run"] == "kept" for row in some)
+    }
     assert marked == {CELLS[0].method}
     assert len(kept_rows) == len(CELLS)
 
@@ -151,12 +185,16 @@ def test_everything_in_the_article_is_there():
 
 def test_a_text_is_put_between_the_marks_of_its_study(tmp_path):
     page = tmp_path / "page.md"
-    page.write_text("# Ours\n\n<!-- study: begin -->\nold\n<!-- study: end -->\n\nThe rest.\n")
+    page.write_text(
+        "# Ours\n\n<!-- study: begin -->\nold\n<!-- study: end -->\n\nThe rest.\n"
+    )
     put_into_page(page, "study", "# Title\n\n| table |\n")
     assert page.read_text().splitlines()[2::2] == [
         *("<!-- study: begin -->", "| table |", "<!-- study: end -->", "The rest.")
     ]
-    with pytest.raises(InputError, match="has no lines <!-- other: begin --> and <!-- other: end"):
+    with pytest.raises(
+        InputError, match="has no lines <!-- other: begin --> and <!-- other: end"
+    ):
         put_into_page(page, "other", "| table |")
 
 

@@ -33,7 +33,11 @@ def drawn_scores(seed=0, family="car", count=20):
 
 def failures_of(scores, before):
     baseline = Baseline(1, "numpy 2", {score.name: score for score in before})
-    return [failure for comparison in compare(scores, baseline) for failure in comparison.failures]
+    return [
+        failure
+        for comparison in compare(scores, baseline)
+        for failure in comparison.failures
+    ]
 
 
 def worse_errors(score):
@@ -42,12 +46,24 @@ def worse_errors(score):
 
 WORSE = {
     "larger errors": (worse_errors, "errors are"),
-    "intervals too narrow": (lambda score: {"inside": score.inside - 1}, "90 % intervals cover"),
-    "intervals too wide": (lambda score: {"nees": 0.5 * score.nees, "inside": 6}, "NEES"),
-    "allowance too small": (lambda score: {"inside_allowance": 5}, "with the allowance"),
+    "intervals too narrow": (
+        lambda score: {"inside": score.inside - 1},
+        "90 % intervals cover",
+    ),
+    "intervals too wide": (
+        lambda score: {"nees": 0.5 * score.nees, "inside": 6},
+        "NEES",
+    ),
+    "allowance too small": (
+        lambda score: {"inside_allowance": 5},
+        "with the allowance",
+    ),
     "verdicts too strict": (lambda score: {"verdict": "USE WITH CARE"}, "stricter"),
     "no answer": (lambda score: {"verdict": ""}, "no answer: 20 recordings, before 0"),
-    "wrong without a word": (lambda score: {"is_wrong": True}, "USE but wrong: 20 recordings"),
+    "wrong without a word": (
+        lambda score: {"is_wrong": True},
+        "USE but wrong: 20 recordings",
+    ),
 }
 
 
@@ -58,7 +74,9 @@ def test_what_is_worse_fails_in_its_family_and_in_all(name):
     scores = [dataclasses.replace(score, **changes(score)) for score in before]
     failures = failures_of(scores, before)
     for group in ("car", "all"):
-        assert any(text.startswith(f"{group}: ") and sentence in text for text in failures)
+        assert any(
+            text.startswith(f"{group}: ") and sentence in text for text in failures
+        )
 
 
 def test_one_wrong_answer_among_many_fails():
@@ -91,7 +109,9 @@ def test_an_error_that_was_zero_by_luck_does_not_count_as_a_large_ratio():
 def test_errors_over_robust_least_squares_are_a_median_and_a_quantile():
     before = drawn_scores()
     scores = [
-        dataclasses.replace(score, robust_errors=tuple(2.0 * error for error in score.errors))
+        dataclasses.replace(
+            score, robust_errors=tuple(2.0 * error for error in score.errors)
+        )
         for score in before
     ]
     baseline = Baseline(1, "numpy 2", {score.name: score for score in before})
@@ -103,7 +123,9 @@ def test_errors_over_robust_least_squares_are_a_median_and_a_quantile():
 def test_recordings_drawn_anew_pass_by_chance_and_fail_if_errors_are_larger():
     before = drawn_scores(0, count=80)
     new = drawn_scores(1, count=60)
-    worse = [dataclasses.replace(score, over_bound=3.0 * score.over_bound) for score in new]
+    worse = [
+        dataclasses.replace(score, over_bound=3.0 * score.over_bound) for score in new
+    ]
     assert compare_new_draw(new, before).failures == []
     assert compare_new_draw(worse, before).failures == [
         "new draw: errors over their bound are larger than in the baseline"
@@ -135,7 +157,9 @@ def test_a_damaged_baseline_is_named(tmp_path):
 def test_the_stored_baseline_has_all_recordings_of_both_sizes():
     stored = Baseline.read(gate.BASELINE).scores
     for numbers in (gate.USUAL, gate.QUICK):
-        names = {f"{family} {k}" for family, count in numbers.items() for k in range(count)}
+        names = {
+            f"{family} {k}" for family, count in numbers.items() for k in range(count)
+        }
         assert names <= stored.keys()
 
 
@@ -151,7 +175,9 @@ def test_the_command_fails_if_the_baseline_was_better(tmp_path, monkeypatch, cap
     assert "Not worse than the baseline." in capsys.readouterr().out
     stored = Baseline.read(path)
     score = stored.scores["hand_mixture_30s 0"]
-    smaller = dataclasses.replace(score, errors=tuple(0.5 * error for error in score.errors))
+    smaller = dataclasses.replace(
+        score, errors=tuple(0.5 * error for error in score.errors)
+    )
     better = dataclasses.replace(stored, scores=stored.scores | {score.name: smaller})
     better.write(path)
     assert gate.main([*options, "--quick"]) == 1

@@ -36,7 +36,10 @@ MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
 # as with pip and launch.
 DECLARED_AS = {
     # Optional, or without a rosdep key: rosbags reads whole files of mcap.
-    **{n: (n, None) for n in ("mcap", "fsspec", "small_gicp", "segno", "pandas", "pyulog")},
+    **{
+        n: (n, None)
+        for n in ("mcap", "fsspec", "small_gicp", "segno", "pandas", "pyulog")
+    },
     "mcap_protobuf": ("mcap-protobuf-support", None),
     "backports": ("backports.zstd", None),  # rosbags requires it too
     "compression": (None, None),  # the standard library of Python 3.14
@@ -57,11 +60,17 @@ DECLARED_AS = {
             "builtin_interfaces",
             "std_srvs",
             "visualization_msgs",
-            *tuple(f"{kind}_msgs" for kind in ("diagnostic", "geometry", "nav", "sensor", "std")),
+            *tuple(
+                f"{kind}_msgs"
+                for kind in ("diagnostic", "geometry", "nav", "sensor", "std")
+            ),
         )
     },
     # tf2_msgs is not among the wheels; publish_tf alone needs it.
-    **{name: (None, name) for name in ("ament_index_python", "launch", "launch_ros", "tf2_msgs")},
+    **{
+        name: (None, name)
+        for name in ("ament_index_python", "launch", "launch_ros", "tf2_msgs")
+    },
 }
 
 
@@ -91,7 +100,9 @@ def clean_environment(**extra):
     dropped |= {"AMENT_PREFIX_PATH", "COLCON_PREFIX_PATH"}
     kept = {name: value for name, value in os.environ.items() if name not in dropped}
     # As in an activated virtual environment: installed commands take the interpreter on PATH.
-    kept["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), kept.get("PATH", "")])
+    kept["PATH"] = os.pathsep.join(
+        [str(Path(sys.executable).parent), kept.get("PATH", "")]
+    )
     return kept | extra
 
 
@@ -103,7 +114,14 @@ def source(tmp_path_factory):
     compiled = shutil.ignore_patterns("__pycache__")
     for folder in (PACKAGE, "config", "launch", "resource", "scripts"):
         shutil.copytree(ROOT / folder, target / folder, ignore=compiled)
-    for file in ("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "README.md", "LICENSE"):
+    for file in (
+        "package.xml",
+        "setup.py",
+        "setup.cfg",
+        "pyproject.toml",
+        "README.md",
+        "LICENSE",
+    ):
         shutil.copy(ROOT / file, target)
     return target
 
@@ -116,7 +134,9 @@ def third_party_imports(folder, calls=r"import_module|required\("):
                 names |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level:
                 names.add(node.module.split(".")[0])
-            elif isinstance(node, ast.Call) and re.match(calls, ast.unparse(node.func) + "("):
+            elif isinstance(node, ast.Call) and re.match(
+                calls, ast.unparse(node.func) + "("
+            ):
                 names |= set(re.findall(r"'(\w+)[.']", ast.unparse(node.args[0])))
     return names - set(sys.stdlib_module_names) - {PACKAGE}
 
@@ -125,7 +145,9 @@ def test_everything_imported_is_declared_for_rosdep_and_for_pip(declared):
     keys = {element.text for element in MANIFEST.iter("exec_depend")}
     requirements = [declared["install_requires"], *declared["extras_require"].values()]
     requirements = {Requirement(text).name for texts in requirements for text in texts}
-    imported = third_party_imports(ROOT / PACKAGE) | third_party_imports(ROOT / "launch")
+    imported = third_party_imports(ROOT / PACKAGE) | third_party_imports(
+        ROOT / "launch"
+    )
     assert {"numpy", "scipy", "rclpy"} <= imported
     for name in imported:
         pip_name, rosdep_key = DECLARED_AS[name]
@@ -137,7 +159,10 @@ def test_everything_imported_is_declared_for_rosdep_and_for_pip(declared):
         )
     # The saved launch file and the printed command run an executable of one; messages are imported
     # by the names of their types.
-    assert keys - {DECLARED_AS[name][1] for name in imported} == {"tf2_ros", "sensor_msgs"}
+    assert keys - {DECLARED_AS[name][1] for name in imported} == {
+        "tf2_ros",
+        "sensor_msgs",
+    }
 
 
 def test_without_libraries_of_pip_one_line_says_what_is_missing(tmp_path):
@@ -151,7 +176,11 @@ def test_without_libraries_of_pip_one_line_says_what_is_missing(tmp_path):
         "from hand_eye_calib.offline.cli.main import main\n"
         f"print([int(main(command)) for command in {commands}], file=sys.stderr)"
     )
-    done = run([sys.executable, "-c", program], cwd=tmp_path, env=os.environ | {"PYTHONPATH": ROOT})
+    done = run(
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": ROOT},
+    )
     *_, casadi, rosbags, codes = done.stderr.splitlines()
     assert codes == "[0, 0, 1, 1]"
     for library, line in (("casadi", casadi), ("rosbags", rosbags)):
@@ -166,14 +195,18 @@ def test_links_of_the_readme_are_absolute_on_other_pages(declared):
 
 
 def test_oldest_versions_are_pinned_at_the_declared_lower_bounds(declared):
-    lines = (ROOT / "requirements" / "oldest.txt").read_text(encoding="utf-8").splitlines()
+    lines = (
+        (ROOT / "requirements" / "oldest.txt").read_text(encoding="utf-8").splitlines()
+    )
     pins = dict(line.split("==") for line in lines if "==" in line)
     requirements = declared["install_requires"] + declared["extras_require"]["test"]
     bounded = [Requirement(text) for text in requirements if ">=" in text]
     assert len(bounded) > 6
     for requirement in bounded:
         (bound,) = [
-            specifier.version for specifier in requirement.specifier if specifier.operator == ">="
+            specifier.version
+            for specifier in requirement.specifier
+            if specifier.operator == ">="
         ]
         pin = pins[requirement.name]
         assert pin == bound or pin.startswith(bound + "."), (
@@ -190,13 +223,17 @@ def test_libraries_that_the_package_runs_with_have_an_upper_bound(declared):
     assert len(of_users) > 15
     for requirement in map(Requirement, of_users):
         is_of_ros = requirement.name.startswith("ros-jazzy-")
-        has_bound = any(specifier.operator == "<" for specifier in requirement.specifier)
+        has_bound = any(
+            specifier.operator == "<" for specifier in requirement.specifier
+        )
         assert has_bound or is_of_ros, f"{requirement.name} has no upper bound"
 
 
 def test_licences_of_libraries_are_listed(declared):
     page = (ROOT / "THIRD_PARTY.md").read_text(encoding="utf-8")
-    rows = dict(re.findall(r"^\| ([\w.-]+) \| [^|]+ \| ([^|]+) \|$", page, re.MULTILINE))
+    rows = dict(
+        re.findall(r"^\| ([\w.-]+) \| [^|]+ \| ([^|]+) \|$", page, re.MULTILINE)
+    )
     development = {"test", "lint", "coverage"}
     needed = [*declared["install_requires"]]
     for extra, requirements in declared["extras_require"].items():
@@ -207,12 +244,16 @@ def test_licences_of_libraries_are_listed(declared):
 
 
 def test_the_versions_that_ci_ran_are_within_the_declared_bounds(declared):
-    lines = (ROOT / "requirements" / "tested.txt").read_text(encoding="utf-8").splitlines()
+    lines = (
+        (ROOT / "requirements" / "tested.txt").read_text(encoding="utf-8").splitlines()
+    )
     tested = dict(line.split("==") for line in lines if "==" in line)
     tested = {canonicalize_name(name): version for name, version in tested.items()}
     for text in declared["install_requires"]:
         requirement = Requirement(text)
-        assert requirement.specifier.contains(tested[canonicalize_name(requirement.name)])
+        assert requirement.specifier.contains(
+            tested[canonicalize_name(requirement.name)]
+        )
 
 
 def test_the_version_is_the_same_wherever_it_is_written(declared):
@@ -230,17 +271,36 @@ def test_the_version_is_the_same_wherever_it_is_written(declared):
 def test_pip_install_gives_the_commands(declared, source, tmp_path):
     target = tmp_path / "target"
     options = "--quiet --no-deps --no-build-isolation --no-compile --disable-pip-version-check"
-    pip = [sys.executable, "-m", "pip", "install", *options.split(), "--ignore-installed"]
+    pip = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        *options.split(),
+        "--ignore-installed",
+    ]
     run([*pip, "--prefix", target, source], env=clean_environment(), cwd=tmp_path)
     site = next(target.glob("lib/python*/site-packages"))
     environment = clean_environment(PYTHONPATH=str(site))
 
-    assert {path.name for path in (target / "bin").iterdir()} == {"calibrator", PACKAGE, "replay"}
+    assert {path.name for path in (target / "bin").iterdir()} == {
+        "calibrator",
+        PACKAGE,
+        "replay",
+    }
     assert not (target / "lib" / PACKAGE).exists()
     where = run([sys.executable, "-c", WHERE], env=environment, cwd=tmp_path)
     assert Path(where.stdout.strip()).is_relative_to(site)
-    templates = "offline/report/templates/report.html", "formats/templates/extrinsic.urdf.xacro.in"
-    for kept in (*templates, "extras/rig/rig.html", "formats/layouts.yaml", "sample/lidar.tum"):
+    templates = (
+        "offline/report/templates/report.html",
+        "formats/templates/extrinsic.urdf.xacro.in",
+    )
+    for kept in (
+        *templates,
+        "extras/rig/rig.html",
+        "formats/layouts.yaml",
+        "sample/lidar.tum",
+    ):
         assert (site / PACKAGE / kept).is_file()
     for command, expected in (
         ([target / "bin" / "replay", "--help"], "usage: hand_eye_calib replay"),
@@ -257,7 +317,9 @@ def assert_data_files(prefix):
     for folder, pattern in (("config", "*.*"), ("launch", "*.launch.py")):
         expected = {path.name for path in (ROOT / folder).glob(pattern)}
         assert expected, f"{folder} is empty"
-        assert {path.name for path in (share / folder).iterdir() if path.is_file()} == expected
+        assert {
+            path.name for path in (share / folder).iterdir() if path.is_file()
+        } == expected
 
 
 class TutorialCommands(NamedTuple):
@@ -270,7 +332,9 @@ class TutorialCommands(NamedTuple):
 
 def tutorial_commands():
     pages = [*(ROOT / "docs" / "tutorials").glob("*.md")]
-    pages += [ROOT / "docs" / f"{name}.md" for name in ("quickstart", "node", "installation")]
+    pages += [
+        ROOT / "docs" / f"{name}.md" for name in ("quickstart", "node", "installation")
+    ]
     text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
     blocks = "\n".join(re.findall(r"```(?:bash|ini)\n(.*?)```", text, re.DOTALL))
     return TutorialCommands(
@@ -288,7 +352,9 @@ def test_the_commands_of_the_tutorials_exist_after_colcon_and_after_pip():
     assert names.launch_files == {"calibrator.launch.py"}
 
 
-def test_colcon_lays_out_an_install_space_whose_commands_run(declared, source, tmp_path):
+def test_colcon_lays_out_an_install_space_whose_commands_run(
+    declared, source, tmp_path
+):
     colcon = [sys.executable, "-m", "colcon", "--log-base", tmp_path / "log", "build"]
     options = ["--base-paths", source, "--packages-select", PACKAGE]
     options += ["--event-handlers", "console_direct+"]
@@ -299,7 +365,9 @@ def test_colcon_lays_out_an_install_space_whose_commands_run(declared, source, t
     executables = {path.name: path for path in folder.iterdir()}
     assert set(executables) == {PACKAGE, *COMMANDS}
     for path in executables.values():
-        assert path.read_text(encoding="utf-8").splitlines()[0] == "#!/usr/bin/env python3"
+        assert (
+            path.read_text(encoding="utf-8").splitlines()[0] == "#!/usr/bin/env python3"
+        )
     (tmp_path / "each.py").write_text(EACH)
     program = f"source install/setup.bash && {sys.executable} each.py '{folder}'/*"
     program += f" && '{folder}/{PACKAGE}' --version"
@@ -312,7 +380,9 @@ def test_colcon_lays_out_an_install_space_whose_commands_run(declared, source, t
     assert declared["version"] in output
     assert str(prefix / "bin" / PACKAGE) in output
     assert tutorial_commands().executables <= set(executables)
-    assert tutorial_commands().launch_files <= {path.name for path in prefix.rglob("*.launch.py")}
+    assert tutorial_commands().launch_files <= {
+        path.name for path in prefix.rglob("*.launch.py")
+    }
 
 
 WORKFLOWS = {
@@ -326,7 +396,9 @@ def lines(jobs):
     steps = [step for job in jobs.values() for step in job["steps"]]
     steps_run = [line for step in steps for line in step.get("run", "").splitlines()]
     matrices = [job.get("strategy", {}).get("matrix", {}) for job in jobs.values()]
-    return steps_run + [line for matrix in matrices for line in matrix.get("command", [])]
+    return steps_run + [
+        line for matrix in matrices for line in matrix.get("command", [])
+    ]
 
 
 def test_commands_exist_jobs_end_and_leave_no_credentials():
@@ -347,7 +419,9 @@ def test_commands_exist_jobs_end_and_leave_no_credentials():
 
 def test_what_ci_runs_here_runs_there_and_on_every_declared_python():
     """Each step of .ci/run is a job of the workflow."""
-    steps = re.findall(r"^step (make [a-z-]+)", (ROOT / ".ci" / "run").read_text(), re.MULTILINE)
+    steps = re.findall(
+        r"^step (make [a-z-]+)", (ROOT / ".ci" / "run").read_text(), re.MULTILINE
+    )
     assert len(steps) >= 4
     assert set(steps) <= set(lines(WORKFLOWS["ci"]))
     setup = (ROOT / "setup.py").read_text(encoding="utf-8")
@@ -361,12 +435,18 @@ NODE_PAGE = (ROOT / "docs" / "node.md").read_text(encoding="utf-8")
 
 
 def test_rviz_shows_the_latched_extrinsic_with_its_covariance():
-    rviz = yaml.safe_load((CONFIG / "calibrator.rviz").read_text())["Visualization Manager"]
-    (extrinsic,) = (display for display in rviz["Displays"] if display["Name"] == "Extrinsic")
+    rviz = yaml.safe_load((CONFIG / "calibrator.rviz").read_text())[
+        "Visualization Manager"
+    ]
+    (extrinsic,) = (
+        display for display in rviz["Displays"] if display["Name"] == "Extrinsic"
+    )
     assert extrinsic["Topic"]["Value"] == "/calibrator/extrinsic_with_covariance"
     assert extrinsic["Topic"]["Durability Policy"] == "Transient Local"
     assert extrinsic["Covariance"]["Position"]["Value"] is True
-    (markers,) = (display for display in rviz["Displays"] if display["Name"] == "Result")
+    (markers,) = (
+        display for display in rviz["Displays"] if display["Name"] == "Result"
+    )
     assert markers["Topic"]["Value"] == "/calibrator/markers"
     assert "`~/extrinsic_with_covariance`" in NODE_PAGE
     assert "`~/markers`" in NODE_PAGE
@@ -375,15 +455,25 @@ def test_rviz_shows_the_latched_extrinsic_with_its_covariance():
 def test_foxglove_shows_what_the_node_publishes_and_serves_each_panel_once():
     layout = json.loads((CONFIG / "foxglove_layout.json").read_text())
     panels = layout["configById"]
-    services = [panel["serviceName"] for panel in panels.values() if "serviceName" in panel]
-    assert sorted(services) == [f"/calibrator/{name}" for name in ("reset", "save", "solve")]
+    services = [
+        panel["serviceName"] for panel in panels.values() if "serviceName" in panel
+    ]
+    assert sorted(services) == [
+        f"/calibrator/{name}" for name in ("reset", "save", "solve")
+    ]
     for name in services:
         assert f"`~/{name.rpartition('/')[2]}`" in NODE_PAGE
     topics = ["/calibrator/extrinsic_with_covariance", "/calibrator/markers"]
     assert list(panels["3D!extrinsic"]["topics"]) == topics
-    values = [path["value"] for panel in panels.values() for path in panel.get("paths", ())]
+    values = [
+        path["value"] for panel in panels.values() for path in panel.get("paths", ())
+    ]
     keys = set(re.findall(r'key=="([a-z._]+)"', " ".join(values)))
-    assert keys == {*(f"sigma.{key}" for key in AXIS_KEYS.values()), "target.x", "target.about_x"}
+    assert keys == {
+        *(f"sigma.{key}" for key in AXIS_KEYS.values()),
+        "target.x",
+        "target.about_x",
+    }
 
     def placed(panel):
         if isinstance(panel, str):

@@ -10,7 +10,16 @@ import pytest
 from source_code import SOURCE
 
 _FLAGS = ("MULTILINE", "DOTALL", "IGNORECASE")
-_FUNCTIONS = {"compile", "search", "match", "fullmatch", "sub", "split", "findall", "finditer"}
+_FUNCTIONS = {
+    "compile",
+    "search",
+    "match",
+    "fullmatch",
+    "sub",
+    "split",
+    "findall",
+    "finditer",
+}
 # Characters of a hostile text; a line of a trajectory file may have more.
 _LENGTH = 30_000
 # Processor time (s) for a pattern and a text. A linear pattern needs milliseconds, a quadratic one
@@ -38,7 +47,9 @@ def patterns():
         }
         for call in filter(is_of_re, ast.walk(tree)):
             if file not in _OF_OWN_TEXT:
-                flags = sum(getattr(re, name) for name in _FLAGS if name in ast.unparse(call))
+                flags = sum(
+                    getattr(re, name) for name in _FLAGS if name in ast.unparse(call)
+                )
                 functions = {call.func.attr}
                 if call.func.attr == "compile":
                     functions = methods_of(names.get(id(call)), tree) or {"finditer"}
@@ -55,11 +66,19 @@ def methods_of(name, tree):
 
 def is_of_re(node):
     """Whether a node of the syntax tree calls a function of re with a literal pattern."""
-    if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute) or not node.args:
+    if (
+        not isinstance(node, ast.Call)
+        or not isinstance(node.func, ast.Attribute)
+        or not node.args
+    ):
         return False
     module = node.func.value
     has_module = isinstance(module, ast.Name) and module.id == "re"
-    return has_module and node.func.attr in _FUNCTIONS and isinstance(node.args[0], ast.Constant)
+    return (
+        has_module
+        and node.func.attr in _FUNCTIONS
+        and isinstance(node.args[0], ast.Constant)
+    )
 
 
 def alphabet(pattern):
@@ -85,13 +104,20 @@ def alphabet(pattern):
                     visit(child)
 
     visit(sre.parse(pattern))
-    return sorted(characters, key=lambda character: (character.isalpha(), character))[:_ALPHABET]
+    return sorted(characters, key=lambda character: (character.isalpha(), character))[
+        :_ALPHABET
+    ]
 
 
 def hostile_texts(pattern):
     """Long repetitions of one or two characters that the pattern names, after some of them."""
     characters = alphabet(pattern)
-    pairs = [first + second for first in characters for second in characters if first != second]
+    pairs = [
+        first + second
+        for first in characters
+        for second in characters
+        if first != second
+    ]
     for unit in (*characters, *pairs):
         for start in ("", *characters[:2]):
             yield start + unit * (_LENGTH // len(unit)) + "\0"
@@ -115,7 +141,9 @@ def processor_time(seconds, pattern):
     """Fail if the block takes more processor time."""
 
     def stop(*_):
-        raise AssertionError(f"{pattern}: more than {seconds:g} s for {_LENGTH} characters")
+        raise AssertionError(
+            f"{pattern}: more than {seconds:g} s for {_LENGTH} characters"
+        )
 
     before = signal.signal(signal.SIGVTALRM, stop)
     signal.setitimer(signal.ITIMER_VIRTUAL, seconds)
@@ -129,7 +157,9 @@ def processor_time(seconds, pattern):
 @pytest.mark.parametrize("place", patterns())
 def test_a_pattern_is_linear_in_hostile_texts(place):
     pattern, flags, functions = patterns()[place]
-    for text in hostile_texts(pattern.decode() if isinstance(pattern, bytes) else pattern):
+    for text in hostile_texts(
+        pattern.decode() if isinstance(pattern, bytes) else pattern
+    ):
         with processor_time(_MOST_S, f"{pattern!r} on {text[:12]!r} ..."):
             applied(pattern, flags, functions, text)
 

@@ -57,10 +57,19 @@ class TestOptionsOfCalibrate:
             lambda *streams: seen.append(whole_snapshot(*streams).config),
         )
         solved = SimpleNamespace(calibration=result_making.calibration(), snapshot=None)
-        monkeypatch.setattr("hand_eye_calib.offline.calibrate.run", lambda *_, **__: solved)
-        numbers = ["threshold", "min_inlier_fraction", "max_gap", "scale", "parent_scale"]
+        monkeypatch.setattr(
+            "hand_eye_calib.offline.calibrate.run", lambda *_, **__: solved
+        )
+        numbers = [
+            "threshold",
+            "min_inlier_fraction",
+            "max_gap",
+            "scale",
+            "parent_scale",
+        ]
         numbers += [
-            f"keyframe_min_{quantity}" for quantity in ("translation", "rotation", "interval")
+            f"keyframe_min_{quantity}"
+            for quantity in ("translation", "rotation", "interval")
         ]
         numbers += ["target_translation", "target_rotation"]
         numbers_given = {name: 0.0625 * k for k, name in enumerate(numbers, 1)}
@@ -80,7 +89,9 @@ class TestOptionsOfCalibrate:
         assert {name: getattr(config, name) for name in numbers_given} == numbers_given
         assert config.prior() == {"z": (1.85, 0.02)}
         default = CalibratorConfig()
-        assert all(getattr(default, name) != value for name, value in numbers_given.items())
+        assert all(
+            getattr(default, name) != value for name, value in numbers_given.items()
+        )
 
     def test_all_poses_are_used_unless_limited(self):
         parent, child = streams(60)
@@ -94,7 +105,10 @@ class TestOptionsOfCalibrate:
         assert snapshot.config.max_pairs == 100_000
         warnings = " ".join(snapshot.warnings)
         assert "100,000 pose pairs are used at most" in warnings
-        assert whole_snapshot(long, long, {"max_pairs": 2_000_000}).config.max_pairs == 2_000_000
+        assert (
+            whole_snapshot(long, long, {"max_pairs": 2_000_000}).config.max_pairs
+            == 2_000_000
+        )
 
     def test_progress_is_told_and_changes_nothing(self):
         parent, child = streams()
@@ -133,7 +147,9 @@ class TestPrior:
 
 class TestMethods:
     def test_every_record_has_its_solver(self):
-        with_reference = {name for name, record in METHODS.items() if record.uses_reference}
+        with_reference = {
+            name for name, record in METHODS.items() if record.uses_reference
+        }
         assert {Method(name).name for name in with_reference} == with_reference
         for name in set(METHODS) - with_reference:
             with pytest.raises(ConfigError, match=f"method '{name}' is unknown"):
@@ -147,8 +163,12 @@ class TestMethods:
                 options = dict(method=name, reference="B1", backend=backend)
                 hec.calibrate(parent, child, checks=False, **options)
             else:
-                with pytest.raises(ConfigError, match=f"method {name} has no backend {backend}"):
-                    hec.calibrate(parent, child, method=name, reference="B1", backend=backend)
+                with pytest.raises(
+                    ConfigError, match=f"method {name} has no backend {backend}"
+                ):
+                    hec.calibrate(
+                        parent, child, method=name, reference="B1", backend=backend
+                    )
 
 
 class TestResiduals:
@@ -158,7 +178,9 @@ class TestResiduals:
         poses = child.poses.copy()
         poses[40:, :3, 3] += [1.0, -0.7, 0.4]
         jumped = hec.Trajectory(child.stamps_ns, poses)
-        result = hec.calibrate(parent, jumped, method=name, reference="B2", checks=False)
+        result = hec.calibrate(
+            parent, jumped, method=name, reference="B2", checks=False
+        )
         residuals = result.residuals()
         assert len(residuals) == result.n_pairs
         assert residuals == residuals[:] != residuals[1:]
@@ -167,7 +189,9 @@ class TestResiduals:
         assert set(residuals.end_ns - residuals.start_ns) == {step_ns}
         crosses = residuals.start_ns < parent.stamps_ns[40]
         crosses &= residuals.end_ns >= parent.stamps_ns[40]
-        error_m = np.linalg.norm((result.T_parent_child - motions.T_PARENT_CHILD)[:3, 3])
+        error_m = np.linalg.norm(
+            (result.T_parent_child - motions.T_PARENT_CHILD)[:3, 3]
+        )
         assert METHODS[name].rejects_outliers == (error_m < 1e-4)
         assert METHODS[name].rejects_outliers == (result.n_inliers < result.n_pairs)
         if METHODS[name].rejects_outliers:
@@ -175,7 +199,11 @@ class TestResiduals:
             assert residuals.translation_m[~crosses].max() < 1e-6
             assert residuals.rotation_rad.max() < 1e-6
         assert residuals.translation_m[crosses].min() > 0.3
-        assert residuals.translation.shape == residuals.rotation.shape == (result.n_pairs, 3)
+        assert (
+            residuals.translation.shape
+            == residuals.rotation.shape
+            == (result.n_pairs, 3)
+        )
 
     def test_those_of_the_adaptive_estimator_have_its_scale_and_time_offset(self):
         times_s = np.arange(400) / 20
@@ -183,11 +211,17 @@ class TestResiduals:
             motions.disturbed(motions.smooth_poses(times_s), 1, 1e-4, 1e-4), 20.0
         )
         late = motions.child_of(motions.smooth_poses(times_s + 0.05))
-        child = motions.as_trajectory(motions.disturbed(late, 2, 1e-4, 1e-4), 20.0).scaled(0.95)
-        exact = hec.calibrate(parent, child, method="adaptive", time_offset=0.05, scale=1 / 0.95)
+        child = motions.as_trajectory(
+            motions.disturbed(late, 2, 1e-4, 1e-4), 20.0
+        ).scaled(0.95)
+        exact = hec.calibrate(
+            parent, child, method="adaptive", time_offset=0.05, scale=1 / 0.95
+        )
         result = hec.calibrate(parent, child, method="adaptive", checks=False)
         assert result.time_offset_s == pytest.approx(0.05, abs=1e-3)
-        rms = [np.sqrt((r.residuals().translation ** 2).mean()) for r in (exact, result)]
+        rms = [
+            np.sqrt((r.residuals().translation ** 2).mean()) for r in (exact, result)
+        ]
         # Without the time offset it would be fifteen times as much.
         assert rms[1] == pytest.approx(rms[0], rel=0.2)
 
@@ -203,7 +237,9 @@ class TestAnswerOfTheMethod:
         """Flat ground does not reveal z: the method's answer has one, the result has about 0."""
         poses = motions.planar_poses(300)
         parent, child = motions.noisy_pair(poses, 1, 2e-3, 1e-3)
-        result = hec.calibrate(parent, child, method="dnl", reference="B10", checks=False)
+        result = hec.calibrate(
+            parent, child, method="dnl", reference="B10", checks=False
+        )
         assert result.unobservable() == ["z"]
         pairs = motion_pairs(parent.poses, child.poses, "B10")
         own = pair_costs(pairs, result.T_method).sum()
@@ -251,7 +287,9 @@ def test_numbers_that_no_option_can_have_are_refused_in_one_line(name, value):
     assert len(str(caught.value)) < 300
 
 
-@pytest.mark.parametrize("prior", [float("nan"), 3, "z=1", [("z", 1)], {"z": 5}, {"z": (1, 2, 3)}])
+@pytest.mark.parametrize(
+    "prior", [float("nan"), 3, "z=1", [("z", 1)], {"z": 5}, {"z": (1, 2, 3)}]
+)
 def test_a_prior_of_another_form_is_refused_with_an_example(prior):
     with pytest.raises(ConfigError, match="prior"):
         hec.calibrate(*streams(), prior=prior)
@@ -275,12 +313,18 @@ def solved():
         (lambda _: hec.calibrate(PARENT), "a child is missing: pass two trajectories"),
         (lambda _: hec.calibrate("absent"), "no bag at absent"),
         (lambda _: hec.calibrate(PARENT, "absent.tum"), "cannot read absent.tum"),
-        (lambda _: hec.calibrate(PARENT, CHILD, parent_topic="/a"), "pass only the bag"),
+        (
+            lambda _: hec.calibrate(PARENT, CHILD, parent_topic="/a"),
+            "pass only the bag",
+        ),
         (
             lambda _: hec.calibrate("sample:drive.mcap", parent_topic=3),
             "must be of type str; got int",
         ),
-        (lambda _: hec.calibrate("sample:drive.mcap", parent_topic="/x"), "no topic /x in "),
+        (
+            lambda _: hec.calibrate("sample:drive.mcap", parent_topic="/x"),
+            "no topic /x in ",
+        ),
         (
             lambda _: hec.calibrate(PARENT, CHILD, progress=3),
             "progress must be a function; got int",
@@ -293,14 +337,32 @@ def solved():
             lambda _: hec.calibrate(PARENT, CHILD, max_gap=[1]),
             "max_gap must be a number in s; got [1]",
         ),
-        (lambda _: hec.save(3, "out"), "the result must be of type Calibration; got int"),
-        (lambda result: hec.save(result, 3), "directory must be of type str or PathLike; got int"),
-        (lambda _: hec.load(None), "path must be of type str or PathLike; got NoneType"),
+        (
+            lambda _: hec.save(3, "out"),
+            "the result must be of type Calibration; got int",
+        ),
+        (
+            lambda result: hec.save(result, 3),
+            "directory must be of type str or PathLike; got int",
+        ),
+        (
+            lambda _: hec.load(None),
+            "path must be of type str or PathLike; got NoneType",
+        ),
         (lambda _: hec.plot(3), "the result must be of type Calibration; got int"),
-        (lambda result: hec.plot(result, 3), "ax must be three axes of Matplotlib; got int"),
-        (lambda result: result.report(3), "path must be of type str or PathLike; got int"),
+        (
+            lambda result: hec.plot(result, 3),
+            "ax must be three axes of Matplotlib; got int",
+        ),
+        (
+            lambda result: result.report(3),
+            "path must be of type str or PathLike; got int",
+        ),
         (lambda _: hec.compare(3, 4), "results must be of type Sequence; got int"),
-        (lambda _: hec.compare([3]), "each result must be of type Calibration; got int"),
+        (
+            lambda _: hec.compare([3]),
+            "each result must be of type Calibration; got int",
+        ),
         (
             lambda result: hec.compare([result], "robot.urdf"),
             "installed must be of type Calibration",
@@ -309,16 +371,31 @@ def solved():
             lambda result: hec.cross_check(result, 3, CHILD),
             "parent must be of type Trajectory; got",
         ),
-        (lambda _: hec.calibrate_many(3), "recordings must be of type Iterable; got int"),
-        (lambda _: hec.calibrate_together(3), "recordings must be of type Iterable; got int"),
-        (lambda _: hec.calibrate_rig(3), "trajectories must be of type Mapping; got int"),
+        (
+            lambda _: hec.calibrate_many(3),
+            "recordings must be of type Iterable; got int",
+        ),
+        (
+            lambda _: hec.calibrate_together(3),
+            "recordings must be of type Iterable; got int",
+        ),
+        (
+            lambda _: hec.calibrate_rig(3),
+            "trajectories must be of type Mapping; got int",
+        ),
         (
             lambda _: hec.calibrate_rig({"a": 1}),
             "each trajectory must be of type Trajectory; got int",
         ),
         (lambda _: hec.calibrate_stops(3, 4), "parent: expected poses as (N, 4, 4)"),
-        (lambda _: hec.read_arm_samples(3), "path must be of type str or PathLike; got int"),
-        (lambda _: hec.robot_poses(np.zeros((3, 6)), 3), "the robot must be one of abb, fanuc"),
+        (
+            lambda _: hec.read_arm_samples(3),
+            "path must be of type str or PathLike; got int",
+        ),
+        (
+            lambda _: hec.robot_poses(np.zeros((3, 6)), 3),
+            "the robot must be one of abb, fanuc",
+        ),
         (lambda _: hec.simulate("x"), "seed must be of type Integral; got str"),
         (lambda _: hec.Trajectory([1, 2], "x"), "poses must be numbers; got str"),
         (
@@ -329,16 +406,25 @@ def solved():
             lambda _: hec.Trajectory.from_positions([1], 4),
             "positions must be numbers of shape (N, 3)",
         ),
-        (lambda _: hec.Trajectory.from_rates([1], 4), "rates must be numbers of shape (N, 3)"),
+        (
+            lambda _: hec.Trajectory.from_rates([1], 4),
+            "rates must be numbers of shape (N, 3)",
+        ),
         (lambda _: PARENT.shifted("x"), "offset_s must be of type Real; got str"),
         (lambda _: PARENT.scaled(None), "scale must be of type Real; got NoneType"),
-        (lambda _: hec.write_trajectory(PARENT, "x.tum"), "path must be of type str or PathLike"),
+        (
+            lambda _: hec.write_trajectory(PARENT, "x.tum"),
+            "path must be of type str or PathLike",
+        ),
         (
             lambda _: hec.write_trajectory("x.tum", 3),
             "trajectory must be of type Trajectory; got int",
         ),
         (lambda _: hec.read_trajectory(3), "expected a path, an array"),
-        (lambda _: hec.Calibration.from_dict(3), "expected format hand_eye_calib/extrinsic"),
+        (
+            lambda _: hec.Calibration.from_dict(3),
+            "expected format hand_eye_calib/extrinsic",
+        ),
         (lambda result: result.export("kalbr"), "unknown format 'kalbr'; known are"),
     ],
 )
@@ -352,7 +438,9 @@ def test_a_wrong_argument_is_answered_in_one_line(solved, call, message):
 def test_a_bag_is_calibrated_by_its_topics():
     topics = {"parent_topic": "/lidar/odometry", "child_topic": "/camera/odometry"}
     named = hec.calibrate("sample:drive.mcap", checks=False, **topics)
-    with pytest.warns(UserWarning, match="parent is /lidar/odometry, child is /camera/odometry"):
+    with pytest.warns(
+        UserWarning, match="parent is /lidar/odometry, child is /camera/odometry"
+    ):
         chosen = hec.calibrate("sample:drive.mcap", checks=False)
     assert named == chosen
     assert (named.parent_frame, named.child_frame) == ("lidar", "camera")

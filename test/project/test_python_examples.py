@@ -24,7 +24,9 @@ def names(tmp_path_factory):
     parent = drive.parent
     child = drive.child
     noise = np.random.default_rng(1).normal(0.0, 1e-3, (len(child), 6))
-    other = hec.Trajectory(child.stamps_ns, child.poses @ T_CAMERA_REAR @ se3.exp(noise), "rear")
+    other = hec.Trajectory(
+        child.stamps_ns, child.poses @ T_CAMERA_REAR @ se3.exp(noise), "rear"
+    )
     hec.write_trajectory(folder / "lidar.tum", parent)
     hec.write_trajectory(folder / "camera.tum", child)
     hand = parent.at(child.stamps_ns[10:810:20])
@@ -63,7 +65,9 @@ def test_the_roles_may_be_exchanged(names):
     apart = se3.log(se3.inverse(result.inverse().T_parent_child) @ back.T_parent_child)
     assert (np.abs(apart) < 0.5 * np.sqrt(np.diag(back.covariance))).all()
     np.testing.assert_allclose(result.inverse().sigmas, back.sigmas, rtol=0.6)
-    np.testing.assert_allclose(result.inverse().inverse().sigmas, result.sigmas, rtol=1e-6)
+    np.testing.assert_allclose(
+        result.inverse().inverse().sigmas, result.sigmas, rtol=1e-6
+    )
     assert (result == "another", result == result.inverse()) == (False, False)
 
 
@@ -98,7 +102,9 @@ def test_the_notebook_runs_and_keeps_its_outputs(tmp_path):
 
 
 def test_files_are_calibrated_and_saved(tmp_path, capsys):
-    main(["simulate", "--out", str(tmp_path / "drives"), "--poses", "200", "--seed", "2"])
+    main(
+        ["simulate", "--out", str(tmp_path / "drives"), "--poses", "200", "--seed", "2"]
+    )
     run = tmp_path / "drives" / "run_01"
     files = (run / "T_S1_W1.txt", run / "T_S2_W2.txt", tmp_path / "result")
     result = imported("calibrate_files").main(*map(str, files))
@@ -110,4 +116,6 @@ def test_files_are_calibrated_and_saved(tmp_path, capsys):
 
 def test_arrays_are_calibrated(capsys):
     example = imported("from_arrays")
-    assert example.main().T_parent_child == pytest.approx(example.T_LIDAR_CAMERA, abs=1e-6)
+    assert example.main().T_parent_child == pytest.approx(
+        example.T_LIDAR_CAMERA, abs=1e-6
+    )

@@ -37,14 +37,20 @@ def parameter_table(config):
         word = re.match(r"prior\.(.*)|(parent|child)_|", name)
         word = word[1] or word[2] or "nothing"
         cells = [f"`{default(field)}`", meta["unit"], allowed(field), meaning(meta)]
-        alike = tuple(re.sub(rf"(?<![a-z]){word}(?![a-z])", "#", cell) for cell in cells)
+        alike = tuple(
+            re.sub(rf"(?<![a-z]){word}(?![a-z])", "#", cell) for cell in cells
+        )
         rows.setdefault(alike, []).append((name, word))
     table = [
         [", ".join(f"`{name}`" for name, _ in some)]
         + [cell.replace("#", "/".join(word for _, word in some)) for cell in alike]
         for alike, some in rows.items()
     ]
-    lines = [HEADER, ["---"] * len(HEADER), *([escaped(cell) for cell in row] for row in table)]
+    lines = [
+        HEADER,
+        ["---"] * len(HEADER),
+        *([escaped(cell) for cell in row] for row in table),
+    ]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
@@ -85,11 +91,15 @@ def meaning(meta):
 @pytest.mark.parametrize("config", [CalibratorConfig, NodeConfig])
 def test_parameter_table_is_that_of_the_code(config):
     table = parameter_table(config)
-    assert table in PAGES["docs/node.md"], f"docs/node.md must have this table; {HINT}:\n{table}"
+    assert table in PAGES["docs/node.md"], (
+        f"docs/node.md must have this table; {HINT}:\n{table}"
+    )
 
 
 def test_parameter_tables_have_no_other_rows():
-    rows = re.findall(r"^\| (`[a-z_.`, ]+`) \| `[^|]*` \|", PAGES["docs/node.md"], re.MULTILINE)
+    rows = re.findall(
+        r"^\| (`[a-z_.`, ]+`) \| `[^|]*` \|", PAGES["docs/node.md"], re.MULTILINE
+    )
     documented = [name for row in rows for name in re.findall(r"`([a-z_.]+)`", row)]
     assert documented == [
         option_name(field)
@@ -125,7 +135,9 @@ def readable(value, is_in_bytes):
 
 def test_limits_are_those_of_the_code():
     assert limits_table().count("\n") > 6
-    assert limits_table() in PAGES["docs/limits.md"], f"docs/limits.md must have this table; {HINT}"
+    assert limits_table() in PAGES["docs/limits.md"], (
+        f"docs/limits.md must have this table; {HINT}"
+    )
 
 
 def test_readme_is_short_names_its_two_commands_and_shows_the_report():
@@ -188,22 +200,30 @@ def test_every_command_has_its_line():
 def test_launch_arguments_make_targets_and_files_exist(page):
     """Pages name files of the package from its root, such as ``core/solvers/ipopt.py``."""
     launch_file = (ROOT / "launch" / "calibrator.launch.py").read_text(encoding="utf-8")
-    lines = [line for line in PAGES[page].splitlines() if line.startswith("ros2 launch")]
+    lines = [
+        line for line in PAGES[page].splitlines() if line.startswith("ros2 launch")
+    ]
     names = {name for line in lines for name in re.findall(r"(\w+):=", line)}
     parameters = {*CalibratorConfig().to_options(), *NodeConfig().to_options()}
-    assert {name for name in names - parameters if f'"{name}"' not in launch_file} == set()
+    assert {
+        name for name in names - parameters if f'"{name}"' not in launch_file
+    } == set()
     code = "\n".join(re.findall(r"`[^`\n]+`|```bash\n.*?```", PAGES[page], re.DOTALL))
     mentioned = set(re.findall(r"(?:^|`)make ([a-z-]+)", code, re.MULTILINE))
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     assert mentioned <= set(re.findall(r"^([a-z-]+):", makefile, re.MULTILINE))
     names = re.findall(r"`([a-z_]+(?:/[a-z_]+)+\.py)(?::\d+)?`", PAGES[page])
     folders = (ROOT, ROOT / "hand_eye_calib")
-    assert [name for name in names if not any((top / name).exists() for top in folders)] == []
+    assert [
+        name for name in names if not any((top / name).exists() for top in folders)
+    ] == []
 
 
 def test_first_command_of_the_readme_prints_its_output(capsys):
     (command,) = [
-        words for words in commands(PAGES["README.md"]) if words[1:2] == ("sample:lidar.tum",)
+        words
+        for words in commands(PAGES["README.md"])
+        if words[1:2] == ("sample:lidar.tum",)
     ]
     (output,) = re.findall(r"```text\n(.*?)```", PAGES["README.md"], re.DOTALL)
     assert main(list(command)) == 0
@@ -215,8 +235,13 @@ def test_first_command_of_the_readme_prints_its_output(capsys):
 
 def test_commands_of_the_readme_on_samples_run(tmp_path, monkeypatch, no_figures):
     monkeypatch.chdir(tmp_path)
-    runnable = [words for words in commands(PAGES["README.md"]) if "sample:" in " ".join(words)]
-    assert [words[1] for words in runnable[1:]] == ["sample:drive.mcap", "sample:arm.yaml"]
+    runnable = [
+        words for words in commands(PAGES["README.md"]) if "sample:" in " ".join(words)
+    ]
+    assert [words[1] for words in runnable[1:]] == [
+        "sample:drive.mcap",
+        "sample:arm.yaml",
+    ]
     assert [main(list(words)) for words in runnable] == [0, 0, 0]
     assert (tmp_path / "result" / "extrinsic.yaml").exists()
 
@@ -237,7 +262,10 @@ def test_python_of_the_readme_runs(tmp_path, monkeypatch):
 def anchors(text):
     """Names that links to headings of a page have on GitHub."""
     headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+    return {
+        re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+        for heading in headings
+    }
 
 
 def links():
@@ -257,15 +285,22 @@ def test_relative_link_leads_somewhere(page, target):
 
 
 def test_every_package_has_its_line():
-    packages = PAGES["docs/architecture.md"].partition("## Packages")[2].partition("\n## ")[0]
+    packages = (
+        PAGES["docs/architecture.md"].partition("## Packages")[2].partition("\n## ")[0]
+    )
     first = " ".join(re.findall(r"^\| (`[^|]*) \|", packages, re.MULTILINE))
     table = re.findall(r"`([a-z_/]+/|[a-z_]+\.py)`", first)
     source = ROOT / "hand_eye_calib"
-    rooms = {path.parent.relative_to(source).as_posix() for path in source.glob("*/*/__init__.py")}
+    rooms = {
+        path.parent.relative_to(source).as_posix()
+        for path in source.glob("*/*/__init__.py")
+    }
     # A layer has a line if it has files beside its rooms.
     layers = {path.parent.name for path in source.glob("*/[a-z]*.py")}
     folders = [f"{folder}/" for folder in rooms | layers]
-    assert sorted(table) == sorted([*folders, *(path.name for path in source.glob("*.py"))])
+    assert sorted(table) == sorted(
+        [*folders, *(path.name for path in source.glob("*.py"))]
+    )
 
 
 def with_tables_of_the_code(text):
@@ -276,7 +311,9 @@ def with_tables_of_the_code(text):
 
 
 if __name__ == "__main__":
-    NODE_PAGE.write_text(with_tables_of_the_code(PAGES["docs/node.md"]), encoding="utf-8")
+    NODE_PAGE.write_text(
+        with_tables_of_the_code(PAGES["docs/node.md"]), encoding="utf-8"
+    )
     table = re.compile(r"^\| Of \| What \| Limit \|\n(\|.*\n)*", re.MULTILINE)
     page = table.sub(lambda _: limits_table() + "\n", PAGES["docs/limits.md"])
     LIMITS_PAGE.write_text(page, encoding="utf-8")

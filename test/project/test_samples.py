@@ -27,7 +27,8 @@ def test_the_bag_has_the_poses_of_the_files():
 
 def test_the_drive_is_calibrated_within_its_standard_deviations():
     result = hec.calibrate(
-        hec.read_trajectory("sample:lidar.tum"), hec.read_trajectory("sample:camera.tum")
+        hec.read_trajectory("sample:lidar.tum"),
+        hec.read_trajectory("sample:camera.tum"),
     )
     (truth,) = hec.read_trajectory("sample:truth.tum").poses
     assert result.verdict is hec.Verdict.USE
@@ -47,24 +48,37 @@ def test_the_arm_is_made_by_its_script(tmp_path):
     write_sample_arm(tmp_path / "arm.yaml")
     made = hec.read_arm_samples(tmp_path / "arm.yaml")
     kept = hec.read_arm_samples("sample:arm.yaml")
-    np.testing.assert_allclose(se3.log(se3.inverse(made.robot) @ kept.robot), 0.0, atol=1e-5)
-    np.testing.assert_allclose(se3.log(se3.inverse(made.tracking) @ kept.tracking), 0.0, atol=1e-5)
+    np.testing.assert_allclose(
+        se3.log(se3.inverse(made.robot) @ kept.robot), 0.0, atol=1e-5
+    )
+    np.testing.assert_allclose(
+        se3.log(se3.inverse(made.tracking) @ kept.tracking), 0.0, atol=1e-5
+    )
 
 
 def test_the_robot_is_calibrated_within_its_standard_deviations():
     truth = sample_robot()
     with pytest.warns(UserWarning, match="by its columns"):
-        result = hec.calibrate_vehicle("sample:robot_lidar.tum", "sample:robot_wheels.csv")
+        result = hec.calibrate_vehicle(
+            "sample:robot_lidar.tum", "sample:robot_wheels.csv"
+        )
     assert result.verdict is hec.Verdict.USE
     errors = deviation(result.T_parent_child, truth.T_base_sensor)
-    assert (np.abs(errors)[[0, 1, 3, 4, 5]] < 3.0 * result.sigmas[[0, 1, 3, 4, 5]]).all()
-    for parameter, value in zip(result.wheels.parameters, truth.parameters, strict=True):
+    assert (
+        np.abs(errors)[[0, 1, 3, 4, 5]] < 3.0 * result.sigmas[[0, 1, 3, 4, 5]]
+    ).all()
+    for parameter, value in zip(
+        result.wheels.parameters, truth.parameters, strict=True
+    ):
         assert abs(parameter.value - value) < 3.0 * parameter.sigma
 
 
 def test_the_robot_is_made_by_its_script(tmp_path):
     write_sample_robot(tmp_path)
-    for name, separator, n_names in (("robot_lidar.tum", " ", 0), ("robot_wheels.csv", ",", 1)):
+    for name, separator, n_names in (
+        ("robot_lidar.tum", " ", 0),
+        ("robot_wheels.csv", ",", 1),
+    ):
         made, kept = (
             np.loadtxt(path, delimiter=separator, skiprows=n_names)
             for path in (tmp_path / name, local_path(f"sample:{name}"))

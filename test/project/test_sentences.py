@@ -34,15 +34,31 @@ WITH_SEPARATORS = (
 WITHOUT_SEPARATORS = "{}z"
 
 # Attributes that hold sentences.
-SENTENCES = {"headline", "sentence", "what", "advice", "cause", "what_to_do", "warnings", "text"}
+SENTENCES = {
+    "headline",
+    "sentence",
+    "what",
+    "advice",
+    "cause",
+    "what_to_do",
+    "warnings",
+    "text",
+}
 CUTS = {"partition", "rpartition", "split", "rsplit", "removeprefix", "removesuffix"}
 CUTS |= {"startswith", "endswith"}
 
 
 def result():
     """Return a result with an error, a warning and a note."""
-    severities = {"parent": Severity.ERROR, "child": Severity.WARNING, "both": Severity.NOTE}
-    findings = [finding("model_scale", stream, severity) for stream, severity in severities.items()]
+    severities = {
+        "parent": Severity.ERROR,
+        "child": Severity.WARNING,
+        "both": Severity.NOTE,
+    }
+    findings = [
+        finding("model_scale", stream, severity)
+        for stream, severity in severities.items()
+    ]
     return good_calibration(findings=tuple(findings), warnings=())
 
 
@@ -76,7 +92,9 @@ def pages():
 def pages_with(words, monkeypatch):
     """Return the texts with these words in place of those of the core, and times left out."""
     templates = [words.format(name) for name in ("What ", "Advice ", "Cause ")]
-    monkeypatch.setitem(FINDING_WORDS, "core", lambda: {"model_scale": FindingWords(*templates)})
+    monkeypatch.setitem(
+        FINDING_WORDS, "core", lambda: {"model_scale": FindingWords(*templates)}
+    )
     words_of.cache_clear()
     try:
         texts = pages()
@@ -87,7 +105,9 @@ def pages_with(words, monkeypatch):
         text = " ".join(text.split())
         for template in templates:
             text = text.replace(template, template.split()[0].upper())
-            text = text.replace(template.replace(">", "&gt;"), template.split()[0].upper())
+            text = text.replace(
+                template.replace(">", "&gt;"), template.split()[0].upper()
+            )
         texts[name] = text
     return texts
 
@@ -107,7 +127,9 @@ def cuts_of(path):
         texts = []
         if isinstance(node, ast.Call) and getattr(node.func, "attr", "") in CUTS:
             texts = [node.func.value]
-        elif isinstance(node, ast.Compare) and isinstance(node.ops[0], (ast.In, ast.NotIn)):
+        elif isinstance(node, ast.Compare) and isinstance(
+            node.ops[0], (ast.In, ast.NotIn)
+        ):
             texts = [node.left, *node.comparators]
         if any(getattr(text, "attr", "") in SENTENCES for text in texts):
             lines.append(node.lineno)
@@ -119,4 +141,6 @@ def test_no_module_above_the_core_cuts_a_sentence(layer):
     cuts = {path.name: cuts_of(path) for path in (SOURCE / layer).rglob("*.py")}
     assert {name: lines for name, lines in cuts.items() if lines} == {}
     for template in (SOURCE / layer).rglob("*.html"):
-        assert not re.search(r"in calibration\.headline", template.read_text(encoding="utf-8"))
+        assert not re.search(
+            r"in calibration\.headline", template.read_text(encoding="utf-8")
+        )

@@ -38,8 +38,14 @@ SPELLINGS = {
     ),
     "check prior.z": ("check --prior z", 'check prior["z"]'),
     "set time_offset 0.0": ("set --time-offset 0.0", "set time_offset=0"),
-    "set time_offset to estimate": ("set --time-offset to estimate", "set time_offset to estimate"),
-    "ground off leaves them out": ("--ground off leaves them out", 'ground="off" leaves them out'),
+    "set time_offset to estimate": (
+        "set --time-offset to estimate",
+        "set time_offset to estimate",
+    ),
+    "ground off leaves them out": (
+        "--ground off leaves them out",
+        'ground="off" leaves them out',
+    ),
     "target.axes z=1cm": ("--target-axes z=1cm", 'target_axes="z=1cm"'),
     "leave setup out, or setup beside": (
         "leave setup out, or --setup beside",

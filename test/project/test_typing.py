@@ -59,7 +59,10 @@ def test_a_wrong_call_fails_the_type_check_and_a_right_one_passes(tmp_path):
     config = tmp_path / "mypy.ini"
     program.write_text(PROGRAM, encoding="utf-8")
     public = {getattr(hec, name).__module__ for name in hec.__all__}
-    of_arguments = {"hand_eye_calib.core.base.arrays", "hand_eye_calib.core.results.result"}
+    of_arguments = {
+        "hand_eye_calib.core.base.arrays",
+        "hand_eye_calib.core.results.result",
+    }
     of_arguments |= {"hand_eye_calib.core.engine.run"}
     of_arguments |= {
         "hand_eye_calib.core.base.text",
@@ -76,7 +79,11 @@ def test_a_wrong_call_fails_the_type_check_and_a_right_one_passes(tmp_path):
         text=True,
         cwd=ROOT,
     )
-    failed = {int(line.split(":")[1]) for line in done.stdout.splitlines() if ": error:" in line}
+    failed = {
+        int(line.split(":")[1])
+        for line in done.stdout.splitlines()
+        if ": error:" in line
+    }
     lines = enumerate(PROGRAM.splitlines(), start=1)
     assert failed == {number for number, line in lines if line.endswith("# wrong")}, (
         done.stdout + done.stderr
@@ -84,9 +91,15 @@ def test_a_wrong_call_fails_the_type_check_and_a_right_one_passes(tmp_path):
 
 
 def test_the_stub_names_what_exists():
-    tree = ast.parse((ROOT / "hand_eye_calib" / "__init__.pyi").read_text(encoding="utf-8"))
+    tree = ast.parse(
+        (ROOT / "hand_eye_calib" / "__init__.pyi").read_text(encoding="utf-8")
+    )
     imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
-    seen = {alias.asname: (node.module, alias.name) for node in imports for alias in node.names}
+    seen = {
+        alias.asname: (node.module, alias.name)
+        for node in imports
+        for alias in node.names
+    }
     assert sorted(seen) == sorted(hec.__all__)
     for name, (module, original) in seen.items():
         assert getattr(importlib.import_module(module), original) is getattr(hec, name)

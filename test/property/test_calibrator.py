@@ -46,14 +46,18 @@ def test_any_interleaving_gives_the_same_bits(random):
 
 @settings(max_examples=25)
 @given(
-    st.lists(st.sampled_from(MESSAGES), min_size=1, max_size=40), st.randoms(use_true_random=False)
+    st.lists(st.sampled_from(MESSAGES), min_size=1, max_size=40),
+    st.randoms(use_true_random=False),
 )
 def test_repetitions_change_nothing_and_are_counted(repeated, random):
     sequence = MESSAGES + repeated
     random.shuffle(sequence)
     result, calibrator, taken = estimate(sequence)
     assert np.array_equal(result.T_parent_child, IN_ORDER.T_parent_child)
-    refused = sum(calibrator.statistics(stream).refused_duplicate for stream in ("parent", "child"))
+    refused = sum(
+        calibrator.statistics(stream).refused_duplicate
+        for stream in ("parent", "child")
+    )
     assert refused == len(repeated) == taken.count(False)
 
 

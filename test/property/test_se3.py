@@ -8,17 +8,23 @@ from hypothesis import strategies as st
 from hand_eye_calib.core.geometry import se3
 
 ANGLES = st.one_of(
-    st.sampled_from([0.0, 1e-12, 1e-8, 1e-4, 9.9e-3, 1.01e-2, np.pi - 1e-6, np.pi - 1e-3]),
+    st.sampled_from(
+        [0.0, 1e-12, 1e-8, 1e-4, 9.9e-3, 1.01e-2, np.pi - 1e-6, np.pi - 1e-3]
+    ),
     st.floats(0.0, np.pi - 1e-3),
 )
-DIRECTIONS = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
+DIRECTIONS = st.tuples(*[st.floats(-1, 1)] * 3).filter(
+    lambda v: np.linalg.norm(v) > 0.1
+)
 TRANSLATIONS = st.tuples(*[st.floats(-1000, 1000)] * 3)
 
 
 @st.composite
 def tangents(draw):
     direction = np.array(draw(DIRECTIONS))
-    return np.r_[draw(TRANSLATIONS), draw(ANGLES) * direction / np.linalg.norm(direction)]
+    return np.r_[
+        draw(TRANSLATIONS), draw(ANGLES) * direction / np.linalg.norm(direction)
+    ]
 
 
 @given(tangents())
@@ -35,7 +41,9 @@ def test_exp_agrees_with_the_matrix_exponential(xi):
     generator = np.zeros((4, 4))
     generator[:3, :3] = se3.skew(xi[3:])
     generator[:3, 3] = xi[:3]
-    assert se3.exp(xi) == pytest.approx(expm(generator), abs=1e-11 * (1 + np.abs(xi).max()))
+    assert se3.exp(xi) == pytest.approx(
+        expm(generator), abs=1e-11 * (1 + np.abs(xi).max())
+    )
 
 
 @given(tangents(), tangents())
@@ -51,7 +59,9 @@ def test_adjoint_moves_a_twist_across_a_transform(xi, pose_xi):
 def test_inverse_and_quaternions_go_round(xi):
     T = se3.exp(xi)
     np.testing.assert_allclose(se3.inverse(T) @ T, np.eye(4), atol=1e-9)
-    np.testing.assert_allclose(se3.from_quat_xyzw(T[:3, 3], se3.to_quat_xyzw(T)), T, atol=1e-9)
+    np.testing.assert_allclose(
+        se3.from_quat_xyzw(T[:3, 3], se3.to_quat_xyzw(T)), T, atol=1e-9
+    )
 
 
 @given(tangents(), tangents(), st.floats(0, 1))
@@ -79,7 +89,9 @@ def test_conversions_agree_with_scipy(direction, angle):
         atol=1e-14,
         rtol=0,
     )
-    assert se3.rotation_exp(rotation.as_rotvec()) == pytest.approx(rotation.as_matrix(), abs=1e-14)
+    assert se3.rotation_exp(rotation.as_rotvec()) == pytest.approx(
+        rotation.as_matrix(), abs=1e-14
+    )
     quat_xyzw = se3.to_quat_xyzw(rotation.as_matrix())
     expected = Rotation.from_matrix(rotation.as_matrix()).as_quat()
     assert quat_xyzw[3] >= 0.0
@@ -97,7 +109,9 @@ def test_roll_pitch_yaw_agree_with_scipy_up_to_gimbal_lock(roll, pitch, yaw):
     from scipy.spatial.transform import Rotation
 
     rotation = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
-    assert se3.rotation_from_rpy([roll, pitch, yaw]) == pytest.approx(rotation, abs=1e-14)
+    assert se3.rotation_from_rpy([roll, pitch, yaw]) == pytest.approx(
+        rotation, abs=1e-14
+    )
     rpy = se3.rotation_to_rpy(rotation)
     np.testing.assert_allclose(se3.rotation_from_rpy(rpy), rotation, atol=1e-14, rtol=0)
     if abs(pitch) < 1.51:

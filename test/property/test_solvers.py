@@ -51,7 +51,11 @@ def drive(seed):
     pose to pose.
     """
     largest = np.repeat([2.0, 0.8], 3)
-    return walked(se3.exp(np.random.default_rng(seed).uniform(-largest, largest, (N_POSES - 1, 6))))
+    return walked(
+        se3.exp(
+            np.random.default_rng(seed).uniform(-largest, largest, (N_POSES - 1, 6))
+        )
+    )
 
 
 def trajectories(seed, T_parent_child, noise=0.0):
@@ -111,7 +115,9 @@ def test_zhuang_knows_a_false_minimum(seed, axis, angle, shift):
     assert solution.converged == np.allclose(solution.T_parent_child, truth, atol=1e-6)
 
 
-@pytest.mark.parametrize("method", [name for name in SUMMING_METHODS if name != "zhuang"])
+@pytest.mark.parametrize(
+    "method", [name for name in SUMMING_METHODS if name != "zhuang"]
+)
 @few_examples
 @given(seed=seeds, truth=transforms, T_parent_new=transforms, T_child_new=rotations)
 def test_answer_follows_the_sensor_frames_with_noise(
@@ -124,15 +130,21 @@ def test_answer_follows_the_sensor_frames_with_noise(
     residual to the translation residual, and the best compromise moves.
     """
     Ts_pw_p, Ts_cw_c = trajectories(seed, truth, noise=0.01)
-    expected = se3.inverse(T_parent_new) @ answer(method, Ts_pw_p, Ts_cw_c) @ T_child_new
+    expected = (
+        se3.inverse(T_parent_new) @ answer(method, Ts_pw_p, Ts_cw_c) @ T_child_new
+    )
     np.testing.assert_allclose(
-        answer(method, Ts_pw_p @ T_parent_new, Ts_cw_c @ T_child_new), expected, atol=1e-6
+        answer(method, Ts_pw_p @ T_parent_new, Ts_cw_c @ T_child_new),
+        expected,
+        atol=1e-6,
     )
 
 
 @few_examples
 @given(seed=seeds, truth=transforms, T_parent_new=transforms, T_child_new=rotations)
-def test_dnlo_follows_the_sensor_frames_with_outliers(seed, truth, T_parent_new, T_child_new):
+def test_dnlo_follows_the_sensor_frames_with_outliers(
+    seed, truth, T_parent_new, T_child_new
+):
     """Its costs are dnl's; with two pairs that are plainly wrong its answer is that of the others,
     in any frames.
     """
@@ -149,7 +161,9 @@ def test_dnlo_follows_the_sensor_frames_with_outliers(seed, truth, T_parent_new,
     )
     expected = se3.inverse(T_parent_new) @ solution.T_parent_child @ T_child_new
     np.testing.assert_allclose(
-        answer("dnlo", Ts_pw_p @ T_parent_new, Ts_cw_c @ T_child_new), expected, atol=1e-6
+        answer("dnlo", Ts_pw_p @ T_parent_new, Ts_cw_c @ T_child_new),
+        expected,
+        atol=1e-6,
     )
 
 
@@ -158,7 +172,8 @@ def test_dnlo_follows_the_sensor_frames_with_outliers(seed, truth, T_parent_new,
 @given(seed=seeds, truth=transforms, order=st.permutations(range(N_POSES - 1)))
 def test_order_of_the_pairs_does_not_matter(method, seed, truth, order):
     pairs = motion_pairs(
-        *trajectories(seed, truth, noise=0.01 if method in SUMMING_METHODS else 0.0), "B1"
+        *trajectories(seed, truth, noise=0.01 if method in SUMMING_METHODS else 0.0),
+        "B1",
     )
     ours = Method(method).solve(pairs)
     reordered = Method(method).solve(pairs[np.array(order)])
@@ -172,9 +187,9 @@ def test_each_cost_is_lowest_at_its_own_method(seed, truth):
     pairs = motion_pairs(*trajectories(seed, truth, noise=0.03), "B1")
     solutions = {method: Method(method).solve(pairs) for method in PAPER_METHODS}
     for solution in solutions.values():
-        assert solutions["dnl"].objective <= pair_costs(pairs, solution.T_parent_child).sum() * (
-            1 + 1e-9
-        )
+        assert solutions["dnl"].objective <= pair_costs(
+            pairs, solution.T_parent_child
+        ).sum() * (1 + 1e-9)
         assert solutions["dnlo"].objective <= np.minimum(
             pair_costs(pairs, solution.T_parent_child), 0.01
         ).sum() * (1 + 1e-9) or (solutions["dnlo"].weights.sum() < (len(pairs) + 1) / 2)
@@ -195,7 +210,10 @@ def degenerate_motions(seed):
         "rotation about one axis": [shifts, amounts * axis],
         "plane": [shifts * [1, 1, 0], amounts * [0, 0, 1]],
         "rotation on the spot": [none, turns],
-        "half turns": [shifts, np.pi * turns / np.linalg.norm(turns, axis=1, keepdims=True)],
+        "half turns": [
+            shifts,
+            np.pi * turns / np.linalg.norm(turns, axis=1, keepdims=True),
+        ],
         "one pair": [shifts[:1], turns[:1]],
         "two pairs": [shifts[:2], turns[:2]],
         "hardly any": [1e-9 * shifts, 1e-9 * turns],
@@ -209,12 +227,16 @@ def degenerate_motions(seed):
 @settings(max_examples=4)
 @given(
     seed=seeds,
-    truth=st.one_of(transforms, st.just(np.eye(4)), st.just(np.diag([1.0, -1.0, -1.0, 1.0]))),
+    truth=st.one_of(
+        transforms, st.just(np.eye(4)), st.just(np.diag([1.0, -1.0, -1.0, 1.0]))
+    ),
 )
 def test_degenerate_motion_gives_a_rigid_transform(method, kind, seed, truth):
     Ts_parent = se3.exp(degenerate_motions(seed)[kind])
     index = np.arange(len(Ts_parent))
-    pairs = MotionPairs(Ts_parent, se3.inverse(truth) @ Ts_parent @ truth, index, index + 1)
+    pairs = MotionPairs(
+        Ts_parent, se3.inverse(truth) @ Ts_parent @ truth, index, index + 1
+    )
     solution = Method(method).solve(pairs)
     T = solution.T_parent_child
     assert np.isfinite(T).all()
@@ -240,10 +262,14 @@ def test_planar_motion_still_shows_what_it_can(method, seed, yaw, shift):
     """A vehicle on flat ground: the height is left near zero instead of blowing up, and methods
     that use all residuals find the rest.
     """
-    truth = se3.from_rotation_translation(se3.rotation_exp(np.array([0.0, 0.0, yaw])), shift)
+    truth = se3.from_rotation_translation(
+        se3.rotation_exp(np.array([0.0, 0.0, yaw])), shift
+    )
     Ts_parent = se3.exp(degenerate_motions(seed)["plane"])
     index = np.arange(len(Ts_parent))
-    pairs = MotionPairs(Ts_parent, se3.inverse(truth) @ Ts_parent @ truth, index, index + 1)
+    pairs = MotionPairs(
+        Ts_parent, se3.inverse(truth) @ Ts_parent @ truth, index, index + 1
+    )
     solution = Method(method).solve(pairs)
     assert abs(solution.T_parent_child[2, 3]) < 1e-3
     if method in ("dnl", "zhuang"):

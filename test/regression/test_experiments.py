@@ -15,7 +15,12 @@ from reproduction.sources import PublishedSource
 from reproduction.tables import PRINTED
 
 # Levels of the simulated cases that are solved here: ``make paper`` takes a minute for all.
-LEVELS = {"noise": (0.0, 0.01), "outliers": (10.0,), "drift": (0.05,), "mixture": (None,)}
+LEVELS = {
+    "noise": (0.0, 0.01),
+    "outliers": (10.0,),
+    "drift": (0.05,),
+    "mixture": (None,),
+}
 N_LEVELS = sum(map(len, LEVELS.values()))
 # Of one method: 38 drives at each level and both KITTI drives, with six references.
 ROWS = (38 * N_LEVELS + 2) * 6
@@ -44,7 +49,9 @@ def read(path):
         return list(csv.DictReader(file))
 
 
-@pytest.mark.parametrize(("name", "drive"), [("table1", "kitti_short"), ("table2", "kitti_long")])
+@pytest.mark.parametrize(
+    ("name", "drive"), [("table1", "kitti_short"), ("table2", "kitti_long")]
+)
 def test_tables_1_and_2_are_as_printed(tables, name, drive):
     folder = tables[1]
     best = {line["method"].lower(): line for line in read(folder / f"{name}.csv")}
@@ -58,7 +65,9 @@ def test_tables_1_and_2_are_as_printed(tables, name, drive):
     assert "lower objective" in differing["DNLO"]["why"]
     for method in METHODS:
         if method != "dnlo":
-            printed = [value for value in PRINTED[drive][method][1:] if value is not None]
+            printed = [
+                value for value in PRINTED[drive][method][1:] if value is not None
+            ]
             ours = [float(value) for value in list(best[method].values())[2:8] if value]
             assert ours == pytest.approx(printed, abs=5.1e-4)
 
@@ -89,7 +98,9 @@ def few_levels(monkeypatch):
         dataclasses.replace(
             experiment,
             cells=[
-                cell for cell in experiment.cells if cell.level in LEVELS.get(cell.dataset, (None,))
+                cell
+                for cell in experiment.cells
+                if cell.level in LEVELS.get(cell.dataset, (None,))
             ],
         )
         for experiment in command.GROUPS["all"]
@@ -126,9 +137,13 @@ def test_everything_from_one_command(tmp_path, few_levels, one_error_figure):
         if line["agrees"] == "False":
             differing.setdefault(line["method"], []).append(line)
     assert not {"park", "taylor", "ali_as_published"} & set(differing)
-    assert {(line["case"], line["reference"]) for line in differing["dnl"]} <= FALSE_MINIMA_OF_DNL
+    assert {
+        (line["case"], line["reference"]) for line in differing["dnl"]
+    } <= FALSE_MINIMA_OF_DNL
     for line in differing["dnl"]:
-        assert float(line["objective"]) < 0.1 * float(line["objective_at_published"]), line["case"]
+        assert float(line["objective"]) < 0.1 * float(line["objective_at_published"]), (
+            line["case"]
+        )
     # The last of 500 steps of an iteration that never settles may depend on rounding.
     assert all("does not settle" in line["why"] for line in differing.get("zhuang", ()))
     assert rows["agrees"][rows["method"] == "ali"].sum() >= 12
@@ -136,9 +151,19 @@ def test_everything_from_one_command(tmp_path, few_levels, one_error_figure):
     assert objective.sum() == ROWS
     assert "higher" not in objective
     assert objective["lower"] > 250
-    shares = {"figS1": 1.0, "figS2": 0.9, "figS3": 1.0, "figS4": 1.0, "figS5": 0.99, "fig3": 0.5}
+    shares = {
+        "figS1": 1.0,
+        "figS2": 0.9,
+        "figS3": 1.0,
+        "figS4": 1.0,
+        "figS5": 0.99,
+        "fig3": 0.5,
+    }
     for figure, exact in shares.items():
-        points = [line["agrees"] == "True" for line in read(tmp_path / f"{figure}_comparison.csv")]
+        points = [
+            line["agrees"] == "True"
+            for line in read(tmp_path / f"{figure}_comparison.csv")
+        ]
         assert len(points) == N_LEVELS * 6 * 4
         assert sum(points) >= exact * len(points), figure
     assert [path.suffix for path in one_error_figure] == [".png", ".svg"]

@@ -31,7 +31,10 @@ def rpy_deg(T):
 def results():
     """The three pairs of the cycle."""
     options = dict(time_offset="estimate", method="park", reference="B10")
-    return [calibrate(pair.parent, pair.child, **options) for pair in real_data.tango_pairs()]
+    return [
+        calibrate(pair.parent, pair.child, **options)
+        for pair in real_data.tango_pairs()
+    ]
 
 
 class TestThreeDevicesWithoutACommonClock:
@@ -39,13 +42,21 @@ class TestThreeDevicesWithoutACommonClock:
 
     def test_offsets(self, results):
         for pair, result in zip(real_data.tango_pairs(), results, strict=True):
-            assert result.time_offset_s == pytest.approx(pair.time_offset_s, abs=0.002), pair.name
+            assert result.time_offset_s == pytest.approx(
+                pair.time_offset_s, abs=0.002
+            ), pair.name
             assert result.time_offset_sigma_s < 0.002
 
     def test_translations(self, results):
-        translations = [(0.940, -0.403, 1.002), (0.914, -0.113, 0.254), (0.434, 0.072, -0.213)]
+        translations = [
+            (0.940, -0.403, 1.002),
+            (0.914, -0.113, 0.254),
+            (0.434, 0.072, -0.213),
+        ]
         for expected, result in zip(translations, results, strict=True):
-            np.testing.assert_allclose(result.T_parent_child[:3, 3], expected, atol=0.02)
+            np.testing.assert_allclose(
+                result.T_parent_child[:3, 3], expected, atol=0.02
+            )
 
     def test_the_cycle_closes(self, results):
         cycle = np.linalg.multi_dot([result.T_parent_child for result in results])
@@ -64,13 +75,18 @@ class TestRoadVehicle:
         assert result.status is SolveStatus.UNOBSERVABLE
         assert result.unobservable() == ["z"]
         assert rpy_deg(result.T_parent_child)[2] == pytest.approx(-90.78, abs=0.5)
-        np.testing.assert_allclose(result.T_parent_child[:2, 3], (0.002, 0.367), atol=0.04)
+        np.testing.assert_allclose(
+            result.T_parent_child[:2, 3], (0.002, 0.367), atol=0.04
+        )
         assert abs(result.time_offset_s) < 0.09
 
     def test_prior_holds_what_is_unobservable(self):
         recording = real_data.zxl19(1, "LO")
         result = calibrate(
-            recording.parent, recording.child, time_offset="estimate", prior={"z": (1.0, 0.02)}
+            recording.parent,
+            recording.child,
+            time_offset="estimate",
+            prior={"z": (1.0, 0.02)},
         )
         verdicts = {dof.name: dof for dof in result.observability}
         assert result.status is SolveStatus.OK
@@ -78,7 +94,9 @@ class TestRoadVehicle:
         assert result.T_parent_child[2, 3] == pytest.approx(1.0, abs=0.005)
         assert verdicts["z"].sigma == pytest.approx(0.02, rel=0.1)
         assert max(verdicts["x"].sigma, verdicts["y"].sigma) < 0.05
-        np.testing.assert_allclose(result.T_parent_child[:2, 3], (0.002, 0.367), atol=0.04)
+        np.testing.assert_allclose(
+            result.T_parent_child[:2, 3], (0.002, 0.367), atol=0.04
+        )
 
     @pytest.mark.parametrize("method", ["auto", "dnlo"])
     def test_a_flat_drive_on_springs_gives_no_height(self, method):
@@ -90,12 +108,16 @@ class TestRoadVehicle:
         result = calibrate(*streams, time_offset="estimate", method=method)
         assert result.unobservable() == ["z"]
         assert result.T_parent_child[2, 3] == pytest.approx(0.0, abs=0.03)
-        np.testing.assert_allclose(result.T_parent_child[:2, 3], (0.40, -0.02), atol=0.05)
+        np.testing.assert_allclose(
+            result.T_parent_child[:2, 3], (0.40, -0.02), atol=0.05
+        )
 
     @pytest.mark.parametrize(("bag", "scale"), [(1, 3.34), (3, 2.66)])
     def test_monocular_scale(self, bag, scale):
         recording = real_data.zxl19(bag, "VO")
-        result = calibrate(recording.parent, recording.child, time_offset="estimate", scale="auto")
+        result = calibrate(
+            recording.parent, recording.child, time_offset="estimate", scale="auto"
+        )
         assert result.scale == pytest.approx(scale, rel=0.01)
         assert 0 < result.scale_sigma < 0.01 * scale
         assert "z" in result.unobservable()
@@ -108,18 +130,28 @@ class TestBoreas:
         error = np.linalg.inv(real_data.BOREAS_TRUTH) @ result.T_parent_child
         in_plane = result.T_parent_child[:2, 3] - real_data.BOREAS_TRUTH[:2, 3]
         assert np.linalg.norm(in_plane) < 0.005
-        assert abs(np.degrees(Rotation.from_matrix(error[:3, :3]).as_rotvec()[2])) < 0.05
+        assert (
+            abs(np.degrees(Rotation.from_matrix(error[:3, :3]).as_rotvec()[2])) < 0.05
+        )
         z = result.observability[2]
-        assert "z" in result.unobservable() or abs(result.T_parent_child[2, 3] - 0.21) < 4 * z.sigma
+        assert (
+            "z" in result.unobservable()
+            or abs(result.T_parent_child[2, 3] - 0.21) < 4 * z.sigma
+        )
 
     def test_the_files_themselves_are_read_by_one_convention(self):
         folder = real_data.data_folder() / "boreas" / "boreas-2021-08-05-13-34"
         options = FileOptions(format=AUTO)
         files = [(folder / f"{name}_poses.csv", options) for name in SENSORS]
-        result = calibrate(*(reading.trajectory for reading in read_trajectory_files(files)))
+        result = calibrate(
+            *(reading.trajectory for reading in read_trajectory_files(files))
+        )
         error = np.linalg.inv(real_data.BOREAS_TRUTH) @ result.T_parent_child
         assert np.linalg.norm(error[:3, 3]) < 0.001
-        assert np.degrees(np.linalg.norm(Rotation.from_matrix(error[:3, :3]).as_rotvec())) < 0.01
+        assert (
+            np.degrees(np.linalg.norm(Rotation.from_matrix(error[:3, :3]).as_rotvec()))
+            < 0.01
+        )
 
     def test_two_streams_from_one_ins_are_not_independent(self):
         recording = real_data.boreas()
@@ -148,14 +180,20 @@ def test_lengths_in_millimetres_are_noticed_whatever_carries_the_sensors(recordi
 class TestArms:
     @pytest.mark.parametrize("interval_s", [0.2, 1.0, 5.0])
     def test_stops_have_no_error(self, interval_s):
-        parent, child = (as_trajectory(poses, 1 / interval_s) for poses in real_data.stops(0))
+        parent, child = (
+            as_trajectory(poses, 1 / interval_s) for poses in real_data.stops(0)
+        )
         result = calibrate(parent, child)
         assert [f.code for f in result.findings if f.severity == "error"] == []
 
     @pytest.mark.parametrize("interval_s", [0.2, 1.0, 5.0])
     def test_a_fixed_camera_beside_an_arm_has_inverse_poses_by_right(self, interval_s):
-        parent, child = (as_trajectory(poses, 1 / interval_s) for poses in real_data.eye_to_hand())
-        codes = {f.code for f in calibrate(parent, child).findings if f.severity != "note"}
+        parent, child = (
+            as_trajectory(poses, 1 / interval_s) for poses in real_data.eye_to_hand()
+        )
+        codes = {
+            f.code for f in calibrate(parent, child).findings if f.severity != "note"
+        }
         assert codes <= {"inverse_both"}
 
     def test_the_axis_of_one_axis_motion_is_named(self):
@@ -177,7 +215,11 @@ class TestArms:
         ],
     )
     def test_gross_jumps(self, name, low, high):
-        recording = real_data.primesense() if name == "primesense" else real_data.robot_arm(name)
+        recording = (
+            real_data.primesense()
+            if name == "primesense"
+            else real_data.robot_arm(name)
+        )
         result = calibrate(
             recording.parent, recording.child, time_offset="estimate", reference="B20"
         )
@@ -209,7 +251,9 @@ def test_streams_of_1_hz_have_no_error(rig):
     parent = Trajectory(child.stamps_ns, recording.parent.at(child.stamps_ns))
     for faster in (parent, recording.parent):
         findings = calibrate(faster, child).findings
-        assert [finding.code for finding in findings if finding.severity == "error"] == []
+        assert [
+            finding.code for finding in findings if finding.severity == "error"
+        ] == []
 
 
 @pytest.mark.parametrize("start_s", [68.8, 262.8, 424.9])
@@ -217,7 +261,9 @@ def test_fifty_seconds_of_a_farm_robot_are_not_forbidden(start_s):
     """Both worlds drift against each other, and short halves disagree by degrees."""
     nav, velodyne = shrimp_sensors(real_data.data_folder())
     start_ns = int(velodyne.stamps_ns[0] + start_s * 1e9)
-    pair = (between(stream, start_ns, start_ns + 50 * 10**9) for stream in (nav, velodyne))
+    pair = (
+        between(stream, start_ns, start_ns + 50 * 10**9) for stream in (nav, velodyne)
+    )
     assert calibrate(*pair).verdict is not Verdict.DO_NOT_USE
 
 
@@ -255,7 +301,9 @@ def fault_table(every=1):
         parent = recording.parent
         child = recording.corrected()
         other = recordings[(index + 5) % len(recordings)]
-        expected = REALLY_THERE.get(recording.name, set()) | REALLY_THERE.get(other.name, set())
+        expected = REALLY_THERE.get(recording.name, set()) | REALLY_THERE.get(
+            other.name, set()
+        )
         cells = {CLEAN: found_codes(parent, child)}
         cells |= {
             fault: found_codes(*damage(parent, child, other.corrected()))
@@ -264,7 +312,8 @@ def fault_table(every=1):
         }
         table[recording.name] = {
             fault: (
-                (codes - expected) == ({FAULTS[fault][1]} if fault in FAULTS else set()),
+                (codes - expected)
+                == ({FAULTS[fault][1]} if fault in FAULTS else set()),
                 sorted(codes - expected),
             )
             for fault, codes in cells.items()
@@ -276,8 +325,12 @@ def fault_table(every=1):
 def test_faults_are_found_and_named():
     every = 1 if os.environ.get("HAND_EYE_CALIB_ALL_FAULTS") else 12
     table = fault_table(every)
-    false_alarms = {name: cells[CLEAN][1] for name, cells in table.items() if not cells[CLEAN][0]}
+    false_alarms = {
+        name: cells[CLEAN][1] for name, cells in table.items() if not cells[CLEAN][0]
+    }
     assert false_alarms == {}
-    cells = [cell for row in table.values() for fault, cell in row.items() if fault != CLEAN]
+    cells = [
+        cell for row in table.values() for fault, cell in row.items() if fault != CLEAN
+    ]
     assert len(cells) == (150 if every == 1 else 11)
     assert sum(right for right, _ in cells) / len(cells) >= LEAST_SHARE

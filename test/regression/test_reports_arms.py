@@ -30,7 +30,9 @@ def arms():
 
 def run(arms, capsys, command):
     """Exit code, document (None after an error) and what was written to stderr."""
-    words = [str(arms / word) if (arms / word).exists() else word for word in command.split()]
+    words = [
+        str(arms / word) if (arms / word).exists() else word for word in command.split()
+    ]
     return calibrated(capsys, *words)
 
 

@@ -63,7 +63,12 @@ def test_names_the_other_way_round_give_the_inverse(bag, capsys):
 
 
 def test_a_camera_on_an_arm_that_sees_a_marker_is_named_and_right(bag, capsys):
-    sources = ["--parent-topic", "base_link:tool0", "--child-topic", "camera:aruco_marker"]
+    sources = [
+        "--parent-topic",
+        "base_link:tool0",
+        "--child-topic",
+        "camera:aruco_marker",
+    ]
     code, document, _ = calibrated(capsys, bag("tf_bag"), *sources)
     assert (code, document["verdict"]) == (0, "USE")
     assert frames_of(document) == ("tool0", "camera")
@@ -109,7 +114,9 @@ def test_clocks_of_two_epochs_are_estimated(bag, capsys):
     assert_near(document, matrix_of(TRUTH))
     with PoseBag(path) as opened:
         table = opened.poses("/lidar/odometry", "/camera/odometry")
-    first_ns = [table.stamps_ns[table.streams == stream][0] for stream in ("parent", "child")]
+    first_ns = [
+        table.stamps_ns[table.streams == stream][0] for stream in ("parent", "child")
+    ]
     apart_s = (int(first_ns[0]) - int(first_ns[1])) * 1e-9
     assert abs(document["time_offset_s"] - apart_s) < 60.0
     assert document["time_offset_s"] > 1.6e9

@@ -63,7 +63,9 @@ def test_the_truth_is_found(run_files, parent, child, truth):
 
 
 @pytest.mark.parametrize(("parent", "child", "truth", "offset_s"), RIGHT_WITH_OFFSET)
-def test_the_truth_is_found_with_clocks_of_other_epochs(run_files, parent, child, truth, offset_s):
+def test_the_truth_is_found_with_clocks_of_other_epochs(
+    run_files, parent, child, truth, offset_s
+):
     code, document, _ = run_files(parent, child, "--time-offset", "estimate")
     assert code == 0
     assert_is(document, truth)
@@ -90,5 +92,7 @@ def test_check_reads_both_streams_as_calibrate_does(capsys):
     assert main(["check", str(folder / "p.tum"), str(folder / "motive.csv")]) == 1
     out = capsys.readouterr().out
     # Before the choice between both readings, the check proposed to invert both streams.
-    assert out.startswith("DO NOT USE as they are: calibrate with --time-offset estimate.")
+    assert out.startswith(
+        "DO NOT USE as they are: calibrate with --time-offset estimate."
+    )
     assert "inverse" not in out

@@ -13,7 +13,8 @@ from ros_harness import NodeProcess, Peer, free_domain
 def _quick_discovery():
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(
-            "FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name("discovery.xml"))
+            "FASTRTPS_DEFAULT_PROFILES_FILE",
+            str(Path(__file__).with_name("discovery.xml")),
         )
         with pytest.MonkeyPatch.context() as path:
             # It imports what it is told to only from here, and fails in silence.

@@ -20,14 +20,18 @@ HEADER = """\
 # that is set, even if it is the default.
 """
 CONVENTIONS = [
-    f"{stream}_{kind}" for stream in ("parent", "child") for kind in ("invert", "quaternion")
+    f"{stream}_{kind}"
+    for stream in ("parent", "child")
+    for kind in ("invert", "quaternion")
 ]
 ONLY_SHOWN = ("time_offset", "scale", "parent_scale", *CONVENTIONS)
 
 
 def fields():
     return [
-        field for config in (CalibratorConfig, NodeConfig) for field in dataclasses.fields(config)
+        field
+        for config in (CalibratorConfig, NodeConfig)
+        for field in dataclasses.fields(config)
     ]
 
 
@@ -54,7 +58,9 @@ def comment_of(field):
     if meta["choices"]:
         parts.append(f"One of {', '.join(meta['choices'])}.")
     if meta["within"]:
-        parts.append(f"{' to '.join(map(number, meta['within']))} {meta['unit']}".rstrip() + ".")
+        parts.append(
+            f"{' to '.join(map(number, meta['within']))} {meta['unit']}".rstrip() + "."
+        )
     if meta["read_only"]:
         parts.append("Fixed once the node runs.")
     return " ".join(parts)
@@ -67,7 +73,9 @@ def number(value):
 def value_of(field):
     if isinstance(field.default, bool):
         return str(field.default).lower()
-    return f'"{field.default}"' if isinstance(field.default, str) else repr(field.default)
+    return (
+        f'"{field.default}"' if isinstance(field.default, str) else repr(field.default)
+    )
 
 
 def test_the_config_file_follows_the_options_and_has_their_types():

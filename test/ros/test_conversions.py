@@ -26,7 +26,10 @@ T_PARENT_CHILD = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
 
 def calibration(covariance, **changes):
     named = {"child_frame": "camera", "stamp_ns": 1_700_000_000_123_456_789}
-    changes |= named | {"T_parent_child": T_PARENT_CHILD, "covariance_measured": covariance}
+    changes |= named | {
+        "T_parent_child": T_PARENT_CHILD,
+        "covariance_measured": covariance,
+    }
     return good_calibration(**changes)
 
 
@@ -62,7 +65,9 @@ def test_control_characters_do_not_reach_the_log():
 def test_a_message_without_what_is_measured_is_refused(kind, measures):
     message = kind()
     if kind is Imu:
-        message.orientation_covariance[0] = message.angular_velocity_covariance[0] = -1.0
+        message.orientation_covariance[0] = message.angular_velocity_covariance[
+            0
+        ] = -1.0
     else:
         message.status.status = -1
     read = MessageReader(f"sensor_msgs/msg/{kind.__name__}", measures)
@@ -83,7 +88,9 @@ def test_messages_carry_frames_stamp_and_transform():
         (transform.transform.translation, transform.transform.rotation),
         (pose.pose.pose.position, pose.pose.pose.orientation),
     ):
-        read = se3.from_quat_xyzw([place.x, place.y, place.z], [turn.x, turn.y, turn.z, turn.w])
+        read = se3.from_quat_xyzw(
+            [place.x, place.y, place.z], [turn.x, turn.y, turn.z, turn.w]
+        )
         np.testing.assert_allclose(read, T_PARENT_CHILD, atol=1e-15)
 
 
@@ -143,7 +150,9 @@ def test_a_result_that_is_too_uncertain_withdraws_the_one_before():
         made.append(SimpleNamespace(name=name, sent=sent, publish=sent.append))
         return made[-1]
 
-    topics = ResultTopics(SimpleNamespace(create_publisher=create, destroy_publisher=gone.append))
+    topics = ResultTopics(
+        SimpleNamespace(create_publisher=create, destroy_publisher=gone.append)
+    )
     sure, unsure = (
         calibration(np.eye(6), observability_measured=dofs([0.01] * 6, hidden))
         for hidden in ((), NAMES)
@@ -178,6 +187,8 @@ def test_covariance_is_about_the_fixed_axes_of_the_parent():
     scale = np.sqrt(np.outer(np.diag(measured), np.diag(measured)))
     # Standard error of a sampled correlation is below 1 / sqrt(samples); five of them, and the
     # second-order terms of exp.
-    assert converted / scale == pytest.approx(measured / scale, abs=5 / np.sqrt(samples) + 5e-3)
+    assert converted / scale == pytest.approx(
+        measured / scale, abs=5 / np.sqrt(samples) + 5e-3
+    )
     # The test can tell: the unconverted covariance is far off.
     assert np.abs((cov_in_child - measured) / scale).max() > 0.3

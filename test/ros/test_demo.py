@@ -39,7 +39,9 @@ def run(*arguments, domain=0):
 
 
 def numbers(line):
-    return [float(word) for word in re.findall(r"(?<= )-?\d[\d.]*(?:e-?\d+)?(?= |$)", line)]
+    return [
+        float(word) for word in re.findall(r"(?<= )-?\d[\d.]*(?:e-?\d+)?(?= |$)", line)
+    ]
 
 
 def test_demo_recovers_the_truth_offline_and_live_and_replaces_an_earlier_demo(
@@ -59,7 +61,8 @@ def test_demo_recovers_the_truth_offline_and_live_and_replaces_an_earlier_demo(
         apart_m = np.linalg.norm(np.subtract(numbers(line)[:3], T_true[:3, 3]))
         assert 0.0 < apart_m < LARGEST_ERROR_M
         assert (
-            np.abs(np.subtract(numbers(line)[3:6], numbers(truth)[3:6])).max() < LARGEST_ERROR_DEG
+            np.abs(np.subtract(numbers(line)[3:6], numbers(truth)[3:6])).max()
+            < LARGEST_ERROR_DEG
         )
         assert re.search(r"off by [\d.]+ mm and [\d.]+ deg$", line)
     assert max(numbers(apart)) < 1e-6
@@ -73,7 +76,9 @@ def test_demo_recovers_the_truth_offline_and_live_and_replaces_an_earlier_demo(
     assert sorted(path.name for path in tmp_path.iterdir()) == remaining
 
 
-def test_demo_without_ros_says_what_to_install_and_with_it_why_it_does_not_start(tmp_path):
+def test_demo_without_ros_says_what_to_install_and_with_it_why_it_does_not_start(
+    tmp_path,
+):
     command = "demo", "--out", tmp_path / "out"
     program = (
         "import sys; sys.modules['rclpy'] = None; "
@@ -88,11 +93,15 @@ def test_demo_without_ros_says_what_to_install_and_with_it_why_it_does_not_start
     bad = run("-m", "hand_eye_calib", *command, domain="one")
     assert "error: cannot start ROS: " in bad.stderr.splitlines()[-1]
     assert "ROS_DOMAIN_ID is not an integral number" in bad.stderr.splitlines()[-1]
-    assert [(process.returncode, process.stdout) for process in (without, bad)] == [(1, "")] * 2
+    assert [(process.returncode, process.stdout) for process in (without, bad)] == [
+        (1, "")
+    ] * 2
 
 
 def test_player_does_not_wait_for_ever(domain, monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
     monkeypatch.setattr("hand_eye_calib.extras.simulation.player._PATIENCE_S", 0.1)
-    with pytest.raises(HandEyeCalibError, match=r"waited 0\.1 s for the node to listen"):
+    with pytest.raises(
+        HandEyeCalibError, match=r"waited 0\.1 s for the node to listen"
+    ):
         play(None, TOPICS, 1.0, 0, lambda: None)

@@ -16,7 +16,14 @@ from hand_eye_calib.formats.results import load_result
 from hand_eye_calib.online.live.state import Level
 from hand_eye_calib.online.ros.watcher import state_of
 
-PARTS = ("extrinsic", "progress", "parent input", "child input", "stream checks", "journal")
+PARTS = (
+    "extrinsic",
+    "progress",
+    "parent input",
+    "child input",
+    "stream checks",
+    "journal",
+)
 
 
 @pytest.fixture
@@ -27,14 +34,19 @@ def state(peer):
     """
     heard = []
     peer.node.create_subscription(
-        String, "calibrator/progress", lambda message: heard.append(state_of(message.data)), LATCHED
+        String,
+        "calibrator/progress",
+        lambda message: heard.append(state_of(message.data)),
+        LATCHED,
     )
 
     def wait(condition, description="such a state", meanwhile=lambda: None):
         start = len(heard)
 
         def met():
-            return next((document for document in heard[start:] if condition(document)), None)
+            return next(
+                (document for document in heard[start:] if condition(document)), None
+            )
 
         peer.spin_until(lambda: meanwhile() or met(), description)
         return met()
@@ -55,7 +67,9 @@ def test_nothing_is_ok_before_a_valid_result_and_the_inputs_that_are_missing_are
     # An input that delivers is no fault, whatever the result.
     document = state(lambda document: document.inputs["parent"].text.endswith("Hz"))
     assert document.inputs["parent"].level is Level.OK
-    state(lambda document: "synchronised pose pairs are needed" in document.extrinsic.text)
+    state(
+        lambda document: "synchronised pose pairs are needed" in document.extrinsic.text
+    )
     assert Level.OK not in {document.extrinsic.level for document in state.heard}
 
 
@@ -67,34 +81,49 @@ def test_diagnostics_have_the_same_and_tell_two_nodes_apart(start_node, peer):
     topic = "/robot1/calibrator/progress"
     peer.node.create_subscription(String, topic, states.append, LATCHED)
     peer.spin_until(lambda: states and len(statuses) == 2 * len(PARTS), "both nodes")
-    names = [f"{node}: {name}" for node in ("/robot1/calibrator", "/other") for name in PARTS]
+    names = [
+        f"{node}: {name}" for node in ("/robot1/calibrator", "/other") for name in PARTS
+    ]
     assert set(statuses) == set(names)
     progress = statuses["/robot1/calibrator: progress"]
     document = json.loads(states[-1].data)
     assert progress.message == document["progress"]["text"]
     values = values_of(progress)
-    assert (progress.level, progress.hardware_id) == (DiagnosticStatus.WARN, "hand_eye_calib")
+    assert (progress.level, progress.hardware_id) == (
+        DiagnosticStatus.WARN,
+        "hand_eye_calib",
+    )
     z = [values[f"{name}.z"] for name in ("sigma", "target")]
     assert (values["done"], *z) == ("false", "unknown", "0.03")
 
 
 def test_a_good_drive_is_ok_with_all_its_figures(start_node, peer, state, tmp_path):
-    start_node("-p solve_period:=0.5", f"-p output_directory:={tmp_path}", *RELIABLE_INPUTS)
+    start_node(
+        "-p solve_period:=0.5", f"-p output_directory:={tmp_path}", *RELIABLE_INPUTS
+    )
     publishers = peer.publishers()
     stamps_ns, Ts_pw_p, Ts_cw_c = drive()
     peer.wait_matched(*publishers)  # the child's clock is 20 s behind
     for publisher, frame, Ts, late_ns in zip(
-        publishers, ("lidar", "camera"), (Ts_pw_p, Ts_cw_c), (0, 20 * 10**9), strict=True
+        publishers,
+        ("lidar", "camera"),
+        (Ts_pw_p, Ts_cw_c),
+        (0, 20 * 10**9),
+        strict=True,
     ):
         for stamp_ns, T in zip(stamps_ns, Ts, strict=True):
-            publisher.publish(message(publisher.msg_type, int(stamp_ns) - late_ns, T, frame))
+            publisher.publish(
+                message(publisher.msg_type, int(stamp_ns) - late_ns, T, frame)
+            )
     sentence = "the streams do not overlap in time (120 parent and 120 child poses"
     # A solve may come before.
     apart = state(lambda document: sentence in document.extrinsic.text).extrinsic
     assert (apart.level, "set time_offset" in apart.text) == (Level.WARN, True)
     assert peer.set_parameter("time_offset", 20.0).successful
     good = state(
-        lambda document: document.extrinsic.level is Level.OK and document.extrinsic.n_poses == 120
+        lambda document: (
+            document.extrinsic.level is Level.OK and document.extrinsic.n_poses == 120
+        )
     )
     assert good.extrinsic.text.startswith("USE: good to ")
     assert all(angle > 20 for angle in good.extrinsic.rotation_deg.values())
@@ -102,7 +131,10 @@ def test_a_good_drive_is_ok_with_all_its_figures(start_node, peer, state, tmp_pa
     assert result.status == "ok"
     assert all(0.001 < result.pose_sigma[axis] < 0.01 for axis in "xyz")  # the floor
     assert 0 <= result.age_s < 60
-    assert (good.journal.level, good.journal.directory) == (Level.OK, str(tmp_path / "journal"))
+    assert (good.journal.level, good.journal.directory) == (
+        Level.OK,
+        str(tmp_path / "journal"),
+    )
 
 
 def test_bad_input_is_an_error_by_topic_and_reason(start_node, peer, state):
@@ -119,7 +151,9 @@ def test_bad_input_is_an_error_by_topic_and_reason(start_node, peer, state):
 
     def only_the_parent_goes_on():
         stamp_ns = next(later_ns)
-        publishers[0].publish(message(publishers[0].msg_type, stamp_ns, Ts_pw_p[-1], "lidar"))
+        publishers[0].publish(
+            message(publishers[0].msg_type, stamp_ns, Ts_pw_p[-1], "lidar")
+        )
 
     def is_broken(document):
         child = document.inputs["child"]
@@ -128,28 +162,43 @@ def test_bad_input_is_an_error_by_topic_and_reason(start_node, peer, state):
     state(is_broken, "the silence of the child", only_the_parent_goes_on)
     for stamp_ns in stamps_ns[:8]:  # enough to be believed after the pause
         publishers[1].publish(
-            message(publishers[1].msg_type, int(stamp_ns) + 12 * 10**9, Ts_cw_c[0], "other_camera")
+            message(
+                publishers[1].msg_type,
+                int(stamp_ns) + 12 * 10**9,
+                Ts_cw_c[0],
+                "other_camera",
+            )
         )
-    child = state(lambda document: document.inputs["child"].level is Level.ERROR).inputs["child"]
+    child = state(
+        lambda document: document.inputs["child"].level is Level.ERROR
+    ).inputs["child"]
     assert (
         "/child_odom: the child stream's sensor frame changed from 'camera' to 'other_camera'"
         in child.text
     )
     assert child.refused["unusable"] == 8
     for stamp_ns in (0, next(later_ns)):
-        publishers[0].publish(message(publishers[0].msg_type, stamp_ns, Ts_pw_p[0], "lidar"))
-    newest = state(lambda document: document.inputs["parent"].refused.get("corrupt stamp") == 1)
+        publishers[0].publish(
+            message(publishers[0].msg_type, stamp_ns, Ts_pw_p[0], "lidar")
+        )
+    newest = state(
+        lambda document: document.inputs["parent"].refused.get("corrupt stamp") == 1
+    )
     assert newest.inputs["parent"].level is Level.ERROR
 
 
-def test_repeated_stamps_gaps_and_rates_are_counted_and_disabled_is_said(start_node, peer, state):
+def test_repeated_stamps_gaps_and_rates_are_counted_and_disabled_is_said(
+    start_node, peer, state
+):
     start_node(*RELIABLE_INPUTS)
     publishers = peer.publishers()
     stamps_ns, Ts_pw_p, Ts_cw_c = drive()
     kept = np.r_[0:20, 30:60, 60:60]
     peer.feed(publishers, stamps_ns[kept], Ts_pw_p[kept], Ts_cw_c[kept])
     peer.feed(publishers, stamps_ns[55:60], Ts_pw_p[55:60], Ts_cw_c[55:60])
-    parent = state(lambda document: document.inputs["parent"].refused["repeated stamp"] == 5)
+    parent = state(
+        lambda document: document.inputs["parent"].refused["repeated stamp"] == 5
+    )
     parent = parent.inputs["parent"]
     assert (parent.messages, parent.poses_taken) == (55, 50)
     assert parent.longest_gap_s == pytest.approx(1.1)
@@ -159,7 +208,9 @@ def test_repeated_stamps_gaps_and_rates_are_counted_and_disabled_is_said(start_n
     state(lambda document: disabled in document.extrinsic.text)
 
 
-def test_a_dead_publisher_pauses_the_session_and_a_second_one_is_named(start_node, peer, state):
+def test_a_dead_publisher_pauses_the_session_and_a_second_one_is_named(
+    start_node, peer, state
+):
     start_node("-p solve_period:=0.5", *RELIABLE_INPUTS)
     publishers = peer.publishers()
     stamps_ns, Ts_pw_p, Ts_cw_c = drive(200)
@@ -168,7 +219,9 @@ def test_a_dead_publisher_pauses_the_session_and_a_second_one_is_named(start_nod
 
     def both_go_on():
         stamp_ns = next(later_ns)
-        newest = zip(publishers, (Ts_pw_p[-1], Ts_cw_c[-1]), ("lidar", "camera"), strict=True)
+        newest = zip(
+            publishers, (Ts_pw_p[-1], Ts_cw_c[-1]), ("lidar", "camera"), strict=True
+        )
         for publisher, T, frame in newest:
             publisher.publish(message(publisher.msg_type, stamp_ns, T, frame))
 
@@ -182,9 +235,13 @@ def test_a_dead_publisher_pauses_the_session_and_a_second_one_is_named(start_nod
     def has_two_publishers(document):
         return document.inputs["child"].publishers == 2
 
-    child = state(has_two_publishers, "the second publisher", both_go_on).inputs["child"]
+    child = state(has_two_publishers, "the second publisher", both_go_on).inputs[
+        "child"
+    ]
     assert child.level is Level.WARN
-    assert "/child_odom has 2 publishers: /peer and /peer. Stop all but one" in child.text
+    assert (
+        "/child_odom has 2 publishers: /peer and /peer. Stop all but one" in child.text
+    )
     for publisher in (publishers[1], second):
         peer.node.destroy_publisher(publisher)
 
@@ -201,12 +258,18 @@ def test_a_dead_publisher_pauses_the_session_and_a_second_one_is_named(start_nod
     assert child.progress.level is Level.WARN
     gone = "it has no publisher any more"
     child = state(
-        lambda document: gone in document.inputs["child"].text, "the end of the publisher"
+        lambda document: gone in document.inputs["child"].text,
+        "the end of the publisher",
     )
-    assert (child.inputs["child"].publishers, child.inputs["child"].level) == (0, Level.WARN)
+    assert (child.inputs["child"].publishers, child.inputs["child"].level) == (
+        0,
+        Level.WARN,
+    )
 
 
-def test_too_little_driving_is_said_also_where_time_does_not_run(start_node, peer, state):
+def test_too_little_driving_is_said_also_where_time_does_not_run(
+    start_node, peer, state
+):
     start_node("-p use_sim_time:=true", "-p solve_period:=0.2", *RELIABLE_INPUTS)
     peer.feed(peer.publishers(), *drive())
     newest = state(lambda document: document.extrinsic.result)
@@ -246,10 +309,17 @@ class TestStreamChecks:
             is_whole = document.extrinsic.n_poses == len(
                 stamps_ns
             )  # solves come before the last pose
-            return result and is_whole and any(sentence in text for text in result.warnings)
+            return (
+                result
+                and is_whole
+                and any(sentence in text for text in result.warnings)
+            )
 
         newest = state(is_told)
-        assert (newest.checks.level, newest.extrinsic.result.verdict) == (Level.OK, "USE")
+        assert (newest.checks.level, newest.extrinsic.result.verdict) == (
+            Level.OK,
+            "USE",
+        )
         node.wait_for_log(sentence)
 
     def test_what_helps_is_a_parameter_and_what_is_mended_is_no_longer_said(
@@ -264,11 +334,14 @@ class TestStreamChecks:
         peer.feed(peer.publishers(), stamps_ns, Ts_pw_p, Ts_cw_c)
         state(lambda document: document.checks.text.endswith(": set scale to 0.001"))
         assert peer.trigger("save").success
-        assert load_result(tmp_path).headline.startswith("DO NOT USE: the child's lengths must be")
+        assert load_result(tmp_path).headline.startswith(
+            "DO NOT USE: the child's lengths must be"
+        )
         assert peer.set_parameter("scale", 0.001).successful
         newest = state(
             lambda document: (
-                document.checks.level is Level.OK and document.extrinsic.level is Level.OK
+                document.checks.level is Level.OK
+                and document.extrinsic.level is Level.OK
             )
         )
         assert newest.checks.text == "both streams can be of one rigid body"
@@ -281,7 +354,9 @@ class TestStreamChecks:
         peer.feed(peer.publishers(), *drive(250, sigma_rad=7e-4))
         newest = state(lambda document: document.checks.level is Level.OK)
         assert not [
-            sentence for sentence in newest.checks.findings if not sentence.startswith("note")
+            sentence
+            for sentence in newest.checks.findings
+            if not sentence.startswith("note")
         ]
         warnings = [line for line in node.log.splitlines() if "[WARN]" in line]
         # Other programs may keep the computer busy.

@@ -12,7 +12,15 @@ import pytest
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros_harness import RELIABLE_INPUTS, START_NS, T_PARENT_CHILD, drive, matrix, message, values_of
+from ros_harness import (
+    RELIABLE_INPUTS,
+    START_NS,
+    T_PARENT_CHILD,
+    drive,
+    matrix,
+    message,
+    values_of,
+)
 from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
@@ -41,13 +49,19 @@ def test_unusable_messages_are_refused_by_topic_and_poison_nothing(start_node, p
     publishers[0].publish(message(Odometry, stamps_ns[-1], Ts_pw_p[-1], "lidar"))
     log = node.wait_for_log(*refused, "is repeated or too late")
     assert len(re.findall(r"message with stamp .* refused: ", log)) == 2, log
-    assert len(re.findall(r"message with stamp .* is left out: .*not finite", log)) == 1, log
+    assert (
+        len(re.findall(r"message with stamp .* is left out: .*not finite", log)) == 1
+    ), log
     assert "Traceback" not in log
     np.testing.assert_allclose(matrix(extrinsic), T_PARENT_CHILD, atol=1e-3)
 
 
-def test_a_sensor_frame_without_a_name_is_named_by_default_or_by_parameter(start_node, peer):
-    publishers = peer.publishers(Odometry, PoseStamped)  # an empty name, and no place for one
+def test_a_sensor_frame_without_a_name_is_named_by_default_or_by_parameter(
+    start_node, peer
+):
+    publishers = peer.publishers(
+        Odometry, PoseStamped
+    )  # an empty name, and no place for one
     for options, names in (
         ([], ("parent_sensor", "child_sensor")),
         (["-p parent_frame:=lidar"], ("lidar", "child_sensor")),
@@ -80,7 +94,9 @@ def test_bag_that_loops_starts_a_new_session(start_node, peer):
     assert "poses, " in peer.trigger("solve").message
 
 
-def test_solves_at_once_have_answers_and_a_reset_forgets_poses_and_result(start_node, peer):
+def test_solves_at_once_have_answers_and_a_reset_forgets_poses_and_result(
+    start_node, peer
+):
     node = start_node(*QUIET)
     answer = peer.trigger("solve")
     assert not answer.success
@@ -94,7 +110,9 @@ def test_solves_at_once_have_answers_and_a_reset_forgets_poses_and_result(start_
     assert all(answer.result().success for answer in answers)
     assert peer.trigger("reset").success
     late = peer.listen(TransformStamped, "extrinsic")
-    peer.spin_until(lambda: peer.node.count_publishers("/calibrator/extrinsic") == 1, "one topic")
+    peer.spin_until(
+        lambda: peer.node.count_publishers("/calibrator/extrinsic") == 1, "one topic"
+    )
     time.sleep(0.5)  # what is not to come has no event
     assert not peer.trigger("solve").success
     assert not late
@@ -111,7 +129,10 @@ def test_result_of_a_session_that_was_reset_meanwhile_is_dropped(start_node, pee
         name = "/calibrator: extrinsic"
         statuses.clear()
         peer.spin_until(
-            lambda: name in statuses and values_of(statuses[name])["is_solving"] == is_solving,
+            lambda: (
+                name in statuses
+                and values_of(statuses[name])["is_solving"] == is_solving
+            ),
             f"is_solving {is_solving}",
         )
 
@@ -134,9 +155,13 @@ def test_result_of_a_session_that_was_reset_meanwhile_is_dropped(start_node, pee
 BEST_EFFORT = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-def test_best_effort_publishers_of_a_remapped_topic_are_counted_heard_and_named(start_node, peer):
+def test_best_effort_publishers_of_a_remapped_topic_are_counted_heard_and_named(
+    start_node, peer
+):
     """Whatever QoS the other input has."""
-    node = start_node("-p solve_period:=0.1", "-r parent_odom:=/lidar/odom", RELIABLE_INPUTS[1])
+    node = start_node(
+        "-p solve_period:=0.1", "-r parent_odom:=/lidar/odom", RELIABLE_INPUTS[1]
+    )
     child = peer.publisher(Odometry, "child_odom")
     peer.wait_matched(child)  # its override comes first
     parent = peer.node.create_publisher(Odometry, "/lidar/odom", BEST_EFFORT)
@@ -151,7 +176,10 @@ def test_a_qos_that_keeps_messages_away_is_named(start_node, peer):
     peer.node.create_publisher(Odometry, "parent_odom", BEST_EFFORT)
     sentence = "no message on /parent_odom yet: it is published best effort, but qos_overrides ask"
     peer.spin_until(
-        lambda: any(status.message.startswith(sentence) for status in statuses.values()), "that"
+        lambda: any(
+            status.message.startswith(sentence) for status in statuses.values()
+        ),
+        "that",
     )
 
 
@@ -200,11 +228,21 @@ class TestRefusedInput:
                 "positions determine a lever arm only beside poses of the other sensor",
             ),
             (
-                ["child_measures:=positions", "monitor:=true", "installed:=1 0 0 0 0 0"],
+                [
+                    "child_measures:=positions",
+                    "monitor:=true",
+                    "installed:=1 0 0 0 0 0",
+                ],
                 "monitor needs poses of both sensors; the parent measures auto, the child positio",
             ),
-            (["monitor:=true"], "monitor needs installed: set it to the transform to compare with"),
-            (["journal:=resume"], "journal resume needs output_directory: set the session"),
+            (
+                ["monitor:=true"],
+                "monitor needs installed: set it to the transform to compare with",
+            ),
+            (
+                ["journal:=resume"],
+                "journal resume needs output_directory: set the session",
+            ),
             (["output_directory:=~nosuchuser/x"], "output_directory '~nosuchuser/x'"),
         ],
     )
@@ -225,8 +263,12 @@ class TestLoss:
         node = start_node("-p solve_period:=1000.0", "-r parent_odom:=/lidar/odom")
         qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
         topics = "/lidar/odom", "child_odom"
-        publishers = [peer.node.create_publisher(Odometry, topic, qos) for topic in topics]
-        made = [message(Odometry, START_NS, stream[0], "lidar") for stream in drive(1)[1:]]
+        publishers = [
+            peer.node.create_publisher(Odometry, topic, qos) for topic in topics
+        ]
+        made = [
+            message(Odometry, START_NS, stream[0], "lidar") for stream in drive(1)[1:]
+        ]
         n_sent = 0
         calls = itertools.count()
 
@@ -247,20 +289,25 @@ class TestLoss:
             if next(calls) % 50 == 0:
                 send(1)
             values = [
-                values_of(status) for name, status in statuses.items() if name.endswith(" input")
+                values_of(status)
+                for name, status in statuses.items()
+                if name.endswith(" input")
             ]
             if len(values) < 2 or any(row["lost"] == "unknown" for row in values):
                 return []
             return [[int(row[key]) for key in ("messages", "lost")] for row in values]
 
         peer.spin_until(told, "both inputs to receive")
-        n_before = n_sent  # of these, an unknown number went out before the subscriptions
+        n_before = (
+            n_sent  # of these, an unknown number went out before the subscriptions
+        )
         node.process.send_signal(signal.SIGSTOP)
         send(3800)
         node.process.send_signal(signal.SIGCONT)
         peer.spin_until(
             lambda: all(
-                lost >= 500 and -n_before - 0.02 * lost <= received + lost - n_sent <= 0.02 * lost
+                lost >= 500
+                and -n_before - 0.02 * lost <= received + lost - n_sent <= 0.02 * lost
                 for received, lost in told() or [(0, 0)]
             ),
             "all messages to be received or lost",

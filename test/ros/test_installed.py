@@ -34,7 +34,9 @@ def status(peer):
 
     def wait(name, condition):
         name = f"/calibrator: {name}"
-        peer.spin_until(lambda: name in statuses and condition(statuses[name]), f"such a {name}")
+        peer.spin_until(
+            lambda: name in statuses and condition(statuses[name]), f"such a {name}"
+        )
         return statuses[name], values_of(statuses[name])
 
     return wait
@@ -45,7 +47,9 @@ def noisy(stamps_ns, Ts_pw_p, Ts_cw_c):
     return stamps_ns, Ts_pw_p @ se3.exp(noise[0]), Ts_cw_c @ se3.exp(noise[1])
 
 
-def test_a_result_is_compared_with_what_is_installed(start_node, peer, status, tmp_path):
+def test_a_result_is_compared_with_what_is_installed(
+    start_node, peer, status, tmp_path
+):
     moved = NUMBERS.split()
     moved[2] = f"{float(moved[2]) + 0.2:.6f}"
     start_node(
@@ -57,7 +61,10 @@ def test_a_result_is_compared_with_what_is_installed(start_node, peer, status, t
     def is_told(status):
         of = values_of(status)
         # Not the one of an early solve, of a few poses.
-        return of.get("comparison.verdict") == "moved" and float(of["comparison.sigma.z"]) < 0.02
+        return (
+            of.get("comparison.verdict") == "moved"
+            and float(of["comparison.sigma.z"]) < 0.02
+        )
 
     _, values = status("progress", is_told)
     assert float(values["comparison.difference.z"]) == pytest.approx(-0.2, abs=0.02)
@@ -81,10 +88,20 @@ def test_the_monitor_learns_then_is_quiet_and_raises_an_alarm_when_the_mount_mov
     peer.feed(publishers, stamps_ns[:1800], Ts_pw_p[:1800], Ts_cw_c[:1800])
     quiet, values = status("mount", lambda status: "has not moved" in status.message)
     assert quiet.level == DiagnosticStatus.OK
-    assert all(float(values[f"visible_10min.{axis}"]) < 0.02 for axis in ("x", "y", "z", "about_z"))
+    assert all(
+        float(values[f"visible_10min.{axis}"]) < 0.02
+        for axis in ("x", "y", "z", "about_z")
+    )
     knocked = se3.exp(np.array([0, 0, 0, 0, 0, np.radians(1.0)]))
-    peer.feed(publishers, stamps_ns[1800:2400], Ts_pw_p[1800:2400], Ts_cw_c[1800:2400] @ knocked)
-    alarm, values = status("mount", lambda status: status.level == DiagnosticStatus.ERROR)
+    peer.feed(
+        publishers,
+        stamps_ns[1800:2400],
+        Ts_pw_p[1800:2400],
+        Ts_cw_c[1800:2400] @ knocked,
+    )
+    alarm, values = status(
+        "mount", lambda status: status.level == DiagnosticStatus.ERROR
+    )
     assert alarm.message.startswith("the mount has moved: ")
     since_s = (int(values["since_ns"]) - stamps_ns[1800]) * 1e-9
     assert abs(since_s) < 10.0
@@ -109,12 +126,16 @@ def test_a_wrong_path_to_what_is_installed_ends_the_start_in_one_line(start_node
     )
 
 
-def test_frames_that_are_not_in_what_is_installed_are_said(start_node, peer, status, tmp_path):
+def test_frames_that_are_not_in_what_is_installed_are_said(
+    start_node, peer, status, tmp_path
+):
     (tmp_path / "robot.urdf").write_text(
         '<robot name="r"><link name="base"/><link name="lidar"/><joint name="j" type="fixed">'
         '<parent link="base"/><child link="lidar"/></joint></robot>'
     )
-    start_node("-p monitor:=true", f"-p installed:={tmp_path / 'robot.urdf'}", *RELIABLE_INPUTS)
+    start_node(
+        "-p monitor:=true", f"-p installed:={tmp_path / 'robot.urdf'}", *RELIABLE_INPUTS
+    )
     early, _ = status("mount", lambda status: True)
     assert early.message == "no poses yet"
     peer.feed(peer.publishers(), *drive(100))
@@ -128,7 +149,9 @@ def test_frames_that_are_not_in_what_is_installed_are_said(start_node, peer, sta
 # ---- the robot's own frames
 
 
-LIDAR = se3.from_rotation_translation(se3.rotation_from_rpy([0.1, 0.0, 0.5]), [1.0, 0.0, 2.0])
+LIDAR = se3.from_rotation_translation(
+    se3.rotation_from_rpy([0.1, 0.0, 0.5]), [1.0, 0.0, 2.0]
+)
 
 
 def edge(parent, child, T):
@@ -148,7 +171,9 @@ class Heard:
         monkeypatch.setattr(module, "message_type", lambda: object)
         self.lines = []
         self._callbacks = []
-        logger = SimpleNamespace(**dict.fromkeys(("info", "warning", "error"), self.lines.append))
+        logger = SimpleNamespace(
+            **dict.fromkeys(("info", "warning", "error"), self.lines.append)
+        )
         log = NodeLog(logger)
         tree = RobotTree(self, log)
         tree.listen(STATIC_TOPIC)
@@ -177,7 +202,10 @@ def test_the_base_frame_comes_from_tf(monkeypatch):
     mounting = heard.robot.complete(result())
     np.testing.assert_allclose(mounting.T_base_child, LIDAR @ X, atol=1e-12)
     broadcast = to_transform(mounting, is_mounting=True)
-    assert (broadcast.header.frame_id, broadcast.child_frame_id) == ("base_link", "camera")
+    assert (broadcast.header.frame_id, broadcast.child_frame_id) == (
+        "base_link",
+        "camera",
+    )
     assert broadcast.transform.translation.x == pytest.approx((LIDAR @ X)[0, 3])
 
 
@@ -194,7 +222,9 @@ def test_what_is_installed_comes_from_tf_but_not_from_the_node_itself(monkeypatc
     assert heard.robot.problem == ""
 
 
-def test_the_one_axis_that_motion_does_not_show_is_that_of_what_is_installed(monkeypatch):
+def test_the_one_axis_that_motion_does_not_show_is_that_of_what_is_installed(
+    monkeypatch,
+):
     known_pose = result()
     dofs = [*known_pose.observability_measured]
     dofs[2] = DofObservability("z", DofVerdict.UNOBSERVABLE, np.inf)
@@ -208,7 +238,10 @@ def test_the_one_axis_that_motion_does_not_show_is_that_of_what_is_installed(mon
     T = heard.robot.complete(hidden).T_parent_child
     np.testing.assert_allclose(T[:2, 3], known_pose.T_parent_child[:2, 3], atol=1e-4)
     assert T[2, 3] == pytest.approx(9.0)
-    assert "z is that of the installed transform (7 8" in heard.robot.complete(hidden).warnings[-1]
+    assert (
+        "z is that of the installed transform (7 8"
+        in heard.robot.complete(hidden).warnings[-1]
+    )
     np.testing.assert_array_equal(
         heard.robot.complete(known_pose).T_parent_child, known_pose.T_parent_child
     )

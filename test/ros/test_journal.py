@@ -46,7 +46,9 @@ def test_a_killed_session_goes_on_where_it_ended(start_node, peer, tmp_path):
     np.testing.assert_allclose(matrix(heard[-1]), T_PARENT_CHILD, atol=1e-3)
 
 
-def test_an_earlier_session_is_kept_aside_once_and_an_empty_one_is_not(start_node, peer, tmp_path):
+def test_an_earlier_session_is_kept_aside_once_and_an_empty_one_is_not(
+    start_node, peer, tmp_path
+):
     node = start_node(*QUIET, *into(tmp_path))
     peer.feed(peer.publishers(), *drive(30))
     wait_written(peer, tmp_path, 60)
@@ -71,19 +73,27 @@ def test_an_earlier_session_is_kept_aside_once_and_an_empty_one_is_not(start_nod
     assert count_poses(tmp_path / "journal.previous") == 40
 
 
-def test_nothing_to_resume_and_a_damaged_journal_begin_a_new_session(start_node, peer, tmp_path):
+def test_nothing_to_resume_and_a_damaged_journal_begin_a_new_session(
+    start_node, peer, tmp_path
+):
     node = start_node(*QUIET, *into(tmp_path, "resume"))
-    node.wait_for_log(f"no session to resume in {tmp_path / 'journal'}: a new session begins")
+    node.wait_for_log(
+        f"no session to resume in {tmp_path / 'journal'}: a new session begins"
+    )
     assert node.stop()[0] == 0
     (tmp_path / "journal" / "parent.tum").write_text("something else")
     node = start_node(*QUIET, *into(tmp_path, "resume"))
     node.wait_for_log(
-        "cannot resume: ", "damaged from its first byte", "the session before this one is kept in"
+        "cannot resume: ",
+        "damaged from its first byte",
+        "the session before this one is kept in",
     )
     wait_written(peer, tmp_path, 0)
 
 
-def test_a_signal_saves_the_newest_result_and_the_whole_journal(start_node, peer, tmp_path):
+def test_a_signal_saves_the_newest_result_and_the_whole_journal(
+    start_node, peer, tmp_path
+):
     live = tmp_path / "live"
     node = start_node(*QUIET, *into("live"))  # told as a whole path
     node.wait_for_log(f"files go to {live}")
@@ -91,13 +101,17 @@ def test_a_signal_saves_the_newest_result_and_the_whole_journal(start_node, peer
     code, _ = node.stop(signal.SIGTERM)
     assert (code, "Traceback" in node.log) == (0, False), node.log
     assert f"result saved to {live}: " in node.log
-    np.testing.assert_allclose(load_result(live).T_parent_child, T_PARENT_CHILD, atol=1e-3)
+    np.testing.assert_allclose(
+        load_result(live).T_parent_child, T_PARENT_CHILD, atol=1e-3
+    )
     assert count_poses(live / "journal") == 240
     for stream, n_bytes in read_journal(live / "journal").whole_bytes.items():
         assert n_bytes == (live / "journal" / f"{stream}.tum").stat().st_size
 
 
-def test_a_disk_that_is_full_is_reported_and_the_node_goes_on(start_node, peer, tmp_path):
+def test_a_disk_that_is_full_is_reported_and_the_node_goes_on(
+    start_node, peer, tmp_path
+):
     node = start_node(*QUIET, *into(tmp_path / "out"))
     publishers = peer.publishers()
     stamps_ns, Ts_pw_p, Ts_cw_c = drive()
@@ -106,7 +120,9 @@ def test_a_disk_that_is_full_is_reported_and_the_node_goes_on(start_node, peer, 
     saved = fingerprints(tmp_path / "out")
     # No file may grow beyond so many bytes, which its log does not reach: for the node, the disk is
     # full.
-    resource.prlimit(node.process.pid, resource.RLIMIT_FSIZE, (3000, resource.RLIM_INFINITY))
+    resource.prlimit(
+        node.process.pid, resource.RLIMIT_FSIZE, (3000, resource.RLIM_INFINITY)
+    )
     answer, _ = peer.solve(publishers, stamps_ns[40:], Ts_pw_p[40:], Ts_cw_c[40:])
     assert answer.success
     peer.spin_until(lambda: not peer.trigger("save").success, "the save to fail")
@@ -115,7 +131,9 @@ def test_a_disk_that_is_full_is_reported_and_the_node_goes_on(start_node, peer, 
         "cannot write the session journal in", "no journal until ~/reset", "cannot save"
     )
     resource.prlimit(
-        node.process.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY)
+        node.process.pid,
+        resource.RLIMIT_FSIZE,
+        (resource.RLIM_INFINITY, resource.RLIM_INFINITY),
     )
     assert peer.trigger("save").success
     assert peer.trigger("reset").success
@@ -134,7 +152,9 @@ def test_a_directory_that_cannot_be_made_is_reported_and_the_node_goes_on(
     statuses = peer.diagnostics()
     name = "/calibrator: journal"
     error = "a crash would lose the session"
-    peer.spin_until(lambda: name in statuses and error in statuses[name].message, "the status")
+    peer.spin_until(
+        lambda: name in statuses and error in statuses[name].message, "the status"
+    )
     assert statuses[name].level == DiagnosticStatus.ERROR
     refused = peer.trigger("save")
     assert (refused.success, str(blocked) in refused.message) == (False, True)
@@ -162,11 +182,15 @@ def test_two_nodes_do_not_share_a_directory(start_node, peer, tmp_path):
     assert second.log == f"calibrator: {line} choose another directory\n"
     first.process.kill()
     first.wait()
-    third = start_node("-p solve_period:=0.2", *into(used))  # a node that was killed keeps nothing
+    third = start_node(
+        "-p solve_period:=0.2", *into(used)
+    )  # a node that was killed keeps nothing
     third.wait_for_log("no pose yet on /parent_odom")
 
 
-def test_participants_choose_a_directory_below_that_of_the_start_only(start_node, peer, tmp_path):
+def test_participants_choose_a_directory_below_that_of_the_start_only(
+    start_node, peer, tmp_path
+):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "link").symlink_to(tmp_path / "elsewhere")
@@ -178,16 +202,22 @@ def test_participants_choose_a_directory_below_that_of_the_start_only(start_node
     refused = peer.set_parameter("output_directory", "~nosuchuser/x")
     assert (refused.successful, "~nosuchuser/x" in refused.reason) == (False, True)
     assert peer.parameter("output_directory") == str(tmp_path / "mine")
-    assert peer.set_parameter("output_directory", str(tmp_path / "mine" / "truck")).successful
+    assert peer.set_parameter(
+        "output_directory", str(tmp_path / "mine" / "truck")
+    ).successful
     assert not list((tmp_path / "elsewhere").iterdir())
 
 
-def test_an_earlier_result_is_kept_once_and_replaced_whatever_it_is(start_node, peer, tmp_path):
+def test_an_earlier_result_is_kept_once_and_replaced_whatever_it_is(
+    start_node, peer, tmp_path
+):
     (tmp_path / "extrinsic.yaml").write_bytes(b"\xff\xfe\x00 not UTF-8")
     node = start_node(*QUIET, *into(tmp_path))
     peer.solve(peer.publishers(), *drive())
     for _ in range(2):
         assert peer.trigger("save").success
     assert node.stop()[0] == 0
-    assert (tmp_path / "previous" / "extrinsic.yaml").read_bytes().startswith(b"\xff\xfe")
+    assert (
+        (tmp_path / "previous" / "extrinsic.yaml").read_bytes().startswith(b"\xff\xfe")
+    )
     assert load_result(tmp_path).n_poses == 120

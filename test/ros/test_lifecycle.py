@@ -25,8 +25,12 @@ def service_names(peer):
     return {name for name, _ in peer.node.get_service_names_and_types()}
 
 
-def test_a_managed_node_calibrates_between_activate_and_deactivate(start_node, peer, tmp_path):
-    node = start_node("-p lifecycle:=true", "-p output_directory:=live", *RELIABLE_INPUTS)
+def test_a_managed_node_calibrates_between_activate_and_deactivate(
+    start_node, peer, tmp_path
+):
+    node = start_node(
+        "-p lifecycle:=true", "-p output_directory:=live", *RELIABLE_INPUTS
+    )
     assert label(peer) == "unconfigured"
     assert "/calibrator/solve" not in service_names(peer)
 
@@ -73,8 +77,12 @@ def test_a_managed_node_starts_a_new_session_after_a_cleanup(start_node, peer):
         peer.wait_left(*publishers)
 
 
-def test_an_option_that_cannot_be_applied_leaves_the_node_unconfigured(start_node, peer):
-    node = start_node("-p lifecycle:=true", "-p installed:=nowhere.urdf", *RELIABLE_INPUTS)
+def test_an_option_that_cannot_be_applied_leaves_the_node_unconfigured(
+    start_node, peer
+):
+    node = start_node(
+        "-p lifecycle:=true", "-p installed:=nowhere.urdf", *RELIABLE_INPUTS
+    )
     assert not change(peer, Transition.TRANSITION_CONFIGURE)
     assert label(peer) == "unconfigured"
     node.wait_for_log("the node is not configured: ")
@@ -87,7 +95,9 @@ def managed(peer, transition, wanted):
     assert label(peer) == wanted
 
 
-def test_nav2_lifecycle_manager_starts_pauses_resumes_resets_and_shuts_down(start_node, peer):
+def test_nav2_lifecycle_manager_starts_pauses_resumes_resets_and_shuts_down(
+    start_node, peer
+):
     # The requests of nav2_lifecycle_manager with bond_timeout 0, in its order, for one node.
     node = start_node("-p lifecycle:=true", *RELIABLE_INPUTS)
 

@@ -70,18 +70,27 @@ def fed(tmp_path_factory):
     """
     domain = ros_harness.free_domain()
     node = ros_harness.NodeProcess(
-        domain, tmp_path_factory.mktemp("effects") / "node.log", [*QUIET, "-p reference:=B5"]
+        domain,
+        tmp_path_factory.mktemp("effects") / "node.log",
+        [*QUIET, "-p reference:=B5"],
     )
     peer = ros_harness.Peer(domain)
     stamps_ns, Ts_pw_p, Ts_cw_c = ros_harness.drive(200)
-    noise = se3.exp(np.random.default_rng(0).normal(size=(2, 200, 6)) * np.repeat([0.01, 0.003], 3))
+    noise = se3.exp(
+        np.random.default_rng(0).normal(size=(2, 200, 6)) * np.repeat([0.01, 0.003], 3)
+    )
     publishers = peer.publishers()
     peer.wait_matched(*publishers)
     late_ns = stamps_ns + 30_000_000
-    streams = (stamps_ns, Ts_pw_p @ noise[0], "lidar"), (late_ns, Ts_cw_c @ noise[1], "camera")
+    streams = (
+        (stamps_ns, Ts_pw_p @ noise[0], "lidar"),
+        (late_ns, Ts_cw_c @ noise[1], "camera"),
+    )
     for publisher, (times_ns, Ts, frame) in zip(publishers, streams, strict=True):
         for stamp_ns, T in zip(times_ns.tolist(), Ts, strict=True):
-            publisher.publish(ros_harness.message(publisher.msg_type, stamp_ns, T, frame))
+            publisher.publish(
+                ros_harness.message(publisher.msg_type, stamp_ns, T, frame)
+            )
 
     def has_all():
         peer.with_defaults = peer.trigger("solve").message
@@ -98,7 +107,9 @@ def fed(tmp_path_factory):
 @pytest.mark.parametrize("name", CHANGES)
 def test_a_change_while_the_node_runs_changes_the_answer_and_back(fed, name):
     value, beforehand = CHANGES[name]
-    defaults = {parameter: fed.parameter(parameter) for parameter in (name, *beforehand)}
+    defaults = {
+        parameter: fed.parameter(parameter) for parameter in (name, *beforehand)
+    }
     for parameter, other in beforehand.items():
         assert fed.set_parameter(parameter, other).successful
     before = fed.trigger("solve").message if beforehand else fed.with_defaults
@@ -126,7 +137,10 @@ def type_is_used(start_node, peer, tmp_path, stream):
 
 def measures_is_used(start_node, peer, tmp_path, stream):
     start_node(*QUIET, f"-p {stream}_measures:=rotations")
-    assert peer.solve(peer.publishers(), *ros_harness.drive())[1].transform.translation.x == 0.0
+    assert (
+        peer.solve(peer.publishers(), *ros_harness.drive())[1].transform.translation.x
+        == 0.0
+    )
 
 
 def solve_period_is_used(start_node, peer, tmp_path):
@@ -151,7 +165,9 @@ def output_directory_is_used(start_node, peer, tmp_path):
 
 
 def journal_is_used(start_node, peer, tmp_path):
-    node = start_node(*QUIET, f"-p output_directory:={tmp_path / 'off'}", "-p journal:=off")
+    node = start_node(
+        *QUIET, f"-p output_directory:={tmp_path / 'off'}", "-p journal:=off"
+    )
     assert not peer.trigger("solve").success
     assert node.stop()[0] == 0
     assert not has_session(tmp_path / "off" / "journal")
@@ -185,13 +201,17 @@ def others_are_solved_together(start_node, peer, tmp_path):
 def report_is_used(start_node, peer, tmp_path):
     """The report follows after the end of the node; a replay of the journal makes it again."""
     out = tmp_path / "out"
-    node = start_node(*QUIET, "-p report:=true", f"-p output_directory:={out}", "-p scale:=none")
+    node = start_node(
+        *QUIET, "-p report:=true", f"-p output_directory:={out}", "-p scale:=none"
+    )
     with_a_gap = (poses[np.r_[0:60, 75:120]] for poses in ros_harness.drive())
     answer, _ = peer.solve(peer.publishers(), *with_a_gap)
     assert answer.success
     code, _ = node.stop()
     assert code == 0
-    node.wait_for_log("report.html follows", "wrote", "report.html\n", may_have_ended=True)
+    node.wait_for_log(
+        "report.html follows", "wrote", "report.html\n", may_have_ended=True
+    )
     page = (out / "report.html").read_text()
     assert "/parent_odom" in page
     saved = yaml.safe_load((out / "extrinsic.yaml").read_text())
@@ -218,9 +238,13 @@ def publish_tf_is_used(start_node, peer, tmp_path):
         assert peer.parameter("publish_tf") is False
         return
     assert peer.set_parameter("publish_tf", True).successful
-    peer.spin_until(lambda: peer.node.count_subscribers("/tf") == 1, "the node to look at /tf")
+    peer.spin_until(
+        lambda: peer.node.count_subscribers("/tf") == 1, "the node to look at /tf"
+    )
     assert peer.set_parameter("publish_tf", False).successful
-    peer.spin_until(lambda: peer.node.count_subscribers("/tf") == 0, "the node to stop that")
+    peer.spin_until(
+        lambda: peer.node.count_subscribers("/tf") == 0, "the node to stop that"
+    )
 
 
 def tf_is_used(start_node, peer, tmp_path, name, value, topic):
@@ -231,12 +255,16 @@ def tf_is_used(start_node, peer, tmp_path, name, value, topic):
             f"calibrator: {name} needs the message package tf2_msgs, which is not installed"
         )
         return
-    peer.spin_until(lambda: peer.node.count_subscribers(topic) == 1, f"a listener to {topic}")
+    peer.spin_until(
+        lambda: peer.node.count_subscribers(topic) == 1, f"a listener to {topic}"
+    )
 
 
 def installed_is_used(start_node, peer, tmp_path):
     node = start_node(
-        "-p solve_period:=0.2", "-p installed:=1 2 3 0 0 0", *ros_harness.RELIABLE_INPUTS
+        "-p solve_period:=0.2",
+        "-p installed:=1 2 3 0 0 0",
+        *ros_harness.RELIABLE_INPUTS,
     )
     peer.feed(peer.publishers(), *ros_harness.drive())
     node.wait_for_log("the installed transform is from 1 2 3 0 0 0")
@@ -255,7 +283,9 @@ def enabled_is_used(start_node, peer, tmp_path):
             for name in inputs
             if statuses
         ]
-        return [(row["messages"], row["poses_taken"]) for row in values] == [("10", "0")] * 2
+        return [(row["messages"], row["poses_taken"]) for row in values] == [
+            ("10", "0")
+        ] * 2
 
     peer.spin_until(ignored, "messages that are not taken")
     assert peer.set_enabled(True).success
@@ -272,7 +302,9 @@ def monitor_is_used(start_node, peer, tmp_path):
     # Its page has a button that ends the watch, and calibrates anew.
     assert peer.set_parameter("monitor", False).successful
     peer.solve(peer.publishers(), *ros_harness.drive(60))
-    peer.spin_until(lambda: "/calibrator: extrinsic" in statuses, "the state of a calibration")
+    peer.spin_until(
+        lambda: "/calibrator: extrinsic" in statuses, "the state of a calibration"
+    )
 
 
 def lifecycle_is_used(start_node, peer, tmp_path):
@@ -287,8 +319,14 @@ EFFECTS = {
     "parent_frame": partial(frame_is_used, stream="parent", text="camera in chosen: "),
     "child_frame": partial(frame_is_used, stream="child", text="chosen in lidar: "),
     **{f"{stream}_type": partial(type_is_used, stream=stream) for stream in STREAMS},
-    **{f"{stream}_measures": partial(measures_is_used, stream=stream) for stream in STREAMS},
-    **{name: partial(tf_is_used, name=name, value=value, topic=topic) for name, value, topic in TF},
+    **{
+        f"{stream}_measures": partial(measures_is_used, stream=stream)
+        for stream in STREAMS
+    },
+    **{
+        name: partial(tf_is_used, name=name, value=value, topic=topic)
+        for name, value, topic in TF
+    },
     "solve_period": solve_period_is_used,
     "output_directory": output_directory_is_used,
     "journal": journal_is_used,
@@ -370,10 +408,14 @@ LAUNCHER = [sys.executable, "-c", LAUNCH, str(ROOT / "launch" / "calibrator.laun
 def environment(prefix, **more):
     """The environment in which launch finds the package."""
     variables = (
-        os.environ | {"ROS_LOG_DIR": str(prefix / "ros_log"), "PYTHONUNBUFFERED": "1"} | more
+        os.environ
+        | {"ROS_LOG_DIR": str(prefix / "ros_log"), "PYTHONUNBUFFERED": "1"}
+        | more
     )
     for name, path in (("AMENT_PREFIX_PATH", prefix), ("PYTHONPATH", ROOT)):
-        variables[name] = os.pathsep.join(filter(None, [str(path), os.environ.get(name, "")]))
+        variables[name] = os.pathsep.join(
+            filter(None, [str(path), os.environ.get(name, "")])
+        )
     return variables
 
 
@@ -381,12 +423,21 @@ def environment(prefix, **more):
 def prefix(tmp_path):
     """An installed package, as far as launch looks."""
     pytest.importorskip("launch_ros")
-    marker = tmp_path / "share" / "ament_index" / "resource_index" / "packages" / "hand_eye_calib"
+    marker = (
+        tmp_path
+        / "share"
+        / "ament_index"
+        / "resource_index"
+        / "packages"
+        / "hand_eye_calib"
+    )
     program = tmp_path / "lib" / "hand_eye_calib" / "calibrator"
     for path in (marker, program):
         path.parent.mkdir(parents=True)
         path.touch()
-    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m hand_eye_calib calibrator "$@"\n')
+    program.write_text(
+        f'#!/bin/sh\nexec {sys.executable} -m hand_eye_calib calibrator "$@"\n'
+    )
     program.chmod(0o755)
     return tmp_path
 
@@ -422,7 +473,9 @@ def start_launch(prefix, domain, tmp_path):
 
 
 @pytest.mark.parametrize("names", TOGETHER, ids=["most", "monitor"])
-def test_every_parameter_is_an_argument_and_arrives(start_launch, peer, tmp_path, names):
+def test_every_parameter_is_an_argument_and_arrives(
+    start_launch, peer, tmp_path, names
+):
     options = {name: GIVEN[name] for name in names}
     texts = {name: text.format(folder=tmp_path) for name, (text, _) in options.items()}
     start_launch(*(f"{name}:={text}" for name, text in texts.items()))
@@ -433,7 +486,9 @@ def test_every_parameter_is_an_argument_and_arrives(start_launch, peer, tmp_path
 
 def test_what_is_not_given_is_left_to_the_parameter_file(start_launch, peer, tmp_path):
     config = tmp_path / "mine.yaml"
-    config.write_text("/**: {ros__parameters: {use_sim_time: true, method: park, scale: auto}}")
+    config.write_text(
+        "/**: {ros__parameters: {use_sim_time: true, method: park, scale: auto}}"
+    )
     start_launch(f"config_file:={config}", "scale:=2")
     assert peer.parameter("method") == "park"
     assert peer.parameter("use_sim_time") is True
@@ -451,7 +506,9 @@ TYPES = [f"{stream}_type:=nav_msgs/msg/Odometry" for stream in ("parent", "child
         ("method:=magic", "method must be one of "),
     ],
 )
-def test_a_value_that_is_not_allowed_is_refused_with_its_name(prefix, argument, message):
+def test_a_value_that_is_not_allowed_is_refused_with_its_name(
+    prefix, argument, message
+):
     """The node is not started."""
     options = dict(capture_output=True, text=True, timeout=ros_harness.PATIENCE_S)
     done = subprocess.run([*LAUNCHER, argument], env=environment(prefix), **options)
@@ -467,19 +524,33 @@ def test_the_launch_file_also_serves_the_page_and_records(start_launch, peer, tm
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PATH", f"{recorder.parent}{os.pathsep}{os.environ['PATH']}")
         log = start_launch(
-            *TYPES, "namespace:=robot1", "parent_topic:=/lidar/odom", "watch:=true", "record:=drive"
+            *TYPES,
+            "namespace:=robot1",
+            "parent_topic:=/lidar/odom",
+            "watch:=true",
+            "record:=drive",
         )
     peer.target = "/robot1/calibrator"
     assert peer.trigger("reset").success
-    ready = ("open http://", "recorded: bag record -o drive /lidar/odom /robot1/child_odom /tf")
+    ready = (
+        "open http://",
+        "recorded: bag record -o drive /lidar/odom /robot1/child_odom /tf",
+    )
     peer.spin_until(lambda: all(text in log.read_text() for text in ready), f"{ready}")
-    assert "/robot1/calibrator/extrinsic /robot1/calibrator/extrinsic_with" in log.read_text()
+    assert (
+        "/robot1/calibrator/extrinsic /robot1/calibrator/extrinsic_with"
+        in log.read_text()
+    )
 
 
 def test_name_namespace_topics_and_log_level(start_launch, peer):
     arguments = ["name:=front", "namespace:=/robot1", "parent_topic:=/lidar/odom"]
     arguments += ["other_children:=1", "child2_topic:=/rear/odom"]
-    arguments += ["publish_tf:=true", "tf_topic:=/robot1/tf", "tf_static_topic:=tf_static"]
+    arguments += [
+        "publish_tf:=true",
+        "tf_topic:=/robot1/tf",
+        "tf_static_topic:=tf_static",
+    ]
     log = start_launch(*TYPES, *arguments, "log_level:=warn")
     peer.target = "/robot1/front"
     topics = ("/lidar/odom", "/robot1/child_odom", "/rear/odom")

@@ -22,7 +22,9 @@ def parameter_file(path, **parameters):
     return f"--params-file {path}"
 
 
-def test_every_option_is_a_described_parameter_changes_are_applied_or_rejected(start_node, peer):
+def test_every_option_is_a_described_parameter_changes_are_applied_or_rejected(
+    start_node, peer
+):
     start_node("-p solve_period:=1000.0", *RELIABLE_INPUTS)
     assert set(FIELDS) <= set(peer.call(ListParameters, "list_parameters").result.names)
     (of_threshold,) = peer.describe("threshold").floating_point_range
@@ -70,7 +72,9 @@ def test_every_option_is_a_described_parameter_changes_are_applied_or_rejected(s
         ("scale", "[]", "a parameter has an unusable value, such as []"),
     ],
 )
-def test_bad_value_in_the_file_is_one_line_and_code_1(start_node, tmp_path, name, value, expected):
+def test_bad_value_in_the_file_is_one_line_and_code_1(
+    start_node, tmp_path, name, value, expected
+):
     node = start_node(parameter_file(tmp_path / "bad.yaml", **{name: value}))
     assert node.wait() == 1
     assert node.log.startswith(f"calibrator: {expected}")

@@ -33,7 +33,9 @@ def drive_over_ramps(n_poses=300, flat_s=12.0):
     return stamps_ns, disturbed(Ts_pw_p, 2, 1e-3, 7e-4), Ts_cw_c
 
 
-def test_a_contradicted_prior_withdraws_the_result_until_it_is_removed(start_node, peer, tmp_path):
+def test_a_contradicted_prior_withdraws_the_result_until_it_is_removed(
+    start_node, peer, tmp_path
+):
     directory = tmp_path / "out"
     node = start_node(
         "-p solve_period:=0.2",
@@ -51,30 +53,41 @@ def test_a_contradicted_prior_withdraws_the_result_until_it_is_removed(start_nod
     peer.feed(publishers, stamps_ns[100:], Ts_pw_p[100:], Ts_cw_c[100:])
     sentence = "the prior on z is"
     peer.spin_until(
-        lambda: sentence in statuses["/calibrator: extrinsic"].message, "the contradiction"
+        lambda: sentence in statuses["/calibrator: extrinsic"].message,
+        "the contradiction",
     )
     peer.spin_until(
         lambda: sentence in statuses["/calibrator: progress"].message, "the same advice"
     )
     answer = peer.trigger("solve")
-    assert (answer.success, answer.message.startswith("DO NOT USE: the prior on z")) == (
+    assert (
+        answer.success,
+        answer.message.startswith("DO NOT USE: the prior on z"),
+    ) == (
         False,
         True,
     )
     for name in ("extrinsic", "progress"):
         status = statuses[f"/calibrator: {name}"]
         assert status.level == status.WARN
-        assert status.message.endswith("check value, unit and sign of prior.z, or remove it")
+        assert status.message.endswith(
+            "check value, unit and sign of prior.z, or remove it"
+        )
     values = values_of(statuses["/calibrator: extrinsic"])
     assert (values["standing"], values["contradicted"]) == ("refuted", "z")
     assert json.loads(states[-1].data)["extrinsic"]["result"]["verdict"] == "DO NOT USE"
     # Who subscribes now gets no number.
     late = peer.listen(TransformStamped, "extrinsic")
-    late_with_covariance = peer.listen(PoseWithCovarianceStamped, "extrinsic_with_covariance")
+    late_with_covariance = peer.listen(
+        PoseWithCovarianceStamped, "extrinsic_with_covariance"
+    )
     late_states = peer.listen(String, "progress")
     peer.spin_until(lambda: late_states, "what is latched")
     saved = peer.trigger("save")
-    assert (saved.success, ": DO NOT USE: the prior on z is " in saved.message) == (True, True)
+    assert (saved.success, ": DO NOT USE: the prior on z is " in saved.message) == (
+        True,
+        True,
+    )
     assert load_result(directory).verdict is Verdict.DO_NOT_USE
     kept = peer.trigger("reset").message
     assert kept.startswith("all poses discarded, new session; prior.z ")
@@ -87,8 +100,12 @@ def test_a_contradicted_prior_withdraws_the_result_until_it_is_removed(start_nod
     node.wait_for_log("[WARN]", "DO NOT USE: the prior on z is")
 
 
-def test_a_prior_that_is_removed_gives_the_result_of_the_same_poses_back(start_node, peer):
-    start_node("-p solve_period:=0.2", f"-p prior.z:={WRONG_Z:.3f}+/-0.02", *RELIABLE_INPUTS)
+def test_a_prior_that_is_removed_gives_the_result_of_the_same_poses_back(
+    start_node, peer
+):
+    start_node(
+        "-p solve_period:=0.2", f"-p prior.z:={WRONG_Z:.3f}+/-0.02", *RELIABLE_INPUTS
+    )
     publishers = peer.publishers()
     statuses = peer.diagnostics()
     extrinsics = peer.listen(TransformStamped, "extrinsic")
@@ -99,6 +116,9 @@ def test_a_prior_that_is_removed_gives_the_result_of_the_same_poses_back(start_n
     peer.spin_until(lambda: standing() == "current", "the result without the prior")
 
     def is_right():
-        return extrinsics and abs(matrix(extrinsics[-1])[2, 3] - T_PARENT_CHILD[2, 3]) < 0.02
+        return (
+            extrinsics
+            and abs(matrix(extrinsics[-1])[2, 3] - T_PARENT_CHILD[2, 3]) < 0.02
+        )
 
     peer.spin_until(is_right, "the right height")

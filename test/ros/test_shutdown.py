@@ -24,7 +24,8 @@ def stopped(node, *signals):
 
 # Busy, and waiting for nothing but messages. The interpreter's own end is part of what is tested.
 @pytest.mark.parametrize(
-    ("signals", "solve_period"), [([signal.SIGINT] * 4, 0.1), ([signal.SIGTERM], 1000.0)]
+    ("signals", "solve_period"),
+    [([signal.SIGINT] * 4, 0.1), ([signal.SIGTERM], 1000.0)],
 )
 def test_signals_end_the_node_cleanly(start_node, peer, signals, solve_period):
     start = time.monotonic()
@@ -53,7 +54,9 @@ tempfile.TemporaryFile = lambda: open("/dev/full", "w+b", buffering=0)
 """
 
 
-def test_a_full_temporary_directory_costs_the_report_and_not_the_result(start_node, peer, tmp_path):
+def test_a_full_temporary_directory_costs_the_report_and_not_the_result(
+    start_node, peer, tmp_path
+):
     node = start_node(
         "-p solve_period:=1000.0", "-p report:=true", f"-p output_directory:={tmp_path}",
         *RELIABLE_INPUTS, before=FULL,
@@ -62,8 +65,12 @@ def test_a_full_temporary_directory_costs_the_report_and_not_the_result(start_no
     saved = peer.trigger("save")
     assert saved.success
     assert saved.message.startswith(f"result saved to {tmp_path}: USE")
-    assert saved.message.endswith("; report.html cannot be written: No space left on device")
-    np.testing.assert_allclose(load_result(tmp_path).T_parent_child, T_PARENT_CHILD, atol=1e-3)
+    assert saved.message.endswith(
+        "; report.html cannot be written: No space left on device"
+    )
+    np.testing.assert_allclose(
+        load_result(tmp_path).T_parent_child, T_PARENT_CHILD, atol=1e-3
+    )
     (tmp_path / "extrinsic.yaml").unlink()
     stopped(node, signal.SIGTERM)
     assert load_result(tmp_path).n_poses == 120

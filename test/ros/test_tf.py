@@ -65,7 +65,10 @@ class TestNode:
         def start():
             heard = []
             peer.node.create_subscription(
-                kind, "/tf_static", lambda message: heard.extend(message.transforms), LATCHED
+                kind,
+                "/tf_static",
+                lambda message: heard.extend(message.transforms),
+                LATCHED,
             )
             return heard
 
@@ -98,7 +101,11 @@ class TestNode:
         )  # fmt: skip
 
         def edges(transforms):
-            return [transform for transform in transforms if transform.child_frame_id == "camera"]
+            return [
+                transform
+                for transform in transforms
+                if transform.child_frame_id == "camera"
+            ]
 
         def state(name="extrinsic", key="tf_static"):
             return values_of(statuses[f"/calibrator: {name}"])[key]
@@ -131,10 +138,13 @@ class TestNode:
         assert saved.T_parent_child == pytest.approx(T)
         assert f"{saved.n_poses} poses" in answer
         document = json.loads(states[-1].data)
-        assert [document["extrinsic"]["result"]["pose"][axis] for axis in "xyz"] == pytest.approx(
-            T[:3, 3].tolist()
+        assert [
+            document["extrinsic"]["result"]["pose"][axis] for axis in "xyz"
+        ] == pytest.approx(T[:3, 3].tolist())
+        assert (document["progress"]["progress"]["done"], saved.goal.done) == (
+            True,
+            True,
         )
-        assert (document["progress"]["progress"]["done"], saved.goal.done) == (True, True)
         assert peer.trigger("reset").success
         late = listen()
         peer.spin_until(lambda: late, "the robot's edge")
@@ -161,7 +171,9 @@ class TestNode:
         standing, why = broadcaster.state
         assert standing is Broadcast.REFUSED
         assert why.startswith(f"{child} has the parent base_link on /tf_static")
-        assert f"publish_tf is refused: {child} has the parent" in capfd.readouterr().err
+        assert (
+            f"publish_tf is refused: {child} has the parent" in capfd.readouterr().err
+        )
 
     def test_a_parent_that_comes_later_ends_the_broadcast(
         self, peer, robot, listen, broadcaster, calibration, capfd
@@ -187,15 +199,25 @@ class TestNode:
         broadcaster.update(calibration, faulty)
         assert broadcaster.state == (Broadcast.WAITING, faulty)
         dofs = [*calibration.observability_measured]
-        dofs[2] = dataclasses.replace(dofs[2], verdict=DofVerdict.UNOBSERVABLE, sigma=np.inf)
-        broadcaster.update(dataclasses.replace(calibration, observability_measured=tuple(dofs)), "")
+        dofs[2] = dataclasses.replace(
+            dofs[2], verdict=DofVerdict.UNOBSERVABLE, sigma=np.inf
+        )
+        broadcaster.update(
+            dataclasses.replace(calibration, observability_measured=tuple(dofs)), ""
+        )
         assert broadcaster.state == (Broadcast.REFUSED, "z not determined")
-        broadcaster.update(dataclasses.replace(calibration, status=SolveStatus.NOT_CONVERGED), "")
+        broadcaster.update(
+            dataclasses.replace(calibration, status=SolveStatus.NOT_CONVERGED), ""
+        )
         assert broadcaster.state[0] is Broadcast.REFUSED
-        assert broadcaster.state[1].startswith("DO NOT USE: the solver did not converge")
+        assert broadcaster.state[1].startswith(
+            "DO NOT USE: the solver did not converge"
+        )
 
     @staticmethod
     def frames_of_new_listener(peer, listen, until):
         heard = listen()
-        peer.spin_until(lambda: until in {transform.child_frame_id for transform in heard}, until)
+        peer.spin_until(
+            lambda: until in {transform.child_frame_id for transform in heard}, until
+        )
         return {transform.child_frame_id for transform in heard}

@@ -53,7 +53,8 @@ class Watch:
                 [sys.executable, "-m", "hand_eye_calib", "watch", *arguments],
                 stdout=seen,
                 stderr=notes,
-                env=os.environ | {"ROS_DOMAIN_ID": str(domain), "XDG_STATE_HOME": str(directory)},
+                env=os.environ
+                | {"ROS_DOMAIN_ID": str(domain), "XDG_STATE_HOME": str(directory)},
             )
 
     def wait_for(self, pattern, file=None):

@@ -41,7 +41,9 @@ def wheel_odometry(machine):
 
 def joint_states(machine):
     messages = []
-    for stamp_ns, values in zip(machine.stamps_ns.tolist(), machine.values.tolist(), strict=True):
+    for stamp_ns, values in zip(
+        machine.stamps_ns.tolist(), machine.values.tolist(), strict=True
+    ):
         state = stamped(JointState, stamp_ns)
         state.name = [*LEFT_AND_RIGHT, "head_joint"]
         state.position = [0.0, 0.0, 0.1]
@@ -55,11 +57,19 @@ def car_states(machine):
     speed, angle = machine.values.T
     angles = np.cumsum(speed) * 0.02 * ROWS
     half_width = 0.4  # of the front axle, as a share of the wheelbase
-    both = [np.arctan(np.tan(angle) / (1 + side * half_width * np.tan(angle))) for side in (-1, 1)]
+    both = [
+        np.arctan(np.tan(angle) / (1 + side * half_width * np.tan(angle)))
+        for side in (-1, 1)
+    ]
     messages = []
     for stamp_ns, *row in zip(machine.stamps_ns.tolist(), angles, *both, strict=True):
         state = stamped(JointState, stamp_ns)
-        state.name = ["rear_left_wheel", "rear_right_wheel", "left_steering", "right_steering"]
+        state.name = [
+            "rear_left_wheel",
+            "rear_right_wheel",
+            "left_steering",
+            "right_steering",
+        ]
         state.position = [float(row[0]), *map(float, row)]
         messages.append(state)
     return messages
@@ -67,7 +77,9 @@ def car_states(machine):
 
 def twists(machine):
     messages = []
-    for stamp_ns, values in zip(machine.stamps_ns.tolist(), machine.values.tolist(), strict=True):
+    for stamp_ns, values in zip(
+        machine.stamps_ns.tolist(), machine.values.tolist(), strict=True
+    ):
         twist = stamped(TwistStamped, stamp_ns, "base_link")
         twist.twist.linear.x, twist.twist.linear.y, twist.twist.angular.z = values
         messages.append(twist)
@@ -127,7 +139,9 @@ def test_wheels_as_parent(start_node, peer, tmp_path, case):
     assert "Traceback" not in node.log
 
 
-def test_joints_without_wheels_are_answered_with_the_command_for_a_bag(start_node, peer):
+def test_joints_without_wheels_are_answered_with_the_command_for_a_bag(
+    start_node, peer
+):
     machine = machine_of("wheels", 2.0)
     node = start_node("-p parent_measures:=wheels", *RELIABLE_INPUTS)
     messages = joint_states(machine)

@@ -139,7 +139,9 @@ def correlate_rates(
     """
     if min(len(parent), len(child)) < 4:
         return Correlation()
-    step_s = float(np.clip(max(parent.interval_s, child.interval_s), _MIN_STEP_S, _MAX_STEP_S))
+    step_s = float(
+        np.clip(max(parent.interval_s, child.interval_s), _MIN_STEP_S, _MAX_STEP_S)
+    )
     step_s = max(step_s, max(parent.duration_s, child.duration_s) / _MAX_SAMPLES)
     window_s = max(_WINDOW_STEPS * step_s, _MIN_WINDOW_S)
     parent_rates = angular_rates(parent, window_s, step_s, max_gap_s, of_speed)
@@ -158,7 +160,9 @@ def correlate_rates(
     return second if second.is_clear else best
 
 
-def _shorter_s(parent_rates: FloatArray, child_rates: FloatArray, step_s: float) -> float:
+def _shorter_s(
+    parent_rates: FloatArray, child_rates: FloatArray, step_s: float
+) -> float:
     """Return the total duration (s) of finite rates, of the stream with fewer finite rates."""
     n_of_parent = np.isfinite(parent_rates).sum()
     n_of_child = np.isfinite(child_rates).sum()
@@ -177,7 +181,11 @@ def _clear_repetitions(
 
 
 def _best_correlation(
-    of_parent: FloatArray, of_child: FloatArray, start_s: float, step_s: float, window_s: float
+    of_parent: FloatArray,
+    of_child: FloatArray,
+    start_s: float,
+    step_s: float,
+    window_s: float,
 ) -> Correlation:
     """Return the best correlation of rates (M,) and (N,) over all lags.
 
@@ -219,7 +227,11 @@ def _best_correlation(
 
 
 def angular_rates(
-    trajectory: Trajectory, window_s: float, step_s: float, max_gap_s: float, of_speed: bool = False
+    trajectory: Trajectory,
+    window_s: float,
+    step_s: float,
+    max_gap_s: float,
+    of_speed: bool = False,
 ) -> FloatArray:
     """Return the mean angular rates (M,) in rad/s, or the speeds in m/s, of M windows.
 
@@ -228,13 +240,19 @@ def angular_rates(
     """
     stamps_ns = trajectory.stamps_ns
     n_windows = max(int((trajectory.duration_s - window_s) / step_s), 0)
-    starts_ns = stamps_ns[0] + np.round(np.arange(n_windows) * step_s * 1e9).astype(np.int64)
+    starts_ns = stamps_ns[0] + np.round(np.arange(n_windows) * step_s * 1e9).astype(
+        np.int64
+    )
     ends_ns = starts_ns + round(window_s * 1e9)
     before, after = np.split(trajectory.at(np.concatenate([starts_ns, ends_ns])), 2)
     if of_speed:
-        moved = np.linalg.norm(se3.translation_of(after) - se3.translation_of(before), axis=1)
+        moved = np.linalg.norm(
+            se3.translation_of(after) - se3.translation_of(before), axis=1
+        )
     else:
-        rotations = se3.relative_rotations(se3.rotation_of(before), se3.rotation_of(after))
+        rotations = se3.relative_rotations(
+            se3.rotation_of(before), se3.rotation_of(after)
+        )
         moved = se3.rotation_angle(rotations)
     rates = moved / window_s
     # Number of long gaps before each pose. A window overlaps a gap if it differs at both ends.
@@ -287,7 +305,9 @@ def _masked_correlation(
     has_variance = variance_a > 1e-9 * square_a.max(initial=0.0)
     has_variance &= variance_b > 1e-9 * square_b.max(initial=0.0)
     scale = np.sqrt(np.where(has_variance, variance_a * variance_b, 1.0))
-    ratios = np.where(has_variance, variance_b, 1.0) / np.where(has_variance, variance_a, 1.0)
+    ratios = np.where(has_variance, variance_b, 1.0) / np.where(
+        has_variance, variance_a, 1.0
+    )
     lags = np.arange(size)
     lags = np.where(lags < len(first), lags, lags - size)
     return lags, np.where(has_variance, covariance / scale, 0.0), count, ratios

@@ -203,7 +203,10 @@ def fit_similarity(
             break
     fits = fits or [problem.describe(T, scale, 0.0)]
     # The best fit has the smallest volume of residuals, measured in the smaller unit of length.
-    return min(fits, key=lambda fit: fit.sigma_translation * fit.sigma_rotation / min(fit.scale, 1))
+    return min(
+        fits,
+        key=lambda fit: fit.sigma_translation * fit.sigma_rotation / min(fit.scale, 1),
+    )
 
 
 def estimate_scale(
@@ -235,7 +238,9 @@ def estimate_scale(
     best = _best_scale(pose_pairs, first_fits)
     if not best.has_own_unit:
         return best
-    exchanged = replace(pose_pairs, Ts_pw_p=pose_pairs.Ts_cw_c, Ts_cw_c=pose_pairs.Ts_pw_p)
+    exchanged = replace(
+        pose_pairs, Ts_pw_p=pose_pairs.Ts_cw_c, Ts_cw_c=pose_pairs.Ts_pw_p
+    )
     T_child_parent = se3.inverse(best.T_parent_child)
     T_child_parent[:3, 3] /= best.scale
     start = replace(best, T_parent_child=T_child_parent, scale=1.0 / best.scale)
@@ -248,7 +253,9 @@ def estimate_scale(
 
 
 def _best_scale(
-    pose_pairs: PosePairs, first_fits: Sequence[SimilarityFit], start: SimilarityFit | None = None
+    pose_pairs: PosePairs,
+    first_fits: Sequence[SimilarityFit],
+    start: SimilarityFit | None = None,
 ) -> SimilarityFit:
     """Return the fit whose scale has the smallest relative standard deviation.
 
@@ -268,12 +275,16 @@ def _best_scale(
 
     def doubt(fit: SimilarityFit) -> float:
         relative_sigma = fit.scale_sigma / fit.scale
-        return relative_sigma + (0.0 if fit.explains_translation else fit.unexplained_translation)
+        return relative_sigma + (
+            0.0 if fit.explains_translation else fit.unexplained_translation
+        )
 
     return min(fits, key=doubt)
 
 
-def settle_scale(pose_pairs: PosePairs, option: str | float) -> tuple[float, SimilarityFit | None]:
+def settle_scale(
+    pose_pairs: PosePairs, option: str | float
+) -> tuple[float, SimilarityFit | None]:
     """Return the scale for the value of the option ``scale``, and its fit if it is estimated.
 
     Parameters
@@ -402,7 +413,10 @@ class _Problem:
     """
 
     def __init__(
-        self, pairs: MotionPairs, twists: tuple[FloatArray, FloatArray] | None, same_unit: bool
+        self,
+        pairs: MotionPairs,
+        twists: tuple[FloatArray, FloatArray] | None,
+        same_unit: bool,
     ) -> None:
         A = pairs.Ts_parenti_parentj
         B = pairs.Ts_childi_childj
@@ -464,7 +478,9 @@ class _Problem:
         rotations *= (root / sigma_rad)[:, None, None]
         return [translations, rotations], (sigma_m, sigma_rad), root
 
-    def _translation_rows(self, T: FloatArray, scale: float, offset_s: float) -> FloatArray:
+    def _translation_rows(
+        self, T: FloatArray, scale: float, offset_s: float
+    ) -> FloatArray:
         """Return derivatives and residuals (K, 3, 9) of the translations, without weights."""
         rotation = se3.rotation_of(T)
         back = rotation.T
@@ -540,7 +556,9 @@ class _Problem:
         # A step of d with constant robust weights is too short, because the weights of a block
         # change as d changes. Geman-McClure weights reduce the curvature of the cost by this share.
         pulls = (rows[:, :, _OFFSET] * rows[:, :, -1]).sum(axis=1) ** 2 / root
-        fall = pulls.sum() / (1.5 * _QUARTER_WEIGHT_SIGMAS**2) / max(weights.sum(), 1e-300)
+        fall = (
+            pulls.sum() / (1.5 * _QUARTER_WEIGHT_SIGMAS**2) / max(weights.sum(), 1e-300)
+        )
         curvature_share = float(np.clip(1.0 - fall, 0.5, 1.0))
         offsets = -blocks.sums[:, _OFFSET, -1] / np.where(weights > 0.0, weights, 1.0)
         of_translation, unexplained = self.shares(sigmas_of_residuals, scale)

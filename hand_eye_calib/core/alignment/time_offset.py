@@ -11,7 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hand_eye_calib.core.alignment.rate_correlation import Correlation, correlate_rates
-from hand_eye_calib.core.alignment.similarity import MIN_PAIRS, SimilarityFit, fit_similarity
+from hand_eye_calib.core.alignment.similarity import (
+    MIN_PAIRS,
+    SimilarityFit,
+    fit_similarity,
+)
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import InputError, NotEnoughDataError
@@ -184,7 +188,9 @@ def refine_time_offset(
         The refined offset. The coarse offset, with a large standard deviation, if no fit explains
         the motion.
     """
-    reach_s = max(_FINE_RANGE_S, _FINE_RANGE_INTERVALS * max(parent.interval_s, child.interval_s))
+    reach_s = max(
+        _FINE_RANGE_S, _FINE_RANGE_INTERVALS * max(parent.interval_s, child.interval_s)
+    )
     coarse_s = at.correlation.offset_s
     best = TimeOffset(coarse_s, reach_s / 5, at.correlation)
     offsets_s = list[float]()
@@ -265,7 +271,9 @@ def offset_over(
             if is_settled and (max_pairs > MAX_PAIRS or not rate.is_used):
                 break
     estimated_rate = rate if np.isfinite(rate.sigma_ppm) else None
-    return TimeOffset(offset_s, fit.offset_sigma_s, at.correlation, fit, rate=estimated_rate)
+    return TimeOffset(
+        offset_s, fit.offset_sigma_s, at.correlation, fit, rate=estimated_rate
+    )
 
 
 def _unknown_rate(child: Trajectory) -> ClockRate:

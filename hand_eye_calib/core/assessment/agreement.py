@@ -190,7 +190,10 @@ class _Common(NamedTuple):
 
 
 def _common(
-    Ts: FloatArray, covariances: FloatArray, usual_scatter: FloatArray, start: FloatArray
+    Ts: FloatArray,
+    covariances: FloatArray,
+    usual_scatter: FloatArray,
+    start: FloatArray,
 ) -> _Common:
     """Estimate the common extrinsic of N results of one mount.
 
@@ -294,7 +297,9 @@ def _explain(errors: FloatArray, weights: FloatArray, level: float) -> _Explanat
 
     n_results = len(errors)
     number = np.arange(n_results)
-    design = np.concatenate([np.broadcast_to(np.eye(6), weights.shape), errors[:, :, None]], axis=2)
+    design = np.concatenate(
+        [np.broadcast_to(np.eye(6), weights.shape), errors[:, :, None]], axis=2
+    )
     products = Blocks(np.swapaxes(design, 1, 2) @ weights @ design)
     ranks = Blocks(_ranks(weights))
     total_chi2, total_dof = map(float, _chi2_and_dof(products.total, ranks.total))
@@ -340,7 +345,9 @@ def _p_values_of_splits(products: Blocks, ranks: Blocks, since: IntArray) -> Flo
     group = np.concatenate([products.sums, products.since(since)])
     group_ranks = np.concatenate([ranks.sums, ranks.since(since)])
     group_chi2, group_dof = _chi2_and_dof(group, group_ranks)
-    other_chi2, other_dof = _chi2_and_dof(products.total - group, ranks.total - group_ranks)
+    other_chi2, other_dof = _chi2_and_dof(
+        products.total - group, ranks.total - group_ranks
+    )
     chi2 = group_chi2 + other_chi2
     dof = group_dof + other_dof
     gained = total_chi2 - chi2
@@ -354,7 +361,9 @@ def _p_values_of_splits(products: Blocks, ranks: Blocks, since: IntArray) -> Flo
     return p_values
 
 
-def _chi2_and_dof(products: FloatArray, ranks: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _chi2_and_dof(
+    products: FloatArray, ranks: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return chi-square and degrees of freedom of groups of errors about the mean of each group.
 
     Parameters

@@ -59,7 +59,11 @@ class Moved:
 
     def _axes_that(self, change: Change) -> list[str]:
         """Return the axes with this verdict."""
-        return [axis for axis, difference in self.axes.items() if difference.verdict == change]
+        return [
+            axis
+            for axis, difference in self.axes.items()
+            if difference.verdict == change
+        ]
 
     @property
     def sentence(self) -> str:
@@ -150,7 +154,9 @@ def moved(values: FloatArray, covariance: FloatArray, limits: FloatArray) -> Mov
         elif visible[index] <= limits[index]:
             verdict = Change.SAME
         verdicts.append(verdict)
-        axes[axis] = AxisDifference(difference, sigma, float(visible[index]), verdict.value)
+        axes[axis] = AxisDifference(
+            difference, sigma, float(visible[index]), verdict.value
+        )
     if chi2 > stats.CHI2[0.001][6]:
         return Moved(axes, Change.MOVED)
     return Moved(axes, Change.of_all(verdicts))

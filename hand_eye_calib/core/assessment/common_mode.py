@@ -93,7 +93,10 @@ def open_scale_floor(by_scale: FloatArray, scale_variance: float) -> FloatArray:
 
 
 def floor_of_pairs(
-    pairs: MotionPairs, weights: FloatArray, T_parent_child: FloatArray, speed_m_s: float
+    pairs: MotionPairs,
+    weights: FloatArray,
+    T_parent_child: FloatArray,
+    speed_m_s: float,
 ) -> FloatArray:
     """Return the floor (6, 6) of an answer that minimises the squared residuals of motion pairs.
 
@@ -114,7 +117,9 @@ def floor_of_pairs(
     by_xi, of_rotation = derivatives(pairs, rotation)
     by_log_scale = se3.translation_of(pairs.Ts_childi_childj) @ rotation.T
     residual_t, _ = pairs.residuals(T_parent_child)
-    columns = np.concatenate([by_xi, by_log_scale[:, :, None], residual_t[:, :, None]], axis=2)
+    columns = np.concatenate(
+        [by_xi, by_log_scale[:, :, None], residual_t[:, :, None]], axis=2
+    )
     weight_of_pair = weights[:, None, None]
     products = multiplied(weight_of_pair * columns, columns)
     information = products[:6, :6].copy()

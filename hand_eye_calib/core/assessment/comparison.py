@@ -67,7 +67,9 @@ def compare(
         require_type("installed", installed, Calibration, Extrinsic)
     by_name = _by_name(results, names)
     require_same_frames(
-        extrinsic for extrinsic in (*results, installed) if isinstance(extrinsic, Calibration)
+        extrinsic
+        for extrinsic in (*results, installed)
+        if isinstance(extrinsic, Calibration)
     )
     if installed is not None:
         return _comparison_with_installed(by_name, installed)
@@ -78,17 +80,23 @@ def _comparison_with_installed(
     by_name: Mapping[str, Calibration], installed: Calibration | Extrinsic
 ) -> Comparison:
     """Compare results with the installed extrinsic."""
-    differences = _differences([(("installed", installed), named) for named in by_name.items()])
+    differences = _differences(
+        [(("installed", installed), named) for named in by_name.items()]
+    )
     verdict = _verdict_of(differences)
     moved_names = tuple(
-        difference.second for difference in differences if difference.verdict == Change.MOVED
+        difference.second
+        for difference in differences
+        if difference.verdict == Change.MOVED
     )
     if len(differences) == 1:
         sentence = differences[0].sentence
     elif moved_names:
         sentence = f"moved: {listing(moved_names)} of {len(differences)}"
     else:
-        sentence = f"{verdict}: none of {len(differences)} differs from what is installed"
+        sentence = (
+            f"{verdict}: none of {len(differences)} differs from what is installed"
+        )
     return Comparison(
         sentence=sentence, verdict=verdict, moved=moved_names, differences=differences
     )
@@ -128,7 +136,9 @@ def _verdict_of(differences: Sequence[Difference]) -> str:
     return Change.of_all(verdicts).value
 
 
-def _by_name(results: Sequence[Calibration], names: Sequence[str] | None) -> dict[str, Calibration]:
+def _by_name(
+    results: Sequence[Calibration], names: Sequence[str] | None
+) -> dict[str, Calibration]:
     """Return results by name: ``result 1``, ``result 2`` and so on if no names are provided."""
     if not names:
         names = [f"result {number}" for number in range(1, len(results) + 1)]
@@ -154,15 +164,22 @@ def _moved_results(
         for difference in differences
         if difference.verdict == Change.MOVED
     ]
-    return (), f"moved: {'; '.join(couples)} differ; they do not show which of them has moved"
+    return (
+        (),
+        f"moved: {'; '.join(couples)} differ; they do not show which of them has moved",
+    )
 
 
-def with_comparison(result: Calibration, installed: Calibration | Extrinsic) -> Calibration:
+def with_comparison(
+    result: Calibration, installed: Calibration | Extrinsic
+) -> Calibration:
     """Return a copy of a result that contains its comparison with the installed extrinsic."""
     origin = "a result" if isinstance(installed, Calibration) else installed.origin
     values = by_axis(xyz_rpy(installed.T_parent_child))
     comparison = compare([result], installed, ["result"])
-    return replace(result, comparison=replace(comparison, installed=origin, values=values))
+    return replace(
+        result, comparison=replace(comparison, installed=origin, values=values)
+    )
 
 
 def _difference(first: _Named, second: tuple[str, Calibration]) -> Difference:
@@ -209,7 +226,9 @@ def _covariances(extrinsic: Calibration | Extrinsic) -> FloatArray:
     if np.isfinite(measured).all():
         covariance = turned(rotation, measured)
     if isinstance(extrinsic, Calibration):
-        is_hidden = [dof.verdict is DofVerdict.UNOBSERVABLE for dof in extrinsic.observability]
+        is_hidden = [
+            dof.verdict is DofVerdict.UNOBSERVABLE for dof in extrinsic.observability
+        ]
         covariance = covariance + np.diag(np.where(is_hidden, UNKNOWN**2, 0.0))
     scatter = np.zeros((6, 6))
     if _is_from_motion(extrinsic):
@@ -217,7 +236,9 @@ def _covariances(extrinsic: Calibration | Extrinsic) -> FloatArray:
     return np.array([covariance, scatter, allowance])
 
 
-def agreement_of_results(results: Sequence[Calibration], level: float = 0.01) -> Agreement:
+def agreement_of_results(
+    results: Sequence[Calibration], level: float = 0.01
+) -> Agreement:
     """Test whether the results of several recordings of one rig agree.
 
     ``results`` are in the order of time. ``level`` is the significance level of

@@ -124,7 +124,9 @@ class Assessment:
 
 
 def assess(
-    pairs: MotionPairs, solution: Solution, solve_without: Callable[[BoolArray], FloatArray]
+    pairs: MotionPairs,
+    solution: Solution,
+    solve_without: Callable[[BoolArray], FloatArray],
 ) -> Assessment:
     """Assess the solution of K motion pairs.
 
@@ -152,7 +154,9 @@ def assess(
 def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assessment:
     """Assess a solution of the adaptive estimator for these poses."""
     T_parent_child = solution.T_parent_child
-    covariance = widened_by_blocks(solution.cov_parent_child_in_child, solution, slice(0, 6))
+    covariance = widened_by_blocks(
+        solution.cov_parent_child_in_child, solution, slice(0, 6)
+    )
     least_share = _MIN_SHARE
     if not solution.is_noise_dominated:
         # Rotations exceed the noise of single poses. The solution then includes an estimate of the
@@ -185,7 +189,11 @@ def assess_rotation(Ts_pw_p: FloatArray, solution: AdaptiveSolution) -> Assessme
     model = solution.cov_parent_child_in_child[part, part]
     covariance = np.zeros((6, 6))
     covariance[part, part] = widened_by_blocks(model, solution, part)
-    unseen = [phi for phi in solution.unseen[part].T if np.linalg.norm(phi) > _SHARE_OF_ROTATION]
+    unseen = [
+        phi
+        for phi in solution.unseen[part].T
+        if np.linalg.norm(phi) > _SHARE_OF_ROTATION
+    ]
     lone_axes = _hidden_by_noise(
         Ts_pw_p, solution.T_parent_child, solution.jumps, solution.rotation_variance
     )
@@ -250,7 +258,9 @@ def _white_rotation_variance(rotations: FloatArray) -> float:
     return float(two_smallest.mean())
 
 
-def widened_by_blocks(covariance: FloatArray, solution: ModelSolution, part: slice) -> FloatArray:
+def widened_by_blocks(
+    covariance: FloatArray, solution: ModelSolution, part: slice
+) -> FloatArray:
     """Widen the model's covariance of a part of xi to the scatter of blocks.
 
     All directions share one factor, the mean of their variance ratios: the ratio of a single
@@ -339,7 +349,9 @@ def _larger(model: FloatArray, resampled: FloatArray) -> FloatArray:
     return (raised * np.maximum(ratios, 1.0)) @ raised.T
 
 
-def combined(T_parent_child: FloatArray, covariance: FloatArray, unknown: FloatArray) -> Assessment:
+def combined(
+    T_parent_child: FloatArray, covariance: FloatArray, unknown: FloatArray
+) -> Assessment:
     """Assess a result from its covariance and the directions that the motion does not reveal.
 
     Parameters
@@ -380,7 +392,9 @@ def without_direction(assessment: Assessment, axis: FloatArray) -> Assessment:
     """Return an assessment in which a lever arm along an axis (3,) of the parent is unknown."""
     # The direction of an unobservable translation is this axis already. A second, slightly
     # different direction would make another axis unobservable.
-    if any(dof.verdict is DofVerdict.UNOBSERVABLE for dof in assessment.observability[:3]):
+    if any(
+        dof.verdict is DofVerdict.UNOBSERVABLE for dof in assessment.observability[:3]
+    ):
         return assessment
     in_child = se3.rotation_of(assessment.T_parent_child).T @ axis
     return _without(assessment, _translations(in_child[None]).T)
@@ -388,15 +402,21 @@ def without_direction(assessment: Assessment, axis: FloatArray) -> Assessment:
 
 def _without(assessment: Assessment, unknown: FloatArray) -> Assessment:
     """Return an assessment in which directions (6, U) of the child are unknown, too."""
-    hidden = combined(assessment.T_parent_child, assessment.cov_parent_child_in_child, unknown)
+    hidden = combined(
+        assessment.T_parent_child, assessment.cov_parent_child_in_child, unknown
+    )
     observability = tuple(
         before if before.verdict is DofVerdict.UNOBSERVABLE else after
-        for before, after in zip(assessment.observability, hidden.observability, strict=True)
+        for before, after in zip(
+            assessment.observability, hidden.observability, strict=True
+        )
     )
     return replace(hidden, observability=observability)
 
 
-def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray, FloatArray]:
+def model_covariance(
+    pairs: MotionPairs, solution: Solution
+) -> tuple[FloatArray, FloatArray]:
     """Return the covariance (6, 6) for independent errors of the pairs, and the unknown directions.
 
     The cost is ``|r_t|^2 + 2 |r_R|^2`` with the residual translation r_t and the residual rotation
@@ -416,7 +436,9 @@ def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray
     cov_r = (weights[:, None] * residual_r).T @ residual_r / n_effective
     variance_r = np.trace(cov_r) / 3
 
-    jacobian_t, jacobian_r = derivatives(pairs, se3.rotation_of(solution.T_parent_child))
+    jacobian_t, jacobian_r = derivatives(
+        pairs, se3.rotation_of(solution.T_parent_child)
+    )
     weight_of_pair = weights[:, None, None]
     information_t = multiplied(weight_of_pair * jacobian_t, jacobian_t)
     information_r = np.zeros((6, 6))
@@ -437,7 +459,9 @@ def model_covariance(pairs: MotionPairs, solution: Solution) -> tuple[FloatArray
     return covariance, basis([*_translations(hidden), *unseen])
 
 
-def derivatives(pairs: MotionPairs, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
+def derivatives(
+    pairs: MotionPairs, rotation: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Derivatives of the residuals of motion pairs.
 
     Returns
@@ -456,7 +480,9 @@ def derivatives(pairs: MotionPairs, rotation: FloatArray) -> tuple[FloatArray, F
     return of_translation, child_chords
 
 
-def lever_arm_products(chords: FloatArray, weights: FloatArray | None = None) -> FloatArray:
+def lever_arm_products(
+    chords: FloatArray, weights: FloatArray | None = None
+) -> FloatArray:
     """Return S (3, 3), the weighted mean product of the chords of motions.
 
     Parameters
@@ -502,7 +528,9 @@ def _hidden_directions(
     return directions[:, powers < least_powers]
 
 
-def hidden_axes(products: FloatArray, cov_rotation: FloatArray | None = None) -> tuple[str, ...]:
+def hidden_axes(
+    products: FloatArray, cov_rotation: FloatArray | None = None
+) -> tuple[str, ...]:
     """Return the names of the axes x, y, z that lie too far in hidden directions.
 
     Parameters

@@ -100,7 +100,9 @@ def scatter_of_recordings(covariance: FloatArray) -> FloatArray:
     return np.diag(sigmas**2)
 
 
-def shift_covariance(metres: float = _SHIFT_M, radians: float = _SHIFT_RAD) -> FloatArray:
+def shift_covariance(
+    metres: float = _SHIFT_M, radians: float = _SHIFT_RAD
+) -> FloatArray:
     """Return the prior covariance L (6, 6) of shifts, from standard deviations per axis."""
     variances = np.repeat([metres**2, radians**2], 3)
     return np.diag(variances)
@@ -157,7 +159,9 @@ def squares_about(tables: FloatArray, shifts: FloatArray, ridge: float) -> Float
     """
     H = information(tables)
     scores = score(tables) - se3.times(H, shifts)
-    return np.asarray((scores * _solve(H + ridge * SHIFT_INFORMATION, scores)).sum(axis=-1))
+    return np.asarray(
+        (scores * _solve(H + ridge * SHIFT_INFORMATION, scores)).sum(axis=-1)
+    )
 
 
 # ---------------------------------------------------------------- within a recording
@@ -195,7 +199,9 @@ def residuals_and_jacobians(
     e with respect to X0, and the negative derivative with respect to the true extrinsic.
     """
     Bs_inverse = se3.inverse(pairs.Ts_childi_childj)
-    Bs_predicted = se3.inverse(T_parent_child) @ pairs.Ts_parenti_parentj @ T_parent_child
+    Bs_predicted = (
+        se3.inverse(T_parent_child) @ pairs.Ts_parenti_parentj @ T_parent_child
+    )
     return se3.log(Bs_inverse @ Bs_predicted), np.eye(6) - se3.adjoint(Bs_inverse)
 
 
@@ -227,17 +233,23 @@ def noise_covariance(residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     The second result are the robust weights (K,) of the residuals: 1 on average, small for jumps.
     """
-    sigmas = np.repeat([stats.robust_sigma(part) for part in np.split(residuals, 2, axis=1)], 3)
+    sigmas = np.repeat(
+        [stats.robust_sigma(part) for part in np.split(residuals, 2, axis=1)], 3
+    )
     covariance = np.diag(np.maximum(sigmas, _MIN_SIGMAS) ** 2)
     for _ in range(_NOISE_ITERATIONS):
-        squared = np.einsum("ki,ki->k", residuals @ np.linalg.inv(covariance), residuals)
+        squared = np.einsum(
+            "ki,ki->k", residuals @ np.linalg.inv(covariance), residuals
+        )
         weights = stats.robust_weights("student", squared)
         scatter = (weights[:, None] * residuals).T @ residuals / len(residuals)
         covariance = scatter + np.diag(_MIN_SIGMAS**2)
     return covariance, weights
 
 
-def find_change(pose_pairs: PosePairs, T_parent_child: FloatArray) -> MountChange | None:
+def find_change(
+    pose_pairs: PosePairs, T_parent_child: FloatArray
+) -> MountChange | None:
     """Return the most likely shift of the mount within a recording.
 
     The shift is tested at the start of every second, except near both ends. A ratio below
@@ -256,7 +268,9 @@ def find_change(pose_pairs: PosePairs, T_parent_child: FloatArray) -> MountChang
     long_run = _worst_long_run_variance(blocks)
     if long_run is None:
         return None
-    shifts = blocks.shift_since(np.arange(1, n_blocks), _PRIOR_SHARE * SHIFT_INFORMATION)
+    shifts = blocks.shift_since(
+        np.arange(1, n_blocks), _PRIOR_SHARE * SHIFT_INFORMATION
+    )
     ratios = log_ratio(shifts / long_run)
     n_edge = max(int(n_blocks * _MIN_WINDOWS_PER_SIDE / max(_WINDOW_COUNTS)), 1)
     ratios[: n_edge - 1] = -np.inf
@@ -295,7 +309,9 @@ def _worst_long_run_variance(blocks: Blocks) -> float | None:
     The ratio is at least 1. ``blocks`` has ``[H S]`` of each second. Returns None if there are too
     few seconds.
     """
-    counts = [count for count in _WINDOW_COUNTS if len(blocks.sums) >= count * _MIN_WINDOW_S]
+    counts = [
+        count for count in _WINDOW_COUNTS if len(blocks.sums) >= count * _MIN_WINDOW_S
+    ]
     if not counts:
         return None
     return max(1.0, *(_long_run_variance(blocks.merged(count)) for count in counts))
@@ -318,7 +334,9 @@ def _long_run_variance(windows: Blocks) -> float:
     answers = estimates[row_of_cut, side_of_window]
     traces = np.trace(information(windows.sums), axis1=1, axis2=2)
     has_evidence = traces > 0
-    squares = squares_about(windows.sums[has_evidence], answers[:, has_evidence], _PRIOR_SHARE)
+    squares = squares_about(
+        windows.sums[has_evidence], answers[:, has_evidence], _PRIOR_SHARE
+    )
     # Each window has six values; the two estimates use up twelve.
     dof = max(6 * int(has_evidence.sum()) - 12, 1)
     return float(squares.sum(axis=1).min()) / dof
@@ -350,7 +368,9 @@ def evidence_by_second(
     return starts_ns, Blocks.gathered(tables, block_of_pair, n_blocks)
 
 
-def possible_shift(products: FloatArray, misfit: float) -> tuple[FloatArray, tuple[str, ...]]:
+def possible_shift(
+    products: FloatArray, misfit: float
+) -> tuple[FloatArray, tuple[str, ...]]:
     """Return the covariance that a possible shift of the mount adds, and a warning.
 
     The estimates before and after each possible time are compared under the noise model. The
@@ -380,7 +400,9 @@ def possible_shift(products: FloatArray, misfit: float) -> tuple[FloatArray, tup
     is_complete = before.is_complete & after.is_complete
     if not is_complete.any():
         return np.zeros((6, 6)), ()
-    covariances = max(misfit, 1.0) * (before.covariance + after.covariance)[is_complete, :6, :6]
+    covariances = (
+        max(misfit, 1.0) * (before.covariance + after.covariance)[is_complete, :6, :6]
+    )
     steps = (after.step - before.step)[is_complete, :6]
     tables = answer_evidence(steps, covariances)
     ratios = log_ratio(tables)
@@ -414,6 +436,8 @@ def _probability(log_ratios: FloatArray) -> float:
     """Return the probability of a shift at any of several times with these likelihood ratios."""
     most = log_ratios.max()
     log_odds = most + np.log(
-        np.exp(log_ratios - most).mean() * _PRIOR_PROBABILITY / (1.0 - _PRIOR_PROBABILITY)
+        np.exp(log_ratios - most).mean()
+        * _PRIOR_PROBABILITY
+        / (1.0 - _PRIOR_PROBABILITY)
     )
     return float(np.exp(-np.logaddexp(0.0, -log_odds)))

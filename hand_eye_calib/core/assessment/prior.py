@@ -227,7 +227,9 @@ def _weighted(T: FloatArray, prior: Prior) -> FloatArray:
         for axis, angle in angles.items():
             # The phase of a complex number is between -pi and pi.
             errors[axis] = np.angle(np.exp(1j * (rpy[axis] - angle)))
-    return np.array([errors[axis] / max(sigma, _SMALL) for axis, (_, sigma) in prior.items()])
+    return np.array(
+        [errors[axis] / max(sigma, _SMALL) for axis, (_, sigma) in prior.items()]
+    )
 
 
 def _contradictions(assessment: Assessment, prior: Prior) -> dict[str, float]:

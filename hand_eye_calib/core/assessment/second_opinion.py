@@ -15,7 +15,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hand_eye_calib.core.assessment.covariance import Assessment, combined, model_covariance
+from hand_eye_calib.core.assessment.covariance import (
+    Assessment,
+    combined,
+    model_covariance,
+)
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.stats import medians
 from hand_eye_calib.core.geometry import se3
@@ -59,7 +63,9 @@ def second_opinions(
 def assess_robust(pairs: MotionPairs, solution: RobustSolution) -> Assessment:
     """Return the standard deviations and unknown directions of a robust solution."""
     _, unknown = model_covariance(pairs, solution)
-    return combined(solution.T_parent_child, solution.cov_parent_child_in_child, unknown)
+    return combined(
+        solution.T_parent_child, solution.cov_parent_child_in_child, unknown
+    )
 
 
 def excess_covariance(answer: Assessment, opinions: Sequence[Assessment]) -> FloatArray:
@@ -87,6 +93,8 @@ def excess_covariance(answer: Assessment, opinions: Sequence[Assessment]) -> Flo
         difference = se3.deviation(opinion.T_parent_child, answer.T_parent_child)
         expected = np.maximum(opinion.sigmas**2 - sigmas**2, 0.0)
         is_comparable = opinion.sigmas < _MAX_SIGMA_RATIO * sigmas
-        excesses.append(np.where(is_comparable, np.maximum(difference**2 - expected, 0.0), 0.0))
+        excesses.append(
+            np.where(is_comparable, np.maximum(difference**2 - expected, 0.0), 0.0)
+        )
     variances = medians(np.array(excesses).T)
     return se3.turned(se3.rotation_of(answer.T_parent_child).T, np.diag(variances))

@@ -27,4 +27,6 @@ def floats(name: str, values: ArrayLike, columns: int = 0) -> FloatArray:
         return array.reshape(-1, columns) if columns else array
     except (TypeError, ValueError):
         shape = f" of shape (N, {columns})" if columns else ""
-        raise InputError(f"{name} must be numbers{shape}; got {type(values).__name__}") from None
+        raise InputError(
+            f"{name} must be numbers{shape}; got {type(values).__name__}"
+        ) from None

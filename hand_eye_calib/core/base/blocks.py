@@ -36,7 +36,9 @@ class Blocks:
     sums: FloatArray
 
     @classmethod
-    def of_rows(cls, rows: FloatArray, n_blocks: int, probes: FloatArray | None = None) -> "Blocks":
+    def of_rows(
+        cls, rows: FloatArray, n_blocks: int, probes: FloatArray | None = None
+    ) -> "Blocks":
         """Return the tables of weighted rows ``W^(1/2) [J y]`` (K, d, p + 1) in equal blocks.
 
         ``probes`` (K, d, p + 1), if any, are instrumental variables: they replace the left factor
@@ -47,11 +49,15 @@ class Blocks:
         right_factors = np.array_split(rows, n_blocks)
         tables = []
         for left_rows, right_rows in zip(left_factors, right_factors, strict=True):
-            tables.append(left_rows.reshape(-1, n_columns).T @ right_rows.reshape(-1, n_columns))
+            tables.append(
+                left_rows.reshape(-1, n_columns).T @ right_rows.reshape(-1, n_columns)
+            )
         return cls(np.stack(tables))
 
     @classmethod
-    def gathered(cls, values: FloatArray, block_of: IntArray, n_blocks: int) -> "Blocks":
+    def gathered(
+        cls, values: FloatArray, block_of: IntArray, n_blocks: int
+    ) -> "Blocks":
         """Return the sums of values (K, ...) over blocks.
 
         ``block_of`` (K,) is the index of the block of each value.
@@ -133,7 +139,9 @@ def answer_evidence(answers: FloatArray, covariances: FloatArray) -> FloatArray:
     return np.concatenate([H, H @ answers[..., None]], axis=-1)
 
 
-def shift_evidence(tables: FloatArray, before: FloatArray, covariance: FloatArray) -> FloatArray:
+def shift_evidence(
+    tables: FloatArray, before: FloatArray, covariance: FloatArray
+) -> FloatArray:
     """Return information and score ``[H S]`` (..., p, p + 1) of a shift of the unknowns.
 
     Parameters

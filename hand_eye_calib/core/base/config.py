@@ -17,8 +17,27 @@ from hand_eye_calib.core.base.registry import LIVE_READINGS, MEASURES
 TRAJECTORY_FORMATS = ("tum", "kitti", "euroc", "csv")
 # The same names as in formats/layouts.yaml.
 EXPORT_FORMATS = (
-    *("autoware", "fast_lio", "fast_livo2", "lio_sam", "kalibr", "openvins", "vins", "orbslam3"),
-    *("apollo", "dlio", "glim", "msa", "px4", "kitti", "nuscenes", "colmap", "driveworks"),
+    *(
+        "autoware",
+        "fast_lio",
+        "fast_livo2",
+        "lio_sam",
+        "kalibr",
+        "openvins",
+        "vins",
+        "orbslam3",
+    ),
+    *(
+        "apollo",
+        "dlio",
+        "glim",
+        "msa",
+        "px4",
+        "kitti",
+        "nuscenes",
+        "colmap",
+        "driveworks",
+    ),
     *("easy_handeye2", "opencv", "numpy"),
 )
 #: Files of a robot description and of a launch, beside the formats of other programs.
@@ -28,8 +47,15 @@ STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 POSE_TYPES = (
     "auto",
     "nav_msgs/msg/Odometry",
-    *(f"geometry_msgs/msg/{name}Stamped" for name in ("Pose", "PoseWithCovariance", "Transform")),
-    *("sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix", "geometry_msgs/msg/PointStamped"),
+    *(
+        f"geometry_msgs/msg/{name}Stamped"
+        for name in ("Pose", "PoseWithCovariance", "Transform")
+    ),
+    *(
+        "sensor_msgs/msg/Imu",
+        "sensor_msgs/msg/NavSatFix",
+        "geometry_msgs/msg/PointStamped",
+    ),
 )
 
 BACKENDS = ("fast", "ipopt")
@@ -79,7 +105,8 @@ def require_backend(method: str, backend: str) -> None:
 def _both(default: str, doc: str, **settings: Any) -> dict[str, Any]:
     """Return one option for each stream; its name replaces {} in the help text ``doc``."""
     return {
-        stream: option(default, doc.format(stream), **settings) for stream in ("parent", "child")
+        stream: option(default, doc.format(stream), **settings)
+        for stream in ("parent", "child")
     }
 
 
@@ -201,7 +228,9 @@ class CalibratorConfig(OptionSet):
         within=(0.0, 1.0),
     )
     min_pairs: int = option(
-        10, "Smallest number of synchronised pose pairs to solve with.", within=(3, 1_000_000)
+        10,
+        "Smallest number of synchronised pose pairs to solve with.",
+        within=(3, 1_000_000),
     )
     max_pairs: int = option(
         5000,
@@ -302,10 +331,14 @@ class CalibratorConfig(OptionSet):
         parse=text.parse_targets,
     )
     parent_frame: str = option(
-        "", "Name of the parent sensor's frame. Empty for the name in the messages.", read_only=True
+        "",
+        "Name of the parent sensor's frame. Empty for the name in the messages.",
+        read_only=True,
     )
     child_frame: str = option(
-        "", "Name of the child sensor's frame. Empty for the name in the messages.", read_only=True
+        "",
+        "Name of the child sensor's frame. Empty for the name in the messages.",
+        read_only=True,
     )
 
     def is_known(self, name: str) -> bool:
@@ -341,7 +374,11 @@ class CalibratorConfig(OptionSet):
         if len(kinds) == 1 and not (reasons and len(partial) == 2):
             self._require_order()
             return kinds.pop()
-        reason = reasons[0] if reasons else "these kinds of streams cannot be calibrated together"
+        reason = (
+            reasons[0]
+            if reasons
+            else "these kinds of streams cannot be calibrated together"
+        )
         raise ConfigError(
             f"{reason}; the parent measures {self.parent_measures}, the child {self.child_measures}"
         )
@@ -371,7 +408,9 @@ class CalibratorConfig(OptionSet):
         """Target standard deviations (6,) of x, y, z (m), roll, pitch and yaw (rad)."""
         single = text.parse_targets("target.axes", self.target_axes)
         of_unit = {"m": self.target_translation, "rad": self.target_rotation}
-        return tuple(single.get(axis, of_unit[unit]) for axis, unit in text.AXIS_UNITS.items())
+        return tuple(
+            single.get(axis, of_unit[unit]) for axis, unit in text.AXIS_UNITS.items()
+        )
 
     def prior(self) -> dict[str, tuple[float, float]]:
         """Return the prior: (value, standard deviation) in m or rad, by the name of the axis."""
@@ -401,7 +440,9 @@ def defaults_of(names: Iterable[str]) -> dict[str, Any]:
 class NodeConfig(OptionSet):
     """Options that only the node has, besides those of the engine."""
 
-    solve_period: float = option(2.0, "Time between solves.", unit="s", within=(0.05, 3600.0))
+    solve_period: float = option(
+        2.0, "Time between solves.", unit="s", within=(0.05, 3600.0)
+    )
     parent_type: str = _TYPE["parent"]
     child_type: str = _TYPE["child"]
     other_children: int = option(
@@ -429,7 +470,9 @@ class NodeConfig(OptionSet):
         read_only=True,
     )
     enabled: bool = option(
-        True, "Accept poses from the start; false waits for ~/set_enabled.", read_only=True
+        True,
+        "Accept poses from the start; false waits for ~/set_enabled.",
+        read_only=True,
     )
     report: bool = option(
         True,

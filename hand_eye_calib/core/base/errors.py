@@ -78,7 +78,9 @@ def require_type(name: str, value: object, *kinds: type) -> None:
     """Raise InputError if an argument of the Python interface is of none of these types."""
     if not isinstance(value, kinds):
         expected = " or ".join(kind.__name__ for kind in kinds)
-        raise InputError(f"{name} must be of type {expected}; got {type(value).__name__}")
+        raise InputError(
+            f"{name} must be of type {expected}; got {type(value).__name__}"
+        )
 
 
 @contextmanager

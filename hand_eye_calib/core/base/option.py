@@ -18,7 +18,12 @@ OptionField: TypeAlias = dataclasses.Field[Any]
 LARGEST_INT = 1 << 63
 
 _GROUPS = ("keyframe", "prior", "target")
-_TYPE_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+_TYPE_NAMES = {
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "a text",
+}
 
 
 def options_in_words(options: Options) -> str:
@@ -106,7 +111,9 @@ def check_value(field: OptionField, value: object) -> OptionValue:
         value = _as_float(value, has_words=bool(words))
     if type(value) is not kind or not isinstance(value, bool | int | float):
         hint = did_you_mean(str(value), words)
-        raise ConfigError(f"{name} must be {_expected(field)}; got {shown_value(value)}{hint}")
+        raise ConfigError(
+            f"{name} must be {_expected(field)}; got {shown_value(value)}{hint}"
+        )
     return _checked_number(field, value)
 
 
@@ -119,7 +126,9 @@ def _expected(field: OptionField) -> str:
     """Return the type and the unit of an option, for messages."""
     words = field.metadata["words"]
     unit = field.metadata["unit"]
-    expected = f"{' or '.join(words)} or a number" if words else _TYPE_NAMES[_type_of(field)]
+    expected = (
+        f"{' or '.join(words)} or a number" if words else _TYPE_NAMES[_type_of(field)]
+    )
     if option_name(field).startswith("prior."):
         return f"{expected} with its standard deviation, such as '1.85+/-0.02'"
     return f"{expected} in {unit}" if unit else expected
@@ -160,7 +169,9 @@ def _checked_number(field: OptionField, value: float) -> float:
     if not low <= value <= high:
         bound = f"at least {low}" if value < low else f"at most {high}"
         unit = field.metadata["unit"]
-        raise ConfigError(f"{name} must be {' '.join([bound, unit]).rstrip()}; got {value}")
+        raise ConfigError(
+            f"{name} must be {' '.join([bound, unit]).rstrip()}; got {value}"
+        )
     return value
 
 
@@ -172,7 +183,9 @@ class OptionSet:
 
     def __post_init__(self, _: object = None) -> None:
         for field in dataclasses.fields(self):
-            object.__setattr__(self, field.name, check_value(field, getattr(self, field.name)))
+            object.__setattr__(
+                self, field.name, check_value(field, getattr(self, field.name))
+            )
 
     @classmethod
     def by_name(cls) -> dict[str, OptionField]:
@@ -199,4 +212,6 @@ class OptionSet:
 
     def to_options(self) -> dict[str, OptionValue]:
         """Return the values of all options by their public names."""
-        return {name: getattr(self, field.name) for name, field in self.by_name().items()}
+        return {
+            name: getattr(self, field.name) for name, field in self.by_name().items()
+        }

@@ -33,7 +33,9 @@ class Registry(dict[str, Entry]):
 
     def __missing__(self, name: str) -> Entry:
         names = ", ".join(self) or "none"
-        raise ConfigError(f"unknown {self._noun} {name!r}; this installation has: {names}")
+        raise ConfigError(
+            f"unknown {self._noun} {name!r}; this installation has: {names}"
+        )
 
 
 class Command(NamedTuple):
@@ -140,7 +142,9 @@ EXTRA_RULES: Registry[ExtraRule] = Registry("rule")
 RESULT_PARTS: Registry[Callable[[], Any]] = Registry("part of a result")
 
 #: Functions ``examine(result, snapshot)`` that return the result of a solve with a further part.
-RESULT_EXAMINATIONS: Registry[Callable[[Any, Any], Any]] = Registry("examination of results")
+RESULT_EXAMINATIONS: Registry[Callable[[Any, Any], Any]] = Registry(
+    "examination of results"
+)
 
 #: Modules of the public names of the extras.
 PUBLIC_NAMES: Registry[str] = Registry("public name")

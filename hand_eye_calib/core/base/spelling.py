@@ -95,7 +95,9 @@ def _is_value(name: str, text: str) -> bool:
         return name not in _CHOICES or text in _CHOICES[name]
     field = _FIELDS[name]
     is_text = isinstance(field.default, str)
-    if is_text and not any(field.metadata[form] for form in ("parse", "choices", "words")):
+    if is_text and not any(
+        field.metadata[form] for form in ("parse", "choices", "words")
+    ):
         # Any text may be the name of a frame.
         return False
     value: float | str = text

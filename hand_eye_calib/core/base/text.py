@@ -34,7 +34,9 @@ def length(metres: float) -> str:
     return f"{two_digits(factor * metres)} {unit}"
 
 
-def _suitable_unit(size: float, units: Iterable[tuple[float, str, int]]) -> tuple[str, int]:
+def _suitable_unit(
+    size: float, units: Iterable[tuple[float, str, int]]
+) -> tuple[str, int]:
     """Return the name and factor of the first unit that is suitable for a size."""
     return next((name, factor) for largest, name, factor in units if not size > largest)
 
@@ -57,7 +59,9 @@ def amount_beside(axis: str, value: float, other: float) -> str:
     if text != amount(axis, other) or value == other or not math.isfinite(value):
         return text
     *_, unit = text.split(" ")
-    factors = {name: factor for _, name, factor in _LENGTHS} | {"deg": math.degrees(1.0)}
+    factors = {name: factor for _, name, factor in _LENGTHS} | {
+        "deg": math.degrees(1.0)
+    }
     for decimals in range(_MAX_DECIMALS):
         number = f"{factors[unit] * value:.{decimals}f}"
         other_number = f"{factors[unit] * other:.{decimals}f}"
@@ -204,10 +208,17 @@ def counted(count: int, noun: str) -> str:
 # Largest number of characters of a value in a message.
 _MAX_CHARACTERS = 80
 
-AXIS_UNITS = dict.fromkeys(("x", "y", "z"), "m") | dict.fromkeys(("roll", "pitch", "yaw"), "rad")
+AXIS_UNITS = dict.fromkeys(("x", "y", "z"), "m") | dict.fromkeys(
+    ("roll", "pitch", "yaw"), "rad"
+)
 # Factors from the units that a user may type to m or rad.
-_IN_SI = {"m": {"m": 1.0, "cm": 0.01, "mm": 0.001}, "rad": {"rad": 1.0, "deg": math.pi / 180}}
-_QUANTITY = re.compile(r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)(m|cm|mm|rad|deg)?")
+_IN_SI = {
+    "m": {"m": 1.0, "cm": 0.01, "mm": 0.001},
+    "rad": {"rad": 1.0, "deg": math.pi / 180},
+}
+_QUANTITY = re.compile(
+    r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)(m|cm|mm|rad|deg)?"
+)
 
 # Largest length (m) or angle (rad) that a user may type, so that squares do not overflow.
 _MAX_TYPED = 1e6
@@ -325,7 +336,9 @@ def parse_targets(name: str, text: str) -> dict[str, float]:
                 f"{name} takes AXIS=TARGET of {', '.join(AXIS_UNITS)}, once each, such as z=10cm "
                 f"yaw=0.5deg; got {shown_value(word)}"
             )
-        (targets[axis],) = quantities(f"{name}: {axis}", [AXIS_UNITS[axis]], [value], "TARGET", 0.0)
+        (targets[axis],) = quantities(
+            f"{name}: {axis}", [AXIS_UNITS[axis]], [value], "TARGET", 0.0
+        )
         if AXIS_UNITS[axis] == "rad" and targets[axis] > math.pi:
             raise ConfigError(
                 f"{name} is in rad without a unit; for degrees write {axis}={value}deg"
@@ -334,7 +347,11 @@ def parse_targets(name: str, text: str) -> dict[str, float]:
 
 
 def quantities(
-    name: str, units: Sequence[str], words: Sequence[str], form: str, above: float = -math.inf
+    name: str,
+    units: Sequence[str],
+    words: Sequence[str],
+    form: str,
+    above: float = -math.inf,
 ) -> list[float]:
     """Return the numbers of words, each converted to its unit (m or rad).
 
@@ -362,7 +379,9 @@ def quantities(
     for unit, word in zip(units, words, strict=True):
         value = _quantity(name, unit, word)
         if not value > above:
-            raise ConfigError(f"{name} needs a standard deviation above 0; got {shown_value(word)}")
+            raise ConfigError(
+                f"{name} needs a standard deviation above 0; got {shown_value(word)}"
+            )
         if unit == "rad" and not _unit_of(word) and abs(value) > 2 * math.pi:
             raise ConfigError(
                 f"{name} is in radians without a unit; got {word[:20]}: write "
@@ -379,10 +398,14 @@ def _quantity(name: str, unit: str, word: str) -> float:
     unit_of_word = _unit_of(word) or unit
     if not match or unit_of_word not in factors:
         allowed = " or ".join(factors)
-        raise ConfigError(f"{name} must be numbers in {allowed}; got {shown_value(word)}")
+        raise ConfigError(
+            f"{name} must be numbers in {allowed}; got {shown_value(word)}"
+        )
     value = float(match[1]) * factors[unit_of_word]
     if abs(value) > _MAX_TYPED:
-        raise ConfigError(f"{name} must be at most {_MAX_TYPED:g} {unit}; got {word[:20]!r}")
+        raise ConfigError(
+            f"{name} must be at most {_MAX_TYPED:g} {unit}; got {word[:20]!r}"
+        )
     return value
 
 

@@ -24,7 +24,13 @@ from hand_eye_calib.core.checks.fault_regression import (
     delay_regression,
     motion_regression,
 )
-from hand_eye_calib.core.checks.findings import LIMITS, Finding, Severity, finding, graded
+from hand_eye_calib.core.checks.findings import (
+    LIMITS,
+    Finding,
+    Severity,
+    finding,
+    graded,
+)
 from hand_eye_calib.core.checks.open_delay import NO_DELAY, OpenDelay, open_delay
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
@@ -147,7 +153,9 @@ def check_agreement(
     """
     if same := check_same(best):
         return Agreement(same)
-    speed_m_s = usual_speed(pose_pairs.stamps_ns, se3.translation_of(pose_pairs.Ts_pw_p))
+    speed_m_s = usual_speed(
+        pose_pairs.stamps_ns, se3.translation_of(pose_pairs.Ts_pw_p)
+    )
     suspects = slow_suspects(pose_pairs, motions, X, speed_m_s)
     short_motions = pairs_over(pose_pairs, SHORT_S, MAX_SHORT_MOTIONS)
     delay = NO_DELAY
@@ -174,7 +182,9 @@ def slow_suspects(
     they explain about the same, and any of them may be significant.
     """
     change = find_change(pose_pairs, X)
-    slow, axes = motion_regression(pose_pairs, motions, X, change.at_ns if change else None)
+    slow, axes = motion_regression(
+        pose_pairs, motions, X, change.at_ns if change else None
+    )
     checks: dict[str, Callable[[], Finding | None]] = {
         "drift": lambda: _world_drift(slow, pose_pairs, speed_m_s),
         "gain": lambda: rotation_gain(slow, axes),
@@ -335,7 +345,9 @@ def moved_mount(change: MountChange, start_ns: int) -> Finding | None:
     return graded("mount_moved", "both", size, size=listing(sizes), at_s=at_s)
 
 
-def _world_drift(slow: Regression, pose_pairs: PosePairs, speed_m_s: float) -> Finding | None:
+def _world_drift(
+    slow: Regression, pose_pairs: PosePairs, speed_m_s: float
+) -> Finding | None:
     """Return the finding about a child's world that moves in the parent's world, or None.
 
     The drift is graded as a share of the usual speed of the sensors, ``speed_m_s``.
@@ -419,7 +431,10 @@ class _Delay:
             return False
         if shift_m > LIMITS["late"].error:
             return True
-        return shift_m > _ALWAYS_ERROR_SHIFT_M and self.explained_share > _ALWAYS_ERROR_SHARE
+        return (
+            shift_m > _ALWAYS_ERROR_SHIFT_M
+            and self.explained_share > _ALWAYS_ERROR_SHARE
+        )
 
 
 def delay_suspects(
@@ -470,7 +485,9 @@ def delay_suspects(
                 yield Suspect(delay.explained_share, delay.finding(stream, offset_s))
 
 
-def smoothing_suspects(fast: Regression, interval_s: float, speed_m_s: float) -> Iterator[Suspect]:
+def smoothing_suspects(
+    fast: Regression, interval_s: float, speed_m_s: float
+) -> Iterator[Suspect]:
     """Yield suspects for positions or orientations that are smoothed, while the other are not.
 
     A smoothing is an error by the distance that it displaces poses, and a warning by its time at

@@ -31,7 +31,14 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.base.spelling import PLACEHOLDER
 from hand_eye_calib.core.base.text import axes_in_words
-from hand_eye_calib.core.checks import agreement, fusion, hypotheses, independence, misread, parts
+from hand_eye_calib.core.checks import (
+    agreement,
+    fusion,
+    hypotheses,
+    independence,
+    misread,
+    parts,
+)
 from hand_eye_calib.core.checks.agreement import Agreement, ExtrinsicEstimate
 from hand_eye_calib.core.checks.clock_and_scale import (
     ROUNDED,
@@ -39,10 +46,21 @@ from hand_eye_calib.core.checks.clock_and_scale import (
     in_metres,
     own_unit,
 )
-from hand_eye_calib.core.checks.findings import LIMITS, Finding, finding, graded, gravest_first
+from hand_eye_calib.core.checks.findings import (
+    LIMITS,
+    Finding,
+    finding,
+    graded,
+    gravest_first,
+)
 from hand_eye_calib.core.checks.hypotheses import Explanation, Readings
 from hand_eye_calib.core.checks.open_delay import NO_DELAY
-from hand_eye_calib.core.checks.stream_pair import LAGS_S, MAX_PAIRS, MIN_PAIRS, StreamPair
+from hand_eye_calib.core.checks.stream_pair import (
+    LAGS_S,
+    MAX_PAIRS,
+    MIN_PAIRS,
+    StreamPair,
+)
 from hand_eye_calib.core.checks.streams import (
     check_flat,
     check_frozen,
@@ -96,7 +114,9 @@ class CheckResult:
     fit: SimilarityFit | None = None
     offset: TimeOffset | None = None
     readings: Readings | None = None
-    open_covariance: FloatArray = field(default_factory=lambda: NO_DELAY.covariance, compare=False)
+    open_covariance: FloatArray = field(
+        default_factory=lambda: NO_DELAY.covariance, compare=False
+    )
 
 
 def check_streams(
@@ -150,7 +170,9 @@ def check_streams(
         return CheckResult(gravest_first([*findings, *incomplete]))
     if not explanation:
         is_frozen = _are_unusable(frozen)
-        explanation, mistakes = _explain_or_misread(streams, aligned, offset, earlier, is_frozen)
+        explanation, mistakes = _explain_or_misread(
+            streams, aligned, offset, earlier, is_frozen
+        )
         findings += mistakes
     if not explanation:
         return CheckResult(gravest_first(findings))
@@ -241,22 +263,31 @@ def _check_explained(
         readings = None
         findings = [found for found in findings if found not in of_reading]
     findings = in_metres(findings, [*lengths, *sizes], arguments.scale)
-    is_sound = not _are_unusable([found for found in findings if found not in of_reading])
+    is_sound = not _are_unusable(
+        [found for found in findings if found not in of_reading]
+    )
     findings += [*lengths, *check_offset(offset, arguments.time_offset_s), *sizes]
     delay = NO_DELAY
     if is_sound and not lengths:
         earlier = arguments.earlier
-        corrected, fit = _preferred_reading(streams, corrected, explanation, fit, offset, earlier)
+        corrected, fit = _preferred_reading(
+            streams, corrected, explanation, fit, offset, earlier
+        )
         agreeing, delay = _check_agreeing(corrected, fit, offset, arguments)
         findings += agreeing
         if delay.found and not agreeing:
             findings.append(delay.found)
     sorted_findings = gravest_first(findings)
-    return CheckResult(sorted_findings, explanation.fit, offset, readings, delay.covariance)
+    return CheckResult(
+        sorted_findings, explanation.fit, offset, readings, delay.covariance
+    )
 
 
 def _lengths_of_explained(
-    streams: StreamPair, corrected: StreamPair, fit: SimilarityFit, explanation: Explanation
+    streams: StreamPair,
+    corrected: StreamPair,
+    fit: SimilarityFit,
+    explanation: Explanation,
 ) -> list[Finding]:
     """Return the finding about lengths or speeds that no vehicle has, or none.
 
@@ -285,7 +316,9 @@ def _preferred_reading(
     both streams, although they may also be right without inversion, the uninverted streams are
     fitted. Otherwise ``corrected`` and ``fit`` are returned.
     """
-    has_other_reading = explanation.may_be_uninverted and not explanation.hypothesis.is_uninverted
+    has_other_reading = (
+        explanation.may_be_uninverted and not explanation.hypothesis.is_uninverted
+    )
     if not earlier or not has_other_reading:
         return corrected, fit
     uninverted = streams.shifted(offset.seconds)
@@ -334,7 +367,9 @@ def _explain_by_extrinsic(
     if offset.largest_s(streams.child.duration_s) >= error_s:
         return None, TimeOffset()
     shifted = streams.shifted(offset.seconds)
-    explanation = hypotheses.choose_reading(Explanation(hypotheses.PLAIN, fit), shifted, lag_s)
+    explanation = hypotheses.choose_reading(
+        Explanation(hypotheses.PLAIN, fit), shifted, lag_s
+    )
     if explanation.findings:
         return None, TimeOffset()
     return explanation, offset
@@ -350,10 +385,15 @@ def _fine_offset(
     good to one interval between poses.
     """
     note_s = LIMITS["time_offset"].note
-    if coarse_offset.fit and coarse_offset.largest_s(corrected.child.duration_s) < note_s:
+    if (
+        coarse_offset.fit
+        and coarse_offset.largest_s(corrected.child.duration_s) < note_s
+    ):
         return coarse_offset
     if corrected.is_slow:
-        return TimeOffset(coarse_offset.seconds, corrected.interval_s, coarse_offset.correlation)
+        return TimeOffset(
+            coarse_offset.seconds, corrected.interval_s, coarse_offset.correlation
+        )
     return time_offset.refine_time_offset(
         corrected.parent,
         corrected.child,
@@ -375,7 +415,10 @@ def _align_slow(
         if len(candidate.synchronised) <= MIN_PAIRS:
             continue
         error_s = abs(correlation.offset_s - offset_s)
-        if error_s < _COARSE_INTERVALS * original.interval_s or not correlation.is_clear:
+        if (
+            error_s < _COARSE_INTERVALS * original.interval_s
+            or not correlation.is_clear
+        ):
             return candidate, replace(correlation, offset_s=0.0)
     remaining = replace(correlation, offset_s=correlation.offset_s - added_s)
     max_gap_s = _SLOW_GAP_INTERVALS * original.interval_s
@@ -397,7 +440,9 @@ def _explain_or_misread(
     misread_positions = misread.check_earth_centred(aligned)
     if misread_positions:
         return None, misread_positions
-    explanation, findings = _explain(aligned, coarse_offset.correlation, start, is_frozen)
+    explanation, findings = _explain(
+        aligned, coarse_offset.correlation, start, is_frozen
+    )
     if not explanation:
         findings = misread.check_misread(streams, aligned) or findings
     return explanation, findings
@@ -423,7 +468,9 @@ def _explain(
             return explanation, [*explanation.findings]
         if correlation.is_clear:
             pairs = streams.synchronised
-            coordinates = agreement.check_coordinates(pairs, _motions(pairs, MAX_MOTIONS))
+            coordinates = agreement.check_coordinates(
+                pairs, _motions(pairs, MAX_MOTIONS)
+            )
             return None, coordinates or [*explanation.findings]
     # The angular rates of a frozen stream are no evidence.
     if is_frozen:
@@ -434,7 +481,10 @@ def _explain(
 
 
 def _check_sizes(
-    streams: StreamPair, explanation: Explanation, timed: SimilarityFit | None, used_scale: float
+    streams: StreamPair,
+    explanation: Explanation,
+    timed: SimilarityFit | None,
+    used_scale: float,
 ) -> tuple[list[Finding], SimilarityFit]:
     """Return findings about scale and unobservable axes of streams that agree, and the fit.
 
@@ -453,7 +503,9 @@ def _check_sizes(
     fits_of_scale = [fit]
     if timed:
         fits_of_scale.append(timed)
-    fits_of_scale = [candidate for candidate in fits_of_scale if candidate.scale_sigma > 0.0]
+    fits_of_scale = [
+        candidate for candidate in fits_of_scale if candidate.scale_sigma > 0.0
+    ]
     with suppress(NotEnoughDataError):
         fit = similarity.estimate_scale(pose_pairs, fits_of_scale)
         other_unit = own_unit(streams, fit, used_scale) if fit.has_own_unit else None
@@ -476,7 +528,9 @@ def _check_agreeing(
     earlier = arguments.earlier
     if earlier and earlier.sigmas[:3].max() < best.sigmas[:3].max():
         best = earlier
-    copied = independence.check_copies(arguments.original, corrected, arguments.are_exact)
+    copied = independence.check_copies(
+        arguments.original, corrected, arguments.are_exact
+    )
     if copied:
         return Agreement([*copied, *agreement.check_same(best)])
     pose_pairs = corrected.synchronised.child_scaled(fit.scale)
@@ -484,7 +538,9 @@ def _check_agreeing(
         return Agreement(other)
     motions = _motions(pose_pairs, MAX_MOTIONS)
     offset_s = arguments.time_offset_s + offset.seconds
-    agreeing = agreement.check_agreement(pose_pairs, motions, fit.T_parent_child, best, offset_s)
+    agreeing = agreement.check_agreement(
+        pose_pairs, motions, fit.T_parent_child, best, offset_s
+    )
     if arguments.are_exact:
         return agreeing
     correction = fusion.check_correction(pose_pairs, best.T_parent_child)

@@ -24,7 +24,9 @@ def check_offset(offset: TimeOffset, added_s: float) -> list[Finding]:
     values = offset_values(offset.seconds, added_s) | {"sigma_s": offset.sigma_s}
     values["beyond"] = f" beyond the {added_s:.4f} s that were added" if added_s else ""
     values["options"] = {"time_offset": values["total_s"]}
-    clocks_differ = graded("time_offset", "child", offset.seconds, offset.sigma_s, **values)
+    clocks_differ = graded(
+        "time_offset", "child", offset.seconds, offset.sigma_s, **values
+    )
     return [clocks_differ] if clocks_differ else []
 
 
@@ -61,14 +63,18 @@ def check_model_scale(scale: float, sigma: float) -> list[Finding]:
     return [other_scale] if other_scale else []
 
 
-def own_unit(streams: StreamPair, fit: SimilarityFit, used_scale: float) -> Finding | None:
+def own_unit(
+    streams: StreamPair, fit: SimilarityFit, used_scale: float
+) -> Finding | None:
     """Return the finding that the child has another unit of length, or else another scale.
 
     None if the scale is near 1. The child's lengths are the original lengths times ``used_scale``.
     """
     original_child = streams.child.scaled(1.0 / used_scale)
     sigma_and_bias = float(np.hypot(fit.scale_sigma, fit.scale_bias))
-    unit = in_other_units(fit.scale, sigma_and_bias, streams.parent, original_child, used_scale)
+    unit = in_other_units(
+        fit.scale, sigma_and_bias, streams.parent, original_child, used_scale
+    )
     if unit:
         return unit
     total_scale = used_scale * fit.scale
@@ -82,7 +88,9 @@ def own_unit(streams: StreamPair, fit: SimilarityFit, used_scale: float) -> Find
     )
 
 
-def in_metres(findings: Sequence[Finding], units: Sequence[Finding], scale: float) -> list[Finding]:
+def in_metres(
+    findings: Sequence[Finding], units: Sequence[Finding], scale: float
+) -> list[Finding]:
     """Return the findings, with those about rounded positions graded in metres.
 
     Parameters

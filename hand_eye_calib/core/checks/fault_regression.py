@@ -203,7 +203,9 @@ class _Stream:
         Displacements from start to end (m), in the stream's world and in the axes at the middle.
     """
 
-    def __init__(self, poses: FloatArray, pairs: MotionPairs, R_parent_sensor: FloatArray) -> None:
+    def __init__(
+        self, poses: FloatArray, pairs: MotionPairs, R_parent_sensor: FloatArray
+    ) -> None:
         self._poses = poses
         self._R_parent_sensor = R_parent_sensor
         self.rows = pairs.i, (pairs.i + pairs.j) // 2, pairs.j
@@ -214,7 +216,9 @@ class _Stream:
         self.chords = self.R_end - self.R_start
         to_start = R_parent_sensor @ np.swapaxes(se3.rotation_of(start), 1, 2)
         self.rotations = to_start @ se3.rotation_of(end) @ R_parent_sensor.T
-        self.displacements_in_world = se3.translation_of(end) - se3.translation_of(start)
+        self.displacements_in_world = se3.translation_of(end) - se3.translation_of(
+            start
+        )
         self.displacements = se3.times(self.from_world, self.displacements_in_world)
 
     def start_minus_end(self, vectors: FloatArray) -> FloatArray:
@@ -225,13 +229,19 @@ class _Stream:
         start, _, end = self.rows
         return vectors[start] - se3.times(self.rotations, vectors[end])
 
-    def angular_derivatives(self, around: Stencil, step_s: float) -> tuple[FloatArray, FloatArray]:
+    def angular_derivatives(
+        self, around: Stencil, step_s: float
+    ) -> tuple[FloatArray, FloatArray]:
         """Return angular rates and angular accelerations (N, 3) of all poses, in parent's axes."""
         turns = rotations_around(se3.rotation_of(self._poses), around)
-        turn, turn_before, turn_after = (vectors @ self._R_parent_sensor.T for vectors in turns)
+        turn, turn_before, turn_after = (
+            vectors @ self._R_parent_sensor.T for vectors in turns
+        )
         return turn / (2 * step_s), (turn_after - turn_before) / (3 * step_s**2)
 
-    def derivatives(self, around: Stencil, step_s: float) -> tuple[FloatArray, FloatArray]:
+    def derivatives(
+        self, around: Stencil, step_s: float
+    ) -> tuple[FloatArray, FloatArray]:
         """Return velocities and accelerations (N, 3) of all poses, in the stream's world."""
         return path_derivatives(se3.translation_of(self._poses), around, step_s)
 
@@ -285,7 +295,9 @@ def motion_regression(
         "axes_child": _regressors(child.from_world * child_predicted[:, None, :]),
         "axes_parent": _regressors(-parent.from_world * parent_predicted[:, None, :]),
         "drift": np.concatenate([translating, rotating], axis=2),
-        "gain": _regressors(np.zeros_like(drifted), (rotations @ axes)[:, None, :] * axes[None]),
+        "gain": _regressors(
+            np.zeros_like(drifted), (rotations @ axes)[:, None, :] * axes[None]
+        ),
     }
     if moved_at_ns is not None:
         is_after = (stamps_ns[motions.i] + stamps_ns[motions.j]) // 2 >= moved_at_ns
@@ -317,11 +329,15 @@ def delay_regression(
     is_regular = np.zeros(len(stamps_ns), dtype=bool)
     inner = np.arange(2 * step, len(stamps_ns) - 2 * step)
     multiples = np.array([-2, -1, 1, 2])
-    elapsed_s = (stamps_ns[inner[:, None] + step * multiples] - stamps_ns[inner, None]) * 1e-9
+    elapsed_s = (
+        stamps_ns[inner[:, None] + step * multiples] - stamps_ns[inner, None]
+    ) * 1e-9
     errors_s = np.abs(elapsed_s - step_s * multiples)
     is_regular[inner] = (errors_s < _MAX_STAMP_ERROR * step_s).all(axis=1)
     middles = (motions.i + motions.j) // 2
-    motions = motions[is_regular[motions.i] & is_regular[motions.j] & is_regular[middles]]
+    motions = motions[
+        is_regular[motions.i] & is_regular[motions.j] & is_regular[middles]
+    ]
     if len(motions) < BLOCKS**2:
         return None
     X = T_parent_child
@@ -336,13 +352,19 @@ def delay_regression(
     # The same regressors from poses of each sensor that are computed from the other stream.
     parent_of_child = _Stream(Ts_child @ se3.inverse(X), motions, np.eye(3))
     child_of_parent = _Stream(Ts_parent @ X, motions, R_X)
-    from_other = _filter_groups(parent_of_child, child_of_parent, lever_arm, around, step_s)
+    from_other = _filter_groups(
+        parent_of_child, child_of_parent, lever_arm, around, step_s
+    )
     instruments = {name: from_other[name] for name in ("late_child", "late_parent")}
     return _regression(parent, child, X, groups, instruments, "late")
 
 
 def _filter_groups(
-    parent: _Stream, child: _Stream, lever_arm: FloatArray, around: Stencil, step_s: float
+    parent: _Stream,
+    child: _Stream,
+    lever_arm: FloatArray,
+    around: Stencil,
+    step_s: float,
 ) -> dict[str, FloatArray]:
     """Return the groups of delays and smoothing, and "late": a delay of whole poses of the child.
 
@@ -358,7 +380,9 @@ def _filter_groups(
         late = se3.times(stream.from_world, velocity_change)
         positions = se3.times(stream.from_world, acceleration_change)
         # The orientation of the middle pose rotates the displacement.
-        orientations = sign * se3.cross(angular_acceleration[middle], stream.displacements)
+        orientations = sign * se3.cross(
+            angular_acceleration[middle], stream.displacements
+        )
         if name == "child":
             displaced = late + se3.cross(rate[middle], stream.displacements)
             groups["late"] = _regressors(displaced, stream.start_minus_end(rate))
@@ -366,10 +390,14 @@ def _filter_groups(
             # The parent's orientations at both ends rotate the lever arm.
             at_start = se3.cross(angular_acceleration[start], lever_arm)
             at_end = se3.cross(angular_acceleration[end], lever_arm)
-            orientations += se3.times(stream.R_start, at_start) - se3.times(stream.R_end, at_end)
+            orientations += se3.times(stream.R_start, at_start) - se3.times(
+                stream.R_end, at_end
+            )
         turned = sign * stream.start_minus_end(angular_acceleration)
         groups[f"late_{name}"] = _regressors(late)
-        groups[f"late_axes_{name}"] = _regressors(stream.from_world * velocity_change[:, None, :])
+        groups[f"late_axes_{name}"] = _regressors(
+            stream.from_world * velocity_change[:, None, :]
+        )
         groups[f"positions_{name}"] = _regressors(positions)
         groups[f"orientations_{name}"] = _regressors(orientations, turned)
     return groups
@@ -386,12 +414,16 @@ def _base_groups(parent: _Stream, child: _Stream) -> dict[str, FloatArray]:
     """Return the groups of the base: lever arm (m), small rotation of X (rad), and scale."""
     return {
         "lever": _regressors(parent.chords),
-        "rotation": _regressors(se3.skew(child.displacements), child.rotations - np.eye(3)),
+        "rotation": _regressors(
+            se3.skew(child.displacements), child.rotations - np.eye(3)
+        ),
         "scale": _regressors(child.displacements),
     }
 
 
-def _regressors(of_displacement: FloatArray, of_rotation: FloatArray | None = None) -> FloatArray:
+def _regressors(
+    of_displacement: FloatArray, of_rotation: FloatArray | None = None
+) -> FloatArray:
     """Join regressors of displacements and of rotations to (K, 6, m).
 
     Each part is (K, 3, m), or (K, 3) for one regressor. A fault without rotations has only the
@@ -427,7 +459,9 @@ def _regression(
     for name, regressors in all_groups.items():
         columns[name] = list(range(n_columns, n_columns + regressors.shape[2]))
         n_columns += regressors.shape[2]
-    rows = np.concatenate([*all_groups.values(), _regressors(displaced, turned)], axis=2)
+    rows = np.concatenate(
+        [*all_groups.values(), _regressors(displaced, turned)], axis=2
+    )
     instrument_rows = rows.copy()
     for name, regressors in (_base_groups(child, child) | dict(instruments)).items():
         instrument_rows[:, :, columns[name]] = regressors

@@ -9,7 +9,12 @@ import numpy as np
 
 from hand_eye_calib.core.base.config import METHODS, CalibratorConfig, defaults_of
 from hand_eye_calib.core.base.option import Options, options_in_words
-from hand_eye_calib.core.results.records import Finding, Severity, gravest_first, words_of
+from hand_eye_calib.core.results.records import (
+    Finding,
+    Severity,
+    gravest_first,
+    words_of,
+)
 
 __all__ = [
     "Finding",
@@ -181,7 +186,9 @@ def conventions(code: str, stream: str) -> dict[str, float | str]:
     return {f"{name}_{kind}": value for name in names}
 
 
-def repair_message(findings: Sequence[Finding], options: Options, verdicts: str = "") -> str:
+def repair_message(
+    findings: Sequence[Finding], options: Options, verdicts: str = ""
+) -> str:
     """Return the message about repaired faults, the options that were set, and how to undo them.
 
     Parameters
@@ -212,9 +219,13 @@ def answered(findings: Sequence[Finding], config: CalibratorConfig) -> list[Find
         if found.code in CONVENTIONS:
             # If a corrected stream needs the same correction again, it was right at first: the
             # finding then proposes the default values of these options.
-            repeated = [name for name, value in options.items() if current[name] == value]
+            repeated = [
+                name for name, value in options.items() if current[name] == value
+            ]
             options |= defaults_of(repeated)
-        is_answered = options and all(current.get(name) == options[name] for name in options)
+        is_answered = options and all(
+            current.get(name) == options[name] for name in options
+        )
         if found.code == "jumps" and METHODS[config.method].rejects_outliers:
             is_answered = is_answered or found.evidence["share"] < _FEW_JUMPS
         severity = Severity.NOTE if is_answered else found.severity

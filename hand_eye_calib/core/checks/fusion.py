@@ -102,7 +102,9 @@ class _Fit(NamedTuple):
         return self.is_turned and self.share > _CERTAIN_SHARE
 
 
-def check_correction(pose_pairs: PosePairs, T_parent_child: FloatArray) -> Finding | None:
+def check_correction(
+    pose_pairs: PosePairs, T_parent_child: FloatArray
+) -> Finding | None:
     """Detect a stream that was corrected by the other stream through a wrong mount.
 
     Parameters
@@ -141,7 +143,9 @@ def _best_fit(pose_pairs: PosePairs, T_parent_child: FloatArray) -> _Fit | None:
     differences = _Differences(pose_pairs, T_parent_child)
     if differences.n_motions < _BLOCKS * _MIN_MOTIONS_PER_BLOCK:
         return None
-    regressions = (differences.regression(constant_s) for constant_s in _TIME_CONSTANTS_S)
+    regressions = (
+        differences.regression(constant_s) for constant_s in _TIME_CONSTANTS_S
+    )
     best = max(regressions, key=lambda regression: regression.share)
     return differences.fit(best)
 
@@ -181,7 +185,11 @@ class _Regressors:
     """
 
     def __init__(
-        self, poses: FloatArray, T_parent_child: FloatArray, seconds: FloatArray, pairs: MotionPairs
+        self,
+        poses: FloatArray,
+        T_parent_child: FloatArray,
+        seconds: FloatArray,
+        pairs: MotionPairs,
     ) -> None:
         self._poses = poses.copy()
         # A near origin avoids the rounding of map coordinates.
@@ -217,7 +225,9 @@ class _Regressors:
         errors = [of_clock]
         for displacements in (se3.translation_of(self._poses), of_child, of_parent):
             translations = se3.times(to_child, displacements)
-            errors.append(np.concatenate([translations, np.zeros_like(translations)], axis=1))
+            errors.append(
+                np.concatenate([translations, np.zeros_like(translations)], axis=1)
+            )
         of_motions = self._between(np.stack(errors, axis=2))
         return np.concatenate([mount, of_motions], axis=2)
 
@@ -285,7 +295,9 @@ class _Differences:
 
     def regression(self, time_constant_s: float) -> _Regression:
         """Regress the differences on the regressors for a filter of a time constant (s)."""
-        rows = self._joined(self._usual_errors, self._of_parent.filtered(time_constant_s))
+        rows = self._joined(
+            self._usual_errors, self._of_parent.filtered(time_constant_s)
+        )
         weights = self._robust_weights(rows)
         table = _table(rows, weights)
         weighted = rows * weights[:, None, None]
@@ -308,7 +320,11 @@ class _Differences:
         translation_sigmas = _in_sigmas(mount_change[:3], covariance[:3, :3])
         rotation_sigmas = _in_sigmas(mount_change[3:], covariance[3:, 3:])
         return _Fit(
-            time_constant_s, mount_change, translation_sigmas, rotation_sigmas, regression.share
+            time_constant_s,
+            mount_change,
+            translation_sigmas,
+            rotation_sigmas,
+            regression.share,
         )
 
     def _joined(self, usual_errors: FloatArray, filtered: FloatArray) -> FloatArray:
@@ -328,7 +344,9 @@ class _Differences:
             coefficients = solve(_table(rows, weights), range(rows.shape[2] - 1))
             errors = rows @ np.append(-coefficients, 1.0)
             squared = (errors**2).sum(axis=1)
-            weights = robust_weights("cauchy", squared / (4.0 * median(squared) + 1e-300))
+            weights = robust_weights(
+                "cauchy", squared / (4.0 * median(squared) + 1e-300)
+            )
         return weights
 
 

@@ -24,7 +24,11 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hand_eye_calib.core.alignment.similarity import EXPLAINED, SimilarityFit, fit_similarity
+from hand_eye_calib.core.alignment.similarity import (
+    EXPLAINED,
+    SimilarityFit,
+    fit_similarity,
+)
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.checks.findings import (
@@ -97,9 +101,15 @@ class Hypothesis:
     @property
     def mistakes(self) -> list[tuple[str, str]]:
         """Code and stream ("parent", "child" or "both") of each mistake."""
-        streams = {(False, True): "child", (True, False): "parent", (True, True): "both"}
+        streams = {
+            (False, True): "child",
+            (True, False): "parent",
+            (True, True): "both",
+        }
         codes = dict.fromkeys((*self.parent, *self.child))
-        return [(code, streams[code in self.parent, code in self.child]) for code in codes]
+        return [
+            (code, streams[code in self.parent, code in self.child]) for code in codes
+        ]
 
     @property
     def complexity(self) -> tuple[int, int]:
@@ -148,7 +158,9 @@ class Hypothesis:
 
 def _toggle_inverse(codes: _Codes) -> _Codes:
     """Return the mistakes of one stream with "inverse" added, or removed if it is among them."""
-    return tuple([code for code in CONVENTIONS if (code in codes) != (code == "inverse")])
+    return tuple(
+        [code for code in CONVENTIONS if (code in codes) != (code == "inverse")]
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,7 +199,9 @@ class Readings:
 
         It does not if a fixed camera beside an arm is another cause of that shape.
         """
-        is_fixed_camera = self.is_small and self.hypotheses[0].is_uninverted and self.shape > 0.0
+        is_fixed_camera = (
+            self.is_small and self.hypotheses[0].is_uninverted and self.shape > 0.0
+        )
         return self.by_shape != 0 and not is_fixed_camera
 
     def ordered(self) -> "Readings":
@@ -195,7 +209,9 @@ class Readings:
         first, second = self.hypotheses
         if not second.is_uninverted:
             return self
-        return replace(self, hypotheses=(second, first), shape=-self.shape, paths=-self.paths)
+        return replace(
+            self, hypotheses=(second, first), shape=-self.shape, paths=-self.paths
+        )
 
 
 @dataclass(frozen=True)
@@ -253,7 +269,9 @@ _CODES_OF_STREAM: list[_Codes] = [
     ("quaternion_names",),
 ]
 # All combinations for both streams.
-_CONVENTIONAL = list(itertools.starmap(Hypothesis, itertools.product(_CODES_OF_STREAM, repeat=2)))
+_CONVENTIONAL = list(
+    itertools.starmap(Hypothesis, itertools.product(_CODES_OF_STREAM, repeat=2))
+)
 # The hypothesis without a mistake.
 PLAIN = _CONVENTIONAL[0]
 
@@ -261,7 +279,11 @@ PLAIN = _CONVENTIONAL[0]
 # Usual mistakes. Hypotheses with both streams inverted are missing: they fit as well as those
 # with neither stream inverted.
 _USUAL = [
-    *(usual for usual in _CONVENTIONAL[1:] if ("inverse", "both") not in usual.mistakes),
+    *(
+        usual
+        for usual in _CONVENTIONAL[1:]
+        if ("inverse", "both") not in usual.mistakes
+    ),
     Hypothesis(child=("left_handed",), axes=_MIRROR),
     Hypothesis(parent=("left_handed",), axes=_MIRROR),
     Hypothesis(child=_EULER_ORDER),
@@ -289,7 +311,9 @@ def _axes() -> Iterator[Hypothesis]:
         yield Hypothesis(("axes",), (), matrix, detail)
 
 
-def explain(streams: StreamPair, thorough: bool, start: FloatArray | None = None) -> Explanation:
+def explain(
+    streams: StreamPair, thorough: bool, start: FloatArray | None = None
+) -> Explanation:
     """Find the mistakes under which both streams agree.
 
     Parameters
@@ -357,7 +381,9 @@ def _or_usual_mistake(
     return _or_rival(plain, rivals, streams, lag_s, limit)
 
 
-def _with_findings(chosen: Explanation, streams: StreamPair, lag_s: float) -> Explanation:
+def _with_findings(
+    chosen: Explanation, streams: StreamPair, lag_s: float
+) -> Explanation:
     """Add the findings to an explanation that holds.
 
     The result has the likelier reading: that the streams contain poses, or inverse poses.
@@ -458,7 +484,9 @@ def _or_axes(
     return chosen, [finding("ambiguous", stream, detail=simplest.detail)]
 
 
-def _steadier(chosen: Explanation, streams: StreamPair, lag_s: float) -> tuple[Explanation, bool]:
+def _steadier(
+    chosen: Explanation, streams: StreamPair, lag_s: float
+) -> tuple[Explanation, bool]:
     """Find the explanation under which both sensors travel in a steady direction, as on vehicles.
 
     Returns
@@ -470,7 +498,10 @@ def _steadier(chosen: Explanation, streams: StreamPair, lag_s: float) -> tuple[E
         are not compared (axes, Euler angles).
     """
     hypothesis = chosen.hypothesis
-    if hypothesis.axes is not None or _EULER_ORDER in (hypothesis.parent, hypothesis.child):
+    if hypothesis.axes is not None or _EULER_ORDER in (
+        hypothesis.parent,
+        hypothesis.child,
+    ):
         return chosen, True
     # Scatter of the direction under each hypothesis: that of the less steady of both sensors.
     scatters = np.maximum.outer(_scatters(streams.parent), _scatters(streams.child))
@@ -499,7 +530,9 @@ def _scatters(stream: trajectory.Trajectory) -> list[float]:
     return scatters
 
 
-def choose_reading(explanation: Explanation, streams: StreamPair, lag_s: float) -> Explanation:
+def choose_reading(
+    explanation: Explanation, streams: StreamPair, lag_s: float
+) -> Explanation:
     """Choose whether the streams contain poses or inverse poses, and add the findings.
 
     Both readings fit equally well: the hypothesis, and the hypothesis with both streams inverted. A
@@ -520,12 +553,16 @@ def choose_reading(explanation: Explanation, streams: StreamPair, lag_s: float) 
             paths=STEADY_SHAPE,
             is_small=False,
         )
-        return replace(explanation, findings=findings_of(hypothesis), readings=readings.ordered())
+        return replace(
+            explanation, findings=findings_of(hypothesis), readings=readings.ordered()
+        )
     readings = _readings(explanation, streams)
     if hypothesis.is_uninverted and readings.shape < 0.0:
         findings = findings_of(hypothesis)
         is_doubtful = readings.shape > _SUSPICIOUS
-        return replace(explanation, findings=findings, readings=readings if is_doubtful else None)
+        return replace(
+            explanation, findings=findings, readings=readings if is_doubtful else None
+        )
     return _in_likelier_reading(explanation, readings, streams, lag_s)
 
 
@@ -560,14 +597,18 @@ def _in_likelier_reading(
     if likelier is not hypothesis:
         explanation = _fitted(likelier, streams, lag_s)
     # Options that invert streams are set only if the choice is clear.
-    findings = findings_of(likelier, has_options=readings.is_clear or likelier.is_uninverted)
+    findings = findings_of(
+        likelier, has_options=readings.is_clear or likelier.is_uninverted
+    )
     if likelier.is_uninverted:
         options = conventions("inverse", "both")
         findings += (finding("inverse_both", "both", Severity.WARNING, options),)
     return replace(explanation, findings=findings, readings=readings.ordered())
 
 
-def findings_of(hypothesis: Hypothesis, has_options: bool = True) -> tuple[Finding, ...]:
+def findings_of(
+    hypothesis: Hypothesis, has_options: bool = True
+) -> tuple[Finding, ...]:
     """Return one finding per mistake of a hypothesis.
 
     Without ``has_options``, the findings about inverse poses lack the options that repair them.

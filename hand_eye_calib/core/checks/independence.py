@@ -17,15 +17,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.core.base.stats import median, quantile, robust_regression, robust_weights
+from hand_eye_calib.core.base.stats import (
+    median,
+    quantile,
+    robust_regression,
+    robust_weights,
+)
 from hand_eye_calib.core.base.text import angle, length
 from hand_eye_calib.core.checks.fault_regression import ROUNDS
 from hand_eye_calib.core.checks.findings import Finding, Severity, finding
-from hand_eye_calib.core.checks.stream_pair import MAX_ROTATION_RAD, MIN_PAIRS, StreamPair
+from hand_eye_calib.core.checks.stream_pair import (
+    MAX_ROTATION_RAD,
+    MIN_PAIRS,
+    StreamPair,
+)
 from hand_eye_calib.core.checks.streams import USUAL, coarse
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
-from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_between
+from hand_eye_calib.core.pairing.motion_pairs import (
+    MotionPairs,
+    PosePairs,
+    pairs_between,
+)
 from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
 
 # Orientations are copies if their residual is below this angle (rad): rounding to five digits.
@@ -93,7 +106,9 @@ _CONTAINED_SIGMAS = 4.0
 _MOST_POSES = 2000
 
 
-def check_copies(given: StreamPair, aligned: StreamPair, are_exact: bool) -> list[Finding]:
+def check_copies(
+    given: StreamPair, aligned: StreamPair, are_exact: bool
+) -> list[Finding]:
     """Detect a stream that was computed from the other stream.
 
     Two sensors differ by their noise, for any extrinsic. Computed poses agree with their source to
@@ -113,15 +128,20 @@ def check_copies(given: StreamPair, aligned: StreamPair, are_exact: bool) -> lis
     # the computed one.
     pairs = [(streams.child, streams.parent) for streams in (given, aligned)]
     pairs += [(streams.parent, streams.child) for streams in (given, aligned)]
-    residual_rad = min(_residual_at_nearest(computed, source) for computed, source in pairs)
+    residual_rad = min(
+        _residual_at_nearest(computed, source) for computed, source in pairs
+    )
     if residual_rad < _ROUNDING_RAD:
         severity = Severity.WARNING if are_exact else Severity.ERROR
-        text = f"both streams agree to {angle(residual_rad)}, which two sensors hardly do"
+        text = (
+            f"both streams agree to {angle(residual_rad)}, which two sensors hardly do"
+        )
         return [_doubt(text, severity, residual_rad=residual_rad)]
     if are_exact:
         return []
     excess = max(
-        _shared_noise(_second_half(computed, source), source) for computed, source in pairs
+        _shared_noise(_second_half(computed, source), source)
+        for computed, source in pairs
     )
     if excess > 1.0:
         return [_doubt("the noise of both streams is unusually alike", more=excess)]
@@ -183,7 +203,11 @@ def _residual(motions: MotionPairs) -> float:
         return np.inf
     X = se3.from_rotation_translation(align_rotation_vectors(motions), np.zeros(3))
     residual_rad = quantile(np.linalg.norm(motions.residuals(X)[1], axis=1), USUAL)
-    return residual_rad if residual_rad < _SMALL_SHARE * quantile(angles, USUAL) else np.inf
+    return (
+        residual_rad
+        if residual_rad < _SMALL_SHARE * quantile(angles, USUAL)
+        else np.inf
+    )
 
 
 def _shared_noise(computed: Trajectory, source: Trajectory) -> float:
@@ -201,7 +225,9 @@ def _shared_noise(computed: Trajectory, source: Trajectory) -> float:
     of_source = of_source @ se3.nearest_rotation(of_source[:, 1].T @ of_computed[:, 1])
     difference = of_source - of_computed
     arms = se3.skew(of_computed[:, 1])
-    lever_arm = np.linalg.lstsq(arms.reshape(-1, 3), difference[:, 0].ravel(), rcond=None)[0]
+    lever_arm = np.linalg.lstsq(
+        arms.reshape(-1, 3), difference[:, 0].ravel(), rcond=None
+    )[0]
     difference[:, 0] -= arms @ lever_arm
     is_calm = _is_calm(of_computed, of_source)
     quarters = _upper_quarters(
@@ -268,7 +294,9 @@ def check_drift(pose_pairs: PosePairs, X: FloatArray) -> list[Finding]:
         The extrinsic.
     """
     path = coarse(Trajectory(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p), _STEP_S)
-    path_m = float(np.linalg.norm(np.diff(se3.translation_of(path.poses), axis=0), axis=1).sum())
+    path_m = float(
+        np.linalg.norm(np.diff(se3.translation_of(path.poses), axis=0), axis=1).sum()
+    )
     aligned = _AlignedPositions.of(pose_pairs[:: 1 + len(pose_pairs) // _MOST_POSES], X)
     apart_m = median(aligned.distances_m)
     is_close = path_m >= _LONG_PATH_M and apart_m <= _LEAST_DRIFT * path_m
@@ -354,17 +382,27 @@ def _is_steady(aligned: _AlignedPositions) -> bool:
     """
     rows = aligned.regressors(se3.rotation_of(aligned.pose_pairs.Ts_pw_p))
     values, distances_m = robust_regression(
-        "cauchy", rows, aligned.differences, ROUNDS, lambda lengths_m: 2.0 * median(lengths_m)
+        "cauchy",
+        rows,
+        aligned.differences,
+        ROUNDS,
+        lambda lengths_m: 2.0 * median(lengths_m),
     )
     corrected = aligned.points + rows @ values
-    windows_m = _apart_in_windows(aligned.pose_pairs.stamps_ns, corrected, aligned.others)
+    windows_m = _apart_in_windows(
+        aligned.pose_pairs.stamps_ns, corrected, aligned.others
+    )
     return median(distances_m) < _STEADY * windows_m
 
 
-def _apart_in_windows(stamps_ns: IntArray, points: FloatArray, others: FloatArray) -> float:
+def _apart_in_windows(
+    stamps_ns: IntArray, points: FloatArray, others: FloatArray
+) -> float:
     """Align points (N, 3) in each window of time, and return the median distance (m) of all."""
     # A window needs enough points, also of a long recording with few of its poses.
-    window_ns = max(round(_WINDOW_S * 1e9), round(2 * MIN_PAIRS * median(np.diff(stamps_ns))))
+    window_ns = max(
+        round(_WINDOW_S * 1e9), round(2 * MIN_PAIRS * median(np.diff(stamps_ns)))
+    )
     windows = (stamps_ns - stamps_ns[0]) // window_ns
     distances_m = [
         median(_alignment(points[windows == window], others[windows == window])[1])
@@ -383,7 +421,9 @@ def _is_difference_white(aligned: _AlignedPositions) -> bool:
     times_s = [time_s for time_s in _GROWN_S if time_s <= seconds[-1] / 3.0]
     differences = _pose_differences(aligned)
     first = _size_of_changes(differences, 1)
-    sizes = [_size_of_changes(differences, round(time_s / interval_s)) for time_s in times_s]
+    sizes = [
+        _size_of_changes(differences, round(time_s / interval_s)) for time_s in times_s
+    ]
     return bool((np.array(sizes) < _WHITE_GROWTH * first).all())
 
 

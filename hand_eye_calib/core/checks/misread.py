@@ -164,7 +164,9 @@ def _find_turn(name: str, streams: StreamPair) -> _TurnedPositions | None:
         poses = se3.from_rotation_translation(se3.rotation_of(child.poses), turned)
         unexplained = _unexplained(replace(streams, child=replace(child, poses=poses)))
         if unexplained < HOLDS:
-            return _TurnedPositions(name, rotation, unexplained, are_earth_centred(positions))
+            return _TurnedPositions(
+                name, rotation, unexplained, are_earth_centred(positions)
+            )
     return None
 
 
@@ -186,5 +188,7 @@ def _fit_turn(streams: StreamPair, lag_s: float) -> FloatArray:
     of_lever_arm = -(se3.rotation_of(pairs.Ts_parenti_parentj) - np.eye(3))
     rows = np.concatenate([of_W, of_lever_arm], axis=2)
     target = se3.translation_of(pairs.Ts_parenti_parentj)
-    unknowns, _ = robust_regression("huber", rows, target, _ROUNDS, lambda _: _RESIDUAL_UNIT_M)
+    unknowns, _ = robust_regression(
+        "huber", rows, target, _ROUNDS, lambda _: _RESIDUAL_UNIT_M
+    )
     return se3.nearest_rotation(unknowns[:9].reshape(3, 3))

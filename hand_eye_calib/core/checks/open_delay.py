@@ -78,7 +78,9 @@ def _of_stream(fast: Regression, stream: str, X: FloatArray) -> OpenDelay:
     # Change of the lever arm (m) and rotation of X (rad) in the parent's axes for a delay of 1 s.
     response = fast.response(group)[:, 0]
     R_child_parent = se3.rotation_of(X).T
-    by_delay = np.concatenate([R_child_parent @ response[:3], R_child_parent @ response[3:]])
+    by_delay = np.concatenate(
+        [R_child_parent @ response[:3], R_child_parent @ response[3:]]
+    )
     covariance = variance_s2 * np.outer(by_delay, by_delay)
     shift_m = float(np.sqrt(np.trace(covariance[:3, :3])))
     if shift_m < LIMITS["late"].note:

@@ -110,7 +110,10 @@ def check_other_extrinsic(pose_pairs: PosePairs, X: FloatArray) -> list[Finding]
         row = cut * len(pose_pairs) // _EXCHANGE_BLOCKS
         at_s = _seconds_at(pose_pairs.stamps_ns, row)
         exchanged = _exchanged(motions[is_other])
-        if median(_unexplained_path(exchanged, candidate)) < _OTHER_SHARE / _OTHER_FACTOR:
+        if (
+            median(_unexplained_path(exchanged, candidate))
+            < _OTHER_SHARE / _OTHER_FACTOR
+        ):
             return [finding("exchanged", at_s=at_s)]
         return [_parts_turned(candidate, own.T_parent_child, at_s)]
     return []
@@ -125,7 +128,9 @@ def _parts_turned(first: FloatArray, second: FloatArray, at_s: float) -> Finding
     """Return the finding that the extrinsics (4, 4) of two parts have different rotations."""
     between = se3.rotation_of(first).T @ se3.rotation_of(second)
     turned_rad = float(se3.rotation_angle(between))
-    return finding("parts_turned", size=angle(turned_rad), at_s=at_s, turned_rad=turned_rad)
+    return finding(
+        "parts_turned", size=angle(turned_rad), at_s=at_s, turned_rad=turned_rad
+    )
 
 
 def _exchanged(motions: MotionPairs) -> MotionPairs:
@@ -141,7 +146,9 @@ def _unexplained_path(motions: MotionPairs, X: FloatArray) -> FloatArray:
     """Return the shares (K,) of the displacements that an extrinsic X (4, 4) leaves unexplained."""
     residuals_m, _ = motions.residuals(X)
     lengths_m = np.linalg.norm(se3.translation_of(motions.Ts_parenti_parentj), axis=1)
-    return np.asarray(np.linalg.norm(residuals_m, axis=1) / np.maximum(lengths_m, 1e-12))
+    return np.asarray(
+        np.linalg.norm(residuals_m, axis=1) / np.maximum(lengths_m, 1e-12)
+    )
 
 
 def _own_fit(motions: MotionPairs) -> SimilarityFit | None:
@@ -151,7 +158,10 @@ def _own_fit(motions: MotionPairs) -> SimilarityFit | None:
         fit = fit_similarity(motions[::stride], same_unit=True)
     except NotEnoughDataError:
         return None
-    is_sound = median(_unexplained_path(motions, fit.T_parent_child)) < _OTHER_SHARE / _OTHER_FACTOR
+    is_sound = (
+        median(_unexplained_path(motions, fit.T_parent_child))
+        < _OTHER_SHARE / _OTHER_FACTOR
+    )
     return fit if is_sound else None
 
 
@@ -208,7 +218,9 @@ def _check_exchanged(motions: MotionPairs, stamps_ns: IntArray) -> Finding | Non
     usual_rad = quantile(as_exchanged, _EXCHANGE_QUANTILE)
     angles = np.linalg.norm(of_parent, axis=1)
     is_sound = usual_rad < _SOUND_PART * quantile(angles, _EXCHANGE_QUANTILE)
-    if not is_sound or usual_rad > _EXCHANGE_GAIN * quantile(as_given, _EXCHANGE_QUANTILE):
+    if not is_sound or usual_rad > _EXCHANGE_GAIN * quantile(
+        as_given, _EXCHANGE_QUANTILE
+    ):
         return None
     row = cuts[best] * len(stamps_ns) // _EXCHANGE_BLOCKS
     return finding("exchanged", at_s=_seconds_at(stamps_ns, row))

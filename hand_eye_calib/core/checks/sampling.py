@@ -86,7 +86,9 @@ def step_velocities(trajectory: Trajectory) -> tuple[StepVelocities, StepVelocit
     # R' d for each step: its displacement d in the axes of the sensor, whose orientation is R.
     linear = np.einsum("kji,kj->ki", rotations[:-1], displacements) / seconds
     angular = se3.rotations_between(rotations[:-1], rotations[1:]) / seconds
-    return StepVelocities(linear, _excess(linear)), StepVelocities(angular, _excess(angular))
+    return StepVelocities(linear, _excess(linear)), StepVelocities(
+        angular, _excess(angular)
+    )
 
 
 def _excess(velocities: FloatArray) -> FloatArray:
@@ -131,7 +133,9 @@ def check_interpolated(positions: FloatArray, stream: str) -> list[Finding]:
     return [finding("interpolated", stream, share=share)]
 
 
-def _straight_share(positions: FloatArray, is_steady: BoolArray) -> tuple[float, BoolArray]:
+def _straight_share(
+    positions: FloatArray, is_steady: BoolArray
+) -> tuple[float, BoolArray]:
     """Return the share of moving positions on straight lines, and which positions are measured.
 
     Measured are the moving inner positions (N - 2,) that are not on the line through both
@@ -160,7 +164,9 @@ def _find_interpolation(
     measured poses. Their positions and orientations are consistent, so they are no fault.
     """
     changes_rad_s = np.linalg.norm(np.diff(rates_rad_s, axis=0), axis=1)
-    limits_rad_s = _ROUNDING_RAD_S + _STEADY_SHARE * np.linalg.norm(rates_rad_s[1:], axis=1)
+    limits_rad_s = _ROUNDING_RAD_S + _STEADY_SHARE * np.linalg.norm(
+        rates_rad_s[1:], axis=1
+    )
     positions = se3.translation_of(trajectory.poses)
     share, are_measured = _straight_share(positions, changes_rad_s < limits_rad_s)
     if share <= _STRAIGHT_SHARE or not are_measured.any():
@@ -168,10 +174,14 @@ def _find_interpolation(
     # The velocity changes at the measured positions. The true path between two of them is an arc.
     # The largest distance of the arc from its chord is (change of velocity) * interval / 8.
     seconds = np.diff(trajectory.stamps_ns)[:, None] * 1e-9
-    changes = np.linalg.norm(np.diff(np.diff(positions, axis=0) / seconds, axis=0), axis=1)
+    changes = np.linalg.norm(
+        np.diff(np.diff(positions, axis=0) / seconds, axis=0), axis=1
+    )
     interval_s = trajectory.interval_s / (1.0 - share)
     displaced_m = median(changes[are_measured]) * interval_s / 8.0
-    return graded("interpolated", stream, displaced_m, share=share, displaced_m=displaced_m)
+    return graded(
+        "interpolated", stream, displaced_m, share=share, displaced_m=displaced_m
+    )
 
 
 def _find_propagation(
@@ -189,7 +199,9 @@ def _find_propagation(
             # Size in m or rad. A rotation by 1 rad moves a place 1 m from the sensor by 1 m, so the
             # limits of both are equal.
             size = median(excess[is_correction] * steps_s[is_correction])
-            propagated = graded("propagated", stream, size, size_m=size, interval_s=interval_s)
+            propagated = graded(
+                "propagated", stream, size, size_m=size, interval_s=interval_s
+            )
             if propagated:
                 return propagated
     return None
@@ -223,7 +235,14 @@ def _find_arrival(trajectory: Trajectory, stream: str) -> Finding | None:
     windows = np.lib.stride_tricks.sliding_window_view(late_s, _WINDOW_POSES)
     half = _WINDOW_POSES // 2
     scatter_s = median(np.abs(late_s[half:-half] - np.median(windows, axis=1)))
-    shift_m = scatter_s * usual_speed(trajectory.stamps_ns, se3.translation_of(trajectory.poses))
+    shift_m = scatter_s * usual_speed(
+        trajectory.stamps_ns, se3.translation_of(trajectory.poses)
+    )
     return graded(
-        "arrival", stream, shift_m, share=share, scatter_ms=1e3 * scatter_s, shift_m=shift_m
+        "arrival",
+        stream,
+        shift_m,
+        share=share,
+        scatter_ms=1e3 * scatter_s,
+        shift_m=shift_m,
     )

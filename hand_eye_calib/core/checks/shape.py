@@ -44,7 +44,10 @@ def may_be_an_arm(streams: StreamPair) -> bool:
     for poses in (streams.parent.poses, streams.child.poses):
         for candidates in (poses, se3.inverse(poses)):
             positions = se3.translation_of(candidates)
-            if np.linalg.norm(positions - medians(positions.T), axis=1).max() >= _REACH_M:
+            if (
+                np.linalg.norm(positions - medians(positions.T), axis=1).max()
+                >= _REACH_M
+            ):
                 return False
     return True
 

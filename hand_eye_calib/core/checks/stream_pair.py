@@ -69,6 +69,8 @@ class StreamPair:
         """
         pairs = motion_pairs.pairs_over(self.synchronised, lag_s, max_pairs)
         if len(pairs) < MIN_PAIRS:
-            text = f"the streams have only {len(pairs)} motions over {lag_s:g} s in common"
+            text = (
+                f"the streams have only {len(pairs)} motions over {lag_s:g} s in common"
+            )
             raise NotEnoughDataError(text)
         return pairs

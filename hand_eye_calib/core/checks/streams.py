@@ -147,7 +147,9 @@ def check_stream(
     return [*findings, jumps] if jumps else findings
 
 
-def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> list[Finding]:
+def check_positions(
+    trajectory: Trajectory, stream: str, max_gap_s: float
+) -> list[Finding]:
     """Return the findings about the stamps and the positions of one stream."""
     if len(trajectory) < 4:
         return [finding("too_few_poses", stream, poses=str(len(trajectory)))]
@@ -159,10 +161,14 @@ def check_positions(trajectory: Trajectory, stream: str, max_gap_s: float) -> li
         share = float(intervals_s[gaps].sum() / intervals_s.sum())
         longest_s = float(intervals_s.max())
         n_gaps = int(gaps.sum())
-        findings = [finding("gaps", stream, gaps=n_gaps, longest_s=longest_s, share=share)]
+        findings = [
+            finding("gaps", stream, gaps=n_gaps, longest_s=longest_s, share=share)
+        ]
     if apart_m := _interleaved(trajectory):
         return [*findings, finding("interleaved", stream, distance_m=apart_m)]
-    step_m = max(_grid_step(column) for column in se3.translation_of(trajectory.poses).T)
+    step_m = max(
+        _grid_step(column) for column in se3.translation_of(trajectory.poses).T
+    )
     # In a stream without orientations, rounding is noise like any other: never an error.
     most = np.inf if trajectory.has_rotations else LIMITS["coarse_positions"].error
     coarse = graded("coarse_positions", stream, min(step_m, most), step_m=step_m)
@@ -188,11 +194,15 @@ def _interleaved(trajectory: Trajectory) -> float:
         after = positions[2 * lag :]
         elapsed = (stamps_ns[2 * lag :] - stamps_ns[: -2 * lag]).astype(float)
         share = (stamps_ns[lag:-lag] - stamps_ns[: -2 * lag]) / elapsed
-        deviations.append(positions[lag:-lag] - before - share[:, None] * (after - before))
+        deviations.append(
+            positions[lag:-lag] - before - share[:, None] * (after - before)
+        )
     roughness_m = [median(np.linalg.norm(vectors, axis=1)) for vectors in deviations]
     # Positions that alternate are rough from pose to pose, and smooth over whole periods.
     period = 2 + int(np.argmin(roughness_m[1:]))
-    if roughness_m[0] < max(_MIN_ROUGHNESS_RATIO * roughness_m[period - 1], _MIN_ROUGHNESS_M):
+    if roughness_m[0] < max(
+        _MIN_ROUGHNESS_RATIO * roughness_m[period - 1], _MIN_ROUGHNESS_M
+    ):
         return 0.0
     in_world = deviations[0]
     in_sensor = np.einsum("kji,kj->ki", trajectory.poses[1:-1, :3, :3], in_world)
@@ -234,14 +244,21 @@ def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
     ):
         vertical = flat.poses[:, 2, 2]
         heights = flat.poses[:, 2, 3]
-        if np.abs(vertical - vertical[0]).max() > SAME_POSE or np.ptp(heights) > SAME_POSE:
+        if (
+            np.abs(vertical - vertical[0]).max() > SAME_POSE
+            or np.ptp(heights) > SAME_POSE
+        ):
             continue
         # The scatter in the world of the other sensor's axis of rotation: the direction in that
         # sensor whose image in the world scatters least.
         mean = whole.poses[::10, :3, :3].mean(axis=0)
-        tilt_rad = float(np.sqrt(max(np.linalg.eigvalsh(np.eye(3) - mean.T @ mean)[0], 0.0)))
+        tilt_rad = float(
+            np.sqrt(max(np.linalg.eigvalsh(np.eye(3) - mean.T @ mean)[0], 0.0))
+        )
         if tilt_rad > _MIN_TILT_RAD:
-            return [finding("flat", name, other=other, tilt_deg=float(np.degrees(tilt_rad)))]
+            return [
+                finding("flat", name, other=other, tilt_deg=float(np.degrees(tilt_rad)))
+            ]
     return []
 
 
@@ -250,7 +267,10 @@ def check_frozen(parent: Trajectory, child: Trajectory) -> list[Finding]:
 
     Both streams are on one clock.
     """
-    shares = {"parent": frozen_share(parent, child), "child": frozen_share(child, parent)}
+    shares = {
+        "parent": frozen_share(parent, child),
+        "child": frozen_share(child, parent),
+    }
     durations_s = {"parent": parent.duration_s, "child": child.duration_s}
     findings = (
         graded("frozen", name, share, share=share, frozen_s=share * durations_s[name])
@@ -299,7 +319,9 @@ def _exceeds(away: FloatArray, least: float) -> bool:
     return largest > max(least, _MOVES_NOISES * noise)
 
 
-def check_lengths(parent: Trajectory, child: Trajectory, lever_arm_m: float = 0.0) -> list[Finding]:
+def check_lengths(
+    parent: Trajectory, child: Trajectory, lever_arm_m: float = 0.0
+) -> list[Finding]:
     """Detect lengths in another unit than metres, from a motion that no vehicle has in metres.
 
     Two streams in millimetres agree with each other, so that only their motion reveals the unit.
@@ -330,8 +352,12 @@ def check_lengths(parent: Trajectory, child: Trajectory, lever_arm_m: float = 0.
             unit=unit,
             speed_m_s=speed,
             acceleration_m_s2=change,
-            beside=f", {lever_arm_m:.0f} m away from the child" if is_by_lever_arm else "",
-            condition="" if is_clear else "0.01 is for centimetres; if they are millimetres, ",
+            beside=f", {lever_arm_m:.0f} m away from the child"
+            if is_by_lever_arm
+            else "",
+            condition=""
+            if is_clear
+            else "0.01 is for centimetres; if they are millimetres, ",
         )
     ]
 

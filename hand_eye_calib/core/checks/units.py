@@ -23,7 +23,11 @@ _NEAR_UNIT_SHARE = 0.05
 
 
 def in_other_units(
-    scale: float, sigma: float, parent: Trajectory, child: Trajectory, known: float = 1.0
+    scale: float,
+    sigma: float,
+    parent: Trajectory,
+    child: Trajectory,
+    known: float = 1.0,
 ) -> Finding | None:
     """Return the finding that a stream's lengths are in another unit, or None.
 
@@ -103,5 +107,9 @@ def _parent_or_child(
     if is_too_slow(child) and not is_too_slow(parent):
         return None
     options = {"scale": float(f"{values['scale']:.4g}")}
-    values |= {"unit": _UNITS[unit.size_m], "factor": unit.size_m, "is_exact": unit.is_exact}
+    values |= {
+        "unit": _UNITS[unit.size_m],
+        "factor": unit.size_m,
+        "is_exact": unit.is_exact,
+    }
     return finding("unit_or_scale", "parent", options=options, **values)

@@ -45,7 +45,9 @@ WORDS = {
     # The sentences of documents without values.
     AS_WRITTEN: FindingWords("{what}", "{advice}", "{cause}"),
     # Of one stream.
-    "disorder": FindingWords("{text}", "repair the source of the stamps", severity=Severity.NOTE),
+    "disorder": FindingWords(
+        "{text}", "repair the source of the stamps", severity=Severity.NOTE
+    ),
     "leap": FindingWords("{whose} {leap}", "{remedy}"),
     "gaps": FindingWords(
         "the {stream} stream has gaps: {gaps}, of up to {longest_s:.2f} s ({share:.0%} of the "

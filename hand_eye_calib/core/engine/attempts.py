@@ -14,7 +14,11 @@ from hand_eye_calib.core.results.calibration import Calibration
 #: Options that correct a stream before it is paired.
 STREAM_REPAIRS = (
     "parent_scale",
-    *(f"{stream}_{option}" for stream in STREAMS for option in ("invert", "quaternion")),
+    *(
+        f"{stream}_{option}"
+        for stream in STREAMS
+        for option in ("invert", "quaternion")
+    ),
 )
 
 # A noise model fits if its misfit, the weighted squared residual per degree of freedom, is at most
@@ -54,7 +58,9 @@ class Attempt:
     @property
     def n_objections(self) -> int:
         """Number of findings graver than a note."""
-        return sum(finding.severity is not Severity.NOTE for finding in self.check.findings)
+        return sum(
+            finding.severity is not Severity.NOTE for finding in self.check.findings
+        )
 
     @property
     def noise_fits(self) -> bool:
@@ -96,7 +102,10 @@ class Attempt:
         warnings = tuple(dict.fromkeys((*messages, *self.calibration.warnings)))
         calibration = replace(self.calibration, warnings=warnings)
         return replace(
-            self, calibration=calibration, options=dict(options), messages=tuple(messages)
+            self,
+            calibration=calibration,
+            options=dict(options),
+            messages=tuple(messages),
         )
 
 

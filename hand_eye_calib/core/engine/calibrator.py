@@ -200,7 +200,11 @@ class Calibrator:
         streams = {}
         for stream, topic in topics.items():
             counts = asdict(self._buffers[stream].statistics)
-            streams[stream] = {"topic": str(topic), "messages": counts.pop("received"), **counts}
+            streams[stream] = {
+                "topic": str(topic),
+                "messages": counts.pop("received"),
+                **counts,
+            }
         return {"options": self.config.to_options(), **streams}
 
     def statistics(self, stream: str) -> StreamStatistics:
@@ -274,7 +278,9 @@ class Calibrator:
         InputError
             If a value is not finite or the quaternion is not of unit length.
         """
-        is_unit = abs(math.hypot(*quat_xyzw) - 1.0) <= trajectory.QUATERNION_NORM_TOLERANCE
+        is_unit = (
+            abs(math.hypot(*quat_xyzw) - 1.0) <= trajectory.QUATERNION_NORM_TOLERANCE
+        )
         if not (is_unit and math.hypot(*position) <= trajectory.FARTHEST_M):
             # Raise InputError with the reason.
             check_pose(*position, *quat_xyzw)
@@ -300,7 +306,9 @@ class Calibrator:
             buffered_parent=parent.trajectory(),
             buffered_child=child.trajectory(),
             paired_at=self._paired_at,
-            parent_names=snapshots.names_of(config, "parent", parent.frame, parent.world),
+            parent_names=snapshots.names_of(
+                config, "parent", parent.frame, parent.world
+            ),
             child_names=snapshots.names_of(config, "child", child.frame, child.world),
             time_offset=self._time_offset,
         )
@@ -345,14 +353,22 @@ class Calibrator:
             config = replace(config, time_offset=self._time_offset.seconds)
         offset_ns = round(float(config.time_offset) * 1e9)
         if self._paired_at is None:
-            self._paired_at = slower_stream(np.array(parent.stamps_ns), np.array(child.stamps_ns))
+            self._paired_at = slower_stream(
+                np.array(parent.stamps_ns), np.array(child.stamps_ns)
+            )
         # Last stamp of the batch, on the parent's clock.
-        horizon_ns = min(self._end_of_batch(parent), self._end_of_batch(child) + offset_ns)
+        horizon_ns = min(
+            self._end_of_batch(parent), self._end_of_batch(child) + offset_ns
+        )
         to_horizon = child.trajectory(horizon_ns - offset_ns)
         if self._time_offset:
             to_horizon = self._time_offset.steadied(to_horizon)
         pairs = snapshots.pair_poses(
-            config, parent.trajectory(horizon_ns), to_horizon, self._paired_at, self._kept_parts[-1]
+            config,
+            parent.trajectory(horizon_ns),
+            to_horizon,
+            self._paired_at,
+            self._kept_parts[-1],
         )
         pairs = pairs[pairs.stamps_ns <= horizon_ns]
         if len(pairs):
@@ -420,7 +436,11 @@ class Calibrators(dict[str, Calibrator]):
             calibrator.set_world(own_stream, world_frame)
 
     def add_pose(
-        self, stream: str, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float]
+        self,
+        stream: str,
+        stamp_ns: int,
+        position: Sequence[float],
+        quat_xyzw: Sequence[float],
     ) -> bool:
         """Add a pose; see :meth:`Calibrator.add_pose`."""
         (own_stream, first), *others = self.takers(stream)

@@ -53,7 +53,9 @@ _MAX_RATIO_OF_HALVES = 5.0
 _ROUNDING = 1e-9
 
 
-def cross_checked(solved: Solved, config: CalibratorConfig, pose_pairs: PosePairs) -> Calibration:
+def cross_checked(
+    solved: Solved, config: CalibratorConfig, pose_pairs: PosePairs
+) -> Calibration:
     """Return the result of a solve with its cross-check.
 
     If only the result determines an axis, and no other estimate does, the verdict of this axis
@@ -102,7 +104,9 @@ def _unconfirmed(result: Calibration, others: Sequence[Assessment]) -> BoolArray
     return is_known & is_known_to_none
 
 
-def answers_of_whole(result: Calibration, pose_pairs: PosePairs) -> tuple[Assessment, ...]:
+def answers_of_whole(
+    result: Calibration, pose_pairs: PosePairs
+) -> tuple[Assessment, ...]:
     """Estimate X from the motions of each of several strides, with the scale of the result.
 
     A stride is the number of poses from the start to the end of a motion.
@@ -128,12 +132,16 @@ def answers_of_halves(result: Calibration, pose_pairs: PosePairs) -> list[Assess
         pairs = motion_pairs(half.Ts_pw_p, half.Ts_cw_c, reference)
         if len(pairs):
             pairs = pairs[:: math.ceil(len(pairs) / _MAX_PAIRS)]
-            answers.append(assess_robust(pairs, robust.solve(pairs, result.T_parent_child)))
+            answers.append(
+                assess_robust(pairs, robust.solve(pairs, result.T_parent_child))
+            )
     return answers
 
 
 def compare_answers(
-    calibration: Calibration, others: Sequence[Assessment] = (), halves: Sequence[Assessment] = ()
+    calibration: Calibration,
+    others: Sequence[Assessment] = (),
+    halves: Sequence[Assessment] = (),
 ) -> CrossCheck:
     """Compare a result with other estimates of the same transform.
 

@@ -16,7 +16,10 @@ from hand_eye_calib.core.assessment import common_mode, covariance
 from hand_eye_calib.core.assessment.moved import possible_shift
 from hand_eye_calib.core.assessment.prior import fuse, widened
 from hand_eye_calib.core.assessment.rocking import rocking_axis
-from hand_eye_calib.core.assessment.second_opinion import excess_covariance, second_opinions
+from hand_eye_calib.core.assessment.second_opinion import (
+    excess_covariance,
+    second_opinions,
+)
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.config import CalibratorConfig, require_backend
 from hand_eye_calib.core.base.errors import NotEnoughDataError
@@ -28,7 +31,11 @@ from hand_eye_calib.core.noise import estimator as adaptive_estimator
 from hand_eye_calib.core.noise.estimator import AdaptiveSolution, NoiseModelError
 from hand_eye_calib.core.noise.increments import SYSTEMATIC
 from hand_eye_calib.core.noise.tuning import TUNING
-from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, motion_pairs
+from hand_eye_calib.core.pairing.motion_pairs import (
+    MotionPairs,
+    PosePairs,
+    motion_pairs,
+)
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, SolveStatus
 from hand_eye_calib.core.results.records import Residuals
 from hand_eye_calib.core.solvers.all_pairs import Solution
@@ -285,7 +292,9 @@ def solve_poses(
         relative_sigma = scale_fit.scale_sigma / scale_fit.scale
         spread += np.outer(by_log_scale, by_log_scale) * relative_sigma**2
     # If the noise model estimates the time offset, its covariance contains the uncertainty already.
-    has_offset = isinstance(solved.solution, AdaptiveSolution) and solved.solution.time_offset_s
+    has_offset = (
+        isinstance(solved.solution, AdaptiveSolution) and solved.solution.time_offset_s
+    )
     if time_offset and time_offset.fit and not has_offset:
         by_offset = time_offset.fit.sensitivity[:, 1]
         spread += np.outer(by_offset, by_offset) * time_offset.sigma_s**2
@@ -308,7 +317,9 @@ def solve_poses(
     )
 
 
-def floor_of(solved: Solved, pose_pairs: PosePairs, config: CalibratorConfig) -> FloatArray:
+def floor_of(
+    solved: Solved, pose_pairs: PosePairs, config: CalibratorConfig
+) -> FloatArray:
     """Return the covariance (6, 6) of constant errors of the sensors that are odometries."""
     # The functions in `common_mode` return the covariance for two odometries.
     share = [config.parent_kind, config.child_kind].count("odometry") / 2
@@ -318,10 +329,14 @@ def floor_of(solved: Solved, pose_pairs: PosePairs, config: CalibratorConfig) ->
     if isinstance(solved.solution, AdaptiveSolution):
         return share * common_mode.common_mode_floor(speed_m_s)
     T = solved.solution.T_parent_child
-    return share * common_mode.floor_of_pairs(solved.pairs, solved.weights, T, speed_m_s)
+    return share * common_mode.floor_of_pairs(
+        solved.pairs, solved.weights, T, speed_m_s
+    )
 
 
-def _solve_stream(pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free: bool) -> Solved:
+def _solve_stream(
+    pose_pairs: PosePairs, config: CalibratorConfig, is_clock_free: bool
+) -> Solved:
     """Solve with the adaptive estimator.
 
     Method ``auto`` uses DNLO instead if the noise model does not fit these poses, or if the user
@@ -378,7 +393,10 @@ def _with_opinions(dnlo: Solved, pose_pairs: PosePairs, reason: str) -> Solved:
 
 
 def _of_model(
-    pose_pairs: PosePairs, config: CalibratorConfig, solution: AdaptiveSolution, reason: str
+    pose_pairs: PosePairs,
+    config: CalibratorConfig,
+    solution: AdaptiveSolution,
+    reason: str,
 ) -> Solved:
     """Assess a solution of the adaptive estimator.
 
@@ -427,7 +445,9 @@ def _solve_pairs(
         Solution of the adaptive estimator, which chooses the reference ``auto``. By default, it is
         computed if the reference is ``auto``.
     """
-    method = Method(config.method, config.threshold, config.min_inlier_fraction, config.backend)
+    method = Method(
+        config.method, config.threshold, config.min_inlier_fraction, config.backend
+    )
     reference = config.reference
     reason = ""
     spread = _zero_covariance()
@@ -440,7 +460,9 @@ def _solve_pairs(
     elif reference == "auto":
         from hand_eye_calib.core.assessment.reference_selection import select_reference
 
-        choice = select_reference(pose_pairs, replace(method, backend="fast"), solution=adaptive)
+        choice = select_reference(
+            pose_pairs, replace(method, backend="fast"), solution=adaptive
+        )
         reference = choice.reference
         reason = choice.reason()
         model = choice.model

@@ -63,7 +63,9 @@ class Kind:
         """
         for name in _OF_WHEELS:
             if getattr(config, name) and config.measured != "vehicle":
-                raise ConfigError(f"{name} needs wheel data, see the option parent_measures")
+                raise ConfigError(
+                    f"{name} needs wheel data, see the option parent_measures"
+                )
         for name, values in self.allowed.items():
             value = getattr(config, name)
             if value not in values:

@@ -49,7 +49,9 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
     config = snapshot.config
     result = checking.check_streams(
         *snapshot.streams,
-        time_offset_s=calibration.time_offset_s if calibration else config.given_time_offset_s,
+        time_offset_s=calibration.time_offset_s
+        if calibration
+        else config.given_time_offset_s,
         scale=calibration.scale if calibration else config.given_scale,
         max_gap_s=snapshot.max_gap_s,
         correlate=lambda: snapshot.correlation,
@@ -64,7 +66,9 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
     if INVERSIONS & config.given:
         # The user has decided whether both streams are inverse.
         findings = [
-            replace(finding, severity=Severity.NOTE) if finding.code == "inverse_both" else finding
+            replace(finding, severity=Severity.NOTE)
+            if finding.code == "inverse_both"
+            else finding
             for finding in findings
         ]
     return replace(
@@ -94,7 +98,9 @@ def _limited_by_prior(
     return se3.turned(rotation.T, of_parent * np.outer(factors, factors))
 
 
-def _extrinsic_estimate(calibration: Calibration | None) -> checking.ExtrinsicEstimate | None:
+def _extrinsic_estimate(
+    calibration: Calibration | None,
+) -> checking.ExtrinsicEstimate | None:
     """Return the extrinsic of a result, and its standard deviations (6,); None without a result.
 
     All standard deviations are infinite if the result does not determine every axis.

@@ -77,7 +77,9 @@ def choose(
     """
     readings = result.readings
     assert readings is not None
-    findings_of_readings = [findings_of(hypothesis) for hypothesis in readings.hypotheses]
+    findings_of_readings = [
+        findings_of(hypothesis) for hypothesis in readings.hypotheses
+    ]
     options = [_options_of(findings) for findings in findings_of_readings]
     difference = _loss_difference(pairs_of(options[0]), pairs_of(options[1]))
     index = decide(readings, difference)
@@ -172,7 +174,9 @@ def _loss_difference(first: PosePairs, second: PosePairs) -> float:
     second = second.child_scaled(scale)
     try:
         return loss_difference(
-            first.stamps_ns, (first.Ts_pw_p, first.Ts_cw_c), (second.Ts_pw_p, second.Ts_cw_c)
+            first.stamps_ns,
+            (first.Ts_pw_p, first.Ts_cw_c),
+            (second.Ts_pw_p, second.Ts_cw_c),
         )
     except np.linalg.LinAlgError:
         return 0.0
@@ -198,7 +202,11 @@ def _unclear(
         texts.append(f"{reading} ({pose})")
     code = "inverse" if options[0] else "inverse_both"
     return finding(
-        "inverse_unclear", code=code, first=texts[0], second=texts[1], difference=difference
+        "inverse_unclear",
+        code=code,
+        first=texts[0],
+        second=texts[1],
+        difference=difference,
     )
 
 

@@ -25,7 +25,12 @@ from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.checks import units
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.clock_and_scale import offset_values
-from hand_eye_calib.core.checks.findings import Finding, Severity, gravest_first, repair_message
+from hand_eye_calib.core.checks.findings import (
+    Finding,
+    Severity,
+    gravest_first,
+    repair_message,
+)
 from hand_eye_calib.core.checks.findings import finding as new_finding
 from hand_eye_calib.core.checks.hypotheses import HOLDS
 from hand_eye_calib.core.engine import readings as choosing
@@ -117,7 +122,9 @@ def run(
     return best
 
 
-def review(calibration: Calibration, snapshot: Snapshot, settled: Collection[str] = ()) -> Attempt:
+def review(
+    calibration: Calibration, snapshot: Snapshot, settled: Collection[str] = ()
+) -> Attempt:
     """Check the streams of a result, and solve again if a check is certain of other options.
 
     Parameters
@@ -131,7 +138,9 @@ def review(calibration: Calibration, snapshot: Snapshot, settled: Collection[str
     return _best(_checked(calibration, snapshot), settled, None)
 
 
-def _solved_and_checked(snapshot: Snapshot, checks: bool | None, report: Progress) -> Attempt:
+def _solved_and_checked(
+    snapshot: Snapshot, checks: bool | None, report: Progress
+) -> Attempt:
     """Return the best attempt at a snapshot; ``checks`` is that of :func:`run`."""
     on_clock = _on_another_clock(snapshot)
     if on_clock and on_clock.is_sound and not on_clock.check.readings:
@@ -149,7 +158,9 @@ def _solved_and_checked(snapshot: Snapshot, checks: bool | None, report: Progres
     return _best(_checked(calibration, snapshot), (), on_clock)
 
 
-def _best(first: Attempt, settled: Collection[str], on_clock: Attempt | None) -> Attempt:
+def _best(
+    first: Attempt, settled: Collection[str], on_clock: Attempt | None
+) -> Attempt:
     """Return the best attempt: the first one, or one solved again with options from its check.
 
     First a reading is chosen: both streams as poses, or both as inverse poses. Then options that a
@@ -159,10 +170,14 @@ def _best(first: Attempt, settled: Collection[str], on_clock: Attempt | None) ->
     ``settled`` are options that must not be changed. ``on_clock`` is the attempt with an estimated
     time offset if there is one already.
     """
-    reading = _reading_of(first.snapshot, first.check, settled, first.calibration.time_offset_s)
+    reading = _reading_of(
+        first.snapshot, first.check, settled, first.calibration.time_offset_s
+    )
     first = first.with_findings(reading.findings)
     settled = reading.settled.union(settled)
-    certain_options = _certain(first.check.findings, first.snapshot.config.given.union(settled))
+    certain_options = _certain(
+        first.check.findings, first.snapshot.config.given.union(settled)
+    )
     if {*certain_options} & {*STREAM_REPAIRS}:
         verdict = first.calibration.verdict.value
         repaired = _repaired(
@@ -192,7 +207,9 @@ def _on_another_clock(snapshot: Snapshot) -> Attempt | None:
         return None
     coarse = TimeOffset(snapshot.correlation.offset_s, correlation=snapshot.correlation)
     # This precision suffices to decide whether the clocks differ.
-    preliminary = refine_time_offset(*snapshot.streams, coarse, snapshot.max_gap_s, UNASKED_S)
+    preliminary = refine_time_offset(
+        *snapshot.streams, coarse, snapshot.max_gap_s, UNASKED_S
+    )
     fit = preliminary.fit
     smallest_s = abs(preliminary.seconds) - 3.0 * preliminary.sigma_s
     if fit is None or smallest_s < MOST_MOVED_S:
@@ -202,7 +219,9 @@ def _on_another_clock(snapshot: Snapshot) -> Attempt | None:
     if fit.has_own_unit or fit.unexplained > HOLDS:
         return None
     offset = refine_time_offset(*snapshot.streams, preliminary, snapshot.max_gap_s)
-    other = replace(snapshot, config=replace(config, **_ESTIMATED_CLOCK), time_offset=offset)
+    other = replace(
+        snapshot, config=replace(config, **_ESTIMATED_CLOCK), time_offset=offset
+    )
     return _solved_with(other, {})
 
 
@@ -210,7 +229,9 @@ def _clock_is_off(first: Attempt) -> bool:
     """Return whether the time offset has changed so much that poses must be paired anew."""
     snapshot = first.snapshot
     calibration = first.calibration
-    moved_s = abs(calibration.time_offset_s - float(snapshot.resolved.config.time_offset))
+    moved_s = abs(
+        calibration.time_offset_s - float(snapshot.resolved.config.time_offset)
+    )
     clock = first.check.offset
     is_free = not METHODS[snapshot.config.method].uses_reference
     if clock and is_free and snapshot.config.reference == "auto":
@@ -247,7 +268,9 @@ def _reading_of(
         return attempt.calibration if attempt else None
 
     choice = choosing.choose(result, pairs_of, answer_with)
-    return _Reading(choice.findings, choice.doubts, frozenset() if choice.is_repair else INVERSIONS)
+    return _Reading(
+        choice.findings, choice.doubts, frozenset() if choice.is_repair else INVERSIONS
+    )
 
 
 def _without_readings(result: CheckResult) -> tuple[Finding, ...]:
@@ -298,7 +321,9 @@ def _repaired(
     verdict_as_given : str
         Verdict of the streams without the repair, for the message.
     """
-    options = {name: value for name, value in certain_options.items() if value != "estimate"}
+    options = {
+        name: value for name, value in certain_options.items() if value != "estimate"
+    }
     second = _solved_with(snapshot, options) if options else None
     if not second and "time_offset" in certain_options:
         options["time_offset"] = "estimate"
@@ -310,8 +335,12 @@ def _repaired(
     reading = _reading_of(second.snapshot, second.check, settled, offset_s)
     second = second.with_findings(reading.findings)
     settled |= reading.settled
-    further = _certain(second.check.findings, second.snapshot.config.given.union(settled))
-    further = {name: value for name, value in further.items() if name not in STREAM_REPAIRS}
+    further = _certain(
+        second.check.findings, second.snapshot.config.given.union(settled)
+    )
+    further = {
+        name: value for name, value in further.items() if name not in STREAM_REPAIRS
+    }
     second = _estimated(second, further, settled, None).with_doubts(reading.doubts)
     if any(map(_contradicts_repair, second.check.findings)):
         return None
@@ -321,7 +350,9 @@ def _repaired(
         options,
         f": {verdict}; as the streams are: {verdict_as_given}",
     )
-    second = second.with_messages({**options, **second.options}, (message, *second.messages))
+    second = second.with_messages(
+        {**options, **second.options}, (message, *second.messages)
+    )
     # A difference of lengths may also be a scale of the child instead of a unit of the parent.
     doubts = [
         replace(finding, severity=Severity.WARNING, options={})
@@ -344,7 +375,10 @@ def _contradicts_repair(finding: Finding) -> bool:
 
 
 def _estimated(
-    first: Attempt, certain_options: Options, settled: Collection[str], on_clock: Attempt | None
+    first: Attempt,
+    certain_options: Options,
+    settled: Collection[str],
+    on_clock: Attempt | None,
 ) -> Attempt:
     """Return the attempt with an estimated time offset or scale, or the first attempt.
 
@@ -367,11 +401,15 @@ def _estimated(
     if not (second.is_better_than(first, n_fewer) or second.is_sound):
         return first
     findings = first.check.findings
-    doubts = () if "parent_scale" in fixed else _unit_doubts(findings, second.calibration)
+    doubts = (
+        () if "parent_scale" in fixed else _unit_doubts(findings, second.calibration)
+    )
     return _with_estimate_warnings(second, options, findings).with_doubts(doubts)
 
 
-def _unit_doubts(findings: Collection[Finding], calibration: Calibration) -> tuple[Finding, ...]:
+def _unit_doubts(
+    findings: Collection[Finding], calibration: Calibration
+) -> tuple[Finding, ...]:
     """Return findings that a difference of lengths, estimated as a scale, may be a wrong unit.
 
     A finding is an error if the scale in the check or in the result equals that of the unit within
@@ -484,7 +522,9 @@ def _solved_with(snapshot: Snapshot, options: Options) -> Attempt | None:
         return None
 
 
-def _certain(findings: Collection[Finding], fixed: Collection[str]) -> dict[str, float | str]:
+def _certain(
+    findings: Collection[Finding], fixed: Collection[str]
+) -> dict[str, float | str]:
     """Return the options that certainly repair a stream, except those in ``fixed``.
 
     Values of units and conventions are those of the findings. Time offset and scale get the value
@@ -494,13 +534,17 @@ def _certain(findings: Collection[Finding], fixed: Collection[str]) -> dict[str,
     certain_options: dict[str, float | str] = {}
     for finding in findings:
         for name, value in finding.options.items():
-            is_clock_warning = name == "time_offset" and finding.severity is Severity.WARNING
+            is_clock_warning = (
+                name == "time_offset" and finding.severity is Severity.WARNING
+            )
             is_convention = name.endswith(("invert", "quaternion"))
             is_certain = finding.code in _CERTAIN_CODES or is_convention
             if not is_certain or name in fixed:
                 continue
             if finding.makes_unusable or is_clock_warning:
-                certain_options |= options_to_solve(replace(finding, options={name: value}))
+                certain_options |= options_to_solve(
+                    replace(finding, options={name: value})
+                )
     return certain_options
 
 

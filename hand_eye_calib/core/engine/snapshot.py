@@ -17,7 +17,11 @@ from hand_eye_calib.core.engine.kinds import kind_of
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import StreamFrames
 from hand_eye_calib.core.geometry.trajectory import Trajectory
-from hand_eye_calib.core.pairing.motion_pairs import PosePairs, select_keyframes, synchronise
+from hand_eye_calib.core.pairing.motion_pairs import (
+    PosePairs,
+    select_keyframes,
+    synchronise,
+)
 from hand_eye_calib.core.results.calibration import Calibration
 
 STREAMS = ("parent", "child")
@@ -87,7 +91,10 @@ class Snapshot:
         """Return the name of a stream's sensor frame; a default if the frame has no name."""
         names, other = self._names(stream)
         name = names.name
-        if getattr(self.config, f"{stream}_invert") == "poses" and names.inverse_name != other.name:
+        if (
+            getattr(self.config, f"{stream}_invert") == "poses"
+            and names.inverse_name != other.name
+        ):
             name = names.inverse_name
         return name or f"{stream}_sensor"
 
@@ -101,7 +108,9 @@ class Snapshot:
     def frame_warnings(self) -> tuple[str, ...]:
         """Warnings about sensor frames without a name, or with another name by an inversion."""
         warnings = []
-        for stream, frame in zip(STREAMS, (self.parent_frame, self.child_frame), strict=True):
+        for stream, frame in zip(
+            STREAMS, (self.parent_frame, self.child_frame), strict=True
+        ):
             names, _ = self._names(stream)
             if frame == f"{stream}_sensor":
                 warnings.append(
@@ -166,7 +175,11 @@ class Snapshot:
     @cached_property
     def correlation(self) -> Correlation:
         """Best correlation of the angular rates of both streams over all time offsets."""
-        if self.time_offset and self.time_offset.correlation.is_clear and not len(self.kept):
+        if (
+            self.time_offset
+            and self.time_offset.correlation.is_clear
+            and not len(self.kept)
+        ):
             return self.time_offset.correlation
         return correlate_rates(*self.streams, self.max_gap_s)
 
@@ -187,8 +200,12 @@ class Snapshot:
             return self.resolved.pose_pairs
         kept = self.kept
         if len(kept):
-            parent = _corrected(Trajectory(kept.stamps_ns, kept.Ts_pw_p), "parent", self.config)
-            child = _corrected(Trajectory(kept.stamps_ns, kept.Ts_cw_c), "child", self.config)
+            parent = _corrected(
+                Trajectory(kept.stamps_ns, kept.Ts_pw_p), "parent", self.config
+            )
+            child = _corrected(
+                Trajectory(kept.stamps_ns, kept.Ts_cw_c), "child", self.config
+            )
             kept = PosePairs(kept.stamps_ns, parent.poses, child.poses)
         pairs = pair_poses(self.config, *self.unpaired, self.paired_at, kept)
         if len(kept):
@@ -293,7 +310,9 @@ def _measuring(trajectory: Trajectory, measures: str) -> Trajectory:
     return replace(trajectory, measures=measures)
 
 
-def _corrected(trajectory: Trajectory, stream: str, config: CalibratorConfig) -> Trajectory:
+def _corrected(
+    trajectory: Trajectory, stream: str, config: CalibratorConfig
+) -> Trajectory:
     """Return a stream with the options about inversion, quaternions and parent scale applied.
 
     Raises
@@ -305,10 +324,15 @@ def _corrected(trajectory: Trajectory, stream: str, config: CalibratorConfig) ->
     order = getattr(config, f"{stream}_quaternion")
     if (invert, order) != ("none", "xyzw"):
         kind = trajectory.measures
-        if kind not in ("poses", "rotations") or (invert, kind) == ("poses", "rotations"):
+        if kind not in ("poses", "rotations") or (invert, kind) == (
+            "poses",
+            "rotations",
+        ):
             options = f"{stream}_invert {invert}, {stream}_quaternion {order}"
             raise ConfigError(f"{options} cannot be: the {stream} measures {kind}")
-        trajectory = replace(trajectory, poses=se3.put_right(trajectory.poses, invert, order))
+        trajectory = replace(
+            trajectory, poses=se3.put_right(trajectory.poses, invert, order)
+        )
     if stream == "parent" and config.parent_scale != 1.0:
         return trajectory.scaled(config.parent_scale)
     return trajectory
@@ -333,18 +357,24 @@ def whole_snapshot(
     config = CalibratorConfig.from_options(of_streams | dict(options))
     warnings: tuple[str, ...] = ()
     if min(len(parent), len(child)) > config.max_pairs == _MAX_PAIRS:
-        warnings = (f"{_MAX_PAIRS:,} pose pairs are used at most; set max_pairs to use more",)
+        warnings = (
+            f"{_MAX_PAIRS:,} pose pairs are used at most; set max_pairs to use more",
+        )
     return Snapshot(
         config=config,
         buffered_parent=parent,
         buffered_child=child,
-        parent_names=names_of(config, "parent", parent.sensor_frame, parent.world_frame),
+        parent_names=names_of(
+            config, "parent", parent.sensor_frame, parent.world_frame
+        ),
         child_names=names_of(config, "child", child.sensor_frame, child.world_frame),
         warnings=warnings,
     )
 
 
-def names_of(config: CalibratorConfig, stream: str, sensor: str, world: str) -> StreamFrames:
+def names_of(
+    config: CalibratorConfig, stream: str, sensor: str, world: str
+) -> StreamFrames:
     """Return the names of the frames of a stream, from its messages and the options."""
     option = getattr(config, f"{stream}_frame")
     return StreamFrames(frame_name(sensor), frame_name(world), frame_name(option))
@@ -368,8 +398,12 @@ def downsample(pose_pairs: PosePairs, max_pairs: int) -> PosePairs:
         candidates = np.arange(1, len(pose_pairs) - 1, 2)
         rotations = se3.rotation_of(pose_pairs.Ts_pw_p)
         # Trace of the rotation between both neighbours: 1 + 2 cos(angle).
-        traces = np.einsum("kij,kij->k", rotations[candidates - 1], rotations[candidates + 1])
-        n_drop = min(len(pose_pairs) - max_pairs + max_pairs // 10, (len(candidates) + 1) // 2)
+        traces = np.einsum(
+            "kij,kij->k", rotations[candidates - 1], rotations[candidates + 1]
+        )
+        n_drop = min(
+            len(pose_pairs) - max_pairs + max_pairs // 10, (len(candidates) + 1) // 2
+        )
         keep = np.ones(len(pose_pairs), dtype=bool)
         keep[candidates[np.argsort(-traces, kind="stable")[:n_drop]]] = False
         pose_pairs = pose_pairs[keep]
@@ -396,7 +430,9 @@ def pair_poses(
     kept : PosePairs
         Earlier pairs.
     """
-    pairs = synchronise(parent, child.shifted(float(config.time_offset)), config.max_gap, at)
+    pairs = synchronise(
+        parent, child.shifted(float(config.time_offset)), config.max_gap, at
+    )
     if len(kept):
         pairs = pairs[pairs.stamps_ns > kept.stamps_ns[-1]]
     keyframes = select_keyframes(

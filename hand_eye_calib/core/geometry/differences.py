@@ -39,7 +39,9 @@ def stencil(stamps_s: FloatArray, step: int) -> Stencil:
     """
     rows = np.arange(len(stamps_s))
     last = len(stamps_s) - 1
-    before_2, before, after, after_2 = (np.clip(rows + k * step, 0, last) for k in (-2, -1, 1, 2))
+    before_2, before, after, after_2 = (
+        np.clip(rows + k * step, 0, last) for k in (-2, -1, 1, 2)
+    )
     spans_s = stamps_s[after_2] - stamps_s[before_2]
     return Stencil(before_2, before, after, after_2, spans_s)
 

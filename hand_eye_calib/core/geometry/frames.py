@@ -33,10 +33,30 @@ _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 LAST_ROW_WITHIN = 1e-6
 
 # Words in the name of a fixed frame, such as a map or the origin of an odometry.
-_WORLDS = {"map", "odom", "odometry", "world", "earth", "ecef", "enu", "ned", "utm", "global"}
+_WORLDS = {
+    "map",
+    "odom",
+    "odometry",
+    "world",
+    "earth",
+    "ecef",
+    "enu",
+    "ned",
+    "utm",
+    "global",
+}
 _WORLDS |= {"origin", "init", "mocap", "vicon", "optitrack", "inertial"}
 # Words in the name of a frame that a camera observes.
-_TARGETS = {"aruco", "marker", "tag", "apriltag", "charuco", "target", "board", "chessboard"}
+_TARGETS = {
+    "aruco",
+    "marker",
+    "tag",
+    "apriltag",
+    "charuco",
+    "target",
+    "board",
+    "chessboard",
+}
 _TARGETS |= {"checkerboard", "pattern", "fiducial", "aprilgrid"}
 
 # Largest number of edges of a tree in a message.
@@ -79,7 +99,9 @@ def check_pose(*values: float) -> None:
     check_not_null(*values)
     length = math.hypot(*values[3:])
     if abs(length - 1.0) > QUATERNION_NORM_TOLERANCE:
-        raise InputError(f"the pose has a quaternion of length {length:.4g}, expected 1")
+        raise InputError(
+            f"the pose has a quaternion of length {length:.4g}, expected 1"
+        )
     if max(map(abs, values[:3])) > FARTHEST_M:
         raise InputError(far_position(*values[:3]))
 
@@ -161,7 +183,9 @@ def pose_stack(values: Any, label: str) -> FloatArray:
     Ts = _joined(*pair, label) if pair else _single_stack(values, label)
     is_finite = np.isfinite(Ts).all(axis=(1, 2))
     if not is_finite.all():
-        raise InputError(f"{label}, row {np.argmin(is_finite) + 1}: a number is not finite")
+        raise InputError(
+            f"{label}, row {np.argmin(is_finite) + 1}: a number is not finite"
+        )
     return _rigid(Ts, label)
 
 
@@ -237,7 +261,9 @@ def _single_stack(values: Any, label: str) -> FloatArray:
     if array is not None and array.shape[1:] == (3, 4):
         return se3.from_rotation_translation(array[:, :, :3], array[:, :, 3])
     if array is None or array.shape[1:] != (4, 4):
-        shape = "rows of different shapes" if array is None else f"an array {array.shape}"
+        shape = (
+            "rows of different shapes" if array is None else f"an array {array.shape}"
+        )
         raise InputError(
             f"{label}: expected poses as (N, 4, 4), (N, 7) of x, y, z, qx, qy, qz, qw, or a pair "
             f"of rotations (N, 3, 3) and translations (N, 3); found {shape}"
@@ -382,7 +408,11 @@ class FrameTree:
         self._origin = origin
 
     def add(
-        self, parent: str, frame: str, pose: FloatArray | None = None, is_static: bool = True
+        self,
+        parent: str,
+        frame: str,
+        pose: FloatArray | None = None,
+        is_static: bool = True,
     ) -> Edge:
         """Add an edge, or replace its pose. An edge that has moved once is never static again.
 
@@ -426,7 +456,9 @@ class FrameTree:
             edge = self.edges[step]
             T_above_step = moving.get(step, edge.pose)
             if T_above_step is None or not (edge.is_static or moving):
-                raise InputError(f"{frame} and {of} are not fixed to each other: {step} moves")
+                raise InputError(
+                    f"{frame} and {of} are not fixed to each other: {step} moves"
+                )
             if step in up:
                 T_above_step = se3.inverse(T_above_step)
             T_frame_of = T_frame_of @ T_above_step
@@ -445,7 +477,9 @@ class FrameTree:
         up = self.above(frame_name(frame))
         down = self.above(frame_name(of))
         if up[-1] != down[-1]:
-            raise InputError(f"frames {frame!r} and {of!r} are not connected; {self.listing()}")
+            raise InputError(
+                f"frames {frame!r} and {of!r} are not connected; {self.listing()}"
+            )
         while up and down and up[-1] == down[-1]:
             del up[-1], down[-1]
         return up, down[::-1]
@@ -458,7 +492,9 @@ class FrameTree:
         InputError
             If the frame is missing, or the frames above it form a loop.
         """
-        if frame not in self.edges and all(edge.parent != frame for edge in self.edges.values()):
+        if frame not in self.edges and all(
+            edge.parent != frame for edge in self.edges.values()
+        ):
             raise InputError(f"no frame {frame!r} in {self._origin}; {self.listing()}")
         frames = [frame]
         while frame in self.edges:

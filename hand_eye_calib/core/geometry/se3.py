@@ -71,7 +71,9 @@ def translation_of(transforms: FloatArray) -> FloatArray:
     return transforms[..., :3, 3]
 
 
-def from_rotation_translation(rotation: ArrayLike, translation: ArrayLike) -> FloatArray:
+def from_rotation_translation(
+    rotation: ArrayLike, translation: ArrayLike
+) -> FloatArray:
     """Return transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3), m."""
     rotation = np.asarray(rotation, dtype=float)
     translation = np.asarray(translation, dtype=float)
@@ -97,7 +99,9 @@ def from_quat_xyzw(translation: ArrayLike, quat_xyzw: ArrayLike) -> FloatArray:
     norms = np.linalg.norm(quats, axis=-1, keepdims=True)
     if not norms.all():
         raise ValueError("found a quaternion of length zero")
-    return from_rotation_translation(_matrices(*np.moveaxis(quats / norms, -1, 0)), translation)
+    return from_rotation_translation(
+        _matrices(*np.moveaxis(quats / norms, -1, 0)), translation
+    )
 
 
 def to_quat_xyzw(transforms: ArrayLike) -> FloatArray:
@@ -278,7 +282,8 @@ def retracted(transform: FloatArray, step: FloatArray) -> FloatArray:
     """
     rotation = rotation_of(transform)
     return from_rotation_translation(
-        rotation @ rotation_exp(step[3:]), translation_of(transform) + rotation @ step[:3]
+        rotation @ rotation_exp(step[3:]),
+        translation_of(transform) + rotation @ step[:3],
     )
 
 
@@ -312,7 +317,9 @@ def exp(xi: ArrayLike) -> FloatArray:
     second_series = 1 / 6 - squared / 120 + squared**2 / 5040
     second = np.where(is_small, second_series, (safe - np.sin(safe)) / safe**3)
     cross_once = cross(phi, rho)
-    translation = rho + first[..., None] * cross_once + second[..., None] * cross(phi, cross_once)
+    translation = (
+        rho + first[..., None] * cross_once + second[..., None] * cross(phi, cross_once)
+    )
     return from_rotation_translation(rotation_exp(phi), translation)
 
 
@@ -345,7 +352,9 @@ def log(transforms: ArrayLike) -> FloatArray:
     closed = (1 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2
     coefficient = np.where(is_small, series, closed)
     cross_once = cross(phi, translation)
-    rho = translation - 0.5 * cross_once + coefficient[..., None] * cross(phi, cross_once)
+    rho = (
+        translation - 0.5 * cross_once + coefficient[..., None] * cross(phi, cross_once)
+    )
     return np.concatenate([rho, phi], axis=-1)
 
 
@@ -413,7 +422,9 @@ def chained(steps: FloatArray) -> FloatArray:
     return products
 
 
-def put_right(Ts: FloatArray, invert: str = "none", quaternion: str = "xyzw") -> FloatArray:
+def put_right(
+    Ts: FloatArray, invert: str = "none", quaternion: str = "xyzw"
+) -> FloatArray:
     """Correct poses (N, 4, 4) that were read in the wrong convention.
 
     Parameters
@@ -477,7 +488,9 @@ def block_diagonal(rotation: FloatArray) -> FloatArray:
     return both
 
 
-def sigmas_in_parent(rotation_parent_child: FloatArray, covariance: FloatArray) -> FloatArray:
+def sigmas_in_parent(
+    rotation_parent_child: FloatArray, covariance: FloatArray
+) -> FloatArray:
     """Return standard deviations (6,), m and rad, along and about the parent's axes.
 
     All are infinite if the covariance (6, 6) of xi in the child's frame is not finite.
@@ -528,7 +541,9 @@ def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArra
     return sigmas
 
 
-def inverse_covariance(T_target_source: FloatArray, covariance: FloatArray) -> FloatArray:
+def inverse_covariance(
+    T_target_source: FloatArray, covariance: FloatArray
+) -> FloatArray:
     """Return the covariance (6, 6) of the inverse of a transform T with covariance C (6, 6) of xi.
 
     ``inverse(T exp(xi)) = inverse(T) exp(-Ad_T xi)``, so the covariance is ``Ad_T C Ad_T'``. All
@@ -551,7 +566,9 @@ def absolute_errors(
     translation = np.linalg.norm(
         translation_of(truth_T_parent_child) - translation_of(T_parent_child)
     )
-    rotation = rotation_angle(rotation_of(T_parent_child).T @ rotation_of(truth_T_parent_child))
+    rotation = rotation_angle(
+        rotation_of(T_parent_child).T @ rotation_of(truth_T_parent_child)
+    )
     return float(translation), float(rotation)
 
 

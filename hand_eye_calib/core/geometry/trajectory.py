@@ -73,7 +73,9 @@ def scatter_of_direction(poses: FloatArray) -> float:
     rotations = se3.rotation_of(poses)
     # Select the first pose after each further step along the path.
     step_m = float(np.linalg.norm(np.ptp(positions, axis=0))) / _STEPS_IN_EXTENT
-    travelled_m = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))]
+    travelled_m = np.r_[
+        0.0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))
+    ]
     n_steps_before = np.floor(travelled_m / (step_m or np.inf))
     rows = np.flatnonzero(np.diff(n_steps_before, prepend=-1.0))
     steps = np.diff(positions[rows], axis=0)
@@ -255,11 +257,15 @@ class Trajectory(Columns):
 
         Examples are the antenna of a GNSS receiver and the prism of a total station.
         """
-        poses = se3.from_rotation_translation(np.eye(3), floats("positions", positions, 3))
+        poses = se3.from_rotation_translation(
+            np.eye(3), floats("positions", positions, 3)
+        )
         return cls(stamps_ns, poses, sensor_frame, world_frame, "positions")
 
     @classmethod
-    def from_rates(cls, stamps_ns: IntArray, rates: ArrayLike, sensor_frame: str = "") -> Self:
+    def from_rates(
+        cls, stamps_ns: IntArray, rates: ArrayLike, sensor_frame: str = ""
+    ) -> Self:
         """Make a trajectory of angular rates (N, 3), rad/s, of a gyroscope about its own axes.
 
         Raises
@@ -349,7 +355,9 @@ class Trajectory(Columns):
         # Positions are not checked, because in another unit they may exceed the largest position.
         return self._unchecked("poses", poses)
 
-    def _unchecked(self, name: str, value: NDArray[Any], unshifted: Self | None = None) -> Self:
+    def _unchecked(
+        self, name: str, value: NDArray[Any], unshifted: Self | None = None
+    ) -> Self:
         """Return a copy with another value of a field, without checks."""
         changed = object.__new__(type(self))
         values = {column.name: getattr(self, column.name) for column in fields(self)}
@@ -388,7 +396,9 @@ class Trajectory(Columns):
             powers = _sums_nearby(0.5 * (squares[1:] + squares[:-1]))
             # The correlation is 1 for motion and -2/3 for white noise.
             correlation = products / np.maximum(powers, 1e-300)
-            motion = np.clip((correlation - _CORRELATION) / (1.0 - _CORRELATION), 0.0, 1.0)
+            motion = np.clip(
+                (correlation - _CORRELATION) / (1.0 - _CORRELATION), 0.0, 1.0
+            )
             noise = (1.0 - motion) * _VARIANCE_OF_MEAN
             shares[:, columns] = (motion / (motion + noise))[:, None]
         return steps, changes, shares
@@ -417,7 +427,9 @@ class Trajectory(Columns):
         """
         stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
         if len(self) < 2:
-            raise InputError(f"interpolation needs at least two poses; found {len(self)}")
+            raise InputError(
+                f"interpolation needs at least two poses; found {len(self)}"
+            )
         is_outside = (stamps_ns < self.stamps_ns[0]) | (stamps_ns > self.stamps_ns[-1])
         if is_outside.any() and not extrapolate:
             raise InputError(
@@ -438,7 +450,11 @@ class Trajectory(Columns):
         is_bent = is_between & ~is_outside
         if is_bent.any() and not straight:
             corrections = corner_corrections(
-                self.stamps_ns, changes, shares, start=before[is_bent], fraction=fraction[is_bent]
+                self.stamps_ns,
+                changes,
+                shares,
+                start=before[is_bent],
+                fraction=fraction[is_bent],
             )
             poses[is_bent] = poses[is_bent] @ se3.exp(corrections)
         return poses

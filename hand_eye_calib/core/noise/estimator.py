@@ -129,10 +129,14 @@ class ModelSolution:
         sentences = []
         if len(jumps_s):
             jumps = counted(len(jumps_s), "jump")
-            sentences.append(f"{jumps} of a trajectory, just before {_first_times(jumps_s)} s")
+            sentences.append(
+                f"{jumps} of a trajectory, just before {_first_times(jumps_s)} s"
+            )
         if len(outliers_s):
             outlier_poses = counted(len(outliers_s), "outlier pose")
-            sentences.append(f"{outlier_poses}, left out, at {_first_times(outliers_s)} s")
+            sentences.append(
+                f"{outlier_poses}, left out, at {_first_times(outliers_s)} s"
+            )
         return sentences
 
 
@@ -173,8 +177,14 @@ class AdaptiveSolution(ModelSolution):
     @property
     def systematic(self) -> str:
         """Names of the significant systematic errors, joined by ``+``; ``none`` without any."""
-        is_significant = np.abs(self.parameters) > MIN_REPORTED_SIGMAS * self.parameter_sigmas
-        names = [name for name, columns in PARAMETERS.items() if is_significant[columns].any()]
+        is_significant = (
+            np.abs(self.parameters) > MIN_REPORTED_SIGMAS * self.parameter_sigmas
+        )
+        names = [
+            name
+            for name, columns in PARAMETERS.items()
+            if is_significant[columns].any()
+        ]
         return "+".join(names) or "none"
 
     @property
@@ -208,7 +218,9 @@ class AdaptiveSolution(ModelSolution):
         for (kind, part), sigma, tau_s in zip(
             self.model.processes, process_sigmas.tolist(), taus_s.tolist(), strict=True
         ):
-            lasting.append(CorrelatedError(kind=kind, part=part, sigma=sigma, tau_s=tau_s))
+            lasting.append(
+                CorrelatedError(kind=kind, part=part, sigma=sigma, tau_s=tau_s)
+            )
         return Noise(
             in_words=(),
             rotation_white_rad=sigmas.rotation_rad,
@@ -221,7 +233,10 @@ class AdaptiveSolution(ModelSolution):
         )
 
     def describe(
-        self, stamps_ns: IntArray, offset_s: float | None = None, scale: float | None = None
+        self,
+        stamps_ns: IntArray,
+        offset_s: float | None = None,
+        scale: float | None = None,
     ) -> Noise:
         """Return the noise in numbers and in words, with the times of jumps and outliers.
 
@@ -251,7 +266,9 @@ class AdaptiveSolution(ModelSolution):
             drift = f"{after_1_m} and {turned_after_1_m} after 1 m, ten times that after 100 m"
         else:
             # Streams of rotations have no translations.
-            processes = tuple(process for process in processes if process.part == "rotation")
+            processes = tuple(
+                process for process in processes if process.part == "rotation"
+            )
         sentences = [
             f"Noise: {white} per axis of each pose (both sensors together).",
             f"Drift: {drift}.",
@@ -262,7 +279,9 @@ class AdaptiveSolution(ModelSolution):
             sentences.append(f"stamps jitter by {jitter_ms:.2g} ms")
         return sentences
 
-    def _systematic_in_words(self, offset_s: float | None, scale: float | None) -> list[str]:
+    def _systematic_in_words(
+        self, offset_s: float | None, scale: float | None
+    ) -> list[str]:
         """Return sentences about the significant systematic errors; see :meth:`describe`."""
         systematic = self.systematic.split("+")
         sentences = []
@@ -275,7 +294,9 @@ class AdaptiveSolution(ModelSolution):
             size = f"{abs(percent):.2f} +/- {sigma:.2g} %"
             # A scale above 1 makes the child's lengths longer: as measured, they are too short.
             comparison = "shorter" if percent > 0 else "longer"
-            sentences.append(f"the child's lengths are {size} {comparison} than the parent's")
+            sentences.append(
+                f"the child's lengths are {size} {comparison} than the parent's"
+            )
         if "bias" in systematic:
             bias = zip("xyz", 1000 * self.parameters[BIAS], strict=True)
             along = ", ".join(f"{axis} {value:.2g}" for axis, value in bias)
@@ -284,11 +305,17 @@ class AdaptiveSolution(ModelSolution):
             )
         if "rate" in systematic:
             rates = zip("xyz", *np.degrees(self.rate_bias), strict=True)
-            about = ", ".join(f"{axis} {bias:.3g} +/- {sigma:.1g}" for axis, bias, sigma in rates)
-            sentences.append(f"bias of the angular rates, along the child's axes: {about} deg/s")
+            about = ", ".join(
+                f"{axis} {bias:.3g} +/- {sigma:.1g}" for axis, bias, sigma in rates
+            )
+            sentences.append(
+                f"bias of the angular rates, along the child's axes: {about} deg/s"
+            )
         elif "time" in systematic and offset_s is not None:
             value = f"{offset_s + self.time_offset_s:.4f} +/- {self.time_offset_sigma_s:.4f} s"
-            sentences.append(f"the time offset is {value}, refined from {offset_s:.4f} s")
+            sentences.append(
+                f"the time offset is {value}, refined from {offset_s:.4f} s"
+            )
         elif "time" in systematic:
             ms = 1000 * self.time_offset_s
             sigma = 1000 * self.time_offset_sigma_s
@@ -306,7 +333,9 @@ def _process_in_words(process: CorrelatedError) -> str:
         return f"the scale drifts by {100 * process.sigma:.2g} % within {duration}"
     if process.part == "direction":
         return f"the direction of travel drifts by {angle(process.sigma)} within {duration}"
-    size = length(process.sigma) if process.part == "translation" else angle(process.sigma)
+    size = (
+        length(process.sigma) if process.part == "translation" else angle(process.sigma)
+    )
     frame = _FIXED_TO[process.kind]
     return f"errors of {size} per axis, correlated over {duration}, keep their direction in {frame}"
 
@@ -382,7 +411,9 @@ def _search(problem: Problem) -> AdaptiveSolution:
             return _expand_to_all_poses(_search(fewer), kept, first.outliers.spikes)
     fit = _run_stages(_LAST_STAGES, workspace, first)
     if not is_settled(workspace, fit):
-        workspace = Workspace(replace(problem, without=problem.without | {"time_correlated"}))
+        workspace = Workspace(
+            replace(problem, without=problem.without | {"time_correlated"})
+        )
         fit = _run_stages(_LAST_STAGES, workspace, first)
     return _solution(workspace, fit)
 
@@ -404,7 +435,9 @@ def _strided_poses(problem: Problem, fit: Fit) -> IntArray:
     tuning = problem.tuning
     sound_poses = np.flatnonzero(~fit.outliers.spikes)
     # A solution needs about 50 poses.
-    possible_strides = [stride for stride in tuning.strides if len(sound_poses) >= stride * 50]
+    possible_strides = [
+        stride for stride in tuning.strides if len(sound_poses) >= stride * 50
+    ]
     longest_stride = max(possible_strides, default=1)
     noise_rad = np.exp(0.5 * fit.levels[ROTATION])
     rotations = problem.streams.Ts_pw_p[sound_poses, :3, :3]
@@ -429,7 +462,9 @@ def _expand_to_all_poses(
     jumps[kept[1:][fewer.jumps] - 1] = True
     spikes[kept[fewer.spikes]] = True
     weights[kept] = fewer.weights
-    return replace(fewer, jumps=jumps, spikes=spikes, weights=weights, is_noise_dominated=True)
+    return replace(
+        fewer, jumps=jumps, spikes=spikes, weights=weights, is_noise_dominated=True
+    )
 
 
 def _solution(workspace: Workspace, fit: Fit) -> AdaptiveSolution:
@@ -452,7 +487,9 @@ def _solution(workspace: Workspace, fit: Fit) -> AdaptiveSolution:
     # not detected, and X contains their mean. Their variance is assumed to be a share of the
     # variance of the detected ones.
     undetected = np.zeros(6)
-    for (kind, _), level in zip(fit.model.processes, fit.levels[VARIANCES], strict=True):
+    for (kind, _), level in zip(
+        fit.model.processes, fit.levels[VARIANCES], strict=True
+    ):
         if kind == "body":
             undetected[:3] += problem.tuning.undetected_share * np.exp(level)
     steps = np.diff(se3.translation_of(problem.streams.Ts_pw_p), axis=0)
@@ -472,7 +509,8 @@ def _solution(workspace: Workspace, fit: Fit) -> AdaptiveSolution:
         jumps=fit.outliers.jumps,
         spikes=fit.outliers.spikes,
         misfit=misfit,
-        metres_per_pose=float(np.linalg.norm(steps, axis=1).sum()) / len(problem.streams),
+        metres_per_pose=float(np.linalg.norm(steps, axis=1).sum())
+        / len(problem.streams),
         part_products=posterior.part_products(),
         objective=0.5 * (posterior.log_determinant + float(normal.cost)),
         converged=is_settled(workspace, fit),
@@ -483,7 +521,8 @@ def _degrees_of_freedom(problem: Problem, fit: Fit) -> int:
     """Return the number of residuals that are used, less that of parameters; at least 1."""
     streams = problem.streams
     positions = np.concatenate(
-        [se3.translation_of(streams.Ts_pw_p), se3.translation_of(streams.Ts_cw_c)], axis=1
+        [se3.translation_of(streams.Ts_pw_p), se3.translation_of(streams.Ts_cw_c)],
+        axis=1,
     )
     # Streams of rotations alone have constant positions.
     n_rows = 6 if np.ptp(positions, axis=0).any() else 3

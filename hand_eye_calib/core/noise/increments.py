@@ -133,7 +133,9 @@ class Course(Columns):
     along: FloatArray
 
 
-def course_of(streams: Streams, T_parent_child: FloatArray, noise_m2: float = np.inf) -> Course:
+def course_of(
+    streams: Streams, T_parent_child: FloatArray, noise_m2: float = np.inf
+) -> Course:
     """Smooth the motion of the child.
 
     The smoothed steps are the mean of the child's steps according to both streams. The lengths of
@@ -156,8 +158,12 @@ def course_of(streams: Streams, T_parent_child: FloatArray, noise_m2: float = np
     rotated = se3.rotation_of(streams.motions_p) @ lever_arm - lever_arm
     steps_by_parent = (rotated + se3.translation_of(streams.motions_p)) @ R
     intervals_s = np.diff(streams.stamps_s)
-    steps = _smooth_steps(0.5 * (steps_by_child + steps_by_parent), intervals_s, noise_m2)
-    metres = np.linalg.norm(_smooth_steps(steps_by_parent, intervals_s, noise_m2), axis=1)
+    steps = _smooth_steps(
+        0.5 * (steps_by_child + steps_by_parent), intervals_s, noise_m2
+    )
+    metres = np.linalg.norm(
+        _smooth_steps(steps_by_parent, intervals_s, noise_m2), axis=1
+    )
     rotations_c = streams.Ts_cw_c[:-1, :3, :3]
     return Course(
         streams.twists,
@@ -166,7 +172,9 @@ def course_of(streams: Streams, T_parent_child: FloatArray, noise_m2: float = np
     )
 
 
-def _smooth_steps(steps: FloatArray, intervals_s: FloatArray, noise_m2: float) -> FloatArray:
+def _smooth_steps(
+    steps: FloatArray, intervals_s: FloatArray, noise_m2: float
+) -> FloatArray:
     """Move each step i of (n, 3) towards the mean velocity of steps i - 2 and i + 2.
 
     The difference from this mean is multiplied by the share of its median square that is not noise.
@@ -260,12 +268,16 @@ def linearise(
     systematic[:, :, TIME] = se3.times(adjoints, course.twists[:-1]) - course.twists[1:]
     systematic[:, 3:, RATE] = by_rate
     by_xi = np.eye(6) - adjoints
-    all_columns = np.concatenate([by_xi, systematic[:, :, columns], residuals[:, :, None]], axis=2)
+    all_columns = np.concatenate(
+        [by_xi, systematic[:, :, columns], residuals[:, :, None]], axis=2
+    )
     by_path = {"scale": by_steps[:, :, :1], "direction": by_steps[:, :, 1:]}
     return Linearisation(all_columns, adjoints, by_path)
 
 
-def first_residuals(streams: Streams, course: Course, T_parent_child: FloatArray) -> FloatArray:
+def first_residuals(
+    streams: Streams, course: Course, T_parent_child: FloatArray
+) -> FloatArray:
     """Return the residuals e (n, 6) of :func:`linearise` without systematic errors."""
     residuals = []
     for start in range(0, len(streams) - 1, _BATCH):
@@ -295,11 +307,15 @@ def _child_motions(
     rotations = se3.rotation_of(child_motions)
     by_rate = _derivatives_by_rate_bias(rotations, np.diff(streams.stamps_s))
     if parameters[RATE].any():
-        child_motions[:, :3, :3] = rotations @ se3.rotation_exp(-by_rate @ parameters[RATE])
+        child_motions[:, :3, :3] = rotations @ se3.rotation_exp(
+            -by_rate @ parameters[RATE]
+        )
     return child_motions, by_rate
 
 
-def _derivatives_by_rate_bias(rotations: FloatArray, intervals_s: FloatArray) -> FloatArray:
+def _derivatives_by_rate_bias(
+    rotations: FloatArray, intervals_s: FloatArray
+) -> FloatArray:
     """Return derivatives (n, 3, 3), in s, of rotations (n, 3, 3) with respect to a bias of rates.
 
     A constant bias (rad/s) along the body's axes turns the end of an interval by about its duration
@@ -309,7 +325,9 @@ def _derivatives_by_rate_bias(rotations: FloatArray, intervals_s: FloatArray) ->
     return intervals_s[:, None, None] * mean_axes
 
 
-def without_rate_bias(stamps_ns: IntArray, Ts_cw_c: FloatArray, bias: FloatArray) -> FloatArray:
+def without_rate_bias(
+    stamps_ns: IntArray, Ts_cw_c: FloatArray, bias: FloatArray
+) -> FloatArray:
     """Remove a bias (3,), rad/s, of angular rates from the rotations integrated from them.
 
     Returns

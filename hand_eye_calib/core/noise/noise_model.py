@@ -25,7 +25,12 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.noise.increments import PATH_PARTS, SCALE, Linearisation, Streams
+from hand_eye_calib.core.noise.increments import (
+    PATH_PARTS,
+    SCALE,
+    Linearisation,
+    Streams,
+)
 from hand_eye_calib.core.noise.normal import transposed
 from hand_eye_calib.core.noise.reml import Prior
 from hand_eye_calib.core.noise.state_space import WHITE, StateSpace
@@ -181,7 +186,9 @@ class NoiseModel:
             prior=prior,
         )
 
-    def _rotations_about_origin(self, streams: Streams, to_child: FloatArray) -> FloatArray:
+    def _rotations_about_origin(
+        self, streams: Streams, to_child: FloatArray
+    ) -> FloatArray:
         """Return the covariances (N, 6, 6) of c for rotation errors about the origin of a world.
 
         The errors have a standard deviation of 1 rad per axis. The world is that of ``centre``,
@@ -309,7 +316,9 @@ class NoiseModel:
         return error
 
 
-def _directions(kind: str, part: str, streams: Streams, to_child: FloatArray) -> FloatArray:
+def _directions(
+    kind: str, part: str, streams: Streams, to_child: FloatArray
+) -> FloatArray:
     """Return the matrices M (N, 6, 3) from a process of kind "body" or "world" to the error c."""
     if kind == "body":
         return np.broadcast_to(np.eye(6)[:, PARTS[part]], (len(streams), 6, 3))
@@ -329,7 +338,9 @@ def increment_levels(levels: FloatArray) -> FloatArray:
     return np.logaddexp(levels[WALKS], levels[WHITES] + np.log(2.0))
 
 
-def rough_levels(residuals: FloatArray, left_out: BoolArray, jitter: float) -> FloatArray:
+def rough_levels(
+    residuals: FloatArray, left_out: BoolArray, jitter: float
+) -> FloatArray:
     """Return levels (5,) for the start of a search: half of the variance is white, half is walk.
 
     Parameters

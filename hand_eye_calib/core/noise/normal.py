@@ -65,7 +65,9 @@ def inverse_roots(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
     inverse = np.zeros_like(lower)
     for row in range(lower.shape[1]):
         inverse[:, row, row] = 1.0
-        inverse[:, row, :row] = -(lower[:, row, None, :row] @ inverse[:, :row, :row])[:, 0]
+        inverse[:, row, :row] = -(lower[:, row, None, :row] @ inverse[:, :row, :row])[
+            :, 0
+        ]
         inverse[:, row] /= pivots[:, row, None]
     return inverse, log_determinants
 
@@ -123,7 +125,9 @@ class Factor:
         blocks = np.arange(self._n_last)
         dense[blocks, :, blocks] = diagonal
         dense[blocks[1:], :, blocks[:-1]] = below
-        roots, log_determinants = inverse_roots(dense.reshape(1, self._n_last * self._size, -1))
+        roots, log_determinants = inverse_roots(
+            dense.reshape(1, self._n_last * self._size, -1)
+        )
         self.log_determinant += float(log_determinants.sum())
         self._last = roots[0]
 
@@ -270,7 +274,9 @@ class NormalEquations:
         self.is_complete = self._is_observed.all(axis=-1)
         self.step = -(self.covariance @ gradient[..., None])[..., 0]
         self.cost = products[..., -1, -1] + (gradient * self.step).sum(axis=-1)
-        self.log_determinant = np.log(values).sum(axis=-1) - 2.0 * np.log(scale).sum(axis=-1)
+        self.log_determinant = np.log(values).sum(axis=-1) - 2.0 * np.log(scale).sum(
+            axis=-1
+        )
         self.log_determinant += self._log_unseen_scale()
 
     def _log_unseen_scale(self) -> FloatArray:
@@ -283,7 +289,9 @@ class NormalEquations:
         is_unseen = ~self._is_observed
         both_unseen = is_unseen[..., :, None] & is_unseen[..., None, :]
         products = np.where(
-            both_unseen, transposed(self._axes) @ self._axes, np.eye(is_unseen.shape[-1])
+            both_unseen,
+            transposed(self._axes) @ self._axes,
+            np.eye(is_unseen.shape[-1]),
         )
         return np.asarray(np.linalg.slogdet(products)[1])
 

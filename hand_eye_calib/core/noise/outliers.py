@@ -71,7 +71,9 @@ class Outliers:
 
     def differs_by(self, other: Outliers) -> float:
         """Return the share of poses at which only one of both sets has a jump or a spike."""
-        differing = np.sum(self.jumps != other.jumps) + np.sum(self.spikes != other.spikes)
+        differing = np.sum(self.jumps != other.jumps) + np.sum(
+            self.spikes != other.spikes
+        )
         return float(differing) / len(self.spikes)
 
 
@@ -92,7 +94,9 @@ def first_outliers(
     """
     lengths = _lengths(residuals)
     usual_lengths = np.array([median(column) for column in lengths.T])
-    limits = np.maximum(tuning.first_jump_sigmas * usual_lengths / MEDIAN_LENGTH, _MIN_JUMP)
+    limits = np.maximum(
+        tuning.first_jump_sigmas * usual_lengths / MEDIAN_LENGTH, _MIN_JUMP
+    )
     is_large: BoolArray = np.asarray((lengths > limits).any(axis=1))
     spikes = np.r_[False, is_large[1:] & is_large[:-1], False]
     if np.mean(spikes) > tuning.max_outlier_share:
@@ -131,7 +135,9 @@ def innovation_chi_squares(
     return np.concatenate(of_walk)[:-1], np.concatenate(of_white)
 
 
-def _chi_squares_of_part(posterior: Posterior, spikes: BoolArray) -> tuple[FloatArray, FloatArray]:
+def _chi_squares_of_part(
+    posterior: Posterior, spikes: BoolArray
+) -> tuple[FloatArray, FloatArray]:
     """Return the chi-squares of :func:`innovation_chi_squares` for one part of a recording."""
     space = posterior.space
     # Column 0 is the posterior mean, the others are a root of the covariance that the uncertainty
@@ -197,7 +203,9 @@ def detect_outliers(
     """
     # Tail probability of one test, so that all poses together have the expected false alarms.
     threshold = chi_square_quantile(tuning.false_alarms / len(of_white))
-    jump_threshold = _jump_factor(of_walk[~outliers.jumps], threshold, tuning) * threshold
+    jump_threshold = (
+        _jump_factor(of_walk[~outliers.jumps], threshold, tuning) * threshold
+    )
     at_either_end = np.maximum(of_white[1:], of_white[:-1])
     is_new = _is_peak(of_walk) & (of_walk >= at_either_end) & ~outliers.jumps
     jumps = (of_walk > jump_threshold) & (outliers.jumps | is_new)
@@ -230,7 +238,9 @@ def _is_peak(values: FloatArray) -> BoolArray:
     return (padded[1:-1] >= padded[:-2]) & (padded[1:-1] > padded[2:])
 
 
-def bridge_outliers(streams: Streams, T_parent_child: FloatArray, spikes: BoolArray) -> Streams:
+def bridge_outliers(
+    streams: Streams, T_parent_child: FloatArray, spikes: BoolArray
+) -> Streams:
     """Replace each outlier pose of the child by the pose before, moved as the parent moved.
 
     The state space ignores the error of an outlier pose. Yet the linearisation of the increments on
@@ -238,7 +248,9 @@ def bridge_outliers(streams: Streams, T_parent_child: FloatArray, spikes: BoolAr
     """
     Ts_cw_c = streams.Ts_cw_c.copy()
     outlier_poses = np.flatnonzero(spikes[1:]) + 1
-    As = se3.inverse(streams.Ts_pw_p[outlier_poses - 1]) @ streams.Ts_pw_p[outlier_poses]
+    As = (
+        se3.inverse(streams.Ts_pw_p[outlier_poses - 1]) @ streams.Ts_pw_p[outlier_poses]
+    )
     Bs = se3.inverse(T_parent_child) @ As @ T_parent_child
     for pose, B in zip(outlier_poses, Bs, strict=True):
         Ts_cw_c[pose] = Ts_cw_c[pose - 1] @ B

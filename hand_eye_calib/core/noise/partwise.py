@@ -16,7 +16,12 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.noise.normal import NormalEquations
-from hand_eye_calib.core.noise.state_space import MAX_BLOCKS, Posterior, StateSpace, combined
+from hand_eye_calib.core.noise.state_space import (
+    MAX_BLOCKS,
+    Posterior,
+    StateSpace,
+    combined,
+)
 
 # Largest number of poses of a part. The posterior of a part needs about 90 MB. A simulated drive of
 # 100,000 poses in parts of 20,000 has sigmas that are 0.05 % larger than without parts.
@@ -72,7 +77,9 @@ class PartwisePosterior:
         """Compute the posterior of each part, without the prior of the parameters."""
         for poses in self._poses_of_parts:
             space = self._space_of(poses)
-            yield Posterior(replace(space, prior=np.zeros_like(self._prior)), self._levels)
+            yield Posterior(
+                replace(space, prior=np.zeros_like(self._prior)), self._levels
+            )
 
     def states_after(self, step: FloatArray) -> FloatArray:
         """Return the posterior mean (N, d) of the states after a step (p,) of the parameters."""
@@ -83,5 +90,7 @@ class PartwisePosterior:
     def part_products(self) -> FloatArray:
         """Return the contribution of each block of time to ``products``, for a jackknife."""
         n_blocks = max(MAX_BLOCKS // len(self._poses_of_parts), 1)
-        products = np.concatenate([part.part_products(n_blocks) for part in self._parts()])
+        products = np.concatenate(
+            [part.part_products(n_blocks) for part in self._parts()]
+        )
         return products + self._prior / len(products)

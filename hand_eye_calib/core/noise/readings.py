@@ -82,7 +82,9 @@ def loss_difference(
     return losses[1] - losses[0]
 
 
-def _smallest_loss(workspace: stages.Workspace, start: stages.Fit, outliers: Outliers) -> float:
+def _smallest_loss(
+    workspace: stages.Workspace, start: stages.Fit, outliers: Outliers
+) -> float:
     """Return the smallest loss of a reading over all centres of rotation noise.
 
     ``start`` is a fit of this reading. The search does not use the poses and increments in

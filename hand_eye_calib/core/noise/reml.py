@@ -147,7 +147,9 @@ def _newton_step(
     step = np.zeros(len(levels))
     damping = 0.0
     while True:
-        step[is_free] = -np.linalg.solve(curvature + damping * np.eye(len(gradient)), gradient)
+        step[is_free] = -np.linalg.solve(
+            curvature + damping * np.eye(len(gradient)), gradient
+        )
         if np.abs(step).max() <= _MAX_STEP:
             return np.clip(levels + step, prior.lower, prior.upper) - levels
         damping = 2.0 * damping + added_damping
@@ -168,7 +170,9 @@ def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
     traces += [float((walk_D * basis).sum()) for basis in posterior.space.walk_bases]
     variances = np.exp(posterior.levels[: len(traces)])
     gradient = [0.5 * variances * traces]
-    gradient += [_group_gradient(posterior, group, states) for group in posterior.groups]
+    gradient += [
+        _group_gradient(posterior, group, states) for group in posterior.groups
+    ]
     information = _average_information(posterior, states[:, :, 0], walk[:, :, 0])
     return np.concatenate(gradient), information
 
@@ -194,7 +198,9 @@ def _walk_difference(posterior: Posterior, walk: FloatArray) -> FloatArray:
     return n_used * precision - precision @ total @ precision
 
 
-def _group_gradient(posterior: Posterior, group: Markov, states: FloatArray) -> FloatArray:
+def _group_gradient(
+    posterior: Posterior, group: Markov, states: FloatArray
+) -> FloatArray:
     """Return numerical derivatives (2,) of the loss with respect to the two levels of a group.
 
     The levels are the log variance and the log time constant. The loss depends on them through
@@ -220,7 +226,9 @@ def _group_gradient(posterior: Posterior, group: Markov, states: FloatArray) -> 
     return gradient
 
 
-def _average_information(posterior: Posterior, states: FloatArray, walk: FloatArray) -> FloatArray:
+def _average_information(
+    posterior: Posterior, states: FloatArray, walk: FloatArray
+) -> FloatArray:
     """Return the average information (m, m) for the posterior means of states and walk.
 
     It is ``1/2 f' P f = 1/2 (f' V^-1 f - f' V^-1 J (J' V^-1 J)^-1 J' V^-1 f)``.
@@ -235,13 +243,17 @@ def _average_information(posterior: Posterior, states: FloatArray, walk: FloatAr
     f = _working_columns(posterior, states, walk)
     weighted, whitened = posterior.forward_half(f)
     f_V_f = multiplied(f, weighted) - multiplied(whitened, whitened)
-    J_V_f = multiplied(space.columns, weighted) - multiplied(posterior.whitened, whitened)
+    J_V_f = multiplied(space.columns, weighted) - multiplied(
+        posterior.whitened, whitened
+    )
     J_V_f = J_V_f[:-1]
     information = 0.5 * (f_V_f - J_V_f.T @ posterior.normal.covariance @ J_V_f)
     return 0.5 * (information + information.T)
 
 
-def _working_columns(posterior: Posterior, states: FloatArray, walk: FloatArray) -> FloatArray:
+def _working_columns(
+    posterior: Posterior, states: FloatArray, walk: FloatArray
+) -> FloatArray:
     """Return the columns f_k (n, 6, m) of the average information, one for each level."""
     space = posterior.space
     variances = np.exp(posterior.levels)
@@ -251,7 +263,9 @@ def _working_columns(posterior: Posterior, states: FloatArray, walk: FloatArray)
     forces = (posterior.white_precision @ states[:, :WHITE, None])[:, :, 0]
     forces[space.weights == 0.0] = 0.0
     for level, basis in enumerate(space.white_bases):
-        moved[:, :WHITE, level] = variances[level] * (basis @ forces[:, :, None])[:, :, 0]
+        moved[:, :WHITE, level] = (
+            variances[level] * (basis @ forces[:, :, None])[:, :, 0]
+        )
     first_of_groups = n_white + len(space.walk_bases)
     for level, group in zip(
         range(first_of_groups, len(variances), 2), posterior.groups, strict=True

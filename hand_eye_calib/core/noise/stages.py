@@ -131,7 +131,9 @@ class Problem:
     def is_noisy(self, fit: Fit) -> bool:
         """Return whether rotation noise exceeds a share of the usual rotation between poses."""
         turns = se3.rotation_angle(se3.rotation_of(self.streams.motions_p))
-        return bool(np.exp(0.5 * fit.levels[ROTATION]) > self.tuning.noisy_share * median(turns))
+        return bool(
+            np.exp(0.5 * fit.levels[ROTATION]) > self.tuning.noisy_share * median(turns)
+        )
 
 
 class Workspace:
@@ -366,7 +368,9 @@ def outliers(workspace: Workspace, fit: Fit) -> Fit:
     return detected
 
 
-def _detect_in_rounds(workspace: Workspace, fit: Fit, rounds: int, with_spikes: bool = True) -> Fit:
+def _detect_in_rounds(
+    workspace: Workspace, fit: Fit, rounds: int, with_spikes: bool = True
+) -> Fit:
     """Detect jumps and outlier poses, at most ``rounds`` times, until few of them change.
 
     Without spikes, detect only jumps: outlier poses have small weights then.
@@ -376,12 +380,16 @@ def _detect_in_rounds(workspace: Workspace, fit: Fit, rounds: int, with_spikes: 
     for _ in range(rounds):
         if problem.is_noisy(fit):
             fit = fit.corrected(problem.streams, _expected_states(workspace, fit))
-        of_walk, of_white = innovation_chi_squares(workspace.posterior(fit), fit.outliers.spikes)
+        of_walk, of_white = innovation_chi_squares(
+            workspace.posterior(fit), fit.outliers.spikes
+        )
         detected = detect_outliers(fit.outliers, of_walk, of_white, tuning, with_spikes)
         change = detected.differs_by(fit.outliers)
         if change:
             poses = bridge_outliers(problem.streams, fit.T, detected.spikes)
-            fit = replace(fit, outliers=detected, poses=poses, error=np.zeros_like(fit.error))
+            fit = replace(
+                fit, outliers=detected, poses=poses, error=np.zeros_like(fit.error)
+            )
         if change <= tuning.negligible_share:
             break
     if with_spikes:
@@ -437,7 +445,9 @@ def time_correlated(workspace: Workspace, fit: Fit) -> Fit:
     for n_steps in (_FIRST_STEPS, reml.MAX_STEPS):
         space = problem.space(rival, kept)
         prior = rival.model.prior(rival.levels)
-        fitted, information = reml.fit(space, rival.levels, prior, settled_loss, n_steps)
+        fitted, information = reml.fit(
+            space, rival.levels, prior, settled_loss, n_steps
+        )
         matters = np.diag(information)[VARIANCES] > tuning.min_information
         if n_steps == _FIRST_STEPS:
             # A process whose level has risen may get information in the other steps.
@@ -542,7 +552,9 @@ def _likeliest(
         present = path_columns + time_columns
         # A bias of rates is always present.
         is_present = [k in present or k in RATE for k in range(N_SYSTEMATIC)]
-        rival = replace(fit, sigmas=np.where(is_present, tuning.sizes, tuning.absent_sigma))
+        rival = replace(
+            fit, sigmas=np.where(is_present, tuning.sizes, tuning.absent_sigma)
+        )
         normal = NormalEquations(products + problem.prior(rival))
         loss = 2.0 * n_rows * np.log1p(max(float(normal.cost), 0.0) / n_rows)
         loss += float(normal.log_determinant + 2.0 * np.log(rival.sigmas).sum())
@@ -593,4 +605,11 @@ def is_settled(workspace: Workspace, fit: Fit) -> bool:
 
 # Function of a stage of the search.
 Stage: TypeAlias = Callable[[Workspace, Fit], Fit]
-STAGES: tuple[Stage, ...] = (noise, outliers, tails, time_correlated, systematic, polish)
+STAGES: tuple[Stage, ...] = (
+    noise,
+    outliers,
+    tails,
+    time_correlated,
+    systematic,
+    polish,
+)

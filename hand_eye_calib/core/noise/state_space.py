@@ -110,7 +110,9 @@ class StateSpace:
         (N,) array
             Logarithms of the determinants of the covariances.
         """
-        roots, log_determinants = inverse_roots(total_covariance(levels, self.white_bases))
+        roots, log_determinants = inverse_roots(
+            total_covariance(levels, self.white_bases)
+        )
         return transposed(roots) @ roots, log_determinants
 
     def apply_u(self, states: FloatArray) -> FloatArray:
@@ -164,7 +166,9 @@ class Markov:
         Log determinant of the covariance of one process: -log|Pi|.
     """
 
-    def __init__(self, states: slice, levels: FloatArray, intervals_s: FloatArray) -> None:
+    def __init__(
+        self, states: slice, levels: FloatArray, intervals_s: FloatArray
+    ) -> None:
         self.states = states
         self._levels = levels
         self._intervals_s = intervals_s
@@ -195,7 +199,9 @@ class Markov:
         It equals ``-Pi^-1 (d Pi / d log tau) values``; the derivative of Pi is numerical.
         """
         change = np.array([0.0, LEVEL_CHANGE])
-        forces = self.changed(change).forces(values) - self.changed(-change).forces(values)
+        forces = self.changed(change).forces(values) - self.changed(-change).forces(
+            values
+        )
         factor = Factor(self.diagonal[:, None, None], self.between[:, None, None])
         moved = factor.restore(factor.whiten(forces[:, None]))[:, 0]
         return moved / (-2.0 * LEVEL_CHANGE)
@@ -260,7 +266,9 @@ class Posterior:
         self.factor = self._factorised()
         self.log_determinant = self._log_determinant(white_log_determinants[~is_free])
         weighted, self.whitened = self.forward_half(space.columns)
-        products = multiplied(space.columns, weighted) - multiplied(self.whitened, self.whitened)
+        products = multiplied(space.columns, weighted) - multiplied(
+            self.whitened, self.whitened
+        )
         self.products = 0.5 * (products + products.T) + space.prior
         self.normal = NormalEquations(self.products)
         determinants = self.log_determinant + self.normal.log_determinant
@@ -273,7 +281,9 @@ class Posterior:
         level = first_level
         for size in self.space.group_sizes:
             states = slice(state, state + size)
-            groups.append(Markov(states, self.levels[level : level + 2], self.space.intervals_s))
+            groups.append(
+                Markov(states, self.levels[level : level + 2], self.space.intervals_s)
+            )
             state += size
             level += 2
         return groups
@@ -373,7 +383,9 @@ class Posterior:
         covariances, below = self.factor.selected_inverse
         h0 = space.h0
         half = space.apply_h1(covariances[1:])
-        total = space.apply_h1(transposed(half)) + h0 @ covariances[:-1] @ transposed(h0)
+        total = space.apply_h1(transposed(half)) + h0 @ covariances[:-1] @ transposed(
+            h0
+        )
         mixed = space.apply_h1(below) @ transposed(h0)
         total -= mixed
         total -= transposed(mixed)
@@ -404,7 +416,9 @@ class Posterior:
         totals = [np.zeros((n_columns, n_columns))]
         for start, end in pairwise(ends):
             form = self._form_between(start, end)
-            start_and_columns = np.r_[np.arange(n_states), np.arange(2 * n_states, len(form))]
+            start_and_columns = np.r_[
+                np.arange(n_states), np.arange(2 * n_states, len(form))
+            ]
             form[np.ix_(start_and_columns, start_and_columns)] += history
             history = _eliminate(form, n_states)
             totals.append(_eliminate(history, n_states))
@@ -423,7 +437,9 @@ class Posterior:
         size = space.h0.shape[2]
         diagonal, below = self._precision_blocks(start, end)
         weighted = self._walk_precisions[increments] @ columns
-        block = replace(space, h1_processes=space.h1_processes[increments], h0=space.h0[increments])
+        block = replace(
+            space, h1_processes=space.h1_processes[increments], h0=space.h0[increments]
+        )
         forces = block.apply_u_transposed(weighted)
         coupling = below[0] if len(diagonal) == 2 else np.zeros((size, size))
         products = multiplied(columns, weighted)

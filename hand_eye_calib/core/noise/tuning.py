@@ -138,7 +138,13 @@ class Tuning:
     # Prior standard deviations: of the lever arm (m), of the scale of the odometry, of its
     # direction (rad: 0.15 deg), of the time offset (s), of the response of positions to
     # acceleration (s^2).
-    of_positions: tuple[float, ...] = (*[10.0] * 3, 0.01, *[math.radians(0.15)] * 3, 1.0, 0.002)
+    of_positions: tuple[float, ...] = (
+        *[10.0] * 3,
+        0.01,
+        *[math.radians(0.15)] * 3,
+        1.0,
+        0.002,
+    )
     # Time (s) between the two positions of a velocity; an acceleration is the difference of two
     # velocities.
     accelerating_s: float = 0.2

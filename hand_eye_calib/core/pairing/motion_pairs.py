@@ -166,10 +166,14 @@ def select_keyframes(
         has_passed = stamps_ns[window] - last_ns >= min_interval_s * 1e9
         has_moved = np.full(len(has_passed), max(min_translation, min_rotation) == 0.0)
         if min_translation > 0.0:
-            distances_m = np.linalg.norm(poses[window, :3, 3] - se3.translation_of(T_last), axis=1)
+            distances_m = np.linalg.norm(
+                poses[window, :3, 3] - se3.translation_of(T_last), axis=1
+            )
             has_moved |= distances_m >= min_translation
         if min_rotation > 0.0:
-            angles = se3.rotation_angle(se3.rotation_of(T_last).T @ poses[window, :3, :3])
+            angles = se3.rotation_angle(
+                se3.rotation_of(T_last).T @ poses[window, :3, :3]
+            )
             has_moved |= angles >= min_rotation
         candidates = np.flatnonzero(has_passed & has_moved)
         if not candidates.size:
@@ -200,7 +204,11 @@ def find_leap(stamps_ns: IntArray) -> tuple[str, str] | None:
     days = float(intervals_s[before - 1]) / _MAX_PAUSE_S
     if days <= 1.0:
         return None
-    shorter_end = f"the first {before}" if before < count - before else f"the last {count - before}"
+    shorter_end = (
+        f"the first {before}"
+        if before < count - before
+        else f"the last {count - before}"
+    )
     problem = f"stamps leap by {days:,.0f} days after pose {before} of {count}"
     return problem, f"repair the stamps, or remove {shorter_end} of its poses"
 
@@ -247,7 +255,9 @@ class MotionPairs(Columns):
         return translations, se3.rotations_between(R_A @ R, R @ R_B)
 
 
-def motion_pairs(Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, reference: str) -> MotionPairs:
+def motion_pairs(
+    Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, reference: str
+) -> MotionPairs:
     """Return the relative motions of two synchronised trajectories for a reference.
 
     The reference defines between which poses the motions are.
@@ -301,11 +311,15 @@ def motions(start: FloatArray, end: FloatArray) -> FloatArray:
     """
     motion = end.copy()
     motion[..., :3, 3] -= se3.translation_of(start)
-    motion[..., :3, :] = np.swapaxes(se3.rotation_of(start), -1, -2) @ motion[..., :3, :]
+    motion[..., :3, :] = (
+        np.swapaxes(se3.rotation_of(start), -1, -2) @ motion[..., :3, :]
+    )
     return motion
 
 
-def pairs_over(pose_pairs: PosePairs, lag_s: float, max_pairs: int = MAX_PAIRS) -> MotionPairs:
+def pairs_over(
+    pose_pairs: PosePairs, lag_s: float, max_pairs: int = MAX_PAIRS
+) -> MotionPairs:
     """Return motion pairs that last about ``lag_s`` seconds, spread evenly over the recording.
 
     Motions that last more than half longer, because of a gap, are skipped.

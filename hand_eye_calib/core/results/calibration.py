@@ -18,7 +18,12 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import inverse_covariance, sigmas_in_parent
 from hand_eye_calib.core.results import document
 from hand_eye_calib.core.results.parts import part
-from hand_eye_calib.core.results.records import AXES, DofObservability, DofVerdict, SolveStatus
+from hand_eye_calib.core.results.records import (
+    AXES,
+    DofObservability,
+    DofVerdict,
+    SolveStatus,
+)
 from hand_eye_calib.core.results.verdict import Judged, Verdict
 
 if TYPE_CHECKING:
@@ -129,7 +134,9 @@ class Calibration(Judged):
             observability_measured=tuple(observability),
             parent_frame=self.child_frame,
             child_frame=self.parent_frame,
-            parts={name: part(name).invert(value) for name, value in self.parts.items()},
+            parts={
+                name: part(name).invert(value) for name, value in self.parts.items()
+            },
             time_offset_s=0.0 - self.time_offset_s,
             scale=1.0 / self.scale,
             scale_sigma=self.scale_sigma / self.scale**2,

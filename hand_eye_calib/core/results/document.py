@@ -14,9 +14,19 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import METHODS
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.plain import Document, from_plain, plain
-from hand_eye_calib.core.base.text import amount, fixed, given_or_estimated, listing, with_sigma
+from hand_eye_calib.core.base.text import (
+    amount,
+    fixed,
+    given_or_estimated,
+    listing,
+    with_sigma,
+)
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.se3 import inverse_covariance, sigmas_in_parent, sigmas_rpy
+from hand_eye_calib.core.geometry.se3 import (
+    inverse_covariance,
+    sigmas_in_parent,
+    sigmas_rpy,
+)
 from hand_eye_calib.core.geometry.trajectory import check_poses
 from hand_eye_calib.core.results.parts import ExtraTransform, all_parts, part
 from hand_eye_calib.core.results.records import (
@@ -51,7 +61,10 @@ _NOT_IN_FILES = ("motion_residuals", "recording", "parts")
 _READ_APART = (*_NOT_IN_FILES, "findings")
 
 # Names of the covariances in version 2, and their names in version 1.
-_OLD_COVARIANCES = {"covariance_measured": "covariance", "covariance_allowance": "floor"}
+_OLD_COVARIANCES = {
+    "covariance_measured": "covariance",
+    "covariance_allowance": "floor",
+}
 
 # If a direction is unobservable, an axis with a larger standard deviation (m) is unknown, too.
 UNKNOWN_M = 0.9
@@ -132,14 +145,18 @@ def _covariances_of(result: Result) -> Document:
     return {
         "covariance": matrix_of(of, child, result.covariance) | {"order": order},
         "covariance_measured": matrix_of(measured, child, result.covariance_measured),
-        "covariance_allowance": matrix_of(allowance, child, result.covariance_allowance),
+        "covariance_allowance": matrix_of(
+            allowance, child, result.covariance_allowance
+        ),
     }
 
 
 def _observability_of(result: Result) -> list[Document]:
     """Return a row for each axis: its standard deviation, and the two parts of it."""
     rows = []
-    columns = zip(result.observability, result.sigmas_measured, result.allowance, strict=True)
+    columns = zip(
+        result.observability, result.sigmas_measured, result.allowance, strict=True
+    )
     for dof, measured, allowance in columns:
         row = plain(dof) | {"sigma_measured": measured, "allowance": allowance}
         rows.append(row | {"frame": result.parent_frame})
@@ -185,14 +202,22 @@ def transforms_of(result: Result) -> dict[str, Notation]:
         ),
     }
     if result.T_base_child is not None:
-        transforms["T_base_child"] = _Transform(result.T_base_child, child, result.base_frame, own)
+        transforms["T_base_child"] = _Transform(
+            result.T_base_child, child, result.base_frame, own
+        )
     for name, extra in extra_transforms(result).items():
         covariances = extra.covariance, np.zeros((6, 6))
         transforms[name] = _Transform(
-            extra.T_target_source, extra.source, extra.target, covariances, is_extra=True
+            extra.T_target_source,
+            extra.source,
+            extra.target,
+            covariances,
+            is_extra=True,
         )
     hidden = {*result.unobservable()}
-    return {name: _notation(transform, hidden) for name, transform in transforms.items()}
+    return {
+        name: _notation(transform, hidden) for name, transform in transforms.items()
+    }
 
 
 def _notation(transform: _Transform, hidden: Collection[str]) -> Notation:
@@ -219,7 +244,9 @@ def _notation(transform: _Transform, hidden: Collection[str]) -> Notation:
         sigma_rpy_deg=np.degrees(np.hypot(sigmas, sigmas_rpy(T, allowance))),
         sigma_measured_rpy_deg=np.degrees(sigmas),
         sigma_about_deg=np.degrees(
-            np.hypot(sigmas_in_parent(R, measured)[3:], sigmas_in_parent(R, allowance)[3:])
+            np.hypot(
+                sigmas_in_parent(R, measured)[3:], sigmas_in_parent(R, allowance)[3:]
+            )
         ),
         matrix=T,
     )
@@ -264,12 +291,18 @@ def summary(result: Result) -> dict[str, str]:
         "Scale": given_or_estimated(result.scale, result.scale_sigma, ""),
     }
     if result.proved_global in proof:
-        rows["Objective"] += f", {proof[result.proved_global]}proved to be the global minimum"
+        rows["Objective"] += (
+            f", {proof[result.proved_global]}proved to be the global minimum"
+        )
     if rate and rate.is_used:
-        rows["Time offset"] += f" at {rate.at_ns * 1e-9:.3f} s; the child's clock is {rate}"
+        rows["Time offset"] += (
+            f" at {rate.at_ns * 1e-9:.3f} s; the child's clock is {rate}"
+        )
     if result.noise:
         # Documents begin the first sentence with the name of this row.
-        sentences = [text.removeprefix("Noise: ").rstrip(".") for text in result.noise.in_words]
+        sentences = [
+            text.removeprefix("Noise: ").rstrip(".") for text in result.noise.in_words
+        ]
         rows["Noise"] = "; ".join(sentences)
     return rows
 
@@ -290,13 +323,17 @@ def printed_numbers(
         if {*axes} <= {*out_of_reach}:
             texts[listing(axes)] = "not estimated"
             continue
-        for axis, value, sigma in zip(axes, values.tolist(), sigmas.tolist(), strict=True):
+        for axis, value, sigma in zip(
+            axes, values.tolist(), sigmas.tolist(), strict=True
+        ):
             if not np.isfinite(value):
                 texts[axis] = "unknown"
             elif not np.isfinite(sigma):  # near gimbal lock
                 texts[axis] = f"{fixed(value, 2)} {unit}"
             else:
-                number = with_sigma(value, sigma, 3 if unit == "m" else 2).replace("+/-", sign)
+                number = with_sigma(value, sigma, 3 if unit == "m" else 2).replace(
+                    "+/-", sign
+                )
                 texts[axis] = f"{number} {unit}"
     return texts
 
@@ -309,10 +346,13 @@ def parts_of_sigmas(transform: Notation) -> dict[str, str]:
     """
     sigmas = np.r_[transform.sigma_translation, np.radians(transform.sigma_rpy_deg)]
     measured = np.r_[
-        transform.sigma_measured_translation, np.radians(transform.sigma_measured_rpy_deg)
+        transform.sigma_measured_translation,
+        np.radians(transform.sigma_measured_rpy_deg),
     ]
     parts = {}
-    for axis, sigma, sigma_measured in zip(AXES, sigmas.tolist(), measured.tolist(), strict=True):
+    for axis, sigma, sigma_measured in zip(
+        AXES, sigmas.tolist(), measured.tolist(), strict=True
+    ):
         if not math.isfinite(sigma):
             continue
         allowance = math.sqrt(max(sigma**2 - sigma_measured**2, 0.0))
@@ -346,7 +386,9 @@ def _about_axes_in_words(transform: Notation) -> str:
     ratios = transform.sigma_rpy_deg / about_deg
     if not np.isfinite(ratios).all() or np.abs(np.log(ratios)).max() < _SAME_ANGLES:
         return ""
-    sizes = listing([amount("roll", math.radians(sigma)) for sigma in about_deg.tolist()])
+    sizes = listing(
+        [amount("roll", math.radians(sigma)) for sigma in about_deg.tolist()]
+    )
     return (
         "roll, pitch and yaw are turns one after the other; about the axes x, y and z the rotation "
         f"is good to {sizes}"
@@ -389,11 +431,15 @@ def usable_numbers(result: Judged) -> dict[str, float | str]:
         hidden = components.max(axis=1, initial=0.0) > _SHARED
     numbers: dict[str, float | str] = {
         axis: by_hand(axis) if is_hidden else float(value)
-        for axis, value, is_hidden in zip(TRANSLATIONS, se3.translation_of(T), hidden, strict=True)
+        for axis, value, is_hidden in zip(
+            TRANSLATIONS, se3.translation_of(T), hidden, strict=True
+        )
     }
     if unknown.intersection(ROTATIONS):
         return numbers | usable_angles(result)
-    return numbers | dict(zip(("qx", "qy", "qz", "qw"), se3.to_quat_xyzw(T), strict=True))
+    return numbers | dict(
+        zip(("qx", "qy", "qz", "qw"), se3.to_quat_xyzw(T), strict=True)
+    )
 
 
 def transform_arguments(result: Judged, decimals: int) -> list[str]:
@@ -403,9 +449,17 @@ def transform_arguments(result: Judged, decimals: int) -> list[str]:
     """
     arguments: list[str] = []
     for name, value in usable_numbers(result).items():
-        arguments += [f"--{name}", value if isinstance(value, str) else fixed(value, decimals)]
+        arguments += [
+            f"--{name}",
+            value if isinstance(value, str) else fixed(value, decimals),
+        ]
     if arguments:
-        arguments += ["--frame-id", result.mounting[0], "--child-frame-id", result.child_frame]
+        arguments += [
+            "--frame-id",
+            result.mounting[0],
+            "--child-frame-id",
+            result.child_frame,
+        ]
     return arguments
 
 
@@ -454,7 +508,9 @@ def result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
     try:
         return _result_from(of, _measured_parts(data))
     except KeyError as error:
-        raise InputError(f"the calibration has no {error}: restore or repeat it") from None
+        raise InputError(
+            f"the calibration has no {error}: restore or repeat it"
+        ) from None
     except (TypeError, ValueError) as error:
         raise InputError(
             f"the calibration was changed after it was written: {error}; restore or repeat it"
@@ -465,13 +521,17 @@ def _measured_parts(data: Mapping[str, Any]) -> Document:
     """Return a document of any version with the measured parts under the names of version 2."""
     document = dict(data)
     if data["version"] == 1:
-        document |= {name: data[old] for name, old in _OLD_COVARIANCES.items() if old in data}
+        document |= {
+            name: data[old] for name, old in _OLD_COVARIANCES.items() if old in data
+        }
         document["observability_measured"] = data["observability"]
         return document
     whole = covariance_of(data["covariance"])
     parts = [covariance_of(data[name]) for name in _OLD_COVARIANCES]
     if not np.allclose(whole, parts[0] + parts[1], rtol=1e-6, atol=1e-300):
-        raise ValueError("covariance is not the sum of covariance_measured and its allowance")
+        raise ValueError(
+            "covariance is not the sum of covariance_measured and its allowance"
+        )
     document["observability_measured"] = [
         {**row, "sigma": row["sigma_measured"]} for row in data["observability"]
     ]

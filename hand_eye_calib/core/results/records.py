@@ -215,7 +215,9 @@ class Finding:
     def evidence(self) -> dict[str, float]:
         """Numbers among the values, by name."""
         return {
-            name: float(value) for name, value in self.values.items() if not isinstance(value, str)
+            name: float(value)
+            for name, value in self.values.items()
+            if not isinstance(value, str)
         }
 
     @property
@@ -251,7 +253,9 @@ class Finding:
         sentences = {"cause": "", **data}
         for name in ("what", "advice", "cause"):
             values[name] = from_plain(str, sentences[name])
-        as_written: Self = from_plain(cls, {**data, "key": AS_WRITTEN, "values": values})
+        as_written: Self = from_plain(
+            cls, {**data, "key": AS_WRITTEN, "values": values}
+        )
         return as_written
 
     def _has_templates(self) -> bool:
@@ -264,7 +268,9 @@ class Finding:
 
     def _filled(self, template: str) -> str:
         """Fill a template with the values of the finding."""
-        whose = "both streams'" if self.stream == "both" else f"the {self.stream} stream's"
+        whose = (
+            "both streams'" if self.stream == "both" else f"the {self.stream} stream's"
+        )
         return template.format(stream=self.stream, whose=whose, **self.values)
 
     def __str__(self) -> str:

@@ -149,7 +149,9 @@ class Result:
     n_pairs: int
     n_inliers: int
     stamp_ns: int = 0
-    motion_residuals: records.Residuals | None = field(default=None, repr=False, compare=False)
+    motion_residuals: records.Residuals | None = field(
+        default=None, repr=False, compare=False
+    )
 
     noise: records.Noise | None = None
 
@@ -184,8 +186,14 @@ class Result:
             for extra in () if name.startswith("_") else all_parts():
                 if name in extra.without:
                     value = self.parts.get(extra.name)
-                    return extra.without[name] if value is None else extra.attribute(value, name)
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+                    return (
+                        extra.without[name]
+                        if value is None
+                        else extra.attribute(value, name)
+                    )
+            raise AttributeError(
+                f"{type(self).__name__!r} object has no attribute {name!r}"
+            )
 
     def with_part(self, name: str, value: object) -> Self:
         """Return the result with a part of a layer above the core."""
@@ -264,14 +272,18 @@ class Result:
 
         Constant errors of odometries cannot be estimated from a recording.
         """
-        return sigmas_in_parent(se3.rotation_of(self.T_parent_child), self.covariance_allowance)
+        return sigmas_in_parent(
+            se3.rotation_of(self.T_parent_child), self.covariance_allowance
+        )
 
     @property
     def observability(self) -> tuple[records.DofObservability, ...]:
         """x, y, z, roll, pitch, yaw in the parent sensor's frame, with their :attr:`sigmas`."""
         return tuple(
             replace(dof, sigma=sigma)
-            for dof, sigma in zip(self.observability_measured, self.sigmas.tolist(), strict=True)
+            for dof, sigma in zip(
+                self.observability_measured, self.sigmas.tolist(), strict=True
+            )
         )
 
     @property

@@ -249,7 +249,10 @@ def _is_notable(finding: Finding) -> bool:
 
     It does if the finding changes the meaning of the numbers.
     """
-    return finding.code in ("model_scale", "outliers") and finding.severity is Severity.NOTE
+    return (
+        finding.code in ("model_scale", "outliers")
+        and finding.severity is Severity.NOTE
+    )
 
 
 def shown(reasons: Sequence[Reason]) -> tuple[Reason, ...]:
@@ -304,7 +307,9 @@ def _contradicted(result: Result) -> Iterator[Ground]:
             which = f"the prior {listing(texts)}"
             names = listing([f"prior.{axis}" for axis in distances])
         sentence = f"{which} the estimate from the motion"
-        yield Ground(sentence, f"check value, unit and sign of {names}", tuple(distances))
+        yield Ground(
+            sentence, f"check value, unit and sign of {names}", tuple(distances)
+        )
 
 
 def _nothing_known(result: Result) -> Iterator[Ground]:
@@ -319,9 +324,15 @@ def _nothing_known(result: Result) -> Iterator[Ground]:
         )
     elif result.reference == "stops" and result.hidden:
         has_one_axis = any(finding.code == "one_axis" for finding in result.findings)
-        why = "do not turn about two axes" if has_one_axis else "turn too little for their errors"
+        why = (
+            "do not turn about two axes"
+            if has_one_axis
+            else "turn too little for their errors"
+        )
         ground = _hidden_ground(result, f"these stops, which {why}")
-        advice = f"turn the hand about at least two axes between them, or {ground.advice}"
+        advice = (
+            f"turn the hand about at least two axes between them, or {ground.advice}"
+        )
         yield ground._replace(advice=advice)
 
 
@@ -354,7 +365,9 @@ def _contradiction(kind: str, result: Result) -> Iterator[Ground]:
     if distances:
         who, claims, advice = _CONTRADICTION_TEXTS[kind]
         disagree = f"{who} {listing([*distances.values()])}"
-        yield Ground(f"{disagree}; {claims} {listing(sigmas)}", advice, tuple(distances))
+        yield Ground(
+            f"{disagree}; {claims} {listing(sigmas)}", advice, tuple(distances)
+        )
 
 
 def _scatter_of(kind: str, row: AxisScatter, axis: "_Axis") -> tuple[float, bool]:
@@ -384,7 +397,9 @@ def _unconfirmed(result: Result) -> Iterator[Ground]:
     axes = [
         (axis.name, axis.total)
         for axis in _axes(result)
-        if axis.name in rows and not rows[axis.name].is_confirmed and not axis.is_known_by_hand
+        if axis.name in rows
+        and not rows[axis.name].is_confirmed
+        and not axis.is_known_by_hand
     ]
     if axes:
         names = tuple(name for name, _ in axes)
@@ -409,7 +424,9 @@ def _hidden_ground(result: Result, source: str) -> Ground:
     if len(axes) > 1:
         advice = "measure them by hand and give priors"
     sentence = f"{axes_in_words(axes)} cannot be determined from {source}"
-    return Ground(sentence, advice, axes, {f"prior.{axis}": PLACEHOLDER for axis in axes})
+    return Ground(
+        sentence, advice, axes, {f"prior.{axis}": PLACEHOLDER for axis in axes}
+    )
 
 
 def _few_inliers(result: Result) -> Iterator[Ground]:
@@ -424,7 +441,9 @@ def _few_inliers(result: Result) -> Iterator[Ground]:
         if result.reference == "windows":
             # The outliers of a vehicle are slips.
             text = f"the wheels or the vehicle slip {1 - share:.0%} of the time"
-            advice = "drive more slowly in curves, on a floor with grip, and record again"
+            advice = (
+                "drive more slowly in curves, on a floor with grip, and record again"
+            )
         yield Ground(text, advice)
 
 
@@ -436,7 +455,9 @@ _FLOOR_ADVICE = (
 
 def _amounts(axes: Iterable[tuple[str, float]], between: str = " ") -> str:
     """List axes with their sizes (m or rad) in words."""
-    texts = [f"{axes_in_words([name])}{between}{amount(name, size)}" for name, size in axes]
+    texts = [
+        f"{axes_in_words([name])}{between}{amount(name, size)}" for name, size in axes
+    ]
     return listing(texts)
 
 
@@ -445,8 +466,12 @@ def _worse_than_target(result: Result) -> Iterator[Ground]:
     if not rough:
         return
     names = tuple(axis.name for axis in rough)
-    sizes = [f"{axes_in_words([axis.name])} {axis.sigma_beside_target()}" for axis in rough]
-    sentence = f"standard deviations above the target of {_targets(rough)}: {listing(sizes)}"
+    sizes = [
+        f"{axes_in_words([axis.name])} {axis.sigma_beside_target()}" for axis in rough
+    ]
+    sentence = (
+        f"standard deviations above the target of {_targets(rough)}: {listing(sizes)}"
+    )
     allowances = [(axis, math.sqrt(axis.total**2 - axis.sigma**2)) for axis in rough]
     # The target cannot be reached if the allowance alone is above it. A longer recording still
     # helps if the allowance is less than half of the rest.
@@ -454,7 +479,11 @@ def _worse_than_target(result: Result) -> Iterator[Ground]:
     advice = []
     if any(size <= axis.target or 2.0 * size < axis.sigma for axis, size in allowances):
         are_stops = result.reference == "stops"
-        more = "more stops, with larger rotations" if are_stops else "longer, with more motion"
+        more = (
+            "more stops, with larger rotations"
+            if are_stops
+            else "longer, with more motion"
+        )
         advice.append(f"record {more}")
     if hopeless:
         alone = f"constant odometry errors alone leave {_amounts(hopeless)}"
@@ -469,11 +498,20 @@ def _floor(result: Result) -> Iterator[Ground]:
         return
     names = tuple(axis.name for axis in above)
     sizes = [f"{axes_in_words(names[:1])} is good to {above[0].sigma_beside_target()}"]
-    sizes += [f"{axes_in_words([axis.name])} to {axis.sigma_beside_target()}" for axis in above[1:]]
+    sizes += [
+        f"{axes_in_words([axis.name])} to {axis.sigma_beside_target()}"
+        for axis in above[1:]
+    ]
     is_one = len({amount(axis.name, axis.target) for axis in above}) == 1
     target_is = "the target is" if is_one else "the targets are"
-    share = "Most" if all(axis.total**2 > 2.0 * axis.sigma**2 for axis in above) else "Part"
-    errors = "constant errors" if result.measured == "positions" else "constant odometry errors"
+    share = (
+        "Most" if all(axis.total**2 > 2.0 * axis.sigma**2 for axis in above) else "Part"
+    )
+    errors = (
+        "constant errors"
+        if result.measured == "positions"
+        else "constant odometry errors"
+    )
     sentence = (
         f"{listing(sizes)}; {target_is} {_targets(above)}. "
         f"{share} of it is an allowance for {errors}"
@@ -549,8 +587,15 @@ _OWN_RULES = (
         "the solver did not converge, and no stream check found an error",
         _not_converged,
     ),
-    Rule("nothing_known", _NEVER, "all six axes are unobservable; of stops, any", _nothing_known),
-    Rule("unobservable", _CARE, "an axis cannot be determined from the motion", _hidden),
+    Rule(
+        "nothing_known",
+        _NEVER,
+        "all six axes are unobservable; of stops, any",
+        _nothing_known,
+    ),
+    Rule(
+        "unobservable", _CARE, "an axis cannot be determined from the motion", _hidden
+    ),
     Rule(
         "warning_finding",
         _CARE,

@@ -72,7 +72,9 @@ def solve_park(pairs: MotionPairs) -> Solution:
     return Solution(T_parent_child, objective, True, np.ones(len(pairs)))
 
 
-def translation_equations(pairs: MotionPairs, R: FloatArray) -> tuple[FloatArray, FloatArray]:
+def translation_equations(
+    pairs: MotionPairs, R: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return both sides of the equations ``(R_A - I) t = R t_B - t_A`` for the translation t.
 
     Parameters
@@ -94,7 +96,9 @@ def translation_equations(pairs: MotionPairs, R: FloatArray) -> tuple[FloatArray
     return se3.rotation_of(A) - np.eye(3), t_B @ R.T - se3.translation_of(A)
 
 
-def align_rotation_vectors(pairs: MotionPairs, weights: FloatArray | None = None) -> FloatArray:
+def align_rotation_vectors(
+    pairs: MotionPairs, weights: FloatArray | None = None
+) -> FloatArray:
     """Estimate the rotation R (3, 3) of X from rotation vectors a of the parent and b of the child.
 
     ``R_A = R R_B R'`` means ``a = R b``. The least squares solution comes from the singular value

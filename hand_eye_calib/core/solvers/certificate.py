@@ -88,7 +88,9 @@ def _maximise_smallest_eigenvalue(M: FloatArray, enough: float) -> float:
     for _ in range(quadratic_form.MAX_NEWTON_STEPS):
         if best >= enough:
             break
-        solved = np.linalg.solve(Z_across + np.tensordot(unknowns, derivatives, 1), derivatives)
+        solved = np.linalg.solve(
+            Z_across + np.tensordot(unknowns, derivatives, 1), derivatives
+        )
         step, decrement = _newton_step(solved, weight)
         unknowns = unknowns + step
         lowest = np.linalg.eigvalsh(Z + np.tensordot(unknowns[:-1], tables.free, 1))[0]

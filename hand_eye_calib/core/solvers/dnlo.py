@@ -100,14 +100,18 @@ def solve(pairs: MotionPairs, threshold: float, min_inlier_fraction: float) -> S
     return _refined(pairs, T, threshold, min_inlier_fraction * len(pairs))
 
 
-def _refined(pairs: MotionPairs, T: FloatArray, threshold: float, floor: float) -> Solution:
+def _refined(
+    pairs: MotionPairs, T: FloatArray, threshold: float, floor: float
+) -> Solution:
     """Improve X and the weights alternately on all pairs, from a start T (4, 4).
 
     ``floor`` is d. The costs are computed from the coefficients of the pairs, which lose fewer
     digits than their quadratic forms.
     """
     coefficients = quadratic_form.coefficients(pairs)
-    weights, objective = truncate(quadratic_form.costs(coefficients, T), threshold, floor)
+    weights, objective = truncate(
+        quadratic_form.costs(coefficients, T), threshold, floor
+    )
     Q = quadratic_form.weighted_sum(coefficients, weights)
     converged = False
     for _ in range(_MAX_ROUNDS):
@@ -164,7 +168,9 @@ def solve_without(
     return search.settle(starts, _TOLERANCE, left_out)[0]
 
 
-def truncate(costs: FloatArray, threshold: float, floor: float) -> tuple[FloatArray, FloatArray]:
+def truncate(
+    costs: FloatArray, threshold: float, floor: float
+) -> tuple[FloatArray, FloatArray]:
     """Return the weights alpha that minimise eq. (5) for given costs, and the objectives.
 
     Parameters
@@ -196,7 +202,9 @@ def truncate(costs: FloatArray, threshold: float, floor: float) -> tuple[FloatAr
         excess = too_few * (is_inlier.sum(axis=-1) - floor)
         if excess.any():
             is_tied = costs == largest
-            weights -= is_tied * (excess / np.maximum(is_tied.sum(axis=-1), 1))[..., None]
+            weights -= (
+                is_tied * (excess / np.maximum(is_tied.sum(axis=-1), 1))[..., None]
+            )
     n_outliers = costs.shape[-1] - weights.sum(axis=-1)
     return weights, np.einsum("...k,...k", weights, costs) + threshold * n_outliers
 
@@ -239,7 +247,9 @@ class _Search:
         ``pairs`` are the motion pairs of the forms.
         """
         total = self.condensed.sum(axis=0)
-        Ts = se3.from_rotation_translation(all_pairs.start_rotations(pairs), np.zeros(3))
+        Ts = se3.from_rotation_translation(
+            all_pairs.start_rotations(pairs), np.zeros(3)
+        )
         for _ in range(_STEPS_OVER_ALL):
             Ts = quadratic_form.gauss_newton_step(quadratic_form.expand(total), Ts)
         of_all = int(np.argmin(quadratic_form.monomials(Ts) @ total))
@@ -300,7 +310,9 @@ class _Search:
             if not sharpness.any():
                 # First round: the weights of all pairs are above zero.
                 largest = costs.max(axis=1)
-                sharpness = truncation / np.maximum(2 * largest - truncation, truncation)
+                sharpness = truncation / np.maximum(
+                    2 * largest - truncation, truncation
+                )
                 sharpness = np.maximum(sharpness, 1e-4)
             if sharpness.min() >= _MAX_SHARPNESS:
                 return Ts
@@ -334,7 +346,9 @@ class _Search:
         (S,) array
             Their objectives.
         """
-        weights, objectives = truncate(self.costs(Ts, left_out), self.threshold, self.floor)
+        weights, objectives = truncate(
+            self.costs(Ts, left_out), self.threshold, self.floor
+        )
         Ts = Ts.copy()
         # Indices of the starts whose objective still decreases. The other starts are finished.
         active = np.arange(len(Ts))

@@ -33,7 +33,9 @@ def solve_dnl(pairs: MotionPairs) -> Solution:
     return Solution(T_parent_child, objective, settled, np.ones(len(pairs)))
 
 
-def solve_dnlo(pairs: MotionPairs, threshold: float, min_inlier_fraction: float) -> Solution:
+def solve_dnlo(
+    pairs: MotionPairs, threshold: float, min_inlier_fraction: float
+) -> Solution:
     """Minimise eq. (5) from the identity with all weights 1.
 
     The parameters are those of :func:`hand_eye_calib.core.solvers.dnlo.solve`.
@@ -56,7 +58,9 @@ def solve_dnlo(pairs: MotionPairs, threshold: float, min_inlier_fraction: float)
         lbg=floor,
         ubg=np.inf,
     )
-    weights, objective = dnlo.truncate(pair_costs(pairs, T_parent_child), threshold, floor)
+    weights, objective = dnlo.truncate(
+        pair_costs(pairs, T_parent_child), threshold, floor
+    )
     return Solution(T_parent_child, float(objective), settled, weights)
 
 
@@ -90,7 +94,10 @@ def _cost_expressions(pairs: MotionPairs, pose: _Expression) -> _Expression:
     translation = x[3:]
     rotation_residual = motion_a[:, :3] @ rotation - rotation @ motion_b[:, :3]
     translation_residual = (
-        motion_a[:, :3] @ translation + motion_a[:, 3] - rotation @ motion_b[:, 3] - translation
+        motion_a[:, :3] @ translation
+        + motion_a[:, 3]
+        - rotation @ motion_b[:, 3]
+        - translation
     )
     cost = casadi.sumsqr(rotation_residual) + casadi.sumsqr(translation_residual)
     columns_a = casadi.vec(motion_a)

@@ -129,7 +129,9 @@ def costs(coefficients: FloatArray, T_parent_child: FloatArray) -> FloatArray:
     return np.einsum("ki,ki->k", residuals, residuals)
 
 
-def median_costs(coefficients: FloatArray, Ts: FloatArray, scales: FloatArray) -> FloatArray:
+def median_costs(
+    coefficients: FloatArray, Ts: FloatArray, scales: FloatArray
+) -> FloatArray:
     """Return the medians (S,) of the costs of all pairs, at each X and scale of the child.
 
     The costs are in the smaller unit of length. Otherwise a scale of zero would have the smallest
@@ -192,7 +194,9 @@ def expand(condensed: FloatArray) -> FloatArray:
     return condensed.take(_TRIANGLE, axis=-1)
 
 
-def minimise(Q: FloatArray, rotation_start: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+def minimise(
+    Q: FloatArray, rotation_start: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Minimise ``x' Q x`` over SE(3), for one form from several starts or for several forms.
 
     The translation is eliminated exactly. The remaining quadratic function of the nine entries of R
@@ -338,7 +342,9 @@ def gauss_newton_step(Q: FloatArray, Ts_parent_child: FloatArray) -> FloatArray:
     return Ts_parent_child @ (np.eye(4) + shrink * second_order)
 
 
-def _derivatives(forms: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _derivatives(
+    forms: FloatArray, R: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the values of forms of (vec R, 1) at ``R Exp(phi)``, and derivatives at phi = 0.
 
     With r = vec R, a form is ``r' S r + 2 linear' r`` plus a constant.

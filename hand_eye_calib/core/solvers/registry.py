@@ -82,11 +82,15 @@ class Method:
 
     def __post_init__(self) -> None:
         if self.name not in _SOLVERS:
-            raise ConfigError(f"method {self.name!r} is unknown; known are {', '.join(_SOLVERS)}")
+            raise ConfigError(
+                f"method {self.name!r} is unknown; known are {', '.join(_SOLVERS)}"
+            )
         require_backend(self.name, self.backend)
 
     @property
-    def solve_best_stride(self) -> Callable[[FloatArray, FloatArray], robust.Stride] | None:
+    def solve_best_stride(
+        self,
+    ) -> Callable[[FloatArray, FloatArray], robust.Stride] | None:
         """Function ``(Ts_pw_p, Ts_cw_c)`` that chooses the motions for the reference ``auto``.
 
         None if the method has no such function.
@@ -122,7 +126,9 @@ class Method:
         """
         if self.name not in ("dnl", "dnlo"):
             return "not tried"
-        Q = quadratic_form.weighted_sum(quadratic_form.coefficients(pairs), solution.weights)
+        Q = quadratic_form.weighted_sum(
+            quadratic_form.coefficients(pairs), solution.weights
+        )
         return "yes" if certificate.is_global(Q, solution.T_parent_child) else "no"
 
     def solve_without(

@@ -85,7 +85,9 @@ class RobustSolution(Solution):
 
 
 def solve(
-    pairs: MotionPairs, T_start: FloatArray | None = None, tolerance: float = _STEP_TOLERANCE
+    pairs: MotionPairs,
+    T_start: FloatArray | None = None,
+    tolerance: float = _STEP_TOLERANCE,
 ) -> RobustSolution:
     """Solve A X = X B for K >= 1 pairs.
 
@@ -110,7 +112,9 @@ def solve(
         components = _components(pairs, T_parent_child)
         if step_number < _FREE_SCALE_STEPS:
             scales = _scales(components)
-        hessian, scores = _normal_equations(components, scales, _weights(components, scales))
+        hessian, scores = _normal_equations(
+            components, scales, _weights(components, scales)
+        )
         step = -_inverse(hessian) @ scores.sum(axis=(0, 1))
         T_parent_child = se3.retracted(T_parent_child, step)
         if step @ hessian @ step < tolerance**2:
@@ -194,7 +198,9 @@ class _Component:
     jacobians: FloatArray
 
 
-def _components(pairs: MotionPairs, T_parent_child: FloatArray) -> tuple[_Component, _Component]:
+def _components(
+    pairs: MotionPairs, T_parent_child: FloatArray
+) -> tuple[_Component, _Component]:
     """Return residuals and their derivatives with respect to xi in ``X Exp(xi)``.
 
     The first component are the translations (m), the second the rotation vectors (rad).
@@ -218,11 +224,15 @@ def _scales(components: tuple[_Component, _Component]) -> FloatArray:
     return np.maximum(sigmas, _MIN_SCALE)
 
 
-def _weights(components: tuple[_Component, _Component], scales: FloatArray) -> FloatArray:
+def _weights(
+    components: tuple[_Component, _Component], scales: FloatArray
+) -> FloatArray:
     """Return the Cauchy weights (2, K) of translations and of rotations."""
     squared = []
     for component, scale in zip(components, scales, strict=True):
-        squared.append((component.residuals**2).sum(axis=1) / 3.0 / (_CAUCHY_UNIT * scale) ** 2)
+        squared.append(
+            (component.residuals**2).sum(axis=1) / 3.0 / (_CAUCHY_UNIT * scale) ** 2
+        )
     return robust_weights("cauchy", np.array(squared))
 
 
@@ -235,7 +245,9 @@ def _normal_equations(
     """
     hessian = np.zeros((6, 6))
     scores = []
-    for component, scale, component_weights in zip(components, scales, weights, strict=True):
+    for component, scale, component_weights in zip(
+        components, scales, weights, strict=True
+    ):
         jacobians = component.jacobians / scale
         weighted = jacobians * component_weights[:, None, None]
         hessian += np.einsum("kij,kil->jl", weighted, jacobians)
@@ -243,7 +255,9 @@ def _normal_equations(
     return hessian, np.stack(scores)
 
 
-def _covariance(hessian: FloatArray, scores: FloatArray, pairs: MotionPairs) -> FloatArray:
+def _covariance(
+    hessian: FloatArray, scores: FloatArray, pairs: MotionPairs
+) -> FloatArray:
     """Return the covariance (6, 6) from the weighted Hessian and the scores (2, K, 6) of pairs.
 
     It allows for errors that are correlated over a share of the recording.
@@ -261,7 +275,9 @@ def _covariance(hessian: FloatArray, scores: FloatArray, pairs: MotionPairs) -> 
     # n / (n - 6) corrects this, for n motions that do not overlap.
     n_motions = n_poses / motion
     n_free = max(n_motions - 6.0, 1.0)
-    return n_motions / n_free * _sandwich(hessian - curvature, scores.sum(axis=0), window)
+    return (
+        n_motions / n_free * _sandwich(hessian - curvature, scores.sum(axis=0), window)
+    )
 
 
 def _sandwich(hessian: FloatArray, scores: FloatArray, window: int) -> FloatArray:
@@ -280,7 +296,9 @@ def _inverse(hessian: FloatArray) -> FloatArray:
     may differ by many powers of ten.
     """
     units = _units(hessian)
-    balanced = np.linalg.pinv(hessian / units / units[:, None], RANK_TOLERANCE, hermitian=True)
+    balanced = np.linalg.pinv(
+        hessian / units / units[:, None], RANK_TOLERANCE, hermitian=True
+    )
     return balanced / units / units[:, None]
 
 
@@ -324,7 +342,9 @@ def _start(pairs: MotionPairs) -> FloatArray:
     vectors_parent = se3.rotation_log(se3.rotation_of(pairs.Ts_parenti_parentj))
     vectors_child = se3.rotation_log(se3.rotation_of(pairs.Ts_childi_childj))
     # Both motions of a pair rotate by the same angle, for any X. Other pairs get small weights.
-    differences = np.linalg.norm(vectors_parent, axis=1) - np.linalg.norm(vectors_child, axis=1)
+    differences = np.linalg.norm(vectors_parent, axis=1) - np.linalg.norm(
+        vectors_child, axis=1
+    )
     unit = max(1.5 * median(np.abs(differences)), _MIN_SCALE)
     weights = robust_weights("cauchy", (differences / unit) ** 2)
     aligned = align_rotation_vectors(pairs, weights)

@@ -55,11 +55,17 @@ def solve(pairs: MotionPairs) -> Solution:
     # The cost at a false minimum is higher than that of the minimum near the solution of Park.
     rounding = _ROUNDING**2 * float((M**2).sum())
     is_lowest = objective <= objective_near_park / (1 - _MIN_DIFFERENCE) + rounding
-    T_parent_child = se3.from_rotation_translation(_rotation(parameters[:3]), parameters[3:])
-    return Solution(T_parent_child, objective, settled and is_lowest, np.ones(len(pairs)))
+    T_parent_child = se3.from_rotation_translation(
+        _rotation(parameters[:3]), parameters[3:]
+    )
+    return Solution(
+        T_parent_child, objective, settled and is_lowest, np.ones(len(pairs))
+    )
 
 
-def _gauss_newton(M: FloatArray, parameters: FloatArray) -> tuple[FloatArray, float, bool]:
+def _gauss_newton(
+    M: FloatArray, parameters: FloatArray
+) -> tuple[FloatArray, float, bool]:
     """Minimise ``|M products(z, t)|^2`` from the start ``parameters`` = (z, t) (6,).
 
     M is the matrix of :func:`_condense`.
@@ -75,7 +81,9 @@ def _gauss_newton(M: FloatArray, parameters: FloatArray) -> tuple[FloatArray, fl
     """
     for _ in range(_MAX_ITERATIONS):
         products, derivatives = _products(parameters)
-        step = np.linalg.lstsq(M @ derivatives, -M @ products, rcond=all_pairs.RANK_TOLERANCE)[0]
+        step = np.linalg.lstsq(
+            M @ derivatives, -M @ products, rcond=all_pairs.RANK_TOLERANCE
+        )[0]
         parameters = parameters + step
         settled = bool((np.abs(step) < _STEP_TOLERANCE).all())
         if settled:

@@ -43,7 +43,11 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.records import AXES, DofVerdict
-from hand_eye_calib.extras.detectability.record import FOUND_SHARE, SIGMAS, Detectability
+from hand_eye_calib.extras.detectability.record import (
+    FOUND_SHARE,
+    SIGMAS,
+    Detectability,
+)
 
 # Number of random splits.
 _N_TRIALS = 10
@@ -185,7 +189,9 @@ def _columns_of_streams(pairs: MotionPairs, pose_pairs: PosePairs) -> FloatArray
     seconds = (stamps_ns[after] - stamps_ns[before]) * 1e-9
     twists = se3.log(se3.inverse(poses[before]) @ poses[after]) / seconds[:, None]
     Bs_inverse = se3.inverse(pairs.Ts_childi_childj)
-    of_time_offset = se3.times(se3.adjoint(Bs_inverse), twists[pairs.i]) - twists[pairs.j]
+    of_time_offset = (
+        se3.times(se3.adjoint(Bs_inverse), twists[pairs.i]) - twists[pairs.j]
+    )
     of_scale = np.zeros_like(of_time_offset)
     of_scale[:, :3] = se3.translation_of(Bs_inverse)
     return np.stack([of_time_offset, of_scale], axis=2)
@@ -281,14 +287,18 @@ def _first_shifts(blocks: Blocks, R: FloatArray) -> FloatArray:
     threshold = 2.0 * (moved.SIGNIFICANT - moved.log_ratio(evidence))
     # Columns are the scores of unit shifts along the parent's axes.
     scores = H @ np.kron(np.eye(2), R.T)
-    squares = (scores * np.linalg.solve(H + moved.SHIFT_INFORMATION, scores)).sum(axis=0)
+    squares = (scores * np.linalg.solve(H + moved.SHIFT_INFORMATION, scores)).sum(
+        axis=0
+    )
     # Without motion, no shift along an axis changes the score: its size is unlimited.
     sizes = np.full(6, np.inf)
     np.divide(threshold, squares, out=sizes, where=squares > 0.0)
     return np.maximum(_WEIGHT_FACTOR * np.sqrt(sizes), _LEAST_SHIFT)
 
 
-def _smallest_reported(pose_pairs: PosePairs, X: FloatArray, axis: int, first: float) -> float:
+def _smallest_reported(
+    pose_pairs: PosePairs, X: FloatArray, axis: int, first: float
+) -> float:
     """Return the smallest shift that the stream check reports; infinite if there is none.
 
     Parameters
@@ -306,7 +316,10 @@ def _smallest_reported(pose_pairs: PosePairs, X: FloatArray, axis: int, first: f
     for _ in range(_N_SIZES):
         if not size < _LARGEST[axis]:
             break
-        if all(_is_reported(pose_pairs, X, axis, share, sign * size) for share, sign in _INJECTED):
+        if all(
+            _is_reported(pose_pairs, X, axis, share, sign * size)
+            for share, sign in _INJECTED
+        ):
             return size
         size *= _GROWTH
     return np.inf
@@ -326,7 +339,9 @@ def _is_reported(
     motions = pairs_over(moved_pairs, LAGS_S[0], MAX_MOTIONS)
     if len(motions) < MIN_PAIRS:
         return False
-    speed_m_s = usual_speed(pose_pairs.stamps_ns, se3.translation_of(pose_pairs.Ts_pw_p))
+    speed_m_s = usual_speed(
+        pose_pairs.stamps_ns, se3.translation_of(pose_pairs.Ts_pw_p)
+    )
     # A fit to all motions lies between both mounts.
     between = X @ se3.exp(xi / 2.0)
     for suspect in slow_suspects(moved_pairs, motions, between, speed_m_s):

@@ -5,7 +5,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from hand_eye_calib.core.base.text import ABOUT, amount, axes_in_words, listing, two_digits
+from hand_eye_calib.core.base.text import (
+    ABOUT,
+    amount,
+    axes_in_words,
+    listing,
+    two_digits,
+)
 from hand_eye_calib.core.results.parts import Part
 from hand_eye_calib.core.results.records import AXES, DofVerdict
 from hand_eye_calib.core.results.verdict import Ground, target_of

@@ -23,7 +23,9 @@ def register() -> None:
     COMMANDS["compare"] = Command(
         "compare results with the installed transform, or with each other", _compare
     )
-    COMMANDS["batch"] = Command("calibrate many recordings, such as those of a fleet", _batch)
+    COMMANDS["batch"] = Command(
+        "calibrate many recordings, such as those of a fleet", _batch
+    )
     RESULT_PARTS["together"] = _together
     EXTRA_RULES["recordings_differ"] = ExtraRule(
         "nothing_known",
@@ -58,7 +60,9 @@ def _add_arguments(parser: Any) -> None:
     from hand_eye_calib.offline.cli.options import at_least
 
     add = parser.add_argument_group("many recordings").add_argument
-    batch = "bags, folders of bags, or patterns of bags in quotes, such as 'fleet/*/drive'"
+    batch = (
+        "bags, folders of bags, or patterns of bags in quotes, such as 'fleet/*/drive'"
+    )
     add("--batch", metavar="BAG", nargs="+", help=batch)
     vehicle = (
         "the vehicle's name, or its position in the paths of --batch, such "

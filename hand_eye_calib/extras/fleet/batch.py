@@ -61,7 +61,11 @@ def run_batch(arguments: argparse.Namespace) -> int:
         _print_json(title, done, vehicles)
     else:
         _print_results(done, vehicles)
-    alone = [outcome for outcome in done if outcome.row["verdict"] and not outcome.row["vehicle"]]
+    alone = [
+        outcome
+        for outcome in done
+        if outcome.row["verdict"] and not outcome.row["vehicle"]
+    ]
     n_alone = len(alone)
     if n_alone > 1:
         why = "set --vehicle to"
@@ -76,7 +80,9 @@ def run_batch(arguments: argparse.Namespace) -> int:
     return gravest_code(codes)
 
 
-def _print_json(title: str, done: Sequence[Outcome], vehicles: Mapping[str, Calibration]) -> None:
+def _print_json(
+    title: str, done: Sequence[Outcome], vehicles: Mapping[str, Calibration]
+) -> None:
     """Print one JSON document with all outcomes. Each outcome is a JSON text already."""
     document = {
         "batch": title,
@@ -88,21 +94,27 @@ def _print_json(title: str, done: Sequence[Outcome], vehicles: Mapping[str, Cali
     print(",\n".join(f"    {outcome.text}" for outcome in done) + "\n  ]\n}")
 
 
-def run_together(arguments: argparse.Namespace, groups: Sequence[Sequence[Path | str]]) -> int:
+def run_together(
+    arguments: argparse.Namespace, groups: Sequence[Sequence[Path | str]]
+) -> int:
     """Calibrate from several recordings of one rig to one result; return the exit code.
 
     ``groups`` are the bags of each recording.
     """
     done = _all_done([[*map(str, group)] for group in groups], "rig", arguments)
     usable = {
-        outcome.row["name"]: outcome.calibration for outcome in done if outcome.row["verdict"]
+        outcome.row["name"]: outcome.calibration
+        for outcome in done
+        if outcome.row["verdict"]
     }
     if not usable:
         errors = [f"{outcome.row['name']}: {outcome.row['error']}" for outcome in done]
         raise InputError("; ".join(errors))
     result = together(usable)
     if arguments.out:
-        _write_rows_and_page(arguments.out, "recordings of one rig", done, {"rig": result}, REPORT)
+        _write_rows_and_page(
+            arguments.out, "recordings of one rig", done, {"rig": result}, REPORT
+        )
     inputs = {"recordings": {outcome.row["name"]: outcome.inputs for outcome in done}}
     code = deliver(result, inputs, arguments)
     return 1 if any(outcome.row["error"] for outcome in done) else code
@@ -131,7 +143,9 @@ def _all_done(
             _store(task, outcome, out)
         error = outcome.row["error"]
         if error or not sys.stderr.isatty():
-            note(f"{len(done)} of {len(tasks)}: {task.name}: {error or outcome.row['headline']}")
+            note(
+                f"{len(done)} of {len(tasks)}: {task.name}: {error or outcome.row['headline']}"
+            )
     return [done[task.name] for task in tasks]
 
 
@@ -143,7 +157,9 @@ def _earlier_outcomes(tasks: Sequence[Task], directory: Path) -> dict[str, Outco
         if earlier:
             done[task.name] = earlier
     if done:
-        note(f"{len(done)} of {len(tasks)} bags are done already; their results are in {directory}")
+        note(
+            f"{len(done)} of {len(tasks)} bags are done already; their results are in {directory}"
+        )
     return done
 
 
@@ -153,9 +169,17 @@ def stored(task: Task, directory: Path) -> Outcome | None:
     A failed run has stored an empty key, see :func:`_store`. An empty key is never that of a task.
     """
     try:
-        about, text = (directory / task.name / work.STATE).read_text(encoding="utf-8").splitlines()
+        about, text = (
+            (directory / task.name / work.STATE)
+            .read_text(encoding="utf-8")
+            .splitlines()
+        )
         state = json.loads(about)
-        return Outcome(state["row"], state["code"], text) if state["key"] == task.key() else None
+        return (
+            Outcome(state["row"], state["code"], text)
+            if state["key"] == task.key()
+            else None
+        )
     # The task is repeated, whatever is wrong with the file.
     except Exception:
         return None
@@ -179,7 +203,9 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
     text = io.StringIO()
     # Rows of failures lack columns; the longest row has all columns.
     columns = [*max(rows, key=len)]
-    writer = csv.DictWriter(text, columns, None, lineterminator="\n", quoting=csv.QUOTE_NONNUMERIC)
+    writer = csv.DictWriter(
+        text, columns, None, lineterminator="\n", quoting=csv.QUOTE_NONNUMERIC
+    )
     writer.writeheader()
     for row in rows:
         safe = dict(row)
@@ -191,7 +217,9 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
     save_text(path, text.getvalue())
 
 
-def _vehicles(done: Sequence[Outcome], directory: Path | None) -> dict[str, Calibration]:
+def _vehicles(
+    done: Sequence[Outcome], directory: Path | None
+) -> dict[str, Calibration]:
     """Return the common result of each vehicle with several recordings, by the vehicle's name.
 
     The result of an earlier run with the same recordings is reused.
@@ -206,7 +234,9 @@ def _vehicles(done: Sequence[Outcome], directory: Path | None) -> dict[str, Cali
             continue
         texts = "\n".join(outcome.text for outcome in group)
         digest = hashlib.sha256(texts.encode()).hexdigest()
-        task = Task(name=f"{work.VEHICLES}/{vehicle}", bags=(), options={"results": digest})
+        task = Task(
+            name=f"{work.VEHICLES}/{vehicle}", bags=(), options={"results": digest}
+        )
         earlier = stored(task, directory) if directory else None
         if earlier:
             results[vehicle] = earlier.calibration
@@ -234,13 +264,17 @@ def _write_rows_and_page(
 
     rows = [outcome.row for outcome in done]
     write_rows(directory / work.TABLE, rows)
-    linked = {row["name"] for row in rows if (directory / row["name"] / REPORT).exists()}
+    linked = {
+        row["name"] for row in rows if (directory / row["name"] / REPORT).exists()
+    }
     save_text(directory / page, render_batch(title, rows, vehicles, linked))
     for name in (work.TABLE, page):
         note(f"wrote {directory / name}")
 
 
-def _print_results(done: Sequence[Outcome], vehicles: Mapping[str, Calibration]) -> None:
+def _print_results(
+    done: Sequence[Outcome], vehicles: Mapping[str, Calibration]
+) -> None:
     """Print a line for each recording, the worst first, and the results of the vehicles."""
     in_order = sorted(done, key=lambda outcome: _GRAVITY.index(outcome.verdict))
     for outcome in in_order[:_MOST_LINES]:
@@ -251,7 +285,9 @@ def _print_results(done: Sequence[Outcome], vehicles: Mapping[str, Calibration])
         print(f"{len(done) - _MOST_LINES} more, none with a worse verdict")
     counts = Counter(outcome.verdict for outcome in in_order)
     failed = counts.pop("failed", 0)
-    print(f"{len(done) - failed} of {counted(len(done), 'bag')} calibrated, {failed} failed")
+    print(
+        f"{len(done) - failed} of {counted(len(done), 'bag')} calibrated, {failed} failed"
+    )
     if counts:
         print(_counts_in_words(counts))
     if vehicles:

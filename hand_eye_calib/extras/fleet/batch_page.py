@@ -109,7 +109,9 @@ def _trend(result: Calibration, number: int) -> Drawn:
     return as_drawn(figure, f"vehicle-{number}", title, _CAPTION)
 
 
-def _draw_axis(panel: Any, axis: str, sigma: float, recordings: Sequence[Recorded]) -> None:
+def _draw_axis(
+    panel: Any, axis: str, sigma: float, recordings: Sequence[Recorded]
+) -> None:
     """Draw the differences of recordings from the common value of an axis (m or rad).
 
     ``sigma`` is the measured standard deviation of the common value.
@@ -121,10 +123,14 @@ def _draw_axis(panel: Any, axis: str, sigma: float, recordings: Sequence[Recorde
         factor = np.degrees(1.0)
         unit = "deg"
         title = f"about {ABOUT[axis]}"
-    stamps_ns = np.array([recording.stamp_ns for recording in recordings], dtype="datetime64[ns]")
+    stamps_ns = np.array(
+        [recording.stamp_ns for recording in recordings], dtype="datetime64[ns]"
+    )
     days = date2num(stamps_ns)
     is_apart = np.array([bool(recording.left_out) for recording in recordings])
-    points = [(recording.deviations[axis], recording.sigmas[axis]) for recording in recordings]
+    points = [
+        (recording.deviations[axis], recording.sigmas[axis]) for recording in recordings
+    ]
     values, sigmas = factor * np.where(np.isfinite(points), points, np.nan).T
     band = factor * LOOK.sigmas * sigma
     is_determined = np.isfinite(band)
@@ -138,8 +144,13 @@ def _draw_axis(panel: Any, axis: str, sigma: float, recordings: Sequence[Recorde
     for half, width in ((sigmas, 0.8), (0 * sigmas, 3.2)):
         # The NaN after each line separates it from the next line.
         ends = np.stack([values - half, values + half, gap], axis=1)
-        for group, colour, cap in ((~is_apart, INK, "round"), (is_apart, BAD, "projecting")):
-            (line,) = panel.plot(np.repeat(days[group], 3), ends[group].ravel(), color=colour)
+        for group, colour, cap in (
+            (~is_apart, INK, "round"),
+            (is_apart, BAD, "projecting"),
+        ):
+            (line,) = panel.plot(
+                np.repeat(days[group], 3), ends[group].ravel(), color=colour
+            )
             line.set(lw=width, solid_capstyle=cap)
 
 

@@ -9,7 +9,12 @@ from typing import TYPE_CHECKING
 from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.base.registry import COMPARISONS
 from hand_eye_calib.core.base.text import amount, distinct_names
-from hand_eye_calib.offline.cli.options import add_json_argument, note, print_result, waiting_for
+from hand_eye_calib.offline.cli.options import (
+    add_json_argument,
+    note,
+    print_result,
+    waiting_for,
+)
 
 if TYPE_CHECKING:
     from hand_eye_calib.core.results.calibration import Calibration
@@ -30,7 +35,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.usage = "%(prog)s [OPTION ...] RESULT ..."
     parser.epilog = _EPILOG
-    results = "extrinsic.yaml, or the directory that contains it; two or more without --with"
+    results = (
+        "extrinsic.yaml, or the directory that contains it; two or more without --with"
+    )
     parser.add_argument("results", metavar="RESULT", nargs="+", help=results)
     installed = (
         "installed transform: a URDF, an earlier extrinsic.yaml, a file of "
@@ -56,7 +63,9 @@ def run(arguments: argparse.Namespace) -> int:
         if code is not None:
             return code
     if arguments.fleet:
-        raise ConfigError("--fleet needs digests of the monitor, and this installation has none")
+        raise ConfigError(
+            "--fleet needs digests of the monitor, and this installation has none"
+        )
     results = [load_result(path) for path in arguments.results]
     for path, result in zip(arguments.results, results, strict=True):
         if result.status.failure:

@@ -24,7 +24,9 @@ examples:
 
 def _prepare(arguments: Any) -> None:
     if not arguments.paths:
-        raise ConfigError("batch needs bags, folders or patterns of bags: batch fleet/ --out DIR")
+        raise ConfigError(
+            "batch needs bags, folders or patterns of bags: batch fleet/ --out DIR"
+        )
     arguments.batch = [*map(str, arguments.paths), *(arguments.batch or ())]
     arguments.paths = []
 

@@ -16,7 +16,12 @@ from hand_eye_calib.core.assessment.comparison import (
     require_same_frames,
 )
 from hand_eye_calib.core.assessment.covariance import Assessment, combined
-from hand_eye_calib.core.base.errors import HandEyeCalibError, InputError, located, require_type
+from hand_eye_calib.core.base.errors import (
+    HandEyeCalibError,
+    InputError,
+    located,
+    require_type,
+)
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.text import listing
 from hand_eye_calib.core.geometry import se3
@@ -52,7 +57,13 @@ _COUNTS = ("n_poses", "n_pairs", "n_inliers")
 # Fields of the common result that are taken from the newest recording.
 _OF_NEWEST = (
     *("reference", "backend", "measured", "stamp_ns", "parent_frame", "child_frame"),
-    *("base_frame", "T_base_parent", "target_translation", "target_rotation", "target_axes"),
+    *(
+        "base_frame",
+        "T_base_parent",
+        "target_translation",
+        "target_rotation",
+        "target_axes",
+    ),
 )
 
 
@@ -143,7 +154,9 @@ def calibrate_many(
     return data_frame(rows, "name")
 
 
-def _named(recordings: _Recordings, names: Sequence[str] | None) -> Iterable[tuple[str, _Pair]]:
+def _named(
+    recordings: _Recordings, names: Sequence[str] | None
+) -> Iterable[tuple[str, _Pair]]:
     """Return the names and the pairs of all recordings, after checks."""
     if isinstance(recordings, Mapping):
         names = [*recordings]
@@ -151,9 +164,13 @@ def _named(recordings: _Recordings, names: Sequence[str] | None) -> Iterable[tup
     require_type("recordings", recordings, Iterable)
     pairs = [*recordings]
     if not all(isinstance(pair, Sequence) and len(pair) == 2 for pair in pairs):
-        raise InputError("each recording must be a pair of parent and child: [(parent, child)]")
+        raise InputError(
+            "each recording must be a pair of parent and child: [(parent, child)]"
+        )
     if names is not None and len(set(names)) < len(pairs):
-        raise InputError(f"expected {len(pairs)} different names, found {', '.join(names)}")
+        raise InputError(
+            f"expected {len(pairs)} different names, found {', '.join(names)}"
+        )
     return zip(names or map(str, count(1)), pairs, strict=False)
 
 
@@ -167,7 +184,9 @@ def row_of_result(calibration: Document) -> Document:
     sigmas = [*transform["sigma_translation"], *transform["sigma_rpy_deg"]]
     for column, value, sigma in zip(columns, values, sigmas, strict=True):
         row |= {column: value, f"sigma_{column}": sigma}
-    return row | {f"{dof['name']}_is": dof["verdict"] for dof in calibration["observability"]}
+    return row | {
+        f"{dof['name']}_is": dof["verdict"] for dof in calibration["observability"]
+    }
 
 
 def together(results: Mapping[str, Calibration]) -> Calibration:
@@ -187,7 +206,11 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
     """
     results = dict(sorted(results.items(), key=lambda item: item[1].stamp_ns))
     require_same_frames(results.values())
-    left_out = {name: result.headline for name, result in results.items() if _is_unusable(result)}
+    left_out = {
+        name: result.headline
+        for name, result in results.items()
+        if _is_unusable(result)
+    }
     usable = {name: result for name, result in results.items() if name not in left_out}
     if not usable:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
@@ -227,7 +250,9 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
 
 def _is_unusable(result: Calibration) -> bool:
     """Return whether the verdict is DO NOT USE for another reason than unknown axes."""
-    rules = {reason.rule for reason in result.reasons if reason.verdict is Verdict.DO_NOT_USE}
+    rules = {
+        reason.rule for reason in result.reasons if reason.verdict is Verdict.DO_NOT_USE
+    }
     return bool(rules - {"nothing_known"})
 
 
@@ -259,7 +284,9 @@ def _joint(
     return Calibration(
         T_parent_child=agreement.T_parent_child,
         covariance_measured=assessed.cov_parent_child_in_child,
-        covariance_allowance=np.mean([result.covariance_allowance for result in used], axis=0),
+        covariance_allowance=np.mean(
+            [result.covariance_allowance for result in used], axis=0
+        ),
         observability_measured=assessed.observability,
         status=SolveStatus.UNOBSERVABLE if is_open else SolveStatus.OK,
         objective=agreement.chi2,

@@ -93,7 +93,9 @@ def _state(bag: str) -> list[Any]:
     return [[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
 
 
-def tasks_of(groups: Sequence[Sequence[str]], vehicle: str = "", **common: Any) -> list[Task]:
+def tasks_of(
+    groups: Sequence[Sequence[str]], vehicle: str = "", **common: Any
+) -> list[Task]:
     """Return a task for each recording.
 
     Parameters
@@ -202,10 +204,14 @@ class Outcome(NamedTuple):
         row |= _times_of([inputs[stream] for stream in STREAMS if stream in inputs])
         row |= {"verdict": None, "headline": None, "bags": " ".join(bags)}
         if document and result:
-            row |= row_of_result(document) | {"warnings": "; ".join(document["warnings"])}
+            row |= row_of_result(document) | {
+                "warnings": "; ".join(document["warnings"])
+            }
             row["findings"] = " ".join(finding.code for finding in result.findings)
         code = exit_code(result) if result and not error else 1
-        return cls(row, code, json.dumps(whole, separators=(",", ":")), restore_urls(page))
+        return cls(
+            row, code, json.dumps(whole, separators=(",", ":")), restore_urls(page)
+        )
 
     @property
     def calibration(self) -> Calibration:
@@ -256,7 +262,9 @@ def work(task: Task) -> Outcome:
             recording = read_recording(bags, task.sources, task.options, task.without)
             result = recording.solved(task.with_fingerprints)
             inputs = recording.inputs
-            page = render(result, recording.snapshot, inputs) if task.with_report else ""
+            page = (
+                render(result, recording.snapshot, inputs) if task.with_report else ""
+            )
             error = result.reasons[0].sentence if result.has_failed else None
             return Outcome.of(task, error, result, inputs, page, restore_urls)
     except HandEyeCalibError as error:

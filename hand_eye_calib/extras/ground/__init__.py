@@ -23,7 +23,11 @@ def register() -> None:
     )
     BESIDE_MOTION["ground"] = BesideMotion(_add_arguments, _find, _topics)
     PUBLIC_NAMES["calibrate_on_ground"] = "hand_eye_calib.extras.ground.calibrate"
-    for name in ("ground_from_clouds", "gravity_from_accelerations", "gravity_from_attitude"):
+    for name in (
+        "ground_from_clouds",
+        "gravity_from_accelerations",
+        "gravity_from_attitude",
+    ):
         PUBLIC_NAMES[name] = "hand_eye_calib.extras.ground.tracks"
 
 

@@ -122,7 +122,9 @@ def _track_of_bag(
         return vertical_track(bag, topic, stream, beside)
 
 
-def vertical_track(bag: PoseBag, topic: str, stream: Trajectory, beside: Source) -> VerticalTrack:
+def vertical_track(
+    bag: PoseBag, topic: str, stream: Trajectory, beside: Source
+) -> VerticalTrack:
     """Return the vertical from the clouds or IMU data of a topic.
 
     ``stream`` has the poses of the sensor, and ``beside`` is what the other sensor measures.

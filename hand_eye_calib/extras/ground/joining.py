@@ -102,7 +102,9 @@ class VerticalPair:
         S = H @ C @ H.T + measurement.covariance
         distances = np.abs(values) / np.sqrt(np.diag(S))
         squared = float(values @ np.linalg.solve(S, values))
-        agrees = bool(distances.max() < CONTRADICTED_SIGMAS and squared < CHI2[0.01][len(values)])
+        agrees = bool(
+            distances.max() < CONTRADICTED_SIGMAS and squared < CHI2[0.01][len(values)]
+        )
         updated = calibration
         if agrees:
             gain = np.asarray(np.linalg.solve(S, H @ C).T, dtype=float)
@@ -111,14 +113,18 @@ class VerticalPair:
         part = GroundResult(self.parent.source, self.child.source, agrees, axes)
         return updated.with_part("ground", part)
 
-    def measurement(self, calibration: Calibration, snapshot: Any) -> Measurement | None:
+    def measurement(
+        self, calibration: Calibration, snapshot: Any
+    ) -> Measurement | None:
         """Return the measurement, linearised at a result.
 
         Return None if no instants are common, or if too few sections of the drive have data.
         """
         T = calibration.T_parent_child
         R = se3.rotation_of(T)
-        parent, child = _at_same_times(self.parent, self.child, calibration.time_offset_s)
+        parent, child = _at_same_times(
+            self.parent, self.child, calibration.time_offset_s
+        )
         if not len(parent):
             return None
         basis, axes = _measured_axes(parent.ups)
@@ -208,7 +214,9 @@ def _differences(
     sines = np.linalg.norm(crosses, axis=1)
     cosines = np.einsum("ki,ki->k", child_ups, parent.ups)
     angles = np.arctan2(sines, cosines)
-    angle_per_sine = np.divide(angles, sines, out=np.ones_like(sines), where=sines > 0.0)
+    angle_per_sine = np.divide(
+        angles, sines, out=np.ones_like(sines), where=sines > 0.0
+    )
     rotation_vectors = angle_per_sine[:, None] * crosses
     tilts = rotation_vectors @ basis[:, :2]
     if parent.heights_m is None or child.heights_m is None:
@@ -331,7 +339,9 @@ def _correlation_factor(residuals: FloatArray) -> float:
     return 1.0 + 2.0 * max(correlation, 0.0)
 
 
-def _updated(calibration: Calibration, measurement: Measurement, gain: FloatArray) -> Calibration:
+def _updated(
+    calibration: Calibration, measurement: Measurement, gain: FloatArray
+) -> Calibration:
     """Update a result by a Kalman gain (6, M).
 
     Its covariance is the Joseph form ``(I - K H) C (I - K H)' + K V K'``.
@@ -369,7 +379,10 @@ def _updated(calibration: Calibration, measurement: Measurement, gain: FloatArra
 
 
 def _ground_axes(
-    calibration: Calibration, updated: Calibration, measurement: Measurement, distances: FloatArray
+    calibration: Calibration,
+    updated: Calibration,
+    measurement: Measurement,
+    distances: FloatArray,
 ) -> tuple[GroundAxis, ...]:
     """Return each measured axis by the motion alone and by the ground alone.
 

@@ -125,7 +125,9 @@ def disagreements(result: Any) -> Iterator[Ground]:
     for axis in far:
         by_ground = _number(axis.name, axis.ground, axis.ground_sigma)
         by_motion = _number(axis.name, axis.motion, axis.motion_sigma)
-        texts.append(f"{axis.name} is {by_ground} by {_source(value)}, {by_motion} by the motion")
+        texts.append(
+            f"{axis.name} is {by_ground} by {_source(value)}, {by_motion} by the motion"
+        )
     names = tuple(axis.name for axis in far)
     yield Ground(
         "; ".join(texts),

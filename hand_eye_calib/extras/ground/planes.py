@@ -103,7 +103,9 @@ def _cell_means(points: FloatArray, width_m: float) -> FloatArray:
     used = points[in_range & in_lane & (z < 0.0)]
     # Cells are cubes: a wall fills cubes of its own, and does not raise the ground at its foot.
     cubes = np.floor(used / _CELL_M).astype(int)
-    _, cell_of_point, counts = np.unique(cubes, axis=0, return_inverse=True, return_counts=True)
+    _, cell_of_point, counts = np.unique(
+        cubes, axis=0, return_inverse=True, return_counts=True
+    )
     sums = Blocks.gathered(used, cell_of_point.ravel(), len(counts)).sums
     return sums / counts[:, None]
 

@@ -147,7 +147,10 @@ class _GroundOfScans:
 
 
 def _ground_of_scans(
-    clouds: Iterable[tuple[int, FloatArray]], up: FloatArray, ahead: FloatArray, beside: Source
+    clouds: Iterable[tuple[int, FloatArray]],
+    up: FloatArray,
+    ahead: FloatArray,
+    beside: Source,
 ) -> _GroundOfScans:
     """Return the ground in the scans, for the lane widths of the other sensor's quantity.
 
@@ -199,7 +202,9 @@ def gravity_from_accelerations(
     margin_ns = int(_WINDOW_S / 10 * 1e9)
     first_ns = trajectory.stamps_ns[0] + margin_ns
     last_ns = trajectory.stamps_ns[-1] - margin_ns
-    is_used = (stamps_ns > first_ns) & (stamps_ns < last_ns) & np.isfinite(forces).all(axis=1)
+    is_used = (
+        (stamps_ns > first_ns) & (stamps_ns < last_ns) & np.isfinite(forces).all(axis=1)
+    )
     stamps_ns = stamps_ns[is_used]
     forces = forces[is_used]
     n_windows = 0
@@ -207,7 +212,9 @@ def gravity_from_accelerations(
         n_windows = int((stamps_ns[-1] - stamps_ns[0]) * 1e-9 / _WINDOW_S)
     if n_windows < 3:
         raise NotEnoughDataError("accelerations and poses overlap for less than 15 s")
-    middles_ns, verticals = _verticals_of_windows(stamps_ns, forces, trajectory, n_windows)
+    middles_ns, verticals = _verticals_of_windows(
+        stamps_ns, forces, trajectory, n_windows
+    )
     length = median(np.linalg.norm(verticals, axis=1))
     if abs(length - g) > g / 20:
         raise NotEnoughDataError(
@@ -269,7 +276,9 @@ def gravity_from_attitude(trajectory: Trajectory) -> VerticalTrack:
     return _in_sensor(trajectory, trajectory.stamps_ns, ups)
 
 
-def _in_sensor(trajectory: Trajectory, stamps_ns: IntArray, ups: FloatArray) -> VerticalTrack:
+def _in_sensor(
+    trajectory: Trajectory, stamps_ns: IntArray, ups: FloatArray
+) -> VerticalTrack:
     """Return the track of a sensor from verticals (N, 3) in the world of its poses."""
     rotations = se3.rotation_of(trajectory.at(stamps_ns, extrapolate=True))
     # Transposed rotations: from the world to the sensor.

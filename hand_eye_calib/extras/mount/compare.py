@@ -29,7 +29,9 @@ def compare_digests(arguments: argparse.Namespace) -> int | None:
         If the arguments name an installed transform, because the digests already contain it.
     """
     paths = [Path(path) for path in arguments.results]
-    histories = _histories_of_fleet(paths) if arguments.fleet else _histories_of_mount(paths)
+    histories = (
+        _histories_of_fleet(paths) if arguments.fleet else _histories_of_mount(paths)
+    )
     if not histories:
         return None
     if arguments.installed:
@@ -62,7 +64,9 @@ def _histories_of_fleet(paths: list[Path]) -> list[History]:
     return histories
 
 
-def _write_fleet(histories: Mapping[str, History], arguments: argparse.Namespace) -> None:
+def _write_fleet(
+    histories: Mapping[str, History], arguments: argparse.Namespace
+) -> None:
     """Write the page of a fleet, and print a line for each vehicle."""
     from hand_eye_calib.extras.mount.fleet_page import render_fleet
 
@@ -81,7 +85,9 @@ def _lines(history: History) -> Iterator[str]:
     names = "".join(f"{key.replace('_', ' '):>{_WIDTH}}" for key in AXIS_KEYS.values())
     yield f"  {'session':<18}{'motion':>8}{names}"
     by_index = {changepoint.index: changepoint for changepoint in history.changes}
-    for index, (digest, offset) in enumerate(zip(history.digests, history.offsets, strict=True)):
+    for index, (digest, offset) in enumerate(
+        zip(history.digests, history.offsets, strict=True)
+    ):
         if changepoint := by_index.get(index):
             yield f"  -- moved before {digest.day}: {changepoint.shift.what}"
         cells = [

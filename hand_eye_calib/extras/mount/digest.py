@@ -24,7 +24,12 @@ FOLDER = "digests"
 _KIND = "mount_digest"
 
 # Shapes of the arrays in a digest.
-_SHAPES = {"installed": (4, 4), "covariance": (6, 6), "wander": (6, 6), "evidence": (6, 7)}
+_SHAPES = {
+    "installed": (4, 4),
+    "covariance": (6, 6),
+    "wander": (6, 6),
+    "evidence": (6, 7),
+}
 
 # Larger files (bytes) are not read, because they are no digests.
 _LARGEST = 100_000

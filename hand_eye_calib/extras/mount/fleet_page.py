@@ -63,12 +63,19 @@ def render_fleet(histories: Mapping[str, History]) -> str:
     histories : mapping of str to History
         History of each vehicle, by its name.
     """
-    ordered = sorted(histories.items(), key=lambda item: item[1].newest_event_ns, reverse=True)
+    ordered = sorted(
+        histories.items(), key=lambda item: item[1].newest_event_ns, reverse=True
+    )
     rows = [_row(name, history) for name, history in ordered]
     n_moved = sum(row.tone != "good" for row in rows)
-    figures = [_figure(history, index) for index, (_, history) in enumerate(ordered[:_MAX_FIGURES])]
+    figures = [
+        _figure(history, index)
+        for index, (_, history) in enumerate(ordered[:_MAX_FIGURES])
+    ]
     verdict = (
-        f"{n_moved} of {counted(len(rows), 'mount')} to check" if n_moved else "No mount moved"
+        f"{n_moved} of {counted(len(rows), 'mount')} to check"
+        if n_moved
+        else "No mount moved"
     )
     n_sessions = sum(row.n_sessions for row in rows)
     sentence = f"{counted(len(rows), 'vehicle')}, {counted(n_sessions, 'session')}"
@@ -97,7 +104,9 @@ def _row(name: str, history: History) -> _Row:
         return _Row(name, "bad", "MOVED", day, what, len(digests), newest)
     alarms = [digest for digest in digests if digest.alarm]
     if alarms:
-        return _Row(name, "bad", "ALARM", alarms[-1].day, alarms[-1].alarm, len(digests), newest)
+        return _Row(
+            name, "bad", "ALARM", alarms[-1].day, alarms[-1].alarm, len(digests), newest
+        )
     return _Row(name, "good", "NOT MOVED", "", "", len(digests), newest)
 
 
@@ -105,7 +114,11 @@ def _change_rows(history: History) -> list[tuple[str, str]]:
     """Return day and text of each change and alarm, in order of time."""
     digests = history.digests
     events = [
-        (digests[item.index].start_ns, f"moved before {digests[item.index].day}", item.shift.what)
+        (
+            digests[item.index].start_ns,
+            f"moved before {digests[item.index].day}",
+            item.shift.what,
+        )
         for item in history.changes
     ]
     events += [
@@ -150,11 +163,17 @@ def _figure(history: History, number: int) -> Drawn:
     locator = AutoDateLocator(minticks=2, maxticks=4)
     panels[0].xaxis.set_major_locator(locator)
     panels[0].xaxis.set_major_formatter(ConciseDateFormatter(locator))
-    return as_drawn(figure, f"mount-{number}", "Offset from the installed pose", _CAPTION)
+    return as_drawn(
+        figure, f"mount-{number}", "Offset from the installed pose", _CAPTION
+    )
 
 
 def _draw_axis(
-    panel: Any, axis: str, days: FloatArray, offsets: Sequence[change.Moved], cuts: Sequence[int]
+    panel: Any,
+    axis: str,
+    days: FloatArray,
+    offsets: Sequence[change.Moved],
+    cuts: Sequence[int],
 ) -> None:
     """Draw the offset of an axis and its band, interrupted at each change of the mount."""
     factor, unit = (100.0, "cm") if axis in "xyz" else (np.degrees(1.0), "deg")
@@ -164,7 +183,9 @@ def _draw_axis(
     unknown = factor * LOOK.sigmas * float(change.UNKNOWN[AXES.index(axis)])
     is_determined = bands < _DETERMINED * unknown
     name = f"about {ABOUT[axis]}" if axis in ABOUT else axis
-    panel.set_title(f"{name}, {unit}" if is_determined.any() else f"{name}: not determined")
+    panel.set_title(
+        f"{name}, {unit}" if is_determined.any() else f"{name}: not determined"
+    )
     panel.axhline(0, color=GRID, lw=0.8)
     edges = [0, *cuts, len(days)]
     for start, end in pairwise(edges):
@@ -177,7 +198,9 @@ def _draw_axis(
             alpha=0.2,
             lw=0,
         )
-        panel.plot(days[part], values[part], color=PARENT, marker="." if len(part) == 1 else "")
+        panel.plot(
+            days[part], values[part], color=PARENT, marker="." if len(part) == 1 else ""
+        )
     panel.tick_params(axis="y", colors=MUTED)
 
 

@@ -19,7 +19,13 @@ import numpy as np
 
 from hand_eye_calib.core.assessment import change, moved
 from hand_eye_calib.core.base.arrays import FloatArray
-from hand_eye_calib.core.base.blocks import Blocks, information, inverse, score, shift_evidence
+from hand_eye_calib.core.base.blocks import (
+    Blocks,
+    information,
+    inverse,
+    score,
+    shift_evidence,
+)
 from hand_eye_calib.core.base.plain import plain
 from hand_eye_calib.core.base.text import counted
 from hand_eye_calib.core.geometry import se3
@@ -92,7 +98,9 @@ class History:
     @property
     def newest_event_ns(self) -> int:
         """Start of the newest session with a change or an alarm (ns); 0 without any."""
-        changed = [self.digests[changepoint.index].start_ns for changepoint in self.changes]
+        changed = [
+            self.digests[changepoint.index].start_ns for changepoint in self.changes
+        ]
         alarmed = [digest.start_ns for digest in self.digests if digest.alarm]
         return max(changed + alarmed, default=0)
 
@@ -126,7 +134,9 @@ class History:
         return {
             "sessions": [digest.day for digest in self.digests],
             "changes": plain(rows),
-            "alarms": {digest.day: digest.alarm for digest in self.digests if digest.alarm},
+            "alarms": {
+                digest.day: digest.alarm for digest in self.digests if digest.alarm
+            },
         }
 
 
@@ -152,7 +162,11 @@ def _evidence_on_common_offset(digest: Digest) -> FloatArray:
 
 
 def _changes(
-    tables: FloatArray, start: int, prior: FloatArray, to_parent: FloatArray, cuts_from: int
+    tables: FloatArray,
+    start: int,
+    prior: FloatArray,
+    to_parent: FloatArray,
+    cuts_from: int,
 ) -> Iterator[Changepoint]:
     """Yield the changes within a sequence of n sessions, by binary segmentation.
 
@@ -184,7 +198,9 @@ def _changes(
     if ratios[best] < TUNING.threshold:
         return
     cut = int(cuts[best])
-    yield Changepoint(start + cut, float(ratios[best]), _shift_of(shifts[best], to_parent))
+    yield Changepoint(
+        start + cut, float(ratios[best]), _shift_of(shifts[best], to_parent)
+    )
     yield from _changes(tables[:cut], start, prior, to_parent, cuts_from)
     yield from _changes(tables[cut:], start + cut, _UNKNOWN, to_parent, cuts_from=1)
 

@@ -65,12 +65,16 @@ class MountWatch:
         calibrator = self._session.calibrator
         pairs = calibrator.take_pairs()
         pairs = pairs[pairs.stamps_ns > self._last_ns]
-        if self._monitor is None and len(pairs):  # the frames are known from the first pair on
+        if self._monitor is None and len(
+            pairs
+        ):  # the frames are known from the first pair on
             snapshot = calibrator.snapshot()
             installed = self._installed(snapshot.parent_frame, snapshot.child_frame)
             if installed is not None:
                 self._frames = snapshot.parent_frame, snapshot.child_frame
-                self._monitor = MountMonitor(installed.T_parent_child, installed.covariance)
+                self._monitor = MountMonitor(
+                    installed.T_parent_child, installed.covariance
+                )
         if self._monitor is not None and len(pairs):
             self._last_ns = int(pairs.stamps_ns[-1])
             if alarm := self._monitor.add(pairs):
@@ -95,7 +99,9 @@ class MountWatch:
         """Return the state for ``/diagnostics``: alarm, or detectable shifts on this robot."""
         monitor = self._monitor
         if monitor is None:
-            return MountState(level=Level.WARN, text=self._why_unknown() or "no poses yet")
+            return MountState(
+                level=Level.WARN, text=self._why_unknown() or "no poses yet"
+            )
         visible = monitor.visible(TUNING.session_s)
         alarm = monitor.alarm
         if alarm is not None:

@@ -26,11 +26,21 @@ import numpy as np
 from hand_eye_calib.core.assessment import change, moved
 from hand_eye_calib.core.assessment.common_mode import floor_of_pairs
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
-from hand_eye_calib.core.base.blocks import Blocks, information, inverse, score, shift_evidence
+from hand_eye_calib.core.base.blocks import (
+    Blocks,
+    information,
+    inverse,
+    score,
+    shift_evidence,
+)
 from hand_eye_calib.core.base.stats import NINE_TIMES_OUT_OF_TEN, robust_weights
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import sigmas_in_parent
-from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_between
+from hand_eye_calib.core.pairing.motion_pairs import (
+    MotionPairs,
+    PosePairs,
+    pairs_between,
+)
 from hand_eye_calib.extras.mount.digest import Digest
 
 
@@ -96,13 +106,19 @@ class Tuning:
 TUNING = Tuning()
 
 # Tested times since a shift (s).
-_LAGS = np.geomspace(TUNING.shortest_s, TUNING.memory_s, TUNING.lags).round().astype(int)
+_LAGS = (
+    np.geomspace(TUNING.shortest_s, TUNING.memory_s, TUNING.lags).round().astype(int)
+)
 _SECOND_NS = 1_000_000_000
 
 # Prior covariances (3, 6, 6) of shifts: only a translation, only a rotation, or both. A shift that
 # only rotates the sensor is detected sooner with the second covariance than with the third.
 KNOCKS = np.array(
-    [moved.shift_covariance(radians=1e-6), moved.shift_covariance(1e-6), moved.shift_covariance()]
+    [
+        moved.shift_covariance(radians=1e-6),
+        moved.shift_covariance(1e-6),
+        moved.shift_covariance(),
+    ]
 )
 
 
@@ -151,7 +167,9 @@ class Alarm:
 
     def __str__(self) -> str:
         """Return the axes that have moved, by how much, and since when (local time), as text."""
-        since = datetime.fromtimestamp(self.since_ns * 1e-9).isoformat(" ", timespec="minutes")
+        since = datetime.fromtimestamp(self.since_ns * 1e-9).isoformat(
+            " ", timespec="minutes"
+        )
         return f"the mount has moved: {self.shift.what}, since about {since}"
 
 
@@ -179,7 +197,9 @@ class MountMonitor:
 
     def __init__(self, T_parent_child: FloatArray, covariance: FloatArray) -> None:
         self._installed = np.asarray(T_parent_child, dtype=float)
-        self._covariance = TUNING.covariance_factor * np.asarray(covariance, dtype=float)
+        self._covariance = TUNING.covariance_factor * np.asarray(
+            covariance, dtype=float
+        )
         self._wander = np.zeros((6, 6))
         self._noise = np.zeros((6, 6))
         self._learning: list[_Second] = []
@@ -239,7 +259,9 @@ class MountMonitor:
             if not 0 < gap_ns <= TUNING.max_motion_s * _SECOND_NS:
                 self._tail = PosePairs.empty()
         poses = PosePairs.concatenate(self._tail, pose_pairs)
-        poses = poses[np.unique(poses.stamps_ns // TUNING.step_ns, return_index=True)[1]]
+        poses = poses[
+            np.unique(poses.stamps_ns // TUNING.step_ns, return_index=True)[1]
+        ]
         stamps_ns = poses.stamps_ns
         seconds = poses.stamps_ns // _SECOND_NS
         # A motion lasts from pose i to the first pose j that is at least one second later.
@@ -249,7 +271,9 @@ class MountMonitor:
         has_end = j < len(stamps_ns)
         incomplete_s = int(seconds[has_end][-1]) if has_end.any() else -1
         self._tail = poses[seconds >= incomplete_s]
-        i = np.flatnonzero(has_end & (seconds < incomplete_s) & (seconds > self._last_s))
+        i = np.flatnonzero(
+            has_end & (seconds < incomplete_s) & (seconds > self._last_s)
+        )
         i = i[stamps_ns[j[i]] - stamps_ns[i] <= TUNING.max_motion_s * _SECOND_NS]
         self._last_s = max(self._last_s, incomplete_s - 1)
         pairs = pairs_between(poses.Ts_pw_p, poses.Ts_cw_c, i, j[i])
@@ -257,12 +281,16 @@ class MountMonitor:
         residuals, jacobians = moved.residuals_and_jacobians(pairs, self._installed)
         # Column for the logarithm of the child's scale, which changes only the translation.
         by_scale = -se3.inverse(pairs.Ts_childi_childj)[:, :3, 3:]
-        jacobians = np.append(jacobians, np.pad(by_scale, ((0, 0), (0, 3), (0, 0))), axis=2)
+        jacobians = np.append(
+            jacobians, np.pad(by_scale, ((0, 0), (0, 3), (0, 0))), axis=2
+        )
         complete = []
         for second in np.unique(second_of_pair).tolist():
             rows = second_of_pair == second
             stamp_ns = second * _SECOND_NS
-            complete.append(_Second(stamp_ns, pairs[rows], residuals[rows], jacobians[rows]))
+            complete.append(
+                _Second(stamp_ns, pairs[rows], residuals[rows], jacobians[rows])
+            )
         return complete
 
     def _learn(self, second: _Second) -> None:
@@ -287,7 +315,9 @@ class MountMonitor:
             table, _ = _evidence(residuals, jacobians, self._noise)
             shift = moved.most_likely(table, TUNING.ridge)
             self._noise, _ = moved.noise_covariance(residuals + jacobians @ shift)
-        distances_m = np.linalg.norm(se3.translation_of(pairs.Ts_parenti_parentj), axis=1)
+        distances_m = np.linalg.norm(
+            se3.translation_of(pairs.Ts_parenti_parentj), axis=1
+        )
         speed_m_s = float(np.median(distances_m))
         floor = floor_of_pairs(pairs, np.ones(len(pairs)), self._installed, speed_m_s)
         floor += moved.shift_covariance(1e-3, 1e-4)  # keeps the covariance regular
@@ -302,10 +332,15 @@ class MountMonitor:
         The scale of the child in this second is unknown, and is eliminated from the evidence.
         """
         n_seconds = len(self._seconds.sums)
-        if self.seconds % TUNING.long_run_every_s == 0 and n_seconds >= TUNING.learning_s:
+        if (
+            self.seconds % TUNING.long_run_every_s == 0
+            and n_seconds >= TUNING.learning_s
+        ):
             self._centre = moved.most_likely(self._seconds.total, TUNING.ridge)
         shift = np.append(self._centre, 0.0)
-        table, scatter = _evidence(second.residuals, second.jacobians, self._noise, shift)
+        table, scatter = _evidence(
+            second.residuals, second.jacobians, self._noise, shift
+        )
         # Eliminate the scale (row and column 6), with its prior, from the evidence [H S] (7, 8) by
         # the Schur complement.
         scale_information = table[6, 6] + self.long_run / TUNING.scale_sigma**2
@@ -315,7 +350,9 @@ class MountMonitor:
         )
         # The oldest second leaves the memory. After an alarm, the old evidence must not change.
         if n_seconds == TUNING.memory_s and self.alarm is None:
-            self._old = (1.0 - 1.0 / TUNING.old_memory_s) * self._old + self._seconds.sums[0]
+            self._old = (
+                1.0 - 1.0 / TUNING.old_memory_s
+            ) * self._old + self._seconds.sums[0]
         stamps_ns = np.append(self._stamps_ns, np.int64(second.stamp_ns))
         self._stamps_ns = stamps_ns[-TUNING.memory_s :]
         tables = np.concatenate([self._seconds.sums, table[None]])
@@ -324,7 +361,9 @@ class MountMonitor:
         self._noise = (1.0 - share) * self._noise + share * scatter
         # Mean over the last 100 seconds.
         n_averaged = min(n_seconds + 1, 100)
-        self._motions_per_s += (len(second.residuals) - self._motions_per_s) / n_averaged
+        self._motions_per_s += (
+            len(second.residuals) - self._motions_per_s
+        ) / n_averaged
 
     # ---- test
 
@@ -333,7 +372,10 @@ class MountMonitor:
 
         If there is an alarm already, its shift is updated when the ratio has grown.
         """
-        if self.seconds % TUNING.long_run_every_s == 0 or self.seconds <= TUNING.learning_s:
+        if (
+            self.seconds % TUNING.long_run_every_s == 0
+            or self.seconds <= TUNING.learning_s
+        ):
             self.long_run = _long_run_variance(self._seconds, self.long_run)
         if len(self._stamps_ns) < _LAGS[0]:
             return
@@ -376,7 +418,9 @@ class MountMonitor:
         n_seconds = len(self._stamps_ns)
         lags = _LAGS[: np.searchsorted(_LAGS, n_seconds, side="right")]
         since = self._seconds.since(n_seconds - lags)
-        since = np.concatenate([since, [self._old + self._seconds.total]]) / self.long_run
+        since = (
+            np.concatenate([since, [self._old + self._seconds.total]]) / self.long_run
+        )
         before = since[-1] - since
         covariances = inverse(inverse(self._covariance) + information(before))
         offsets = se3.times(covariances, score(before))
@@ -411,7 +455,9 @@ class MountMonitor:
             return np.full(6, np.inf)
         H = information(self._seconds.total)
         before = (information(self._old) + H) / self.long_run
-        cov_before = np.linalg.inv(np.linalg.inv(self._covariance) + before) + self._wander
+        cov_before = (
+            np.linalg.inv(np.linalg.inv(self._covariance) + before) + self._wander
+        )
         H = H / len(self._stamps_ns)
         # Subtract the spurious information on the translation that rotation noise produces:
         # sum_jk noise_jk G_j' precision G_k, with the generators G_j (3, 3) of rotations.
@@ -431,7 +477,9 @@ class MountMonitor:
         # covariance C and the prior covariance L of a translation or of a rotation.
         volumes = np.eye(6) + KNOCKS[:2] @ np.linalg.inv(covariance)
         log_volumes = np.linalg.slogdet(volumes)[1]
-        detected_sigmas = np.sqrt(2.0 * TUNING.threshold + log_volumes) + NINE_TIMES_OUT_OF_TEN
+        detected_sigmas = (
+            np.sqrt(2.0 * TUNING.threshold + log_volumes) + NINE_TIMES_OUT_OF_TEN
+        )
         sigmas = sigmas_in_parent(se3.rotation_of(self._installed), covariance)
         return np.repeat(detected_sigmas, 3) * sigmas
 
@@ -481,5 +529,7 @@ def _long_run_variance(seconds: Blocks, previous: float) -> float:
         windows = Blocks(seconds.sums[-n_windows * length :]).merged(n_windows)
         squares = moved.squares_about(windows.sums, shift, TUNING.ridge)
         limited = np.minimum(squares, TUNING.max_of_median * np.median(squares))
-        variances.append((limited.sum() / 6 + prior) / (n_windows + TUNING.assumed_windows))
+        variances.append(
+            (limited.sum() / 6 + prior) / (n_windows + TUNING.assumed_windows)
+        )
     return max(variances, default=previous)

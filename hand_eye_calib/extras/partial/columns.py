@@ -94,7 +94,9 @@ class Split(NamedTuple):
         return whole.reshape(n_windows, self.size, *values.shape[1:])[self.is_enough]
 
 
-def split(stamps_s: FloatArray, spans_s: FloatArray, step: int, longest_s: float) -> Split | None:
+def split(
+    stamps_s: FloatArray, spans_s: FloatArray, step: int, longest_s: float
+) -> Split | None:
     """Divide a recording into windows; return None if the recording is too short.
 
     Parameters

@@ -15,7 +15,11 @@ def copied(evidence: str, **residual: Any) -> list[Finding]:
 
     ``residual`` is the remaining difference of both streams, with its unit in its name.
     """
-    return [finding("not_independent", "both", Severity.ERROR, evidence=evidence, **residual)]
+    return [
+        finding(
+            "not_independent", "both", Severity.ERROR, evidence=evidence, **residual
+        )
+    ]
 
 
 def as_errors(findings: Sequence[Finding]) -> list[Finding]:

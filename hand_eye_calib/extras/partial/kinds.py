@@ -72,8 +72,12 @@ def _solve_positions(snapshot: Snapshot, cross_check: bool | None) -> Calibratio
         return result
     known_s = float(config.time_offset)
     parent, child = snapshot.streams
-    correlation = correlate_rates(parent, child.shifted(known_s), config.max_gap, of_speed=True)
-    offset_s = correlation.offset_s if correlation.is_clear else _offset_of_paths(snapshot)
+    correlation = correlate_rates(
+        parent, child.shifted(known_s), config.max_gap, of_speed=True
+    )
+    offset_s = (
+        correlation.offset_s if correlation.is_clear else _offset_of_paths(snapshot)
+    )
     if not MOST_MOVED_S < abs(offset_s) < UNASKED_S:
         return result
     shifted = _solve(_shifted(snapshot, offset_s), estimate_lever_arm)
@@ -83,7 +87,9 @@ def _solve_positions(snapshot: Snapshot, cross_check: bool | None) -> Calibratio
 def _shifted(snapshot: Snapshot, offset_s: float) -> Snapshot:
     """Return the snapshot with a time offset (s) in addition to that of its options."""
     known_s = float(snapshot.config.time_offset)
-    return replace(snapshot, config=replace(snapshot.config, time_offset=known_s + offset_s))
+    return replace(
+        snapshot, config=replace(snapshot.config, time_offset=known_s + offset_s)
+    )
 
 
 def _offset_of_paths(snapshot: Snapshot) -> float:
@@ -111,7 +117,9 @@ def _is_unrelated(calibration: Calibration) -> bool:
 
 def _solve_rotations(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
     """Estimate the rotation, and the bias of angular rates."""
-    return _solve(snapshot, partial(estimate_rotation, cross_check=cross_check is not False))
+    return _solve(
+        snapshot, partial(estimate_rotation, cross_check=cross_check is not False)
+    )
 
 
 def _solve(snapshot: Snapshot, estimate: Callable[..., Calibration]) -> Calibration:
@@ -131,7 +139,9 @@ def _solve(snapshot: Snapshot, estimate: Callable[..., Calibration]) -> Calibrat
     # for small offsets only.
     config = replace(config, time_offset=result.time_offset_s)
     pose_pairs = replace(snapshot, config=config).pose_pairs
-    return estimate(pose_pairs, config) if len(pose_pairs) >= config.min_pairs else result
+    return (
+        estimate(pose_pairs, config) if len(pose_pairs) >= config.min_pairs else result
+    )
 
 
 def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckResult:
@@ -191,10 +201,14 @@ def _check_solved(
     parent, child = snapshot.streams
     config = snapshot.config
     if calibration.measured == "rotations":
-        return rotation_checks.check_solved(parent, child, calibration, config, is_unrelated)
+        return rotation_checks.check_solved(
+            parent, child, calibration, config, is_unrelated
+        )
     if len(calibration.hidden) == 3 and not is_unrelated:
         return []
-    return position_checks.check_solved(parent, child, calibration, config, is_unrelated)
+    return position_checks.check_solved(
+        parent, child, calibration, config, is_unrelated
+    )
 
 
 def _check_aligned(
@@ -231,7 +245,9 @@ def _check_clock(
     """Detect a clock offset by the correlation of speeds or angular rates, if it is clear."""
     uses_speeds = kind_of(snapshot.config).is_timed_by_speed
     max_gap_s = snapshot.config.max_gap
-    correlation = correlate_rates(parent, child.shifted(known_s), max_gap_s, uses_speeds)
+    correlation = correlate_rates(
+        parent, child.shifted(known_s), max_gap_s, uses_speeds
+    )
     if not correlation.is_clear or abs(correlation.offset_s) < _FOUND_BY_SOLVE_S:
         return []
     sigma_s = _COARSE_INTERVALS * max(parent.interval_s, child.interval_s)

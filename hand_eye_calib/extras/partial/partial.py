@@ -16,7 +16,10 @@ import numpy as np
 
 from hand_eye_calib.core.assessment import common_mode, covariance
 from hand_eye_calib.core.assessment.prior import fuse, widened
-from hand_eye_calib.core.assessment.second_opinion import excess_covariance, second_opinions
+from hand_eye_calib.core.assessment.second_opinion import (
+    excess_covariance,
+    second_opinions,
+)
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import InputError
@@ -81,12 +84,18 @@ class _Paths:
         parent = pose_pairs.Ts_pw_p
         child = pose_pairs.child_scaled(config.given_scale).Ts_cw_c
         if config.child_measures == "positions":
-            return cls(pose_pairs.stamps_ns, parent, se3.translation_of(child), is_child=True)
-        return cls(pose_pairs.stamps_ns, child, se3.translation_of(parent), is_child=False)
+            return cls(
+                pose_pairs.stamps_ns, parent, se3.translation_of(child), is_child=True
+            )
+        return cls(
+            pose_pairs.stamps_ns, child, se3.translation_of(parent), is_child=False
+        )
 
     def solve(self, with_scale: bool) -> of_positions.LeverArmSolution:
         """Estimate the lever arm, and the scale if asked for."""
-        return of_positions.solve(self.stamps_ns, self.poses, self.positions, with_scale)
+        return of_positions.solve(
+            self.stamps_ns, self.poses, self.positions, with_scale
+        )
 
     def unexplained_share(self, solution: of_positions.LeverArmSolution) -> float:
         """Return the share of the path of the positions that a lever arm does not explain."""
@@ -183,19 +192,25 @@ def _allowance(paths: _Paths, config: CalibratorConfig) -> FloatArray:
     if kind_of_positions != "exact":
         variance += _POINT_M**2
     if kind_of_poses != "exact":
-        speed_m_s = common_mode.usual_speed(paths.stamps_ns, se3.translation_of(paths.poses))
+        speed_m_s = common_mode.usual_speed(
+            paths.stamps_ns, se3.translation_of(paths.poses)
+        )
         variance += (common_mode.FLOOR_TRAVEL_S * speed_m_s) ** 2
     return variance * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 
 
-def _step_residuals(solution: of_positions.LeverArmSolution, paths: _Paths) -> Residuals:
+def _step_residuals(
+    solution: of_positions.LeverArmSolution, paths: _Paths
+) -> Residuals:
     """Return the residuals of the distances between consecutive positions.
 
     A residual is the predicted minus the measured distance (m), as a vector along the predicted
     step, in the axes of the sensor with poses. The rotation of the world does not matter.
     """
     rotations = se3.rotation_of(paths.poses)
-    steps = np.diff(rotations @ solution.lever_arm + se3.translation_of(paths.poses), axis=0)
+    steps = np.diff(
+        rotations @ solution.lever_arm + se3.translation_of(paths.poses), axis=0
+    )
     lengths = np.linalg.norm(steps, axis=1)
     excess = lengths - np.linalg.norm(np.diff(paths.positions, axis=0), axis=1)
     along = (excess / np.maximum(lengths, 1e-12))[:, None] * steps
@@ -231,14 +246,18 @@ def _check_path(
         unit = _check_units(scaled, paths)
         if unit and not is_near and unexplained < _UNRELATED_PATH:
             return (unit,)
-        if not is_scale_given and unexplained < min(_SUSPECT_PATH, _MENDED_PATH * share):
+        if not is_scale_given and unexplained < min(
+            _SUSPECT_PATH, _MENDED_PATH * share
+        ):
             return _check_scale(scaled, np.inf, paths)
     share = min(share, 1.0)
     severity = Severity.WARNING if is_near else Severity.ERROR
     return (finding("unrelated_positions", severity=severity, share=share),)
 
 
-def _check_units(solution: of_positions.LeverArmSolution, paths: _Paths) -> Finding | None:
+def _check_units(
+    solution: of_positions.LeverArmSolution, paths: _Paths
+) -> Finding | None:
     """Detect positions or an odometry in another unit of length."""
     scale = paths.child_scale(solution.scale)
     sigma = solution.scale_sigma * (scale / solution.scale)
@@ -297,7 +316,9 @@ def estimate_rotation(
     opinions = second_opinions(Ts_pw_p, on_one_clock.Ts_cw_c, solution.T_parent_child)
     assessment = of_model
     if not findings:
-        open_covariance = _open_covariance(on_one_clock, solution.T_parent_child, config)
+        open_covariance = _open_covariance(
+            on_one_clock, solution.T_parent_child, config
+        )
         assessment = widened(of_model, open_covariance)
     solved = estimation.Solved(
         solution=solution,
@@ -365,13 +386,19 @@ def _solve_rotation(
     return replace(solution, parameters=parameters), Ts_cw_c
 
 
-def _rate_bias(solution: adaptive_estimator.AdaptiveSolution, config: CalibratorConfig) -> RateBias:
+def _rate_bias(
+    solution: adaptive_estimator.AdaptiveSolution, config: CalibratorConfig
+) -> RateBias:
     """Return the bias of the rates, in the axes of the sensor that has it.
 
     Two gyroscopes reveal only the difference of their biases, the child's less the parent's.
     """
     bias, sigmas = solution.rate_bias
-    of = "child" if config.parent_measures != "rates" else "child less parent, child's axes"
+    of = (
+        "child"
+        if config.parent_measures != "rates"
+        else "child less parent, child's axes"
+    )
     if config.child_measures != "rates":
         rotation = se3.rotation_of(solution.T_parent_child)
         of = "parent"

@@ -164,7 +164,11 @@ def check_position(
     priors : collection of str
         Axes with a prior; they are not checked.
     """
-    axes = [k for k, axis in enumerate("xyz") if np.isfinite(sigmas[k]) and axis not in priors]
+    axes = [
+        k
+        for k, axis in enumerate("xyz")
+        if np.isfinite(sigmas[k]) and axis not in priors
+    ]
     if len(axes) < 2:
         return []
     lengths_m = np.abs(lever_arm[axes])
@@ -179,10 +183,14 @@ def check_position(
     severity = Severity.ERROR if is_sure else Severity.WARNING
     distance_m = float(np.linalg.norm(lengths_m))
     size = f"{length(distance_m)} +/- {length(float(sigmas_m.max()))}"
-    return [finding("no_lever_arm", "both", severity, size=size, translation_m=distance_m)]
+    return [
+        finding("no_lever_arm", "both", severity, size=size, translation_m=distance_m)
+    ]
 
 
-def check_positions(fitted: PositionFit, stream: str, is_unrelated: bool) -> list[Finding]:
+def check_positions(
+    fitted: PositionFit, stream: str, is_unrelated: bool
+) -> list[Finding]:
     """Detect the fault of a stream of positions that is most significant.
 
     Parameters
@@ -248,7 +256,9 @@ def _scale_of_axis(fitted: PositionFit, stream: str) -> Suspect:
         return Suspect(0.0, None)
     factor = 1.0 + size
     values = {"axis": "xyz"[axis], "factor": factor, "sigma": sigma}
-    return Suspect(abs(size) / sigma, graded("axis_scale", stream, size, sigma, **values))
+    return Suspect(
+        abs(size) / sigma, graded("axis_scale", stream, size, sigma, **values)
+    )
 
 
 def _lag_of_axis(fitted: PositionFit, stream: str) -> Suspect:

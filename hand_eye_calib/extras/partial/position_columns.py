@@ -23,7 +23,13 @@ from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.differences import path_derivatives, stencil
-from hand_eye_calib.extras.partial.columns import Column, Fit, by_axis, fit_columns, split
+from hand_eye_calib.extras.partial.columns import (
+    Column,
+    Fit,
+    by_axis,
+    fit_columns,
+    split,
+)
 
 # Duration of a window (s): long enough for a turn, short enough for little drift of an odometry.
 _WINDOW_S = 10.0
@@ -149,7 +155,9 @@ def fit_positions(
         path_m=float(np.linalg.norm(_root_mean_square(windows.path, is_used))),
         spreads_m=np.sqrt(information[fitted.places["scales"]] / weight),
         speeds_m_s=_root_mean_square(windows.velocities, is_used),
-        acceleration_m_s2=float(np.linalg.norm(_root_mean_square(windows.accelerations, is_used))),
+        acceleration_m_s2=float(
+            np.linalg.norm(_root_mean_square(windows.accelerations, is_used))
+        ),
     )
 
 
@@ -160,7 +168,10 @@ def _root_mean_square(vectors: FloatArray, is_used: BoolArray) -> FloatArray:
 
 
 def _windows(
-    stamps_s: FloatArray, poses: FloatArray, positions: FloatArray, lever_arm: FloatArray
+    stamps_s: FloatArray,
+    poses: FloatArray,
+    positions: FloatArray,
+    lever_arm: FloatArray,
 ) -> _Windows | None:
     """Return windows of predicted and measured positions, or None for a short recording."""
     step = max(round(_STEP_S / median(np.diff(stamps_s))), 1)

@@ -100,7 +100,9 @@ class LeverArmSolution(ModelSolution):
         """Return the noise in numbers and in words."""
         sigmas = fast_sigmas(self.levels)
         white = length(sigmas.translation_m)
-        drift = f"{length(sigmas.walk_translation_m)} and {angle(sigmas.walk_rotation_rad)}"
+        drift = (
+            f"{length(sigmas.walk_translation_m)} and {angle(sigmas.walk_rotation_rad)}"
+        )
         sentences = [
             f"each position is off by {white} per axis, and the odometry drifts by {drift} from "
             "one to the next"
@@ -237,7 +239,11 @@ class _State:
         )
         residuals = state.linearised().residuals
         squares = (residuals[:, :3] ** 2).sum(axis=1)
-        square_of_position = [squares[:1], 0.5 * (squares[1:] + squares[:-1]), squares[-1:]]
+        square_of_position = [
+            squares[:1],
+            0.5 * (squares[1:] + squares[:-1]),
+            squares[-1:],
+        ]
         imprecise = _imprecise(np.concatenate(square_of_position), tuning, MIN_VARIANCE)
         levels = rough_levels(residuals, imprecise[1:] | imprecise[:-1], tuning.jitter)
         levels[ROTATION] = _ANY_ROTATION
@@ -258,12 +264,16 @@ class _State:
         positions.
         """
         streams = self.streams
-        course = increments.course_of(replace(streams, Ts_cw_c=streams.Ts_pw_p @ self.X), self.X)
+        course = increments.course_of(
+            replace(streams, Ts_cw_c=streams.Ts_pw_p @ self.X), self.X
+        )
         back_p = np.swapaxes(streams.Ts_pw_p[:-1, :3, :3], 1, 2)
         worlds = streams.Ts_cw_c[:-1, :3, :3] @ back_p
         return replace(
             course,
-            path=increments.cumulative_sum(se3.times(worlds, np.diff(course.path, axis=0))),
+            path=increments.cumulative_sum(
+                se3.times(worlds, np.diff(course.path, axis=0))
+            ),
             along=increments.cumulative_sum(worlds @ np.diff(course.along, axis=0)),
         )
 
@@ -273,7 +283,9 @@ class _State:
         linearisation = increments.linearise(
             self.streams, self.course, self.X, self.parameters[:RESPONSE], _SHARED
         )
-        response = se3.times(linearisation.adjoints, accelerations[:-1]) - accelerations[1:]
+        response = (
+            se3.times(linearisation.adjoints, accelerations[:-1]) - accelerations[1:]
+        )
         columns = np.insert(linearisation.columns, -1, response, axis=2)
         return replace(linearisation, columns=np.delete(columns, [3, 4, 5], axis=2))
 
@@ -282,7 +294,9 @@ class _State:
 
         It has no rotation to estimate, orientations without bounds, and the odometry's walk.
         """
-        values = np.r_[se3.translation_of(self.X), self.parameters[[*_SHARED, RESPONSE]]]
+        values = np.r_[
+            se3.translation_of(self.X), self.parameters[[*_SHARED, RESPONSE]]
+        ]
         prior = prior_products(values, self.sigmas, len(values) + 1)
         space = (model or self.model).state_space(
             self.streams,
@@ -297,7 +311,11 @@ class _State:
         return replace(
             space,
             walk_factors=space.walk_factors * self.walk_factors,
-            white_bases=(TRANSLATIONS[None], ROTATIONS[None], space.white_bases[JITTER]),
+            white_bases=(
+                TRANSLATIONS[None],
+                ROTATIONS[None],
+                space.white_bases[JITTER],
+            ),
             walk_bases=(TRANSLATIONS, to_child @ ROTATIONS @ to_child.T),
         )
 
@@ -329,9 +347,13 @@ class _State:
         best = replace(self, levels=fit.levels)
         loss = fit.loss - tuning.least_gain
         for kind in kinds:
-            model, levels = self.model.with_processes(((kind, "translation"),), fit.levels)
+            model, levels = self.model.with_processes(
+                ((kind, "translation"),), fit.levels
+            )
             prior = _level_prior(model, levels)
-            rival, _ = reml.fit(self.sampled_space(model), levels, prior, tuning.settled_loss)
+            rival, _ = reml.fit(
+                self.sampled_space(model), levels, prior, tuning.settled_loss
+            )
             if rival.loss < loss:
                 best = replace(self, model=model, levels=rival.levels)
                 loss = rival.loss
@@ -452,7 +474,9 @@ def _solved(products: FloatArray) -> FloatArray:
     return np.delete(np.delete(products, response, axis=-2), response, axis=-1)
 
 
-def _accelerations(streams: increments.Streams, X: FloatArray, tuning: Tuning) -> FloatArray:
+def _accelerations(
+    streams: increments.Streams, X: FloatArray, tuning: Tuning
+) -> FloatArray:
     """Return the accelerations (N, 6) of the antenna by the odometry, m/s^2, in the body's axes.
 
     An acceleration is the difference of two velocities, before and after a pose, and does not
@@ -510,11 +534,15 @@ def _start(
         if with_scale:
             products = (rotated * predicted).sum(axis=(1, 2))
             squares = (rotated**2).sum(axis=(1, 2))
-            scales = np.divide(products, squares, np.zeros_like(products), where=squares > 0.0)
+            scales = np.divide(
+                products, squares, np.zeros_like(products), where=squares > 0.0
+            )
             # Paths that do not move have no scale.
             scale = float(np.median(scales)) or 1.0
         residuals = scale * rotated - path
-        errors = np.sqrt(((residuals - rotations @ lever_arm) ** 2).sum(axis=2).mean(axis=1))
+        errors = np.sqrt(
+            ((residuals - rotations @ lever_arm) ** 2).sum(axis=2).mean(axis=1)
+        )
         weights = robust_weights("cauchy", (errors / (np.median(errors) + 1e-12)) ** 2)
         score = np.einsum("n,nkij,nki->j", weights, rotations, residuals)
         previous = lever_arm

@@ -29,11 +29,20 @@ from hand_eye_calib.core.checks.streams import check_flat
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.noise.increments import without_rate_bias
-from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over, synchronise
+from hand_eye_calib.core.pairing.motion_pairs import (
+    MotionPairs,
+    PosePairs,
+    pairs_over,
+    synchronise,
+)
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
 from hand_eye_calib.extras.partial.copies import COPIED_SHARE, as_errors, copied
-from hand_eye_calib.extras.partial.rotation_columns import PLANES, RotationFit, fit_pairs
+from hand_eye_calib.extras.partial.rotation_columns import (
+    PLANES,
+    RotationFit,
+    fit_pairs,
+)
 from hand_eye_calib.extras.partial.suspects import Suspect, most_significant
 
 # Median residual (rad) below which rotations were computed from those of the other stream. It
@@ -161,7 +170,9 @@ def check_solved(
     -------
     list of Finding
     """
-    pairs = synchronise(parent, child.shifted(calibration.time_offset_s), config.max_gap)
+    pairs = synchronise(
+        parent, child.shifted(calibration.time_offset_s), config.max_gap
+    )
     if len(pairs) < MIN_PAIRS:
         return []
     name = measured_stream(parent.measures, child.measures)
@@ -196,8 +207,12 @@ def _without_bias(pairs: PosePairs, calibration: Calibration) -> PosePairs:
         return pairs
     bias = np.array(rate_bias.rad_per_s)
     if rate_bias.of == "parent":
-        return replace(pairs, Ts_pw_p=without_rate_bias(pairs.stamps_ns, pairs.Ts_pw_p, bias))
-    return replace(pairs, Ts_cw_c=without_rate_bias(pairs.stamps_ns, pairs.Ts_cw_c, bias))
+        return replace(
+            pairs, Ts_pw_p=without_rate_bias(pairs.stamps_ns, pairs.Ts_pw_p, bias)
+        )
+    return replace(
+        pairs, Ts_cw_c=without_rate_bias(pairs.stamps_ns, pairs.Ts_cw_c, bias)
+    )
 
 
 def check_rotation(
@@ -222,11 +237,21 @@ def check_rotation(
     if {"roll", "pitch", "yaw"} & {*priors} or not sigmas.max() < limit_rad:
         return []
     angles_rad = np.abs(se3.rotation_log(rotation))
-    if (angles_rad > np.maximum(agreement.SAME_RAD, agreement.ZERO_SIGMAS * sigmas)).any():
+    if (
+        angles_rad > np.maximum(agreement.SAME_RAD, agreement.ZERO_SIGMAS * sigmas)
+    ).any():
         return []
     angle_rad = float(np.linalg.norm(angles_rad))
     severity = Severity.ERROR if has_rates else Severity.WARNING
-    return [finding("parallel_axes", "both", severity, size=angle(angle_rad), angle_rad=angle_rad)]
+    return [
+        finding(
+            "parallel_axes",
+            "both",
+            severity,
+            size=angle(angle_rad),
+            angle_rad=angle_rad,
+        )
+    ]
 
 
 def _copied_rotations(pairs: PosePairs, rotation: FloatArray) -> list[Finding]:
@@ -238,7 +263,9 @@ def _copied_rotations(pairs: PosePairs, rotation: FloatArray) -> list[Finding]:
     usual_rad = median(np.linalg.norm(of_parent, axis=1))
     if residual_rad > min(_COPIED_RAD, COPIED_SHARE * usual_rad):
         return []
-    return copied("The rotations of both streams agree to rounding", residual_rad=residual_rad)
+    return copied(
+        "The rotations of both streams agree to rounding", residual_rad=residual_rad
+    )
 
 
 def _rotation_vectors(
@@ -252,7 +279,9 @@ def _usable_vectors(motions: MotionPairs) -> tuple[FloatArray, FloatArray]:
     """Rotation vectors (K, 3) of the motions of parent and child that have a clear axis."""
     of_parent = se3.rotation_log(se3.rotation_of(motions.Ts_parenti_parentj))
     of_child = se3.rotation_log(se3.rotation_of(motions.Ts_childi_childj))
-    angles = np.maximum(np.linalg.norm(of_parent, axis=1), np.linalg.norm(of_child, axis=1))
+    angles = np.maximum(
+        np.linalg.norm(of_parent, axis=1), np.linalg.norm(of_child, axis=1)
+    )
     is_usable = angles < MAX_ROTATION_RAD
     return of_parent[is_usable], of_child[is_usable]
 
@@ -290,9 +319,13 @@ def _check_conventions(streams: _Streams) -> list[Finding]:
     frames. Without rates, they do not reveal the stream either.
     """
     pairs = streams.pairs
-    inverted = replace(pairs, Ts_pw_p=se3.put_right(pairs.Ts_pw_p, invert="orientations"))
+    inverted = replace(
+        pairs, Ts_pw_p=se3.put_right(pairs.Ts_pw_p, invert="orientations")
+    )
     if streams.name == "parent":
-        inverted = replace(pairs, Ts_cw_c=se3.put_right(pairs.Ts_cw_c, invert="orientations"))
+        inverted = replace(
+            pairs, Ts_cw_c=se3.put_right(pairs.Ts_cw_c, invert="orientations")
+        )
     share = _unexplained(inverted)
     if share > min(_MAX_UNEXPLAINED, _unexplained(pairs) / _DECISIVE):
         return []
@@ -328,7 +361,9 @@ def _check_handedness(streams: _Streams) -> list[Finding]:
         residuals_rad.append(median(np.linalg.norm(errors, axis=1)))
     by_rotation, by_mirror = residuals_rad
     usual = median(np.linalg.norm(of_parent, axis=1))
-    is_mirrored = by_mirror < _MIRRORED * by_rotation and by_rotation > _UNMIRRORED * usual
+    is_mirrored = (
+        by_mirror < _MIRRORED * by_rotation and by_rotation > _UNMIRRORED * usual
+    )
     return [finding("mirrored_rates", streams.name)] if is_mirrored else []
 
 
@@ -409,7 +444,11 @@ def _check_response(streams: _Streams, rotation: FloatArray) -> list[Finding]:
     fitted = fit_pairs(streams.pairs, rotation, streams.name, streams.has_rates)
     if not fitted:
         return [finding("unchecked_rotations", streams.name)]
-    if streams.has_rates and not streams.are_exact and fitted.remaining < _COPIED_RATES_RAD:
+    if (
+        streams.has_rates
+        and not streams.are_exact
+        and fitted.remaining < _COPIED_RATES_RAD
+    ):
         evidence = "The rates agree with the orientations of the other sensor"
         return copied(evidence, residual_rad=fitted.remaining)
     suspects = [_smoothing(fitted, streams), _gain(fitted, streams)]
@@ -419,7 +458,9 @@ def _check_response(streams: _Streams, rotation: FloatArray) -> list[Finding]:
     findings = most_significant(suspects)
     if findings or not streams.has_rates or fitted.bias_drift < _BIAS_DRIFT_RAD_S:
         return findings
-    return [finding("bias_drift", streams.name, deg_s=float(np.degrees(fitted.bias_drift)))]
+    return [
+        finding("bias_drift", streams.name, deg_s=float(np.degrees(fitted.bias_drift)))
+    ]
 
 
 def _smoothing(fitted: RotationFit, streams: _Streams) -> Suspect:
@@ -435,7 +476,9 @@ def _smoothing(fitted: RotationFit, streams: _Streams) -> Suspect:
     stream = streams.child if name == "child" else streams.parent
     part = "rates" if stream.measures == "rates" else "orientations"
     seconds = abs(smoothing_s2) ** 0.5
-    return Suspect(n_sigmas, finding("smoothed_rotations", name, part=part, smoothing_s=seconds))
+    return Suspect(
+        n_sigmas, finding("smoothed_rotations", name, part=part, smoothing_s=seconds)
+    )
 
 
 class _Largest(NamedTuple):
@@ -467,7 +510,9 @@ def _gain(fitted: RotationFit, streams: _Streams) -> Suspect:
         return Suspect(0.0, None)
     place, gain, sigma = largest
     values = {"axis": "xyz"[place], "gain": 1.0 + gain, "sigma": sigma}
-    return Suspect(abs(gain) / sigma, graded("gain_of_axis", streams.name, gain, sigma, **values))
+    return Suspect(
+        abs(gain) / sigma, graded("gain_of_axis", streams.name, gain, sigma, **values)
+    )
 
 
 def _main_gain(fitted: RotationFit, streams: _Streams) -> Suspect:
@@ -476,7 +521,9 @@ def _main_gain(fitted: RotationFit, streams: _Streams) -> Suspect:
     if abs(gain) <= agreement.BIASES * bias:
         return Suspect(0.0, None)
     values = {"axis": "main", "gain": 1.0 + gain, "sigma": sigma}
-    return Suspect(abs(gain) / sigma, graded("gain_of_axis", streams.name, gain, sigma, **values))
+    return Suspect(
+        abs(gain) / sigma, graded("gain_of_axis", streams.name, gain, sigma, **values)
+    )
 
 
 def _shear(fitted: RotationFit, streams: _Streams) -> Suspect:

@@ -131,7 +131,9 @@ class RotationFit(Fit):
         same angle. The covariance is at most that of faults of usual size.
         """
         shears, sigmas = self.estimate("shears")
-        estimated = self.open_covariance + np.diag(np.maximum(shears**2 - sigmas**2, 0.0))
+        estimated = self.open_covariance + np.diag(
+            np.maximum(shears**2 - sigmas**2, 0.0)
+        )
         return min(estimated, self._usual_covariance, key=np.trace)
 
     @property
@@ -296,7 +298,9 @@ def _motion(
     halfway = orientations[:-1] @ se3.rotation_exp(0.5 * turns)
     if has_rates:
         between = 0.5 * (accelerations[:-1] + accelerations[1:])
-        bends = bends - _integral(stamps_s, se3.times(halfway, se3.cross(steps, between)))
+        bends = bends - _integral(
+            stamps_s, se3.times(halfway, se3.cross(steps, between))
+        )
     gains = halfway * steps[:, None, :]
     shears = np.zeros_like(halfway)
     for column, (k, m) in enumerate(PLANES):

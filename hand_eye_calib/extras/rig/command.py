@@ -42,18 +42,24 @@ def calibrate_rig(arguments: argparse.Namespace, restore_urls: "RestoreUrls") ->
     from hand_eye_calib.formats.results import keep_earlier_results, save_rig
 
     if arguments.installed or arguments.base_frame:
-        raise ConfigError("--installed and --base-frame apply to two sensors, not to a rig")
+        raise ConfigError(
+            "--installed and --base-frame apply to two sensors, not to a rig"
+        )
     readings = _read_topics(arguments) if arguments.topics else _read_files(arguments)
     sensors = _by_frame(readings)
     inputs = restore_urls(readings.inputs) | {"options": options_from(arguments)}
     if arguments.label:
         inputs["labels"] = dict(arguments.label)
     with waiting_for(f"solving for {len(sensors)} sensors"):
-        rig = of_rig.calibrated(sensors, inputs["options"], partial(_completed, arguments))
+        rig = of_rig.calibrated(
+            sensors, inputs["options"], partial(_completed, arguments)
+        )
     rig = rig.with_warnings(restore_urls(readings.warnings))
     if arguments.out:
         kept = keep_earlier_results(arguments.out)
-        note(f"wrote {save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs)}{kept}")
+        note(
+            f"wrote {save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs)}{kept}"
+        )
     document = rig.to_dict() | {"inputs": inputs} if arguments.json else None
     try:
         print_result(as_lines(rig, arguments.verbose), document)
@@ -98,7 +104,9 @@ def _read_topics(arguments: argparse.Namespace) -> _Readings:
     refuse_recordings(arguments.paths, sources)
     stamps = arguments.stamps or "header"
     with PoseBag(*arguments.paths) as bag:
-        trajectories, repairs = read_sources(bag, [(source, "auto", stamps) for source in sources])
+        trajectories, repairs = read_sources(
+            bag, [(source, "auto", stamps) for source in sources]
+        )
         inputs: Document = {"bag": str(bag), "topics": topics}
         if arguments.out:
             inputs["files"] = [fingerprint(file) for file in bag.files]
@@ -138,7 +146,10 @@ def as_lines(rig: "RigCalibration", with_details: bool = False) -> list[str]:
     lines = [rig.headline, ""]
     for calibration in rig.calibrations:
         first, *others = verdict_lines(calibration)
-        lines += [f"{calibration.child_frame} in {calibration.parent_frame}: {first}", *others]
+        lines += [
+            f"{calibration.child_frame} in {calibration.parent_frame}: {first}",
+            *others,
+        ]
         transform = transforms_of(calibration)["T_parent_child"]
         lines += transform_lines(transform, calibration.out_of_reach, with_details)
         lines += allowance_lines(calibration)

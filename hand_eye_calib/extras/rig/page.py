@@ -17,13 +17,18 @@ _NAMELESS = "child_sensor"
 
 
 def write_rig_report(
-    directory: Path, rig: RigCalibration, names: Sequence[str], road: Road = Road.TERMINAL
+    directory: Path,
+    rig: RigCalibration,
+    names: Sequence[str],
+    road: Road = Road.TERMINAL,
 ) -> None:
     """Write the report of a rig; ``names`` are the files, topics or frames of its sensors."""
     write_page(directory, lambda: render_rig(rig, names, road))
 
 
-def render_rig(rig: RigCalibration, inputs: Sequence[str], road: Road = Road.TERMINAL) -> str:
+def render_rig(
+    rig: RigCalibration, inputs: Sequence[str], road: Road = Road.TERMINAL
+) -> str:
     """Return the report of a rig as HTML; ``inputs`` are the files, topics or frames."""
     return page(
         Path(__file__).with_name("rig.html"),
@@ -59,7 +64,10 @@ def write_session_rig(directory: Path, session: SessionResult) -> None:
         names.append("scale")
     else:
         child = child.scaled(config.scale)
-    sensors = {session.snapshot.parent_frame: parent, session.snapshot.child_frame: child}
+    sensors = {
+        session.snapshot.parent_frame: parent,
+        session.snapshot.child_frame: child,
+    }
     for name, other in session.others.items():
         frame = other.child_frame
         sensors[name if frame in {*sensors, _NAMELESS} else frame] = other.streams[1]

@@ -96,11 +96,16 @@ def calibrated(
         replace(trajectory, sensor_frame=frame_name(name))
         for name, trajectory in trajectories.items()
     ]
-    attempts = [run(complete(whole_snapshot(first, other, options))) for other in others]
+    attempts = [
+        run(complete(whole_snapshot(first, other, options))) for other in others
+    ]
     # Results with the first sensor, and the other trajectories on the clock and in the unit of the
     # first trajectory.
     star = [attempt.calibration for attempt in attempts]
-    aligned = [_aligned(other, attempt) for other, attempt in zip(others, attempts, strict=True)]
+    aligned = [
+        _aligned(other, attempt)
+        for other, attempt in zip(others, attempts, strict=True)
+    ]
     max_gap_s = attempts[0].snapshot.config.max_gap
     neighbours = [
         _between(parent, child, calibration.method, max_gap_s)
@@ -123,15 +128,21 @@ def _aligned(child: Trajectory, attempt: Attempt) -> Trajectory:
     return child.scaled(calibration.scale).shifted(calibration.time_offset_s)
 
 
-def _between(parent: Trajectory, child: Trajectory, method: str, max_gap_s: float) -> Calibration:
+def _between(
+    parent: Trajectory, child: Trajectory, method: str, max_gap_s: float
+) -> Calibration:
     """Calibrate two neighbours in the list, which already have the same clock and unit."""
     pairs = synchronise(parent, child, max_gap_s)
     config = CalibratorConfig(method=method, max_pairs=max(len(pairs), 10))
     calibration = solve_poses(pairs, config).calibration()
-    return replace(calibration, parent_frame=parent.sensor_frame, child_frame=child.sensor_frame)
+    return replace(
+        calibration, parent_frame=parent.sensor_frame, child_frame=child.sensor_frame
+    )
 
 
-def _require_rig(trajectories: Mapping[str, Trajectory], options: Mapping[str, Any]) -> None:
+def _require_rig(
+    trajectories: Mapping[str, Trajectory], options: Mapping[str, Any]
+) -> None:
     """Raise an InputError for unusable trajectories, a ConfigError for options of two sensors."""
     require_type("trajectories", trajectories, Mapping)
     for trajectory in trajectories.values():
@@ -270,7 +281,9 @@ class RigCalibration:
         closures = tuple(closure(*results) for results in triangles)
         rig = cls(sensors, tuple(star), tuple(neighbours), closures)
         calibrations = tuple(
-            replace(calibration, T_parent_child=se3.exp(step) @ calibration.T_parent_child)
+            replace(
+                calibration, T_parent_child=se3.exp(step) @ calibration.T_parent_child
+            )
             for calibration, step in zip(star, rig._steps(), strict=True)
         )
         return replace(rig, calibrations=calibrations)._with_findings()
@@ -284,7 +297,9 @@ class RigCalibration:
         calibrations = list(self.calibrations)
         for loop, closure in enumerate(self.closures):
             results = self.calibrations[loop : loop + 2]
-            has_bad_result = any(result.verdict is Verdict.DO_NOT_USE for result in results)
+            has_bad_result = any(
+                result.verdict is Verdict.DO_NOT_USE for result in results
+            )
             if closure.closes or has_bad_result:
                 continue
             for k in (loop, loop + 1):
@@ -296,7 +311,9 @@ class RigCalibration:
     def headline(self) -> str:
         """The verdict, and the names of its sensors if other sensors have a better verdict."""
         results = self.calibrations
-        gravest = [result.child_frame for result in results if result.verdict is self.verdict]
+        gravest = [
+            result.child_frame for result in results if result.verdict is self.verdict
+        ]
         of_sensors = f"{len(self.sensors)} sensors"
         if len(gravest) < len(results):
             of_sensors = f"{listing(gravest)} of {of_sensors}"
@@ -351,7 +368,9 @@ class RigCalibration:
 
     def T(self, first: str, second: str) -> FloatArray:
         """Return the pose (4, 4) of the sensor ``second`` in the frame of the sensor ``first``."""
-        X_first, X_second = self.Xs[[self.sensors.index(first), self.sensors.index(second)]]
+        X_first, X_second = self.Xs[
+            [self.sensors.index(first), self.sensors.index(second)]
+        ]
         return se3.inverse(X_first) @ X_second
 
     def covariance(self, first: str, second: str) -> FloatArray:
@@ -377,10 +396,14 @@ class RigCalibration:
         if low > 0 and high == low + 1:
             results = [(self.neighbours[low - 1], self.Xs[high])]
         else:
-            results = [(self.calibrations[k - 1], self.Xs[k]) for k in (low, high) if k > 0]
+            results = [
+                (self.calibrations[k - 1], self.Xs[k]) for k in (low, high) if k > 0
+            ]
         # Add in the frame of the rig's first sensor, and transform the sum to the second sensor.
         to_second = se3.adjoint(self.T(second, self.sensors[0]))
-        in_first = np.sum([_in_first(*result, with_allowance) for result in results], axis=0)
+        in_first = np.sum(
+            [_in_first(*result, with_allowance) for result in results], axis=0
+        )
         return to_second @ in_first @ to_second.T
 
     def to_dict(self) -> Document:
@@ -390,14 +413,19 @@ class RigCalibration:
             "version": 1,
             "sensors": list(self.sensors),
             "verdict": self.verdict.value,
-            "closures": [plain(closure) | {"closes": closure.closes} for closure in self.closures],
+            "closures": [
+                plain(closure) | {"closes": closure.closes} for closure in self.closures
+            ],
             "calibrations": {
-                calibration.child_frame: calibration.to_dict() for calibration in self.calibrations
+                calibration.child_frame: calibration.to_dict()
+                for calibration in self.calibrations
             },
         }
 
 
-def _in_first(calibration: Calibration, X: FloatArray, with_allowance: bool = False) -> FloatArray:
+def _in_first(
+    calibration: Calibration, X: FloatArray, with_allowance: bool = False
+) -> FloatArray:
     """Return the covariance (6, 6) of a result in another frame than that of its child.
 
     X is the pose (4, 4) of the child in this frame.
@@ -409,7 +437,9 @@ def _in_first(calibration: Calibration, X: FloatArray, with_allowance: bool = Fa
     return adjoint @ covariance @ adjoint.T
 
 
-def closure(to_second: Calibration, between: Calibration, to_third: Calibration) -> Closure:
+def closure(
+    to_second: Calibration, between: Calibration, to_third: Calibration
+) -> Closure:
     """Return the closure error of three sensors a, b and c.
 
     Parameters
@@ -418,7 +448,9 @@ def closure(to_second: Calibration, between: Calibration, to_third: Calibration)
         Results for b in a, c in b, and c in a.
     """
     chain = to_second.T_parent_child @ between.T_parent_child
-    covariance = _in_first(to_second, to_second.T_parent_child) + _in_first(between, chain)
+    covariance = _in_first(to_second, to_second.T_parent_child) + _in_first(
+        between, chain
+    )
     covariance += _in_first(to_third, to_third.T_parent_child)
     variances, axes = np.linalg.eigh(covariance)
     is_determined = variances < _UNKNOWN

@@ -33,7 +33,12 @@ from hand_eye_calib.formats.trajectory_files.columns import (
     QUATERNION,
     ROTATION_VECTOR,
 )
-from hand_eye_calib.formats.trajectory_files.dates import DAY_S, GPS_EPOCH_S, GPS_TIME, WEEK_S
+from hand_eye_calib.formats.trajectory_files.dates import (
+    DAY_S,
+    GPS_EPOCH_S,
+    GPS_TIME,
+    WEEK_S,
+)
 from hand_eye_calib.formats.trajectory_files.file_options import FileOptions
 from hand_eye_calib.formats.trajectory_files.table import Table, columns_of_array
 
@@ -64,7 +69,9 @@ class _Rows(NamedTuple):
 _Reader = Callable[[bytes, str | None], _Rows]
 
 
-def table_of_program(path: str | Path, data: bytes, options: FileOptions) -> Table | None:
+def table_of_program(
+    path: str | Path, data: bytes, options: FileOptions
+) -> Table | None:
     """Return the rows of a file in one of the formats of :data:`PROGRAMS`; None for other files.
 
     Raises
@@ -80,7 +87,11 @@ def table_of_program(path: str | Path, data: bytes, options: FileOptions) -> Tab
 
 
 def foreign_table(
-    path: str | Path, data: bytes, read: _Reader | str, choice: str | None, measures: str
+    path: str | Path,
+    data: bytes,
+    read: _Reader | str,
+    choice: str | None,
+    measures: str,
 ) -> Table:
     """Read a file by its value in :data:`PROGRAMS`.
 
@@ -169,8 +180,12 @@ def _of_nmea(data: bytes, _: str | None) -> _Rows:
             row[0] += DAY_S
         rows.append(row)
     if not rows:
-        raise ValueError("NMEA: expected GGA sentences with a fix, and the date in RMC sentences")
-    notes = [f"{n_damaged} sentences with a wrong checksum left out"] if n_damaged else []
+        raise ValueError(
+            "NMEA: expected GGA sentences with a fix, and the date in RMC sentences"
+        )
+    notes = (
+        [f"{n_damaged} sentences with a wrong checksum left out"] if n_damaged else []
+    )
     return _Rows(_PLACE, rows, notes)
 
 
@@ -217,7 +232,9 @@ def _of_gpx(data: bytes, _: str | None) -> _Rows:
         time = point.findtext("{*}time")
         height = point.findtext("{*}ele")
         if time is None:
-            raise ValueError("a point of the GPX track has no time; record it with times")
+            raise ValueError(
+                "a point of the GPX track has no time; record it with times"
+            )
         rows.append((time, point.attrib["lat"], point.attrib["lon"], height or "0"))
     return _Rows(_PLACE, rows, ["heights of GPX are above the sea"])
 
@@ -255,10 +272,16 @@ def _of_novatel(data: bytes, _: str | None) -> _Rows:
             height += float(cells[5])
             angles = cells[9:12]
         week = 5 if line[0] == "#" else 1
-        rows.append((_of_week(header[week], header[week + 1]), *cells[2:4], height, *angles))
+        rows.append(
+            (_of_week(header[week], header[week + 1]), *cells[2:4], height, *angles)
+        )
     if not rows:
-        raise ValueError("the log of NovAtel contains neither INSPVA nor INSPVAX: log one of them")
-    return _Rows((*_PLACE, "roll [deg]", "pitch [deg]", "heading [deg]"), rows, [GPS_TIME])
+        raise ValueError(
+            "the log of NovAtel contains neither INSPVA nor INSPVAX: log one of them"
+        )
+    return _Rows(
+        (*_PLACE, "roll [deg]", "pitch [deg]", "heading [deg]"), rows, [GPS_TIME]
+    )
 
 
 def _of_week(week: str, second: str) -> str:
@@ -271,9 +294,13 @@ def _of_week(week: str, second: str) -> str:
 
 def _of_g2o(data: bytes, _: str | None) -> _Rows:
     """Read the vertices of a pose graph, in two or three dimensions."""
-    vertices = [line.split()[1:9] for line in _lines(data) if line.startswith("VERTEX_SE")]
+    vertices = [
+        line.split()[1:9] for line in _lines(data) if line.startswith("VERTEX_SE")
+    ]
     if not vertices:
-        raise ValueError("a g2o graph without vertices; save the optimised graph with its vertices")
+        raise ValueError(
+            "a g2o graph without vertices; save the optimised graph with its vertices"
+        )
     vertices.sort(key=lambda row: int(row[0]))
     names = _POSE if len(vertices[0]) > len(_POSE) else ("x", "y", "yaw [rad]")
     return _Rows(("t [s]", *names), vertices, [_NUMBERED.format("vertices")])
@@ -302,17 +329,24 @@ def _of_json(data: bytes, _: str | None) -> _Rows:
     if isinstance(frames, list) and frames and isinstance(frames[0], dict):
         names = set(frames[0])
     if names >= {"timestamp", "translation", "rotation"}:
-        rows = [(item["timestamp"], *item["translation"], *item["rotation"]) for item in frames]
+        rows = [
+            (item["timestamp"], *item["translation"], *item["rotation"])
+            for item in frames
+        ]
         return _Rows(("t [us]", *POSITION, "qw", "qx", "qy", "qz"), sorted(rows))
     if "transform_matrix" not in names:
         raise ValueError(
             "it is JSON of an unsupported kind; expected transforms.json of "
             "nerfstudio, ego_pose.json of nuScenes, or csv"
         )
-    Ts_world_camera = np.array([item["transform_matrix"] for item in frames], dtype=float)
+    Ts_world_camera = np.array(
+        [item["transform_matrix"] for item in frames], dtype=float
+    )
     Ts_world_camera[:, :3, :3] = se3.rotation_of(Ts_world_camera) @ _FLIP
     note = "axes of the camera: x right, y down, z forward, not those of OpenGL in the file"
-    return _of_images([str(item["file_path"]) for item in frames], Ts_world_camera, [note])
+    return _of_images(
+        [str(item["file_path"]) for item in frames], Ts_world_camera, [note]
+    )
 
 
 def _of_images(names: Sequence[str], poses: FloatArray, notes: list[str]) -> _Rows:
@@ -348,12 +382,16 @@ def _of_motive(data: bytes, choice: str | None) -> _Rows:
     kinds = next((row for row in range(1, last) if "Rigid Body" in head[row]), None)
     if kinds is None:
         raise ValueError("it contains no rigid bodies of Motive: export them")
-    columns = zip(head[kinds], head[kinds + 1], head[last - 1], head[last], strict=False)
+    columns = zip(
+        head[kinds], head[kinds + 1], head[last - 1], head[last], strict=False
+    )
     places_of_bodies = _places_of_bodies(columns)
     body = _chosen(places_of_bodies, choice, "rigid bodies")
     place_of = places_of_bodies[body]
     if not place_of.keys() >= {*_POSE}:
-        raise ValueError("it contains Euler angles of Motive: export with rotation type Quaternion")
+        raise ValueError(
+            "it contains Euler angles of Motive: export with rotation type Quaternion"
+        )
     # The first line contains names and values in turn.
     properties = dict(zip(head[0][::2], head[0][1::2], strict=False))
     unit = _MOTIVE_UNITS[properties.get("Length Units", "Meters")]
@@ -393,7 +431,9 @@ def _of_vicon(data: bytes, choice: str | None) -> _Rows:
             "it contains no segments of Vicon: export Segments or Objects (global), not markers"
         )
     # Columns of each body: its rotation from RX on, then its position from TX on.
-    starts = {names[at] or "object": at for at, name in enumerate(columns) if name == "RX"}
+    starts = {
+        names[at] or "object": at for at, name in enumerate(columns) if name == "RX"
+    }
     body = _chosen(starts, choice, "segments")
     start = starts[body]
     place = columns.index("TX", start)
@@ -441,16 +481,23 @@ def _of_ulog(data: bytes, _: str | None) -> _Rows:
     try:
         log = pyulog.ULog(io.BytesIO(data), topics)
         first_instances = [logged for logged in log.data_list if logged.multi_id == 0]
-        stamps_us, Ts = _logged_poses({logged.name: logged.data for logged in first_instances})
+        stamps_us, Ts = _logged_poses(
+            {logged.name: logged.data for logged in first_instances}
+        )
     # Damaged logs raise errors of many kinds.
     except Exception as error:
-        reason = "" if isinstance(error, KeyError) else f", {type(error).__name__}: {error}"
+        reason = (
+            "" if isinstance(error, KeyError) else f", {type(error).__name__}: {error}"
+        )
         raise ValueError(
             f"the log of PX4 does not contain {' or '.join(topics[:2])}{reason}"
         ) from None
     flip = np.diag([*np.diag(_FLIP), 1.0])
     poses = _as_rows(flip @ Ts @ flip).tolist()
-    rows = [(stamp_us, *pose) for stamp_us, pose in zip(stamps_us.tolist(), poses, strict=True)]
+    rows = [
+        (stamp_us, *pose)
+        for stamp_us, pose in zip(stamps_us.tolist(), poses, strict=True)
+    ]
     note = "axes: x forward, y left, z up, in north, west, up; PX4 has forward, right, down"
     return _Rows(("t [us]", *MATRIX), rows, [note])
 
@@ -460,7 +507,11 @@ def _logged_poses(data: Mapping[str, Any]) -> tuple[IntArray, FloatArray]:
     quaternion = ["q[1]", "q[2]", "q[3]", "q[0]"]
     if "vehicle_odometry" in data:
         odometry = data["vehicle_odometry"]
-        place = [*POSITION] if "x" in odometry else ["position[0]", "position[1]", "position[2]"]
+        place = (
+            [*POSITION]
+            if "x" in odometry
+            else ["position[0]", "position[1]", "position[2]"]
+        )
         stamps_us, values = _logged(odometry, *place, *quaternion)
         return stamps_us, se3.from_quat_xyzw(values[:, :3], values[:, 3:])
     stamps_us, positions = _logged(data["vehicle_local_position"], *POSITION)
@@ -483,7 +534,9 @@ def _logged(data: Mapping[str, Any], *names: str) -> tuple[IntArray, FloatArray]
         is_valid &= data[flag] > 0
     if not is_valid.any():
         raise ValueError(f"none of {', '.join(names)} is valid")
-    stamps_us = data.get("timestamp_sample", data["timestamp"])[is_valid].astype(np.int64)
+    stamps_us = data.get("timestamp_sample", data["timestamp"])[is_valid].astype(
+        np.int64
+    )
     stamps_us, first = np.unique(stamps_us, return_index=True)
     return stamps_us, values[is_valid][first]
 
@@ -517,7 +570,9 @@ def _of_echo(data: bytes, _: str | None) -> _Rows:
     messages = [line.split(",") for line in _lines(data) if line]
     start = _POSE_CELL.get(len(messages[0]))
     if start is None:
-        raise ValueError("messages of ros2 topic echo --csv without poses; record a bag")
+        raise ValueError(
+            "messages of ros2 topic echo --csv without poses; record a bag"
+        )
     rows = ([*cells[:2], *cells[start : start + 7]] for cells in messages)
     return _Rows(("secs", "nsecs", *_POSE), rows)
 

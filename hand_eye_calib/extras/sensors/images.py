@@ -46,7 +46,9 @@ def read_images(bag: PoseBag, stream: str, topic: str, text: str) -> "ImageReadi
         raise InputError(f"{topic} has type {type_}, which contains no images")
     if file:
         return ImageReading(stream, topic, target, read_camera(file))
-    candidates = [str(namespace / "camera_info") for namespace in PurePosixPath(topic).parents]
+    candidates = [
+        str(namespace / "camera_info") for namespace in PurePosixPath(topic).parents
+    ]
     info = next((candidate for candidate in candidates if candidate in bag.topics), "")
     run = next(bag.runs([info]), None)
     if run is None:

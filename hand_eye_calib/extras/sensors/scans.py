@@ -35,7 +35,15 @@ from hand_eye_calib.formats.bags.sources import Reading
 from hand_eye_calib.formats.npz import read_arrays
 
 # Names that drivers use for the time of a point.
-_TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time", "timeOffset", "ts")
+_TIME_FIELDS = (
+    "t",
+    "time",
+    "timestamp",
+    "time_stamp",
+    "offset_time",
+    "timeOffset",
+    "ts",
+)
 
 
 class Step(NamedTuple):
@@ -157,7 +165,9 @@ def scan_of(message: Any) -> Scan:
     first = times.min() if len(times) else 0.0
     last = times.max() if len(times) else 0.0
     duration = last - first
-    units_ns = [ns for ns in STAMP_UNITS.values() if 0 < duration * ns <= TUNING.longest_ns]
+    units_ns = [
+        ns for ns in STAMP_UNITS.values() if 0 < duration * ns <= TUNING.longest_ns
+    ]
     unit_ns = max(units_ns, default=0)
     middle = (first + last) / 2
     stamp_ns = round(float(middle) * unit_ns)
@@ -183,9 +193,13 @@ class ScanReading(Reading):
         If small_gicp is not installed, and no result is stored.
     """
 
-    def __init__(self, stream: str, topic: str, bag: Path, files: Sequence[Path]) -> None:
+    def __init__(
+        self, stream: str, topic: str, bag: Path, files: Sequence[Path]
+    ) -> None:
         super().__init__(stream, topic)
-        self._state = np.array([[file.stat().st_size, file.stat().st_mtime_ns] for file in files])
+        self._state = np.array(
+            [[file.stat().st_size, file.stat().st_mtime_ns] for file in files]
+        )
         self._path = bag.with_name(f"{bag.name}{topic.replace('/', '.')}.odometry.npz")
         self._stored: Mapping[str, Any] = {}
         # Many kinds of errors are possible: the file is absent, cut off, or of an older version.
@@ -195,7 +209,9 @@ class ScanReading(Reading):
                 self._stored = {name: stored[name] for name in _STORED}
                 self.topics = ()
                 return
-        self._gicp = required("small_gicp", "odometry from the points of a lidar", "lidar")
+        self._gicp = required(
+            "small_gicp", "odometry from the points of a lidar", "lidar"
+        )
         # Size of a voxel of the fine map.
         self._voxel_m = 0.0
         self._rough_map: Any = None
@@ -349,7 +365,9 @@ class ScanReading(Reading):
         self._gicp.estimate_covariances(thinned, num_neighbors=TUNING.n_neighbours)
         return thinned
 
-    def _learn_range_errors(self, scan: Scan, still: FloatArray, pose: FloatArray) -> None:
+    def _learn_range_errors(
+        self, scan: Scan, still: FloatArray, pose: FloatArray
+    ) -> None:
         """Estimate the range errors of rings from points near planes of the fine map.
 
         A range that is too long by e displaces the point from its plane by e times the cosine

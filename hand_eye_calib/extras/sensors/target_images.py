@@ -224,10 +224,14 @@ class Camera:
             numbers = np.array(matrix, dtype=float).reshape(3, 3)
             if not np.isfinite(numbers).all() or numbers[0, 0] <= 0.0:
                 raise ValueError("no focal length")
-            return cls(numbers, np.array(distortion, dtype=float).ravel(), _IS_FISHEYE[model])
+            return cls(
+                numbers, np.array(distortion, dtype=float).ravel(), _IS_FISHEYE[model]
+            )
         except (KeyError, TypeError, ValueError):
             models = ", ".join(model for model in _IS_FISHEYE if model)
-            raise InputError(f"{where}: expected {_EXPECTED_CAMERA}; models are {models}") from None
+            raise InputError(
+                f"{where}: expected {_EXPECTED_CAMERA}; models are {models}"
+            ) from None
 
 
 def read_camera(path: str | Path) -> Camera:
@@ -273,7 +277,9 @@ def _camera_of_visp(path: Path) -> Camera:
         centre_y = float(model.findtext("v0", ""))
         k1 = float(model.findtext("kud", "0"))
     except (ElementTree.ParseError, ValueError):
-        raise InputError(f"{path}: expected {_EXPECTED_CAMERA}, of one camera") from None
+        raise InputError(
+            f"{path}: expected {_EXPECTED_CAMERA}, of one camera"
+        ) from None
     matrix = [focal_x, 0.0, centre_x, 0.0, focal_y, centre_y, 0.0, 0.0, 1.0]
     return Camera.of(path, matrix, [k1, 0.0, 0.0, 0.0])
 
@@ -299,14 +305,19 @@ def camera_of(info: Any, is_rectified: bool, where: str) -> Camera:
 
 def images_in(folder: Path) -> list[Path]:
     """Return the image files of a folder by name; numbers in names sort by value."""
-    images = [path for path in folder.iterdir() if path.suffix.lower() in _IMAGE_SUFFIXES]
+    images = [
+        path for path in folder.iterdir() if path.suffix.lower() in _IMAGE_SUFFIXES
+    ]
     return sorted(images, key=lambda path: _by_number(path.name))
 
 
 def _by_number(name: str) -> list[tuple[int, str]]:
     """Return a key that sorts names by the values of their numbers."""
     parts = re.split("([0-9]+)", name)
-    return [(int(part), "") if part.isascii() and part.isdigit() else (-1, part) for part in parts]
+    return [
+        (int(part), "") if part.isascii() and part.isdigit() else (-1, part)
+        for part in parts
+    ]
 
 
 def read_image(path: Path) -> Any:
@@ -326,7 +337,9 @@ def image_in(data: Any, where: object) -> Any:
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
     except cv2.error:
-        raise InputError(f"{where} has more than {_MOST_PIXELS:,} pixels, or is damaged") from None
+        raise InputError(
+            f"{where} has more than {_MOST_PIXELS:,} pixels, or is damaged"
+        ) from None
     if image is None:
         raise InputError(f"{where} is not a readable image")
     return image
@@ -346,7 +359,9 @@ def grey_of(message: Any) -> Any:
     conversion = _TO_GREY.get(message.encoding)
     if conversion is None:
         expected = ", ".join(_TO_GREY)
-        raise InputError(f"images are encoded as {message.encoding[:40]!r}; expected {expected}")
+        raise InputError(
+            f"images are encoded as {message.encoding[:40]!r}; expected {expected}"
+        )
     n_channels = message.step // message.width
     rows = data.reshape(message.height, message.step)[:, : message.width * n_channels]
     image = rows.reshape(message.height, message.width, n_channels)
@@ -475,7 +490,9 @@ class TargetFinder:
         """
         cv2 = self._cv2
         camera = self._camera
-        undistort = cv2.fisheye.undistortPoints if camera.is_fisheye else cv2.undistortPoints
+        undistort = (
+            cv2.fisheye.undistortPoints if camera.is_fisheye else cv2.undistortPoints
+        )
         rays = undistort(pixels, camera.matrix, camera.distortion).reshape(-1, 2)
         focal = camera.matrix[[0, 1], [0, 1]]
         # Rays are pixels of a camera without distortion, with this matrix.
@@ -514,7 +531,9 @@ def _detector(cv2: Any, target: Target) -> _Detector:
         If OpenCV is too old for the target.
     """
     if target.kind == "chessboard":
-        return _Detector(partial(_detect_chessboard, cv2, target), _chessboard_corners(target))
+        return _Detector(
+            partial(_detect_chessboard, cv2, target), _chessboard_corners(target)
+        )
     dictionary = _dictionary(cv2, target)
     if target.kind == "aprilgrid":
         # Kalibr's tags have a border of two bits.
@@ -549,12 +568,16 @@ def _dictionary(cv2: Any, target: Target) -> Any:
     return dictionary
 
 
-def _tag_detector(cv2: Any, dictionary: Any, border_bits: int, corners: FloatArray) -> _Detector:
+def _tag_detector(
+    cv2: Any, dictionary: Any, border_bits: int, corners: FloatArray
+) -> _Detector:
     """Return the detector of separate markers, whose black border is ``border_bits`` cells wide."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border_bits
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    return _Detector(cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers, corners)
+    return _Detector(
+        cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers, corners
+    )
 
 
 def _detect_chessboard(cv2: Any, target: Target, image: Any) -> tuple[Any, Any]:

@@ -8,7 +8,9 @@ from hand_eye_calib.core.base.registry import COMMANDS, PUBLIC_NAMES, Command
 def register() -> None:
     """Register the commands ``simulate`` and ``demo``."""
     PUBLIC_NAMES["simulate"] = "hand_eye_calib.extras.simulation.drive"
-    COMMANDS["simulate"] = Command("simulate trajectories or a bag with known truth", _simulate)
+    COMMANDS["simulate"] = Command(
+        "simulate trajectories or a bag with known truth", _simulate
+    )
     COMMANDS["demo"] = Command(
         "simulate a recording and calibrate from it, offline and live", _demo
     )

@@ -31,7 +31,9 @@ if TYPE_CHECKING:
 TOPICS = {"parent": "/lidar/odometry", "child": "/camera/odometry"}
 
 # Drive of one minute that the demo simulates.
-DRIVE = dataclasses.replace(HILLY_DRIVE, poses=600, parent_frame="lidar", child_frame="camera")
+DRIVE = dataclasses.replace(
+    HILLY_DRIVE, poses=600, parent_frame="lidar", child_frame="camera"
+)
 
 # Ratio of the speed of the playback to that of the recording.
 PLAY_SPEED = 20.0
@@ -40,12 +42,16 @@ PLAY_SPEED = 20.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.usage = "%(prog)s [OPTION ...]"
-    parser.epilog = "examples:\n  hand_eye_calib demo\n  hand_eye_calib demo --out demo_2"
+    parser.epilog = (
+        "examples:\n  hand_eye_calib demo\n  hand_eye_calib demo --out demo_2"
+    )
     out = (
         "directory for the bag, the node's log and report.html; files of an "
         "earlier demo are replaced. Default: demo_output"
     )
-    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("demo_output"), help=out)
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, default=Path("demo_output"), help=out
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -71,7 +77,9 @@ def run(arguments: argparse.Namespace) -> int:
     note(f"1/4 simulated {drive.parent.duration_s:.0f} s of driving into {bag_path}")
     recording = read_recording([bag_path], TOPICS, {})
     offline = recording.snapshot.estimate()
-    note(f"2/4 calibrated offline; playing the bag to the live node at {PLAY_SPEED:g} times speed")
+    note(
+        f"2/4 calibrated offline; playing the bag to the live node at {PLAY_SPEED:g} times speed"
+    )
     # Robots on the network must not receive simulated odometry.
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     # Use a domain from 1 to 100. The ports of domains from 102 on may be in use, because Linux
@@ -124,7 +132,9 @@ def _node(log_path: Path) -> Iterator[Callable[[], None]]:
             process.kill()
 
 
-def _lines(drive: "SimulatedDrive", offline: "Calibration", live: "ndarray") -> Iterator[str]:
+def _lines(
+    drive: "SimulatedDrive", offline: "Calibration", live: "ndarray"
+) -> Iterator[str]:
     """Yield lines with the verdict, the truth, and both results with their errors.
 
     ``live`` is ``T_parent_child`` (4, 4) of the node.
@@ -133,11 +143,17 @@ def _lines(drive: "SimulatedDrive", offline: "Calibration", live: "ndarray") -> 
     from hand_eye_calib.core.geometry.se3 import absolute_errors
 
     yield offline.headline
-    heads = "".join(f"{name:>10}" for name in ("x", "y", "z", "m", "roll", "pitch", "yaw"))
+    heads = "".join(
+        f"{name:>10}" for name in ("x", "y", "z", "m", "roll", "pitch", "yaw")
+    )
     yield f"{f'Pose of {offline.child_frame} in {offline.parent_frame}':<26}{heads}  deg"
     truth = drive.T_parent_child
     replayed = offline.T_parent_child
-    for title, T in (("truth", truth), ("replay of the bag", replayed), ("live node", live)):
+    for title, T in (
+        ("truth", truth),
+        ("replay of the bag", replayed),
+        ("live node", live),
+    ):
         pose = se3.xyz_rpy(T).tolist()
         position = "".join(f"{value:10.4f}" for value in pose[:3])
         degrees = "".join(f"{math.degrees(value):10.3f}" for value in pose[3:])

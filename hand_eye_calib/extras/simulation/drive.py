@@ -94,7 +94,9 @@ def simulate(
     """
     config = options.HILLY_DRIVE if drive == "hilly" else options.PUBLISHED_DRIVE
     config = replace(config, poses=poses, parent_frame="lidar", child_frame="camera")
-    noise = replace(options.REALISTIC, gaussian=gaussian, outliers=outliers, drift=drift)
+    noise = replace(
+        options.REALISTIC, gaussian=gaussian, outliers=outliers, drift=drift
+    )
     require_type("seed", seed, Integral)
     return simulate_drive(seed, config, noise)
 
@@ -127,19 +129,29 @@ def simulate_drive(
     Ts_pw_p = _poses_on_terrain(config, positions, headings)
     Ts_pw_p_at_child = Ts_pw_p[config.poses :]
     Ts_pw_p = Ts_pw_p[: config.poses]
-    rotation = se3.rotation_of(se3.from_quat_xyzw(np.zeros(3), extrinsic_rng.standard_normal(4)))
+    rotation = se3.rotation_of(
+        se3.from_quat_xyzw(np.zeros(3), extrinsic_rng.standard_normal(4))
+    )
     offset = extrinsic_rng.uniform(-_LARGEST_OFFSET_M, _LARGEST_OFFSET_M, 3)
     T_parent_child = se3.from_rotation_translation(rotation, offset)
     # Pose of the child's world: yaw, pitch, roll (rad) and translation (m) are differences of two
     # uniform random numbers each.
-    angles, translation = extrinsic_rng.uniform(size=(2, 3)) - extrinsic_rng.uniform(size=(2, 3))
-    T_pw_cw = se3.from_rotation_translation(se3.rotation_from_rpy(angles[::-1]), translation)
+    angles, translation = extrinsic_rng.uniform(size=(2, 3)) - extrinsic_rng.uniform(
+        size=(2, 3)
+    )
+    T_pw_cw = se3.from_rotation_translation(
+        se3.rotation_from_rpy(angles[::-1]), translation
+    )
     Ts_cw_c = se3.inverse(T_pw_cw) @ Ts_pw_p_at_child @ T_parent_child
     Ts_pw_p, Ts_cw_c = add_noise(Ts_pw_p, Ts_cw_c, noise, noise_rng)
 
-    def trajectory(times_s: FloatArray, Ts_world_sensor: FloatArray, frame: str) -> Trajectory:
+    def trajectory(
+        times_s: FloatArray, Ts_world_sensor: FloatArray, frame: str
+    ) -> Trajectory:
         """Return a trajectory with stamps that begin at the start time of the drive."""
-        stamps_ns = round(config.start_time * 1e9) + np.round(times_s * 1e9).astype(np.int64)
+        stamps_ns = round(config.start_time * 1e9) + np.round(times_s * 1e9).astype(
+            np.int64
+        )
         return Trajectory(stamps_ns, Ts_world_sensor, frame, f"{frame}_odom")
 
     return SimulatedDrive(
@@ -170,7 +182,9 @@ def _ground_track(
     # Index of the arc at each time.
     arc = np.searchsorted(starts_s, times_s, side="right") - 1
     elapsed_s = times_s - starts_s[arc]
-    positions = corners[arc] + _arc(config.speed, headings[arc], yaw_rates[arc], elapsed_s)
+    positions = corners[arc] + _arc(
+        config.speed, headings[arc], yaw_rates[arc], elapsed_s
+    )
     return positions, headings[arc] + yaw_rates[arc] * elapsed_s
 
 
@@ -204,7 +218,9 @@ def _poses_on_terrain(
         rotations = np.swapaxes(transposed, -1, -2)
     else:
         # z is along the normal, and x is in the vertical plane of the heading.
-        ahead = np.stack([np.cos(headings), np.sin(headings), np.zeros_like(headings)], axis=-1)
+        ahead = np.stack(
+            [np.cos(headings), np.sin(headings), np.zeros_like(headings)], axis=-1
+        )
         y_axes = np.cross(normals, ahead)
         y_axes /= np.linalg.norm(y_axes, axis=-1, keepdims=True)
         x_axes = np.cross(y_axes, normals)
@@ -212,7 +228,9 @@ def _poses_on_terrain(
     return se3.from_rotation_translation(rotations, np.column_stack([positions, z]))
 
 
-def surface(config: options.DriveConfig, x: FloatArray, y: FloatArray) -> tuple[FloatArray, ...]:
+def surface(
+    config: options.DriveConfig, x: FloatArray, y: FloatArray
+) -> tuple[FloatArray, ...]:
     """Return the height (N,) of the ground, m, and its slopes (N,) along x and y.
 
     Parameters
@@ -265,7 +283,10 @@ def _mirrored(values: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]
 
 
 def add_noise(
-    Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, noise: options.NoiseConfig, rng: np.random.Generator
+    Ts_pw_p: FloatArray,
+    Ts_cw_c: FloatArray,
+    noise: options.NoiseConfig,
+    rng: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray]:
     """Add Gaussian noise to both sensors, then drift to the child, then jumps to both sensors.
 
@@ -307,7 +328,9 @@ def _with_gaussian(
     return Ts_world_sensor @ se3.from_rotation_translation(rotations, translations)
 
 
-def _with_jumps(Ts_world_sensor: FloatArray, share: float, rng: np.random.Generator) -> FloatArray:
+def _with_jumps(
+    Ts_world_sensor: FloatArray, share: float, rng: np.random.Generator
+) -> FloatArray:
     """Return a trajectory (N, 4, 4) with jumps: each shifts all later poses along the world's axes.
 
     ``round(share * N)`` poses at which it jumps are drawn with replacement.
@@ -315,7 +338,11 @@ def _with_jumps(Ts_world_sensor: FloatArray, share: float, rng: np.random.Genera
     count = len(Ts_world_sensor)
     indices = rng.integers(count, size=round(share * count))
     shifts = np.zeros((count, 3))
-    np.add.at(shifts, indices, np.sqrt(_JUMP_VARIANCE) * rng.standard_normal((len(indices), 3)))
+    np.add.at(
+        shifts,
+        indices,
+        np.sqrt(_JUMP_VARIANCE) * rng.standard_normal((len(indices), 3)),
+    )
     jumped = Ts_world_sensor.copy()
     jumped[:, :3, 3] += np.cumsum(shifts, axis=0)
     return jumped

@@ -92,7 +92,9 @@ class NoiseConfig:
 
 # Good odometry: 2 mm and 0.06 deg per pose, 2 mm of drift per metre, and a few jumps of some
 # decimetres, as from corrections by SLAM.
-REALISTIC = NoiseConfig(gaussian=0.002, rotation_per_metre=0.5, outliers=0.005, drift=0.002)
+REALISTIC = NoiseConfig(
+    gaussian=0.002, rotation_per_metre=0.5, outliers=0.005, drift=0.002
+)
 
 # Mixture of the article: the middle of each published range.
 MIXTURE = NoiseConfig(gaussian=0.005, outliers=0.05, drift=0.025)

@@ -25,7 +25,9 @@ from hand_eye_calib.formats.bags.pose_table import PoseTable
 from hand_eye_calib.online.ros.conversions import LATCHED, to_time
 
 # Quality of service with which no message is lost.
-_LOSSLESS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
+_LOSSLESS = QoSProfile(
+    history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE
+)
 # Longest time to wait for one callback (s).
 _SPIN_S = 0.02
 # Longest time to wait until the node has done what the player needs for its next step (s).
@@ -64,12 +66,16 @@ def play(
         for stream, topic in topics.items():
             publishers[stream] = node.create_publisher(Odometry, topic, _LOSSLESS)
         solve = node.create_client(Trigger, "calibrator/solve")
-        node.create_subscription(TransformStamped, "calibrator/extrinsic", results.append, LATCHED)
+        node.create_subscription(
+            TransformStamped, "calibrator/extrinsic", results.append, LATCHED
+        )
         wait = partial(_wait, executor, check)
 
         def are_subscribed() -> bool:
             """Whether the node has subscribed to all topics."""
-            return all(publisher.get_subscription_count() for publisher in publishers.values())
+            return all(
+                publisher.get_subscription_count() for publisher in publishers.values()
+            )
 
         def has_all_poses() -> bool:
             """Whether the newest result uses all poses; call ~/solve again if it does not."""
@@ -82,7 +88,9 @@ def play(
         # Time at which the stamp 0 would be played.
         start_s = time.monotonic() - int(poses.stamps_ns[0]) * 1e-9 / speed
         for row, stamp_ns in enumerate(poses.stamps_ns.tolist()):
-            while (remaining_s := start_s + stamp_ns * 1e-9 / speed - time.monotonic()) > 0:
+            while (
+                remaining_s := start_s + stamp_ns * 1e-9 / speed - time.monotonic()
+            ) > 0:
                 executor.spin_once(timeout_sec=remaining_s)
             publishers[poses.streams[row]].publish(_odometry(poses, row))
         wait(solve.service_is_ready, "serve ~/solve")
@@ -107,7 +115,9 @@ def _wait(
     while not condition():
         check()
         if time.monotonic() > end_s:
-            raise HandEyeCalibError(f"waited {_PATIENCE_S:g} s for the node to {purpose}")
+            raise HandEyeCalibError(
+                f"waited {_PATIENCE_S:g} s for the node to {purpose}"
+            )
         executor.spin_once(timeout_sec=_SPIN_S)
 
 
@@ -118,7 +128,9 @@ def _player_node() -> Iterator[tuple[Node, SingleThreadedExecutor]]:
     try:
         rclpy.init(args=[], context=context)
     except RCLError as error:
-        raise HandEyeCalibError(f"cannot start ROS: {' '.join(str(error).split())}") from None
+        raise HandEyeCalibError(
+            f"cannot start ROS: {' '.join(str(error).split())}"
+        ) from None
     node = rclpy.create_node("hand_eye_calib_player", context=context)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)

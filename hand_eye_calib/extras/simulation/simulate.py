@@ -61,7 +61,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     out = "directory to make; it must be empty or not exist"
     add("--out", metavar="DIR", type=Path, required=True, help=out)
-    add("--runs", type=at_least(1), default=1, metavar="N", help="number of recordings. Default: 1")
+    add(
+        "--runs",
+        type=at_least(1),
+        default=1,
+        metavar="N",
+        help="number of recordings. Default: 1",
+    )
     seed = "the same seed gives the same recordings. Default: 0"
     add("--seed", type=at_least(0), default=0, help=seed)
     bag = "also write a bag of every recording, in this storage format"
@@ -97,7 +103,10 @@ def run(arguments: argparse.Namespace) -> int:
     noise = MIXTURE if arguments.mixture else REALISTIC
     _make_empty(arguments.out)
     digits = max(2, len(str(arguments.runs)))
-    folders = [arguments.out / f"run_{number:0{digits}}" for number in range(1, arguments.runs + 1)]
+    folders = [
+        arguments.out / f"run_{number:0{digits}}"
+        for number in range(1, arguments.runs + 1)
+    ]
     for number, folder in with_progress(enumerate(folders), len(folders), "simulating"):
         drive = simulate_drive((arguments.seed, number), config, noise)
         _make_empty(folder)
@@ -109,13 +118,23 @@ def run(arguments: argparse.Namespace) -> int:
             from hand_eye_calib.formats.bags.writer import write_bag
 
             name = "bag.bag" if arguments.bag == "rosbag1" else "bag"
-            streams = {PARENT_TOPIC: (drive.parent, _TYPE), CHILD_TOPIC: (drive.child, _TYPE)}
+            streams = {
+                PARENT_TOPIC: (drive.parent, _TYPE),
+                CHILD_TOPIC: (drive.child, _TYPE),
+            }
             write_bag(folder / name, streams, arguments.bag)
     document = None
     if arguments.json:
         runs = [str(folder) for folder in folders]
-        document = {"runs": runs, "seed": arguments.seed, "drive": config, "noise": noise}
-    print_result([f"{counted(len(folders), 'recording')} written to {arguments.out}"], document)
+        document = {
+            "runs": runs,
+            "seed": arguments.seed,
+            "drive": config,
+            "noise": noise,
+        }
+    print_result(
+        [f"{counted(len(folders), 'recording')} written to {arguments.out}"], document
+    )
     return 0
 
 

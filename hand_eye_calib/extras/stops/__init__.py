@@ -75,7 +75,9 @@ def _are_stops(arguments: Any) -> bool:
     """Return whether the arguments name stops; raise ConfigError if they contradict."""
     are_images = bool(arguments.target) and not arguments.child_topic
     if not arguments.child_topic and are_images != bool(arguments.camera):
-        raise ConfigError("--target and --camera go together: a target and a camera's intrinsics")
+        raise ConfigError(
+            "--target and --camera go together: a target and a camera's intrinsics"
+        )
     are_samples = len(arguments.paths) == 1 and _has_samples(arguments.paths[0])
     are_stops = are_samples or are_images or arguments.order == "none"
     if arguments.command == "arm" and not (are_stops or arguments.child_topic):
@@ -84,7 +86,9 @@ def _are_stops(arguments: Any) -> bool:
             f"{', '.join(sorted(_SAMPLES))}, a folder with files such as robot_1.txt and "
             "target_1.txt, or two files with a row for each stop"
         )
-    _refuse_without_stops(arguments, are_stops, has_hand_file=are_stops and not are_samples)
+    _refuse_without_stops(
+        arguments, are_stops, has_hand_file=are_stops and not are_samples
+    )
     return are_stops
 
 

@@ -182,7 +182,9 @@ def calibrate_arm(
         config = names = None
     config = _checked(config, options)
     if setup is not None and setup not in SETUPS:
-        raise ConfigError(f"setup must be one of {', '.join(SETUPS)}; got {shown_value(setup)}")
+        raise ConfigError(
+            f"setup must be one of {', '.join(SETUPS)}; got {shown_value(setup)}"
+        )
     named = _names_of_frames(names)
     poses = _checked_poses({"robot": robot, "tracking": tracking}, config)
     poses = replace(poses, is_arm=True, has_target=True)
@@ -190,7 +192,10 @@ def calibrate_arm(
 
 
 def calibrate_hand_and_camera(
-    Ts_base_hand: Any, Ts_target_camera: Any, config: CalibratorConfig, setup: str | None = None
+    Ts_base_hand: Any,
+    Ts_target_camera: Any,
+    config: CalibratorConfig,
+    setup: str | None = None,
 ) -> Calibration:
     """Calibrate an arm like :func:`calibrate_arm`, from poses of the camera in the target.
 
@@ -199,24 +204,33 @@ def calibrate_hand_and_camera(
     """
     config = _checked(config, {})
     poses = _checked_poses({"hand": Ts_base_hand, "camera": Ts_target_camera}, config)
-    return _calibrated_arm(replace(poses, is_arm=True), config, _names_of_frames(None), setup)
+    return _calibrated_arm(
+        replace(poses, is_arm=True), config, _names_of_frames(None), setup
+    )
 
 
 def _calibrated_arm(
-    poses: StopPoses, config: CalibratorConfig, named: Mapping[str, str], setup: str | None
+    poses: StopPoses,
+    config: CalibratorConfig,
+    named: Mapping[str, str],
+    setup: str | None,
 ) -> Calibration:
     """Return the result of an arm; ``named`` are the frames base, hand, camera and target."""
     solved = solve_checked(poses, config, setup)
     setup_fit = solved.setup_fit
     solved = solved.adding(*_check_setup(setup_fit, setup))
-    if setup_fit.is_inverse and not (poses.has_target or setup or config.given & _INVERSIONS):
+    if setup_fit.is_inverse and not (
+        poses.has_target or setup or config.given & _INVERSIONS
+    ):
         solved = solved.adding(finding("beside_or_inverse", "child"))
     warnings = list(solved.warnings)
     if solved.is_usable and not config.given >= _INVERSIONS:
         if not setup:
             warnings.append(_setup_in_words(setup_fit))
         solved = solved.adding(*_check_distances(setup_fit, named))
-    return _calibration_of(solved, warnings, _frames_of_arm(named, setup_fit.is_inverse))
+    return _calibration_of(
+        solved, warnings, _frames_of_arm(named, setup_fit.is_inverse)
+    )
 
 
 # ------------------------------------------------------------------ options and poses
@@ -229,7 +243,9 @@ def _are_arrays_of_opencv(config: Any, names: Any) -> bool:
     return not (has_options or has_names)
 
 
-def _checked(config: CalibratorConfig | None, options: Mapping[str, Any]) -> CalibratorConfig:
+def _checked(
+    config: CalibratorConfig | None, options: Mapping[str, Any]
+) -> CalibratorConfig:
     """Return the options of ``config``, those of the keywords, or the default ones.
 
     Raises
@@ -240,7 +256,9 @@ def _checked(config: CalibratorConfig | None, options: Mapping[str, Any]) -> Cal
         If an option is set that has no meaning for stops, or if there are both kinds of options.
     """
     if config is not None and options:
-        raise ConfigError(f"give {', '.join(options)} in config, or without config as keywords")
+        raise ConfigError(
+            f"give {', '.join(options)} in config, or without config as keywords"
+        )
     if options:
         prior = prior_fields(options.get("prior", {}))
         others = {name: value for name, value in options.items() if name != "prior"}
@@ -260,7 +278,9 @@ def _checked(config: CalibratorConfig | None, options: Mapping[str, Any]) -> Cal
                 "one solver; leave it out"
             )
     if config.measured not in ("poses", "rotations"):
-        raise ConfigError(f"stops need poses or rotations of both sides, not {config.measured}")
+        raise ConfigError(
+            f"stops need poses or rotations of both sides, not {config.measured}"
+        )
     return config
 
 
@@ -312,7 +332,9 @@ def _is_copy(fit: RobotWorld) -> bool:
     """
     offsets = np.r_[se3.log(fit.T_parent_child), se3.log(fit.T_world_world)]
     sigmas = np.sqrt(np.diag(fit.covariance))
-    return bool(np.all(np.abs(offsets) < np.maximum(_MIN_IDENTITY, _IDENTITY_SIGMAS * sigmas)))
+    return bool(
+        np.all(np.abs(offsets) < np.maximum(_MIN_IDENTITY, _IDENTITY_SIGMAS * sigmas))
+    )
 
 
 def _setup_in_words(setup_fit: SetupFit) -> str:
@@ -331,7 +353,10 @@ def _check_distances(setup_fit: SetupFit, frames: Mapping[str, str]) -> list[Fin
     the base. ``frames`` has the names of base, hand, camera and target.
     """
     fit = setup_fit.fit
-    if fit.undetermined().size or not se3.translation_of(setup_fit.stops.Ts_world_child).any():
+    if (
+        fit.undetermined().size
+        or not se3.translation_of(setup_fit.stops.Ts_world_child).any()
+    ):
         return []
     on_hand_m = float(np.linalg.norm(se3.translation_of(fit.T_parent_child)))
     from_base_m = float(np.linalg.norm(se3.translation_of(fit.T_world_world)))
@@ -351,7 +376,9 @@ def _check_distances(setup_fit: SetupFit, frames: Mapping[str, str]) -> list[Fin
 
 def _check_left_out(fit: RobotWorld, stops: Stops) -> list[Finding]:
     """Return a finding with the numbers (from 1) of the stops that are clear outliers, if any."""
-    is_clear = (fit.weights == 0.0) & (_squared_distances(fit, stops) > _MIN_REPORTED_SQUARED)
+    is_clear = (fit.weights == 0.0) & (
+        _squared_distances(fit, stops) > _MIN_REPORTED_SQUARED
+    )
     numbers = [str(row + 1) for row in np.flatnonzero(is_clear)]
     count = len(numbers)
     if count == 0:
@@ -375,7 +402,9 @@ def _squared_distances(fit: RobotWorld, stops: Stops) -> FloatArray:
 
     The errors are those in the frame of the child, or in that of its world if they are smaller.
     """
-    predicted = se3.inverse(fit.T_world_world) @ stops.Ts_world_parent @ fit.T_parent_child
+    predicted = (
+        se3.inverse(fit.T_world_world) @ stops.Ts_world_parent @ fit.T_parent_child
+    )
     measured = se3.inverse(stops.Ts_world_child)
     errors = se3.log(np.stack([measured @ predicted, predicted @ measured]))
     levels = np.repeat([fit.level_m, fit.level_rad], 3)
@@ -401,11 +430,17 @@ class _Frames(NamedTuple):
 def _frames_of_arm(names: Mapping[str, str], is_beside: bool) -> _Frames:
     """Return the frames of an arm; ``names`` are those of base, hand, camera and target."""
     if is_beside:
-        return _Frames(names["base"], names["camera"], names["hand"], names["target"], "beside")
-    return _Frames(names["hand"], names["camera"], names["base"], names["target"], "hand")
+        return _Frames(
+            names["base"], names["camera"], names["hand"], names["target"], "beside"
+        )
+    return _Frames(
+        names["hand"], names["camera"], names["base"], names["target"], "hand"
+    )
 
 
-def _calibration_of(solved: SolvedStops, warnings: Sequence[str], frames: _Frames) -> Calibration:
+def _calibration_of(
+    solved: SolvedStops, warnings: Sequence[str], frames: _Frames
+) -> Calibration:
     """Return the result: the fit fused with the prior, with residuals, findings and advice."""
     fit = solved.setup_fit.fit
     stops = solved.setup_fit.stops
@@ -431,7 +466,9 @@ def _calibration_of(solved: SolvedStops, warnings: Sequence[str], frames: _Frame
         start_ns=rows,
         end_ns=rows,
     )
-    worlds = Worlds(Z, covariance_Z, frames.parent_world, frames.child_world, frames.setup)
+    worlds = Worlds(
+        Z, covariance_Z, frames.parent_world, frames.child_world, frames.setup
+    )
     table = StopTable(stop_table(errors, fit.weights, stops.Ts_world_child))
     if solved.is_usable:
         table = _with_advice(table, solved, frames)
@@ -464,7 +501,9 @@ def _with_advice(table: StopTable, solved: SolvedStops, frames: _Frames) -> Stop
         hand = frames.parent_world
     targets = np.repeat([config.target_translation, config.target_rotation], 3)
     setup_fit = solved.setup_fit
-    start, following = next_stops(setup_fit.stops, setup_fit.fit, hand, is_beside, targets)
+    start, following = next_stops(
+        setup_fit.stops, setup_fit.fit, hand, is_beside, targets
+    )
     advice = advice_in_words(start + 1, following)
     return replace(table, start=start + 1, next=following, advice=advice)
 

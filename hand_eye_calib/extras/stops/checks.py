@@ -226,7 +226,9 @@ def _check_conventions(
     """Return findings on inverse poses, and on rival hypotheses that are equally likely."""
     findings = []
     if mistakes.is_inverse and not poses.is_arm:
-        findings.append(finding("inverse_stops", "child", options={"child_invert": "poses"}))
+        findings.append(
+            finding("inverse_stops", "child", options={"child_invert": "poses"})
+        )
     streams = _codes_and_streams(mistakes)
     others = [rival for rival in rivals if _codes_and_streams(rival) != streams]
     if others:
@@ -241,7 +243,9 @@ def _ambiguous(mistakes: Mistakes, rival: Mistakes) -> Finding:
     # Each list has all options that either hypothesis sets, with defaults where necessary. So a
     # user who sets a list selects one hypothesis.
     first = options | defaults_of(name for name in rival_options if name not in options)
-    second = rival_options | defaults_of(name for name in options if name not in rival_options)
+    second = rival_options | defaults_of(
+        name for name in options if name not in rival_options
+    )
     return finding(
         "ambiguous_stops",
         options=second,
@@ -271,11 +275,17 @@ def _check_agreement(fit: RoughFit) -> list[Finding]:
     rotation_share = fit.rotation_share
     position_share = fit.position_share
     ratio = fit.position_ratio
-    are_too_large = rotation_share > MAX_UNEXPLAINED or position_share > UNRELATED_UNEXPLAINED
-    are_beyond_noise = position_share > SMALL_UNEXPLAINED and ratio > _MAX_POSITION_RATIO
+    are_too_large = (
+        rotation_share > MAX_UNEXPLAINED or position_share > UNRELATED_UNEXPLAINED
+    )
+    are_beyond_noise = (
+        position_share > SMALL_UNEXPLAINED and ratio > _MAX_POSITION_RATIO
+    )
     if not (are_too_large or are_beyond_noise):
         return []
-    contradict = position_share > _CONTRADICTING_SHARE and ratio > _CONTRADICTING_POSITION_RATIO
+    contradict = (
+        position_share > _CONTRADICTING_SHARE and ratio > _CONTRADICTING_POSITION_RATIO
+    )
     if contradict or fit.unexplained_share > MAX_UNEXPLAINED:
         severity = Severity.ERROR
     elif fit.unexplained_share >= _DOUBTFUL_SHARE:
@@ -295,7 +305,9 @@ def _do_inliers_agree(sample: StopPoses, fit: RoughFit) -> bool:
     is_inlier = inliers_of(sample.without(fit.mistakes, fit.scale or 1.0))
     if 2 * is_inlier.sum() < len(sample):
         return False
-    inliers = replace(sample, parent=sample.parent[is_inlier], child=sample.child[is_inlier])
+    inliers = replace(
+        sample, parent=sample.parent[is_inlier], child=sample.child[is_inlier]
+    )
     return not _check_agreement(rough_fit(inliers, fit.mistakes))
 
 
@@ -321,7 +333,10 @@ def _check_axes(sample: StopPoses, fit: RoughFit) -> Finding | None:
                 se3.rotation_of(Ts), se3.translation_of(Ts) @ axes.T
             )
             other = rough_fit(sample.with_side(stream, turned), mistakes)
-            if other.log_likelihood > largest and other.unexplained_share < MAX_UNEXPLAINED:
+            if (
+                other.log_likelihood > largest
+                and other.unexplained_share < MAX_UNEXPLAINED
+            ):
                 best = finding("axes", stream, detail=_axes_in_words(axes))
                 largest = other.log_likelihood
     return best
@@ -348,7 +363,9 @@ def _axes_in_words(axes: FloatArray) -> str:
 # ------------------------------------------------------------------ lengths
 
 
-def _with_units(sample: StopPoses, examination: Examination, is_scale_free: bool) -> Examination:
+def _with_units(
+    sample: StopPoses, examination: Examination, is_scale_free: bool
+) -> Examination:
     """Return the examination with findings or repairs of units of length, and the scale left over.
 
     The scale left over is the rough factor of the child's lengths once both sides are in metres.

@@ -55,10 +55,14 @@ def solved(arguments: Namespace) -> tuple[Calibration, Document]:
     if len(paths) == 1:
         samples = read_arm_samples(paths[0])
         setup = arguments.setup
-        result = calibrate_arm(samples.robot, samples.tracking, config, samples.frames, setup)
+        result = calibrate_arm(
+            samples.robot, samples.tracking, config, samples.frames, setup
+        )
         return result, {"samples": _input(paths[0], len(samples.robot))}
     if len(paths) != 2:
-        raise ConfigError("--order none takes two trajectory files, or the samples of an arm")
+        raise ConfigError(
+            "--order none takes two trajectory files, or the samples of an arm"
+        )
     refuse_repeated_paths(paths)
     arguments.pair_by = arguments.pair_by or "row"
     return _from_two_files(arguments, config, options)
@@ -76,7 +80,9 @@ def _from_two_files(
     _require_equal(arguments.paths, len(parent), len(child))
     config = _measuring(config, {"parent": parent, "child": child})
     if arguments.command == "arm" or arguments.setup:
-        result = calibrate_hand_and_camera(parent.poses, child.poses, config, arguments.setup)
+        result = calibrate_hand_and_camera(
+            parent.poses, child.poses, config, arguments.setup
+        )
     else:
         result = calibrate_stops(parent.poses, child.poses, config)
     return result, _inputs(arguments, len(parent), len(child))
@@ -108,13 +114,18 @@ def _from_images(
     _require_equal([hand_path, folder], len(hand), len(images))
     config = _measuring(config, {"parent": hand})
     target = target_images.Target.parse(arguments.target)
-    finder = target_images.TargetFinder(target, target_images.read_camera(arguments.camera))
+    finder = target_images.TargetFinder(
+        target, target_images.read_camera(arguments.camera)
+    )
     for image in with_progress(images, len(images), "finding the target"):
         finder.look(target_images.read_image(image))
     detections = finder.found()
     note(str(detections))
     result = calibrate_arm(
-        hand.poses[detections.images], detections.Ts_camera_target, config, setup=arguments.setup
+        hand.poses[detections.images],
+        detections.Ts_camera_target,
+        config,
+        setup=arguments.setup,
     )
     return result, _inputs(arguments, len(hand), len(detections.images))
 
@@ -154,13 +165,18 @@ def _inputs(arguments: Namespace, n_parent: int, n_child: int) -> Document:
     """Return file and number of poses of both sides, for the result file."""
     parent_path = arguments.paths[0]
     child_path = arguments.paths[-1]
-    return {"parent": _input(parent_path, n_parent), "child": _input(child_path, n_child)}
+    return {
+        "parent": _input(parent_path, n_parent),
+        "child": _input(child_path, n_child),
+    }
 
 
 def _refuse_ignored(arguments: Namespace) -> None:
     """Raise ConfigError for an argument that has no effect on stops."""
     if arguments.pair_by == "time":
-        raise ConfigError("--pair-by time has no meaning for stops, which have no stamps; give row")
+        raise ConfigError(
+            "--pair-by time has no meaning for stops, which have no stamps; give row"
+        )
     names = ["topics"]
     of_streams = ["topic", "fields"]
     if len(arguments.paths) == 1:
@@ -172,7 +188,9 @@ def _refuse_ignored(arguments: Namespace) -> None:
             raise ConfigError(f"--{flag(name)} has no meaning for stops; leave it out")
 
 
-def _measuring(config: CalibratorConfig, streams: Mapping[str, Trajectory]) -> CalibratorConfig:
+def _measuring(
+    config: CalibratorConfig, streams: Mapping[str, Trajectory]
+) -> CalibratorConfig:
     """Return the options with the kind of data of each stream taken from its file.
 
     An option of the user other than ``auto`` wins.

@@ -118,7 +118,9 @@ def fit_components(
     # J. M. G. Taylor, *Robust statistical modeling using the t distribution*, JASA 84, 1989,
     # section 4.
     expected_weights = (degrees + 6.0) / (degrees + 8.0) * weights
-    information = np.einsum("n,nij,nik->jk", expected_weights, jacobian, precisions @ jacobian)
+    information = np.einsum(
+        "n,nij,nik->jk", expected_weights, jacobian, precisions @ jacobian
+    )
     return ComponentsFit(X, Z, information, whitening, iteration.student)
 
 
@@ -166,12 +168,17 @@ def fit_linear(
     values = np.zeros(len(lengths))
     for _ in range(_MAX_LINEAR_ROUNDS):
         remaining = errors + columns @ values
-        iteration = _iteration(components, sources, remaining, columns, weights, degrees)
+        iteration = _iteration(
+            components, sources, remaining, columns, weights, degrees
+        )
         values = values + iteration.step
         updated = _updated(components, prior, iteration.quadratic, iteration.expected)
         log_change = float(np.max(np.abs(np.log(updated / components))))
         components = updated
-        if iteration.decrease < _SMALL_LINEAR_STEP**2 and log_change < _SMALL_LOG_CHANGE:
+        if (
+            iteration.decrease < _SMALL_LINEAR_STEP**2
+            and log_change < _SMALL_LOG_CHANGE
+        ):
             break
     shares = (degrees + 6.0) / (degrees + 8.0) * weights
     by_values = iteration.precisions @ columns
@@ -243,7 +250,10 @@ def _iteration(
 
 
 def _updated(
-    components: FloatArray, prior: FloatArray, quadratic: FloatArray, expected: FloatArray
+    components: FloatArray,
+    prior: FloatArray,
+    quadratic: FloatArray,
+    expected: FloatArray,
 ) -> FloatArray:
     """Return the variances (4,) after one iteration of the MM algorithm with the prior."""
     # Derivative of the prior's log density, times two.
@@ -256,7 +266,9 @@ def _updated(
     denominator = not_negative + downwards / components
     # A source without effect keeps its variance: that along the line of sight if all positions are
     # zero.
-    squared = np.divide(numerator, denominator, out=components**2, where=denominator > 0.0)
+    squared = np.divide(
+        numerator, denominator, out=components**2, where=denominator > 0.0
+    )
     return np.maximum(np.sqrt(squared), MIN_VARIANCE)
 
 

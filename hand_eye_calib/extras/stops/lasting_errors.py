@@ -25,7 +25,9 @@ _N_BY_PLACE = 2
 _TINY = np.finfo(float).tiny
 
 
-def views_of_stops(Ts_world_parent: FloatArray, Ts_world_child: FloatArray) -> FloatArray:
+def views_of_stops(
+    Ts_world_parent: FloatArray, Ts_world_child: FloatArray
+) -> FloatArray:
     """Return the views (N, 13) of stops, whose distances are about angles in rad.
 
     Column 0 is the length of the way up to the stop: the sum of the changes of the view. Columns 1

@@ -48,7 +48,10 @@ _N_COLUMNS = 13
 _PARTS = {"camera": slice(0, 6), "target": slice(6, 12)}
 
 # Names of the parts for two sensors that are no arm.
-_SENSOR_PARTS = {"camera": "the child on the parent", "target": "the world of one sensor"}
+_SENSOR_PARTS = {
+    "camera": "the child on the parent",
+    "target": "the world of one sensor",
+}
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,9 @@ def _movements(stops: Stops, fit: RobotWorld) -> list[_Movement]:
             after[:start] = 0.0
             jacobian = np.concatenate([rows[:, :, :_N_COLUMNS], after], axis=2)
             linear = fit_linear(stops, errors, jacobian, variances, weights, _DEGREES)
-            typical = min(median(linear.weights[:start]), median(linear.weights[start:]))
+            typical = min(
+                median(linear.weights[:start]), median(linear.weights[start:])
+            )
             if typical < _MIN_WEIGHT:
                 continue
             change = linear.values[_N_COLUMNS:]

@@ -76,10 +76,14 @@ def next_stops(
         jacobian = whitened_rows(stop, fit)[0, :, :12]
         gains[NextStop(axis, angle_deg, frame)] = jacobian.T @ jacobian
     levels = np.repeat([fit.level_m, fit.level_rad], 3)
-    information = fit.information + np.diag(np.tile(1.0 / (_PRIOR_LEVELS * levels) ** 2, 2))
+    information = fit.information + np.diag(
+        np.tile(1.0 / (_PRIOR_LEVELS * levels) ** 2, 2)
+    )
     chosen = []
     for _ in range(_N_NEXT):
-        costs = {stop: _cost(information + gain, targets) for stop, gain in gains.items()}
+        costs = {
+            stop: _cost(information + gain, targets) for stop, gain in gains.items()
+        }
         best = min(costs, key=costs.__getitem__)
         chosen.append(best)
         information = information + gains.pop(best)
@@ -95,7 +99,9 @@ def advice_in_words(number: int, stops: tuple[NextStop, ...]) -> str:
     )
 
 
-def _turned(stop: Stops, fit: RobotWorld, vector: FloatArray, is_inverse: bool) -> Stops:
+def _turned(
+    stop: Stops, fit: RobotWorld, vector: FloatArray, is_inverse: bool
+) -> Stops:
     """Return a stop with the hand turned by a rotation vector (3,), given in its own axes.
 
     The hand is moved so that the target keeps its position in the camera. ``is_inverse`` as in

@@ -26,7 +26,17 @@ _SUFFIXES = (".yaml", ".yml", ".json", ".txt")
 # Words for the sides in names of files. ViSP names the pose of b in a ``aPb``, where f is the base,
 # e the end effector, c the camera and o the object (target).
 _ROBOT_WORDS = {"pe", "robot", "hand", "gripper", "flange", "ee", "eef", "tcp", "tool"}
-_TARGET_WORDS = {"po", "target", "marker", "board", "tag", "object", "camera", "cam", "tracking"}
+_TARGET_WORDS = {
+    "po",
+    "target",
+    "marker",
+    "board",
+    "tag",
+    "object",
+    "camera",
+    "cam",
+    "tracking",
+}
 
 # Words for poses of the robot if no file has a word above, as in ``pos01.yaml`` of Zivid.
 _POSE_WORDS = {"pos", "pose", "poses"}

@@ -69,7 +69,9 @@ def robot_poses(rows: Any, robot: str) -> FloatArray:
     values = np.atleast_2d(floats("rows", rows))
     n_values = 7 if robot == "abb" else 6
     if values.ndim != 2 or values.shape[1] != n_values:
-        raise InputError(f"a pose of {robot} has {n_values} numbers; found {values.shape[-1]}")
+        raise InputError(
+            f"a pose of {robot} has {n_values} numbers; found {values.shape[-1]}"
+        )
     positions = values[:, :3]
     angles = values[:, 3:]
     if robot == "abb":

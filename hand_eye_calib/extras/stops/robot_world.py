@@ -306,7 +306,9 @@ def _variances(
     final_sum = ((degrees + 6.0) * n - 2.0 * n_free) / degrees
     means = final_sum / weights.sum() * (weights @ squared) / n_free
     if 3 * n <= _N_VALUES:
-        places_m2 = se3.translation_of(stops.Ts_world_child).var(axis=0).sum() + MIN_VARIANCE
+        places_m2 = (
+            se3.translation_of(stops.Ts_world_child).var(axis=0).sum() + MIN_VARIANCE
+        )
         means = means @ [0.5 / places_m2, 0.5] * np.array([places_m2, 1.0])
     return np.maximum(means, MIN_VARIANCE)
 
@@ -359,7 +361,9 @@ def _fit(
         distances = squared @ (1.0 / variances)
         weights = rests * student_weights(distances, degrees)
         whitening = np.sqrt(weights[:, None] * np.repeat(1.0 / variances, 3))
-        rows = whitening[..., None] * np.concatenate([jacobian, errors[..., None]], axis=2)
+        rows = whitening[..., None] * np.concatenate(
+            [jacobian, errors[..., None]], axis=2
+        )
         products = _products(rows)
         step = _gauss_newton_step(products)
         step_X, step_Z = se3.exp(step.reshape(2, 6))
@@ -378,7 +382,9 @@ def _fit(
         T_world_world=Z,
         covariance=np.zeros((_N_VALUES, _N_VALUES)),
         information=fisher,
-        weights=np.where(distances < _OUTLIER_SQUARED, np.minimum(weights / rests, 1.0), 0.0),
+        weights=np.where(
+            distances < _OUTLIER_SQUARED, np.minimum(weights / rests, 1.0), 0.0
+        ),
         level_m=float(np.sqrt(variances[0])),
         level_rad=float(np.sqrt(variances[1])),
         objective=float(objective),
@@ -458,7 +464,9 @@ def _with_lasting_errors(
     scores = lasting[:12, :12] + longer.scores
     # Few stops hardly determine the variances of the errors.
     level_factor = 1.0 + 2.0 / max(3.0 * len(stops) - 0.5 * _N_VALUES, 0.5)
-    covariance = level_factor * (fit.covariance + fit.covariance @ scores @ fit.covariance)
+    covariance = level_factor * (
+        fit.covariance + fit.covariance @ scores @ fit.covariance
+    )
     return replace(
         fit,
         covariance=covariance,
@@ -486,7 +494,9 @@ def rows_of(stops: Stops, fit: RobotWorld) -> FloatArray:
     estimated scale too small.
     """
     errors, jacobian = _linearise(stops, fit.T_parent_child, fit.T_world_world)
-    predicted = se3.inverse(fit.T_world_world) @ stops.Ts_world_parent @ fit.T_parent_child
+    predicted = (
+        se3.inverse(fit.T_world_world) @ stops.Ts_world_parent @ fit.T_parent_child
+    )
     by_length = np.zeros((len(stops), 6))
     by_length[:, :3] = se3.translation_of(se3.inverse(predicted))
     return np.concatenate([jacobian, by_length[..., None], errors[..., None]], axis=2)
@@ -509,7 +519,9 @@ def _stretch_of(rows: FloatArray, lasting: FloatArray, stretch: float) -> _Stret
     # Components of the scale's derivative, and of the errors along it, that X and Z cannot explain.
     by_length, by_errors = np.linalg.cholesky(products)[12:, 12]
     direction = np.append(-np.linalg.solve(products[:12, :12], products[:12, 12]), 1.0)
-    inflation = max(1.0 + float(direction @ lasting @ direction) / float(by_length**2), 1.0)
+    inflation = max(
+        1.0 + float(direction @ lasting @ direction) / float(by_length**2), 1.0
+    )
     step = 0.0
     sigma = math.inf
     # The regularisation of ``products`` alone would give a value below this limit.

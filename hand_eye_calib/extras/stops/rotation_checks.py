@@ -117,7 +117,9 @@ def _usual_orders(n: int) -> Iterator[_Order]:
         earlier = rows[:-shift]
         yield _Order(f"if the child's are moved down {by_rows}", later, earlier)
         yield _Order(f"if the parent's are moved down {by_rows}", earlier, later)
-    yield _Order("if those of one side are read from the last to the first", rows, rows[::-1])
+    yield _Order(
+        "if those of one side are read from the last to the first", rows, rows[::-1]
+    )
     for first in (0, 1):
         by_name = np.argsort([str(row + first) for row in rows], kind="stable")
         if np.array_equal(by_name, rows):
@@ -127,7 +129,9 @@ def _usual_orders(n: int) -> Iterator[_Order]:
         yield _Order(f"{text} and the other by numbers (parent)", rows, by_name)
 
 
-def _check_shifted_block(of_parent: FloatArray, of_child: FloatArray) -> Iterator[Finding]:
+def _check_shifted_block(
+    of_parent: FloatArray, of_child: FloatArray
+) -> Iterator[Finding]:
     """Yield a finding if one side misses a row: from there on, its rows are shifted by one.
 
     Parameters
@@ -135,14 +139,19 @@ def _check_shifted_block(of_parent: FloatArray, of_child: FloatArray) -> Iterato
     of_parent, of_child : (N, N) arrays
         Angles between the stops of each side, rad.
     """
-    blocks = [_likeliest_block(of_parent, of_child), _likeliest_block(of_child, of_parent)]
+    blocks = [
+        _likeliest_block(of_parent, of_child),
+        _likeliest_block(of_child, of_parent),
+    ]
     gain, first_row = max(blocks)
     if gain > _MIN_BLOCK_GAIN:
         text = f"from row {first_row + 1} on if one side is moved by one row"
         yield finding("rows", text=text)
 
 
-def _likeliest_block(angles: FloatArray, angles_of_other: FloatArray) -> tuple[float, int]:
+def _likeliest_block(
+    angles: FloatArray, angles_of_other: FloatArray
+) -> tuple[float, int]:
     """Return the gain of shifting the likeliest block of rows by one, and its first row.
 
     In the block, which reaches to the last row, row i of ``angles`` (N, N) belongs to row i + 1 of
@@ -219,7 +228,9 @@ def _vectors_of_one_sign(rotations: FloatArray) -> FloatArray:
 _VECTORS = "rotation vectors"
 _FIXED = "angles about the fixed axes x, y, z (roll, pitch, yaw)"
 _MOVING = "angles about the moving axes x, y, z"
-_REVERSED = "angles about the fixed axes x, y, z in the order yaw, pitch, roll (A, B, C)"
+_REVERSED = (
+    "angles about the fixed axes x, y, z in the order yaw, pitch, roll (A, B, C)"
+)
 
 # For each kind of angles: the function from three numbers (N, 3) to rotations (N, 3, 3).
 _ROTATIONS_OF: dict[str, _Conversion] = {
@@ -256,7 +267,8 @@ class _AngleKind(NamedTuple):
     def unexplained_share(self) -> float:
         """Unexplained share of the better setup with these rotations."""
         fits = [
-            rough_fit(self.poses, Mistakes(is_inverse=is_inverse)) for is_inverse in (False, True)
+            rough_fit(self.poses, Mistakes(is_inverse=is_inverse))
+            for is_inverse in (False, True)
         ]
         return min(fit.unexplained_share for fit in fits)
 
@@ -272,11 +284,18 @@ def check_angles(poses: StopPoses) -> Iterator[Finding]:
     if are_equal or difference_rad < SMALL_UNEXPLAINED * turn_rad:
         return
     within_rad = min(difference_rad / MIN_IMPROVEMENT, MAX_UNEXPLAINED * turn_rad)
-    kinds = [*_other_kinds(sample, "parent", of_child), *_other_kinds(sample, "child", of_parent)]
+    kinds = [
+        *_other_kinds(sample, "parent", of_child),
+        *_other_kinds(sample, "child", of_parent),
+    ]
     agreeing = [kind for kind in kinds if kind.difference_rad < within_rad]
     if agreeing:
         smallest_rad = min(kind.difference_rad for kind in agreeing)
-        best = [kind for kind in agreeing if kind.difference_rad <= _MAX_EQUAL_RATIO * smallest_rad]
+        best = [
+            kind
+            for kind in agreeing
+            if kind.difference_rad <= _MAX_EQUAL_RATIO * smallest_rad
+        ]
         chosen = min(best, key=lambda kind: kind.unexplained_share)
         yield finding("angles", chosen.stream, detail=chosen.text)
     elif difference_rad > MIN_TURN_RAD and _are_unrelated(of_parent, of_child):
@@ -299,7 +318,9 @@ def _other_kinds(
             rotations = rotations_of(numbers)
             reread = se3.from_rotation_translation(rotations, se3.translation_of(Ts))
             yield _AngleKind(
-                difference_rad=median_difference(angles_between(reread), angles_of_other),
+                difference_rad=median_difference(
+                    angles_between(reread), angles_of_other
+                ),
                 stream=stream,
                 text=f"{meant}, not {read_as}",
                 poses=sample.with_side(stream, reread),
@@ -312,6 +333,8 @@ def _are_unrelated(of_parent: FloatArray, of_child: FloatArray) -> bool:
     in_random_order_rad = []
     for _ in range(_N_RANDOM_ORDERS):
         rows = random.permutation(len(of_child))
-        in_random_order_rad.append(median_difference(of_parent, of_child[np.ix_(rows, rows)]))
+        in_random_order_rad.append(
+            median_difference(of_parent, of_child[np.ix_(rows, rows)])
+        )
     difference_rad = median_difference(of_parent, of_child)
     return difference_rad > UNRELATED_UNEXPLAINED * median(in_random_order_rad)

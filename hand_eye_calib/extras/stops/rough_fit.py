@@ -13,7 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray
-from hand_eye_calib.core.base.stats import median, medians, robust_regression, robust_weights
+from hand_eye_calib.core.base.stats import (
+    median,
+    medians,
+    robust_regression,
+    robust_weights,
+)
 from hand_eye_calib.core.checks.findings import CONVENTIONS
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.stops.closed_form import Stops, closest_rotations
@@ -76,7 +81,9 @@ class StopPoses:
 
     def with_side(self, stream: str, Ts: FloatArray) -> "StopPoses":
         """Return the stops with other poses (N, 4, 4) of the parent or the child."""
-        return replace(self, parent=Ts) if stream == "parent" else replace(self, child=Ts)
+        return (
+            replace(self, parent=Ts) if stream == "parent" else replace(self, child=Ts)
+        )
 
     def without(self, mistakes: "Mistakes", scale: float = 1.0) -> Stops:
         """Return stops of ``A X = Z B``, with mistakes undone and the child's lengths scaled."""
@@ -151,7 +158,9 @@ def min_certain_gain(n_stops: int) -> float:
 
 def scaled(Ts: FloatArray, factor: float) -> FloatArray:
     """Return poses (N, 4, 4) with their translations multiplied by a factor."""
-    return se3.from_rotation_translation(se3.rotation_of(Ts), factor * se3.translation_of(Ts))
+    return se3.from_rotation_translation(
+        se3.rotation_of(Ts), factor * se3.translation_of(Ts)
+    )
 
 
 def angles_between(Ts: FloatArray) -> FloatArray:

@@ -29,7 +29,11 @@ from hand_eye_calib.formats.npz import read_arrays
 from hand_eye_calib.formats.yaml_files import read_yaml
 
 # Names of the two poses of a sample in files of other programs: robot first, then target.
-_NAMES = (("effector_wrt_world", "object_wrt_sensor"), ("robot", "tracking"), ("robot", "optical"))
+_NAMES = (
+    ("effector_wrt_world", "object_wrt_sensor"),
+    ("robot", "tracking"),
+    ("robot", "optical"),
+)
 
 # Keys of the names of frames in files of easy_handeye and easy_handeye2.
 _FRAMES = {
@@ -61,7 +65,9 @@ _QUANTITIES = {
 _OPENCV_FRAMES = {
     **dict.fromkeys(("gripper", "hand", "ee", "eef", "flange", "tool", "tcp"), "hand"),
     **dict.fromkeys(("base", "robot"), "base"),
-    **dict.fromkeys(("target", "world", "board", "marker", "tag", "object", "obj"), "target"),
+    **dict.fromkeys(
+        ("target", "world", "board", "marker", "tag", "object", "obj"), "target"
+    ),
     **dict.fromkeys(("cam", "camera", "sensor"), "camera"),
 }
 
@@ -137,7 +143,11 @@ def _listed_samples(path: str | Path, document: Any) -> ArmSamples:
     is_inverse = False
     if isinstance(document, Mapping) and "samples" in document:
         parameters = document.get("parameters") or {}
-        frames = {name: parameters[key] for name, key in _FRAMES.items() if parameters.get(key)}
+        frames = {
+            name: parameters[key]
+            for name, key in _FRAMES.items()
+            if parameters.get(key)
+        }
         # For eye_on_base, easy_handeye stores the pose of the base in the hand as ``robot``.
         is_inverse = parameters.get("calibration_type") == "eye_on_base"
         document = document["samples"]

@@ -137,7 +137,9 @@ def solve_checked(
         If the scale is to be estimated from rotations alone.
     """
     if config.scale == "estimate" and not poses.has_positions:
-        raise ConfigError("scale estimate needs positions; both sides have rotations alone")
+        raise ConfigError(
+            "scale estimate needs positions; both sides have rotations alone"
+        )
     repaired = _repaired(poses, config)
     poses = repaired.poses
     findings = repaired.findings
@@ -181,7 +183,9 @@ def _repaired(poses: StopPoses, config: CalibratorConfig) -> _Repaired:
     return _Repaired(poses, config, unit, rough_scale or 1.0, findings, warnings)
 
 
-def _in_metres(poses: StopPoses, config: CalibratorConfig, child_unit: float) -> StopPoses:
+def _in_metres(
+    poses: StopPoses, config: CalibratorConfig, child_unit: float
+) -> StopPoses:
     """Return poses in metres and in the usual convention, by the options.
 
     ``child_unit`` is the factor from the child's lengths to metres.
@@ -189,7 +193,9 @@ def _in_metres(poses: StopPoses, config: CalibratorConfig, child_unit: float) ->
     parent = se3.put_right(poses.parent, config.parent_invert, config.parent_quaternion)
     child = se3.put_right(poses.child, config.child_invert, config.child_quaternion)
     return replace(
-        poses, parent=scaled(parent, config.parent_scale), child=scaled(child, child_unit)
+        poses,
+        parent=scaled(parent, config.parent_scale),
+        child=scaled(child, child_unit),
     )
 
 
@@ -208,7 +214,9 @@ def _with_user_options(
             findings.append(_with_user_values(issue, config))
         elif not is_decided:
             findings.append(issue)
-    settled_codes = {issue.code for issue in examination.repairs if {*issue.options} & config.given}
+    settled_codes = {
+        issue.code for issue in examination.repairs if {*issue.options} & config.given
+    }
     repairs = []
     for issue in examination.repairs:
         if issue.code in settled_codes:
@@ -274,7 +282,11 @@ def _likelier_setup(poses: StopPoses, scale: float, setup: str | None) -> SetupF
 
 def _determines_scale(poses: StopPoses, findings: Sequence[Finding]) -> bool:
     """Return whether the stops determine the scale of the child's lengths: no error, two axes."""
-    return not has_error(findings) and poses.has_positions and turns_about_two_axes(poses.parent)
+    return (
+        not has_error(findings)
+        and poses.has_positions
+        and turns_about_two_axes(poses.parent)
+    )
 
 
 def _with_estimated_scale(poses: StopPoses, setup_fit: SetupFit) -> SetupFit:
@@ -293,7 +305,9 @@ def _with_estimated_scale(poses: StopPoses, setup_fit: SetupFit) -> SetupFit:
     return replace(setup_fit, fit=fit, stops=stops, scale=scale, scale_sigma=sigma)
 
 
-def _with_checked_scale(setup_fit: SetupFit, repaired: _Repaired, setup: str | None) -> SetupFit:
+def _with_checked_scale(
+    setup_fit: SetupFit, repaired: _Repaired, setup: str | None
+) -> SetupFit:
     """Return the fit with unchanged lengths of the child, or with an estimated scale.
 
     The scale is estimated if it is clearly not 1, or if the user asks for it. The first case is
@@ -317,11 +331,15 @@ def _with_checked_scale(setup_fit: SetupFit, repaired: _Repaired, setup: str | N
     scale = repaired.unit * free.scale
     sigma = repaired.unit * free.scale_sigma
     if not (is_auto and is_size):
-        issue = finding("target_scale", "child", scale=scale, sigma=sigma, times=1.0 / scale)
+        issue = finding(
+            "target_scale", "child", scale=scale, sigma=sigma, times=1.0 / scale
+        )
         repaired.findings.append(replace(issue, options={"scale": "estimate"}))
     if not is_size or config.is_known("scale"):
         return as_given
-    repaired.warnings.append(_scale_in_words(scale, sigma, 1.0 if is_auto else repaired.unit))
+    repaired.warnings.append(
+        _scale_in_words(scale, sigma, 1.0 if is_auto else repaired.unit)
+    )
     return free
 
 
@@ -344,19 +362,25 @@ def _is_clearly_not_one(free: SetupFit) -> bool:
     return change > max(_MIN_SCALE_CHANGE, _MIN_SCALE_SIGMAS * sigma)
 
 
-def _with_movement(poses: StopPoses, setup_fit: SetupFit, findings: list[Finding]) -> list[Finding]:
+def _with_movement(
+    poses: StopPoses, setup_fit: SetupFit, findings: list[Finding]
+) -> list[Finding]:
     """Return the findings, with a movement of the camera or of the target if there is one.
 
     The movement replaces the finding that stops disagree. Other errors may look like a movement.
     """
     others = [issue for issue in findings if issue.key != "disagreeing_stops"]
-    if has_error(others) or not (poses.has_positions and turns_about_two_axes(poses.parent)):
+    if has_error(others) or not (
+        poses.has_positions and turns_about_two_axes(poses.parent)
+    ):
         return findings
     moved = check_movement(setup_fit.stops, setup_fit.fit, poses.is_arm)
     return [moved, *others] if moved else findings
 
 
-def _check_unknown(poses: StopPoses, fit: RobotWorld, findings: Sequence[Finding]) -> list[Finding]:
+def _check_unknown(
+    poses: StopPoses, fit: RobotWorld, findings: Sequence[Finding]
+) -> list[Finding]:
     """Return a finding if directions of X are unobservable.
 
     The cause is that the stops rotate about one axis only, or that they contradict each other.

@@ -43,7 +43,9 @@ def _of_two_wheels(wheels: VehicleParameters) -> Controller:
     remarks = []
     if wheels.is_factor:
         nominal_radius = 1.0
-        remarks.append("wheel_radius: keep the value with which the speeds in m/s were computed")
+        remarks.append(
+            "wheel_radius: keep the value with which the speeds in m/s were computed"
+        )
     else:
         nominal_radius = wheels.nominal_radius_m or wheels.radius
         values["wheel_radius"] = nominal_radius
@@ -112,7 +114,9 @@ def _of_omni(wheels: VehicleParameters) -> Controller:
     if wheels.nominal_radius_m:
         values["kinematics.wheels_radius"] = forward * wheels.nominal_radius_m
     else:
-        remarks.append(f"kinematics.wheels_radius: multiply yours by {fixed(forward, _DECIMALS)}")
+        remarks.append(
+            f"kinematics.wheels_radius: multiply yours by {fixed(forward, _DECIMALS)}"
+        )
     remarks.append(
         f"Sideways the wheels roll {fixed(left / forward, _DECIMALS)} times as far; the controller "
         "has no parameter for this"
@@ -149,6 +153,8 @@ def controller_text(wheels: VehicleParameters, headline: str) -> str:
         *controller.remarks,
     ]
     comments = "".join(f"# {line}\n" for line in lines)
-    parameters = {name: round(value, _DECIMALS) for name, value in controller.values.items()}
+    parameters = {
+        name: round(value, _DECIMALS) for name, value in controller.values.items()
+    }
     document = {controller.name: {"ros__parameters": parameters}}
     return comments + (yaml.safe_dump(document, sort_keys=False) if parameters else "")

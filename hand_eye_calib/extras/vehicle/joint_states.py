@@ -25,7 +25,9 @@ class JointStateReading(Reading):
         Kind of wheel data; "auto" for the left and the right wheels.
     """
 
-    def __init__(self, stream: str, topic: str, names: str, measures: str = "auto") -> None:
+    def __init__(
+        self, stream: str, topic: str, names: str, measures: str = "auto"
+    ) -> None:
         super().__init__(stream, topic)
         self._measures = "wheels" if measures == "auto" else measures
         self._joints = WheelJoints(topic, self._measures, names)
@@ -43,8 +45,12 @@ class JointStateReading(Reading):
         """Return the path of the unit vehicle; raise InputError if no message has wheels."""
         joints = self._joints.joints
         if joints is None or not self._rows:
-            raise InputError(f"{self.name}: no message has wheels; {self._joints.expected}")
-        words = ("wheels", "steering") if self._measures in STEERED else ("left", "right")
+            raise InputError(
+                f"{self.name}: no message has wheels; {self._joints.expected}"
+            )
+        words = (
+            ("wheels", "steering") if self._measures in STEERED else ("left", "right")
+        )
         self.notes.append(
             f"{self.name}: {words[0]} {listing(joints.first)}, {words[1]} {listing(joints.second)}"
         )
@@ -57,12 +63,16 @@ class JointStateReading(Reading):
         stamps_ns = stamps_ns[is_used]
         means = self._joints.means(stamps_ns, values[is_used])
         wheels = unit_path(stamps_ns, means, self._measures)
-        table = PoseTable.of(stamps_ns, se3.to_rows(wheels.poses), "", wheels.sensor_frame)
+        table = PoseTable.of(
+            stamps_ns, se3.to_rows(wheels.poses), "", wheels.sensor_frame
+        )
         return self._stamped(table.recorded(self.stream, bag_times_ns[is_used]))
 
     def _usable(self, values: FloatArray, stamps_ns: IntArray) -> BoolArray:
         """Return which messages (N,) have all values, and stamps after those before them."""
-        earlier_ns = np.maximum.accumulate(np.insert(stamps_ns[:-1], 0, stamps_ns[0] - 1))
+        earlier_ns = np.maximum.accumulate(
+            np.insert(stamps_ns[:-1], 0, stamps_ns[0] - 1)
+        )
         is_used = np.isfinite(values).all(axis=1) & (stamps_ns > earlier_ns)
         if not is_used.all():
             self.notes.append(

@@ -85,7 +85,10 @@ class WheelJoints:
         return f"name the joints: {self._topic}?{pair}"
 
     def row(
-        self, names: Sequence[str], positions: Sequence[float], velocities: Sequence[float]
+        self,
+        names: Sequence[str],
+        positions: Sequence[float],
+        velocities: Sequence[float],
     ) -> tuple[float, float] | None:
         """Return the wheel data in a message; None for a message of other joints.
 
@@ -99,7 +102,9 @@ class WheelJoints:
             If the joints of the wheels are unclear.
         """
         self.joints = self.joints or self._found(names)
-        if self.joints is None or not {*self.joints.first, *self.joints.second} <= {*names}:
+        if self.joints is None or not {*self.joints.first, *self.joints.second} <= {
+            *names
+        }:
             # Other joints may be published on the same topic.
             return None
         self.are_positions = not len(velocities)

@@ -18,7 +18,12 @@ from hand_eye_calib.core.base.registry import OUT_OF_REACH
 from hand_eye_calib.core.base.stats import quantile
 from hand_eye_calib.core.base.text import listing
 from hand_eye_calib.core.checks.check import CheckResult
-from hand_eye_calib.core.checks.findings import Finding, Severity, finding, gravest_first
+from hand_eye_calib.core.checks.findings import (
+    Finding,
+    Severity,
+    finding,
+    gravest_first,
+)
 from hand_eye_calib.core.checks.streams import check_stream
 from hand_eye_calib.core.engine import estimation
 from hand_eye_calib.core.engine.kinds import Kind
@@ -150,7 +155,9 @@ def _solve(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
     rival = RIVALS.get(config.parent_measures)
     if rival:
         model = MODELS[rival]
-        other = fit_drive(replace(drive, model=model), replace(longer, model=model), fixed)
+        other = fit_drive(
+            replace(drive, model=model), replace(longer, model=model), fixed
+        )
         if _log_ratio(other, fit) > SIGNIFICANT:
             findings = (finding(f"speed_of_{rival}"),)
     return _calibration(fit, findings, drive, pairs, offset_s, config)
@@ -251,7 +258,9 @@ def _calibration(
         return result
     sigmas = np.sqrt(np.diag(fit.covariance))[N_FIXED:]
     values = fit.others[N_FIXED - CLOCK :]
-    parameters = map(VehicleParameter, drive.model.names, values.tolist(), sigmas.tolist())
+    parameters = map(
+        VehicleParameter, drive.model.names, values.tolist(), sigmas.tolist()
+    )
     wheels = VehicleParameters(
         tuple(parameters),
         slip_share=float(np.mean(fit.weights == 0.0)),
@@ -275,7 +284,13 @@ def _check_size(wheels: VehicleParameters) -> tuple[Finding, ...]:
             return ()
         cause = _cause_of(ratio)
         return (
-            finding("radius_not_nominal", radius=radius, ratio=ratio, nominal=nominal, cause=cause),
+            finding(
+                "radius_not_nominal",
+                radius=radius,
+                ratio=ratio,
+                nominal=nominal,
+                cause=cause,
+            ),
         )
     lowest, highest = _USUAL_RADII_M if radius else _USUAL_MULTIPLIERS
     if lowest <= ratio <= highest:
@@ -308,7 +323,9 @@ def _allowance(pairs: PosePairs, config: CalibratorConfig) -> FloatArray:
     """Return the covariance (6, 6) of constant errors of the sensor that no recording reveals."""
     if config.child_kind != "odometry":
         return np.zeros((6, 6))
-    speed_m_s = common_mode.usual_speed(pairs.stamps_ns, se3.translation_of(pairs.Ts_cw_c))
+    speed_m_s = common_mode.usual_speed(
+        pairs.stamps_ns, se3.translation_of(pairs.Ts_cw_c)
+    )
     # The floor is that of two odometries. Here only the sensor has one: half of the floor.
     return 0.5 * common_mode.common_mode_floor(speed_m_s)
 
@@ -320,7 +337,9 @@ def _residuals_of(fit: Fit, drive: Drive, start_ns: int) -> Residuals:
     """
     residuals = np.zeros(drive.xi.shape)
     residuals[:, drive.components] = fit.residuals
-    window_start_ns, window_end_ns = start_ns + np.round(drive.ends_s * 1e9).astype(np.int64)
+    window_start_ns, window_end_ns = start_ns + np.round(drive.ends_s * 1e9).astype(
+        np.int64
+    )
     return Residuals(
         translation=residuals[:, :3],
         rotation=residuals[:, 3:] @ se3.rotation_of(fit.T_base_sensor),
@@ -352,12 +371,16 @@ def _check_fit(fit: Fit, drive: Drive, config: CalibratorConfig) -> tuple[Findin
     sigmas = 2.0 * np.sqrt(np.diag(fit.covariance))
     differences = np.abs(np.subtract(*fit.halves)) / sigmas
     different = [
-        axis for axis, index in index_of.items() if differences[index] > _MAX_SIGMAS_OF_HALVES
+        axis
+        for axis, index in index_of.items()
+        if differences[index] > _MAX_SIGMAS_OF_HALVES
     ]
     return (finding("vehicle_halves", axes=listing(different)),) if different else ()
 
 
-def _undetermined_axes(fit: Fit, drive: Drive, index_of: Mapping[str, int]) -> list[str]:
+def _undetermined_axes(
+    fit: Fit, drive: Drive, index_of: Mapping[str, int]
+) -> list[str]:
     """Return the axes that the drive does not determine, or only in a part of it."""
     ratios = fit.signal_to_noise(drive.components)
     undetermined = []
@@ -368,7 +391,9 @@ def _undetermined_axes(fit: Fit, drive: Drive, index_of: Mapping[str, int]) -> l
     return undetermined
 
 
-def _check_wheels(fit: Fit, drive: Drive, config: CalibratorConfig) -> tuple[Finding, ...]:
+def _check_wheels(
+    fit: Fit, drive: Drive, config: CalibratorConfig
+) -> tuple[Finding, ...]:
     """Return the finding about wheels of another drive, or about a sensor upside down."""
     share = _unrelated_share(fit, drive)
     if share > _UNRELATED:

@@ -50,7 +50,9 @@ class LiveReading(ABC):
             If the values are unclear.
         """
 
-    def _mean(self, earlier: Sequence[float], later: Sequence[float], _: float) -> list[float]:
+    def _mean(
+        self, earlier: Sequence[float], later: Sequence[float], _: float
+    ) -> list[float]:
         """Return the wheel data between two messages, which are some seconds apart."""
         return [(start + end) / 2.0 for start, end in zip(earlier, later, strict=True)]
 
@@ -139,7 +141,10 @@ class LiveJoints(LiveReading):
     ) -> list[float]:
         means = super()._mean(earlier, later, duration_s)
         if self._joints.are_positions:
-            rates = [(end - start) / duration_s for start, end in zip(earlier, later, strict=True)]
+            rates = [
+                (end - start) / duration_s
+                for start, end in zip(earlier, later, strict=True)
+            ]
             means = [rates[0], means[1]] if self.measures in STEERED else rates
         return means
 

@@ -47,7 +47,9 @@ class VehicleParameters:
     @property
     def radius(self) -> float:
         """Mean radius of the wheels (m) or its factor; 0 for odometry, which has multipliers."""
-        radii = [item.value for item in self.parameters if item.name.endswith("wheel_radius")]
+        radii = [
+            item.value for item in self.parameters if item.name.endswith("wheel_radius")
+        ]
         return sum(radii) / len(radii) if radii else 0.0
 
     @property

@@ -133,7 +133,9 @@ class Drive:
     def motions_of_unit_vehicle(self) -> FloatArray:
         """Return the sums (3, K) of the steps in each window: forward, left and turn."""
         totals = np.insert(np.cumsum(self.steps, axis=1), 0, 0.0, axis=1)
-        at_ends = np.array([np.interp(self.ends_s, self.stamps_s, total) for total in totals])
+        at_ends = np.array(
+            [np.interp(self.ends_s, self.stamps_s, total) for total in totals]
+        )
         return at_ends[:, 1] - at_ends[:, 0]
 
     def measured(self, T: FloatArray) -> FloatArray:
@@ -266,7 +268,10 @@ def fit_drive(drive: Drive, longer: Drive, fixed: Sequence[int]) -> Fit:
     covariance = fit.covariance
     alternatives = [
         (_solve(longer, T, others, sigmas), np.full(len(sigmas), _SHARE_OF_LONGER)),
-        (_solve(drive, T, others, sigmas, is_weighted=False), _shares_of_unweighted(drive, fit)),
+        (
+            _solve(drive, T, others, sigmas, is_weighted=False),
+            _shares_of_unweighted(drive, fit),
+        ),
     ]
     for alternative, shares in alternatives:
         difference = shares * _difference(
@@ -301,7 +306,9 @@ def _shares_of_unweighted(drive: Drive, fit: Fit) -> FloatArray:
     for index in range(N_FIXED, N_FIXED + drive.model.n_wheels):
         # Squared size (K,) of the effect of a slip of 100 %, in standard deviations of the noise.
         effect = fit.others[index - CLOCK] * columns[..., index]
-        squared = np.einsum("kc,cd,kd->k", effect, inverse(fit.noise), effect) + _MIN_VARIANCE
+        squared = (
+            np.einsum("kc,cd,kd->k", effect, inverse(fit.noise), effect) + _MIN_VARIANCE
+        )
         # Mean and standard deviation of a non-central chi-squared distribution, (3, K).
         excess = _SLIPS[:, None] ** 2 * squared
         mean = n_components + excess
@@ -309,7 +316,9 @@ def _shares_of_unweighted(drive: Drive, fit: Fit) -> FloatArray:
         # The hyperbolic tangent is a logistic function that does not overflow.
         is_kept = 0.5 - 0.5 * np.tanh(_LOGISTIC * (mean - threshold) / sigma / 2.0)
         weights = is_kept * (STUDENT + n_components) / (STUDENT + mean)
-        undetected = np.average(weights, axis=1, weights=squared) @ _SLIPS / _SLIPS.sum()
+        undetected = (
+            np.average(weights, axis=1, weights=squared) @ _SLIPS / _SLIPS.sum()
+        )
         undetected = min(float(undetected), _MAX_UNDETECTED)
         shares[index] = undetected / (1.0 - undetected)
     return shares
@@ -376,7 +385,9 @@ def _solve(
         rows = drive.rows(T, others)
         weights, noise = _weights(rows[..., -1], noise, is_weighted)
         whitening = np.linalg.cholesky(inverse(noise)).T
-        blocks = Blocks.of_rows(np.sqrt(weights)[:, None, None] * (whitening @ rows), BLOCKS)
+        blocks = Blocks.of_rows(
+            np.sqrt(weights)[:, None, None] * (whitening @ rows), BLOCKS
+        )
         prior[:-1, -1] = -_difference(T, others, start, first_others) / sigmas**2
         table = blocks.total + prior
         step = solve(table, everything)

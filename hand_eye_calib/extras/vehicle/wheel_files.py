@@ -45,7 +45,11 @@ def _along_and_across(speed: FloatArray, angle: FloatArray) -> tuple[FloatArray,
 # Functions that compute forward speed, left speed and yaw rate of the unit vehicle from the columns
 # of wheel data.
 _RATES: dict[str, Callable[..., tuple[ArrayLike, ...]]] = {
-    "wheels": lambda left, right: ((left + right) / 2.0, 0.0 * left, (right - left) / UNIT_TRACK),
+    "wheels": lambda left, right: (
+        (left + right) / 2.0,
+        0.0 * left,
+        (right - left) / UNIT_TRACK,
+    ),
     "steering": _along_and_across,
     "tricycle": _along_and_across,
     "wheel_odometry": lambda speed, turn: (speed, 0.0 * speed, turn),
@@ -69,7 +73,9 @@ _UNITS = {
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
-def wheel_trajectory(stamps_ns: IntArray, values: ArrayLike, measures: str) -> Trajectory:
+def wheel_trajectory(
+    stamps_ns: IntArray, values: ArrayLike, measures: str
+) -> Trajectory:
     """Convert wheel data to a parent stream for :func:`hand_eye_calib.calibrate`.
 
     Parameters
@@ -103,7 +109,9 @@ def wheel_trajectory(stamps_ns: IntArray, values: ArrayLike, measures: str) -> T
     Trajectory(3 wheels over 0.040 s, sensor_frame='base_link')
     """
     if measures not in _N_COLUMNS:
-        raise ConfigError(f"measures must be one of {', '.join(_N_COLUMNS)}; got {measures!r}")
+        raise ConfigError(
+            f"measures must be one of {', '.join(_N_COLUMNS)}; got {measures!r}"
+        )
     values = floats("values", values)
     n_columns = _N_COLUMNS[measures]
     if values.shape != (len(stamps_ns), n_columns):
@@ -133,7 +141,9 @@ def unit_path(stamps_ns: IntArray, means: FloatArray, measures: str) -> Trajecto
     """
     durations_s = np.diff(stamps_ns) * 1e-9
     if not (durations_s > 0.0).all():
-        raise InputError("stamps of wheel data must increase; sort the rows, drop repeated stamps")
+        raise InputError(
+            "stamps of wheel data must increase; sort the rows, drop repeated stamps"
+        )
     steps = np.stack(unit_rates(measures, means.T)) * durations_s
     if np.abs(steps[2]).max(initial=0.0) > np.pi:
         raise InputError(
@@ -143,7 +153,9 @@ def unit_path(stamps_ns: IntArray, means: FloatArray, measures: str) -> Trajecto
     return trajectory_of(stamps_ns, steps, measures)
 
 
-def table_of_wheels(path: str | Path, data: bytes, options: FileOptions) -> Table | None:
+def table_of_wheels(
+    path: str | Path, data: bytes, options: FileOptions
+) -> Table | None:
     """Read a csv file of wheel data as a table of poses of the unit vehicle; None for other files.
 
     Raises
@@ -166,7 +178,9 @@ def table_of_wheels(path: str | Path, data: bytes, options: FileOptions) -> Tabl
     n_values = names.count(",") + 1
     rates = Table(path, (stamp, "x", "y", "z"), "positions")
     rates.fill(rows, lambda cells: cells[:4])
-    values = rates.values()[:, :n_values] * [_unit_of(name) for name in names.split(",")]
+    values = rates.values()[:, :n_values] * [
+        _unit_of(name) for name in names.split(",")
+    ]
     wheels = wheel_trajectory(stamps_in_ns(rates, options.stamp_unit), values, kinds[0])
     table = Table(path, (stamp, *_POSE), "poses", sensor_frame=wheels.sensor_frame)
     table.fill_from_arrays(se3.to_rows(wheels.poses), rates.stamps)

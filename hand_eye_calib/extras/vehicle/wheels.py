@@ -163,13 +163,17 @@ def path_of(steps: FloatArray) -> tuple[FloatArray, FloatArray]:
     return positions, headings
 
 
-def steps_between(chords: FloatArray, headings: FloatArray, turns: FloatArray) -> FloatArray:
+def steps_between(
+    chords: FloatArray, headings: FloatArray, turns: FloatArray
+) -> FloatArray:
     """Return the steps (3, N) with these chords; the inverse of :func:`path_of`.
 
     ``chords`` (N,) are the displacements, complex, ``headings`` (N,) those at the start of each
     step, and ``turns`` (N,) those of the steps, rad.
     """
-    arcs = chords * np.exp(-1j * (headings + turns / 2.0)) / np.sinc(turns / (2.0 * np.pi))
+    arcs = (
+        chords * np.exp(-1j * (headings + turns / 2.0)) / np.sinc(turns / (2.0 * np.pi))
+    )
     return np.stack([arcs.real, arcs.imag, turns])
 
 
@@ -186,7 +190,9 @@ def trajectory_of(stamps_ns: IntArray, steps: FloatArray, measures: str) -> Traj
 def steps_of(trajectory: Trajectory) -> FloatArray:
     """Return the steps (3, N - 1) of the path of a unit vehicle."""
     positions = trajectory.poses[:, 0, 3] + 1j * trajectory.poses[:, 1, 3]
-    headings = np.unwrap(np.arctan2(trajectory.poses[:, 1, 0], trajectory.poses[:, 0, 0]))
+    headings = np.unwrap(
+        np.arctan2(trajectory.poses[:, 1, 0], trajectory.poses[:, 0, 0])
+    )
     return steps_between(np.diff(positions), headings[:-1], np.diff(headings))
 
 

@@ -18,9 +18,28 @@ _MIN_POSES = 3
 
 # Words in the names of topics whose poses are not measured by one sensor: they are commands, ground
 # truth, or estimates from several sensors.
-_NO_SENSOR = {"goal", "target", "plan", "setpoint", "cmd", "truth", "gt", "filtered", "fused"}
+_NO_SENSOR = {
+    "goal",
+    "target",
+    "plan",
+    "setpoint",
+    "cmd",
+    "truth",
+    "gt",
+    "filtered",
+    "fused",
+}
 # Words in the names of topics that describe the kind of message, not the sensor.
-_KINDS_OF_MESSAGES = {"odometry", "odom", "pose", "poses", "path", "trajectory", "stamped", "local"}
+_KINDS_OF_MESSAGES = {
+    "odometry",
+    "odom",
+    "pose",
+    "poses",
+    "path",
+    "trajectory",
+    "stamped",
+    "local",
+}
 # Kinds of sensors that role_of distinguishes, the likeliest first. Its kind "base" is missing here,
 # because a vehicle is no sensor.
 _SENSORS = ("lidar", "camera", "imu", "gnss")
@@ -80,7 +99,9 @@ def _of_types(
     topics: Sequence[TopicInfo], types: Collection[str], min_count: int = 0
 ) -> list[TopicInfo]:
     """Return the topics with messages of some types, and with at least ``min_count`` messages."""
-    return [topic for topic in topics if topic.type in types and topic.count >= min_count]
+    return [
+        topic for topic in topics if topic.type in types and topic.count >= min_count
+    ]
 
 
 def choose(
@@ -112,7 +133,9 @@ def choose(
     moving = _of_types(topics, messages.POSE_TYPES, _MIN_POSES)
     paths = _of_types(topics, {messages.PATH_TYPE})
     others = _of_types(topics, messages.FIELD_POSE_TYPES, _MIN_POSES)
-    candidates = [_Candidate(topic, frame_of(topic.name)) for topic in moving + paths + others]
+    candidates = [
+        _Candidate(topic, frame_of(topic.name)) for topic in moving + paths + others
+    ]
     sensors = _topic_of_each_sensor(candidates)
     of_known_kinds = [sensor for sensor in sensors if sensor.rank < len(_SENSORS)]
     groups: list[Sequence[TopicInfo | _Candidate]] = [
@@ -134,13 +157,17 @@ def choose(
         # A topic of the same sensor cannot be the other stream.
         frame = sensors[0].frame
         partners = [topic for topic in topics if frame_of(topic.name) != frame]
-    raise _unclear(topics, [sensor.topic for sensor in sensors], missing, edges, partners)
+    raise _unclear(
+        topics, [sensor.topic for sensor in sensors], missing, edges, partners
+    )
 
 
 def _topic_of_each_sensor(candidates: Sequence[_Candidate]) -> list[_Candidate]:
     """Return the likeliest topic of each sensor, the likeliest sensor first."""
     sensors: list[_Candidate] = []
-    ranked = sorted(candidates, key=lambda candidate: (candidate.rank, -candidate.topic.count))
+    ranked = sorted(
+        candidates, key=lambda candidate: (candidate.rank, -candidate.topic.count)
+    )
     for candidate in ranked:
         is_same_sensor = any(candidate.has_sensor_of(sensor) for sensor in sensors)
         if candidate.is_of_sensor and not is_same_sensor:
@@ -169,7 +196,9 @@ def _unclear(
     advice = "record the odometry of the other sensor"
     if not sensors:
         advice = _advice({topic.type for topic in topics})
-    listed = f"The bag has {_listed(topics)}" if topics else "The bag has no other topics"
+    listed = (
+        f"The bag has {_listed(topics)}" if topics else "The bag has no other topics"
+    )
     return UnclearStreamsError(f"{problem}: {advice}. {listed}", {})
 
 
@@ -198,7 +227,8 @@ def _problem_and_sources(
         return f"no topic has poses, but transforms have: {listed}", pairs
     if len(clouds) >= n_missing:
         problem = (
-            f"no topic has poses; the odometry of lidars can be computed from {_listed(clouds)}"
+            "no topic has poses; the odometry of lidars can be "
+            f"computed from {_listed(clouds)}"
         )
         return problem, [topic.name for topic in clouds]
     frames = {edge.split(":")[-1] for edge in edges}
@@ -220,7 +250,9 @@ def _advice(types: set[str]) -> str:
     if not types.isdisjoint(messages.IMAGE_TYPES):
         return "run visual odometry or SLAM on the images, and record its poses"
     if _FIX in types and _IMU in types:
-        return "GNSS and IMU need the poses of another sensor: record its odometry or SLAM"
+        return (
+            "GNSS and IMU need the poses of another sensor: record its odometry or SLAM"
+        )
     return "run the odometry or SLAM of both sensors, and record it"
 
 
@@ -241,7 +273,9 @@ def _options(missing: Sequence[str], names: Sequence[str]) -> dict[str, str]:
     chosen = [*names[: len(missing)]]
     if len(chosen) > 1:
         chosen = roles.parent_and_child(chosen, {}, {})
-    return {f"{stream}_topic": name for stream, name in zip(missing, chosen, strict=True)}
+    return {
+        f"{stream}_topic": name for stream, name in zip(missing, chosen, strict=True)
+    }
 
 
 def _listed(topics: Sequence[TopicInfo]) -> str:

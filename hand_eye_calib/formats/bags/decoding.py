@@ -30,7 +30,9 @@ def decoder_of(kind: MessageKind) -> Callable[[bytes], Any]:
             f"messages of type {kind.type} have the encoding "
             f"{kind.encoding[:40]!r}; expected cdr, ros1, json or protobuf"
         )
-    make_decoder = _protobuf_decoder if kind.encoding == "protobuf" else _rosbags_decoder
+    make_decoder = (
+        _protobuf_decoder if kind.encoding == "protobuf" else _rosbags_decoder
+    )
     try:
         return make_decoder(kind)
     except HandEyeCalibError:
@@ -52,7 +54,12 @@ def _protobuf_decoder(kind: MessageKind) -> Any:
 
 def _rosbags_decoder(kind: MessageKind) -> Callable[[bytes], Any]:
     """Return the function that decodes messages of ROS 1 or ROS 2."""
-    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+    from rosbags.typesys import (
+        Stores,
+        get_types_from_idl,
+        get_types_from_msg,
+        get_typestore,
+    )
 
     typestore = get_typestore(Stores.ROS1_NOETIC if kind.is_ros1 else Stores.ROS2_JAZZY)
     language, content = kind.definition

@@ -50,7 +50,9 @@ def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
         readable = file
         loss = ""
         if file.suffix == ".zstd" or unfinished:
-            folder = opened.enter_context(tempfile.TemporaryDirectory(prefix="hand_eye_calib_"))
+            folder = opened.enter_context(
+                tempfile.TemporaryDirectory(prefix="hand_eye_calib_")
+            )
             readable = Path(folder, f"unpacked{_suffix(file)}")
             if unfinished:
                 _complete(file, unfinished, readable)
@@ -138,12 +140,16 @@ def _files_of(path: Path) -> list[Path]:
             return [path]
         if path.exists():
             raise InputError(f"{path} is not a bag; expected {_EXPECTED}")
-        raise InputError(f"no bag at {path}{files.similar(path) or f'; expected {_EXPECTED}'}")
+        raise InputError(
+            f"no bag at {path}{files.similar(path) or f'; expected {_EXPECTED}'}"
+        )
     paths = {file for file in path.iterdir() if _suffix(file) and file.is_file()}
     if not paths:
         raise InputError(_no_files(path))
     return sorted(
-        file for file in paths if file.suffix != ".zstd" or file.with_suffix("") not in paths
+        file
+        for file in paths
+        if file.suffix != ".zstd" or file.with_suffix("") not in paths
     )
 
 
@@ -157,11 +163,17 @@ def _no_files(folder: Path) -> str:
             "bag"
         )
     advice = "check the path"
-    for subfolder in sorted(file.parent for file in [*folder.glob("*/*"), *folder.glob("*/*/*")]):
+    for subfolder in sorted(
+        file.parent for file in [*folder.glob("*/*"), *folder.glob("*/*/*")]
+    ):
         if any(map(_suffix, subfolder.iterdir())):
-            advice = f"pass {subfolder}, or all bags below: hand_eye_calib batch {folder}"
+            advice = (
+                f"pass {subfolder}, or all bags below: hand_eye_calib batch {folder}"
+            )
             break
-    return f"no bag in {folder}: expected files that end in {', '.join(REPAIRS)}; {advice}"
+    return (
+        f"no bag in {folder}: expected files that end in {', '.join(REPAIRS)}; {advice}"
+    )
 
 
 class MissingFiles(NamedTuple):
@@ -188,7 +200,9 @@ def missing_files(folder: Path) -> MissingFiles:
     # The metadata may be missing or damaged.
     with suppress(InputError, AttributeError, TypeError, KeyError):
         metadata = read_yaml(folder / _METADATA)["rosbag2_bagfile_information"]
-        counts = {file["path"]: file["message_count"] for file in metadata.get("files") or ()}
+        counts = {
+            file["path"]: file["message_count"] for file in metadata.get("files") or ()
+        }
         for path in map(str, metadata["relative_file_paths"]):
             name = printable_name(PurePath(path).name)
             if name.removesuffix(".zstd") not in present:

@@ -14,7 +14,13 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
 from hand_eye_calib.formats import files
-from hand_eye_calib.formats.bags.storage import Message, MessageKind, Storage, kind_of, reason_of
+from hand_eye_calib.formats.bags.storage import (
+    Message,
+    MessageKind,
+    Storage,
+    kind_of,
+    reason_of,
+)
 
 # Header of a record in an mcap file: opcode (uint8) and length of the content in bytes (uint64).
 _RECORD = struct.Struct("<BQ")
@@ -33,7 +39,9 @@ class McapFile(Storage):
     """
 
     def _open(self, opened: ExitStack) -> None:
-        self._stream = _WholeReads(opened.enter_context(self._file.open("rb", buffering=0)))
+        self._stream = _WholeReads(
+            opened.enter_context(self._file.open("rb", buffering=0))
+        )
         # Indexes of the chunks, sorted by time; empty if the file has no usable index.
         self._chunks: list[Any] = []
         try:
@@ -44,10 +52,14 @@ class McapFile(Storage):
             self._scan(error)
             return
         statistics = summary.statistics
-        self._chunks = sorted(summary.chunk_indexes, key=attrgetter("message_start_time"))
+        self._chunks = sorted(
+            summary.chunk_indexes, key=attrgetter("message_start_time")
+        )
         for key, channel in summary.channels.items():
             self._add_kind(channel, summary.schemas)
-            self.counts[self._kinds[key]] += statistics.channel_message_counts.get(key, 0)
+            self.counts[self._kinds[key]] += statistics.channel_message_counts.get(
+                key, 0
+            )
         if statistics.message_count:
             self.span_ns = statistics.message_start_time, statistics.message_end_time
 
@@ -70,7 +82,12 @@ class McapFile(Storage):
     def _add_kind(self, channel: Any, schemas: Mapping[int, Any]) -> None:
         """Store the kind of the messages of a channel; ``schemas`` are those of the file by id."""
         schema = schemas.get(channel.schema_id, _NO_SCHEMA)
-        description = (schema.name, channel.message_encoding, schema.encoding, schema.data)
+        description = (
+            schema.name,
+            channel.message_encoding,
+            schema.encoding,
+            schema.data,
+        )
         self._kinds[channel.id] = kind_of(channel.topic, *description)
 
     def _scan(self, reason: Exception) -> None:
@@ -90,7 +107,9 @@ class McapFile(Storage):
                 schemas[record.id] = record
             elif isinstance(record, records.Channel):
                 self._add_kind(record, schemas)
-            elif isinstance(record, records.Message) and record.channel_id in self._kinds:
+            elif (
+                isinstance(record, records.Message) and record.channel_id in self._kinds
+            ):
                 self.counts[self._kinds[record.channel_id]] += 1
                 times_ns.append(record.log_time)
         if times_ns:
@@ -99,7 +118,9 @@ class McapFile(Storage):
             recovered = f"{len(times_ns)} messages over {seconds:.1f} s were recovered"
             self.losses = [f"{loss}; {recovered}" for loss in self.losses]
         elif self.losses:
-            raise ValueError(f"{self.losses[0]}, and no message before can be read") from reason
+            raise ValueError(
+                f"{self.losses[0]}, and no message before can be read"
+            ) from reason
 
     def _messages(self, kinds: Mapping[int, MessageKind]) -> Iterable[Message]:
         if not self._chunks:
@@ -111,7 +132,9 @@ class McapFile(Storage):
             channels = index.message_index_offsets
             # Skip chunks without messages of these kinds. A chunk may have no index of channels.
             if not channels or kinds.keys() & channels.keys():
-                messages = _messages_of_chunk(self._content(index.chunk_start_offset), kinds)
+                messages = _messages_of_chunk(
+                    self._content(index.chunk_start_offset), kinds
+                )
                 yield from sorted(messages, key=itemgetter(1))
 
     def _content(self, start: int) -> bytes:
@@ -134,7 +157,9 @@ class McapFile(Storage):
         except MemoryError:
             raise
         except Exception as error:
-            losses.append(f"it is truncated or damaged ({reason_of(error)}); the rest is lost")
+            losses.append(
+                f"it is truncated or damaged ({reason_of(error)}); the rest is lost"
+            )
             if isinstance(error, EOFError):
                 # The file is cut off. Reading the records of its last chunk ends in an error, too.
                 with suppress(Exception):
@@ -161,7 +186,9 @@ class McapFile(Storage):
             yield from StreamReader(stream, skip_magic=True).records
 
 
-def _messages_of_chunk(content: bytes, kinds: Mapping[int, MessageKind]) -> Iterator[Message]:
+def _messages_of_chunk(
+    content: bytes, kinds: Mapping[int, MessageKind]
+) -> Iterator[Message]:
     """Iterate over the messages of some channels in the unpacked records of an mcap chunk.
 
     This takes a fraction of the time of the iteration in the library mcap.

@@ -65,7 +65,9 @@ class Cursor:
 
     def __init__(self, data: bytes, is_ros1: bool) -> None:
         if not is_ros1 and bytes(data[:2]) != _CDR:
-            raise ValueError(f"expected plain CDR, found encoding 0x{bytes(data[:2]).hex()}")
+            raise ValueError(
+                f"expected plain CDR, found encoding 0x{bytes(data[:2]).hex()}"
+            )
         self._data = data
         self._is_ros1 = is_ros1
         self.position = _START
@@ -82,7 +84,9 @@ class Cursor:
         """Read a stamp; return it in ns."""
         seconds, nanoseconds = self.read("II" if self._is_ros1 else "iI")
         if nanoseconds >= NS_PER_S:
-            raise ValueError(f"a stamp has {nanoseconds} nanoseconds, more than a second")
+            raise ValueError(
+                f"a stamp has {nanoseconds} nanoseconds, more than a second"
+            )
         return int(seconds * NS_PER_S + nanoseconds)
 
     def name(self) -> str:
@@ -96,7 +100,9 @@ class Cursor:
         if self.position > len(self._data):
             raise ValueError("a text does not fit into the message")
         if length > LONGEST_NAME:
-            raise ValueError(f"the name of a frame has {length} bytes, more than {LONGEST_NAME}")
+            raise ValueError(
+                f"the name of a frame has {length} bytes, more than {LONGEST_NAME}"
+            )
         end = self.position if self._is_ros1 else max(self.position - 1, start)
         return printable(frame_name(str(self._data[start:end], "utf-8")))
 
@@ -160,7 +166,12 @@ class MessageType(NamedTuple):
 
 # Columns of each quantity in the values of :func:`_pose`, :func:`_point`, :func:`_imu` and
 # :func:`_fix`. Latitude, longitude and height are read as positions.
-_COLUMNS = {"poses": slice(7), "positions": slice(3), "rotations": slice(3, 7), "rates": slice(3)}
+_COLUMNS = {
+    "poses": slice(7),
+    "positions": slice(3),
+    "rotations": slice(3, 7),
+    "rates": slice(3),
+}
 _OF_POSES = ("poses", "positions", "rotations")
 _OF_POINTS = ("positions",)
 
@@ -220,15 +231,21 @@ _FIELDS = {
     "geometry_msgs/msg/TwistWithCovarianceStamped": _twist_fields("twist.twist"),
     "px4_msgs/msg/VehicleOdometry": "t_us=timestamp_sample,x=position.0,y=position.1,z=position.2,"
     "qw=q.0,qx=q.1,qy=q.2,qz=q.3",
-    "geometry_msgs/msg/PoseArray": _pose_fields("poses.0.position", "poses.0.orientation"),
+    "geometry_msgs/msg/PoseArray": _pose_fields(
+        "poses.0.position", "poses.0.orientation"
+    ),
     "mocap4r2_msgs/msg/RigidBodies": _pose_fields(
         "rigidbodies.0.pose.position", "rigidbodies.0.pose.orientation"
     ),
     "motion_capture_tracking_interfaces/msg/NamedPoseArray": _pose_fields(
         "poses.0.pose.position", "poses.0.pose.orientation"
     ),
-    "foxglove.PoseInFrame": _pose_fields("pose.position", "pose.orientation", "timestamp"),
-    "foxglove.PosesInFrame": _pose_fields("poses.0.position", "poses.0.orientation", "timestamp"),
+    "foxglove.PoseInFrame": _pose_fields(
+        "pose.position", "pose.orientation", "timestamp"
+    ),
+    "foxglove.PosesInFrame": _pose_fields(
+        "poses.0.position", "poses.0.orientation", "timestamp"
+    ),
     "foxglove.FrameTransform": _pose_fields("translation", "rotation", "timestamp"),
     "gps_msgs/msg/GPSFix": "t=header.stamp,lat_deg=latitude,lon_deg=longitude,height=altitude",
     "foxglove.LocationFix": "t=timestamp,lat_deg=latitude,lon_deg=longitude,height=altitude",
@@ -238,7 +255,9 @@ _ROWS = [
     MessageType("nav_msgs/msg/Odometry", _OF_POSES, _pose, has_child_frame=True),
     MessageType("geometry_msgs/msg/PoseStamped", _OF_POSES, _pose),
     MessageType("geometry_msgs/msg/PoseWithCovarianceStamped", _OF_POSES, _pose),
-    MessageType("geometry_msgs/msg/TransformStamped", _OF_POSES, _pose, has_child_frame=True),
+    MessageType(
+        "geometry_msgs/msg/TransformStamped", _OF_POSES, _pose, has_child_frame=True
+    ),
     MessageType(PATH_TYPE, _OF_POSES),
     MessageType("sensor_msgs/msg/Imu", ("rates", "rotations"), _imu),
     MessageType("sensor_msgs/msg/NavSatFix", _OF_POINTS, _fix),
@@ -298,7 +317,11 @@ def ns_of(stamp: Any) -> int | None:
 
     Stamps of ROS, of Foxglove's JSON and of protobuf name their fields differently.
     """
-    for seconds, nanoseconds in (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos")):
+    for seconds, nanoseconds in (
+        ("sec", "nanosec"),
+        ("sec", "nsec"),
+        ("seconds", "nanos"),
+    ):
         if hasattr(stamp, nanoseconds):
             return int(getattr(stamp, seconds) * NS_PER_S + getattr(stamp, nanoseconds))
     return None
@@ -361,7 +384,10 @@ class Run(NamedTuple):
             try:
                 for transform in getattr(message, "transforms", [message]):
                     yield bag_ns, transform_of(transform)
-            except (AttributeError, TypeError) as error:  # a message in JSON may have any fields
+            except (
+                AttributeError,
+                TypeError,
+            ) as error:  # a message in JSON may have any fields
                 raise self.unreadable(error) from error
 
     def unreadable(self, error: Exception) -> InputError:
@@ -413,7 +439,9 @@ def _unpack(row: MessageType, is_ros1: bool, data: bytes) -> _Unpacked:
     return _Unpacked(stamp_ns, world_frame, sensor_frame, values, cursor.position)
 
 
-def unpack_poses(messages: Sequence[bytes], message_type: str, is_ros1: bool) -> PoseTable:
+def unpack_poses(
+    messages: Sequence[bytes], message_type: str, is_ros1: bool
+) -> PoseTable:
     """Unpack messages of a type in MESSAGE_TYPES.
 
     Raises an error of ``MALFORMED`` if a message is not of this type. Poses with equal frames are
@@ -429,7 +457,9 @@ def unpack_poses(messages: Sequence[bytes], message_type: str, is_ros1: bool) ->
     return PoseTable.of(stamps_ns, values, worlds, sensors)
 
 
-def _unpack_alike(messages: Sequence[bytes], row: MessageType, is_ros1: bool) -> PoseTable | None:
+def _unpack_alike(
+    messages: Sequence[bytes], row: MessageType, is_ros1: bool
+) -> PoseTable | None:
     """Unpack poses together, as columns of the bytes of all messages.
 
     Return None if the messages differ in length or in frames, or if a stamp is invalid. They must
@@ -451,7 +481,9 @@ def _unpack_alike(messages: Sequence[bytes], row: MessageType, is_ros1: bool) ->
     has_same_frames = (frames == frames[0]).all()
     if not (has_same_encoding and are_stamps and has_same_frames):
         return None
-    poses = np.ascontiguousarray(rows[:, first.end - _POSE_SIZE : first.end]).view("<f8")
+    poses = np.ascontiguousarray(rows[:, first.end - _POSE_SIZE : first.end]).view(
+        "<f8"
+    )
     stamps_ns = seconds * NS_PER_S + nanoseconds
     return PoseTable.of(stamps_ns, poses, first.world_frame, first.sensor_frame)
 
@@ -480,7 +512,9 @@ class MessageReader:
         Number of messages without the quantity: null poses, no fix, no orientation.
     """
 
-    def __init__(self, message_type: str, measures: str, origin: LocalOrigin | None = None) -> None:
+    def __init__(
+        self, message_type: str, measures: str, origin: LocalOrigin | None = None
+    ) -> None:
         self._row = MESSAGE_TYPES[message_type]
         self._measures = MEASURES[measures].read_as or measures
         self._are_poses = message_type in POSE_TYPES and self._measures == "poses"
@@ -490,7 +524,9 @@ class MessageReader:
         self._origin = origin or LocalOrigin()
         self.n_left_out = 0
 
-    def columns(self, messages: Sequence[bytes], is_ros1: bool) -> tuple[PoseTable, BoolArray]:
+    def columns(
+        self, messages: Sequence[bytes], is_ros1: bool
+    ) -> tuple[PoseTable, BoolArray]:
         """Unpack the next messages.
 
         Returns
@@ -519,13 +555,17 @@ class MessageReader:
         self.n_left_out += int((~is_usable).sum())
         poses = np.tile([0.0] * 6 + [1.0], (len(values), 1))  # placeholders
         if is_usable.any():
-            target = _COLUMNS["positions" if self._measures == "positions" else "rotations"]
+            target = _COLUMNS[
+                "positions" if self._measures == "positions" else "rotations"
+            ]
             measured = self._measured(columns.stamps_ns[is_usable], values[is_usable])
             poses[is_usable, target] = measured
         poses[~is_usable] = np.nan
         if self._row.name not in SENSOR_TYPES:
             return replace(columns, poses=poses), is_usable
-        return PoseTable.of(columns.stamps_ns, poses, "", columns.world_frames), is_usable
+        return PoseTable.of(
+            columns.stamps_ns, poses, "", columns.world_frames
+        ), is_usable
 
     def _measured(self, stamps_ns: IntArray, values: FloatArray) -> FloatArray:
         """Return positions (N, 3), m, or quaternions (N, 4) from the values of N messages.
@@ -563,7 +603,9 @@ class MessageReader:
         frames = self._frames
         pose = struct.unpack_from("<7d", data, frames.end)
         stamp_ns = Cursor(data, False).stamp_ns()
-        return PoseFields(stamp_ns, frames.world_frame, frames.sensor_frame, pose[:3], pose[3:])
+        return PoseFields(
+            stamp_ns, frames.world_frame, frames.sensor_frame, pose[:3], pose[3:]
+        )
 
     def __call__(self, data: bytes) -> PoseFields:
         """Unpack the next message, in CDR.
@@ -582,7 +624,9 @@ class MessageReader:
         except InputError:
             raise
         except MALFORMED as error:
-            raise InputError(f"not a message of type {self._row.name}: {error}") from error
+            raise InputError(
+                f"not a message of type {self._row.name}: {error}"
+            ) from error
         if not is_usable.all():
             raise NoPoseError(f"the message has no {self._measures}")
         pose = columns.poses[0].tolist()

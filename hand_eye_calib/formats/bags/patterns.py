@@ -50,7 +50,8 @@ def _local_bags(pattern: str) -> list[str]:
 def _is_folder_of_bags(path: Path) -> bool:
     """Whether a path is a folder, but not a bag."""
     return path.is_dir() and not any(
-        file.name == "metadata.yaml" or file.suffix in _SUFFIXES for file in path.iterdir()
+        file.name == "metadata.yaml" or file.suffix in _SUFFIXES
+        for file in path.iterdir()
     )
 
 

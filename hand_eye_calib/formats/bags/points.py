@@ -31,9 +31,13 @@ def rows_of_points(message: Any) -> Any:
     try:
         formats = [byte_order + _DATATYPES[field.datatype] for field in fields.values()]
         offsets = [field.offset for field in fields.values()]
-        dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size})
+        dtype = np.dtype(
+            {"names": names, "formats": formats, "offsets": offsets, "itemsize": size}
+        )
         data = np.asarray(message.data, dtype=np.uint8)[: message.height * row_step]
         rows = data.reshape(message.height, row_step)[:, :width]
         return np.ascontiguousarray(rows).reshape(-1).view(dtype)
     except (ValueError, IndexError, TypeError) as error:
-        raise InputError(f"a scan of points is damaged ({error}); record it again") from error
+        raise InputError(
+            f"a scan of points is damaged ({error}); record it again"
+        ) from error

@@ -41,7 +41,9 @@ class PoseTable(Columns):
     bag_ns: IntArray
 
     @classmethod
-    def of(cls, stamps_ns: Any, poses: Any, world: Any = "", sensor: Any = None) -> Self:
+    def of(
+        cls, stamps_ns: Any, poses: Any, world: Any = "", sensor: Any = None
+    ) -> Self:
         """Return a table without stream names. Its stamps (N,), ns, are also its bag times.
 
         ``world`` and ``sensor`` are either the frame of all poses, or the frame of each pose (N,).

@@ -70,7 +70,9 @@ class PoseBag:
                 if path in storage.paths[0].parents:
                     n_present += storage.counts.total()
             self._notes += losses_of(path, n_present)
-        times_ns = [time_ns for storage in self._storages for time_ns in storage.span_ns]
+        times_ns = [
+            time_ns for storage in self._storages for time_ns in storage.span_ns
+        ]
         self.start_ns = min(times_ns, default=None)
         self.end_ns = max(times_ns, default=None)
 
@@ -81,7 +83,9 @@ class PoseBag:
             for kind, count in storage.counts.items():
                 previous = topics.get(kind.topic, TopicInfo(kind.topic, kind.type, 0))
                 type_ = kind.type if kind.type == previous.type else ""
-                topics[kind.topic] = TopicInfo(kind.topic, type_, previous.count + count)
+                topics[kind.topic] = TopicInfo(
+                    kind.topic, type_, previous.count + count
+                )
         return dict(sorted(topics.items()))
 
     def __enter__(self) -> Self:
@@ -122,7 +126,11 @@ class PoseBag:
 
     def _tf_topics(self) -> list[str]:
         """Return the names of the topics of transforms."""
-        return [topic.name for topic in self.topics.values() if topic.type in messages.TF_TYPES]
+        return [
+            topic.name
+            for topic in self.topics.values()
+            if topic.type in messages.TF_TYPES
+        ]
 
     def edges_on(self, topic: str) -> list[str]:
         """Return the pairs of frames, ``parent:child``, in the first transforms on a topic.
@@ -134,7 +142,10 @@ class PoseBag:
         first_run = next(self.runs([topic]), None)
         if first_run is None:
             return []
-        edges = {f"{edge.world_frame}:{edge.sensor_frame}" for _, edge in first_run.transforms()}
+        edges = {
+            f"{edge.world_frame}:{edge.sensor_frame}"
+            for _, edge in first_run.transforms()
+        }
         return sorted(edges)
 
     def measured(self, source: Source, wanted: str = "auto") -> str:
@@ -179,7 +190,9 @@ class PoseBag:
         for name in topics:
             if name not in self.topics:
                 hint = (
-                    did_you_mean(name, [topic for topic in self.topics if topic not in taken])
+                    did_you_mean(
+                        name, [topic for topic in self.topics if topic not in taken]
+                    )
                     or "."
                 )
                 raise InputError(f"no topic {name} in {self}{hint} {self._listing()}")
@@ -246,7 +259,11 @@ class PoseBag:
             )
         if parent and child:
             return parent, child
-        missing = [name for name, source in (("parent", parent), ("child", child)) if not source]
+        missing = [
+            name
+            for name, source in (("parent", parent), ("child", child))
+            if not source
+        ]
         topics = self._choice(missing, named)
         if parent:
             return parent, topics[0]
@@ -254,7 +271,9 @@ class PoseBag:
             return topics[0], child
         return self._by_role(topics, frames or {})
 
-    def _by_role(self, topics: Sequence[str], frames: Mapping[str, str]) -> tuple[str, str]:
+    def _by_role(
+        self, topics: Sequence[str], frames: Mapping[str, str]
+    ) -> tuple[str, str]:
         """Sort two topics: first that of the parent, then that of the child."""
         sensors = {}
         if any(frames.values()):
@@ -333,7 +352,9 @@ class PoseBag:
             readings.append(self._reading("child", child, measures or {}, max_gap_s))
         return self._poses_of(readings, stamps or {})
 
-    def _poses_of(self, readings: Sequence[Reading], stamps: Mapping[str, str]) -> PoseTable:
+    def _poses_of(
+        self, readings: Sequence[Reading], stamps: Mapping[str, str]
+    ) -> PoseTable:
         """Read the poses of streams in the order of bag time; ``stamps`` are those of `poses`."""
         topics: set[str] = set()
         for reading in readings:
@@ -341,7 +362,9 @@ class PoseBag:
             topics.update(reading.topics)
         count = sum(self.topics[topic].count for topic in topics)
         runs = self.runs(topics)
-        for run in self.shown(runs, count, f"reading {self}", lambda run: len(run.messages)):
+        for run in self.shown(
+            runs, count, f"reading {self}", lambda run: len(run.messages)
+        ):
             for reading in readings:
                 if run.kind.topic in reading.topics:
                     reading.take(run)
@@ -364,7 +387,9 @@ class PoseBag:
             return BAG_READINGS["images of a target"](self, stream, topic, fields)
         type_ = self.type_of(topic)
         if type_ == messages.JOINTS_TYPE and "=" not in fields:
-            return BAG_READINGS[type_](stream, topic, fields, measures.get(stream, "auto"))
+            return BAG_READINGS[type_](
+                stream, topic, fields, measures.get(stream, "auto")
+            )
         row = messages.MESSAGE_TYPES.get(type_)
         if row:
             fields = fields or row.fields
@@ -387,7 +412,9 @@ class PoseBag:
         fixes, rotations = self._parts_of(topic)
         return sources.JoinedReading(
             sources.TopicReading(stream, fixes, self.type_of(fixes), "positions"),
-            sources.TopicReading(stream, rotations, self.type_of(rotations), "rotations"),
+            sources.TopicReading(
+                stream, rotations, self.type_of(rotations), "rotations"
+            ),
         )
 
     def trajectory(
@@ -423,7 +450,9 @@ class PoseBag:
             If the bag or a pose cannot be read.
         """
         self.check(source)
-        reading = self._reading(stream, source, {stream: measures}, CalibratorConfig.max_gap)
+        reading = self._reading(
+            stream, source, {stream: measures}, CalibratorConfig.max_gap
+        )
         poses = self._poses_of([reading], {stream: stamps})
         if not len(poses):
             raise InputError(f"no poses on {source} of {self}")

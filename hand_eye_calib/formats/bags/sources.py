@@ -20,7 +20,12 @@ from typing import Any
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.core.base.errors import ConfigError, InputError, NoPoseError, printable
+from hand_eye_calib.core.base.errors import (
+    ConfigError,
+    InputError,
+    NoPoseError,
+    printable,
+)
 from hand_eye_calib.core.base.text import frame_name, without_poses
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import are_null
@@ -148,7 +153,9 @@ class Reading(ABC):
 class TopicReading(Reading):
     """Reader of a topic with a pose, a position, an orientation or angular rates per message."""
 
-    def __init__(self, stream: str, topic: str, message_type: str, measures: str) -> None:
+    def __init__(
+        self, stream: str, topic: str, message_type: str, measures: str
+    ) -> None:
         super().__init__(stream, topic)
         self._measures = measures
         self._reader = messages.MessageReader(message_type, measures)
@@ -240,7 +247,9 @@ class JoinedReading(Reading):
         rotations = self._rotations.table()
         self.notes += self._fixes.notes + self._rotations.notes
         if not len(fixes) or len(rotations) < 2:
-            raise InputError(f"{self.name}: no positions with a fix, or no orientations")
+            raise InputError(
+                f"{self.name}: no positions with a fix, or no orientations"
+            )
         orientations = rotations.trajectory()
         first_ns, last_ns = orientations.stamps_ns[[0, -1]]
         fixes = fixes[(fixes.stamps_ns >= first_ns) & (fixes.stamps_ns <= last_ns)]
@@ -273,7 +282,10 @@ class PathReading(Reading):
         if self._newest is None:
             return _NO_POSES
         (path,) = self._newest.decoded()
-        rows = [messages.pose_row(item.pose.position, item.pose.orientation) for item in path.poses]
+        rows = [
+            messages.pose_row(item.pose.position, item.pose.orientation)
+            for item in path.poses
+        ]
         stamps_ns = [messages.ns_of(item.header.stamp) for item in path.poses]
         if len(rows) > 1 and not any(stamps_ns):
             raise InputError(
@@ -322,10 +334,15 @@ class FieldReading(Reading):
         self._bag_ns: list[int] = []
         self.measures = "poses" if are_twists else self._table.measures
         if self.measures == "rates":
-            raise InputError(f"{topic}: wx, wy, wz alone are no poses; also name vx, vy, vz")
+            raise InputError(
+                f"{topic}: wx, wy, wz alone are no poses; also name vx, vy, vz"
+            )
 
     def take(self, run: messages.Run) -> None:
-        rows = [[self._cell(message, path) for path in self._paths] for message in run.decoded()]
+        rows = [
+            [self._cell(message, path) for path in self._paths]
+            for message in run.decoded()
+        ]
         self._table.fill(enumerate(rows, len(self._bag_ns) + 1), list)
         self._bag_ns += run.bag_ns.tolist()
 
@@ -345,7 +362,9 @@ class FieldReading(Reading):
     def table(self) -> PoseTable:
         table = self._table
         if not table.stamps:
-            raise InputError(f"no messages on {self.name}, or none of its fields is a stamp, t")
+            raise InputError(
+                f"no messages on {self.name}, or none of its fields is a stamp, t"
+            )
         stamps_ns = stamps_in_ns(table, None)
         self.notes = table.guesses
         self._note_null(table.n_left_out, table.n_rows)
@@ -354,7 +373,9 @@ class FieldReading(Reading):
         else:
             poses = np.column_stack(poses_of(table))
         bag_ns = np.asarray(self._bag_ns)[table.rows]
-        return self._stamped(PoseTable.of(stamps_ns, poses).recorded(self.stream, bag_ns))
+        return self._stamped(
+            PoseTable.of(stamps_ns, poses).recorded(self.stream, bag_ns)
+        )
 
 
 def _integrated(stamps_ns: IntArray, twists: FloatArray) -> FloatArray:
@@ -375,7 +396,9 @@ class TransformReading(Reading):
     """
 
     def __init__(self, stream: str, source: TfStream, topics: Collection[str]) -> None:
-        super().__init__(stream, *(topic for topic in topics if not topic.endswith("tf_static")))
+        super().__init__(
+            stream, *(topic for topic in topics if not topic.endswith("tf_static"))
+        )
         self._source = source
         # For each pose: bag time, stamp, and x y z qx qy qz qw of each moving transform by frame.
         self._poses: list[tuple[int, int, Any]] = []
@@ -403,7 +426,9 @@ class TransformReading(Reading):
         if not self._poses:
             raise InputError(f"{frames}: {self._source.describe_missing()}")
         bag_ns, stamps_ns, edges = zip(*self._poses, strict=True)
-        moving = {frame: np.array([rows[frame] for rows in edges]) for frame in edges[0]}
+        moving = {
+            frame: np.array([rows[frame] for rows in edges]) for frame in edges[0]
+        }
         poses = se3.to_rows(self._source.composed(moving))
         self._note_null(self._n_null, self._n_null + len(poses))
         table = PoseTable.of(stamps_ns, poses, *frames).recorded(self.stream, bag_ns)

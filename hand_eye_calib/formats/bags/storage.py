@@ -15,11 +15,20 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 from urllib.parse import quote
 
-from hand_eye_calib.core.base.errors import InputError, MissingDependencyError, printable, required
+from hand_eye_calib.core.base.errors import (
+    InputError,
+    MissingDependencyError,
+    printable,
+    required,
+)
 from hand_eye_calib.formats import files
 
 # Tool that repairs a damaged storage file with this suffix.
-REPAIRS = {".mcap": "'mcap recover'", ".db3": "sqlite3's '.recover'", ".bag": "'rosbag reindex'"}
+REPAIRS = {
+    ".mcap": "'mcap recover'",
+    ".db3": "sqlite3's '.recover'",
+    ".bag": "'rosbag reindex'",
+}
 # First bytes of a message that is compressed with zstd. Plain CDR never begins with these bytes.
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 # Length in bytes (uint32) before the header and before the data of a rosbag1 record.
@@ -57,12 +66,16 @@ Message: TypeAlias = tuple[MessageKind, int, bytes]
 
 
 @lru_cache
-def kind_of(topic: str, name: str, encoding: str, language: str, content: bytes) -> MessageKind:
+def kind_of(
+    topic: str, name: str, encoding: str, language: str, content: bytes
+) -> MessageKind:
     """Return the kind of a connection's messages; equal connections get the same object."""
     # ROS 1 names types package/Type, ROS 2 package/msg/Type.
     if encoding == "ros1" and name.count("/") == 1:
         name = name.replace("/", "/msg/")
-    return MessageKind(printable_name(topic), printable_name(name), encoding, (language, content))
+    return MessageKind(
+        printable_name(topic), printable_name(name), encoding, (language, content)
+    )
 
 
 def printable_name(name: str) -> str:
@@ -148,7 +161,9 @@ class Storage(ABC):
         except Exception as error:
             # rosbags reads SQLite with apsw, whose NoMemError is not a subclass of MemoryError.
             if isinstance(error, MemoryError) or type(error).__name__ == "NoMemError":
-                why = "reading it needs too much memory; the file is damaged or malicious"
+                why = (
+                    "reading it needs too much memory; the file is damaged or malicious"
+                )
             else:
                 why = (
                     "it is truncated, damaged or of an unsupported kind "
@@ -178,14 +193,18 @@ class RosbagsFile(Storage):
         opened.callback(reader.close)
         # rosbags reads only the messages in the index of an mcap file, so it must be complete.
         if suffix == ".mcap":
-            n_indexed = sum(sum(chunk.channel_count.values()) for chunk in reader.storage.chunks)
+            n_indexed = sum(
+                sum(chunk.channel_count.values()) for chunk in reader.storage.chunks
+            )
             if n_indexed != reader.message_count:
                 raise ValueError("it has no index of its messages")
         for connection in reader.connections:
             encoding = getattr(connection.ext, "serialization_format", "ros1")
             language = connection.msgdef.format.name
             definition = connection.msgdef.data.encode()
-            kind = kind_of(connection.topic, connection.msgtype, encoding, language, definition)
+            kind = kind_of(
+                connection.topic, connection.msgtype, encoding, language, definition
+            )
             self._kinds[connection.id] = kind
             self.counts[kind] += connection.msgcount
         if reader.message_count:
@@ -195,7 +214,11 @@ class RosbagsFile(Storage):
         if self._file.suffix == ".bag":
             yield from self._rosbag1_messages(kinds)
             return
-        wanted = [connection for connection in self._reader.connections if connection.id in kinds]
+        wanted = [
+            connection
+            for connection in self._reader.connections
+            if connection.id in kinds
+        ]
         for connection, bag_ns, data in self._reader.messages(wanted):
             yield kinds[connection.id], bag_ns, data
 
@@ -206,7 +229,11 @@ class RosbagsFile(Storage):
         takes 1.7 times as long.
         """
         reader = self._reader
-        entries = [(entry, kind) for key, kind in kinds.items() for entry in reader.indexes[key]]
+        entries = [
+            (entry, kind)
+            for key, kind in kinds.items()
+            for entry in reader.indexes[key]
+        ]
         entries.sort(key=lambda item: item[0].time)
         # Position and unpacked content of the chunk of the previous message.
         chunk_pos = -1
@@ -266,4 +293,6 @@ def message_blocks(messages: Iterable[Message]) -> Iterator[list[Message]]:
 
 def zstd_module() -> Any:
     """Return the zstd module of Python 3.14 and later, or its backport."""
-    return import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
+    return import_module(
+        "compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd"
+    )

@@ -39,7 +39,10 @@ def write_bag(path: str | Path, streams: Streams, storage: str = "mcap") -> None
         library = rosbags(1)
     else:
         library = rosbags(2)
-        options = {"version": 9, "storage_plugin": library.StoragePlugin[storage.upper()]}
+        options = {
+            "version": 9,
+            "storage_plugin": library.StoragePlugin[storage.upper()],
+        }
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with library.Writer(path, **options) as writer:
@@ -81,7 +84,9 @@ def stamped_messages(
     twist = make("TwistWithCovariance", make("Twist", zero, zero), no_covariance)
     rows = se3.to_rows(trajectory.poses).tolist()
     for number, stamp_ns in enumerate(trajectory.stamps_ns.tolist()):
-        stamp = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, STAMP_UNITS["s"]))
+        stamp = types["builtin_interfaces/msg/Time"](
+            *divmod(stamp_ns, STAMP_UNITS["s"])
+        )
         sequence = {"seq": number} if is_ros1 else {}
         header = types["std_msgs/msg/Header"](
             stamp=stamp, frame_id=trajectory.world_frame, **sequence

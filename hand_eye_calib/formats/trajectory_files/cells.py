@@ -15,7 +15,9 @@ from hand_eye_calib.formats.trajectory_files.dates import is_date_or_time
 BLANKS = ""
 # Possible separators, the preferred one first if several of them fit equally well.
 _SEPARATORS = (";", "\t", ",", "|", BLANKS)
-_NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)(e[-+]?\d+)?|[-+]?nan|[-+]?inf", re.IGNORECASE)
+_NUMBER = re.compile(
+    r"[-+]?(\d+(\.\d*)?|\.\d+)(e[-+]?\d+)?|[-+]?nan|[-+]?inf", re.IGNORECASE
+)
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(e[-+]?\d+)?", re.IGNORECASE)
 # Texts that programs write for a missing value, in lower case.
 _NULLS = {"", "nan", "-nan", "null", "none", "na", "n/a", "#n/a", "nil", "-", "--", "?"}
@@ -43,7 +45,12 @@ def is_number(cell: str) -> bool:
 
 def is_value(cell: str) -> bool:
     """Whether a cell is a number, an angle, a date or time, or the mark of a missing value."""
-    return is_number(cell) or is_null(cell) or is_date_or_time(cell) or _is_marked_angle(cell)
+    return (
+        is_number(cell)
+        or is_null(cell)
+        or is_date_or_time(cell)
+        or _is_marked_angle(cell)
+    )
 
 
 def is_null(cell: str) -> bool:
@@ -157,7 +164,9 @@ def separator_of(lines: Sequence[str]) -> str:
 
 def _digits_in_numbers(cells: Sequence[str]) -> int:
     """Return the number of digits in the cells that are numbers or angles."""
-    numbers = "".join(cell for cell in cells if is_number(cell) or _is_marked_angle(cell))
+    numbers = "".join(
+        cell for cell in cells if is_number(cell) or _is_marked_angle(cell)
+    )
     return sum(map(str.isdigit, numbers))
 
 

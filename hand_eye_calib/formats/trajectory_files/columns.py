@@ -50,7 +50,11 @@ _POSITION_NAMES = (
     "{0} t{0} t_{0} p{0} p_{0} pos_{0} position_{0} translation_{0} position{1} "
     "actual_tcp_pose_{1} ecef_{0} {0}_ecef {0}_ecf {2}"
 )
-_DIRECTIONS = {"x": "easting pos_east", "y": "northing pos_north", "z": "altitude pos_up"}
+_DIRECTIONS = {
+    "x": "easting pos_east",
+    "y": "northing pos_north",
+    "z": "altitude pos_up",
+}
 # Beginnings of the names of angular rates, velocities and quaternions. The name of the axis, or of
 # the coefficient of the quaternion, follows.
 _BEGINNINGS = {
@@ -90,7 +94,9 @@ _NAMES = {
     "sensor": "device_id device_name sensor_id sensor_name camera_id camera_name child_frame_id "
     "rigid_body body_name object_name subject_name",
     **{
-        f"{kind}{axis}": " ".join(f"{beginning}{axis}" for beginning in beginnings.split())
+        f"{kind}{axis}": " ".join(
+            f"{beginning}{axis}" for beginning in beginnings.split()
+        )
         for kind, beginnings in _BEGINNINGS.items()
         for axis in "xyzw"
     },
@@ -174,7 +180,9 @@ def named_columns(names: Sequence[str]) -> tuple[dict[str, list[int]], list[str]
         if quantity in ROTATION_VECTOR:
             # rx, ry and rz in degrees are Euler angles of an unknown order, not a rotation vector.
             places = [
-                place for place in places if not (is_brief(plain[place]) and units[place] == "deg")
+                place
+                for place in places
+                if not (is_brief(plain[place]) and units[place] == "deg")
             ]
         if places:
             columns[quantity] = places
@@ -203,7 +211,9 @@ def is_brief(name: str) -> bool:
     return plain_name(name) in ("rx", "ry", "rz")
 
 
-def _elements(plain: Sequence[str], columns: Mapping[str, list[int]]) -> dict[str, list[int]]:
+def _elements(
+    plain: Sequence[str], columns: Mapping[str, list[int]]
+) -> dict[str, list[int]]:
     """Return the columns of the elements m11 to m34 of a pose; empty without a whole rotation.
 
     The names may count the rows and columns of the matrix from 0 or from 1. The translation may
@@ -216,7 +226,8 @@ def _elements(plain: Sequence[str], columns: Mapping[str, list[int]]) -> dict[st
     # Names that count from 0 have an element 00.
     shift = 1 if (0, 0) in places_of else 0
     elements = {
-        f"m{row + shift}{column + shift}": places for (row, column), places in places_of.items()
+        f"m{row + shift}{column + shift}": places
+        for (row, column), places in places_of.items()
     }
     if not {*ROTATION} <= elements.keys():
         return {}
@@ -244,7 +255,9 @@ def measured(
         the columns have.
     """
     position = _first_group((*_POSITIONS, *PLANAR_POSITIONS), columns)
-    orientation = _first_group((*_ORIENTATIONS, *_PLANAR_ORIENTATIONS), columns) or QUATERNION
+    orientation = (
+        _first_group((*_ORIENTATIONS, *_PLANAR_ORIENTATIONS), columns) or QUATERNION
+    )
     has_matrix = {*ROTATION} <= columns.keys()
     if measures == "auto":
         measures = "poses" if has_matrix else _kind_of(columns, names)
@@ -281,7 +294,9 @@ def _kind_of(columns: Mapping[str, list[int]], names: Sequence[str]) -> str:
     """
     listed = ",".join(plain_name(name) for name in names)
     if _first_group((*_POSITIONS, *PLANAR_POSITIONS), columns):
-        has_orientation = columns.keys() & _ORIENTATION_QUANTITIES or _ORIENTED.search(listed)
+        has_orientation = columns.keys() & _ORIENTATION_QUANTITIES or _ORIENTED.search(
+            listed
+        )
         return "poses" if has_orientation else "positions"
     if columns.keys() & _POSITION_QUANTITIES:
         return "poses"
@@ -342,7 +357,9 @@ def _split(name: str) -> tuple[str, str]:
     if re.search(r"\[\d\]$", name):
         name = re.sub(r"\[(\d)\]", r"_\1_", name)
     # Remove names of frames, as in p_RS_R_x of EuRoC and tx_world_device of Aria.
-    name = re.sub(r"^([pqw])_[a-z]{2}(_[a-z])?_|_(world|odometry)_device$", r"\1_", name)
+    name = re.sub(
+        r"^([pqw])_[a-z]{2}(_[a-z])?_|_(world|odometry)_device$", r"\1_", name
+    )
     # Remove brackets with their content. Text after a bracket that is not closed is kept.
     outside = _BRACKETS.sub(lambda match: "" if match[2] else f" {match[1]}", name)
     words = re.findall("[a-z0-9°µμ]+", outside)

@@ -28,9 +28,26 @@ WEEK_S = 604_800
 #: Beginning of GPS time, 1980-01-06, in s since 1970 (IS-GPS-200).
 GPS_EPOCH_S = 315_964_800
 
-_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
-_YEAR_FIRST = re.compile(r"(\d{4})([-/._ ])(\d\d?|[a-z]{3,9})\2(\d\d?)", re.IGNORECASE | re.ASCII)
-_YEAR_LAST = re.compile(r"(\d\d?)([-/. ])(\d\d?|[a-z]{3,9})\2(\d{4})", re.IGNORECASE | re.ASCII)
+_MONTHS = (
+    "jan",
+    "feb",
+    "mar",
+    "apr",
+    "may",
+    "jun",
+    "jul",
+    "aug",
+    "sep",
+    "oct",
+    "nov",
+    "dec",
+)
+_YEAR_FIRST = re.compile(
+    r"(\d{4})([-/._ ])(\d\d?|[a-z]{3,9})\2(\d\d?)", re.IGNORECASE | re.ASCII
+)
+_YEAR_LAST = re.compile(
+    r"(\d\d?)([-/. ])(\d\d?|[a-z]{3,9})\2(\d{4})", re.IGNORECASE | re.ASCII
+)
 # A date such as 20231114. Its groups have the numbers of those of _YEAR_FIRST.
 _PACKED = re.compile(r"(20\d\d)()(\d\d)(\d\d)", re.ASCII)
 # Text between a date and a time of day.
@@ -119,7 +136,9 @@ def _day_and_rest(text: str) -> tuple[int | None, str]:
 
 def _day(year: str, month: str, day: str) -> int:
     """Return the day since 1970 of a date; the month is a number or a name."""
-    month_number = int(month) if month.isdigit() else 1 + _MONTHS.index(month[:3].lower())
+    month_number = (
+        int(month) if month.isdigit() else 1 + _MONTHS.index(month[:3].lower())
+    )
     return date(int(year), month_number, int(day)).toordinal() - _EPOCH_DAY
 
 
@@ -128,7 +147,9 @@ def _time_of_day(text: str) -> Decimal:
     match = _TIME.fullmatch(text)
     if not match:
         raise ValueError("no time of day")
-    hour_text, separator, minute_text, second_text, point, digits, half, zone = match.groups()
+    hour_text, separator, minute_text, second_text, point, digits, half, zone = (
+        match.groups()
+    )
     hour = _hour_of_day(int(hour_text), half)
     minute = int(minute_text)
     second = int(second_text or 0)

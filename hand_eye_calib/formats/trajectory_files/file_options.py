@@ -50,4 +50,6 @@ class FileOptions:
 def _refuse_unknown(setting: str, value: str, choices: Sequence[str]) -> None:
     """Raise a ConfigError for a value that is not among the choices."""
     if value not in choices:
-        raise ConfigError(f"unknown {setting} {value!r}; known are {', '.join(choices)}")
+        raise ConfigError(
+            f"unknown {setting} {value!r}; known are {', '.join(choices)}"
+        )

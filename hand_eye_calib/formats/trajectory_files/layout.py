@@ -93,7 +93,9 @@ class Layout:
     is_transposable: bool = False
 
 
-def lines_of(path: str | Path, text: str, after: int | None = None) -> Iterator[tuple[int, str]]:
+def lines_of(
+    path: str | Path, text: str, after: int | None = None
+) -> Iterator[tuple[int, str]]:
     """Yield the number and the text of each line that is not blank.
 
     With ``after``, comments and the lines up to this line number are skipped.
@@ -109,7 +111,9 @@ def lines_of(path: str | Path, text: str, after: int | None = None) -> Iterator[
         line_number += text.count("\n", end, match.start())
         end = match.end()
         if end - match.start() > LONGEST_LINE:
-            raise InputError(f"{path}, line {line_number}: longer than {LONGEST_LINE} characters")
+            raise InputError(
+                f"{path}, line {line_number}: longer than {LONGEST_LINE} characters"
+            )
         line = match[0]
         if after is None or (line_number > after and not line.startswith(COMMENTS)):
             yield line_number, line.rstrip()
@@ -143,7 +147,9 @@ def layout_of(path: str | Path, text: str, needs_names: bool) -> Layout:
     row = _usual_row(cells[n_above:])
     header = _header_of(above, row, separator)
     if needs_names and header.names is None:
-        _refuse_other_number_of_names(path, lines[:n_above], _without_last(row), separator)
+        _refuse_other_number_of_names(
+            path, lines[:n_above], _without_last(row), separator
+        )
     cells_of = _merged(split, header.merge) if header.merge else split
     rows = [cells_of(line) for _, line in lines[n_above:]]
     rows_after = lines[n_above - 1][0] if n_above else 0
@@ -169,7 +175,9 @@ def _usual_row(rows: Sequence[list[str]]) -> list[str]:
     return next(row for row in rows if len(row) == n_cells)
 
 
-def _first_lines(path: str | Path, text: str) -> tuple[list[str], list[tuple[int, str]]]:
+def _first_lines(
+    path: str | Path, text: str
+) -> tuple[list[str], list[tuple[int, str]]]:
     """Return the comments above the first other line, and the first lines that are not comments.
 
     A line that is not a comment is returned with its number.
@@ -241,7 +249,12 @@ def _joining(widths: Sequence[int]) -> _Merge:
 
 def _is_split_stamp(cells: Sequence[str]) -> bool:
     """Whether the first two cells are a date and a time of day."""
-    return len(cells) > 1 and is_date(cells[0]) and ":" in cells[1] and is_date_or_time(cells[1])
+    return (
+        len(cells) > 1
+        and is_date(cells[0])
+        and ":" in cells[1]
+        and is_date_or_time(cells[1])
+    )
 
 
 # ---- names above the rows
@@ -271,7 +284,9 @@ def _header_of(above: Sequence[str], row: list[str], separator: str) -> _Header:
     return _Header(None)
 
 
-def _header_above(above: Sequence[str], row: Sequence[str], separator: str) -> _Header | None:
+def _header_above(
+    above: Sequence[str], row: Sequence[str], separator: str
+) -> _Header | None:
     """Return the header from the lines above the rows; None if no line fits the row.
 
     The nearest line with names of quantities is preferred. Without such a line, the nearest line
@@ -295,7 +310,10 @@ def _header_above(above: Sequence[str], row: Sequence[str], separator: str) -> _
 
 
 def _refuse_other_number_of_names(
-    path: str | Path, lines: Sequence[tuple[int, str]], row: Sequence[str], separator: str
+    path: str | Path,
+    lines: Sequence[tuple[int, str]],
+    row: Sequence[str],
+    separator: str,
 ) -> None:
     """Raise an InputError if a line above the rows names more or fewer columns than a row has."""
     for line_number, line in lines:
@@ -342,7 +360,9 @@ def _header_if_fitting(
     return None
 
 
-def _header_of_widths(names: Sequence[str], widths: Sequence[int], row: Sequence[str]) -> _Header:
+def _header_of_widths(
+    names: Sequence[str], widths: Sequence[int], row: Sequence[str]
+) -> _Header:
     """Return the header of names that have ``widths`` cells in a row; names without cells go."""
     names = [name for name, width in zip(names, widths, strict=True) if width]
     if max(widths) == 1:
@@ -415,12 +435,19 @@ def _with_stamp(names: tuple[str, ...], row: Sequence[str]) -> tuple[str, ...]:
     """Rename a first column with an unknown name to "t" if it contains stamps since 1970."""
     columns = named_columns(names)[0].keys()
     has_stamp = not columns.isdisjoint({"t", "secs", *named_columns(names[:1])[0]})
-    return names if has_stamp or not _SINCE_1970.fullmatch(row[0]) else ("t", *names[1:])
+    return (
+        names if has_stamp or not _SINCE_1970.fullmatch(row[0]) else ("t", *names[1:])
+    )
 
 
-def _with_named_columns(layout: Layout, names: tuple[str, ...], is_separated: bool) -> Layout:
+def _with_named_columns(
+    layout: Layout, names: tuple[str, ...], is_separated: bool
+) -> Layout:
     """Set the format and the columns of a layout by the names above the rows."""
-    if not is_separated and " ".join(names[1:]).lower() == TUM_COLUMNS.partition(" ")[2]:
+    if (
+        not is_separated
+        and " ".join(names[1:]).lower() == TUM_COLUMNS.partition(" ")[2]
+    ):
         return replace(layout, format="tum", columns=TUM)
     return replace(layout, format="csv", columns=names)
 
@@ -441,7 +468,9 @@ def _with_fitting_columns(
     may_be_stamped_pose = columns is None or columns[: len(TUM)] == STAMPED_POSE
     is_long_enough = is_separated and n_columns >= len(TUM)
     if may_be_stamped_pose and is_long_enough and _is_in_ns(layout.row[0]):
-        return replace(layout, format="euroc", columns=("t [ns]", *POSITION, *SCALAR_FIRST))
+        return replace(
+            layout, format="euroc", columns=("t [ns]", *POSITION, *SCALAR_FIRST)
+        )
     if columns == STAMPED_POSE and not is_separated:
         return replace(layout, format="tum", columns=columns)
     if columns is not None:

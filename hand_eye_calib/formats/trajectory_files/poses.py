@@ -90,7 +90,9 @@ def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, ...]:
     """
     table.refuse(
         np.asarray(~np.isfinite(table.values()).all(axis=1)),
-        lambda _: "found a value that is not finite; remove the line or repair its source",
+        lambda _: (
+            "found a value that is not finite; remove the line or repair its source"
+        ),
     )
     if table.measures == "rates":
         return (_in_si(table, RATES, "rate"),)
@@ -151,7 +153,9 @@ def _of_matrices(table: Table) -> tuple[FloatArray, FloatArray]:
     _refuse_far(table, positions)
     nearest = se3.nearest_rotation(matrices[:, :, :3])
     table.refuse(
-        np.asarray(np.abs(nearest - matrices[:, :, :3]).max(axis=(1, 2)) > ROTATION_TOLERANCE),
+        np.asarray(
+            np.abs(nearest - matrices[:, :, :3]).max(axis=(1, 2)) > ROTATION_TOLERANCE
+        ),
         lambda _: (
             f"the 3x3 part is not a rotation matrix within {ROTATION_TOLERANCE}; check the order "
             "of the values"
@@ -166,7 +170,9 @@ def _of_matrices(table: Table) -> tuple[FloatArray, FloatArray]:
     }
     fitting = _conventions_that_fit(positions, candidates)
     reason = ", because the motion fits that" if len(fitting) == 1 else ""
-    table.guess(f"rotations and translations are in separate columns; read {fitting[0]}{reason}")
+    table.guess(
+        f"rotations and translations are in separate columns; read {fitting[0]}{reason}"
+    )
     return positions, candidates[fitting[0]]
 
 
@@ -174,7 +180,9 @@ def _of_matrices(table: Table) -> tuple[FloatArray, FloatArray]:
 _R_ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
-def _in_axes_of_earth(table: Table, positions: FloatArray, quats_xyzw: FloatArray) -> FloatArray:
+def _in_axes_of_earth(
+    table: Table, positions: FloatArray, quats_xyzw: FloatArray
+) -> FloatArray:
     """Return the orientations (N, 4) in the earth's axes (ECEF), for positions (N, 3) in ECEF, m.
 
     The orientations ``quats_xyzw`` (N, 4) of the file may be relative to the earth's axes, or to
@@ -232,7 +240,9 @@ def _on_earth(table: Table, up: Sequence[str]) -> tuple[FloatArray, FloatArray]:
         ),
     )
     height_m = _in_si(table, up, "length")[:, 0] if up else np.zeros(len(lat_rad))
-    table.guess("latitude and longitude became metres east and north of the first position")
+    table.guess(
+        "latitude and longitude became metres east and north of the first position"
+    )
     positions = LocalOrigin().local(lat_rad, lon_rad, height_m)
     return positions, rotations_to_first(lat_rad, lon_rad)
 
@@ -284,11 +294,15 @@ def _orientations(table: Table, positions: FloatArray, convention: str) -> Float
         return _of_angles(table, positions, convention)
     if ROTATION_VECTOR[0] in table.at:
         _require_rotation_vectors(table)
-        return se3.to_quat_xyzw(se3.rotation_exp(_in_si(table, ROTATION_VECTOR, "angle")))
+        return se3.to_quat_xyzw(
+            se3.rotation_exp(_in_si(table, ROTATION_VECTOR, "angle"))
+        )
     return np.tile([0.0, 0.0, 0.0, 1.0], (len(positions), 1))
 
 
-def _of_quaternions(table: Table, names: Sequence[str], positions: FloatArray) -> FloatArray:
+def _of_quaternions(
+    table: Table, names: Sequence[str], positions: FloatArray
+) -> FloatArray:
     """Return the quaternions (N, 4) of a table, with the scalar last.
 
     The names q0 to q3 usually mean the scalar first, and columns without names the scalar last.
@@ -315,7 +329,9 @@ def _of_quaternions(table: Table, names: Sequence[str], positions: FloatArray) -
         reason = "the first orientation is then the identity"
     if reason:
         columns = {"first": "qw qx qy qz", "last": "qx qy qz qw"}[opposite]
-        table.guess(f"quaternions read with the scalar {opposite}, t x y z {columns}: {reason}")
+        table.guess(
+            f"quaternions read with the scalar {opposite}, t x y z {columns}: {reason}"
+        )
         return candidates[opposite]
     is_certain = fitting == [usual] or begins_with_identity[usual]
     if names == UNNAMED and table.format != "tum" and not is_certain:
@@ -388,7 +404,8 @@ def _of_angles(table: Table, positions: FloatArray, convention: str) -> FloatArr
     # makes no difference, so on flat ground it fits every motion.
     preference = {expected: 0, _OTHER_ORDER: 2}
     table.conventions = sorted(
-        _conventions_that_fit(positions, candidates), key=lambda name: preference.get(name, 1)
+        _conventions_that_fit(positions, candidates),
+        key=lambda name: preference.get(name, 1),
     )
     used = convention or table.conventions[0]
     if expected == _COMPASS or used != expected:
@@ -404,7 +421,9 @@ def _of_angles(table: Table, positions: FloatArray, convention: str) -> FloatArr
     return candidates[used]
 
 
-def _conventions_that_fit(positions: FloatArray, candidates: Mapping[str, FloatArray]) -> list[str]:
+def _conventions_that_fit(
+    positions: FloatArray, candidates: Mapping[str, FloatArray]
+) -> list[str]:
     """Return the conventions that the direction of travel in the sensor's axes does not exclude.
 
     A convention is excluded if its scatter of the direction exceeds STEADY_SCATTER, and also
@@ -422,4 +441,6 @@ def _conventions_that_fit(positions: FloatArray, candidates: Mapping[str, FloatA
         for convention, quats_xyzw in candidates.items()
     }
     largest = max(STEADY_SCATTER, WRONG_SCATTER_RATIO * min(scatters.values()))
-    return [convention for convention, scatter in scatters.items() if scatter <= largest]
+    return [
+        convention for convention, scatter in scatters.items() if scatter <= largest
+    ]

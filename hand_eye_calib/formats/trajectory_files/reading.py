@@ -17,7 +17,12 @@ from numpy.typing import ArrayLike
 from hand_eye_calib.core.base.arrays import IntArray
 from hand_eye_calib.core.base.config import PAIR_BY
 from hand_eye_calib.core.base.errors import ConfigError, InputError
-from hand_eye_calib.core.base.text import MUCH_NULL, distinct_names, listing, without_poses
+from hand_eye_calib.core.base.text import (
+    MUCH_NULL,
+    distinct_names,
+    listing,
+    without_poses,
+)
 from hand_eye_calib.core.geometry.trajectory import Trajectory, TrajectoryLike
 from hand_eye_calib.formats.files import local_path
 from hand_eye_calib.formats.trajectory_files.file_options import AUTO, FileOptions
@@ -125,9 +130,13 @@ def read_trajectory(
     has_file_options = is_format_set or columns is not None or file_of_times is not None
     has_times_in_memory = times is not None and file_of_times is None
     if topic:
-        has_other_options = any([has_file_options, has_times_in_memory, stamp_unit, repair])
+        has_other_options = any(
+            [has_file_options, has_times_in_memory, stamp_unit, repair]
+        )
         if has_other_options or not path:
-            raise ConfigError("topic is for bags and cannot be combined with options of text files")
+            raise ConfigError(
+                "topic is for bags and cannot be combined with options of text files"
+            )
         return _of_bag(path, topic, measures)
     _refuse_misplaced_options(path, has_file_options, has_times_in_memory)
     options = FileOptions(
@@ -152,7 +161,9 @@ def _refuse_misplaced_options(
     ``path`` is the text file to read, or None for an object.
     """
     if path and path.is_dir():
-        raise ConfigError(f"{path} is a folder: name the topic of the bag, such as topic='/odom'")
+        raise ConfigError(
+            f"{path} is a folder: name the topic of the bag, such as topic='/odom'"
+        )
     has_unusable_options = has_times_in_memory if path else has_file_options
     if has_unusable_options:
         raise ConfigError(
@@ -185,7 +196,9 @@ def _of_bag(path: Path, topic: str, measures: str) -> Trajectory:
     return trajectory
 
 
-def read_trajectory_files(files: Sequence[tuple[Path, FileOptions]]) -> list[FileReading]:
+def read_trajectory_files(
+    files: Sequence[tuple[Path, FileOptions]],
+) -> list[FileReading]:
     """Read the text files of one calibration; a sensor without a name gets that of its file.
 
     Files with the same columns come from the same program, so their angles have the same
@@ -239,7 +252,9 @@ def _corrected_conventions(tables: Sequence[Table]) -> dict[int, str]:
     """
     conventions = {}
     for names in {table.names for table in tables if table.conventions}:
-        numbers = [number for number, table in enumerate(tables) if table.names == names]
+        numbers = [
+            number for number, table in enumerate(tables) if table.names == names
+        ]
         common = tables[numbers[0]].conventions
         for number in numbers:
             common = [name for name in common if name in tables[number].conventions]
@@ -274,10 +289,16 @@ def read_trajectories(*sources: TrajectoryLike) -> list[Trajectory]:
 
     Warnings report guesses and repairs, as in :func:`read_trajectory`.
     """
-    paths = [local_path(fspath(source)) for source in sources if isinstance(source, str | PathLike)]
+    paths = [
+        local_path(fspath(source))
+        for source in sources
+        if isinstance(source, str | PathLike)
+    ]
     if len(paths) < len(sources):
         return [read_trajectory(source, AUTO) for source in sources]
-    readings = read_trajectory_files([(path, FileOptions(format=AUTO)) for path in paths])
+    readings = read_trajectory_files(
+        [(path, FileOptions(format=AUTO)) for path in paths]
+    )
     for reading in readings:
         _warn_of(reading)
     return [reading.trajectory for reading in readings]
@@ -311,7 +332,10 @@ def _rows_without_stamps(tables: Sequence[Table], pair_by: str) -> list[IntArray
 
 
 def _read(
-    table: Table, options: FileOptions, rows: IntArray | None = None, convention: str = ""
+    table: Table,
+    options: FileOptions,
+    rows: IntArray | None = None,
+    convention: str = "",
 ) -> FileReading:
     """Return the trajectory of a table.
 
@@ -326,7 +350,9 @@ def _read(
         Convention of the table's angles. By default, the motion decides.
     """
     if not table.line_numbers:
-        raise InputError(f"{table.path}: the file contains no poses{_why_no_poses(table)}")
+        raise InputError(
+            f"{table.path}: the file contains no poses{_why_no_poses(table)}"
+        )
     repairs, doubts = _notes_on_skipped_rows(table)
     if rows is None:
         stamps_ns = stamps_in_ns(table, options.stamp_unit)

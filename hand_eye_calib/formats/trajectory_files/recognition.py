@@ -9,7 +9,10 @@ from itertools import islice
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray
-from hand_eye_calib.core.geometry.trajectory import QUATERNION_NORM_TOLERANCE, ROTATION_TOLERANCE
+from hand_eye_calib.core.geometry.trajectory import (
+    QUATERNION_NORM_TOLERANCE,
+    ROTATION_TOLERANCE,
+)
 from hand_eye_calib.formats.trajectory_files.cells import is_number, is_value, number
 from hand_eye_calib.formats.trajectory_files.columns import (
     LAST_ROW,
@@ -49,7 +52,9 @@ TRANSPOSABLE = _POSES[3:5]
 _COVARIANCES = (6, 21, 36)
 
 
-def columns_of_rows(row: Sequence[str], rows: Sequence[Sequence[str]]) -> tuple[str, ...] | None:
+def columns_of_rows(
+    row: Sequence[str], rows: Sequence[Sequence[str]]
+) -> tuple[str, ...] | None:
     """Return the quantities of the columns from the values in the first rows; None if none fit.
 
     Columns that contain text have an empty name. ``row`` is a row with the usual number of cells.
@@ -107,14 +112,18 @@ def _pose_with_more(values: FloatArray) -> tuple[str, ...] | None:
     return None
 
 
-def _values_in(rows: Sequence[Sequence[str]], places: Sequence[int], n_columns: int) -> FloatArray:
+def _values_in(
+    rows: Sequence[Sequence[str]], places: Sequence[int], n_columns: int
+) -> FloatArray:
     """Return the values (N, n) in the columns ``places`` of the first rows that have numbers there.
 
     Rows with another number of columns than ``n_columns`` are skipped. A first cell that is not a
     number, such as a date, becomes 0.
     """
     values: list[list[float]] = []
-    for cells in islice((cells for cells in rows if len(cells) == n_columns), _MOST_ROWS):
+    for cells in islice(
+        (cells for cells in rows if len(cells) == n_columns), _MOST_ROWS
+    ):
         first, *others = (cells[place] for place in places)
         try:
             stamp = number(first) if is_number(first) else 0.0
@@ -146,7 +155,9 @@ def _fits(pose: Sequence[str], values: FloatArray) -> bool:
     return bool(np.allclose(last_rows, [0.0, 0.0, 0.0, 1.0], atol=ROTATION_TOLERANCE))
 
 
-def _values_of(names: Sequence[str], pose: Sequence[str], values: FloatArray) -> FloatArray:
+def _values_of(
+    names: Sequence[str], pose: Sequence[str], values: FloatArray
+) -> FloatArray:
     """Return the values (N, k) of k quantities; column i of ``values`` is the quantity pose[i]."""
     columns = [pose.index(name) for name in names]
     return values[:, columns]

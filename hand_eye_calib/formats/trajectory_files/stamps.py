@@ -8,7 +8,12 @@ from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.config import STAMP_UNITS
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.stats import median
-from hand_eye_calib.formats.trajectory_files.dates import DAY_S, WEEK_S, seconds, seconds_of
+from hand_eye_calib.formats.trajectory_files.dates import (
+    DAY_S,
+    WEEK_S,
+    seconds,
+    seconds_of,
+)
 from hand_eye_calib.formats.trajectory_files.layout import UNIT_EXPONENTS
 from hand_eye_calib.formats.trajectory_files.table import Table
 
@@ -147,7 +152,9 @@ def refuse_coarse(table: Table, stamps_ns: IntArray, values: FloatArray) -> None
     )
 
 
-def in_order(table: Table, stamps_ns: IntArray, repair: bool) -> tuple[IntArray, list[str]]:
+def in_order(
+    table: Table, stamps_ns: IntArray, repair: bool
+) -> tuple[IntArray, list[str]]:
     """Return the indices of the poses in order of time, and notes on repairs.
 
     Among poses with equal stamps, only the first is kept.

@@ -22,7 +22,12 @@ from hand_eye_calib.core.base.errors import InputError, require_type
 from hand_eye_calib.core.base.text import shortened, shown_value
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import ROTATION_TOLERANCE, Trajectory
-from hand_eye_calib.formats.files import LONGEST_NAME, path_of, write_atomically, writing
+from hand_eye_calib.formats.files import (
+    LONGEST_NAME,
+    path_of,
+    write_atomically,
+    writing,
+)
 from hand_eye_calib.formats.trajectory_files.cells import angle, is_null, number
 from hand_eye_calib.formats.trajectory_files.columns import (
     MATRIX,
@@ -121,19 +126,25 @@ class Table:
 
     def __post_init__(self) -> None:
         columns, units = named_columns(self.names)
-        self.expected = self.expected or f"{len(self.names)} columns: {self._listed(self.names)}"
+        self.expected = (
+            self.expected or f"{len(self.names)} columns: {self._listed(self.names)}"
+        )
         self.measures, quantities = measured(columns, self.names, self.measures)
         self.stamp_names = stamp_columns(columns)
         self._refuse_unclear_columns(columns, quantities)
         self.at = {name: columns[name][0] for name in quantities}
-        self.units = {name: units[column] for name, column in self.at.items() if units[column]}
+        self.units = {
+            name: units[column] for name, column in self.at.items() if units[column]
+        }
         self.stamp_at = [columns[name][0] for name in self.stamp_names]
         self._set_stamp_units(units)
         self._value_at = [*self.at.values()]
         self._image_at = columns.get("image", [])[:1]
         self._sensor_at = columns.get("sensor", [])[:1]
         self._sensors: set[str] = set()
-        orientation = next((group for group in _ORIENTATIONS if {*group} <= {*quantities}), ())
+        orientation = next(
+            (group for group in _ORIENTATIONS if {*group} <= {*quantities}), ()
+        )
         self._orientation_at = [quantities.index(name) for name in orientation]
 
     def _refuse_unclear_columns(
@@ -188,7 +199,11 @@ class Table:
         """Return the values (N, k) of k quantities; without names, those of all quantities."""
         quantities = [*self.at]
         all_values = np.asarray(self.numbers).reshape(-1, len(quantities))
-        return all_values[:, [quantities.index(name) for name in names]] if names else all_values
+        return (
+            all_values[:, [quantities.index(name) for name in names]]
+            if names
+            else all_values
+        )
 
     def fill(
         self, lines: Iterable[tuple[int, Any]], cells_of: Callable[[Any], Sequence[str]]
@@ -227,7 +242,9 @@ class Table:
             )
         return self
 
-    def fill_from_arrays(self, values: FloatArray, stamps: Sequence[Decimal | None] | None) -> None:
+    def fill_from_arrays(
+        self, values: FloatArray, stamps: Sequence[Decimal | None] | None
+    ) -> None:
         """Add the rows of values (N, k) that have a pose and, if ``stamps`` are given, a stamp."""
         is_pose = np.isfinite(values).all(axis=1)
         if self._orientation_at:
@@ -236,7 +253,9 @@ class Table:
             is_pose &= np.array([stamp is not None for stamp in stamps], dtype=bool)
             stamps_and_uses = zip(stamps, is_pose, strict=True)
             self.stamps = [
-                stamp for stamp, is_used in stamps_and_uses if is_used and stamp is not None
+                stamp
+                for stamp, is_used in stamps_and_uses
+                if is_used and stamp is not None
             ]
         rows = np.flatnonzero(is_pose).tolist()
         self.numbers.frombytes(np.ascontiguousarray(values[is_pose]).tobytes())
@@ -295,7 +314,9 @@ class Table:
             return [float(cells[column]) for column in self._value_at]
         except ValueError:
             return [
-                angle(cells[column]) if name in ("lat", "lon") else number(cells[column])
+                angle(cells[column])
+                if name in ("lat", "lon")
+                else number(cells[column])
                 for name, column in self.at.items()
             ]
 
@@ -305,9 +326,13 @@ class Table:
         # large finite values may be infinite.
         if not math.isfinite(sum(values)) and not all(map(math.isfinite, values)):
             return False
-        return not self._orientation_at or any(values[place] for place in self._orientation_at)
+        return not self._orientation_at or any(
+            values[place] for place in self._orientation_at
+        )
 
-    def _padded(self, cells: Sequence[str], line_number: int, content: object) -> Sequence[str]:
+    def _padded(
+        self, cells: Sequence[str], line_number: int, content: object
+    ) -> Sequence[str]:
         """Return the cells of a row with too few or too many cells, one for each column.
 
         An empty cell at the end is dropped. Empty cells are appended to a row with a stamp only.
@@ -321,7 +346,9 @@ class Table:
         if n_missing == -1 and not cells[-1]:
             return cells[:-1]
         if n_missing > 0 and self.stamp_at and max(self.stamp_at) < len(cells):
-            others = [cell for column, cell in enumerate(cells) if column not in self.stamp_at]
+            others = [
+                cell for column, cell in enumerate(cells) if column not in self.stamp_at
+            ]
             if all(map(is_null, others)):
                 return [*cells, *[""] * n_missing]
         raise InputError(
@@ -337,7 +364,9 @@ class Table:
         """Raise an InputError at the first row for which ``is_wrong`` (N,) is true."""
         index = int(np.argmax(is_wrong))
         if is_wrong[index]:
-            raise InputError(f"{self.path}, line {self.line_numbers[index]}: {message(index)}")
+            raise InputError(
+                f"{self.path}, line {self.line_numbers[index]}: {message(index)}"
+            )
 
 
 # ---- numbers in memory
@@ -383,7 +412,9 @@ def columns_of_array(source: Any) -> tuple[Sequence[str], FloatArray, list[str]]
     return names_of_shape[values.shape[1:]], values, []
 
 
-def _columns_of_matrices(matrices: FloatArray) -> tuple[Sequence[str], FloatArray, list[str]]:
+def _columns_of_matrices(
+    matrices: FloatArray,
+) -> tuple[Sequence[str], FloatArray, list[str]]:
     """Return the columns of matrices (N, 3, 4) or (N, 4, 4), as :func:`columns_of_array` does.
 
     Transposed matrices, whose last column is 0 0 0 1, are transposed back, with a note.
@@ -393,7 +424,9 @@ def _columns_of_matrices(matrices: FloatArray) -> tuple[Sequence[str], FloatArra
         matrices = np.swapaxes(matrices, 1, 2)
         notes = ["matrices are transposed: their rows were read as columns"]
         if not _has_last_row(matrices):
-            raise InputError("the last row of a matrix is not 0 0 0 1; expected poses (N, 4, 4)")
+            raise InputError(
+                "the last row of a matrix is not 0 0 0 1; expected poses (N, 4, 4)"
+            )
     return MATRIX, matrices[:, :3].reshape(len(matrices), len(MATRIX)), notes
 
 
@@ -405,7 +438,9 @@ def _has_last_row(matrices: FloatArray) -> bool:
     is_finite = np.isfinite(matrices).all(axis=(1, 2))
     is_zero = ~matrices.any(axis=(1, 2))
     last_rows = matrices[is_finite & ~is_zero, 3]
-    return bool(np.allclose(last_rows, [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=ROTATION_TOLERANCE))
+    return bool(
+        np.allclose(last_rows, [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=ROTATION_TOLERANCE)
+    )
 
 
 def table_of_object(source: Any, times: Any = None) -> Table:
@@ -420,10 +455,14 @@ def table_of_object(source: Any, times: Any = None) -> Table:
     if hasattr(source, "columns"):
         keys = [*source.columns]
         table = Table("the table", [*map(str, keys)], expected=_KINDS)
-        columns = [np.asarray(source[keys[place]], dtype=float) for place in table.at.values()]
+        columns = [
+            np.asarray(source[keys[place]], dtype=float) for place in table.at.values()
+        ]
         values = np.column_stack(columns)
         if times is None:
-            times = _times_of_columns([source[keys[place]] for place in table.stamp_at], table)
+            times = _times_of_columns(
+                [source[keys[place]] for place in table.stamp_at], table
+            )
     else:
         names, values, notes = columns_of_array(source)
         if names[0] == "t":

@@ -19,7 +19,12 @@ from hand_eye_calib.formats.trajectory_files.columns import (
 )
 from hand_eye_calib.formats.trajectory_files.dates import notes_on_stamps
 from hand_eye_calib.formats.trajectory_files.file_options import AUTO, FileOptions
-from hand_eye_calib.formats.trajectory_files.layout import TUM, Layout, layout_of, lines_of
+from hand_eye_calib.formats.trajectory_files.layout import (
+    TUM,
+    Layout,
+    layout_of,
+    lines_of,
+)
 from hand_eye_calib.formats.trajectory_files.recognition import STAMPED_POSE
 from hand_eye_calib.formats.trajectory_files.table import Table
 
@@ -75,7 +80,9 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
     table.guesses = guesses
     if layout.row:
         table.fill(lines_of(path, text, layout.rows_after), layout.cells_of)
-        stamp_cells = [layout.row[place] for place in table.stamp_at if place < len(layout.row)]
+        stamp_cells = [
+            layout.row[place] for place in table.stamp_at if place < len(layout.row)
+        ]
         for note in notes_on_stamps(table.stamp_names, stamp_cells):
             table.guess(note)
     _add_times(table, options)
@@ -127,9 +134,16 @@ def _guesses_of(layout: Layout) -> list[str]:
     if layout.format == "tum":
         return []
     order = ", qw qx qy qz" if layout.format == "euroc" else ""
-    guesses = [f" is read as format {layout.format}{order}; to change this, set `format`"]
+    guesses = [
+        f" is read as format {layout.format}{order}; to change this, set `format`"
+    ]
     is_usual = layout.columns in (STAMPED_POSE, STAMPED_POSE[1:])
-    if layout.names is None and layout.format == "csv" and layout.columns and not is_usual:
+    if (
+        layout.names is None
+        and layout.format == "csv"
+        and layout.columns
+        and not is_usual
+    ):
         columns = ",".join(name or "-" for name in layout.columns).rstrip(",-")
         guesses.append(
             ": no columns are named; the numbers fit "
@@ -161,7 +175,9 @@ def _empty_table(path: str | Path, layout: Layout, options: FileOptions) -> Tabl
         columns += ("",) * (n_columns - len(columns))
     measures = options.measures if layout.format == "csv" else AUTO
     expected = _FORMATS.get(layout.format, ("", ""))[1]
-    return Table(path, columns, measures, expected, layout.format, layout.is_transposable)
+    return Table(
+        path, columns, measures, expected, layout.format, layout.is_transposable
+    )
 
 
 def _add_times(table: Table, options: FileOptions) -> None:

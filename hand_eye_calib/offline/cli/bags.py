@@ -45,7 +45,9 @@ class SeveralRecordingsError(InputError):
     """
 
     def __init__(self, reason: str, groups: list[list[Path]]) -> None:
-        super().__init__(f"{reason}; calibrate each by itself, or all of one rig together")
+        super().__init__(
+            f"{reason}; calibrate each by itself, or all of one rig together"
+        )
         self.reason = reason
         self.groups = groups
 
@@ -81,9 +83,13 @@ def read_recording(
             f"{journal} is a session of its own", [[path] for path in paths]
         )
     if journal is None:
-        recording = _read_bags(paths, wanted, CalibratorConfig.from_options(dict(options)))
+        recording = _read_bags(
+            paths, wanted, CalibratorConfig.from_options(dict(options))
+        )
         with waiting_for("looking for the ground and gravity"):
-            recording.snapshot, notes = with_measurements(recording.snapshot, paths, without)
+            recording.snapshot, notes = with_measurements(
+                recording.snapshot, paths, without
+            )
         note(*notes)
         return recording
     if wanted:
@@ -105,7 +111,9 @@ def select(
     measures : dict of str to str
         What each stream measures, such as "poses".
     """
-    named = {stream: source_of(wanted[stream]) for stream in STREAMS if stream in wanted}
+    named = {
+        stream: source_of(wanted[stream]) for stream in STREAMS if stream in wanted
+    }
     frames = {stream: getattr(config, f"{stream}_frame") for stream in STREAMS}
     parent, child = bag.select(named.get("parent"), named.get("child"), frames)
     if len(named) < len(STREAMS):
@@ -166,7 +174,9 @@ def _read_bags(
         calibrator = Calibrator(dataclasses.replace(config, **kinds))
         bag.shown = with_progress
         stamps = stamps_of(wanted)
-        poses = bag.poses(sources["parent"], sources["child"], config.max_gap, measures, stamps)
+        poses = bag.poses(
+            sources["parent"], sources["child"], config.max_gap, measures, stamps
+        )
         _feed(calibrator, poses, sources)
         for stream, source in sources.items():
             if not calibrator.frame(stream):
@@ -176,7 +186,9 @@ def _read_bags(
         return Recording(calibrator.snapshot(), inputs, bag.files, tuple(bag.warnings))
 
 
-def _feed(calibrator: Calibrator, poses: PoseTable, topics: Mapping[str, Source]) -> None:
+def _feed(
+    calibrator: Calibrator, poses: PoseTable, topics: Mapping[str, Source]
+) -> None:
     """Add every pose to the engine.
 
     Raises
@@ -211,7 +223,9 @@ def refuse_recordings(paths: Sequence[Path], sources: Collection[Source]) -> Non
     reason = ""
     for bag in sorted(_Bag.of(path, sources) for path in paths):
         for recording in recordings:
-            with_same_topics = [earlier for earlier in recording if earlier.sources & bag.sources]
+            with_same_topics = [
+                earlier for earlier in recording if earlier.sources & bag.sources
+            ]
             difference = bag.difference_from(with_same_topics)
             if not difference:
                 recording.append(bag)
@@ -267,7 +281,9 @@ def journal_in(path: Path | str) -> Path | None:
         return None
     from hand_eye_calib.formats.journal import has_session
 
-    return next((folder for folder in (path, path / "journal") if has_session(folder)), None)
+    return next(
+        (folder for folder in (path, path / "journal") if has_session(folder)), None
+    )
 
 
 def read_journal_of(directory: Path, options: Options) -> Recording:
@@ -293,6 +309,9 @@ def read_journal_of(directory: Path, options: Options) -> Recording:
         given += CalibratorConfig.from_options(options).given
         calibrator = Calibrator(dataclasses.replace(config, given=given))
         replay_journal(journal, directory, Calibrators(child=calibrator))
-    sources = {stream: journal.about.get(stream, {}).get("topic") or stream for stream in STREAMS}
+    sources = {
+        stream: journal.about.get(stream, {}).get("topic") or stream
+        for stream in STREAMS
+    }
     inputs = {"journal": str(directory), **calibrator.inputs(sources)}
     return Recording(calibrator.snapshot(), inputs, sorted(directory.glob("*.tum")))

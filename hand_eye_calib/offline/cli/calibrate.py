@@ -143,7 +143,9 @@ def run(arguments: argparse.Namespace) -> int:
         from hand_eye_calib.formats.bags.patterns import matching
 
         arguments.paths = [
-            type(path)(match) for path in arguments.paths for match in matching(str(path))
+            type(path)(match)
+            for path in arguments.paths
+            for match in matching(str(path))
         ]
     if not any("://" in str(path) for path in arguments.paths):
         return _run_locally(arguments, lambda value: value)
@@ -173,7 +175,9 @@ def _run_locally(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int
     settings = options.options_from(arguments)
     if not are_bags:
         if len(paths) != len(options.STREAMS):
-            raise ConfigError(f"expected the trajectory files of two sensors; got {len(paths)}")
+            raise ConfigError(
+                f"expected the trajectory files of two sensors; got {len(paths)}"
+            )
         options.refuse_options_of_bags(arguments)
         recording = reading.read_pair(arguments, settings)
     else:
@@ -181,15 +185,22 @@ def _run_locally(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int
 
         try:
             recording = bags.read_recording(
-                paths, options.sources_from(arguments), settings, switched_off(vars(arguments))
+                paths,
+                options.sources_from(arguments),
+                settings,
+                switched_off(vars(arguments)),
             )
         except bags.SeveralRecordingsError as several:
             note(f"{several.reason}; they give one result, as recordings of one rig")
             return SEVERAL_RECORDINGS["one rig"](arguments, several.groups)
     calibration = recording.solved(with_fingerprints=bool(arguments.out))
-    calibration = dataclasses.replace(calibration, warnings=tuple(with_urls(calibration.warnings)))
+    calibration = dataclasses.replace(
+        calibration, warnings=tuple(with_urls(calibration.warnings))
+    )
     bag = paths[0] if are_bags else None
-    return deliver(calibration, with_urls(recording.inputs), arguments, recording.snapshot, bag)
+    return deliver(
+        calibration, with_urls(recording.inputs), arguments, recording.snapshot, bag
+    )
 
 
 def _list_topics(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int:
@@ -232,12 +243,15 @@ def _described_topics(bag: "PoseBag") -> list["Document"]:
     rows = []
     for topic in bag.topics.values():
         quantity, frame = measured.get(topic.name, ("", ""))
-        rate_hz = (topic.count - 1) / (bag.duration_s or 1.0) if topic.count > 1 else None
+        rate_hz = (
+            (topic.count - 1) / (bag.duration_s or 1.0) if topic.count > 1 else None
+        )
         rows.append(
             {
                 **topic._asdict(),
                 "rate_hz": rate_hz,
-                "frames": bag.edges_on(topic.name) or _sensor_frames(bag, topic.name, frame),
+                "frames": bag.edges_on(topic.name)
+                or _sensor_frames(bag, topic.name, frame),
                 "is_usable": topic.type in MESSAGE_TYPES,
                 "measures": quantity,
             }
@@ -260,7 +274,8 @@ def _table_of_topics(document: "Document") -> list[str]:
         ]
         lines.append(_ROW.format(*cells).rstrip())
     advice = (
-        "--parent-topic and --child-topic accept a topic with poses, or frames of /tf: odom:lidar"
+        "--parent-topic and --child-topic accept a topic with "
+        "poses, or frames of /tf: odom:lidar"
     )
     if not any(row["count"] for row in document["topics"]):
         advice = "the bag has no messages: record again"

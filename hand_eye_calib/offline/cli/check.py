@@ -52,7 +52,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(brief=_BRIEF)
     parser.usage = "%(prog)s [OPTION ...] PATH ..."
     parser.epilog = _EPILOG
-    options.add_input_arguments(parser, "a bag, or the trajectory files of parent and child")
+    options.add_input_arguments(
+        parser, "a bag, or the trajectory files of parent and child"
+    )
     options.add_config_arguments(parser)
     options.add_json_argument(parser)
 
@@ -83,11 +85,15 @@ def run(arguments: argparse.Namespace) -> int:
         if len(poses) > 1
     }
     summaries = {
-        stream: {"source": sources[stream]} | plain(summary) for stream, summary in streams.items()
+        stream: {"source": sources[stream]} | plain(summary)
+        for stream, summary in streams.items()
     }
     document = None
     if arguments.json:
-        document = {"streams": summaries, "findings": [item.to_dict() for item in findings]}
+        document = {
+            "streams": summaries,
+            "findings": [item.to_dict() for item in findings],
+        }
     lines = [_verdict(findings), "", *_finding_lines(findings), ""]
     lines += _stream_lines(sources, streams)
     print_result(lines, document)
@@ -111,7 +117,9 @@ class _Streams(NamedTuple):
     repairs: list[str]
 
 
-def _read_streams(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> _Streams:
+def _read_streams(
+    arguments: argparse.Namespace, settings: Mapping[str, Any]
+) -> _Streams:
     """Read both streams from a bag or from two trajectory files.
 
     Raises
@@ -141,7 +149,9 @@ def _read_streams(arguments: argparse.Namespace, settings: Mapping[str, Any]) ->
         sources, measures = bags.select(bag, wanted, config)
         stamps = bags.stamps_of(wanted)
         names = {stream: str(source) for stream, source in sources.items()}
-        readings = [(sources[stream], measures[stream], stamps[stream]) for stream in STREAMS]
+        readings = [
+            (sources[stream], measures[stream], stamps[stream]) for stream in STREAMS
+        ]
         return _Streams(names, *bags.read_sources(bag, readings))
 
 
@@ -153,7 +163,9 @@ def _stream_lines(
     yield "{:<8} {:>8} {:>9} {:>7} {:>12} {:>12} {:>10}".format(*_HEADINGS)
     for name, summary in streams.items():
         path = "none" if summary.path_m is None else length(summary.path_m)
-        rotation = "none" if summary.rotation_rad is None else angle(summary.rotation_rad)
+        rotation = (
+            "none" if summary.rotation_rad is None else angle(summary.rotation_rad)
+        )
         yield (
             f"{name:<8} {summary.poses:8d} {summary.duration_s:9.1f} {summary.rate_hz:7.1f} "
             f"{summary.longest_interval_s:10.3f} s {path:>12} {rotation:>10}"

@@ -14,7 +14,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_result_argument(parser)
     formats = f"one of {', '.join(RESULT_FORMATS)}"
-    parser.add_argument("format", metavar="FORMAT", choices=RESULT_FORMATS, help=formats)
+    parser.add_argument(
+        "format", metavar="FORMAT", choices=RESULT_FORMATS, help=formats
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -18,7 +18,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  hand_eye_calib info result --as kalibr > camchain-imucam.yaml"
     )
     add_result_argument(parser)
-    formats = f"print the result as the file of another program: {', '.join(RESULT_FORMATS)}"
+    formats = (
+        f"print the result as the file of another program: {', '.join(RESULT_FORMATS)}"
+    )
     parser.add_argument(
         "--as", dest="format", choices=RESULT_FORMATS, metavar="FORMAT", help=formats
     )

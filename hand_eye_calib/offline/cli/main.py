@@ -78,7 +78,9 @@ def exit_code_of(run: Callable[[], int]) -> int:
         sys.stdout.flush()
         return code
     except HandEyeCalibError as error:
-        return fail(error, Exit.USAGE if isinstance(error, ConfigError) else Exit.FAILED)
+        return fail(
+            error, Exit.USAGE if isinstance(error, ConfigError) else Exit.FAILED
+        )
     except ModuleNotFoundError as error:
         name = error.name or "hand_eye_calib"
         package = name.partition(".")[0]
@@ -123,7 +125,9 @@ class CommandParser(argparse.ArgumentParser):
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(
-            formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False, **settings
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+            **settings,
         )
 
     def error(self, message: str) -> NoReturn:
@@ -168,9 +172,13 @@ def _run(argv: Sequence[str]) -> int:
         description=_description(),
         epilog=_EPILOG,
     )
-    parser.add_argument("--version", action="store_true", help="show the version and exit")
+    parser.add_argument(
+        "--version", action="store_true", help="show the version and exit"
+    )
     if command is not None and command not in COMMANDS:
-        known = f"expected one of {', '.join(COMMANDS)}{did_you_mean(command, COMMANDS)}"
+        known = (
+            f"expected one of {', '.join(COMMANDS)}{did_you_mean(command, COMMANDS)}"
+        )
         parser.error(f"invalid choice: {command!r}, {known}")
     parsers = _add_commands(parser)
     if command is not None:
@@ -204,18 +212,25 @@ def _run_command(module: Any, arguments: argparse.Namespace) -> int:
         if not error.options:
             raise
         typed = shlex.join(["hand_eye_calib", *arguments.typed])
-        raise InputError(f"{error}. Run: {typed} {typed_options(error.options.items())}") from None
+        raise InputError(
+            f"{error}. Run: {typed} {typed_options(error.options.items())}"
+        ) from None
 
 
 def _description() -> str:
     """Return the purpose of the program, and a line for each command."""
-    lines = ["Extrinsic calibration of two sensors on one rigid body from their motion.", ""]
+    lines = [
+        "Extrinsic calibration of two sensors on one rigid body from their motion.",
+        "",
+    ]
     lines.append("commands:")
     lines += [f"  {name:<12}{command.help}" for name, command in COMMANDS.items()]
     return "\n".join(lines)
 
 
-def _add_commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+def _add_commands(
+    parser: argparse.ArgumentParser,
+) -> dict[str, argparse.ArgumentParser]:
     """Add all commands to a parser, and return their parsers by name."""
     # Without ``prog``, argparse would begin the usage of each command with that of the program.
     commands = parser.add_subparsers(

@@ -19,7 +19,12 @@ from typing import Any, NamedTuple, TypeVar
 
 import hand_eye_calib.core.base.config as config
 from hand_eye_calib.core.base.errors import ConfigError, InputError, printable
-from hand_eye_calib.core.base.option import Options, OptionValue, check_value, did_you_mean
+from hand_eye_calib.core.base.option import (
+    Options,
+    OptionValue,
+    check_value,
+    did_you_mean,
+)
 from hand_eye_calib.core.base.spelling import Road, spelled, spelled_options
 from hand_eye_calib.core.base.text import quantities
 from hand_eye_calib.formats.files import local_path
@@ -36,7 +41,9 @@ _ROS_OPTIONS = ("use_sim_time", "start_type_description_service", "qos_overrides
 _NODES = ("calibrator", "**", "*", "")
 # Key of the parameters of a node in a parameter file.
 _ROS_SECTION = "ros__parameters"
-_AXES = ", ".join(name.removeprefix("prior.") for name in OPTION_FIELDS if "prior." in name)
+_AXES = ", ".join(
+    name.removeprefix("prior.") for name in OPTION_FIELDS if "prior." in name
+)
 
 # Options that most users set. They are in the first group of the help.
 _COMMON = ("method", "reference", "time_offset", "scale", "parent_frame", "child_frame")
@@ -102,7 +109,11 @@ class Exit(IntEnum):
 
 
 # Terminal styles of a verdict: bold green, bold yellow, bold red.
-_STYLES = {"USE": "\x1b[1;32m", "USE WITH CARE": "\x1b[1;33m", "DO NOT USE": "\x1b[1;31m"}
+_STYLES = {
+    "USE": "\x1b[1;32m",
+    "USE WITH CARE": "\x1b[1;33m",
+    "DO NOT USE": "\x1b[1;31m",
+}
 
 
 def flag(name: str) -> str:
@@ -127,7 +138,9 @@ def as_typed(text: str) -> str:
 def note(*texts: object) -> None:
     """Print each text as a note to the user, in one line on stderr."""
     for text in texts:
-        print(f"hand_eye_calib: note: {printable(as_typed(str(text)))}", file=sys.stderr)
+        print(
+            f"hand_eye_calib: note: {printable(as_typed(str(text)))}", file=sys.stderr
+        )
 
 
 def fail(error: object, code: int = Exit.FAILED) -> int:
@@ -200,7 +213,9 @@ def print_result(lines: Iterable[str], document: object = None) -> None:
 # ------------------------------------------------------------ the types of arguments
 
 
-def argument_type(parse: Callable[[str], Any], prefix: str = "") -> Callable[[str], Any]:
+def argument_type(
+    parse: Callable[[str], Any], prefix: str = ""
+) -> Callable[[str], Any]:
     """Return a function that argparse can use as the type of an argument.
 
     A ConfigError of ``parse`` becomes an error about wrong usage. ``prefix``, such as the name of
@@ -221,7 +236,9 @@ def at_least(minimum: int) -> Callable[[str], int]:
 
     def parse(text: str) -> int:
         if not text.isdecimal() or int(text) < minimum:
-            raise ConfigError(f"expected a whole number of at least {minimum}, got {text!r}")
+            raise ConfigError(
+                f"expected a whole number of at least {minimum}, got {text!r}"
+            )
         return int(text)
 
     return argument_type(parse)
@@ -236,7 +253,9 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     parser._negative_number_matcher = re.compile(r"-\.?\d")
     group = parser.add_argument_group("calibration options")
     rare = parser.add_argument_group("calibration options that are rarely needed")
-    rest = [name for name in OPTION_FIELDS if name not in _COMMON and "prior." not in name]
+    rest = [
+        name for name in OPTION_FIELDS if name not in _COMMON and "prior." not in name
+    ]
     for name in (*_COMMON, *rest):
         field = OPTION_FIELDS[name]
         meta = field.metadata
@@ -261,7 +280,14 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
         "deviation, such as z=1.85+/-0.02 (m) or yaw=-90deg+/-2deg; AXIS is "
         f"one of {_AXES}; may be repeated"
     )
-    add("--prior", metavar=metavar, dest="options", action="append", type=_prior, help=prior)
+    add(
+        "--prior",
+        metavar=metavar,
+        dest="options",
+        action="append",
+        type=_prior,
+        help=prior,
+    )
     file = "YAML file with these options by name, or a ROS parameter file"
     add("--config", metavar="FILE", type=Path, help=file)
 
@@ -272,7 +298,9 @@ def _prior(text: str) -> tuple[str, OptionValue]:
     axis, equals, value = text.partition("=")
     name = f"prior.{axis}"
     if not equals or name not in OPTION_FIELDS:
-        raise ConfigError(f"expected AXIS=VALUE+/-SIGMA with AXIS one of {_AXES}; got {text!r}")
+        raise ConfigError(
+            f"expected AXIS=VALUE+/-SIGMA with AXIS one of {_AXES}; got {text!r}"
+        )
     return _checked_option(name, value)
 
 
@@ -325,7 +353,9 @@ def _read_config(path: Path) -> Options:
     document = read_yaml(path)
     if not isinstance(document, dict | None):
         kind = type(document).__name__
-        raise ConfigError(f"{path}: expected a mapping of options to values; found {kind}")
+        raise ConfigError(
+            f"{path}: expected a mapping of options to values; found {kind}"
+        )
     settings = _settings_of_file(document or {})
     options: dict[str, OptionValue] = {}
     ignored = []
@@ -402,7 +432,9 @@ def _flat(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, A
 
 def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> None:
     """Add the arguments about the input: paths, streams of a bag, and options of files."""
-    parser.add_argument("paths", metavar="PATH", nargs="*", type=_path, help=help_of_paths)
+    parser.add_argument(
+        "paths", metavar="PATH", nargs="*", type=_path, help=help_of_paths
+    )
     group = parser.add_argument_group(
         "pose streams of a bag",
         "Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped "
@@ -436,7 +468,9 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
         group.add_argument(f"--{flag(name)}", dest=name, **settings)
         for stream in STREAMS:
             for_stream = settings | {"help": f"the same for {stream.upper()} only"}
-            group.add_argument(f"--{stream}-{flag(name)}", dest=f"{stream}_{name}", **for_stream)
+            group.add_argument(
+                f"--{stream}-{flag(name)}", dest=f"{stream}_{name}", **for_stream
+            )
     pair_by = (
         "pairing of the poses of both files: time, by their stamps; row, by "
         "their order, without stamps; name, by the names of their images"
@@ -466,20 +500,28 @@ def sources_from(arguments: argparse.Namespace) -> dict[str, str]:
         if fields and not topic:
             raise ConfigError(f"--{stream}-fields needs --{stream}-topic")
         if stream == "child" and topic and getattr(arguments, "target", None):
-            fields = "@".join(map(str, filter(None, [arguments.target, arguments.camera])))
+            fields = "@".join(
+                map(str, filter(None, [arguments.target, arguments.camera]))
+            )
         sources[stream] = f"{topic}?{fields}" if fields else topic
-        sources[f"{stream}_stamps"] = getattr(arguments, f"{stream}_stamps") or arguments.stamps
+        sources[f"{stream}_stamps"] = (
+            getattr(arguments, f"{stream}_stamps") or arguments.stamps
+        )
     return {name: source for name, source in sources.items() if source}
 
 
 def refuse_options_of_bags(arguments: argparse.Namespace) -> None:
     """Raise a ConfigError if an option about topics or stamps is set for trajectory files."""
     of_streams = [
-        f"{stream}_{name}" for stream in STREAMS for name in ("stamps", "topic", "fields")
+        f"{stream}_{name}"
+        for stream in STREAMS
+        for name in ("stamps", "topic", "fields")
     ]
     for name in ("stamps", *of_streams):
         if getattr(arguments, name, None):
-            raise ConfigError(f"--{flag(name)} applies to bags only; omit it for trajectory files")
+            raise ConfigError(
+                f"--{flag(name)} applies to bags only; omit it for trajectory files"
+            )
 
 
 def add_result_argument(parser: argparse.ArgumentParser) -> None:
@@ -488,7 +530,9 @@ def add_result_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("result", metavar="RESULT", help=path)
 
 
-def add_json_argument(parser: argparse._ActionsContainer, or_verbose: bool = False) -> None:
+def add_json_argument(
+    parser: argparse._ActionsContainer, or_verbose: bool = False
+) -> None:
     """Add ``--json``, and ``--verbose`` if there are details to print."""
     text = "print one JSON document on stdout instead of text"
     parser.add_argument("--json", action="store_true", help=text)

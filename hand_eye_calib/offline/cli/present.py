@@ -111,14 +111,20 @@ def _with_robot(
         If nothing contains the base frame.
     """
     from hand_eye_calib.core.assessment.comparison import with_comparison
-    from hand_eye_calib.formats.installed import frames_of_bag, open_installed, read_urdf
+    from hand_eye_calib.formats.installed import (
+        frames_of_bag,
+        open_installed,
+        read_urdf,
+    )
 
     installed = arguments.installed
     base = frame_name(arguments.base_frame or "")
     if installed:
         frames = calibration.parent_frame, calibration.child_frame
         with waiting_for(f"reading {installed}"):
-            calibration = with_comparison(calibration, open_installed(installed)(*frames))
+            calibration = with_comparison(
+                calibration, open_installed(installed)(*frames)
+            )
     if not base:
         return calibration
     if installed and Path(installed).suffix == ".urdf":
@@ -126,7 +132,9 @@ def _with_robot(
     elif bag:
         tree = frames_of_bag(bag)
     else:
-        raise ConfigError("--base-frame needs --installed ROBOT.urdf: a description with the frame")
+        raise ConfigError(
+            "--base-frame needs --installed ROBOT.urdf: a description with the frame"
+        )
     T_base_parent = tree.pose(base, calibration.parent_frame)
     return replace(calibration, base_frame=base, T_base_parent=T_base_parent)
 
@@ -192,7 +200,11 @@ def publish_lines(calibration: Calibration) -> list[str]:
     if not command:
         return []
     # An unknown number of the command is a text, such as X, which the user must replace.
-    by_hand = [number for number in usable_numbers(calibration).values() if isinstance(number, str)]
+    by_hand = [
+        number
+        for number in usable_numbers(calibration).values()
+        if isinstance(number, str)
+    ]
     condition = f", after you have replaced {listing(by_hand)}" if by_hand else ""
     return [f"To publish it ({calibration.verdict.value}{condition})", f"  {command}"]
 
@@ -207,14 +219,18 @@ def _extrinsic_lines(calibration: Calibration, with_details: bool) -> list[str]:
         "T_base_child": (child, calibration.base_frame),
     }
     extra = extra_transforms(calibration)
-    frames |= {name: (transform.source, transform.target) for name, transform in extra.items()}
+    frames |= {
+        name: (transform.source, transform.target) for name, transform in extra.items()
+    }
     transforms = transforms_of(calibration)
     lines = []
     for name, (source, target) in frames.items():
         if name not in transforms:
             continue
         out_of_reach = () if name in extra else calibration.out_of_reach
-        lines.append(f"{source} in {target}: maps coordinates of {source} into {target}")
+        lines.append(
+            f"{source} in {target}: maps coordinates of {source} into {target}"
+        )
         if name == "T_parent_child" or with_details:
             lines += transform_lines(transforms[name], out_of_reach, with_details)
         else:
@@ -262,9 +278,14 @@ def next_steps(
         extra += [typed_options([option]) for option in reason.options.items()]
     steps = []
     if calibration.verdict is not Verdict.DO_NOT_USE:
-        is_improvable = any(dof.verdict in _IMPROVABLE for dof in calibration.observability)
+        is_improvable = any(
+            dof.verdict in _IMPROVABLE for dof in calibration.observability
+        )
         if is_improvable and snapshot is not None and calibration.measured == "poses":
-            from hand_eye_calib.core.assessment.excitation import excitation, what_is_missing
+            from hand_eye_calib.core.assessment.excitation import (
+                excitation,
+                what_is_missing,
+            )
 
             if motion := what_is_missing(excitation(snapshot.pose_pairs), calibration):
                 steps.append(motion)
@@ -284,7 +305,9 @@ def allowance_lines(calibration: Calibration) -> list[str]:
 
 
 def transform_lines(
-    transform: "Notation", out_of_reach: Sequence[str] = (), with_quaternion: bool = False
+    transform: "Notation",
+    out_of_reach: Sequence[str] = (),
+    with_quaternion: bool = False,
 ) -> Iterator[str]:
     """Yield a row for each number of a transform, with the parts of its standard deviation."""
     parts = parts_of_sigmas(transform)
@@ -303,7 +326,9 @@ def transform_lines(
         yield f"  quaternion {quaternion}"
 
 
-def compact_lines(transform: "Notation", out_of_reach: Sequence[str] = ()) -> Iterator[str]:
+def compact_lines(
+    transform: "Notation", out_of_reach: Sequence[str] = ()
+) -> Iterator[str]:
     """Yield three rows with two columns: x, y, z and roll, pitch, yaw."""
     numbers = printed_numbers(transform, out_of_reach)
     translations = _column(numbers, TRANSLATIONS, 1)

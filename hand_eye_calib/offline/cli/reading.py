@@ -101,7 +101,9 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
     """
     refuse_repeated_paths(paths)
     urls = [path for path in paths if isinstance(path, str)]
-    local_bags = [path for path in paths if isinstance(path, Path) and _looks_like_bag(path)]
+    local_bags = [
+        path for path in paths if isinstance(path, Path) and _looks_like_bag(path)
+    ]
     n_bags = len(urls) + len(local_bags)
     # A single path that does not exist is opened as a bag, which reports the error.
     if n_bags == len(paths) or (len(paths) == 1 and not Path(paths[0]).is_file()):
@@ -142,7 +144,9 @@ def _looks_like_file_of_bag(path: Path) -> bool:
 
 def is_plain_file(path: Path | str) -> bool:
     """Return whether a path is an existing file that does not have the name of a bag."""
-    return isinstance(path, Path) and path.is_file() and not _looks_like_file_of_bag(path)
+    return (
+        isinstance(path, Path) and path.is_file() and not _looks_like_file_of_bag(path)
+    )
 
 
 def _looks_like_bag(path: Path) -> bool:
@@ -158,7 +162,9 @@ def read_pair(arguments: Namespace, options: Options) -> Recording:
     files = read_files(arguments, arguments.paths, options)
     note(*files.repairs)
     inputs: Document = {}
-    for path, stream, poses in zip(arguments.paths, STREAMS, files.trajectories, strict=True):
+    for path, stream, poses in zip(
+        arguments.paths, STREAMS, files.trajectories, strict=True
+    ):
         inputs[stream] = {
             "file": str(path),
             "poses": len(poses),
@@ -232,7 +238,9 @@ def _refuse_options_of_two_files(arguments: Namespace) -> None:
             )
 
 
-def _options_of_file(arguments: Namespace, stream: str, options: Options) -> "FileOptions":
+def _options_of_file(
+    arguments: Namespace, stream: str, options: Options
+) -> "FileOptions":
     """Return how to read the file of a stream; ``stream`` is empty with three files or more."""
     from hand_eye_calib.formats.trajectory_files.file_options import FileOptions
 

@@ -102,7 +102,9 @@ class StreamView:
         if not len(child_times_s):
             return float("nan")
         is_shared = (times_s >= child_times_s[0]) & (times_s <= child_times_s[-1])
-        differences = np.abs(parent_rates - np.interp(times_s, child_times_s, child_rates))
+        differences = np.abs(
+            parent_rates - np.interp(times_s, child_times_s, child_rates)
+        )
         differences = differences[is_shared]
         return median(differences[np.isfinite(differences)])
 
@@ -153,12 +155,16 @@ def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
     config = snapshot.config
     # The clock offset is known from the result: a second estimate would take time.
     settled = replace(config, time_offset=calibration.time_offset_s)
-    pose_pairs = replace(snapshot, config=settled).pose_pairs.child_scaled(calibration.scale)
+    pose_pairs = replace(snapshot, config=settled).pose_pairs.child_scaled(
+        calibration.scale
+    )
     parent_is_positions = config.parent_measures == "positions"
     # Pairs for the excitation, which is computed from the first sensor's orientations.
     oriented = pose_pairs
     if parent_is_positions:
-        oriented = PosePairs(pose_pairs.stamps_ns, pose_pairs.Ts_cw_c, pose_pairs.Ts_pw_p)
+        oriented = PosePairs(
+            pose_pairs.stamps_ns, pose_pairs.Ts_cw_c, pose_pairs.Ts_pw_p
+        )
     parent, child = snapshot.streams
     shifted = child.shifted(calibration.time_offset_s).scaled(calibration.scale)
     without_lever_arm = None
@@ -175,7 +181,9 @@ def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
         times_s=(pose_pairs.stamps_ns - pose_pairs.stamps_ns[0]) * 1e-9,
         parent=parent_path,
         child=child_path,
-        angles=_angles(calibration, pose_pairs) if calibration.measured == "poses" else None,
+        angles=_angles(calibration, pose_pairs)
+        if calibration.measured == "poses"
+        else None,
         excitation=excitation(oriented),
         streams=view_streams(parent, shifted, config.max_gap),
         without_lever_arm=without_lever_arm,
@@ -194,7 +202,9 @@ def view_streams(parent: Trajectory, child: Trajectory, max_gap_s: float) -> Str
     rates = []
     spans_s = []
     for stream in (parent, child):
-        values = angular_rates(stream, window_s, step_s, max_gap_s, of_speed=not has_rates)
+        values = angular_rates(
+            stream, window_s, step_s, max_gap_s, of_speed=not has_rates
+        )
         first_s = (stream.stamps_ns[0] - start_ns) * 1e-9
         rates.append((first_s + np.arange(len(values)) * step_s, values))
         # Each gap ends a span and begins the next one. So the sorted edges are pairs of start and
@@ -261,7 +271,9 @@ def _between_worlds(pose_pairs: PosePairs, Ts_cw_p: FloatArray) -> FloatArray:
     return se3.nearest_rotation(rotations.mean(axis=0))
 
 
-def _angles(calibration: Calibration, pose_pairs: PosePairs) -> tuple[FloatArray, FloatArray]:
+def _angles(
+    calibration: Calibration, pose_pairs: PosePairs
+) -> tuple[FloatArray, FloatArray]:
     """Return the angles (N, 3) turned about the parent's axes as measured, and as computed.
 
     The measured angles (rad) are the sum of the rotation vectors from pose to pose. They have no

@@ -69,7 +69,9 @@ def figures_of(calibration: Calibration, evidence: Evidence | None) -> list[Draw
     if evidence and evidence.angles is not None:
         figures.append(_figure_of_coordinates(calibration, evidence))
     if evidence and evidence.without_lever_arm is not None:
-        figures.append(_figure_of_positions(calibration, evidence, evidence.without_lever_arm))
+        figures.append(
+            _figure_of_positions(calibration, evidence, evidence.without_lever_arm)
+        )
     if calibration.motion_residuals:
         figures.append(_figure_of_residuals(calibration, calibration.motion_residuals))
     if evidence:
@@ -106,7 +108,9 @@ def _figure_of_stops(calibration: Calibration) -> Drawn:
         # (2, 2, N): axis of the view, start or end, stop. So each stop is a line of its own.
         lines = np.stack([points, ends], axis=1).T
         panel.plot(*lines, color=MUTED, lw=0.7)
-        panel.plot(*points[is_used].T, "o", color=CHILD, ms=3.5, label=plain_label(child))
+        panel.plot(
+            *points[is_used].T, "o", color=CHILD, ms=3.5, label=plain_label(child)
+        )
         if not is_used.all():
             panel.plot(*points[~is_used].T, "x", color=BAD, ms=5.5, label="left out")
         panel.plot(0.0, 0.0, "s", color=PARENT, ms=6, label=plain_label(world))
@@ -135,11 +139,17 @@ def figure_of_streams(view: StreamView, names: tuple[str, str]) -> Drawn:
     streams = zip(view.rates, view.spans_s, names, looks, strict=True)
     for row, ((times_s, rates), spans_s, name, (colour, width)) in enumerate(streams):
         values = rates if is_speed else np.degrees(rates)
-        curves.plot(times_s * factor, values, color=colour, lw=width, label=plain_label(name))
+        curves.plot(
+            times_s * factor, values, color=colour, lw=width, label=plain_label(name)
+        )
         # A bar has its start and its length.
-        bars = [(start_s * factor, (end_s - start_s) * factor) for start_s, end_s in spans_s]
+        bars = [
+            (start_s * factor, (end_s - start_s) * factor) for start_s, end_s in spans_s
+        ]
         strip.broken_barh(bars, (0.6 - row, 0.8), color=colour, lw=0)
-    curves.set(ylabel="speed (m/s)" if is_speed else "angular rate (deg/s)", ylim=(0, None))
+    curves.set(
+        ylabel="speed (m/s)" if is_speed else "angular rate (deg/s)", ylim=(0, None)
+    )
     curves.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderaxespad=0)
     strip.set(ylim=(-0.6, 1.6), xlabel=f"time ({unit})")
     strip.set_yticks([1.0, 0.0], ["parent", "child"])
@@ -179,13 +189,19 @@ def _figure_of_paths(calibration: Calibration, evidence: Evidence) -> Drawn:
     for (path, colour, width), label in zip(paths, labels, strict=True):
         points = path[rows]
         look: Document = {"color": colour, "lw": width}
-        plane.plot(points[:, first], points[:, second], label=plain_label(label), **look)
+        plane.plot(
+            points[:, first], points[:, second], label=plain_label(label), **look
+        )
         side.plot(evidence.times_s[rows] * factor, points[:, across], **look)
-    plane.plot(*evidence.parent[0, [first, second]], "o", color=INK, ms=6, label="start")
+    plane.plot(
+        *evidence.parent[0, [first, second]], "o", color=INK, ms=6, label="start"
+    )
     axes = ("x (m)", "y (m)", "z (m)")
     is_level = across == 2
     plane.set(title="From above" if is_level else "In the plane of motion")
-    plane.set(xlabel=axes[first], ylabel=axes[second], aspect="equal", adjustable="datalim")
+    plane.set(
+        xlabel=axes[first], ylabel=axes[second], aspect="equal", adjustable="datalim"
+    )
     side.set(title="Height" if is_level else "Across the plane of motion")
     side.set(xlabel=f"time ({unit})", ylabel=axes[across])
     # Show at least half a metre: on a flat road, rounding would look like hills.
@@ -236,7 +252,14 @@ def _figure_of_coordinates(calibration: Calibration, evidence: Evidence) -> Draw
     assert evidence.angles is not None
     measured = np.hstack([evidence.parent, np.degrees(evidence.angles[0])])
     computed = np.hstack([evidence.child, np.degrees(evidence.angles[1])])
-    labels = ("x (m)", "y (m)", "z (m)", "about x (deg)", "about y (deg)", "about z (deg)")
+    labels = (
+        "x (m)",
+        "y (m)",
+        "z (m)",
+        "about x (deg)",
+        "about y (deg)",
+        "about z (deg)",
+    )
     parent = calibration.parent_frame
     child = calibration.child_frame
     curves = (
@@ -287,7 +310,9 @@ def _figure_of_positions(
         f"of {other}, less the measured ones. Half of the time, they differ by less than {after_m} "
         f"with the result, and by less than {before_m} without a lever arm. That includes drift."
     )
-    return as_drawn(figure, "coordinates", "Positions over time, before and after", caption)
+    return as_drawn(
+        figure, "coordinates", "Positions over time, before and after", caption
+    )
 
 
 @page_style()
@@ -313,7 +338,9 @@ def _figure_of_residuals(calibration: Calibration, residuals: Residuals) -> Draw
         factor, unit = _time_axis(float(times_s.max()))
         times = times_s * factor
         label = f"time ({unit})"
-    figure, panels = make_panels(1.2 + 1.6 * len(sizes), len(sizes), 1, bottom=0.8, sharex=True)
+    figure, panels = make_panels(
+        1.2 + 1.6 * len(sizes), len(sizes), 1, bottom=0.8, sharex=True
+    )
     for panel, (axis, values) in zip(panels, sizes.items(), strict=True):
         to_unit, unit_label = UNITS[axis]
         # A logarithmic axis needs positive values.
@@ -324,7 +351,9 @@ def _figure_of_residuals(calibration: Calibration, residuals: Residuals) -> Draw
     figure.legend(*handles, loc="lower center", ncols=3, borderaxespad=0)
     medians = [amount(axis, float(np.median(values))) for axis, values in sizes.items()]
     largest = [amount(axis, float(np.max(values))) for axis, values in sizes.items()]
-    rejected = f"{is_out.sum():,} ({share(float(is_out.mean()))})" if is_out.any() else "None"
+    rejected = (
+        f"{is_out.sum():,} ({share(float(is_out.mean()))})" if is_out.any() else "None"
+    )
     caption = (
         f"Half of the {len(residuals):,} {items} agree with the result to {listing(medians)}, all "
         f"of them to {listing(largest)}. {rejected} of them are rejected as outliers."
@@ -332,7 +361,9 @@ def _figure_of_residuals(calibration: Calibration, residuals: Residuals) -> Draw
     return as_drawn(figure, "residuals", "Residuals", caption)
 
 
-def _draw_residuals(panel: Axes, times: FloatArray, values: FloatArray, is_out: BoolArray) -> None:
+def _draw_residuals(
+    panel: Axes, times: FloatArray, values: FloatArray, is_out: BoolArray
+) -> None:
     """Draw the sizes (K,) of residuals, all positive, and mark the rejected residuals.
 
     If there are too many, every n-th used residual and the largest rejected residuals are drawn.

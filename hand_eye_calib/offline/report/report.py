@@ -153,7 +153,11 @@ def render(
     )
     parent = printable(calibration.parent_frame)
     child = printable(calibration.child_frame)
-    by_hand = [value for value in usable_numbers(calibration).values() if isinstance(value, str)]
+    by_hand = [
+        value
+        for value in usable_numbers(calibration).values()
+        if isinstance(value, str)
+    ]
     evidence = gather(calibration, snapshot) if snapshot else None
     advice = ""
     if evidence and calibration.verdict is not Verdict.DO_NOT_USE:
@@ -177,7 +181,9 @@ def render(
         directions=[*transforms_of(calibration).values()][:2],
         others=_other_transforms(calibration),
         stops=calibration.parts.get("stops"),
-        numbers_of=partial(printed_numbers, out_of_reach=calibration.out_of_reach, sign="±"),
+        numbers_of=partial(
+            printed_numbers, out_of_reach=calibration.out_of_reach, sign="±"
+        ),
         parts_of=parts_of_sigmas,
         angles_of=partial(angles_in_words, result=calibration),
         axes=list(_axes(calibration)),
@@ -206,7 +212,9 @@ def render_brief(calibration: Calibration) -> str:
     )
 
 
-def _other_transforms(calibration: Calibration) -> list[tuple[Notation, tuple[str, str]]]:
+def _other_transforms(
+    calibration: Calibration,
+) -> list[tuple[Notation, tuple[str, str]]]:
     """Return further transforms of the result with the names of their source and target frames.
 
     The stops of an arm have one, for example: the pose of the target in the base.
@@ -336,12 +344,18 @@ def _data(
     """Return the variables of the section "Data and solution" of the template."""
     defaults = CalibratorConfig().to_options()
     options = snapshot.config.to_options() if snapshot else defaults
-    changed = [(name, value) for name, value in options.items() if value != defaults[name]]
+    changed = [
+        (name, value) for name, value in options.items() if value != defaults[name]
+    ]
     kind = "stops"
     if evidence:
         kind = f"synchronised pose pairs over {text.duration(evidence.times_s[-1])}"
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-    streams = dict(zip(("parent", "child"), snapshot.streams, strict=True)) if snapshot else {}
+    streams = (
+        dict(zip(("parent", "child"), snapshot.streams, strict=True))
+        if snapshot
+        else {}
+    )
     rows = []
     for name in ("parent", "child"):
         if name in streams or name in inputs:
@@ -364,9 +378,14 @@ def _stream(name: str, origin: Document, stream: Trajectory | None) -> dict[str,
     A value that is not known is "-".
     """
     count = origin.get("messages", origin.get("poses"))
-    row = {"name": name, "source": origin.get("topic") or Path(origin.get("file", "-")).name}
+    row = {
+        "name": name,
+        "source": origin.get("topic") or Path(origin.get("file", "-")).name,
+    }
     row |= dict.fromkeys(("poses", "rate", "duration", "gap", "path"), "-")
-    ends_ns = [origin[key] for key in ("first_stamp_ns", "last_stamp_ns") if origin.get(key)]
+    ends_ns = [
+        origin[key] for key in ("first_stamp_ns", "last_stamp_ns") if origin.get(key)
+    ]
     if count and ends_ns:
         duration_s = (ends_ns[-1] - ends_ns[0]) * 1e-9
         if duration_s:

@@ -168,7 +168,9 @@ def as_drawn(figure: Figure, name: str, title: str, caption: str) -> Drawn:
     svg = re.sub(r' (width|height)="[^"]*"', "", svg, count=2)
     svg = f'<svg aria-hidden="true" focusable="false"{svg}'
     # Remove comments, indentation and name spaces.
-    svg = re.sub(r'<!--.*?-->|(?<=\n) +| xmlns(:\w+)?="[^"]*"', "", svg, flags=re.DOTALL)
+    svg = re.sub(
+        r'<!--.*?-->|(?<=\n) +| xmlns(:\w+)?="[^"]*"', "", svg, flags=re.DOTALL
+    )
     # Remove the ids of groups, which nothing refers to. All other ids get the name of the figure.
     svg = re.sub(r'<g id="[^"]*"', "<g", svg)
     svg = re.sub(r'\bid="', f'id="{name}-', svg)
@@ -176,7 +178,9 @@ def as_drawn(figure: Figure, name: str, title: str, caption: str) -> Drawn:
     svg = svg.replace("url(#", f"url(#{name}-")
     svg = re.sub(r"(font: [\d.]+px|font-family:) [^;\"]*", r"\1 var(--sans)", svg)
     # Coordinates of the elements path and use have two decimals: that is enough.
-    svg = re.sub(r"<[pu][^>]*>", lambda shape: re.sub(r"(\.\d\d)\d+", r"\1", shape[0]), svg)
+    svg = re.sub(
+        r"<[pu][^>]*>", lambda shape: re.sub(r"(\.\d\d)\d+", r"\1", shape[0]), svg
+    )
     for colour, variable in _VARIABLES.items():
         svg = svg.replace(colour.lower(), f"var(--{variable})")
     return Drawn(name, title, caption, svg)
@@ -193,7 +197,12 @@ def plain_label(label: str) -> str:
 
 
 def make_panels(
-    height: float, rows: int, columns: int, bottom: float = 0.5, gap: float = 0.2, **options: Any
+    height: float,
+    rows: int,
+    columns: int,
+    bottom: float = 0.5,
+    gap: float = 0.2,
+    **options: Any,
 ) -> tuple[Figure, Sequence[Axes]]:
     """Make a figure with rows and columns of panels, and return the figure and its panels.
 
@@ -214,5 +223,7 @@ def make_panels(
     figure = Figure(figsize=(LOOK.width, height))
     spacing = {"left": 0.085, "right": 0.985, "wspace": gap, "hspace": 0.12}
     spacing |= {"bottom": bottom / height, "top": 1 - 0.3 / height}
-    panels = figure.subplots(rows, columns, gridspec_kw=spacing, squeeze=False, **options)
+    panels = figure.subplots(
+        rows, columns, gridspec_kw=spacing, squeeze=False, **options
+    )
     return figure, panels.ravel()

@@ -80,7 +80,9 @@ def plot(calibration: Calibration, ax: Any = None) -> Figure:
     require_type("the result", calibration, Calibration)
     if ax is not None:
         if np.size(ax) != len(VIEWS):
-            raise InputError(f"ax must be three axes of Matplotlib; got {type(ax).__name__}")
+            raise InputError(
+                f"ax must be three axes of Matplotlib; got {type(ax).__name__}"
+            )
         draw_views(ax, calibration)
         return ax[0].figure
     with page_style(figure_facecolor="white", savefig_facecolor="white"):
@@ -106,17 +108,23 @@ def caption_of_views(*calibrations: Calibration) -> str:
 
 
 def draw_views(
-    panels: Sequence[Axes], *calibrations: Calibration, titles: Mapping[str, str] = VIEWS
+    panels: Sequence[Axes],
+    *calibrations: Calibration,
+    titles: Mapping[str, str] = VIEWS,
 ) -> None:
     """Draw the parent sensor and all child sensors in its frame, one view in each of three panels.
 
     Several calibrations have the same parent sensor. ``titles`` has the keys of :data:`VIEWS`.
     """
-    distances = [float(np.linalg.norm(calibration.translation)) for calibration in calibrations]
+    distances = [
+        float(np.linalg.norm(calibration.translation)) for calibration in calibrations
+    ]
     axis_m = LOOK.axis_share * max(*distances, LOOK.min_distance_m)
     for panel, (axes, title) in zip(panels, titles.items(), strict=True):
         rows = ["xyz".index(axis) for axis in axes]
-        _draw_sensor(panel, np.eye(4)[rows], calibrations[0].parent_frame, PARENT, axis_m, 6)
+        _draw_sensor(
+            panel, np.eye(4)[rows], calibrations[0].parent_frame, PARENT, axis_m, 6
+        )
         for calibration in calibrations:
             T = calibration.T_parent_child[rows]
             # A dotted line from the parent's origin to the child's.
@@ -155,7 +163,9 @@ def _draw_uncertainty(
     variances, axes = np.linalg.eigh(covariance[np.ix_(rows, rows)])
     width, height = 2 * LOOK.sigmas * np.sqrt(np.maximum(variances, 0.0))
     angle_deg = float(np.degrees(np.arctan2(axes[1, 0], axes[0, 0])))
-    panel.add_patch(Ellipse((x, y), width, height, angle=angle_deg, color=CHILD, alpha=0.3))
+    panel.add_patch(
+        Ellipse((x, y), width, height, angle=angle_deg, color=CHILD, alpha=0.3)
+    )
 
 
 def _draw_sensor(
@@ -188,4 +198,6 @@ def figure_of_views(
     """Draw the child sensors of one or several results in their parent's frame."""
     figure, panels = make_panels(3.1, 1, 3, gap=0.36)
     draw_views(panels, *calibrations, titles=titles)
-    return as_drawn(figure, "views", "The sensors in space", caption_of_views(*calibrations))
+    return as_drawn(
+        figure, "views", "The sensors in space", caption_of_views(*calibrations)
+    )

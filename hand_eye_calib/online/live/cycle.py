@@ -38,7 +38,13 @@ from hand_eye_calib.online.live.describing import (
 from hand_eye_calib.online.live.goal import Goal
 from hand_eye_calib.online.live.log import GOES_ON_S, ONCE_S, NodeLog
 from hand_eye_calib.online.live.session import LiveSession
-from hand_eye_calib.online.live.solving import NO_MOTION, Answer, Failure, Job, SolvingProcess
+from hand_eye_calib.online.live.solving import (
+    NO_MOTION,
+    Answer,
+    Failure,
+    Job,
+    SolvingProcess,
+)
 from hand_eye_calib.online.live.state import (
     ANSWER_WITHIN_S,
     Broadcast,
@@ -50,7 +56,11 @@ from hand_eye_calib.online.live.state import (
     ProgressState,
     Standing,
 )
-from hand_eye_calib.online.live.stream_checks import RAW_POSE_CODES, StreamChecks, merged
+from hand_eye_calib.online.live.stream_checks import (
+    RAW_POSE_CODES,
+    StreamChecks,
+    merged,
+)
 
 # Callback that receives the success of a solve and a line of text about the result.
 OnSolved: TypeAlias = Callable[[bool, str], None]
@@ -168,7 +178,9 @@ class SolveCycle:
         targets = {name: getattr(config, name) for name in _TARGETS}
         result = self.published
         has_same_values = replace(before, **targets) == config
-        has_same_names = before.given.difference(_TARGETS) == config.given.difference(_TARGETS)
+        has_same_names = before.given.difference(_TARGETS) == config.given.difference(
+            _TARGETS
+        )
         if result is None or not (has_same_values and has_same_names):
             self.goal.follow(config.targets)
             return
@@ -199,7 +211,9 @@ class SolveCycle:
             return ""
         if is_refuted(result):
             reason = result.reasons[0]
-            remedy = ", or remove it" if result.status is SolveStatus.CONTRADICTED else ""
+            remedy = (
+                ", or remove it" if result.status is SolveStatus.CONTRADICTED else ""
+            )
             return f"{reason.sentence}; {reason.advice_on(Road.NODE)}{remedy}"
         if failure is None or self._failing_since_s is None:
             return ""
@@ -288,7 +302,9 @@ class SolveCycle:
         check = self._is_unchecked and is_due
         if check:
             self._is_unchecked = False
-            self._check_due_s = now_s + max(_CHECK_PERIOD_S, _SOLVES_PER_CHECK * self._job_s)
+            self._check_due_s = now_s + max(
+                _CHECK_PERIOD_S, _SOLVES_PER_CHECK * self._job_s
+            )
         self._submitted = self._session.copy_to_solve()
         job = Job(
             self._session.number,
@@ -304,7 +320,10 @@ class SolveCycle:
     def conclude(self, answer: Answer) -> Outcome:
         """Process an answer; return the success of the solve, and a line of text about it."""
         if answer.session != self._session.number:
-            return False, "the session was reset during the solve: the result is dropped"
+            return (
+                False,
+                "the session was reset during the solve: the result is dropped",
+            )
         # Pause for the processor time of the solve, so that half of the processor time stays free.
         # On a busy computer, the solve takes much longer than this, and no longer pause is needed.
         self._rest_until_s = time.monotonic() + answer.processor_s
@@ -401,7 +420,8 @@ class SolveCycle:
             self._solved = self._submitted, self._check_options
         else:
             reason = (
-                f"the result of {result.n_poses} poses is kept, because the newest result is worse"
+                f"the result of {result.n_poses} poses is kept, "
+                "because the newest result is worse"
             )
             warning = f"{reason}: {describe(newest)}"
             self._log.info(warning, ONCE_S, key="kept")
@@ -424,7 +444,9 @@ class SolveCycle:
         texts = [describe(calibration)]
         progress = self.goal.progress
         self._log.info(texts[0], every_s, key="result")
-        is_final = progress.done or progress.will_not_get_there or calibration.status.failure
+        is_final = (
+            progress.done or progress.will_not_get_there or calibration.status.failure
+        )
         for reason in calibration.reasons:
             text = f"{reason.sentence}; {reason.advice_on(Road.NODE)}"
             texts.append(text)
@@ -465,7 +487,9 @@ class SolveCycle:
 
     # -------------------------------------------------------------------- state
 
-    def extrinsic_state(self, accepts_poses: bool, tf_static: BroadcastState) -> ExtrinsicState:
+    def extrinsic_state(
+        self, accepts_poses: bool, tf_static: BroadcastState
+    ) -> ExtrinsicState:
         """Return the diagnostics of the result.
 
         Parameters
@@ -489,7 +513,9 @@ class SolveCycle:
             path_m=motion.distance,
             motion_s=motion.motion_s,
             has_vehicle_axes=motion.has_vehicle_axes,
-            rotation_deg=dict(zip("xyz", plain(np.degrees(motion.rotation)), strict=True)),
+            rotation_deg=dict(
+                zip("xyz", plain(np.degrees(motion.rotation)), strict=True)
+            ),
             tf_static=tf_static[0],
             tf_static_reason=tf_static[1],
             standing=self.standing,
@@ -502,7 +528,9 @@ class SolveCycle:
     def _slow_in_words(self) -> str:
         """Return a sentence about solves that take long, and the reason; empty if they do not."""
         running_s = time.monotonic() - self._started_s if self.is_solving else 0.0
-        return slow_in_words(max(running_s, self._job_s), self._job_s, self._job_processor_s)
+        return slow_in_words(
+            max(running_s, self._job_s), self._job_s, self._job_processor_s
+        )
 
     def _condition(self, accepts_poses: bool, tf_static: BroadcastState) -> Condition:
         """Return level and text of the gravest condition that applies."""
@@ -510,23 +538,34 @@ class SolveCycle:
         failure = self._failure
         broadcast, why_refused = tf_static
         if failure is not None and failure.details:
-            return Level.ERROR, f"the solve failed unexpectedly, see the log: {failure.what}"
+            return (
+                Level.ERROR,
+                f"the solve failed unexpectedly, see the log: {failure.what}",
+            )
         if result is not None and self.problem:
             separator = ": " if self.standing is Standing.REFUTED else ", but "
             return Level.WARN, f"{result.verdict.value}{separator}{self.problem}"
         if not accepts_poses:
-            return Level.WARN, "poses are not accepted: call ~/set_enabled, or activate the node"
+            return (
+                Level.WARN,
+                "poses are not accepted: call ~/set_enabled, or activate the node",
+            )
         if result is None:
             return Level.WARN, self._why_no_result()
         if broadcast is Broadcast.REFUSED and result.verdict is not Verdict.DO_NOT_USE:
             return Level.WARN, f"publish_tf is refused: {why_refused}"
         if failure is not None:
             return Level.WARN, failure.what
-        return Level.OK if result.verdict is Verdict.USE else Level.WARN, result.headline
+        return (
+            Level.OK if result.verdict is Verdict.USE else Level.WARN,
+            result.headline,
+        )
 
     def _why_no_result(self) -> str:
         """Return the gravest finding and the failure of the newest solve."""
-        texts = [f"{Verdict.DO_NOT_USE.value}: {fault}" for fault in self.checks.faults()[:1]]
+        texts = [
+            f"{Verdict.DO_NOT_USE.value}: {fault}" for fault in self.checks.faults()[:1]
+        ]
         if self._failure is not None:
             texts.append(self._failure.what)
         return "; ".join(texts) or "no result yet"

@@ -16,7 +16,13 @@ from hand_eye_calib.core.results.context import Comparison
 from hand_eye_calib.core.results.parts import facts_of
 from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.online.live.progress import AXIS_KEYS
-from hand_eye_calib.online.live.state import Condition, InputState, Level, ResultState, as_printed
+from hand_eye_calib.online.live.state import (
+    Condition,
+    InputState,
+    Level,
+    ResultState,
+    as_printed,
+)
 
 # A first result is accepted after this duration of motion (s), or after this rotation (rad). Before
 # that, estimates and advice jump.
@@ -46,7 +52,9 @@ def pause_of(inputs: Mapping[str, InputState], accepts_poses: bool) -> Condition
     level = Level.WARN
     if len(paused) == len(inputs):
         level = max(state.level for state in paused.values())
-    remedy = "continue to drive, or save" if level is Level.OK else "start its source again"
+    remedy = (
+        "continue to drive, or save" if level is Level.OK else "start its source again"
+    )
     streams = listing([f"{name} ({state.topic})" for name, state in paused.items()])
     longest_s = max(state.silent_s or 0.0 for state in paused.values())
     return level, f"Paused: no pose of {streams} for {duration(longest_s)}; {remedy}."
@@ -88,7 +96,9 @@ def slow_in_words(seconds: float, last_s: float, last_processor_s: float) -> str
     is_busy = is_held_up(last_s, last_processor_s) or last_s < _SLOW_SOLVE_S
     word = "busy" if is_busy else "slow"
     # Whole tens: the sentence does not change with every second of a running solve.
-    return f"The computer is {word}: a result takes {duration(10.0 * (seconds // 10.0))}."
+    return (
+        f"The computer is {word}: a result takes {duration(10.0 * (seconds // 10.0))}."
+    )
 
 
 def with_newest_halves(kept: Calibration, newest: Calibration) -> Calibration:
@@ -102,7 +112,9 @@ def with_newest_halves(kept: Calibration, newest: Calibration) -> Calibration:
     for axis, row in kept.cross_check.items():
         newest_row = newest.cross_check[axis]
         excess = newest_row.excess_of_halves
-        rows[axis] = replace(row, of_halves=newest_row.of_halves, excess_of_halves=excess)
+        rows[axis] = replace(
+            row, of_halves=newest_row.of_halves, excess_of_halves=excess
+        )
     return replace(kept, cross_check=rows)
 
 
@@ -117,7 +129,9 @@ def with_axis_keys(comparison: Comparison) -> Comparison:
 
 def is_refuted(result: Calibration) -> bool:
     """Whether the solve failed, or an error in the streams makes every axis unusable."""
-    return bool(result.status.failure) or any(finding.makes_unusable for finding in result.findings)
+    return bool(result.status.failure) or any(
+        finding.makes_unusable for finding in result.findings
+    )
 
 
 def priors_of(config: CalibratorConfig) -> dict[str, str]:
@@ -136,7 +150,8 @@ def state_of_result(result: Calibration, age_s: float) -> ResultState:
         verdict=result.verdict.value,
         status=result.status.value,
         reasons=tuple(
-            f"{reason.sentence}: {reason.advice_on(Road.NODE)}" for reason in result.reasons
+            f"{reason.sentence}: {reason.advice_on(Road.NODE)}"
+            for reason in result.reasons
         ),
         pose=as_printed(np.where(np.isfinite(sigmas), pose, np.nan)),
         pose_sigma=as_printed(sigmas),

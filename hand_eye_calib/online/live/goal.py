@@ -18,10 +18,19 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hand_eye_calib.core.assessment.excitation import MIN_ROTATION, Excitation, helpful_motion
+from hand_eye_calib.core.assessment.excitation import (
+    MIN_ROTATION,
+    Excitation,
+    helpful_motion,
+)
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.text import amount, axes_in_words, capital, duration
-from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, SolveStatus, Verdict
+from hand_eye_calib.core.results.calibration import (
+    Calibration,
+    DofVerdict,
+    SolveStatus,
+    Verdict,
+)
 from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.core.results.verdict import what_is_known
 from hand_eye_calib.online.live.progress import AXIS_KEYS, AxisProgress, Progress
@@ -227,7 +236,9 @@ class Goal:
         ratios : (6,) array
             See :meth:`_variance_ratios`.
         """
-        is_usable = newest.status is SolveStatus.OK and newest.verdict is not Verdict.DO_NOT_USE
+        is_usable = (
+            newest.status is SolveStatus.OK and newest.verdict is not Verdict.DO_NOT_USE
+        )
         if not is_usable or self._faults or ratios.max() > 1.0:
             return
         if self.best is None and self._confirmation_s(newest) > 0.0:
@@ -244,7 +255,9 @@ class Goal:
         # Motion (s) of the first result in the latest run of results within the targets.
         first_s = motion_s
         for result in reversed(self._results):
-            is_within = self._variance_ratios(newest, result.sigmas_measured).max() <= 1.0
+            is_within = (
+                self._variance_ratios(newest, result.sigmas_measured).max() <= 1.0
+            )
             if not is_within or not result.is_usable:
                 break
             first_s = result.motion_s
@@ -292,7 +305,9 @@ class Goal:
         total_s += _confirming_motion(motion_s + total_s)
         *axes_left_s, total_s = self._in_steps(np.append(left_s, total_s))
         if is_confirming:
-            step = np.searchsorted(_CONFIRMING_STEPS_S, 0.99 * self._confirmation_s(newest))
+            step = np.searchsorted(
+                _CONFIRMING_STEPS_S, 0.99 * self._confirmation_s(newest)
+            )
             total_s = float(_CONFIRMING_STEPS_S[step])
             # Forget the last reported total, which was estimated.
             self._steps[-1] = len(_STEPS_S) - 1
@@ -329,7 +344,9 @@ class Goal:
         if is_out_of_reach[limiting]:
             return replace(
                 progress,
-                sentence=_too_small_in_words(axis, row.target, newest.allowance[limiting]),
+                sentence=_too_small_in_words(
+                    axis, row.target, newest.allowance[limiting]
+                ),
                 limiting_axis=AXIS_KEYS[axis],
                 will_not_get_there=True,
                 target_is_too_small=True,
@@ -341,13 +358,17 @@ class Goal:
         motion = capital(helpful_motion([axis], self._motion))
         axis_text = axes_in_words([axis])
         if will_not_get_there:
-            sentence = f"This motion will not determine {axis_text} well enough. {motion}."
+            sentence = (
+                f"This motion will not determine {axis_text} well enough. {motion}."
+            )
         else:
             if is_helpful:
                 motion = "This motion is right, more of it"
             if np.isfinite(progress.seconds_left):
                 left = duration(progress.seconds_left)
-                sentence = f"Go on for about {left}, {axis_text} takes longest. {motion}."
+                sentence = (
+                    f"Go on for about {left}, {axis_text} takes longest. {motion}."
+                )
             else:
                 sentence = f"{axis_text} is not determined well enough yet. {motion}."
         return replace(
@@ -388,12 +409,18 @@ class Goal:
 
     def _nothing_yet(self, sentence: str) -> Progress:
         """Return the progress of a session without a result."""
-        return Progress(sentence=sentence, axes=self._by_axis(np.full(6, np.inf), [np.inf] * 6))
+        return Progress(
+            sentence=sentence, axes=self._by_axis(np.full(6, np.inf), [np.inf] * 6)
+        )
 
-    def _by_axis(self, sigmas: FloatArray, left_s: Sequence[float]) -> dict[str, AxisProgress]:
+    def _by_axis(
+        self, sigmas: FloatArray, left_s: Sequence[float]
+    ) -> dict[str, AxisProgress]:
         """Return the progress by axis from standard deviations (6,) and times left (6,) (s)."""
         keys = AXIS_KEYS.values()
-        columns = zip(keys, sigmas.tolist(), self._targets.tolist(), left_s, strict=True)
+        columns = zip(
+            keys, sigmas.tolist(), self._targets.tolist(), left_s, strict=True
+        )
         return {
             key: AxisProgress(sigma=sigma, target=target, seconds_left=seconds)
             for key, sigma, target, seconds in columns

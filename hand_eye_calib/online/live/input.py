@@ -22,7 +22,12 @@ from hand_eye_calib.core.geometry.frames import check_not_null
 from hand_eye_calib.formats.transforms import PoseFields
 from hand_eye_calib.online.live.log import GOES_ON_S, NodeLog
 from hand_eye_calib.online.live.session import LiveSession
-from hand_eye_calib.online.live.state import REPORT_PERIOD_S, Condition, InputState, Level
+from hand_eye_calib.online.live.state import (
+    REPORT_PERIOD_S,
+    Condition,
+    InputState,
+    Level,
+)
 
 # Largest share of lost messages that needs no action of a person.
 _MAX_LOST_SHARE = 0.01
@@ -121,7 +126,9 @@ class StampGuard:
             if step_ns > _MAX_PAUSE_NS:
                 dropped = self._drop_held()
         self._held.append((stamp_ns, message))
-        judgement = self._accept_held(now_s) if len(self._held) >= MIN_HELD else Judgement()
+        judgement = (
+            self._accept_held(now_s) if len(self._held) >= MIN_HELD else Judgement()
+        )
         return judgement._replace(dropped=dropped)
 
     def restart(self, now_s: float | None = None) -> None:
@@ -148,7 +155,9 @@ class StampGuard:
     def period_ns(self) -> float:
         """Return the median interval (ns) of the last accepted stamps; 0 if there are too few."""
         stamps_ns = sorted(self._recent_ns)
-        intervals = [later - earlier for earlier, later in itertools.pairwise(stamps_ns)]
+        intervals = [
+            later - earlier for earlier, later in itertools.pairwise(stamps_ns)
+        ]
         return statistics.median(intervals) if intervals else 0.0
 
     def _is_near(self, stamp_ns: int) -> bool:
@@ -337,7 +346,9 @@ class PoseInput:
         elif judgement.taken and last_ns is not None:
             self._take_gap(judgement.taken[0][0] - last_ns, now_s)
         for dropped_ns in judgement.dropped:
-            self._refuse_stamp(dropped_ns, "its stamp does not fit those before and after it")
+            self._refuse_stamp(
+                dropped_ns, "its stamp does not fit those before and after it"
+            )
         for repeated_ns in judgement.repeated:
             self._refuse_stamp(repeated_ns, repeated_stamps(repeated_ns))
         for message in judgement.taken:
@@ -383,7 +394,9 @@ class PoseInput:
 
     def _refuse_stamp(self, stamp_ns: int, text: str) -> None:
         """Refuse a message because of its stamp."""
-        self.refuse(with_stamp(stamp_ns), "corrupt stamp", text if stamp_ns else _STAMP_IS_0)
+        self.refuse(
+            with_stamp(stamp_ns), "corrupt stamp", text if stamp_ns else _STAMP_IS_0
+        )
 
     def _take(self, stamp_ns: int, read: Callable[[], PoseFields]) -> None:
         """Read a message and add its pose to the session, or count it as refused."""
@@ -393,7 +406,9 @@ class PoseInput:
             row = self.name, stamp_ns, pose.position, pose.quat_xyzw
             if not self._session.engines.add_pose(*row):
                 message = with_stamp(stamp_ns)
-                self._log.debug(f"{self.topic}: message {message} is repeated or too late")
+                self._log.debug(
+                    f"{self.topic}: message {message} is repeated or too late"
+                )
                 return
             self._taken_s = self._arrived_s
             if self._session.journal is not None:
@@ -431,7 +446,9 @@ class PoseInput:
 
     def is_silent(self, steady_s: float) -> bool:
         """Whether messages have arrived, but arrive no longer."""
-        return self._arrived_s is not None and steady_s - self._arrived_s > SILENT_AFTER_S
+        return (
+            self._arrived_s is not None and steady_s - self._arrived_s > SILENT_AFTER_S
+        )
 
     def silent_s(self, steady_s: float) -> float | None:
         """Return the time (s) without a pose; None before the first pose of the session."""
@@ -542,7 +559,11 @@ class PoseInput:
         silent_s = steady_s - arrived_s
         if silent_s > PAUSED_AFTER_S:
             text = f"{self.topic} has been silent for {silent_s:.0f} s"
-            return text if self.publishers != () else f"{text}: it has no publisher any more"
+            return (
+                text
+                if self.publishers != ()
+                else f"{text}: it has no publisher any more"
+            )
         if self._taken_s is None:
             return ""
         without_s = steady_s - self._taken_s

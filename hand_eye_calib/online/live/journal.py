@@ -153,7 +153,9 @@ class SessionJournal:
                 reason = str(error) if isinstance(error, OSError) else repr(error)
                 self._give_up(getattr(error, "strerror", None) or reason)
 
-    def _open(self, about: journal.About, resumed: journal.Journal | None = None) -> None:
+    def _open(
+        self, about: journal.About, resumed: journal.Journal | None = None
+    ) -> None:
         """Start to write; a session in the directory is kept aside, unless it is continued."""
         if resumed is None and journal.is_used(self.directory):
             n_poses = journal.count_poses(self.directory)

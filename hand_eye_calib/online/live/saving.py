@@ -6,7 +6,11 @@ import tempfile
 import time
 
 from hand_eye_calib.core.base.config import NodeConfig
-from hand_eye_calib.core.base.errors import ConfigError, HandEyeCalibError, NotEnoughDataError
+from hand_eye_calib.core.base.errors import (
+    ConfigError,
+    HandEyeCalibError,
+    NotEnoughDataError,
+)
 from hand_eye_calib.core.base.text import listing
 from hand_eye_calib.core.engine.session_result import SessionResult
 from hand_eye_calib.formats.results import keep_earlier_results, save_result
@@ -89,10 +93,16 @@ class Saver:
         if self._cycle.standing is Standing.OUTDATED:
             text = f"{text}; {self._cycle.problem}"
         verdict = result.verdict.value
-        self.state = SavedState(directory=where, at_s=time.time(), text=text, verdict=verdict)
+        self.state = SavedState(
+            directory=where, at_s=time.time(), text=text, verdict=verdict
+        )
         text = f"result saved to {where}: {text}"
         engines = self._session.engines
-        others = {name: engine.snapshot() for name, engine in engines.items() if name != "child"}
+        others = {
+            name: engine.snapshot()
+            for name, engine in engines.items()
+            if name != "child"
+        }
         files = ["report.html"] if options.report else []
         if others:
             files.append("rig/")
@@ -112,7 +122,9 @@ class Saver:
             with tempfile.TemporaryFile() as file:
                 pickle.dump(session, file, pickle.HIGHEST_PROTOCOL)
                 file.seek(0)
-                self._process = start(_PAGES, directory, stdin=file, stdout=subprocess.DEVNULL)
+                self._process = start(
+                    _PAGES, directory, stdin=file, stdout=subprocess.DEVNULL
+                )
         # The temporary directory is full, or no process can be started.
         except OSError as error:
             return f"{files} cannot be written: {error.strerror}"

@@ -11,7 +11,12 @@ from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.engine.calibrator import BufferLimits, Calibrator, Calibrators
 from hand_eye_calib.core.engine.snapshot import STREAMS
 from hand_eye_calib.formats.geodetic import LocalOrigin
-from hand_eye_calib.formats.journal import Journal, has_session, read_journal, replay_journal
+from hand_eye_calib.formats.journal import (
+    Journal,
+    has_session,
+    read_journal,
+    replay_journal,
+)
 from hand_eye_calib.online.live.journal import SessionJournal
 from hand_eye_calib.online.live.log import NodeLog
 from hand_eye_calib.online.live.state import GRACE_S, JournalState, Level
@@ -40,7 +45,9 @@ class LiveSession:
         None if no journal is written.
     """
 
-    def __init__(self, log: NodeLog, config: CalibratorConfig, others: Sequence[str] = ()) -> None:
+    def __init__(
+        self, log: NodeLog, config: CalibratorConfig, others: Sequence[str] = ()
+    ) -> None:
         self.engines = Calibrators(child=Calibrator(config))
         self.engines |= {name: Calibrator(_for_other_child(config)) for name in others}
         self.number = 0
@@ -100,7 +107,9 @@ class LiveSession:
         """
         is_pair = stream in STREAMS
         if measures != "poses" and not (is_pair and self._is_solved):
-            raise ConfigError(f"a rig and the monitor need poses; {stream} has {measures}")
+            raise ConfigError(
+                f"a rig and the monitor need poses; {stream} has {measures}"
+            )
         name = f"{stream}_measures"
         if not is_pair or self._measures.get(name, "poses") == measures:
             return
@@ -156,8 +165,14 @@ class LiveSession:
         self.stop_journal()
         is_resuming = is_first and options.journal == "resume"
         if is_resuming and not options.output_directory:
-            raise ConfigError("journal resume needs output_directory: set the session's directory")
-        if options.output_directory and options.journal != "off" and not options.monitor:
+            raise ConfigError(
+                "journal resume needs output_directory: set the session's directory"
+            )
+        if (
+            options.output_directory
+            and options.journal != "off"
+            and not options.monitor
+        ):
             directory = output_path(options.output_directory).resolve() / "journal"
             resumed = self._resume(directory) if is_resuming else None
             self.journal = SessionJournal(directory, self._about, self._log, resumed)
@@ -238,7 +253,11 @@ class LiveSession:
 
 def _for_other_child(config: CalibratorConfig) -> CalibratorConfig:
     """Return the options for a further child sensor: without the values of the first child."""
-    names = {item.name for item in fields(config) if item.name.startswith(("prior_", "child_"))}
+    names = {
+        item.name
+        for item in fields(config)
+        if item.name.startswith(("prior_", "child_"))
+    }
     for name in ("time_offset", "scale"):
         # A number belongs to the first child; a text such as "estimate" applies to all children.
         if not isinstance(getattr(config, name), str):

@@ -170,7 +170,9 @@ def answer(job: Job) -> Answer:
         result = replace(result, time_offset=snapshot.time_offset)
         pairs = snapshot.pose_pairs
         result = replace(
-            result, motion=excitation(pairs), newest_motion=excitation(newest_pairs(pairs))
+            result,
+            motion=excitation(pairs),
+            newest_motion=excitation(newest_pairs(pairs)),
         )
         result = replace(result, calibration=snapshot.estimate())
     except Exception as error:
@@ -224,7 +226,10 @@ def with_raw_findings(result: CheckResult, snapshot: Snapshot) -> CheckResult:
     config = snapshot.config
     errors: list[Finding] = []
     for stream, trajectory in zip(STREAMS, snapshot.unpaired, strict=True):
-        if len(trajectory) < _MIN_UNPAIRED or trajectory.duration_s < MIN_DURATION_S / 2:
+        if (
+            len(trajectory) < _MIN_UNPAIRED
+            or trajectory.duration_s < MIN_DURATION_S / 2
+        ):
             continue
         if config.measured == "poses":
             findings = check_stream(trajectory, stream, config.max_gap)
@@ -233,7 +238,9 @@ def with_raw_findings(result: CheckResult, snapshot: Snapshot) -> CheckResult:
             # scale 0 removes them from the check.
             scale = 1.0 if config.measured == "positions" else 0.0
             findings = check_positions(trajectory.scaled(scale), stream, config.max_gap)
-        errors += [finding for finding in answered(findings, config) if finding.makes_unusable]
+        errors += [
+            finding for finding in answered(findings, config) if finding.makes_unusable
+        ]
     return replace(result, findings=merged(result.findings, errors))
 
 
@@ -263,7 +270,11 @@ def main() -> None:
     at_low_priority = ThreadPoolExecutor(1, initializer=os.nice, initargs=(_NICENESS,))
     while True:
         job = jobs.get()
-        result = answer(job) if job.has_hurry else at_low_priority.submit(answer, job).result()
+        result = (
+            answer(job)
+            if job.has_hurry
+            else at_low_priority.submit(answer, job).result()
+        )
         pickle.dump(result, outgoing, pickle.HIGHEST_PROTOCOL)
         outgoing.flush()
         # The arrays of a job are in reference cycles. Without a collection, the memory of the
@@ -283,7 +294,9 @@ def _receive(jobs: "queue.SimpleQueue[Job]") -> None:
 # ----------------------------------------------------------------- in the node
 
 
-def start(code: str, *arguments: str, stdin: Any, stdout: Any) -> "subprocess.Popen[bytes]":
+def start(
+    code: str, *arguments: str, stdin: Any, stdout: Any
+) -> "subprocess.Popen[bytes]":
     """Run Python code with the modules of this process.
 
     The new process has a group of its own, so that Ctrl-C in the terminal does not reach it.
@@ -325,7 +338,9 @@ class SolvingProcess:
     def submit(self, job: Job) -> None:
         """Send a job. The answer to the last job must have arrived."""
         # A daemon thread: a pipe that hangs must not delay the end of the node.
-        self._thread = threading.Thread(target=self._run, args=(job,), name="solving", daemon=True)
+        self._thread = threading.Thread(
+            target=self._run, args=(job,), name="solving", daemon=True
+        )
         self._thread.start()
 
     def answers(self) -> list[Answer]:
@@ -342,7 +357,9 @@ class SolvingProcess:
         self._process.communicate()
 
     def _start(self) -> None:
-        self._process = start(self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self._process = start(
+            self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
 
     def _run(self, job: Job) -> None:
         """Send a job, wait for the answer, and store the answer; kill a process that hangs."""

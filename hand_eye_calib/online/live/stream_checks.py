@@ -6,8 +6,17 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from hand_eye_calib.core.base.config import CalibratorConfig
-from hand_eye_calib.core.checks.check import MIN_DURATION_S, MIN_ROTATION_RAD, CheckResult
-from hand_eye_calib.core.checks.findings import Finding, Severity, answered, gravest_first
+from hand_eye_calib.core.checks.check import (
+    MIN_DURATION_S,
+    MIN_ROTATION_RAD,
+    CheckResult,
+)
+from hand_eye_calib.core.checks.findings import (
+    Finding,
+    Severity,
+    answered,
+    gravest_first,
+)
 from hand_eye_calib.core.engine.run import with_open_errors
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.online.live.log import NodeLog
@@ -78,7 +87,11 @@ class StreamChecks:
 
     def with_open_errors(self, calibration: Calibration) -> Calibration:
         """Return a calibration whose allowance contains what the last check left open."""
-        return calibration if self._result is None else with_open_errors(calibration, self._result)
+        return (
+            calibration
+            if self._result is None
+            else with_open_errors(calibration, self._result)
+        )
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -103,19 +116,24 @@ class StreamChecks:
             text="; ".join(self.faults()) or "both streams can be of one rigid body",
             age_s=time.monotonic() - self._checked_at_s,
             findings=tuple(
-                f"{finding.severity.value}: {_in_parameters(finding)}" for finding in findings
+                f"{finding.severity.value}: {_in_parameters(finding)}"
+                for finding in findings
             ),
             gravest=self.findings[0].what if self._faults else "",
         )
 
 
-def merged(newest: Sequence[Finding], earlier: Iterable[Finding]) -> tuple[Finding, ...]:
+def merged(
+    newest: Sequence[Finding], earlier: Iterable[Finding]
+) -> tuple[Finding, ...]:
     """Return the newest findings and all other earlier findings, the gravest first.
 
     An earlier finding is dropped if a newest finding has the same code and stream.
     """
     keys = {(finding.code, finding.stream) for finding in newest}
-    kept = [finding for finding in earlier if (finding.code, finding.stream) not in keys]
+    kept = [
+        finding for finding in earlier if (finding.code, finding.stream) not in keys
+    ]
     return gravest_first([*newest, *kept])
 
 

@@ -37,7 +37,13 @@ from hand_eye_calib.online.ros.inputs import TfInput, TopicInput
 from hand_eye_calib.online.ros.lifecycle import ManagedNode
 from hand_eye_calib.online.ros.outputs import PROGRESS_TOPIC, ResultTopics, StateTopics
 from hand_eye_calib.online.ros.parameters import Parameters
-from hand_eye_calib.online.ros.tf import TF, Robot, RobotTree, TfBroadcaster, message_type
+from hand_eye_calib.online.ros.tf import (
+    TF,
+    Robot,
+    RobotTree,
+    TfBroadcaster,
+    message_type,
+)
 
 
 class CalibratorNode(ManagedNode):
@@ -62,9 +68,13 @@ class CalibratorNode(ManagedNode):
 
     def __init__(self) -> None:
         try:
-            super().__init__("calibrator", automatically_declare_parameters_from_overrides=True)
+            super().__init__(
+                "calibrator", automatically_declare_parameters_from_overrides=True
+            )
         except ValueError as error:
-            raise ConfigError(f"a parameter has an unusable value, such as []: {error}") from None
+            raise ConfigError(
+                f"a parameter has an unusable value, such as []: {error}"
+            ) from None
         self._log = NodeLog(self.get_logger())
         self._output_base: Path | None = None
         self._options = Parameters(self, self._follow_parameters, self._check_options)
@@ -143,7 +153,9 @@ class CalibratorNode(ManagedNode):
             if self._options.node.output_directory:
                 is_saved, _ = self._saver.save(self._options.node)
             else:
-                self._log.warning("the result is not saved: output_directory is not set")
+                self._log.warning(
+                    "the result is not saved: output_directory is not set"
+                )
         self._publish(has_ended=True)
         self._session.stop_journal()
         self._inputs = []
@@ -210,7 +222,9 @@ class CalibratorNode(ManagedNode):
         if frames := getattr(options, f"{name}_tf", ""):
             source = TfInput(self, name, TfSource.parse(frames), parts)
         else:
-            source = TopicInput(self, name, getattr(options, f"{name}_type", "auto"), parts)
+            source = TopicInput(
+                self, name, getattr(options, f"{name}_type", "auto"), parts
+            )
         source.configure(self._options.calibrator)
         source.is_enabled = options.enabled and not options.lifecycle
         return source
@@ -222,7 +236,9 @@ class CalibratorNode(ManagedNode):
         serve = partial(self.create_service, qos_profile=qos)
         # A group of its own: while this callback awaits a solve, no other callback of its group
         # could run.
-        serve(Trigger, "~/solve", self._on_solve, callback_group=ReentrantCallbackGroup())
+        serve(
+            Trigger, "~/solve", self._on_solve, callback_group=ReentrantCallbackGroup()
+        )
         serve(Trigger, "~/save", partial(self._answer, self._save))
         serve(Trigger, "~/reset", partial(self._answer, self._reset))
         serve(SetBool, "~/set_enabled", partial(self._answer, self._set_enabled))
@@ -230,8 +246,12 @@ class CalibratorNode(ManagedNode):
     def _start_timers(self) -> None:
         """Start the timers for solves and for all other periodic tasks."""
         # Steady time goes on while a bag, and with it simulated time, is paused.
-        make_timer = partial(self.create_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self._solve_timer = make_timer(self._options.node.solve_period, self._on_solve_timer)
+        make_timer = partial(
+            self.create_timer, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
+        self._solve_timer = make_timer(
+            self._options.node.solve_period, self._on_solve_timer
+        )
         # The tasks of a second, in order: all at once would delay messages on a slow computer.
         # Every second call flushes the journal; the calls between publish once and then discover.
         flush = self._session.flush_journal
@@ -249,13 +269,17 @@ class CalibratorNode(ManagedNode):
             source.discover()
         name = self.get_fully_qualified_name()
         if self.count_publishers(f"{name}/{PROGRESS_TOPIC}") > 1:
-            self._log.warning(f"another node is called {name}, too: start one with -r __node:=NAME")
+            self._log.warning(
+                f"another node is called {name}, too: start one with -r __node:=NAME"
+            )
 
     def _on_solve_timer(self) -> None:
         """Log inputs without a pose, and start a solve if there are new poses."""
         silent = [source for source in self._inputs if not source.has_poses]
         if silent and silent[0].is_enabled:
-            texts = [f"no pose yet on {source.topic}: {source.problem}" for source in silent]
+            texts = [
+                f"no pose yet on {source.topic}: {source.problem}" for source in silent
+            ]
             self._log.info("; ".join(texts), GOES_ON_S)
         self._cycle.start_if_due()
 
@@ -285,7 +309,11 @@ class CalibratorNode(ManagedNode):
         if not progress.done:
             return "the goal is not reached"
         base_frame = self._options.node.base_frame
-        return "" if result.base_frame == base_frame else f"base_frame {base_frame} is not known"
+        return (
+            ""
+            if result.base_frame == base_frame
+            else f"base_frame {base_frame} is not known"
+        )
 
     def _state(self) -> NodeState:
         """Return the whole state of the node."""
@@ -348,7 +376,9 @@ class CalibratorNode(ManagedNode):
         response.success, response.message = await solved
         return response
 
-    def _answer(self, act: Callable[[Any], Outcome], request: Any, response: Any) -> Any:
+    def _answer(
+        self, act: Callable[[Any], Outcome], request: Any, response: Any
+    ) -> Any:
         """Call ``act`` with a request, and answer with its success and its line of text."""
         response.success, response.message = act(request)
         self._publish()
@@ -377,7 +407,9 @@ class CalibratorNode(ManagedNode):
         text = "all poses discarded, new session"
         priors = priors_of(self._options.calibrator)
         if priors:
-            settings = listing([f"prior.{axis} {value}" for axis, value in priors.items()])
+            settings = listing(
+                [f"prior.{axis} {value}" for axis, value in priors.items()]
+            )
             text = f"{text}; {settings} still set: set to '' to remove it"
         self._log.info(text)
         return True, text
@@ -395,9 +427,13 @@ class CalibratorNode(ManagedNode):
         if options.publish_tf:
             message_type()
         if options.monitor and not options.installed:
-            raise ConfigError("monitor needs installed: set it to the transform to compare with")
+            raise ConfigError(
+                "monitor needs installed: set it to the transform to compare with"
+            )
         if options.monitor and options.other_children:
-            raise ConfigError("monitor watches one child sensor: leave other_children at 0")
+            raise ConfigError(
+                "monitor watches one child sensor: leave other_children at 0"
+            )
         if self._output_base is not None and options.output_directory:
             output_path(options.output_directory, self._output_base)
 

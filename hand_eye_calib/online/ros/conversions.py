@@ -48,7 +48,9 @@ def to_time(stamp_ns: int) -> Time:
     return Time(sec=sec, nanosec=nanosec)
 
 
-def to_transform(calibration: Calibration, is_mounting: bool = False) -> TransformStamped:
+def to_transform(
+    calibration: Calibration, is_mounting: bool = False
+) -> TransformStamped:
     """Return the extrinsic as geometry_msgs/TransformStamped.
 
     ``header.frame_id`` is the parent sensor's frame, ``child_frame_id`` the child sensor's frame.

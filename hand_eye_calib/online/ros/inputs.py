@@ -30,7 +30,13 @@ _QOS_OVERRIDES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELI
 _TYPES = (*POSE_TYPES[1:], *LIVE_READINGS)
 
 # Errors that rclpy raises for QoS overrides that it cannot apply.
-_BAD_QOS = (ParameterException, InvalidQosOverridesError, RuntimeError, AssertionError, ValueError)
+_BAD_QOS = (
+    ParameterException,
+    InvalidQosOverridesError,
+    RuntimeError,
+    AssertionError,
+    ValueError,
+)
 
 # Arguments of PoseInput after name and topic.
 Parts: TypeAlias = tuple[LiveSession, NodeLog, Callable[[PoseInput], None]]
@@ -50,7 +56,9 @@ class RosInput(PoseInput):
         super().__init__(name, topic, *parts)
         # Subscriptions with their callbacks. The arguments of a callback are a message and rclpy's
         # information about the message.
-        self._subscribed: list[tuple[Subscription, Callable[[Any, Mapping[str, int]], None]]] = []
+        self._subscribed: list[
+            tuple[Subscription, Callable[[Any, Mapping[str, int]], None]]
+        ] = []
 
     def take_waiting(self) -> bool:
         """Process the messages that wait in the queues; return whether there were any.
@@ -107,8 +115,12 @@ class TopicInput(RosInput):
             for publisher in publishers
             if self._type_name in ("", publisher.topic_type)
         )
-        self.problem = self._wrong_qos(publishers) or counted(len(publishers), "publisher")
-        type_name = self._choose_type({publisher.topic_type for publisher in publishers})
+        self.problem = self._wrong_qos(publishers) or counted(
+            len(publishers), "publisher"
+        )
+        type_name = self._choose_type(
+            {publisher.topic_type for publisher in publishers}
+        )
         if self._subscribed or not type_name:
             return
         try:
@@ -125,7 +137,9 @@ class TopicInput(RosInput):
         wanted = _TYPES if is_auto else (self._wanted_type,)
         usable = [type_name for type_name in wanted if type_name in offered]
         if offered and not usable:
-            self.problem = f"it has type {listing(sorted(offered))}; expected {', '.join(wanted)}"
+            self.problem = (
+                f"it has type {listing(sorted(offered))}; expected {', '.join(wanted)}"
+            )
             self._log.warning(
                 f"{self.topic}: {self.problem}: remap {self._relative_topic} to a topic with poses"
             )
@@ -136,8 +150,12 @@ class TopicInput(RosInput):
     def _wrong_qos(self, publishers: Sequence[TopicEndpointInfo]) -> str:
         """Return why the middleware delivers no message of these publishers; empty if it does."""
         offered = {publisher.qos_profile.reliability for publisher in publishers}
-        own = {subscription.qos_profile.reliability for subscription, _ in self._subscribed}
-        if own != {ReliabilityPolicy.RELIABLE} or offered != {ReliabilityPolicy.BEST_EFFORT}:
+        own = {
+            subscription.qos_profile.reliability for subscription, _ in self._subscribed
+        }
+        if own != {ReliabilityPolicy.RELIABLE} or offered != {
+            ReliabilityPolicy.BEST_EFFORT
+        }:
             return ""
         return (
             "it is published best effort, but qos_overrides ask for reliable: remove these "
@@ -179,7 +197,9 @@ class TopicInput(RosInput):
             ) from error
         self._subscribed = [(subscription, callback)]
         self._type_name = type_name
-        self._log.info(f"subscribed to {self.topic} ({type_name}) for the {self.name} sensor")
+        self._log.info(
+            f"subscribed to {self.topic} ({type_name}) for the {self.name} sensor"
+        )
 
     def _receive(self, data: bytes, info: Mapping[str, int]) -> None:
         """Process a message in its serialized form."""

@@ -60,7 +60,9 @@ class ManagedNode(LifecycleNodeMixin, Node):
             except RCLError:
                 _, state = self._state_machine.current_state
                 wanted = request.transition.label or request.transition.id
-                self._log.warning(f"transition {wanted} is refused: the node is {state}")
+                self._log.warning(
+                    f"transition {wanted} is refused: the node is {state}"
+                )
                 response.success = False
                 return response
 

@@ -80,7 +80,9 @@ def _markers(calibration: Calibration) -> Iterator[Marker]:
         yield _axes("installed", T_parent_installed, [_GREY] * 3)
 
 
-def _axes(namespace: str, T_parent_sensor: FloatArray, colours: list[ColorRGBA]) -> Marker:
+def _axes(
+    namespace: str, T_parent_sensor: FloatArray, colours: list[ColorRGBA]
+) -> Marker:
     """Return three lines of the colours: x, y and z axis of a sensor in the parent's frame."""
     marker = Marker(ns=namespace, type=Marker.LINE_LIST)
     marker.scale.x = _AXIS_WIDTH_M
@@ -119,14 +121,20 @@ def _text(calibration: Calibration) -> Marker:
         calibration.verdict.value,
     ]
     values = se3.xyz_rpy(calibration.T_parent_child).tolist()
-    for axis, value, sigma in zip(AXES, values, calibration.sigmas_printed, strict=True):
+    for axis, value, sigma in zip(
+        AXES, values, calibration.sigmas_printed, strict=True
+    ):
         if AXIS_UNITS[axis] == "rad":
-            lines.append(f"{axis} {np.degrees(value):.2f} +/- {np.degrees(sigma):.2f} deg")
+            lines.append(
+                f"{axis} {np.degrees(value):.2f} +/- {np.degrees(sigma):.2f} deg"
+            )
         else:
             lines.append(f"{axis} {value:.3f} +/- {sigma:.3f} m")
     marker = Marker(ns="text", type=Marker.TEXT_VIEW_FACING, text="\n".join(lines))
     x, y, z = se3.translation_of(calibration.T_parent_child).tolist()
-    marker.pose.position = Point(x=x, y=y, z=z + _AXIS_LENGTH_M + len(lines) * _TEXT_M / 2.0)
+    marker.pose.position = Point(
+        x=x, y=y, z=z + _AXIS_LENGTH_M + len(lines) * _TEXT_M / 2.0
+    )
     marker.scale.z = _TEXT_M
     marker.color = _COLOURS[calibration.verdict]
     return marker

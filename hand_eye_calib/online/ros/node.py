@@ -66,7 +66,9 @@ def _init(arguments: list[str]) -> int:
     set_logger_level("rcl", LoggingSeverity.FATAL)
     try:
         if unknown := remove_ros_args(args=arguments):
-            return fail(f"unknown arguments {unknown}; ROS arguments follow --ros-args", 2)
+            return fail(
+                f"unknown arguments {unknown}; ROS arguments follow --ros-args", 2
+            )
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except UnknownROSArgsError as error:
         return fail(f"unknown ROS arguments {error}", 2)

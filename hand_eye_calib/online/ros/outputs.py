@@ -54,7 +54,9 @@ class ResultTopics:
         self._has_transform = False
         make = self._node.create_publisher
         self._transform = make(TransformStamped, "~/extrinsic", LATCHED)
-        self._pose = make(PoseWithCovarianceStamped, "~/extrinsic_with_covariance", LATCHED)
+        self._pose = make(
+            PoseWithCovarianceStamped, "~/extrinsic_with_covariance", LATCHED
+        )
 
     def publish(self, calibration: Calibration | None) -> None:
         """Publish a result if it is new; None withdraws the earlier result.

@@ -14,7 +14,12 @@ from rclpy.parameter import Parameter
 
 from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig
 from hand_eye_calib.core.base.errors import ConfigError
-from hand_eye_calib.core.base.option import OptionField, Options, check_value, did_you_mean
+from hand_eye_calib.core.base.option import (
+    OptionField,
+    Options,
+    check_value,
+    did_you_mean,
+)
 
 _OF_NODE = NodeConfig.by_name()
 FIELDS = CalibratorConfig.by_name() | _OF_NODE
@@ -83,7 +88,9 @@ class Parameters:
         self._on_change = on_change
         for name, field in FIELDS.items():
             value = self.given.get(name, field.default)
-            node.declare_parameter(name, value, _descriptor(field), ignore_override=True)
+            node.declare_parameter(
+                name, value, _descriptor(field), ignore_override=True
+            )
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._apply)
 
@@ -125,8 +132,12 @@ def _checked(values: Options) -> Options:
 def _configs(values: Options) -> tuple[CalibratorConfig, NodeConfig]:
     """Return the option objects of parameters."""
     of_node = {name: value for name, value in values.items() if name in _OF_NODE}
-    of_calibrator = {name: value for name, value in values.items() if name not in _OF_NODE}
-    return CalibratorConfig.from_options(of_calibrator), NodeConfig.from_options(of_node)
+    of_calibrator = {
+        name: value for name, value in values.items() if name not in _OF_NODE
+    }
+    return CalibratorConfig.from_options(of_calibrator), NodeConfig.from_options(
+        of_node
+    )
 
 
 def _descriptor(field: OptionField) -> ParameterDescriptor:
@@ -148,7 +159,9 @@ def _descriptor(field: OptionField) -> ParameterDescriptor:
     if meta["within"] is not None:
         low, high = meta["within"]
         if isinstance(field.default, int):
-            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+            descriptor.integer_range = [
+                IntegerRange(from_value=int(low), to_value=int(high))
+            ]
         else:
             descriptor.floating_point_range = [
                 FloatingPointRange(from_value=float(low), to_value=float(high))

@@ -28,7 +28,12 @@ from hand_eye_calib.formats.bags.messages import transform_of
 from hand_eye_calib.formats.installed import open_installed, stated
 from hand_eye_calib.online.live.log import NodeLog
 from hand_eye_calib.online.live.state import Broadcast, BroadcastState
-from hand_eye_calib.online.ros.conversions import LATCHED, LISTENING, quick, to_transform
+from hand_eye_calib.online.ros.conversions import (
+    LATCHED,
+    LISTENING,
+    quick,
+    to_transform,
+)
 
 # Value of the option ``installed`` for the transform on /tf_static.
 TF = "tf"
@@ -97,7 +102,9 @@ class RobotTree(FrameTree):
         # The parent is unknown, or other edges form a circle.
         with contextlib.suppress(InputError):
             if child in self.above(parent):
-                return f"{parent} is below {child} already: the edge would close a circle"
+                return (
+                    f"{parent} is below {child} already: the edge would close a circle"
+                )
         return ""
 
     def _receive(self, topic: str, message: Any) -> None:
@@ -107,10 +114,14 @@ class RobotTree(FrameTree):
             fields = transform_of(transform)
             frame = fields.sensor_frame or ""
             try:
-                edge = self.add(fields.world_frame, frame, None, is_static=topic == STATIC_TOPIC)
+                edge = self.add(
+                    fields.world_frame, frame, None, is_static=topic == STATIC_TOPIC
+                )
                 edge.pose = checked_pose(fields.position, fields.quat_xyzw)
             except InputError as error:
-                self._log.warning(f"{topic} has an unusable transform of {frame}: {error}")
+                self._log.warning(
+                    f"{topic} has an unusable transform of {frame}: {error}"
+                )
 
 
 class Robot:
@@ -140,7 +151,9 @@ class Robot:
         self._installed: Extrinsic | None = None
         self._installed_for = ("", "")
         from_tree = partial(stated, frames.pose, STATIC_TOPIC)
-        self._read = from_tree if self._source in ("", TF) else open_installed(self._source)
+        self._read = (
+            from_tree if self._source in ("", TF) else open_installed(self._source)
+        )
 
     def installed(self, parent_frame: str, child_frame: str) -> Extrinsic | None:
         """Return the installed transform; None if it is unknown, or if no option requests it."""
@@ -153,7 +166,9 @@ class Robot:
                 self._installed = self._read(parent_frame, child_frame)
                 self._installed_for = frames
                 self.problem = ""
-                self._log.info(f"the installed transform is from {self._installed.origin}")
+                self._log.info(
+                    f"the installed transform is from {self._installed.origin}"
+                )
             except HandEyeCalibError as error:
                 self._report(f"the installed transform is unknown: {error}")
         return self._installed
@@ -171,11 +186,17 @@ class Robot:
         if not self._base_frame:
             return calibration
         try:
-            T_base_parent = self._frames.pose(self._base_frame, calibration.parent_frame)
+            T_base_parent = self._frames.pose(
+                self._base_frame, calibration.parent_frame
+            )
         except InputError as error:
-            self._report(f"base_frame {self._base_frame} is not known from {STATIC_TOPIC}: {error}")
+            self._report(
+                f"base_frame {self._base_frame} is not known from {STATIC_TOPIC}: {error}"
+            )
             return calibration
-        return replace(calibration, base_frame=self._base_frame, T_base_parent=T_base_parent)
+        return replace(
+            calibration, base_frame=self._base_frame, T_base_parent=T_base_parent
+        )
 
     @property
     def why_not_compared(self) -> str:
@@ -207,7 +228,9 @@ def _with_axis_of(installed: Extrinsic, calibration: Calibration) -> Calibration
     # its regression on this axis.
     T[:3, 3] += covariance[:3, index] / covariance[index, index] * missing
     warning = f"{axis} is that of the installed transform ({installed.origin})"
-    return replace(calibration, T_parent_child=T, warnings=(*calibration.warnings, warning))
+    return replace(
+        calibration, T_parent_child=T, warnings=(*calibration.warnings, warning)
+    )
 
 
 class TfBroadcaster:
@@ -251,7 +274,9 @@ class TfBroadcaster:
         """
         # Discovery takes seconds, so the publisher is made before the first message.
         if self._is_on and self._publisher is None:
-            self._publisher = self._node.create_publisher(message_type(), STATIC_TOPIC, LATCHED)
+            self._publisher = self._node.create_publisher(
+                message_type(), STATIC_TOPIC, LATCHED
+            )
         was_on = self.state[0] is Broadcast.ON
         self.state = self._decide(result, why_not)
         if result is not None and self.state[0] is Broadcast.ON:

@@ -49,12 +49,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.usage = "%(prog)s [OPTION ...]"
     parser.epilog = EXAMPLES
     node = (
-        "full name of the node, such as /robot1/calibrator. Default: the first node that publishes"
+        "full name of the node, such as /robot1/calibrator. "
+        "Default: the first node that publishes"
     )
     parser.add_argument("--node", metavar="NAME", default="", help=node)
     web = f"also serve a page for browsers, at port {_PORT} of all addresses by default"
     parser.add_argument(
-        "--web", metavar="[HOST:]PORT", nargs="?", const=("", _PORT), type=_address, help=web
+        "--web",
+        metavar="[HOST:]PORT",
+        nargs="?",
+        const=("", _PORT),
+        type=_address,
+        help=web,
     )
 
 
@@ -78,7 +84,10 @@ def run(arguments: argparse.Namespace) -> int:
             stack.callback(server.stop)
             addresses = server.addresses()
             for address in addresses:
-                print(f"hand_eye_calib: note: open {address} in a browser", file=sys.stderr)
+                print(
+                    f"hand_eye_calib: note: open {address} in a browser",
+                    file=sys.stderr,
+                )
         session = Session(board, requests, stack.enter_context(_keyboard()))
         display = stack.enter_context(_display(addresses[0]))
         while not received and not session.is_over:
@@ -109,7 +118,10 @@ class Session:
     """
 
     def __init__(
-        self, board: "Board", requests: "queue.SimpleQueue[str]", keys: Callable[[], str]
+        self,
+        board: "Board",
+        requests: "queue.SimpleQueue[str]",
+        keys: Callable[[], str],
     ) -> None:
         self.is_over = False
         self.shows_code = False
@@ -191,7 +203,9 @@ def _display(address: str) -> Iterator[Callable[[View, bool], None]]:
                 return
             if code and shows_code:
                 # These colours are readable on light terminals, too.
-                live.update(Text.from_ansi(code, style="bright_white on black"), refresh=True)
+                live.update(
+                    Text.from_ansi(code, style="bright_white on black"), refresh=True
+                )
             else:
                 live.update(screen(view, size.width, footer), refresh=True)
             displayed = content
@@ -207,7 +221,9 @@ def qr_code(address: str) -> str:
         return ""
     text = StringIO()
     if address:
-        segno.make(address, micro=False, error="l").terminal(out=text, border=2, compact=True)
+        segno.make(address, micro=False, error="l").terminal(
+            out=text, border=2, compact=True
+        )
     return text.getvalue()
 
 

@@ -58,7 +58,11 @@ class Watcher:
     def __init__(self, board: Board) -> None:
         self._board = board
         self._context = rclpy.Context()
-        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(
+            args=[],
+            context=self._context,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
         self._node = rclpy.create_node(
             f"hand_eye_calib_watch_{os.getpid()}",
             context=self._context,
@@ -106,7 +110,9 @@ class Watcher:
         if parameters := self._parameters(request):
             messages = [parameter.to_parameter_msg() for parameter in parameters]
             message = SetParameters.Request(parameters=messages)
-            client = self._node.create_client(SetParameters, f"{self._board.node}/set_parameters")
+            client = self._node.create_client(
+                SetParameters, f"{self._board.node}/set_parameters"
+            )
         else:
             message = Trigger.Request()
             client = self._node.create_client(Trigger, f"{self._board.node}/{request}")
@@ -121,7 +127,10 @@ class Watcher:
         if request == "recalibrate":
             return [Parameter("monitor", value=False)]
         if request == "forget":
-            return [Parameter(f"prior.{axis}", value="") for axis in self._board.priors or AXES]
+            return [
+                Parameter(f"prior.{axis}", value="")
+                for axis in self._board.priors or AXES
+            ]
         return []
 
     def _discover(self) -> None:
@@ -133,8 +142,14 @@ class Watcher:
         topics = self._node.get_topic_names_and_types()
         for topic, types in topics:
             name, _, last = topic.rpartition("/")
-            is_state = last == PROGRESS_TOPIC and name and "std_msgs/msg/String" in types
-            if is_state and name not in self._sources and len(self._sources) < _MAX_NAMES:
+            is_state = (
+                last == PROGRESS_TOPIC and name and "std_msgs/msg/String" in types
+            )
+            if (
+                is_state
+                and name not in self._sources
+                and len(self._sources) < _MAX_NAMES
+            ):
                 self._sources.add(name)
                 take = partial(self._take, name)
                 self._node.create_subscription(String, topic, take, LATCHED)
@@ -144,7 +159,9 @@ class Watcher:
             for type_name in types
             if type_name in POSE_TYPES and topic.rpartition("/")[0] not in self._sources
         ]
-        lines = [self._describe(topic, type_name) for topic, type_name in poses[:_MAX_NAMES]]
+        lines = [
+            self._describe(topic, type_name) for topic, type_name in poses[:_MAX_NAMES]
+        ]
         self._board.topics = tuple(lines or ["none is published here"])
 
     def _describe(self, topic: str, type_name: str) -> str:
@@ -170,7 +187,11 @@ class Watcher:
         elif request.future is not None and request.future.done():
             response: Any = request.future.result()
             if request.client.srv_type is SetParameters:
-                refused = [result.reason for result in response.results if not result.successful]
+                refused = [
+                    result.reason
+                    for result in response.results
+                    if not result.successful
+                ]
                 self._end(name, not refused, "; ".join(refused))
             else:
                 self._end(name, response.success, response.message)

@@ -4,7 +4,14 @@ import math
 from collections.abc import Iterator
 
 from hand_eye_calib.core.base.stats import LARGEST_OF_SIX
-from hand_eye_calib.core.base.text import ABOUT, amount, change, duration, fixed, two_digits
+from hand_eye_calib.core.base.text import (
+    ABOUT,
+    amount,
+    change,
+    duration,
+    fixed,
+    two_digits,
+)
 from hand_eye_calib.core.results.records import AXES, ROTATIONS
 from hand_eye_calib.online.live.progress import AXIS_KEYS, AxisProgress
 from hand_eye_calib.online.live.state import (
@@ -72,7 +79,9 @@ def _difference(axis: str, session: ProgressState) -> str:
     return change(axis, row.difference, row.sigma)
 
 
-def _progress_in_words(row: AxisProgress, session: ProgressState, axis: str) -> tuple[Tone, str]:
+def _progress_in_words(
+    row: AxisProgress, session: ProgressState, axis: str
+) -> tuple[Tone, str]:
     """Return tone and word of an axis that has a standard deviation."""
     if session.progress.is_faulty:
         return Tone.UNKNOWN, "of faulty streams"
@@ -93,7 +102,10 @@ def pose_values(result: ResultState) -> Iterator[tuple[str, str]]:
         if value is None or sigma is None:
             yield axis, "? not observed"
         elif axis in ROTATIONS:
-            yield axis, f"{fixed(math.degrees(value), 2)} ± {two_digits(math.degrees(sigma))} deg"
+            yield (
+                axis,
+                f"{fixed(math.degrees(value), 2)} ± {two_digits(math.degrees(sigma))} deg",
+            )
         else:
             yield axis, f"{value:.3f} m ± {amount(axis, sigma)}"
 

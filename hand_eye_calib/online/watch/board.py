@@ -44,7 +44,9 @@ _ANSWER_FOR_S = 20.0
 # Tone of each level, verdict, verdict of a comparison, and state of a broadcast.
 _TONES: dict[object, Tone] = {
     **dict.fromkeys((Level.OK, "USE", "same", Broadcast.ON), Tone.GOOD),
-    **dict.fromkeys((Level.WARN, "USE WITH CARE", "moved", Broadcast.REFUSED), Tone.ACT),
+    **dict.fromkeys(
+        (Level.WARN, "USE WITH CARE", "moved", Broadcast.REFUSED), Tone.ACT
+    ),
     **dict.fromkeys((Level.ERROR, "DO NOT USE"), Tone.BAD),
     Broadcast.WAITING: Tone.BUSY,
 }
@@ -154,7 +156,9 @@ def _view(state: NodeState, silent_s: float) -> View:
     if state.mount is not None:
         return _with_mount(view, state.mount)
     view = _with_result(view, state)
-    view = replace(view, facts=_facts(state, is_old), by_hand=_axes_by_hand(state, view.word))
+    view = replace(
+        view, facts=_facts(state, is_old), by_hand=_axes_by_hand(state, view.word)
+    )
     if progress := state.progress:
         bars = tuple(bar_of(axis, progress, state.extrinsic) for axis in AXES)
         view = replace(view, bars=bars)
@@ -179,7 +183,9 @@ def _with_mount(view: View, mount: MountState) -> View:
     facts = f"{duration(mount.seconds_of_motion)} of motion seen"
     if mount.since_ns and mount.newest_ns:
         facts = f"{duration((mount.newest_ns - mount.since_ns) * 1e-9)} ago"
-    view = replace(view, facts=facts, watched=tuple(mount_line(axis, mount) for axis in AXES))
+    view = replace(
+        view, facts=facts, watched=tuple(mount_line(axis, mount) for axis in AXES)
+    )
     if view.word != MOVED:
         return view
     buttons = ("recalibrate", "acknowledge", "reset")
@@ -210,7 +216,9 @@ def _axes_by_hand(state: NodeState, word: str) -> Texts:
     axes = [*extrinsic.contradicted]
     progress = state.progress.progress
     if progress.will_not_get_there and word == CHANGE_MOTION:
-        axes += [axis for axis, key in AXIS_KEYS.items() if key == progress.limiting_axis]
+        axes += [
+            axis for axis, key in AXIS_KEYS.items() if key == progress.limiting_axis
+        ]
     axes += extrinsic.priors
     return tuple(axis for axis in dict.fromkeys(axes) if axis in AXES)
 
@@ -263,7 +271,9 @@ def _result(state: NodeState, word: str) -> Iterator[Line]:
     yield from _prior_lines(state)
     if state.progress and (comparison := state.progress.comparison):
         tone = _TONES.get(comparison.verdict, Tone.UNKNOWN)
-        yield Line(tone, "compared with the installed transform", typeset(comparison.sentence))
+        yield Line(
+            tone, "compared with the installed transform", typeset(comparison.sentence)
+        )
     if state.extrinsic and state.extrinsic.tf_static is not Broadcast.OFF:
         yield _broadcast(state.extrinsic, state.has_ended)
     if state.saved:

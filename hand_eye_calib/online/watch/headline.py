@@ -67,19 +67,29 @@ def _alarm(state: NodeState) -> Headline | None:
     """Return the gravest condition that requires a person; None if there is none."""
     for tone, word, level, part in _conditions(state):
         if part is not None and part.level is level:
-            advice = "Check it, then recalibrate or acknowledge." if word == MOVED else ""
+            advice = (
+                "Check it, then recalibrate or acknowledge." if word == MOVED else ""
+            )
             return Headline(tone, word, _sentence(_headline_text(part)), advice)
     return None
 
 
 def _headline_text(part: Part) -> str:
     """Return the text of a part in a condition that requires a person."""
-    if isinstance(part, ExtrinsicState) and part.contradicted and part.level is Level.WARN:
+    if (
+        isinstance(part, ExtrinsicState)
+        and part.contradicted
+        and part.level is Level.WARN
+    ):
         priors = f"the prior on {axes_in_words(part.contradicted)}"
-        return f"{priors} contradicts the motion. Check value, unit and sign, or remove it"
+        return (
+            f"{priors} contradicts the motion. Check value, unit and sign, or remove it"
+        )
     if not isinstance(part, ChecksState) or not part.gravest:
         return part.text
-    return _in_one_breath(part.gravest, "the streams have a fault: read the checks below")
+    return _in_one_breath(
+        part.gravest, "the streams have a fault: read the checks below"
+    )
 
 
 def _in_one_breath(text: str, otherwise: str) -> str:
@@ -96,7 +106,9 @@ def _conditions(state: NodeState) -> Iterator[tuple[Tone, str, Level, Part | Non
     extrinsic = state.extrinsic
     checks = state.checks
     # The inputs of further child sensors are displayed, but do not become a headline.
-    inputs = [stream for name, stream in state.inputs.items() if name in ("parent", "child")]
+    inputs = [
+        stream for name, stream in state.inputs.items() if name in ("parent", "child")
+    ]
     yield Tone.BAD, "BROKEN", Level.ERROR, extrinsic
     yield Tone.BAD, MOVED, Level.ERROR, state.mount
     if extrinsic and extrinsic.contradicted:
@@ -146,7 +158,9 @@ def _activity(state: NodeState) -> Headline:
         return Headline(Tone.BUSY, "START", sentence, slow)
     if session.progress.target_is_too_small:
         return Headline(tone, CHANGE_TARGET, sentence, slow)
-    return Headline(tone, "GO ON" if tone is Tone.BUSY else CHANGE_MOTION, sentence, slow)
+    return Headline(
+        tone, "GO ON" if tone is Tone.BUSY else CHANGE_MOTION, sentence, slow
+    )
 
 
 def _at_goal(state: NodeState, session: ProgressState) -> Headline:
@@ -163,7 +177,8 @@ def _at_goal(state: NodeState, session: ProgressState) -> Headline:
     if state.result and state.result.verdict != "USE":
         tone = Tone.ACT
         reasons = [
-            _in_one_breath(reason, "read the reasons below") for reason in state.result.reasons[:1]
+            _in_one_breath(reason, "read the reasons below")
+            for reason in state.result.reasons[:1]
         ]
         caution = _sentence(": ".join((state.result.verdict, *reasons)))
     if state.result and session.comparison and session.comparison.verdict == "moved":
@@ -199,7 +214,9 @@ def _displacement(difference: Difference) -> str:
 
 def _silence(state: NodeState, silent_s: float) -> Headline:
     """Return the headline of a node that no longer sends its state."""
-    text = f"No message from the node for {silent_s:.0f} s. If it has died, start it again"
+    text = (
+        f"No message from the node for {silent_s:.0f} s. If it has died, start it again"
+    )
     if state.journal and state.journal.directory:
         text += ", with journal:=resume"
     return Headline(Tone.BAD, "SILENT", f"{text}.")

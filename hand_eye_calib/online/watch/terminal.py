@@ -88,7 +88,9 @@ def _bars(view: View, width: int) -> Table:
         style = _STYLES[bar.tone]
         cells: list[RenderableType] = [
             Text(bar.name, style="bold"),
-            ProgressBar(1.0, bar.share, _BAR_LENGTH, complete_style=style, finished_style=style),
+            ProgressBar(
+                1.0, bar.share, _BAR_LENGTH, complete_style=style, finished_style=style
+            ),
             Text(f"{bar.tone.value} {bar.word}", style=style),
             Text(bar.sigma),
         ]

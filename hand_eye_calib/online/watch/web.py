@@ -55,7 +55,9 @@ _POLICY = (
     "default-src 'none'; connect-src 'self'; img-src data:; script-src 'self'; style-src 'self'; "
     "frame-ancestors 'none'; base-uri 'none'"
 )
-_POLICY_OF_SAVED = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
+_POLICY_OF_SAVED = (
+    "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
+)
 
 
 def _user_key() -> str:
@@ -102,7 +104,9 @@ class WebServer(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
 
-    def __init__(self, board: Board, ask: Callable[[str], None], address: tuple[str, int]) -> None:
+    def __init__(
+        self, board: Board, ask: Callable[[str], None], address: tuple[str, int]
+    ) -> None:
         self.key = _user_key()
         self.board = board
         self.ask = ask
@@ -181,7 +185,9 @@ class _Handler(BaseHTTPRequestHandler):
             request = f"prior.{axis}:="
         elif request == "prior" and axis in AXIS_UNITS:
             # The node refuses a value that is no number.
-            prior = prior_as_typed(axis, self._argument("value"), self._argument("sigma"))
+            prior = prior_as_typed(
+                axis, self._argument("value"), self._argument("sigma")
+            )
             request = printable(f"prior.{axis}:={prior}")
         elif request not in KEYS:
             self._send(HTTPStatus.NOT_FOUND, b"there is no such request")
@@ -199,7 +205,11 @@ class _Handler(BaseHTTPRequestHandler):
         """
         folder = self.server.board.view(time.monotonic()).saved_in
         file = Path(folder, name)
-        return file.read_bytes() if folder and file.is_file() and not file.is_symlink() else b""
+        return (
+            file.read_bytes()
+            if folder and file.is_file() and not file.is_symlink()
+            else b""
+        )
 
     def _path(self) -> str:
         """Return the path of the request without the slash."""
@@ -223,7 +233,9 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(content)
 
-    def _begin(self, status: HTTPStatus, media_type: str, policy: str = _POLICY) -> None:
+    def _begin(
+        self, status: HTTPStatus, media_type: str, policy: str = _POLICY
+    ) -> None:
         """Send the status and the headers of every response."""
         self.send_response(status)
         self.send_header("Content-Type", f"{media_type}; charset=utf-8")
@@ -248,7 +260,9 @@ class _Handler(BaseHTTPRequestHandler):
             now_s = time.monotonic()
             view = self.server.board.view(now_s)
             # Path.is_file would raise an error for a name that is too long.
-            files = [name for name in SAVED if os.path.isfile(f"{view.saved_in}/{name}")]
+            files = [
+                name for name in SAVED if os.path.isfile(f"{view.saved_in}/{name}")
+            ]
             html = fragment(view, files if view.saved_in else ())
             # The data of an event are one line.
             html = " ".join(html.splitlines())
@@ -274,7 +288,9 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
     files : sequence of str
         Saved files to which the page may link.
     """
-    headline = f"<h1>{_sign(view.tone)} {escape(view.word)}</h1>{_element('p', view.sentence)}"
+    headline = (
+        f"<h1>{_sign(view.tone)} {escape(view.word)}</h1>{_element('p', view.sentence)}"
+    )
     if view.advice:
         headline += _element("p", view.advice, "advice")
     if view.facts:
@@ -299,7 +315,9 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
         + _section("answer", "", _lines(view.answer))
         + _section("topics", "topics with poses", _listed(view.topics))
         + _section("axes", axes_title, bars)
-        + _section("axes", "the mount, after ten minutes of motion", _lines(view.watched))
+        + _section(
+            "axes", "the mount, after ten minutes of motion", _lines(view.watched)
+        )
         + '<div class="side">'
         + _section("pose", view.title, _wrapped("dl", pose))
         + _section("health", "result and inputs", health)
