@@ -11,12 +11,11 @@ import hand_eye_calib as hec
 from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.extras.sensors.cameras import Camera, read_camera
 from hand_eye_calib.extras.sensors.target_images import (
-    Camera,
     Target,
     TargetFinder,
     images_in,
-    read_camera,
 )
 from hand_eye_calib.formats.bags.reader import PoseBag
 from hand_eye_calib.formats.bags.writer import stamped_messages

@@ -263,17 +263,21 @@ def offset_over(
         start = fit
         span_s = max(span_s, _span_of_noise_s(fit, np.concatenate(twists)))
         offset_s = float(offset_s + fit.offset_s)
-        is_small = abs(offset_s) + abs(fit.offset_s) < negligible_s / 2
-        if abs(fit.offset_s) < settled_s or is_small:
+        if _is_small_step(fit.offset_s, offset_s, settled_s, negligible_s):
             before = rate
             rate = _rate(fit, pose_pairs.stamps_ns[pairs.i], before)
             is_settled = abs(rate.used - before.used) * child.duration_s < settled_s
             if is_settled and (max_pairs > MAX_PAIRS or not rate.is_used):
                 break
-    estimated_rate = rate if np.isfinite(rate.sigma_ppm) else None
-    return TimeOffset(
-        offset_s, fit.offset_sigma_s, at.correlation, fit, rate=estimated_rate
-    )
+    estimate = TimeOffset(offset_s, fit.offset_sigma_s, at.correlation, fit)
+    return replace(estimate, rate=rate) if np.isfinite(rate.sigma_ppm) else estimate
+
+
+def _is_small_step(
+    step_s: float, offset_s: float, settled_s: float, negligible_s: float
+) -> bool:
+    """Whether the last step ends the iteration: small in itself, or of a negligible offset."""
+    return abs(step_s) < settled_s or abs(offset_s) + abs(step_s) < negligible_s / 2
 
 
 def _unknown_rate(child: Trajectory) -> ClockRate:

@@ -16,10 +16,10 @@ from hand_eye_calib.core.base.text import listing
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import Extrinsic
 from hand_eye_calib.core.geometry.se3 import deviation, turned, xyz_rpy
+from hand_eye_calib.core.results.axes import target_of
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.context import Comparison, Difference
 from hand_eye_calib.core.results.records import AXES, DofVerdict
-from hand_eye_calib.core.results.verdict import target_of
 
 _Named = tuple[str, Calibration | Extrinsic]
 

@@ -286,19 +286,9 @@ def solve_poses(
         solved = _solve_stream(scaled, config, is_clock_free=time_offset is not None)
     else:
         solved = _solve_pairs(scaled, config)
-    spread = _zero_covariance()
-    if scale_fit:
-        by_log_scale = scale_fit.sensitivity[:, 0]
-        relative_sigma = scale_fit.scale_sigma / scale_fit.scale
-        spread += np.outer(by_log_scale, by_log_scale) * relative_sigma**2
-    # If the noise model estimates the time offset, its covariance contains the uncertainty already.
-    has_offset = (
-        isinstance(solved.solution, AdaptiveSolution) and solved.solution.time_offset_s
+    spread = solved.spread + _spread_of_scale_and_offset(
+        solved.solution, scale_fit, time_offset
     )
-    if time_offset and time_offset.fit and not has_offset:
-        by_offset = time_offset.fit.sensitivity[:, 1]
-        spread += np.outer(by_offset, by_offset) * time_offset.sigma_s**2
-    spread += solved.spread
     assessment = solved.assessment
     if spread.any():
         assessment = widened(assessment, spread)
@@ -315,6 +305,25 @@ def solve_poses(
         floor=floor_of(solved, pose_pairs, config),
         excess=excess_covariance(assessment, solved.opinions),
     )
+
+
+def _spread_of_scale_and_offset(
+    solution: object,
+    scale_fit: SimilarityFit | None,
+    time_offset: TimeOffset | None,
+) -> FloatArray:
+    """Covariance (6, 6) of the result by the uncertainty of an estimated scale and time offset."""
+    spread = _zero_covariance()
+    if scale_fit:
+        by_log_scale = scale_fit.sensitivity[:, 0]
+        relative_sigma = scale_fit.scale_sigma / scale_fit.scale
+        spread += np.outer(by_log_scale, by_log_scale) * relative_sigma**2
+    # If the noise model estimates the time offset, its covariance contains the uncertainty already.
+    has_offset = isinstance(solution, AdaptiveSolution) and solution.time_offset_s
+    if time_offset and time_offset.fit and not has_offset:
+        by_offset = time_offset.fit.sensitivity[:, 1]
+        spread += np.outer(by_offset, by_offset) * time_offset.sigma_s**2
+    return spread
 
 
 def floor_of(

@@ -14,7 +14,7 @@ command line, Python, the node, batches and rigs call :func:`run`, or :func:`rev
 result already.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -353,14 +353,18 @@ def _repaired(
     second = second.with_messages(
         {**options, **second.options}, (message, *second.messages)
     )
+    return _with_offset_doubt(second, _doubts_beside_a_repair(findings))
+
+
+def _doubts_beside_a_repair(findings: Iterable[Finding]) -> list[Finding]:
+    """Findings of the streams as given that a repair does not settle, as warnings."""
     # A difference of lengths may also be a scale of the child instead of a unit of the parent.
     doubts = [
         replace(finding, severity=Severity.WARNING, options={})
         for finding in findings
         if (finding.code, finding.stream) == ("units", "parent")
     ]
-    doubts += [finding for finding in findings if finding.code == "ambiguous"]
-    return _with_offset_doubt(second, doubts)
+    return doubts + [finding for finding in findings if finding.code == "ambiguous"]
 
 
 def _contradicts_repair(finding: Finding) -> bool:

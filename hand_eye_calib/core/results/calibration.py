@@ -16,7 +16,7 @@ from hand_eye_calib.core.base.registry import RESULT_METHODS
 from hand_eye_calib.core.base.text import AXIS_UNITS
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import inverse_covariance, sigmas_in_parent
-from hand_eye_calib.core.results import document
+from hand_eye_calib.core.results import document, stored
 from hand_eye_calib.core.results.parts import part
 from hand_eye_calib.core.results.records import (
     AXES,
@@ -234,4 +234,4 @@ class Calibration(Judged):
             If ``data`` is not a calibration, has another version or lacks a value. The message
             names the value.
         """
-        return document.result_from(cls, data)
+        return stored.result_from(cls, data)

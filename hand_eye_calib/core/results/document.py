@@ -1,19 +1,14 @@
-"""Documents: a result as plain values for JSON and YAML, and back.
-
-The module also makes the numbers that other programs read.
-"""
+"""Documents: a result as plain values for JSON and YAML, and the numbers for other programs."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray
-from hand_eye_calib.core.base.config import METHODS
-from hand_eye_calib.core.base.errors import InputError
-from hand_eye_calib.core.base.plain import Document, from_plain, plain
+from hand_eye_calib.core.base.plain import Document, plain
 from hand_eye_calib.core.base.text import (
     amount,
     fixed,
@@ -27,24 +22,20 @@ from hand_eye_calib.core.geometry.se3 import (
     sigmas_in_parent,
     sigmas_rpy,
 )
-from hand_eye_calib.core.geometry.trajectory import check_poses
 from hand_eye_calib.core.results.parts import ExtraTransform, all_parts, part
 from hand_eye_calib.core.results.records import (
     AXES,
     ROTATIONS,
     TRANSLATIONS,
-    CrossCheck,
-    Finding,
     by_hand,
 )
 from hand_eye_calib.core.results.result import Result
 from hand_eye_calib.core.results.verdict import Judged, Reason, Verdict
 
-_FORMAT = "hand_eye_calib/extrinsic"
+FORMAT = "hand_eye_calib/extrinsic"
 # A change that an older reader cannot understand raises the version. In version 1, covariance and
 # sigma did not contain the allowance, and the allowance was called floor.
-_VERSION = 2
-_READABLE = (1, 2)
+VERSION = 2
 
 # Logarithm of the ratio of two standard deviations below which both are the same for a reader.
 _SAME_ANGLES = 0.2
@@ -53,26 +44,16 @@ _SAME_ANGLES = 0.2
 _NEGLIGIBLE_SHARE = 0.01
 
 # Fields of a result that are matrices in a document.
-_TRANSFORMS = ("T_parent_child", "T_method", "T_base_parent")
-_COVARIANCES = ("covariance_measured", "covariance_allowance")
+TRANSFORMS = ("T_parent_child", "T_method", "T_base_parent")
+COVARIANCES = ("covariance_measured", "covariance_allowance")
 # Fields of a result that documents do not have.
-_NOT_IN_FILES = ("motion_residuals", "recording", "parts")
-# Fields that functions of their own read.
-_READ_APART = (*_NOT_IN_FILES, "findings")
-
-# Names of the covariances in version 2, and their names in version 1.
-_OLD_COVARIANCES = {
-    "covariance_measured": "covariance",
-    "covariance_allowance": "floor",
-}
+NOT_IN_FILES = ("motion_residuals", "recording", "parts")
 
 # If a direction is unobservable, an axis with a larger standard deviation (m) is unknown, too.
 UNKNOWN_M = 0.9
 
 # An axis is unknown if it contains more than this share (a cosine) of an unobservable direction.
 _SHARED = 0.02
-
-_OfResult = TypeVar("_OfResult", bound=Result)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,8 +86,8 @@ def document_of(result: Judged) -> Document:
         "verdict": result.verdict,
         "headline": result.headline,
         "reasons": [_reason_of(reason) for reason in result.reasons],
-        "format": _FORMAT,
-        "version": _VERSION,
+        "format": FORMAT,
+        "version": VERSION,
         "parent_frame": parent,
         "child_frame": child,
         **transforms_of(result),
@@ -119,7 +100,7 @@ def document_of(result: Judged) -> Document:
         of = "T_parent_child as the method solved it: nothing set, no prior added"
         document["T_method"] = {"of": of, "matrix": result.T_method}
     document["findings"] = [finding.to_dict() for finding in result.findings]
-    others = {*_TRANSFORMS, *_COVARIANCES, *_NOT_IN_FILES, "observability_measured"}
+    others = {*TRANSFORMS, *COVARIANCES, *NOT_IN_FILES, "observability_measured"}
     for field in fields(result):
         if field.name not in others.union(document):
             document[field.name] = getattr(result, field.name)
@@ -478,151 +459,3 @@ def usable_angles(result: Result) -> dict[str, float | str]:
         name: angle if is_known else by_hand(name)
         for name, angle, is_known in zip(ROTATIONS, angles, are_known, strict=True)
     }
-
-
-# -------------------------------------------------------------------------- reading
-
-
-def result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
-    """Build a calibration from its document, which may be damaged or changed by hand.
-
-    Raises
-    ------
-    InputError
-        If a value is missing or wrong; the message names the value.
-    """
-    is_document = isinstance(data, Mapping)
-    form = data.get("format") if is_document else None
-    version = data.get("version") if is_document else None
-    if form != _FORMAT:
-        found = f"; found format {form}" if form else ""
-        raise InputError(
-            f"not a saved result: expected format {_FORMAT}, as in extrinsic.yaml that --out "
-            f"writes{found}"
-        )
-    if version not in _READABLE:
-        raise InputError(
-            f"expected format {_FORMAT}, version {_READABLE[0]} or {_READABLE[1]}; found version "
-            f"{version}: read it with the release that wrote it, or calibrate again"
-        )
-    try:
-        return _result_from(of, _measured_parts(data))
-    except KeyError as error:
-        raise InputError(
-            f"the calibration has no {error}: restore or repeat it"
-        ) from None
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"the calibration was changed after it was written: {error}; restore or repeat it"
-        ) from None
-
-
-def _measured_parts(data: Mapping[str, Any]) -> Document:
-    """Return a document of any version with the measured parts under the names of version 2."""
-    document = dict(data)
-    if data["version"] == 1:
-        document |= {
-            name: data[old] for name, old in _OLD_COVARIANCES.items() if old in data
-        }
-        document["observability_measured"] = data["observability"]
-        return document
-    whole = covariance_of(data["covariance"])
-    parts = [covariance_of(data[name]) for name in _OLD_COVARIANCES]
-    if not np.allclose(whole, parts[0] + parts[1], rtol=1e-6, atol=1e-300):
-        raise ValueError(
-            "covariance is not the sum of covariance_measured and its allowance"
-        )
-    document["observability_measured"] = [
-        {**row, "sigma": row["sigma_measured"]} for row in data["observability"]
-    ]
-    return document
-
-
-def _result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
-    """Build a result from a document of the right format.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        If a value is missing or wrong.
-    """
-    from hand_eye_calib.core.results.context import Comparison
-
-    readers = dict.fromkeys((*_TRANSFORMS, "T_base_child"), transform_of)
-    readers |= dict.fromkeys(_COVARIANCES, covariance_of)
-    arrays = {name: read(data[name]) for name, read in readers.items() if name in data}
-    if "T_base_child" in arrays:
-        T_child_parent = se3.inverse(arrays["T_parent_child"])
-        arrays["T_base_parent"] = arrays["T_base_child"] @ T_child_parent
-    values = {name: value for name, value in data.items() if name not in _READ_APART}
-    parts = {extra.name: extra.read(data) for extra in all_parts()}
-    parts = {name: value for name, value in parts.items() if value is not None}
-    result: _OfResult = from_plain(of, values | arrays, Comparison=Comparison)
-    result = replace(result, parts=parts, findings=_findings_of(data))
-    if data["version"] == 1 and result.cross_check:
-        result = replace(result, cross_check=_with_allowance(result))
-    _require_known_names(result)
-    if data["version"] != 1:
-        _require_sigmas(result, data["observability"])
-    return result
-
-
-def _require_known_names(result: Result) -> None:
-    """Raise ValueError if a result has an axis or a method that this program does not know."""
-    if tuple(dof.name for dof in result.observability) != AXES:
-        raise ValueError(f"the axes of observability are not {', '.join(AXES)}")
-    for name in ("contradictions", "target_axes", "cross_check"):
-        if not {*(getattr(result, name) or {})} <= {*AXES}:
-            raise ValueError(f"{name} has other axes than {', '.join(AXES)}")
-    if result.method not in METHODS:
-        raise ValueError(f"method {result.method} is not known")
-
-
-def _findings_of(data: Mapping[str, Any]) -> tuple[Finding, ...]:
-    """Return the findings of a document."""
-    rows = data.get("findings", [])
-    if not isinstance(rows, (list, tuple)):
-        raise TypeError(f"findings: a list is {type(rows).__name__}")
-    return tuple(map(Finding.from_dict, rows))
-
-
-def _require_sigmas(result: Result, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Raise ValueError unless each standard deviation is the root sum of squares of its parts."""
-    sigmas = [from_plain(float, row["sigma"]) for row in rows]
-    if not np.allclose(sigmas, result.sigmas, rtol=1e-6, atol=1e-300):
-        raise ValueError("sigma is not that of sigma_measured and the allowance")
-
-
-def _with_allowance(result: Result) -> CrossCheck:
-    """Add the allowance to the standard deviations of a cross-check of version 1."""
-    sizes = dict(zip(AXES, result.allowance.tolist(), strict=True))
-    rows = dict(result.cross_check or {})
-    for axis, row in rows.items():
-        if axis in sizes and row.sigma is not None:
-            rows[axis] = replace(row, sigma=math.hypot(row.sigma, sizes[axis]))
-    return rows
-
-
-def transform_of(data: Mapping[str, Any]) -> FloatArray:
-    """Return the transform (4, 4) of a document."""
-    matrix = _matrix(data, 4)
-    check_poses(matrix[None])
-    return matrix
-
-
-def covariance_of(data: Mapping[str, Any]) -> FloatArray:
-    """Return the covariance (6, 6) of a document; unknown variances are infinite."""
-    matrix = _matrix(data, 6)
-    is_known = np.isfinite(matrix)
-    sigmas = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    # A correlation of 1 may be a little larger due to rounding.
-    bounds = (1 + 1e-6) * np.outer(sigmas, sigmas) + 1e-300
-    is_symmetric = np.allclose(matrix, matrix.T, rtol=1e-6)
-    if not (is_symmetric and np.all(np.abs(matrix[is_known]) <= bounds[is_known])):
-        raise ValueError("a matrix is not a covariance")
-    return matrix
-
-
-def _matrix(data: Mapping[str, Any], size: int) -> FloatArray:
-    rows = from_plain(tuple[tuple[float, ...], ...], data["matrix"])
-    return np.array(rows, dtype=float).reshape(size, size)

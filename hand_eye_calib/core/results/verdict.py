@@ -6,7 +6,7 @@ docs/verdict.md has the same table; a test compares the two tables.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property, partial
@@ -17,18 +17,21 @@ from hand_eye_calib.core.base.registry import EXTRA_RULES
 from hand_eye_calib.core.base.spelling import PLACEHOLDER, Road, with_options
 from hand_eye_calib.core.base.text import (
     amount,
-    amount_beside,
     axes_in_words,
     counted,
     listing,
     two_digits,
 )
+from hand_eye_calib.core.results.axes import (
+    ReachableAxis,
+    amounts_in_words,
+    axes_within_reach,
+    targets_in_words,
+    what_is_known,
+)
 from hand_eye_calib.core.results.parts import part
 from hand_eye_calib.core.results.records import (
-    ROTATIONS,
-    TRANSLATIONS,
     AxisScatter,
-    DofVerdict,
     Finding,
     Severity,
     SolveStatus,
@@ -263,28 +266,6 @@ def shown(reasons: Sequence[Reason]) -> tuple[Reason, ...]:
     return tuple(reason for reason in reasons if reason.verdict is reasons[0].verdict)
 
 
-def what_is_known(result: Result) -> str:
-    """Return the accuracy in words: the largest sigmas of translation and of rotation."""
-    axes = _axes(result)
-    texts = []
-    for names in (TRANSLATIONS, ROTATIONS):
-        if totals := [axis.total for axis in axes if axis.name in names]:
-            texts.append(amount(names[0], max(totals)))
-    if not result.out_of_reach:
-        return f"good to {listing(texts)} on every axis (1 sigma)"
-    within_reach = listing([axis.name for axis in axes])
-    hidden = listing(result.out_of_reach)
-    good_to = f"{within_reach} are good to {listing(texts)} (1 sigma)"
-    verb = "is" if len(result.out_of_reach) == 1 else "are"
-    return f"{good_to}; {hidden} {verb} out of reach of these streams"
-
-
-def target_of(axis: str, result: Result) -> float:
-    """Return the target of an axis: the largest acceptable standard deviation (m or rad)."""
-    default = result.target_rotation if axis in ROTATIONS else result.target_translation
-    return float(result.target_axes.get(axis, default))
-
-
 # ---------------------------------------------------------------- the rules
 
 
@@ -317,7 +298,7 @@ def _nothing_known(result: Result) -> Iterator[Ground]:
         # If stops contradict each other, or a vehicle always drives the same curve, an error
         # finding names the cause.
         return
-    if all(axis.is_hidden for axis in _axes(result)):
+    if all(axis.is_hidden for axis in axes_within_reach(result)):
         yield Ground(
             "nothing about the mounting can be determined from this motion",
             "record motion with rotations about all axes",
@@ -349,7 +330,7 @@ def _contradiction(kind: str, result: Result) -> Iterator[Ground]:
     """
     distances = {}
     sigmas = []
-    for axis in _axes(result):
+    for axis in axes_within_reach(result):
         row = (result.cross_check or {}).get(axis.name)
         if row is None or not math.isfinite(axis.sigma):
             continue
@@ -370,7 +351,7 @@ def _contradiction(kind: str, result: Result) -> Iterator[Ground]:
         )
 
 
-def _scatter_of(kind: str, row: AxisScatter, axis: "_Axis") -> tuple[float, bool]:
+def _scatter_of(kind: str, row: AxisScatter, axis: ReachableAxis) -> tuple[float, bool]:
     """Return the scatter of other estimates on an axis, and whether it is too large."""
     if kind == "halves":
         scatter = row.of_halves
@@ -396,20 +377,21 @@ def _unconfirmed(result: Result) -> Iterator[Ground]:
     rows = result.cross_check or {}
     axes = [
         (axis.name, axis.total)
-        for axis in _axes(result)
+        for axis in axes_within_reach(result)
         if axis.name in rows
         and not rows[axis.name].is_confirmed
         and not axis.is_known_by_hand
     ]
     if axes:
         names = tuple(name for name, _ in axes)
-        text = f"only the noise model determines {_amounts(axes, ' to ')}; no other method does"
+        sizes = amounts_in_words(axes, " to ")
+        text = f"only the noise model determines {sizes}; no other method does"
         advice = f"compare {axes_in_words(names)} with a drawing or a tape measure"
         yield Ground(text, advice, names)
 
 
 def _hidden(result: Result) -> Iterator[Ground]:
-    axes = _axes(result)
+    axes = axes_within_reach(result)
     if 0 < sum(axis.is_hidden for axis in axes) < len(axes):
         yield _hidden_ground(result, "this motion")
 
@@ -419,7 +401,7 @@ def _hidden_ground(result: Result, source: str) -> Ground:
 
     ``source`` names what does not determine them, such as "this motion".
     """
-    axes = tuple(axis.name for axis in _axes(result) if axis.is_hidden)
+    axes = tuple(axis.name for axis in axes_within_reach(result) if axis.is_hidden)
     advice = "measure it by hand and give a prior"
     if len(axes) > 1:
         advice = "measure them by hand and give priors"
@@ -453,25 +435,20 @@ _FLOOR_ADVICE = (
 )
 
 
-def _amounts(axes: Iterable[tuple[str, float]], between: str = " ") -> str:
-    """List axes with their sizes (m or rad) in words."""
-    texts = [
-        f"{axes_in_words([name])}{between}{amount(name, size)}" for name, size in axes
-    ]
-    return listing(texts)
-
-
 def _worse_than_target(result: Result) -> Iterator[Ground]:
-    rough = [axis for axis in _axes(result) if axis.target < axis.sigma < math.inf]
+    rough = [
+        axis
+        for axis in axes_within_reach(result)
+        if axis.target < axis.sigma < math.inf
+    ]
     if not rough:
         return
     names = tuple(axis.name for axis in rough)
     sizes = [
         f"{axes_in_words([axis.name])} {axis.sigma_beside_target()}" for axis in rough
     ]
-    sentence = (
-        f"standard deviations above the target of {_targets(rough)}: {listing(sizes)}"
-    )
+    targets = targets_in_words(rough)
+    sentence = f"standard deviations above the target of {targets}: {listing(sizes)}"
     allowances = [(axis, math.sqrt(axis.total**2 - axis.sigma**2)) for axis in rough]
     # The target cannot be reached if the allowance alone is above it. A longer recording still
     # helps if the allowance is less than half of the rest.
@@ -486,14 +463,18 @@ def _worse_than_target(result: Result) -> Iterator[Ground]:
         )
         advice.append(f"record {more}")
     if hopeless:
-        alone = f"constant odometry errors alone leave {_amounts(hopeless)}"
+        alone = f"constant odometry errors alone leave {amounts_in_words(hopeless)}"
         advice.append(f"{alone}: {_FLOOR_ADVICE}")
     yield Ground(sentence, "; ".join(advice), names)
 
 
 def _floor(result: Result) -> Iterator[Ground]:
     """Yield the ground that the allowance alone puts axes above their target."""
-    above = [axis for axis in _axes(result) if axis.sigma <= axis.target < axis.total]
+    above = [
+        axis
+        for axis in axes_within_reach(result)
+        if axis.sigma <= axis.target < axis.total
+    ]
     if not above:
         return
     names = tuple(axis.name for axis in above)
@@ -513,50 +494,10 @@ def _floor(result: Result) -> Iterator[Ground]:
         else "constant odometry errors"
     )
     sentence = (
-        f"{listing(sizes)}; {target_is} {_targets(above)}. "
+        f"{listing(sizes)}; {target_is} {targets_in_words(above)}. "
         f"{share} of it is an allowance for {errors}"
     )
     yield Ground(sentence, _FLOOR_ADVICE, names)
-
-
-def _targets(axes: Sequence["_Axis"]) -> str:
-    """Return the targets of axes in words, without repetitions."""
-    return listing([*dict.fromkeys(amount(axis.name, axis.target) for axis in axes)])
-
-
-class _Axis(NamedTuple):
-    """An axis that the streams can determine.
-
-    ``sigma`` is the measured standard deviation (m or rad); ``total`` contains the allowance, too.
-    """
-
-    name: str
-    sigma: float
-    total: float
-    target: float
-    is_hidden: bool
-    is_known_by_hand: bool
-
-    def sigma_beside_target(self) -> str:
-        """Return the standard deviation with enough digits to distinguish it from the target."""
-        return amount_beside(self.name, self.total, self.target)
-
-
-def _axes(result: Result) -> list[_Axis]:
-    hidden = result.unobservable()
-    totals = result.sigmas.tolist()
-    return [
-        _Axis(
-            name=dof.name,
-            sigma=dof.sigma,
-            total=total,
-            target=target_of(dof.name, result),
-            is_hidden=dof.name in hidden,
-            is_known_by_hand=dof.verdict is DofVerdict.PRIOR,
-        )
-        for dof, total in zip(result.observability_measured, totals, strict=True)
-        if dof.name not in result.out_of_reach
-    ]
 
 
 _NEVER = Verdict.DO_NOT_USE

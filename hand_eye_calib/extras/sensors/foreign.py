@@ -11,10 +11,7 @@ import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from datetime import UTC, datetime
-from functools import reduce
 from itertools import chain, islice
-from operator import xor
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -26,6 +23,7 @@ from hand_eye_calib.core.base.errors import InputError, MissingDependencyError, 
 from hand_eye_calib.core.base.text import shortened
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.extras.sensors.nmea import places_of
 from hand_eye_calib.formats.files import LONGEST_LINE, LONGEST_NAME
 from hand_eye_calib.formats.trajectory_files.columns import (
     MATRIX,
@@ -34,7 +32,6 @@ from hand_eye_calib.formats.trajectory_files.columns import (
     ROTATION_VECTOR,
 )
 from hand_eye_calib.formats.trajectory_files.dates import (
-    DAY_S,
     GPS_EPOCH_S,
     GPS_TIME,
     WEEK_S,
@@ -148,81 +145,9 @@ def _lines(data: bytes) -> list[str]:
 # ---- positions on the earth
 
 
-def _cells_of_sentence(line: str) -> list[str] | None:
-    """Return the cells of an NMEA sentence; None if its checksum is wrong."""
-    # A sentence is between $ and *; its checksum follows.
-    start = line.find("$") + 1
-    sentence, _, checksum = line[start:].partition("*")
-    if checksum and _checksum(sentence) != checksum[:2].upper():
-        return None
-    return sentence.strip().split(",")
-
-
 def _of_nmea(data: bytes, _: str | None) -> _Rows:
-    """Read GGA sentences; the previous RMC sentence states their day."""
-    rows: list[list[float]] = []
-    day_s = None
-    n_damaged = 0
-    for line in _lines(data):
-        cells = _cells_of_sentence(line)
-        if cells is None:
-            n_damaged += 1
-            continue
-        # The first two letters are the talker, such as GP.
-        kind = cells[0][-3:]
-        if kind == "RMC":
-            day_s = _day_of_rmc(cells) or day_s
-        if kind != "GGA" or day_s is None or not _has_fix(cells):
-            continue
-        row = _gga_row(cells, day_s)
-        # After midnight, the date is that of the day before until the next RMC sentence.
-        if rows and row[0] < rows[-1][0] - DAY_S / 2:
-            row[0] += DAY_S
-        rows.append(row)
-    if not rows:
-        raise ValueError(
-            "NMEA: expected GGA sentences with a fix, and the date in RMC sentences"
-        )
-    notes = (
-        [f"{n_damaged} sentences with a wrong checksum left out"] if n_damaged else []
-    )
-    return _Rows(_PLACE, rows, notes)
-
-
-def _checksum(sentence: str) -> str:
-    """Return the checksum of a sentence of NMEA: two hexadecimal digits."""
-    return f"{reduce(xor, sentence.encode(), 0):02X}"
-
-
-def _day_of_rmc(cells: Sequence[str]) -> float | None:
-    """Return the start of the day (s since 1970) of an RMC sentence; None without a date."""
-    if len(cells) <= 9 or not cells[9]:
-        return None
-    return datetime.strptime(cells[9], "%d%m%y").replace(tzinfo=UTC).timestamp()
-
-
-def _has_fix(cells: Sequence[str]) -> bool:
-    """Return whether a GGA sentence has a fix and a height."""
-    return len(cells) > 11 and cells[6] not in ("", "0") and cells[9] != ""
-
-
-def _gga_row(cells: Sequence[str], day_s: float) -> list[float]:
-    """Return stamp (s), latitude, longitude (deg) and height (m) of a GGA sentence.
-
-    The height is above the ellipsoid: the height above the geoid plus the height of the geoid.
-    """
-    clock, lat, north, lon, east = cells[1:6]
-    # hhmmss.ss, ddmm.mmmm and dddmm.mmmm.
-    stamp_s = day_s + 3600 * int(clock[:2]) + 60 * int(clock[2:4]) + float(clock[4:])
-    lat_deg = int(lat[:2]) + float(lat[2:]) / 60
-    lon_deg = int(lon[:3]) + float(lon[3:]) / 60
-    if north in "SW":
-        lat_deg = -lat_deg
-    if east in "SW":
-        lon_deg = -lon_deg
-    above_geoid_m = float(cells[9])
-    geoid_m = float(cells[11] or 0)
-    return [stamp_s, lat_deg, lon_deg, above_geoid_m + geoid_m]
+    """Read the sentences of a GNSS receiver."""
+    return _Rows(_PLACE, *places_of(_lines(data)))
 
 
 def _of_gpx(data: bytes, _: str | None) -> _Rows:

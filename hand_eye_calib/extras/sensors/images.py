@@ -5,13 +5,11 @@ from pathlib import PurePosixPath
 from hand_eye_calib.core.base.errors import InputError, located, printable
 from hand_eye_calib.core.base.text import frame_name
 from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.extras.sensors.cameras import Camera, camera_of, read_camera
 from hand_eye_calib.extras.sensors.target_images import (
-    Camera,
     Target,
     TargetFinder,
-    camera_of,
     grey_of,
-    read_camera,
 )
 from hand_eye_calib.formats.bags import messages
 from hand_eye_calib.formats.bags.pose_table import PoseTable

@@ -14,6 +14,7 @@ from nav_msgs.msg import Odometry
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
@@ -85,19 +86,28 @@ def play(
             return transform_of(results[-1]).stamp_ns >= until_ns
 
         wait(are_subscribed, "listen")
-        # Time at which the stamp 0 would be played.
-        start_s = time.monotonic() - int(poses.stamps_ns[0]) * 1e-9 / speed
-        for row, stamp_ns in enumerate(poses.stamps_ns.tolist()):
-            while (
-                remaining_s := start_s + stamp_ns * 1e-9 / speed - time.monotonic()
-            ) > 0:
-                executor.spin_once(timeout_sec=remaining_s)
-            publishers[poses.streams[row]].publish(_odometry(poses, row))
+        _publish_in_time(poses, publishers, speed, executor)
         wait(solve.service_is_ready, "serve ~/solve")
         requests = [solve.call_async(Trigger.Request())]
         wait(has_all_poses, "give a result with all poses")
     result = transform_of(results[-1])
     return se3.from_quat_xyzw(result.position, result.quat_xyzw)
+
+
+def _publish_in_time(
+    poses: PoseTable,
+    publishers: Mapping[str, Publisher],
+    speed: float,
+    executor: SingleThreadedExecutor,
+) -> None:
+    """Publish each pose at its time of the playback, and spin between the poses."""
+    # Time at which the stamp 0 would be played.
+    start_s = time.monotonic() - int(poses.stamps_ns[0]) * 1e-9 / speed
+    for row, stamp_ns in enumerate(poses.stamps_ns.tolist()):
+        due_s = start_s + stamp_ns * 1e-9 / speed
+        while (remaining_s := due_s - time.monotonic()) > 0:
+            executor.spin_once(timeout_sec=remaining_s)
+        publishers[poses.streams[row]].publish(_odometry(poses, row))
 
 
 def _wait(

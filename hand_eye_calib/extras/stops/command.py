@@ -113,10 +113,7 @@ def _from_images(
         (hand,) = _read(arguments, [hand_path], options)
     _require_equal([hand_path, folder], len(hand), len(images))
     config = _measuring(config, {"parent": hand})
-    target = target_images.Target.parse(arguments.target)
-    finder = target_images.TargetFinder(
-        target, target_images.read_camera(arguments.camera)
-    )
+    finder = target_images.TargetFinder.parse(arguments.target, arguments.camera)
     for image in with_progress(images, len(images), "finding the target"):
         finder.look(target_images.read_image(image))
     detections = finder.found()

@@ -9,8 +9,9 @@ from hand_eye_calib.core.base.plain import Document, from_plain
 from hand_eye_calib.core.base.text import frame_name
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import inverse_covariance
-from hand_eye_calib.core.results.document import covariance_of, matrix_of, transform_of
+from hand_eye_calib.core.results.document import matrix_of
 from hand_eye_calib.core.results.parts import ExtraTransform, Part
+from hand_eye_calib.core.results.stored import covariance_of, transform_of
 
 # Values of the option ``setup`` (place of the camera of an arm), and their text.
 SETUPS = {"hand": "on the hand", "beside": "beside the robot"}

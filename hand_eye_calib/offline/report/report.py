@@ -20,6 +20,7 @@ from hand_eye_calib.core.base.version import version_of
 from hand_eye_calib.core.engine.snapshot import Snapshot
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.core.results.axes import target_of
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
 from hand_eye_calib.core.results.document import (
     Notation,
@@ -34,7 +35,7 @@ from hand_eye_calib.core.results.document import (
 )
 from hand_eye_calib.core.results.parts import advice_of, facts_of
 from hand_eye_calib.core.results.records import ROTATIONS, TRANSLATIONS
-from hand_eye_calib.core.results.verdict import shown, target_of
+from hand_eye_calib.core.results.verdict import shown
 from hand_eye_calib.offline.report.evidence import Evidence, gather, summarise
 from hand_eye_calib.offline.report.figures import figures_of
 from hand_eye_calib.offline.report.style import LOOK

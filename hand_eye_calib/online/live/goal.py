@@ -25,6 +25,7 @@ from hand_eye_calib.core.assessment.excitation import (
 )
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.text import amount, axes_in_words, capital, duration
+from hand_eye_calib.core.results.axes import what_is_known
 from hand_eye_calib.core.results.calibration import (
     Calibration,
     DofVerdict,
@@ -32,7 +33,6 @@ from hand_eye_calib.core.results.calibration import (
     Verdict,
 )
 from hand_eye_calib.core.results.records import AXES
-from hand_eye_calib.core.results.verdict import what_is_known
 from hand_eye_calib.online.live.progress import AXIS_KEYS, AxisProgress, Progress
 
 # Bounds of the motion (s) that confirms a first result within the targets. Within these bounds, the

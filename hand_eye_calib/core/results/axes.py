@@ -1,0 +1,84 @@
+"""The axes that the streams of a result can determine, with their sigmas and targets."""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+from hand_eye_calib.core.base.text import (
+    amount,
+    amount_beside,
+    axes_in_words,
+    listing,
+)
+from hand_eye_calib.core.results.records import ROTATIONS, TRANSLATIONS, DofVerdict
+from hand_eye_calib.core.results.result import Result
+
+
+class ReachableAxis(NamedTuple):
+    """An axis that the streams can determine.
+
+    ``sigma`` is the measured standard deviation (m or rad); ``total`` contains the allowance, too.
+    """
+
+    name: str
+    sigma: float
+    total: float
+    target: float
+    is_hidden: bool
+    is_known_by_hand: bool
+
+    def sigma_beside_target(self) -> str:
+        """Return the standard deviation with enough digits to distinguish it from the target."""
+        return amount_beside(self.name, self.total, self.target)
+
+
+def axes_within_reach(result: Result) -> list[ReachableAxis]:
+    """Return the axes that the streams can determine, observable or not."""
+    hidden = result.unobservable()
+    totals = result.sigmas.tolist()
+    return [
+        ReachableAxis(
+            name=dof.name,
+            sigma=dof.sigma,
+            total=total,
+            target=target_of(dof.name, result),
+            is_hidden=dof.name in hidden,
+            is_known_by_hand=dof.verdict is DofVerdict.PRIOR,
+        )
+        for dof, total in zip(result.observability_measured, totals, strict=True)
+        if dof.name not in result.out_of_reach
+    ]
+
+
+def target_of(axis: str, result: Result) -> float:
+    """Return the target of an axis: the largest acceptable standard deviation (m or rad)."""
+    default = result.target_rotation if axis in ROTATIONS else result.target_translation
+    return float(result.target_axes.get(axis, default))
+
+
+def amounts_in_words(axes: Iterable[tuple[str, float]], between: str = " ") -> str:
+    """List axes with their sizes (m or rad) in words."""
+    texts = [
+        f"{axes_in_words([name])}{between}{amount(name, size)}" for name, size in axes
+    ]
+    return listing(texts)
+
+
+def targets_in_words(axes: Sequence[ReachableAxis]) -> str:
+    """Return the targets of axes in words, without repetitions."""
+    return listing([*dict.fromkeys(amount(axis.name, axis.target) for axis in axes)])
+
+
+def what_is_known(result: Result) -> str:
+    """Return the accuracy in words: the largest sigmas of translation and of rotation."""
+    axes = axes_within_reach(result)
+    texts = []
+    for names in (TRANSLATIONS, ROTATIONS):
+        if totals := [axis.total for axis in axes if axis.name in names]:
+            texts.append(amount(names[0], max(totals)))
+    if not result.out_of_reach:
+        return f"good to {listing(texts)} on every axis (1 sigma)"
+    within_reach = listing([axis.name for axis in axes])
+    hidden = listing(result.out_of_reach)
+    good_to = f"{within_reach} are good to {listing(texts)} (1 sigma)"
+    verb = "is" if len(result.out_of_reach) == 1 else "are"
+    return f"{good_to}; {hidden} {verb} out of reach of these streams"
