@@ -26,8 +26,8 @@ from hand_eye_calib.core.engine.calibrator import Calibrator, Calibrators
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import FrameTree, StreamFrames
 from hand_eye_calib.core.geometry.trajectory import Trajectory
-from hand_eye_calib.formats.bags.messages import MessageReader
 from hand_eye_calib.formats.bags.reader import PoseBag
+from hand_eye_calib.formats.bags.unpacking import MessageReader
 from hand_eye_calib.formats.installed import open_installed
 from hand_eye_calib.formats.journal import read_journal, replay_journal
 from hand_eye_calib.offline.cli.main import main

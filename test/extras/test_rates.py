@@ -24,7 +24,7 @@ from hand_eye_calib.core.geometry.rates import RateIntegrator
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.document import usable_numbers
 from hand_eye_calib.extras.partial.rotation_checks import measured_stream
-from hand_eye_calib.formats.bags.messages import MessageReader, unpack_poses
+from hand_eye_calib.formats.bags.unpacking import MessageReader, unpack_poses
 from hand_eye_calib.formats.bags.writer import write_bag
 from hand_eye_calib.offline.cli.main import main
 

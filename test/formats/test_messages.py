@@ -7,16 +7,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_eye_calib.core.base.errors import printable
-from hand_eye_calib.formats.bags import messages as unpacking
 from hand_eye_calib.formats.bags.messages import (
     MALFORMED,
     MESSAGE_TYPES,
     POSE_TYPES,
     Run,
-    unpack_poses,
 )
 from hand_eye_calib.formats.bags.pose_table import PoseTable
 from hand_eye_calib.formats.bags.storage import MessageKind
+from hand_eye_calib.formats.bags.unpacking import MessageReader, unpack_poses
 
 ENCODINGS = ("cdr", "ros1")
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
@@ -108,7 +107,7 @@ def test_poses_at_once_whether_their_frames_are_alike_or_not(
         unpack_poses(messages, message_type, encoding == "ros1"), drawn, message_type
     )
     if encoding == "cdr":  # one by one, as the node does
-        read = unpacking.MessageReader(message_type, "poses")
+        read = MessageReader(message_type, "poses")
         stamps, worlds, sensors, *values = zip(*map(read, messages), strict=True)
         table = PoseTable.of(stamps, np.hstack(values), worlds, sensors)
         assert_unpacked(table, drawn, message_type)

@@ -22,9 +22,9 @@ from motions import T_PARENT_CHILD, child_of, wandering_poses
 
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.formats.bags.messages import MessageReader
 from hand_eye_calib.formats.bags.reader import PoseBag
 from hand_eye_calib.formats.bags.sources import source_of
+from hand_eye_calib.formats.bags.unpacking import MessageReader
 from hand_eye_calib.formats.transforms import PoseFields
 from hand_eye_calib.offline.cli.main import main
 from hand_eye_calib.online.live.input import PoseInput

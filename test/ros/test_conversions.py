@@ -15,7 +15,8 @@ from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import turned
 from hand_eye_calib.core.results.context import Comparison
-from hand_eye_calib.formats.bags.messages import MESSAGE_TYPES, MessageReader, ns_of
+from hand_eye_calib.formats.bags.messages import MESSAGE_TYPES, ns_of
+from hand_eye_calib.formats.bags.unpacking import MessageReader
 from hand_eye_calib.online.live.log import NodeLog
 from hand_eye_calib.online.ros import conversions
 from hand_eye_calib.online.ros.markers import to_markers

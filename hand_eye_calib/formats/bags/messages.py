@@ -8,29 +8,20 @@ decode messages of all other types. To support a new type, add a row to ``_ROWS`
 import math
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
+from hand_eye_calib.core.base.arrays import IntArray
 from hand_eye_calib.core.base.config import STAMP_UNITS
 from hand_eye_calib.core.base.errors import (
     ConfigError,
     InputError,
-    NoPoseError,
     printable,
 )
 from hand_eye_calib.core.base.registry import MEASURES
 from hand_eye_calib.core.base.text import frame_name
-from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.frames import are_null
-from hand_eye_calib.core.geometry.rates import RateIntegrator
 from hand_eye_calib.formats.bags.decoding import decoder_of
-from hand_eye_calib.formats.bags.pose_table import PoseTable
 from hand_eye_calib.formats.bags.storage import MessageKind
 from hand_eye_calib.formats.files import LONGEST_NAME
-from hand_eye_calib.formats.geodetic import LocalOrigin
 from hand_eye_calib.formats.transforms import PoseFields
 
 # Types of errors that unpacking raises if the bytes are not a message of the expected type.
@@ -38,9 +29,9 @@ MALFORMED = (struct.error, ValueError)
 
 NS_PER_S = STAMP_UNITS["s"]
 # Number of bytes of a stamp: seconds and nanoseconds.
-_STAMP_SIZE = 8
+STAMP_SIZE = 8
 # Number of bytes of a pose: position and quaternion.
-_POSE_SIZE = struct.calcsize("=7d")
+POSE_SIZE = struct.calcsize("=7d")
 _NO_ROTATION = (math.nan,) * 4
 _NO_VECTOR = (math.nan,) * 3
 
@@ -49,7 +40,7 @@ _NO_VECTOR = (math.nan,) * 3
 
 # Number of bytes before the stamp. In CDR they are the encoding, and values are aligned relative to
 # their end. In ROS 1 they are a sequence number, and values are not aligned.
-_START = struct.calcsize("=I")
+START = struct.calcsize("=I")
 # First bytes of a message in plain CDR, little endian.
 _CDR = b"\x00\x01"
 
@@ -70,12 +61,12 @@ class Cursor:
             )
         self._data = data
         self._is_ros1 = is_ros1
-        self.position = _START
+        self.position = START
 
     def read(self, format_: str) -> tuple[Any, ...]:
         """Read numbers; ``format_`` is a format of ``struct`` with numbers of the same size."""
         if not self._is_ros1:
-            self.position += (_START - self.position) % struct.calcsize(format_[-1])
+            self.position += (START - self.position) % struct.calcsize(format_[-1])
         values = struct.unpack_from(f"<{format_}", self._data, self.position)
         self.position += struct.calcsize(f"={format_}")
         return values
@@ -107,7 +98,7 @@ class Cursor:
         return printable(frame_name(str(self._data[start:end], "utf-8")))
 
 
-def _pose(cursor: Cursor) -> Sequence[float]:
+def unpack_pose(cursor: Cursor) -> Sequence[float]:
     """Read a position x y z (m) and a quaternion xyzw."""
     return cursor.read("7d")
 
@@ -130,7 +121,7 @@ def _imu(cursor: Cursor) -> Sequence[float]:
     return rates + orientation
 
 
-def _fix(cursor: Cursor) -> Sequence[float]:
+def unpack_fix(cursor: Cursor) -> Sequence[float]:
     """Read latitude, longitude (deg) and height (m) of a NavSatFix message; NaN without a fix."""
     (status,) = cursor.read("b")
     cursor.read("H")  # services
@@ -164,9 +155,9 @@ class MessageType(NamedTuple):
     fields: str = ""
 
 
-# Columns of each quantity in the values of :func:`_pose`, :func:`_point`, :func:`_imu` and
-# :func:`_fix`. Latitude, longitude and height are read as positions.
-_COLUMNS = {
+# Columns of each quantity in the values of :func:`unpack_pose`, :func:`_point`, :func:`_imu` and
+# :func:`unpack_fix`. Latitude, longitude and height are read as positions.
+COLUMNS = {
     "poses": slice(7),
     "positions": slice(3),
     "rotations": slice(3, 7),
@@ -252,15 +243,18 @@ _FIELDS = {
 }
 # All types, the most frequent first.
 _ROWS = [
-    MessageType("nav_msgs/msg/Odometry", _OF_POSES, _pose, has_child_frame=True),
-    MessageType("geometry_msgs/msg/PoseStamped", _OF_POSES, _pose),
-    MessageType("geometry_msgs/msg/PoseWithCovarianceStamped", _OF_POSES, _pose),
+    MessageType("nav_msgs/msg/Odometry", _OF_POSES, unpack_pose, has_child_frame=True),
+    MessageType("geometry_msgs/msg/PoseStamped", _OF_POSES, unpack_pose),
+    MessageType("geometry_msgs/msg/PoseWithCovarianceStamped", _OF_POSES, unpack_pose),
     MessageType(
-        "geometry_msgs/msg/TransformStamped", _OF_POSES, _pose, has_child_frame=True
+        "geometry_msgs/msg/TransformStamped",
+        _OF_POSES,
+        unpack_pose,
+        has_child_frame=True,
     ),
     MessageType(PATH_TYPE, _OF_POSES),
     MessageType("sensor_msgs/msg/Imu", ("rates", "rotations"), _imu),
-    MessageType("sensor_msgs/msg/NavSatFix", _OF_POINTS, _fix),
+    MessageType("sensor_msgs/msg/NavSatFix", _OF_POINTS, unpack_fix),
     MessageType("geometry_msgs/msg/PointStamped", _OF_POINTS, _point),
 ]
 for _name, _fields in _FIELDS.items():
@@ -271,9 +265,9 @@ _ROWS.append(MessageType(JOINTS_TYPE, ("wheels", "steering", "tricycle")))
 
 MESSAGE_TYPES = {row.name: row for row in _ROWS}
 #: Types with a complete pose in each message, which is unpacked from the bytes.
-POSE_TYPES = tuple(row.name for row in _ROWS if row.unpack is _pose)
+POSE_TYPES = tuple(row.name for row in _ROWS if row.unpack is unpack_pose)
 #: Types whose header contains the sensor's frame, not a world frame.
-SENSOR_TYPES = tuple(row.name for row in _ROWS if row.unpack in (_imu, _fix))
+SENSOR_TYPES = tuple(row.name for row in _ROWS if row.unpack in (_imu, unpack_fix))
 #: Types with a complete pose in each message, whose fields a library decodes.
 FIELD_POSE_TYPES = tuple(
     name for name, fields in _FIELDS.items() if "qw=" in fields or "roll" in fields
@@ -396,240 +390,3 @@ class Run(NamedTuple):
             f"{self.kind.topic}: a message of type {self.kind.type} cannot be "
             f"read ({error}); the bag is damaged: record it again"
         )
-
-
-# ---- messages that are unpacked from their bytes
-
-
-class _Unpacked(NamedTuple):
-    """Fields of a message. ``end`` is the number of bytes up to the end of the values."""
-
-    stamp_ns: int
-    world_frame: str
-    sensor_frame: str | None
-    values: Sequence[float]
-    end: int
-
-
-class _Frames(NamedTuple):
-    """Frames of a pose in CDR.
-
-    Attributes
-    ----------
-    data : bytes
-        Bytes of the message between its stamp and its pose, which contain the names of the frames.
-    end : int
-        Number of bytes of the message before the pose.
-    world_frame, sensor_frame : str
-    """
-
-    data: bytes
-    end: int
-    world_frame: str
-    sensor_frame: str | None
-
-
-def _unpack(row: MessageType, is_ros1: bool, data: bytes) -> _Unpacked:
-    """Unpack one message; raise an error of ``MALFORMED`` if it is not of the type of the row."""
-    cursor = Cursor(data, is_ros1)
-    stamp_ns = cursor.stamp_ns()
-    world_frame = cursor.name()
-    sensor_frame = cursor.name() if row.has_child_frame else None
-    values = row.unpack(cursor) if row.unpack else ()
-    return _Unpacked(stamp_ns, world_frame, sensor_frame, values, cursor.position)
-
-
-def unpack_poses(
-    messages: Sequence[bytes], message_type: str, is_ros1: bool
-) -> PoseTable:
-    """Unpack messages of a type in MESSAGE_TYPES.
-
-    Raises an error of ``MALFORMED`` if a message is not of this type. Poses with equal frames are
-    unpacked together, which takes less time.
-    """
-    row = MESSAGE_TYPES[message_type]
-    if row.unpack is _pose and len(messages) > 1:
-        table = _unpack_alike(messages, row, is_ros1)
-        if table is not None:
-            return table
-    unpacked = [_unpack(row, is_ros1, data) for data in messages]
-    stamps_ns, worlds, sensors, values, _ = zip(*unpacked, strict=True)
-    return PoseTable.of(stamps_ns, values, worlds, sensors)
-
-
-def _unpack_alike(
-    messages: Sequence[bytes], row: MessageType, is_ros1: bool
-) -> PoseTable | None:
-    """Unpack poses together, as columns of the bytes of all messages.
-
-    Return None if the messages differ in length or in frames, or if a stamp is invalid. They must
-    then be unpacked one by one.
-    """
-    size = len(messages[0])
-    if any(len(data) != size for data in messages):
-        return None
-    first = _unpack(row, is_ros1, messages[0])
-    rows = np.frombuffer(b"".join(messages), dtype=np.uint8).reshape(-1, size)
-    encodings = rows[:, :2]
-    # In CDR these bytes are the encoding, which must be the same. In ROS 1 they belong to the
-    # sequence number.
-    has_same_encoding = is_ros1 or (encodings == encodings[0]).all()
-    frames = rows[:, _START + _STAMP_SIZE : first.end - _POSE_SIZE]
-    stamps = np.ascontiguousarray(rows[:, _START : _START + _STAMP_SIZE])
-    seconds, nanoseconds = stamps.view("<u4" if is_ros1 else "<i4").T.astype(np.int64)
-    are_stamps = (nanoseconds // NS_PER_S == 0).all()
-    has_same_frames = (frames == frames[0]).all()
-    if not (has_same_encoding and are_stamps and has_same_frames):
-        return None
-    poses = np.ascontiguousarray(rows[:, first.end - _POSE_SIZE : first.end]).view(
-        "<f8"
-    )
-    stamps_ns = seconds * NS_PER_S + nanoseconds
-    return PoseTable.of(stamps_ns, poses, first.world_frame, first.sensor_frame)
-
-
-# ---- quantities in the messages of a topic
-
-
-class MessageReader:
-    """Reader of the messages of one topic, in their order, as poses.
-
-    Angular rates are integrated to orientations. If the messages contain no orientation, the poses
-    have the identity as a placeholder; if they contain no position, the poses are at the origin.
-
-    Parameters
-    ----------
-    message_type : str
-    measures : str
-        Quantity to read, see :func:`measured_as`.
-    origin : LocalOrigin, optional
-        Point from which latitudes and longitudes are converted to metres; by default, the first
-        position.
-
-    Attributes
-    ----------
-    n_left_out : int
-        Number of messages without the quantity: null poses, no fix, no orientation.
-    """
-
-    def __init__(
-        self, message_type: str, measures: str, origin: LocalOrigin | None = None
-    ) -> None:
-        self._row = MESSAGE_TYPES[message_type]
-        self._measures = MEASURES[measures].read_as or measures
-        self._are_poses = message_type in POSE_TYPES and self._measures == "poses"
-        self._rates = RateIntegrator()
-        # Frames of the previous pose. The first value differs from the bytes of every message.
-        self._frames = _Frames(data=b" ", end=0, world_frame="", sensor_frame=None)
-        self._origin = origin or LocalOrigin()
-        self.n_left_out = 0
-
-    def columns(
-        self, messages: Sequence[bytes], is_ros1: bool
-    ) -> tuple[PoseTable, BoolArray]:
-        """Unpack the next messages.
-
-        Returns
-        -------
-        PoseTable
-        (N,) bool array
-            True for messages that contain the quantity. The poses of other messages are NaN, or as
-            the message contains them.
-
-        Raises
-        ------
-        struct.error, ValueError
-            If a message is not of its type.
-        InputError
-            If a latitude or longitude is out of range.
-        """
-        columns = unpack_poses(messages, self._row.name, is_ros1)
-        if self._are_poses:
-            is_null = are_null(columns.poses)
-            self.n_left_out += int(is_null.sum())
-            return columns, ~is_null
-        values = columns.poses[:, _COLUMNS[self._measures]]
-        is_usable = np.asarray(np.isfinite(values).all(axis=1), dtype=bool)
-        if self._measures == "rotations":
-            is_usable &= (values != 0.0).any(axis=1)
-        self.n_left_out += int((~is_usable).sum())
-        poses = np.tile([0.0] * 6 + [1.0], (len(values), 1))  # placeholders
-        if is_usable.any():
-            target = _COLUMNS[
-                "positions" if self._measures == "positions" else "rotations"
-            ]
-            measured = self._measured(columns.stamps_ns[is_usable], values[is_usable])
-            poses[is_usable, target] = measured
-        poses[~is_usable] = np.nan
-        if self._row.name not in SENSOR_TYPES:
-            return replace(columns, poses=poses), is_usable
-        return PoseTable.of(
-            columns.stamps_ns, poses, "", columns.world_frames
-        ), is_usable
-
-    def _measured(self, stamps_ns: IntArray, values: FloatArray) -> FloatArray:
-        """Return positions (N, 3), m, or quaternions (N, 4) from the values of N messages.
-
-        Rates are integrated; latitude, longitude (deg) and height become metres.
-        """
-        if self._measures == "rates":
-            return se3.to_quat_xyzw(self._rates.rotations(stamps_ns, values))
-        if self._row.unpack is not _fix:
-            return values
-        out_of_range = values[(np.abs(values[:, :2]) > (90, 360)).any(axis=1)]
-        if len(out_of_range):
-            raise InputError(
-                "found latitude {:.7g} and longitude {:.7g}; the limits are "
-                "90 deg and 360 deg. If both are swapped, repair their source".format(
-                    *out_of_range[0]
-                )
-            )
-        lat, lon = np.radians(values[:, :2]).T
-        return self._origin.local(lat, lon, values[:, 2])
-
-    def _pose_fields(self, data: bytes) -> PoseFields:
-        """Unpack a pose in CDR.
-
-        To save time, names of frames are decoded only if their bytes differ from those of the
-        previous pose.
-        """
-        start = _START + _STAMP_SIZE
-        if data[start : self._frames.end] != self._frames.data:
-            unpacked = _unpack(self._row, False, data)
-            end = unpacked.end - _POSE_SIZE
-            self._frames = _Frames(
-                data[start:end], end, unpacked.world_frame, unpacked.sensor_frame
-            )
-        frames = self._frames
-        pose = struct.unpack_from("<7d", data, frames.end)
-        stamp_ns = Cursor(data, False).stamp_ns()
-        return PoseFields(
-            stamp_ns, frames.world_frame, frames.sensor_frame, pose[:3], pose[3:]
-        )
-
-    def __call__(self, data: bytes) -> PoseFields:
-        """Unpack the next message, in CDR.
-
-        Raises
-        ------
-        NoPoseError
-            If the message does not contain the quantity.
-        InputError
-            If the message cannot be unpacked.
-        """
-        try:
-            if self._are_poses:
-                return self._pose_fields(data)
-            columns, is_usable = self.columns([data], is_ros1=False)
-        except InputError:
-            raise
-        except MALFORMED as error:
-            raise InputError(
-                f"not a message of type {self._row.name}: {error}"
-            ) from error
-        if not is_usable.all():
-            raise NoPoseError(f"the message has no {self._measures}")
-        pose = columns.poses[0].tolist()
-        world = columns.world_frames[0]
-        sensor = columns.sensor_frames[0]
-        return PoseFields(int(columns.stamps_ns[0]), world, sensor, pose[:3], pose[3:])

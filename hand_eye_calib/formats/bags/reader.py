@@ -17,7 +17,7 @@ from hand_eye_calib.core.base.option import did_you_mean
 from hand_eye_calib.core.base.registry import BAG_READINGS
 from hand_eye_calib.core.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.core.geometry.trajectory import Trajectory
-from hand_eye_calib.formats.bags import messages, roles, sources
+from hand_eye_calib.formats.bags import messages, roles, sources, unpacking
 from hand_eye_calib.formats.bags.choice import TopicInfo, choose
 from hand_eye_calib.formats.bags.folders import losses_of, open_bags
 from hand_eye_calib.formats.bags.messages import Run
@@ -303,7 +303,7 @@ class PoseBag:
         if run is None:
             return ""
         try:
-            table = messages.unpack_poses(run.messages[:1], type_, run.kind.is_ros1)
+            table = unpacking.unpack_poses(run.messages[:1], type_, run.kind.is_ros1)
         except messages.MALFORMED as error:
             raise run.unreadable(error) from error
         if type_ in messages.SENSOR_TYPES:

@@ -29,7 +29,7 @@ from hand_eye_calib.core.base.errors import (
 from hand_eye_calib.core.base.text import frame_name, without_poses
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import are_null
-from hand_eye_calib.formats.bags import messages
+from hand_eye_calib.formats.bags import messages, unpacking
 from hand_eye_calib.formats.bags.pose_table import PoseTable
 from hand_eye_calib.formats.trajectory_files.columns import TWIST
 from hand_eye_calib.formats.trajectory_files.poses import poses_of
@@ -158,7 +158,7 @@ class TopicReading(Reading):
     ) -> None:
         super().__init__(stream, topic)
         self._measures = measures
-        self._reader = messages.MessageReader(message_type, measures)
+        self._reader = unpacking.MessageReader(message_type, measures)
         self._tables = [_NO_POSES]
 
     def take(self, run: messages.Run) -> None:

@@ -16,7 +16,7 @@ from hand_eye_calib.core.base.config import POSE_TYPES, CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError, InputError, NoPoseError
 from hand_eye_calib.core.base.registry import LIVE_READINGS
 from hand_eye_calib.core.base.text import counted, listing
-from hand_eye_calib.formats.bags import messages
+from hand_eye_calib.formats.bags import messages, unpacking
 from hand_eye_calib.formats.transforms import PoseFields, TfSource, TfStream
 from hand_eye_calib.online.live.input import PoseInput, with_stamp
 from hand_eye_calib.online.live.log import NodeLog
@@ -176,7 +176,7 @@ class TopicInput(RosInput):
             self._read = LIVE_READINGS[type_name](self.topic, measures)
         else:
             origin = self._session.origin(self.name)
-            self._read = messages.MessageReader(type_name, measures, origin)
+            self._read = unpacking.MessageReader(type_name, measures, origin)
         # rclpy passes the information about a message to any callback with two arguments. The
         # annotations of rclpy do not allow such a callback, hence Any.
         callback: Any = self._receive
