@@ -25,6 +25,7 @@ NOETIC.register(
 TF = "tf2_msgs/msg/TFMessage"
 PATH = "nav_msgs/msg/Path"
 ODOMETRY = "nav_msgs/msg/Odometry"
+POINTS = "sensor_msgs/msg/PointCloud2"
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 STORAGES = ("mcap", "sqlite3", "rosbag1")
 
@@ -179,6 +180,27 @@ def fix(status, latitude=60.0, longitude=25.0, altitude=30.0, stamp_ns=12_000_00
         position_covariance_type=0,
     )
     return bytes(JAZZY.serialize_cdr(message, message.__msgtype__))
+
+
+def cloud_message(typestore, stamp_ns, points, frame, names="xyz"):
+    """A PointCloud2 of points (N, 3)."""
+    field = typestore.types["sensor_msgs/msg/PointField"]
+    fields = [
+        field(name=name, offset=4 * at, datatype=7, count=1)
+        for at, name in enumerate(names)
+    ]
+    rows = np.ascontiguousarray(points, dtype="<f4")
+    return typestore.types[POINTS](
+        header=header(typestore, stamp_ns, frame),
+        height=1,
+        width=len(rows),
+        fields=fields,
+        is_bigendian=False,
+        point_step=12,
+        row_step=12 * len(rows),
+        data=rows.view(np.uint8).ravel(),
+        is_dense=True,
+    )
 
 
 def write_messages(path, messages, storage="mcap"):

@@ -11,6 +11,7 @@ EXTRAS = (
     "rig",  # three sensors or more
     "sensors",  # lidar scans, images of a target, files of other programs
     "ground",  # z, roll and pitch of machines on a flat floor
+    "clouds",  # clouds of both lidars in the report, merged through the result
     "vehicle",  # a sensor in the frame of its vehicle, and the wheels
     "simulation",  # drives with known truth, and the demo
 )

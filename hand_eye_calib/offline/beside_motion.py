@@ -19,7 +19,7 @@ def switched_off(values: Mapping[str, Any]) -> list[str]:
 def with_measurements(
     snapshot: "Snapshot", paths: Sequence[Path], without: Collection[str] = ()
 ) -> "tuple[Snapshot, list[str]]":
-    """Add the measurements beside motion that a bag has.
+    """Add the measurements beside motion that a bag has, and the paths of the bag.
 
     Parameters
     ----------
@@ -44,4 +44,5 @@ def with_measurements(
         found, remarks = source.find(paths, snapshot)
         measurements += found
         notes += remarks
-    return replace(snapshot, beside_motion=tuple(measurements)), notes
+    measured = replace(snapshot, beside_motion=tuple(measurements), bags=tuple(paths))
+    return measured, notes

@@ -7,7 +7,15 @@ from functools import cache, partial
 
 import numpy as np
 import pytest
-from bag_making import JAZZY, ODOMETRY, header, pose_message, write_messages
+from bag_making import (
+    JAZZY,
+    ODOMETRY,
+    POINTS,
+    cloud_message,
+    header,
+    pose_message,
+    write_messages,
+)
 from ground_making import ELEVATIONS, START_NS, Machine
 from published_data import data_folder
 
@@ -23,7 +31,6 @@ from hand_eye_calib.formats.bags.points import rows_of_points
 from hand_eye_calib.formats.bags.reader import PoseBag
 from hand_eye_calib.offline.cli.main import main
 
-POINTS = "sensor_msgs/msg/PointCloud2"
 IMU = "sensor_msgs/msg/Imu"
 # Targets of the ground: z (m), roll and pitch (rad).
 Z_M = 0.02
@@ -235,26 +242,6 @@ def test_arguments_of_a_wrong_type_are_an_error():
 
 
 # ------------------------------------------------------------------- bags
-
-
-def cloud_message(typestore, stamp_ns, points, frame, names="xyz"):
-    field = typestore.types["sensor_msgs/msg/PointField"]
-    fields = [
-        field(name=name, offset=4 * at, datatype=7, count=1)
-        for at, name in enumerate(names)
-    ]
-    rows = np.ascontiguousarray(points, dtype="<f4")
-    return typestore.types[POINTS](
-        header=header(typestore, stamp_ns, frame),
-        height=1,
-        width=len(rows),
-        fields=fields,
-        is_bigendian=False,
-        point_step=12,
-        row_step=12 * len(rows),
-        data=rows.view(np.uint8).ravel(),
-        is_dense=True,
-    )
 
 
 def layout(names, formats, offsets, itemsize):

@@ -18,7 +18,12 @@ ROS_LIBRARIES = [f"{name}_msgs" for name in MESSAGES]
 ROS_LIBRARIES += ["rclpy", "rcl_interfaces", "builtin_interfaces", "rosidl_runtime_py"]
 ROS_LIBRARIES += ["std_srvs", "tf2_ros", "visualization_msgs"]
 ROS = ("online/ros/", "extras/simulation/player.py")
-PAGES = ("offline/report/", "extras/fleet/batch_page.py", "extras/mount/fleet_page.py")
+PAGES = (
+    "offline/report/",
+    "extras/clouds/figure.py",
+    "extras/fleet/batch_page.py",
+    "extras/mount/fleet_page.py",
+)
 CONFINED = dict.fromkeys(ROS_LIBRARIES, ROS) | {
     "rosbags": ("formats/bags/",),
     "mcap": ("formats/bags/",),

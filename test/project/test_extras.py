@@ -43,6 +43,7 @@ if sys.argv[3:]:
 # What needs an extra, and the one line that says so without it.
 SAMPLE = ["sample:lidar.tum", "sample:camera.tum"]
 NEEDING = {
+    "clouds": ([], ""),
     "detectability": ([], ""),
     "fleet": (["compare", "out"], "invalid choice: 'compare'"),
     "ground": (["calibrate", *SAMPLE, "--ground", "off"], "unknown '--ground'"),

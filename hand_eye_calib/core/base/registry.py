@@ -186,8 +186,13 @@ BAG_READINGS: Registry[Callable[..., Any]] = Registry("kind of messages")
 #: ``PoseFields``.
 LIVE_READINGS: Registry[Callable[[str, str], Any]] = Registry("kind of live messages")
 
-#: Functions that return a module that detects targets in the images of a folder.
+#: Functions that return a module for images of a target: "folder" detects targets in the images of
+#: a folder, and "corners" draws the corners of the target on the images.
 TARGET_IMAGES: Registry[Callable[[], Any]] = Registry("reader of images of a target")
+
+#: Functions ``draw(calibration, snapshot)`` that return further figures of the report, a list of
+#: ``Drawn`` of ``offline/report/style.py``.
+REPORT_PICTURES: Registry[Callable[[Any, Any], Any]] = Registry("picture of the report")
 
 #: Functions ``read(path, content, options)`` that read trajectory files of other programs. They
 #: return None for a file of another format.

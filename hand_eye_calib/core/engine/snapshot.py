@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -64,6 +65,8 @@ class Snapshot:
     beside_motion : tuple
         Measurements of the extrinsic beside motion. Each has a method ``joined(calibration,
         snapshot)``, which returns the calibration joined with the measurement.
+    bags : tuple of Path
+        Bags that contain the streams, for pictures of the report; empty for other sources.
     """
 
     config: CalibratorConfig
@@ -76,6 +79,7 @@ class Snapshot:
     warnings: tuple[str, ...] = ()
     time_offset: TimeOffset | None = None
     beside_motion: tuple[Any, ...] = ()
+    bags: tuple[Path, ...] = ()
 
     @property
     def parent_frame(self) -> str:

@@ -1,7 +1,6 @@
 """Read the verticals of both sensors from a bag: from clouds of a lidar or IMU data."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import InputError, NotEnoughDataError
-from hand_eye_calib.core.base.text import frame_name, listing
+from hand_eye_calib.core.base.text import listing
 from hand_eye_calib.core.geometry.frames import StreamFrames
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.extras.ground.joining import VerticalPair
@@ -21,7 +20,7 @@ from hand_eye_calib.extras.ground.tracks import (
     ground_from_clouds,
 )
 from hand_eye_calib.formats.bags.messages import POINTS_TYPE, ns_of
-from hand_eye_calib.formats.bags.points import rows_of_points
+from hand_eye_calib.formats.bags.points import rows_of_points, topics_and_frames
 from hand_eye_calib.formats.bags.reader import PoseBag
 
 _IMU = "sensor_msgs/msg/Imu"
@@ -94,14 +93,8 @@ def vertical_topics(bag: PoseBag) -> dict[str, tuple[str, str]]:
     """
     found: dict[str, tuple[str, str]] = {}
     for message_type, quantity in _QUANTITIES.items():
-        topics = [topic for topic in bag.topics.values() if topic.type == message_type]
-        for topic in sorted(topics, key=lambda topic: -topic.count):
-            run = next(bag.runs([topic.name]), None)
-            if run is None:
-                continue
-            with suppress(InputError):  # a damaged message
-                message = next(run._replace(messages=run.messages[:1]).decoded())
-                found[topic.name] = quantity, frame_name(message.header.frame_id)
+        for topic, frame in topics_and_frames(bag, message_type):
+            found[topic] = quantity, frame
     return found
 
 

@@ -24,26 +24,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
-from hand_eye_calib.core.base.config import STAMP_UNITS
 from hand_eye_calib.core.base.errors import InputError, printable, required
 from hand_eye_calib.core.base.text import frame_name
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.formats.bags.messages import Run, ns_of
-from hand_eye_calib.formats.bags.points import rows_of_points
+from hand_eye_calib.formats.bags.points import rows_of_points, times_of_points
 from hand_eye_calib.formats.bags.pose_table import PoseTable
 from hand_eye_calib.formats.bags.sources import Reading
 from hand_eye_calib.formats.npz import read_arrays
-
-# Names that drivers use for the time of a point.
-_TIME_FIELDS = (
-    "t",
-    "time",
-    "timestamp",
-    "time_stamp",
-    "offset_time",
-    "timeOffset",
-    "ts",
-)
 
 
 class Step(NamedTuple):
@@ -71,9 +59,6 @@ class Step(NamedTuple):
 class Tuning:
     """Constants of the registration."""
 
-    # Longest duration of a scan (ns). Messages do not state the unit of the times of points. The
-    # largest unit is assumed in which no scan is longer.
-    longest_ns: float = 1e9
     # Smallest and largest range that is used (m). Nearer points are on the robot itself, farther
     # points are too sparse.
     ranges_m: tuple[float, float] = (1.0, 80.0)
@@ -158,23 +143,7 @@ def scan_of(message: Any) -> Scan:
     elevations = np.arccos(-points[:, 2] / ranges[used])
     half_degrees = np.degrees(2 * elevations)
     rings = np.round(half_degrees).astype(int)
-    times = np.zeros(len(used))
-    time_field = next((name for name in _TIME_FIELDS if name in rows.dtype.names), "")
-    if time_field:
-        times = rows[time_field][used].astype(float)
-    first = times.min() if len(times) else 0.0
-    last = times.max() if len(times) else 0.0
-    duration = last - first
-    units_ns = [
-        ns for ns in STAMP_UNITS.values() if 0 < duration * ns <= TUNING.longest_ns
-    ]
-    unit_ns = max(units_ns, default=0)
-    middle = (first + last) / 2
-    stamp_ns = round(float(middle) * unit_ns)
-    if stamp_ns <= TUNING.longest_ns:
-        # The times of the points are relative to the stamp in the header.
-        stamp_ns += ns_of(message.header.stamp) or 0
-    times_s = (times - middle) * unit_ns * 1e-9
+    times_s, stamp_ns = times_of_points(rows[used], ns_of(message.header.stamp) or 0)
     frame = printable(frame_name(message.header.frame_id))
     return Scan(points, rings, times_s, stamp_ns, frame)
 

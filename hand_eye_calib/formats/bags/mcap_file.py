@@ -17,6 +17,7 @@ from hand_eye_calib.formats import files
 from hand_eye_calib.formats.bags.storage import (
     Message,
     MessageKind,
+    Span,
     Storage,
     kind_of,
     reason_of,
@@ -122,13 +123,21 @@ class McapFile(Storage):
                 f"{self.losses[0]}, and no message before can be read"
             ) from reason
 
-    def _messages(self, kinds: Mapping[int, MessageKind]) -> Iterable[Message]:
+    def _messages(
+        self, kinds: Mapping[int, MessageKind], span_ns: Span
+    ) -> Iterable[Message]:
         if not self._chunks:
             # Opening the file has added the damage to `losses` already, so pass another list.
             for record in self._records([]):
                 if isinstance(record, records.Message) and record.channel_id in kinds:
                     yield kinds[record.channel_id], record.log_time, record.data
+        start_ns, stop_ns = span_ns
         for index in self._chunks:
+            is_outside = (
+                index.message_end_time < start_ns or index.message_start_time >= stop_ns
+            )
+            if is_outside:
+                continue
             channels = index.message_index_offsets
             # Skip chunks without messages of these kinds. A chunk may have no index of channels.
             if not channels or kinds.keys() & channels.keys():

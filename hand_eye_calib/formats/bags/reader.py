@@ -23,7 +23,7 @@ from hand_eye_calib.formats.bags.folders import losses_of, open_bags
 from hand_eye_calib.formats.bags.messages import Run
 from hand_eye_calib.formats.bags.pose_table import PoseTable
 from hand_eye_calib.formats.bags.sources import Reading, Source
-from hand_eye_calib.formats.bags.storage import MessageKind
+from hand_eye_calib.formats.bags.storage import ALWAYS, MessageKind, Span
 from hand_eye_calib.formats.transforms import TfSource, TfStream
 
 
@@ -490,17 +490,20 @@ class PoseBag:
 
     # ---- messages
 
-    def runs(self, topics: Collection[str]) -> Iterator[Run]:
+    def runs(self, topics: Collection[str], span_ns: Span = ALWAYS) -> Iterator[Run]:
         """Iterate over the messages of some topics in the order of bag time, in runs of one kind.
 
         A run has the messages of one kind in a block of a file. Files that were recorded at the
-        same time are read one after the other.
+        same time are read one after the other. Only messages whose bag time (ns) is in ``span_ns``
+        are read.
         """
+        start_ns, stop_ns = span_ns
         for storage in self._storages:
-            for block in storage.blocks(topics):
+            for block in storage.blocks(topics, span_ns):
                 rows_of = defaultdict[MessageKind, list[tuple[int, bytes]]](list)
                 for kind, bag_ns, data in block:
-                    rows_of[kind].append((bag_ns, data))
+                    if start_ns <= bag_ns < stop_ns:
+                        rows_of[kind].append((bag_ns, data))
                 for kind, rows in rows_of.items():
                     times_ns = _bag_times([bag_ns for bag_ns, _ in rows])
                     yield Run(kind, [data for _, data in rows], times_ns)

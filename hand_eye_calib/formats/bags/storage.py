@@ -3,6 +3,7 @@
 rosbags reads the formats sqlite3 (.db3) and rosbag1 (.bag).
 """
 
+import math
 import struct
 import sys
 from abc import ABC, abstractmethod
@@ -63,6 +64,10 @@ class MessageKind(NamedTuple):
 
 # A recorded message: kind, bag time (ns) and bytes.
 Message: TypeAlias = tuple[MessageKind, int, bytes]
+
+# Bag times (ns) from the first, which is included, to the second, which is not.
+Span: TypeAlias = tuple[float, float]
+ALWAYS: Span = (-math.inf, math.inf)
 
 
 @lru_cache
@@ -127,18 +132,23 @@ class Storage(ABC):
     def _open(self, opened: ExitStack) -> None: ...
 
     @abstractmethod
-    def _messages(self, kinds: Mapping[int, MessageKind]) -> Iterable[Message]: ...
+    def _messages(
+        self, kinds: Mapping[int, MessageKind], span_ns: Span
+    ) -> Iterable[Message]:
+        """Yield the messages of some kinds; those outside a span of bag times may be skipped."""
 
-    def blocks(self, topics: Collection[str]) -> Iterator[list[Message]]:
+    def blocks(
+        self, topics: Collection[str], span_ns: Span = ALWAYS
+    ) -> Iterator[list[Message]]:
         """Iterate over blocks of messages of some topics in the order of bag time.
 
         If chunks of an mcap file overlap in time, their messages are in order only within each
-        chunk.
+        chunk. Messages outside ``span_ns`` may be missing.
         """
         kinds = {key: kind for key, kind in self._kinds.items() if kind.topic in topics}
         if not kinds:
             return
-        blocks = message_blocks(self._messages(kinds))
+        blocks = message_blocks(self._messages(kinds, span_ns))
         while True:
             with self._guarded():
                 block = next(blocks, None)
@@ -210,19 +220,26 @@ class RosbagsFile(Storage):
         if reader.message_count:
             self.span_ns = reader.start_time, reader.end_time - 1
 
-    def _messages(self, kinds: Mapping[int, MessageKind]) -> Iterable[Message]:
+    def _messages(
+        self, kinds: Mapping[int, MessageKind], span_ns: Span
+    ) -> Iterable[Message]:
         if self._file.suffix == ".bag":
-            yield from self._rosbag1_messages(kinds)
+            yield from self._rosbag1_messages(kinds, span_ns)
             return
         wanted = [
             connection
             for connection in self._reader.connections
             if connection.id in kinds
         ]
-        for connection, bag_ns, data in self._reader.messages(wanted):
+        start_ns, stop_ns = (None, None) if span_ns == ALWAYS else span_ns
+        for connection, bag_ns, data in self._reader.messages(
+            wanted, start_ns, stop_ns
+        ):
             yield kinds[connection.id], bag_ns, data
 
-    def _rosbag1_messages(self, kinds: Mapping[int, MessageKind]) -> Iterator[Message]:
+    def _rosbag1_messages(
+        self, kinds: Mapping[int, MessageKind], span_ns: Span
+    ) -> Iterator[Message]:
         """Iterate over messages of rosbag1 in the order of bag time.
 
         The messages are read at the positions in the library's index. The library's own iteration
@@ -233,6 +250,7 @@ class RosbagsFile(Storage):
             (entry, kind)
             for key, kind in kinds.items()
             for entry in reader.indexes[key]
+            if span_ns[0] <= entry.time < span_ns[1]
         ]
         entries.sort(key=lambda item: item[0].time)
         # Position and unpacked content of the chunk of the previous message.

@@ -290,16 +290,24 @@ def _angles(
 
 
 def _is_upright(poses: FloatArray) -> bool:
-    """Return whether z of a sensor is near the normal of the plane in which it moves.
+    """Return whether z of a sensor with ``poses`` (N, 4, 4) is near its normal of motion."""
+    return upward_normal(poses) is not None
 
-    ``poses`` (N, 4, 4) are those of the sensor in its world. The result is False if the sensor
-    moves in all directions.
+
+def upward_normal(poses: FloatArray) -> FloatArray | None:
+    """Return the normal (3,) of the plane in which a sensor moves, on the side of its z axis.
+
+    ``poses`` (N, 4, 4) are those of the sensor in its world. The result is None if the sensor
+    moves in all directions, or if its z axis is not near the normal.
     """
     variances, axes = np.linalg.eigh(np.cov(se3.translation_of(poses).T))
-    is_flat = variances[0] <= _MAX_FLAT * variances[1]
+    normal = axes[:, 0]
     # Cosine between the normal of the plane and z of the sensor.
-    cosine = float(np.mean(poses[:, :3, 2] @ axes[:, 0]))
-    return bool(is_flat and abs(cosine) > _MIN_UPRIGHT)
+    cosine = float(np.mean(poses[:, :3, 2] @ normal))
+    is_flat = variances[0] <= _MAX_FLAT * variances[1]
+    if not is_flat or abs(cosine) <= _MIN_UPRIGHT:
+        return None
+    return np.asarray(np.copysign(1.0, cosine) * normal)
 
 
 def spread_of_position(calibration: Calibration) -> tuple[FloatArray, FloatArray]:

@@ -4,7 +4,7 @@ A caption only states sizes. The verdict has rules of its own.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -100,14 +100,14 @@ def _figure_of_stops(calibration: Calibration) -> Drawn:
     line_m = 0.25 * float(np.median(np.linalg.norm(positions, axis=1)))
     child = calibration.child_frame
     world = calibration.parts["worlds"].child_world_frame
-    figure, panels = make_panels(3.6, 1, 3, bottom=0.85, gap=0.36)
+    figure, panels = make_panels(3.25, 1, 3, gap=0.36)
     for panel, axes in zip(panels, VIEWS, strict=True):
         columns = ["xyz".index(axis) for axis in axes]
         points = positions[:, columns]
         ends = (positions + line_m * directions)[:, columns]
         # (2, 2, N): axis of the view, start or end, stop. So each stop is a line of its own.
-        lines = np.stack([points, ends], axis=1).T
-        panel.plot(*lines, color=MUTED, lw=0.7)
+        directed = np.stack([points, ends], axis=1).T
+        panel.plot(*directed, color=MUTED, lw=0.7)
         panel.plot(
             *points[is_used].T, "o", color=CHILD, ms=3.5, label=plain_label(child)
         )
@@ -116,13 +116,12 @@ def _figure_of_stops(calibration: Calibration) -> Drawn:
         panel.plot(0.0, 0.0, "s", color=PARENT, ms=6, label=plain_label(world))
         panel.set(xlabel=f"{axes[0]} (m)", ylabel=f"{axes[1]} (m)")
         panel.set_aspect("equal", adjustable="datalim")
-    handles = panels[0].get_legend_handles_labels()
-    figure.legend(*handles, loc="lower center", ncols=3, borderaxespad=0)
+    lines, _ = panels[0].get_legend_handles_labels()
     caption = (
         f"Places of {child} at the {len(rows)} stops in the axes of {world}; a line is the viewing "
         f"direction (z of {child}). Good stops view {world} from several sides."
     )
-    return as_drawn(figure, "stops", "The stops", caption)
+    return as_drawn(figure, "stops", "The stops", caption, lines)
 
 
 @page_style()
@@ -150,7 +149,6 @@ def figure_of_streams(view: StreamView, names: tuple[str, str]) -> Drawn:
     curves.set(
         ylabel="speed (m/s)" if is_speed else "angular rate (deg/s)", ylim=(0, None)
     )
-    curves.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderaxespad=0)
     strip.set(ylim=(-0.6, 1.6), xlabel=f"time ({unit})")
     strip.set_yticks([1.0, 0.0], ["parent", "child"])
     strip.tick_params(axis="y", length=0)
@@ -163,7 +161,8 @@ def figure_of_streams(view: StreamView, names: tuple[str, str]) -> Drawn:
         f"{_WHY_EQUAL[view.quantity]} {comparison} The bars below the curves show when there is "
         "data."
     )
-    return as_drawn(figure, "streams", "Both streams before any solve", caption)
+    lines, _ = curves.get_legend_handles_labels()
+    return as_drawn(figure, "streams", "Both streams before any solve", caption, lines)
 
 
 @page_style()
@@ -174,7 +173,7 @@ def _figure_of_paths(calibration: Calibration, evidence: Evidence) -> Drawn:
     # The axis with the least motion is across the plane of motion: z on a vehicle, y for a camera.
     across = int(np.argmin(np.ptp(evidence.parent, axis=0)))
     first, second = (axis for axis in range(3) if axis != across)
-    figure, (plane, side) = make_panels(4.1, 1, 2, bottom=0.85)
+    figure, (plane, side) = make_panels(3.75, 1, 2)
     parent = calibration.parent_frame
     child = calibration.child_frame
     # One sensor has measured its path. The path of the same sensor is also computed from the poses
@@ -208,7 +207,6 @@ def _figure_of_paths(calibration: Calibration, evidence: Evidence) -> Drawn:
     low, high = side.get_ylim()
     if high - low < 0.5:
         side.set_ylim((low + high) / 2 - 0.25, (low + high) / 2 + 0.25)
-    figure.legend(loc="lower center", ncols=3, borderaxespad=0)
     distances_m = np.linalg.norm(evidence.parent - evidence.child, axis=1)
     farthest_s = evidence.times_s[int(np.argmax(distances_m))]
     caption = (
@@ -219,20 +217,22 @@ def _figure_of_paths(calibration: Calibration, evidence: Evidence) -> Drawn:
     )
     if calibration.verdict is not Verdict.DO_NOT_USE:
         caption += " That is mostly drift and jumps of the odometry, not an error of the result."
-    return as_drawn(figure, "trajectories", "Both trajectories, aligned", caption)
+    lines, _ = plane.get_legend_handles_labels()
+    title = "Both trajectories, aligned"
+    return as_drawn(figure, "trajectories", title, caption, lines)
 
 
 def _figure_of_columns(
     evidence: Evidence, labels: Sequence[str], curves: Sequence[_Curve]
-) -> Figure:
+) -> tuple[Figure, list[Any]]:
     """Draw six columns over time: the first three in the left panels, the others in the right.
 
-    ``labels`` are those of the vertical axes.
+    ``labels`` are those of the vertical axes. Return the figure and a line of each curve.
     """
     rows = _downsample(len(evidence.times_s), LOOK.max_coordinate_points)
     factor, unit = _time_axis(evidence.times_s[-1])
     times = evidence.times_s[rows] * factor
-    figure, panels = make_panels(5.4, 3, 2, bottom=0.8, sharex=True)
+    figure, panels = make_panels(5.1, 3, 2, sharex=True)
     for column, label in enumerate(labels):
         panel = panels[2 * (column % 3) + column // 3]
         for curve in curves:
@@ -242,8 +242,8 @@ def _figure_of_columns(
         panel.set_ylabel(label, labelpad=2)
     for panel in panels[-2:]:
         panel.set_xlabel(f"time ({unit})")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="lower center", ncols=3)
-    return figure
+    lines, _ = panels[0].get_legend_handles_labels()
+    return figure, lines
 
 
 @page_style()
@@ -266,7 +266,7 @@ def _figure_of_coordinates(calibration: Calibration, evidence: Evidence) -> Draw
         _Curve(measured, PARENT, 3.2, parent),
         _Curve(computed, CHILD, 1.1, f"{child}, through the result"),
     )
-    figure = _figure_of_columns(evidence, labels, curves)
+    figure, lines = _figure_of_columns(evidence, labels, curves)
     distances_m = np.linalg.norm(evidence.child - evidence.parent, axis=1)
     angles_rad = np.linalg.norm(evidence.angles[1] - evidence.angles[0], axis=1)
     caption = (
@@ -275,7 +275,8 @@ def _figure_of_coordinates(calibration: Calibration, evidence: Evidence) -> Draw
         f"the time, both poses differ by less than {length(float(np.median(distances_m)))} and "
         f"{angle(float(np.median(angles_rad)))}. That includes drift."
     )
-    return as_drawn(figure, "coordinates", "Both streams over time, aligned", caption)
+    title = "Both streams over time, aligned"
+    return as_drawn(figure, "coordinates", title, caption, lines)
 
 
 @page_style()
@@ -302,7 +303,7 @@ def _figure_of_positions(
         _Curve(np.hstack([nothing, before]), MUTED, 1.0, "without lever arm"),
         _Curve(np.hstack([nothing, after]), CHILD, 1.2, "with the result"),
     )
-    figure = _figure_of_columns(evidence, labels, curves)
+    figure, lines = _figure_of_columns(evidence, labels, curves)
     before_m = length(float(np.median(np.linalg.norm(before, axis=1))))
     after_m = length(float(np.median(np.linalg.norm(after, axis=1))))
     caption = (
@@ -310,9 +311,8 @@ def _figure_of_positions(
         f"of {other}, less the measured ones. Half of the time, they differ by less than {after_m} "
         f"with the result, and by less than {before_m} without a lever arm. That includes drift."
     )
-    return as_drawn(
-        figure, "coordinates", "Positions over time, before and after", caption
-    )
+    title = "Positions over time, before and after"
+    return as_drawn(figure, "coordinates", title, caption, lines)
 
 
 @page_style()
@@ -338,17 +338,14 @@ def _figure_of_residuals(calibration: Calibration, residuals: Residuals) -> Draw
         factor, unit = _time_axis(float(times_s.max()))
         times = times_s * factor
         label = f"time ({unit})"
-    figure, panels = make_panels(
-        1.2 + 1.6 * len(sizes), len(sizes), 1, bottom=0.8, sharex=True
-    )
+    figure, panels = make_panels(0.9 + 1.6 * len(sizes), len(sizes), 1, sharex=True)
     for panel, (axis, values) in zip(panels, sizes.items(), strict=True):
         to_unit, unit_label = UNITS[axis]
         # A logarithmic axis needs positive values.
         _draw_residuals(panel, times, np.maximum(values * to_unit, 1e-5), is_out)
         panel.set_ylabel(unit_label)
     panels[-1].set_xlabel(label)
-    handles = panels[0].get_legend_handles_labels()
-    figure.legend(*handles, loc="lower center", ncols=3, borderaxespad=0)
+    lines, _ = panels[0].get_legend_handles_labels()
     medians = [amount(axis, float(np.median(values))) for axis, values in sizes.items()]
     largest = [amount(axis, float(np.max(values))) for axis, values in sizes.items()]
     rejected = (
@@ -358,7 +355,7 @@ def _figure_of_residuals(calibration: Calibration, residuals: Residuals) -> Draw
         f"Half of the {len(residuals):,} {items} agree with the result to {listing(medians)}, all "
         f"of them to {listing(largest)}. {rejected} of them are rejected as outliers."
     )
-    return as_drawn(figure, "residuals", "Residuals", caption)
+    return as_drawn(figure, "residuals", "Residuals", caption, lines)
 
 
 def _draw_residuals(

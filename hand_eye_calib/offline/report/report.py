@@ -15,6 +15,7 @@ from hand_eye_calib.core.base import text
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import printable
 from hand_eye_calib.core.base.plain import Document
+from hand_eye_calib.core.base.registry import REPORT_PICTURES
 from hand_eye_calib.core.base.spelling import Road, spelled, spelled_options
 from hand_eye_calib.core.base.version import version_of
 from hand_eye_calib.core.engine.snapshot import Snapshot
@@ -160,6 +161,9 @@ def render(
         if isinstance(value, str)
     ]
     evidence = gather(calibration, snapshot) if snapshot else None
+    pictures = []
+    for draw in REPORT_PICTURES.values():
+        pictures += draw(calibration, snapshot)
     advice = ""
     if evidence and calibration.verdict is not Verdict.DO_NOT_USE:
         advice = what_is_missing(evidence.excitation, calibration)
@@ -196,6 +200,7 @@ def render(
         target=_targets(calibration),
         reasons=shown(calibration.reasons),
         figures=figures_of(calibration, evidence),
+        pictures=pictures,
         top_figures=_TOP_FIGURES,
         **_data(calibration, snapshot, evidence, inputs, road),
     )

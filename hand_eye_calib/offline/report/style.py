@@ -146,19 +146,39 @@ def page_style(**more: Any) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Drawn:
-    """Figure of a page: name of the HTML element, title, caption and SVG."""
+    """Figure of a page.
+
+    Attributes
+    ----------
+    name : str
+        Name of the HTML element.
+    title, caption : str
+    svg : str
+        Empty if there is nothing to draw, and only the caption is shown.
+    key : tuple of (str, str)
+        Colours, as variables of the style sheet, and their names. The page writes them above the
+        figure, where they are visible on a narrow screen.
+    """
 
     name: str
     title: str
     caption: str
     svg: str
+    key: tuple[tuple[str, str], ...] = ()
 
 
-def as_drawn(figure: Figure, name: str, title: str, caption: str) -> Drawn:
+def as_drawn(
+    figure: Figure,
+    name: str,
+    title: str,
+    caption: str,
+    lines: Sequence[Any] = (),
+) -> Drawn:
     """Return a figure as SVG that fits into a page.
 
     The SVG is scaled by the page, has the colours of the page, and has ids that begin with the name
-    of the figure, so that two figures never share an id.
+    of the figure, so that two figures never share an id. ``lines`` are lines of Matplotlib, whose
+    colours and labels become the key of the figure.
     """
     buffer = io.StringIO()
     no_metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))
@@ -183,7 +203,13 @@ def as_drawn(figure: Figure, name: str, title: str, caption: str) -> Drawn:
     )
     for colour, variable in _VARIABLES.items():
         svg = svg.replace(colour.lower(), f"var(--{variable})")
-    return Drawn(name, title, caption, svg)
+    key = [(_VARIABLES[line.get_color()], _name_of(line)) for line in lines]
+    return Drawn(name, title, caption, svg, tuple(key))
+
+
+def _name_of(line: Any) -> str:
+    """Return the name that :func:`plain_label` has made the label of a line."""
+    return str(line.get_label()).replace(r"\$", "$").removeprefix("\u200b")
 
 
 def plain_label(label: str) -> str:
