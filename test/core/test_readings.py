@@ -12,7 +12,7 @@ from published_data import data_folder
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.checks import hypotheses, shape
-from hand_eye_calib.core.checks.hypotheses import PLAIN, Hypothesis, Readings
+from hand_eye_calib.core.checks.hypothesis import PLAIN, Hypothesis, Readings
 from hand_eye_calib.core.checks.stream_pair import StreamPair
 from hand_eye_calib.core.engine.readings import decide
 from hand_eye_calib.core.engine.run import review

@@ -16,6 +16,7 @@ from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.checks import hypotheses
 from hand_eye_calib.core.checks.check import check_streams
 from hand_eye_calib.core.checks.findings import Severity
+from hand_eye_calib.core.checks.hypothesis import HOLDS
 from hand_eye_calib.core.checks.streams import check_frozen, check_stream, frozen_share
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
@@ -86,7 +87,7 @@ def test_no_rival_is_taken_for_noisy_streams_that_agree(wander, monkeypatch):
 
     monkeypatch.setattr(hypotheses, "fit_similarity", counted)
     assert grave(check_streams(*drive(1, noise=0.02, wander=wander))) == []
-    assert EXPLAINED < fits[0].unexplained < hypotheses.HOLDS
+    assert EXPLAINED < fits[0].unexplained < HOLDS
     assert len(fits) > 1
 
 

@@ -53,7 +53,7 @@ from hand_eye_calib.core.checks.findings import (
     graded,
     gravest_first,
 )
-from hand_eye_calib.core.checks.hypotheses import Explanation, Readings
+from hand_eye_calib.core.checks.hypothesis import HOLDS, PLAIN, Explanation, Readings
 from hand_eye_calib.core.checks.open_delay import NO_DELAY
 from hand_eye_calib.core.checks.stream_pair import (
     LAGS_S,
@@ -200,7 +200,7 @@ def _are_unusable(findings: Sequence[Finding]) -> bool:
 
 def _factor_of_angles(correlation: Correlation) -> Finding | None:
     """Return the finding that one factor is wrong in all rotations of the child, or None."""
-    if 1.0 - correlation.correlation >= hypotheses.HOLDS:
+    if 1.0 - correlation.correlation >= HOLDS:
         return None
     ratio = correlation.ratio
     return graded("turns", "child", float(np.log(ratio)), times=ratio)
@@ -359,7 +359,7 @@ def _explain_by_extrinsic(
         # One step of refinement suffices if the offset is below half of the reported size.
         2.0 * note_s,
         X,
-        hypotheses.HOLDS,
+        HOLDS,
     )
     fit = offset.fit
     if fit is None or not fit.is_in_one_unit or fit.unexplained >= similarity.EXPLAINED:
@@ -367,9 +367,7 @@ def _explain_by_extrinsic(
     if offset.largest_s(streams.child.duration_s) >= error_s:
         return None, TimeOffset()
     shifted = streams.shifted(offset.seconds)
-    explanation = hypotheses.choose_reading(
-        Explanation(hypotheses.PLAIN, fit), shifted, lag_s
-    )
+    explanation = hypotheses.choose_reading(Explanation(PLAIN, fit), shifted, lag_s)
     if explanation.findings:
         return None, TimeOffset()
     return explanation, offset

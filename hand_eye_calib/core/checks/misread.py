@@ -17,7 +17,7 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.base.stats import robust_regression
 from hand_eye_calib.core.checks.findings import Finding, finding
-from hand_eye_calib.core.checks.hypotheses import HOLDS
+from hand_eye_calib.core.checks.hypothesis import HOLDS
 from hand_eye_calib.core.checks.stream_pair import LAGS_S, MAX_PAIRS, StreamPair
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import are_earth_centred

@@ -2,7 +2,7 @@
 
 A reading is an interpretation of both streams, as poses or as inverse poses of the sensors. The
 second reading inverts all poses of the first one. Both readings fit equally well
-(:class:`~hand_eye_calib.core.checks.hypotheses.Readings`), so two other criteria distinguish them:
+(:class:`~hand_eye_calib.core.checks.hypothesis.Readings`), so two other criteria distinguish them:
 the likelihood of the noise (:mod:`~hand_eye_calib.core.noise.readings`) and the shape of the
 motion. The noise has priority. In a small space the shape must support the noise, because the poses
 of a camera that observes a target have the same noise as inverted poses. If the criteria are not
@@ -19,7 +19,8 @@ from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.base.option import Options, options_in_words
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.findings import Finding, finding, gravest_first
-from hand_eye_calib.core.checks.hypotheses import Readings, findings_of
+from hand_eye_calib.core.checks.hypotheses import findings_of
+from hand_eye_calib.core.checks.hypothesis import Readings
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.noise.readings import loss_difference
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs

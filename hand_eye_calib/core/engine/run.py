@@ -32,7 +32,7 @@ from hand_eye_calib.core.checks.findings import (
     repair_message,
 )
 from hand_eye_calib.core.checks.findings import finding as new_finding
-from hand_eye_calib.core.checks.hypotheses import HOLDS
+from hand_eye_calib.core.checks.hypothesis import HOLDS
 from hand_eye_calib.core.engine import readings as choosing
 from hand_eye_calib.core.engine.attempts import STREAM_REPAIRS, Attempt, with_options
 from hand_eye_calib.core.engine.kinds import kind_of
