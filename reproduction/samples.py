@@ -17,6 +17,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.extras.stops.samples import read_arm_samples
 from hand_eye_calib.formats.bags.writer import write_streams
 from hand_eye_calib.formats.files import local_path
 from hand_eye_calib.formats.trajectory_files.reading import read_trajectory
@@ -89,6 +90,19 @@ def write_sample_arm(path: Path) -> None:
     path.write_text("\n".join([*lines, ""]), encoding="utf-8")
 
 
+def write_sample_arm_files(folder: Path) -> None:
+    """Write the stops of ``arm.yaml`` as two files of poses: hand in base, camera in target."""
+    samples = read_arm_samples(folder / "arm.yaml")
+    stacks = {
+        "hand.tum": samples.robot,
+        "camera_in_target.tum": se3.inverse(samples.tracking),
+    }
+    for name, poses in stacks.items():
+        rows = np.column_stack([np.arange(len(poses)), se3.to_rows(poses)])
+        lines = [" ".join(f"{value:.6f}" for value in row) for row in rows.tolist()]
+        (folder / name).write_text("\n".join([*lines, ""]), encoding="utf-8")
+
+
 def sample_robot() -> Machine:
     """Simulate the robot: figures of eight on a flat floor, with slip."""
     return simulate_machine(ROBOT_SEED, duration_s=ROBOT_S)
@@ -134,4 +148,5 @@ if __name__ == "__main__":
     folder = parser.parse_args().out
     write_sample_bag(folder / "drive.mcap")
     write_sample_arm(folder / "arm.yaml")
+    write_sample_arm_files(folder)
     write_sample_robot(folder)

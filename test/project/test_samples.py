@@ -12,6 +12,7 @@ from reproduction.samples import (
     sample_robot,
     se3_of,
     write_sample_arm,
+    write_sample_arm_files,
     write_sample_robot,
 )
 
@@ -54,6 +55,19 @@ def test_the_arm_is_made_by_its_script(tmp_path):
     np.testing.assert_allclose(
         se3.log(se3.inverse(made.tracking) @ kept.tracking), 0.0, atol=1e-5
     )
+
+
+def test_two_files_of_the_arm_have_the_stops_of_its_samples(tmp_path):
+    write_sample_arm(tmp_path / "arm.yaml")
+    write_sample_arm_files(tmp_path)
+    for name in ("hand.tum", "camera_in_target.tum"):
+        made, kept = (
+            np.loadtxt(path) for path in (tmp_path / name, local_path(f"sample:{name}"))
+        )
+        np.testing.assert_allclose(made, kept, atol=2e-6)
+    samples = hec.read_arm_samples("sample:arm.yaml")
+    hand = hec.read_trajectory("sample:hand.tum")
+    np.testing.assert_allclose(hand.poses, samples.robot, atol=3e-6)
 
 
 def test_the_robot_is_calibrated_within_its_standard_deviations():
