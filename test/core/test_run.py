@@ -5,7 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from motions import as_trajectory, child_of, disturbed, walked, wandering_poses
+from motions import (
+    as_trajectory,
+    child_of,
+    disturbed,
+    planar_poses,
+    walked,
+    wandering_poses,
+)
 from scipy.ndimage import uniform_filter1d
 
 import hand_eye_calib as hec
@@ -13,7 +20,7 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.streams import check_lengths
 from hand_eye_calib.core.engine.attempts import with_options
-from hand_eye_calib.core.engine.run import review, run
+from hand_eye_calib.core.engine.run import examine, review, run
 from hand_eye_calib.core.engine.snapshot import Snapshot, whole_snapshot
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
@@ -40,6 +47,29 @@ def test_a_clock_offset_that_is_certain_is_used_and_said(streams):
         text for text in result.warnings if 'solved with time_offset="estimate"' in text
     )
     assert "the child's clock is 0.3" in warning
+
+
+def test_a_check_states_the_clock_offset_and_the_scale_of_the_solution(streams):
+    parent, child, _ = streams
+    other = child.shifted(-0.3).scaled(0.4)
+    found = {issue.code: issue for issue in examine(whole_snapshot(parent, other, {}))}
+    result = hec.calibrate(parent, other)
+    assert found["time_offset"].evidence["size_s"] == result.time_offset_s
+    assert found["time_offset"].evidence["sigma_s"] == result.time_offset_sigma_s
+    assert found["scale"].evidence["scale"] == result.scale
+
+
+def test_an_axis_with_a_prior_is_not_called_unknown():
+    parent = as_trajectory(planar_poses(500))
+    child = as_trajectory(disturbed(child_of(parent.poses), 1, 0.002, 0.001))
+    (without,) = hec.calibrate(parent, child).findings
+    assert (
+        "z cannot be determined from this motion, and will be unknown" in without.what
+    )
+    (with_prior,) = hec.calibrate(parent, child, prior={"z": (0.1, 0.02)}).findings
+    assert with_prior.code == "one_axis"
+    assert with_prior.what.endswith("motion: the prior alone determines the value")
+    assert not with_prior.options
 
 
 def test_a_unit_that_is_certain_is_used_and_said(streams):

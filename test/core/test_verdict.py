@@ -232,7 +232,8 @@ def test_an_axis_that_is_not_shown_does_not_spoil_the_others():
     both = good(observability_measured=observed(y=np.inf, z=np.inf))
     assert both.headline == "USE WITH CARE: all but y and z; measure them by hand"
     assert both.reasons[0].what_to_do == (
-        'measure them by hand and give priors: prior={"y": (VALUE, SIGMA), "z": (VALUE, SIGMA)}'
+        "measure them by hand and give priors, such as "
+        'prior={"y": (0.50, 0.02), "z": (0.50, 0.02)}'
     )
 
 

@@ -216,7 +216,7 @@ def test_out_saves_what_info_shows(run, new_bag, tmp_path):
     assert f"launch.py; the earlier files are in {out_dir}/previous\n" in again[2]
 
 
-def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag):
+def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag, tmp_path):
     parent, child = drive(planar=True)
     code, out, err = run("replay", new_bag(parent, child), *TOPICS, "-v")
     assert (code, err) == (3, "")
@@ -230,14 +230,53 @@ def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag):
         "\nTo publish it (USE WITH CARE, after you have replaced MEASURE_Z_BY_HAND)\n"
         in out
     )
-    (step,) = re.findall(r"^  hand_eye_calib (replay .*)$", out, flags=re.MULTILINE)
-    again = step.replace("VALUE+/-SIGMA", "0.1±0.01")
-    code, out, err = run(*shlex.split(again))
+    assert (
+        "\n  measure z by hand, then add --prior z=0.50+/-0.02 with your value" in out
+    )
+    path = tmp_path / "drive"
+    code, out, err = run("replay", path, *TOPICS, "--prior", "z=0.1±0.01")
     assert (code, err) == (0, "")
     assert "MEASURE_Z_BY_HAND" not in out
 
 
 # ---- what is printed
+
+
+def in_millimetres(parent, child):
+    positions = 1000.0 * se3.translation_of(child.poses)
+    poses = se3.from_rotation_translation(se3.rotation_of(child.poses), positions)
+    return parent, dataclasses.replace(child, poses=poses)
+
+
+def late(parent, child):
+    stamps_ns = child.stamps_ns + 40_000_000
+    return parent, dataclasses.replace(child, stamps_ns=stamps_ns)
+
+
+@pytest.mark.parametrize(
+    ("streams", "options", "n_commands"),
+    [
+        (drive(planar=True), [], 0),
+        (drive(planar=True), ["--prior", "y=-0.1+/-0.02"], 0),
+        (in_millimetres(*drive()), ["--scale", "none"], 1),
+        (in_millimetres(*drive()), ["--scale=0.5"], 1),
+        (late(*drive(600)), ["--time-offset", "0.02", "--prior", "z=0.3+/-0.2"], 1),
+    ],
+)
+def test_every_printed_command_runs_as_it_is(
+    run, new_bag, streams, options, n_commands
+):
+    """Options are in it once, and a value that is still to be measured is not."""
+    _, out, err = run("calibrate", new_bag(*streams), *TOPICS, *options)
+    pattern = r"^  hand_eye_calib (calibrate .*)$"
+    printed = re.findall(pattern, out + err, flags=re.MULTILINE)
+    assert len(printed) == n_commands
+    for command in printed:
+        typed = shlex.split(command)
+        names = [word.partition("=")[0] for word in typed if word.startswith("--")]
+        assert len(names) == len({*names}), command
+        code, _, err = run(*typed)
+        assert code in (0, 3), err
 
 
 def test_each_reason_stands_above_what_to_do_about_it(run, new_bag, tmp_path):
@@ -254,7 +293,7 @@ def test_each_reason_stands_above_what_to_do_about_it(run, new_bag, tmp_path):
     assert lines[0] == "USE WITH CARE: all but z; measure z by hand; many jumps"
     assert lines[1:5] == [
         "- z cannot be determined from this motion",
-        "  -> measure it by hand and give a prior: --prior z=VALUE+/-SIGMA",
+        "  -> measure it by hand and give a prior, such as --prior z=0.50+/-0.02",
         "- many jumps",
         "  -> find out why",
     ]
@@ -711,4 +750,4 @@ def test_control_characters_in_names_do_not_reach_the_terminal(capsys):
 def test_options_are_printed_as_they_are_typed():
     options = {"prior.z": "VALUE+/-SIGMA", "max_gap": 0.2, "target.translation": 0.01}
     typed = typed_options(options.items())
-    assert typed == "--prior z=VALUE+/-SIGMA --max-gap 0.2 --target-translation 0.01"
+    assert typed == "--prior z=0.50+/-0.02 --max-gap 0.2 --target-translation 0.01"

@@ -1,5 +1,6 @@
 """Messages name options as the road of the user spells them: command line, Python or node."""
 
+import ast
 import inspect
 import re
 
@@ -10,7 +11,13 @@ from motions import child_of, planar_poses
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.registry import FINDING_WORDS
-from hand_eye_calib.core.base.spelling import Road, spelled, spelled_options
+from hand_eye_calib.core.base.spelling import (
+    PLACEHOLDER,
+    Road,
+    spelled,
+    spelled_options,
+    with_options,
+)
 from hand_eye_calib.offline.cli.main import main
 from hand_eye_calib.offline.cli.options import as_typed
 
@@ -28,9 +35,9 @@ SPELLINGS = {
         "give --parent-scale 0.3048, or --scale estimate",
         'give parent_scale=0.3048, or scale="estimate"',
     ),
-    "give prior.z VALUE+/-SIGMA": (
-        "give --prior z=VALUE+/-SIGMA",
-        'give prior={"z": (VALUE, SIGMA)}',
+    "give prior.z 0.5+/-0.02": (
+        "give --prior z=0.5+/-0.02",
+        'give prior={"z": (0.5, 0.02)}',
     ),
     "confirm it: prior.roll 179deg+/-10deg": (
         "confirm it: --prior roll=179deg+/-10deg",
@@ -66,10 +73,10 @@ def test_an_option_in_a_message_is_spelled_as_its_road_does(text):
 def test_options_are_joined_as_their_road_does():
     options = {"prior.z": "VALUE+/-SIGMA", "scale": "estimate", "prior.x": "1.5+/-0.1"}
     assert spelled_options(options.items(), Road.PYTHON) == (
-        'scale="estimate", prior={"z": (VALUE, SIGMA), "x": (1.5, 0.1)}'
+        'scale="estimate", prior={"z": (0.50, 0.02), "x": (1.5, 0.1)}'
     )
     assert spelled_options(options.items(), Road.NODE) == (
-        "prior.z VALUE+/-SIGMA, scale estimate, prior.x 1.5+/-0.1"
+        "prior.z 0.50+/-0.02, scale estimate, prior.x 1.5+/-0.1"
     )
 
 
@@ -108,6 +115,16 @@ def test_each_reason_for_unknown_axes_names_a_prior_that_python_accepts():
     reason = next(reason for reason in result.reasons if reason.rule == "unobservable")
     assert [*reason.options] == [f"prior.{axis}" for axis in reason.axes]
     argument = re.search(r"prior=(\{.*\})", reason.what_to_do)[1]
-    prior = eval(argument, {"VALUE": 1.5, "SIGMA": 0.1})
+    prior = ast.literal_eval(argument)
     assert {*prior} == {*reason.axes}
-    assert "--prior z=VALUE+/-SIGMA" in reason.advice_on(Road.TERMINAL)
+    again = hec.calibrate(parent, child, checks=False, prior=prior)
+    assert not again.hidden
+    assert "such as --prior z=0.50+/-0.02" in reason.advice_on(Road.TERMINAL)
+
+
+def test_an_option_in_an_advice_is_not_repeated():
+    options = {"scale": "estimate", "prior.yaw": PLACEHOLDER, "max_gap": 2.0}
+    text = with_options("give scale estimate, and a prior", options, Road.TERMINAL)
+    assert text == (
+        "give --scale estimate, and a prior: --max-gap 2.0, such as --prior yaw=90deg+/-2deg"
+    )

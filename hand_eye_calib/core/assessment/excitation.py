@@ -43,7 +43,9 @@ _MANOEUVRES = ("one wheel over a kerb", "over a ramp or a bump", "curves to both
 # Advice about the height of a vehicle that has only turned about its vertical axis, and what a
 # recording, but no live session, may contain in addition.
 _ON_A_FLAT_FLOOR = "tilt the sensors over a ramp or a kerb, or measure it by hand"
-_WITH_LIDARS = ", or record the clouds of two lidars and run calibrate on the bag"
+_WITH_LIDARS = (
+    ", or, if both sensors are lidars, record their clouds and run calibrate on the bag"
+)
 
 
 @dataclass(frozen=True)

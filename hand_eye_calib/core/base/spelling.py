@@ -25,8 +25,10 @@ class Road(Enum):
     NODE = "node"
 
 
-#: Value of a prior that the user has to measure.
+#: Value of a prior that the user has to measure. Messages contain an example in its place.
 PLACEHOLDER = "VALUE+/-SIGMA"
+_PRIOR_OF_TRANSLATION = "0.50+/-0.02"
+_PRIOR_OF_ROTATION = "90deg+/-2deg"
 
 _FIELDS = CalibratorConfig.by_name()
 # Arguments of extras that messages of the engine name, with their values.
@@ -65,7 +67,11 @@ def spelled(text: str, road: Road, others: Iterable[str] = ()) -> str:
 
 
 def spelled_options(options: Pairs, road: Road) -> str:
-    """Return pairs of public option name and value as a user of the road gives them."""
+    """Return pairs of public option name and value as a user of the road gives them.
+
+    An example replaces the value of a prior that the user has to measure.
+    """
+    options = [(name, _example_of(name, value)) for name, value in options]
     if road is Road.TERMINAL:
         return " ".join(_typed(name, value) for name, value in options)
     if road is Road.NODE:
@@ -84,14 +90,35 @@ def spelled_options(options: Pairs, road: Road) -> str:
 
 
 def with_options(advice: str, options: Mapping[str, object], road: Road) -> str:
-    """Return an advice with the options that it needs, as a user of the road gives them."""
+    """Return an advice with the options that it needs, as a user of the road gives them.
+
+    Options that the advice contains are not repeated.
+    """
     text = spelled(advice, road)
-    return f"{text}: {spelled_options(options.items(), road)}" if options else text
+    ready, measured = {}, {}
+    for name, value in options.items():
+        if value == PLACEHOLDER:
+            measured[name] = value
+        elif spelled_options([(name, value)], road) not in text:
+            ready[name] = value
+    if ready:
+        text = f"{text}: {spelled_options(ready.items(), road)}"
+    if measured:
+        text = f"{text}, such as {spelled_options(measured.items(), road)}"
+    return text
+
+
+def _example_of(name: str, value: object) -> object:
+    """Return an example of a prior that the user has to measure; other values unchanged."""
+    if value != PLACEHOLDER:
+        return value
+    is_translation = name.rpartition(".")[2] in ("x", "y", "z")
+    return _PRIOR_OF_TRANSLATION if is_translation else _PRIOR_OF_ROTATION
 
 
 def _is_value(name: str, text: str) -> bool:
     """Return whether a word behind an option in a message is the value of the option."""
-    if text == PLACEHOLDER or name not in _FIELDS:
+    if name not in _FIELDS:
         return name not in _CHOICES or text in _CHOICES[name]
     field = _FIELDS[name]
     is_text = isinstance(field.default, str)
@@ -136,7 +163,5 @@ def _value_of_python(value: object) -> str:
 
 def _prior_of_python(text: str) -> str:
     """Return the Python notation of a prior: a pair of numbers, or a text with units."""
-    if text == PLACEHOLDER:
-        return "(VALUE, SIGMA)"
     plain = _PLAIN_PRIOR.fullmatch(text)
     return f"({plain[1]}, {plain[2]})" if plain else f'"{text}"'

@@ -29,8 +29,6 @@ from hand_eye_calib.core.assessment.covariance import hidden_axes, lever_arm_pro
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import NotEnoughDataError
-from hand_eye_calib.core.base.spelling import PLACEHOLDER
-from hand_eye_calib.core.base.text import axes_in_words
 from hand_eye_calib.core.checks import (
     agreement,
     fusion,
@@ -52,6 +50,7 @@ from hand_eye_calib.core.checks.findings import (
     finding,
     graded,
     gravest_first,
+    unobservable_axes,
 )
 from hand_eye_calib.core.checks.hypothesis import HOLDS, PLAIN, Explanation, Readings
 from hand_eye_calib.core.checks.open_delay import NO_DELAY
@@ -590,10 +589,3 @@ def _motions(pose_pairs: PosePairs, max_motions: int) -> MotionPairs:
     motions = (pairs_over(pose_pairs, lag_s, max_motions) for lag_s in LAGS_S)
     # Streams that agree were fitted over the first lag with enough motions, so it exists.
     return next(pairs for pairs in motions if len(pairs) >= MIN_PAIRS)
-
-
-def unobservable_axes(axes: Sequence[str]) -> Finding:
-    """Return the note that the motion does not determine some axes of X."""
-    options = {f"prior.{axis}": PLACEHOLDER for axis in axes}
-    pronoun = "it" if len(axes) == 1 else "them"
-    return finding("one_axis", options=options, axes=axes_in_words(axes), it=pronoun)

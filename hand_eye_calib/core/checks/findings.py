@@ -9,6 +9,8 @@ import numpy as np
 
 from hand_eye_calib.core.base.config import METHODS, CalibratorConfig, defaults_of
 from hand_eye_calib.core.base.option import Options, options_in_words
+from hand_eye_calib.core.base.spelling import PLACEHOLDER
+from hand_eye_calib.core.base.text import axes_in_words
 from hand_eye_calib.core.results.records import (
     Finding,
     Severity,
@@ -24,6 +26,7 @@ __all__ = [
     "graded",
     "gravest_first",
     "repair_message",
+    "unobservable_axes",
 ]
 
 # Jumps up to this share of the steps hardly affect the methods that reject outliers.
@@ -206,11 +209,31 @@ def repair_message(
     return f"repaired: {faults}. Solved with {used}{verdicts} (undo with {undo})"
 
 
+def unobservable_axes(axes: Sequence[str]) -> Finding:
+    """Return the note that the motion does not determine some axes of X."""
+    options = {f"prior.{axis}": PLACEHOLDER for axis in axes}
+    pronoun = "it" if len(axes) == 1 else "them"
+    return finding("one_axis", options=options, axes=axes_in_words(axes), it=pronoun)
+
+
+def _beside_priors(note: Finding, current: Options) -> Finding:
+    """Return the note of :func:`unobservable_axes` for the axes that have no prior.
+
+    If all axes have a prior, the note says so. ``current`` are the options of the configuration.
+    """
+    axes = [name.partition(".")[2] for name in note.options]
+    without_prior = [axis for axis in axes if not current[f"prior.{axis}"]]
+    if without_prior:
+        return unobservable_axes(without_prior)
+    return finding("one_axis_with_prior", axes=axes_in_words(axes))
+
+
 def answered(findings: Sequence[Finding], config: CalibratorConfig) -> list[Finding]:
     """Return findings with the severity that they have under a configuration.
 
     A finding becomes a note if the configuration has all options that repair the fault. A small
-    share of jumps becomes a note if the method rejects outliers.
+    share of jumps becomes a note if the method rejects outliers. Axes that have a prior are not
+    called unknown.
     """
     current = config.to_options()
     graded_findings = []
@@ -229,5 +252,8 @@ def answered(findings: Sequence[Finding], config: CalibratorConfig) -> list[Find
         if found.code == "jumps" and METHODS[config.method].rejects_outliers:
             is_answered = is_answered or found.evidence["share"] < _FEW_JUMPS
         severity = Severity.NOTE if is_answered else found.severity
-        graded_findings.append(replace(found, options=options, severity=severity))
+        answer = replace(found, options=options, severity=severity)
+        if found.key == "one_axis":
+            answer = _beside_priors(found, current)
+        graded_findings.append(answer)
     return graded_findings

@@ -222,7 +222,7 @@ WORDS = {
         code="inverse_both",
     ),
     "time_offset": FindingWords(
-        "the child's clock is {size_s:.4f} +/- {sigma_s:.4f} s {direction} the parent's{beyond}",
+        "the child's clock is {size_s:.4f} +/- {sigma_s:.2g} s {direction} the parent's{beyond}",
         "set the offset to {total_s} s, or have it estimated",
     ),
     "large_time_offset": FindingWords(
@@ -241,12 +241,12 @@ WORDS = {
         "estimated",
     ),
     "unit_or_scale": FindingWords(
-        "the child's lengths must be multiplied by {scale:.5g} +/- {sigma:.2g}: the parent's are "
-        "{unit}, or the child has a scale of its own",
+        "the child's lengths must be multiplied by {scale:.5g} +/- {sigma:.2g}: the child "
+        "has a scale of its own, as a single camera, or the parent's lengths are {unit}",
         "give scale estimate, or parent_scale {factor:g} if the parent's lengths are {unit}",
     ),
     "scale": FindingWords(
-        "the child's lengths must be multiplied by {scale:.4f} +/- {sigma:.4f} to agree with the "
+        "the child's lengths must be multiplied by {scale:.5g} +/- {sigma:.2g} to agree with the "
         "parent's",
         "have the scale estimated, or find out which of the two measures wrongly",
     ),
@@ -255,6 +255,12 @@ WORDS = {
         "rotate about other axes, too (a vehicle: over slopes or kerbs), or measure {it} and give "
         "a prior",
         severity=Severity.NOTE,
+    ),
+    "one_axis_with_prior": FindingWords(
+        "{axes} cannot be determined from this motion: the prior alone determines the value",
+        "check the prior with a second measurement, or rotate about other axes, too",
+        severity=Severity.NOTE,
+        code="one_axis",
     ),
     "same_frame": FindingWords(
         "both streams are of the same frame: the extrinsic is the identity within {size}",

@@ -426,19 +426,45 @@ def _unit_doubts(
             is_near = difference <= units.UNIT_SIGMAS * calibration.scale_sigma
             is_exact = finding.evidence["is_exact"] or is_near
             severity = Severity.ERROR if is_exact else Severity.WARNING
-            doubts.append(replace(finding, severity=severity, options={}))
+            doubt = replace(finding, severity=severity, options={})
+            doubts.append(_with_solved_scale(doubt, calibration))
     return tuple(doubts)
+
+
+def _with_solved_scale(finding: Finding, calibration: Calibration) -> Finding:
+    """Return a finding about the scale with the scale of a result; other findings unchanged."""
+    if finding.code not in ("scale", "unit_or_scale") or not calibration.scale_sigma:
+        return finding
+    scale = {"scale": calibration.scale, "sigma": calibration.scale_sigma}
+    return replace(finding, values={**finding.values, **scale})
+
+
+def _with_solved_offset(finding: Finding, calibration: Calibration) -> Finding:
+    """Return a finding about the clock offset with the time offset of a result; others unchanged.
+
+    The offset of the check has no noise model, so that it differs from the estimated one.
+    """
+    if finding.key != "time_offset" or not calibration.time_offset_sigma_s:
+        return finding
+    values = offset_values(calibration.time_offset_s)
+    values |= {"sigma_s": calibration.time_offset_sigma_s, "beyond": ""}
+    options = {"time_offset": values["total_s"]}
+    return replace(finding, values={**finding.values, **values}, options=options)
 
 
 def _with_estimate_warnings(
     attempt: Attempt, options: Options, findings: Collection[Finding]
 ) -> Attempt:
     """Return the attempt with a warning about each option that was set because of findings."""
-    reasons = {name: finding.what for finding in findings for name in finding.options}
     calibration = attempt.calibration
+    reasons = {
+        name: _with_solved_scale(finding, calibration).what
+        for finding in findings
+        for name in finding.options
+    }
     offset_s = calibration.time_offset_s
     reasons["time_offset"] = (
-        f"the child's clock is {abs(offset_s):.4f} +/- {calibration.time_offset_sigma_s:.4f} "
+        f"the child's clock is {abs(offset_s):.4f} +/- {calibration.time_offset_sigma_s:.2g} "
         f"s {offset_values(offset_s)['direction']} the parent's"
     )
     rate = calibration.clock_rate
@@ -475,7 +501,8 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
 def examine(snapshot: Snapshot) -> tuple[Finding, ...]:
     """Return the findings about the streams without repairs, the gravest first.
 
-    As in :func:`run`, the check starts from a solve, and one of two readings is chosen.
+    As in :func:`run`, the check starts from a solve, and one of two readings is chosen. Clock
+    offset and scale in the findings are those that :func:`run` estimates.
 
     Raises
     ------
@@ -493,7 +520,19 @@ def examine(snapshot: Snapshot) -> tuple[Finding, ...]:
     if calibration:
         known_s = calibration.time_offset_s
     reading = _reading_of(snapshot, result, (), known_s)
-    return gravest_first((*reading.findings, *reading.doubts))
+    findings = gravest_first((*reading.findings, *reading.doubts))
+    estimates = {"time_offset", "scale"} & {*_certain(findings, snapshot.config.given)}
+    if not calibration or not estimates:
+        return findings
+    best = _best(Attempt(calibration, snapshot, result), (), None)
+    if estimates <= {*best.options}:
+        findings = tuple(
+            _with_solved_offset(
+                _with_solved_scale(issue, best.calibration), best.calibration
+            )
+            for issue in findings
+        )
+    return findings
 
 
 def with_open_errors(

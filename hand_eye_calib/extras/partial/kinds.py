@@ -15,7 +15,11 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.checks import check as checking
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.clock_and_scale import check_offset
-from hand_eye_calib.core.checks.findings import Finding, gravest_first
+from hand_eye_calib.core.checks.findings import (
+    Finding,
+    gravest_first,
+    unobservable_axes,
+)
 from hand_eye_calib.core.engine.kinds import Kind, kind_of
 from hand_eye_calib.core.engine.snapshot import MOST_MOVED_S, UNASKED_S, Snapshot
 from hand_eye_calib.core.geometry.trajectory import Trajectory
@@ -173,7 +177,7 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
         else:
             findings += of_solve
     if hidden and not any(issue.makes_unusable for issue in findings):
-        findings.append(checking.unobservable_axes(hidden))
+        findings.append(unobservable_axes(hidden))
     # Lengths in another unit come first: they cause the findings of the solve.
     findings.sort(key=lambda issue: issue.code != "lengths")
     return CheckResult(gravest_first(_without_repetitions(findings)))

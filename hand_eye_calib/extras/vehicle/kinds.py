@@ -143,7 +143,7 @@ def _solve(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
             f"at least {3 * BLOCKS * window_s:.0f} s are needed: drive figures of eight"
         )
     fixed = []
-    if drive.model is None or "time_offset" in config.given:
+    if _is_clock_fixed(drive, config):
         fixed.append(CLOCK)
     if drive.model is None:
         fixed.append(Y)
@@ -213,6 +213,11 @@ def _drive(
     )
 
 
+def _is_clock_fixed(drive: Drive, config: CalibratorConfig) -> bool:
+    """Return whether the clock offset is not estimated: it is given, or there are no wheels."""
+    return drive.model is None or "time_offset" in config.given
+
+
 def _is_flat(drive: Drive) -> bool:
     """Whether the poses of the sensor are of two dimensions."""
     return 2 not in drive.components
@@ -251,7 +256,9 @@ def _calibration(
         T_method=fit.T_base_sensor,
         covariance_allowance=fused.allowance(_allowance(pairs, config)),
         time_offset_s=offset_s + float(fit.others[0]),
-        time_offset_sigma_s=float(np.sqrt(fit.covariance[CLOCK, CLOCK])),
+        time_offset_sigma_s=0.0
+        if _is_clock_fixed(drive, config)
+        else float(np.sqrt(fit.covariance[CLOCK, CLOCK])),
         findings=findings,
     )
     if drive.model is None or unknown_axes == AXES:

@@ -8,7 +8,6 @@ command.
 import argparse
 import os
 import re
-import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -25,7 +24,7 @@ from hand_eye_calib.core.base.option import did_you_mean
 from hand_eye_calib.core.base.registry import COMMANDS
 from hand_eye_calib.core.base.text import shown_value
 from hand_eye_calib.formats.files import limit_memory
-from hand_eye_calib.offline.cli.options import Exit, as_typed, fail, typed_options
+from hand_eye_calib.offline.cli.options import Exit, as_typed, command_with, fail
 
 _EPILOG = """\
 examples:
@@ -211,10 +210,8 @@ def _run_command(module: Any, arguments: argparse.Namespace) -> int:
     except UnclearStreamsError as error:
         if not error.options:
             raise
-        typed = shlex.join(["hand_eye_calib", *arguments.typed])
-        raise InputError(
-            f"{error}. Run: {typed} {typed_options(error.options.items())}"
-        ) from None
+        command = command_with(arguments.typed, error.options)
+        raise InputError(f"{error}. Run: {command}") from None
 
 
 def _description() -> str:

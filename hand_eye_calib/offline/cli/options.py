@@ -9,8 +9,9 @@ This module imports no library outside of Python, so that ``--help`` is quick.
 
 import argparse
 import re
+import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from enum import IntEnum
 from functools import partial
@@ -124,6 +125,36 @@ def flag(name: str) -> str:
 def typed_options(options: Iterable[tuple[str, object]]) -> str:
     """Return pairs of public option name and value as a user types them on the command line."""
     return spelled_options(options, Road.TERMINAL)
+
+
+def command_with(typed: Sequence[str], options: Options) -> str:
+    """Return a command with further options, in place of values that it has for these options.
+
+    Parameters
+    ----------
+    typed : sequence of str
+        Arguments of the command, without the name of the program.
+    options : mapping
+        Further options by their public names, and their values.
+    """
+    added = [typed_options([pair]).partition(" ") for pair in options.items()]
+    replaced = {_flag_with_axis(name, value) for name, _, value in added}
+    kept = []
+    tokens = [*typed]
+    while tokens:
+        token = tokens.pop(0)
+        name, equals, value = token.partition("=")
+        value = value if equals else next(iter(tokens), "")
+        if _flag_with_axis(name, value) not in replaced:
+            kept.append(token)
+        elif not equals:
+            tokens = tokens[1:]
+    return f"{shlex.join(['hand_eye_calib', *kept])} {typed_options(options.items())}"
+
+
+def _flag_with_axis(name: str, value: str) -> tuple[str, str]:
+    """Return the name of a typed option, and the axis of a prior, which may be repeated."""
+    return name, value.partition("=")[0] if name == "--prior" else ""
 
 
 def as_typed(text: str) -> str:

@@ -1,7 +1,6 @@
 """Output of a calibration: a text for people, JSON for programs, and the exit code."""
 
 import argparse
-import shlex
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -11,7 +10,8 @@ from typing import TYPE_CHECKING
 from hand_eye_calib.core.base.errors import ConfigError, printable
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.spelling import PLACEHOLDER, Road
-from hand_eye_calib.core.base.text import frame_name, listing
+from hand_eye_calib.core.base.text import frame_name, listing, with_sigma
+from hand_eye_calib.core.checks.findings import LIMITS
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, Verdict
 from hand_eye_calib.core.results.document import (
     allowance_in_words,
@@ -29,6 +29,7 @@ from hand_eye_calib.core.results.verdict import shown
 from hand_eye_calib.offline.cli.options import (
     Exit,
     as_typed,
+    command_with,
     fail,
     note,
     print_result,
@@ -73,9 +74,14 @@ def deliver(
         inputs = inputs | {"labels": dict(arguments.label)}
     written = _saved(calibration, arguments.out, inputs) if arguments.out else ""
     steps = () if arguments.json else next_steps(calibration, arguments, snapshot)
+    is_scale_free = snapshot is not None and snapshot.config.scale in (
+        "estimate",
+        "auto",
+    )
     document = calibration.to_dict() | {"inputs": inputs} if arguments.json else None
     try:
-        print_result(as_lines(calibration, steps, arguments.verbose), document)
+        lines = as_lines(calibration, steps, arguments.verbose, is_scale_free)
+        print_result(lines, document)
     # Write the report even if the program that reads stdout has closed it.
     finally:
         if arguments.out:
@@ -165,15 +171,20 @@ def exit_code(calibration: Calibration) -> int:
 
 
 def as_lines(
-    calibration: Calibration, steps: Sequence[str] = (), with_details: bool = False
+    calibration: Calibration,
+    steps: Sequence[str] = (),
+    with_details: bool = False,
+    is_scale_free: bool = False,
 ) -> list[str]:
     """Return the lines of a calibration for a person.
 
     The lines are, in this order: verdict and reasons, the extrinsic in both directions, the next
     steps, the command that publishes the extrinsic, and details such as the comparison with the
     installed extrinsic. ``with_details`` adds quaternions and facts about the solution.
+    ``is_scale_free`` says that the user had the scale estimated.
     """
     lines = [*verdict_lines(calibration), *_extrinsic_lines(calibration, with_details)]
+    lines += _clock_and_scale_lines(calibration, is_scale_free)
     if steps:
         lines += ["Next", *(f"  {step}" for step in steps)]
     lines += publish_lines(calibration)
@@ -242,6 +253,23 @@ def _extrinsic_lines(calibration: Calibration, with_details: bool) -> list[str]:
     return lines
 
 
+def _clock_and_scale_lines(calibration: Calibration, is_scale_free: bool) -> list[str]:
+    """Return the estimated time offset and the scale, which users of the child's data need.
+
+    A scale near 1 is left out unless the user had it estimated.
+    """
+    lines = []
+    child = calibration.child_frame
+    if sigma_s := calibration.time_offset_sigma_s:
+        offset = with_sigma(calibration.time_offset_s, sigma_s, 4)
+        lines.append(f"time offset {offset} s: add it to the stamps of {child}")
+    is_far = abs(calibration.scale - 1.0) > LIMITS["model_scale"].note
+    if calibration.scale_sigma and (is_far or is_scale_free):
+        scale = with_sigma(calibration.scale, calibration.scale_sigma, 4)
+        lines.append(f"scale {scale}: multiply the lengths of {child} by it")
+    return lines
+
+
 def verdict_lines(calibration: Calibration) -> Iterator[str]:
     """Yield the headline, the reasons with their advice, and the warnings."""
     yield calibration.headline
@@ -273,9 +301,11 @@ def next_steps(
     """Return sentences and commands that improve the result; empty if the verdict is USE."""
     if calibration.verdict is Verdict.USE:
         return []
-    extra = []
+    options: dict[str, object] = {}
     for reason in shown(calibration.reasons):
-        extra += [typed_options([option]) for option in reason.options.items()]
+        options |= reason.options
+    # A command with a value that is still to be measured would not run.
+    options = {name: value for name, value in options.items() if value != PLACEHOLDER}
     steps = []
     if calibration.verdict is not Verdict.DO_NOT_USE:
         is_improvable = any(
@@ -289,12 +319,14 @@ def next_steps(
 
             if motion := what_is_missing(excitation(snapshot.pose_pairs), calibration):
                 steps.append(motion)
-        priors = {f"prior.{axis}": PLACEHOLDER for axis in calibration.hidden}
-        extra += [typed_options([prior]) for prior in priors.items()]
+        if axes := calibration.hidden:
+            priors = typed_options((f"prior.{axis}", PLACEHOLDER) for axis in axes)
+            steps.append(
+                f"measure {listing(axes)} by hand, then add {priors} with your values"
+            )
     steps += advice_of(calibration)
-    if extra:
-        typed = shlex.join(arguments.typed)
-        steps.append(f"hand_eye_calib {typed} {' '.join(dict.fromkeys(extra))}")
+    if options:
+        steps.append(command_with(arguments.typed, options))
     return steps
 
 
