@@ -35,8 +35,6 @@ from hand_eye_calib.offline.report.style import (
 _TITLE = "The clouds of both sensors, merged"
 # Half the thickness (m) of the slice of the view from the side.
 _HALF_SLICE_M = 1.5
-# Width of the bins (m) of heights, the fullest of which is the ground.
-_HEIGHT_BIN_M = 0.1
 # Points of the view from above are higher than the ground by this (m). Rings on the ground would
 # hide the walls.
 _ABOVE_GROUND_M = 0.5
@@ -47,8 +45,6 @@ _CELLS = 250
 # Smallest share of the child's points near surfaces of the parent. Below it the clouds hardly
 # overlap, and a distance between them has no meaning.
 _MIN_SHARED = 0.05
-# A turn (rad) of the vehicle between the scans below which a wrong lever arm is hardly visible.
-_MIN_TURN = np.radians(20.0)
 
 
 def figures_of_clouds(
@@ -125,9 +121,10 @@ def _above_ground(merged: MergedClouds) -> tuple[BoolArray, BoolArray]:
     All points are, if the axes of the picture are not upright or nothing is on the ground.
     """
     heights = np.r_[merged.parent[:, 2], merged.after[:, 2]]
-    bins = np.round(heights / _HEIGHT_BIN_M).astype(int)
-    fullest = np.bincount(bins - bins.min()).argmax() + bins.min()
-    is_above = heights > fullest * _HEIGHT_BIN_M + _ABOVE_GROUND_M
+    bins = np.floor((heights - heights.min()) / _ABOVE_GROUND_M).astype(int)
+    # The ground has most points.
+    ground_m = np.median(heights[bins == np.bincount(bins).argmax()])
+    is_above = heights > ground_m + _ABOVE_GROUND_M
     if not merged.is_upright or is_above.mean() < _MIN_SHARED:
         is_above[:] = True
     n_parent = len(merged.parent)
@@ -176,8 +173,9 @@ def _caption(calibration: Calibration, merged: MergedClouds) -> str:
     if installed_transform(calibration) is None:
         before = "as if both sensors had one pose"
     text = (
-        f"A few scans of both sensors, placed by the poses of {parent}: left {before}, right "
-        "through the result. Right, each wall should be one thin line of both colours."
+        f"A few scans of both sensors, placed by the poses of {parent}, which turned by "
+        f"{angle(merged.turn_rad)} between them: left {before}, right through the result. Right, "
+        "each wall should be one thin line of both colours."
     )
     after_m = distances_from_surfaces(merged.parent, merged.after)
     shared = float(np.isfinite(after_m).mean())
@@ -194,10 +192,4 @@ def _caption(calibration: Calibration, merged: MergedClouds) -> str:
     )
     if len(before_m):
         text += f"; before, within {length(median(before_m))}"
-    text += "."
-    if merged.turn_rad < _MIN_TURN:
-        text += (
-            f" The vehicle turned by only {angle(merged.turn_rad)} between the scans: a wrong "
-            "lever arm would hardly be visible."
-        )
-    return text
+    return f"{text}."

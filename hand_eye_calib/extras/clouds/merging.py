@@ -41,8 +41,6 @@ class Tuning:
     max_points: int = 5_000
     # Smallest and largest range of a point (m): nearer points are on the vehicle.
     ranges_m: tuple[float, float] = (1.0, 80.0)
-    # Time (s) in which points of a scan have the same pose.
-    part_s: float = 0.002
     # A plane is fitted to this number of neighbours within this distance (m).
     n_neighbours: int = 12
     reach_m: float = 1.0
@@ -263,8 +261,7 @@ def _cloud_of(message: Any) -> _Cloud:
     if len(used) > TUNING.max_points:
         evenly = np.linspace(0, len(used) - 1, TUNING.max_points)
         used = used[evenly.astype(int)]
-    parts = np.round(times_s[used] / TUNING.part_s) * TUNING.part_s
-    stamps_ns = middle_ns + np.round(parts * 1e9).astype(np.int64)
+    stamps_ns = middle_ns + np.round(times_s[used] * 1e9).astype(np.int64)
     return _Cloud(points[used], stamps_ns)
 
 

@@ -11,6 +11,7 @@ def register() -> None:
     BAG_READINGS["sensor_msgs/msg/PointCloud2"] = _scans
     BAG_READINGS["images of a target"] = _images
     TARGET_IMAGES["folder"] = _target_images
+    TARGET_IMAGES["corners"] = _corners
     FILE_READERS["other programs"] = _other_programs
 
 
@@ -36,3 +37,9 @@ def _target_images() -> Any:
     from hand_eye_calib.extras.sensors import target_images
 
     return target_images
+
+
+def _corners() -> Any:
+    from hand_eye_calib.extras.sensors import corners
+
+    return corners

@@ -260,6 +260,10 @@ class TargetPoses:
         Residuals of the corners of each image (root mean square, pixels).
     sigmas : (N, 2) array
         Standard deviations (m, rad) of each pose, from the residuals of its corners.
+    corners : list of N (n, 3) arrays
+        Places of the detected corners in the frame of the target, m.
+    pixels : list of N (n, 2) arrays
+        Pixels of these corners.
     n_images : int
         Number of all images.
     """
@@ -268,6 +272,8 @@ class TargetPoses:
     images: list[int]
     rms_px: FloatArray
     sigmas: FloatArray
+    corners: list[FloatArray]
+    pixels: list[FloatArray]
     n_images: int
 
     def __str__(self) -> str:
@@ -281,11 +287,16 @@ class TargetPoses:
 
 
 class _Pose(NamedTuple):
-    """Pose of the target, residual of its corners (rms, pixels), standard deviations (m, rad)."""
+    """Pose of the target, residual of its corners (rms, pixels), standard deviations (m, rad).
+
+    Its corners (n, 3), m, and their pixels (n, 2) follow.
+    """
 
     T_camera_target: FloatArray
     rms_px: float
     sigmas: FloatArray
+    corners: FloatArray
+    pixels: FloatArray
 
 
 class _Detector(NamedTuple):
@@ -308,6 +319,10 @@ class _Detector(NamedTuple):
 class TargetFinder:
     """Detect a target in grey images of a camera, and estimate its poses from its corners.
 
+    Attributes
+    ----------
+    camera : Camera
+
     Raises
     ------
     ConfigError
@@ -319,7 +334,7 @@ class TargetFinder:
     def __init__(self, target: Target, camera: Camera) -> None:
         self._cv2 = _opencv()
         self._target = target
-        self._camera = camera
+        self.camera = camera
         self._n_images = 0
         # Poses by the index of the image.
         self._poses: dict[int, _Pose] = {}
@@ -367,8 +382,16 @@ class TargetFinder:
                 f"none of {self._n_images} images contains at least "
                 f"{self._target.fewest_corners} corners of the target {self._target}"
             )
-        Ts, rms_px, sigmas = map(np.array, zip(*self._poses.values(), strict=True))
-        return TargetPoses(Ts, [*self._poses], rms_px, sigmas, self._n_images)
+        poses = [*self._poses.values()]
+        return TargetPoses(
+            Ts_camera_target=np.array([pose.T_camera_target for pose in poses]),
+            images=[*self._poses],
+            rms_px=np.array([pose.rms_px for pose in poses]),
+            sigmas=np.array([pose.sigmas for pose in poses]),
+            corners=[pose.corners for pose in poses],
+            pixels=[pose.pixels for pose in poses],
+            n_images=self._n_images,
+        )
 
     def _pose(self, corners: FloatArray, pixels: FloatArray) -> _Pose:
         """Estimate the pose of the target from its corners (n, 3) at pixels (n, 1, 2).
@@ -376,7 +399,7 @@ class TargetFinder:
         Two poses nearly fit a flat target. The one with the smaller residual is returned.
         """
         cv2 = self._cv2
-        camera = self._camera
+        camera = self.camera
         undistort = (
             cv2.fisheye.undistortPoints if camera.is_fisheye else cv2.undistortPoints
         )
@@ -404,7 +427,8 @@ class TargetFinder:
         variances = variance_px2 * np.diag(unit_covariance)
         # OpenCV's parameters are rotations, then translations.
         turn_rad, shift_m = np.sqrt(variances.reshape(2, 3).mean(axis=1))
-        return _Pose(T, rms_px, np.array([shift_m, turn_rad]))
+        sigmas = np.array([shift_m, turn_rad])
+        return _Pose(T, rms_px, sigmas, corners, pixels.reshape(-1, 2))
 
 
 def _detector(cv2: Any, target: Target) -> _Detector:

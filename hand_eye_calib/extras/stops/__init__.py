@@ -119,7 +119,8 @@ def _calibrate(arguments: Any, _: Any) -> int:
     from hand_eye_calib.offline.cli.present import deliver
 
     refuse_options_of_bags(arguments)
-    return deliver(*stops.solved(arguments), arguments)
+    result, inputs, pictures = stops.solved(arguments)
+    return deliver(result, inputs, arguments, pictures=pictures)
 
 
 def _worlds() -> Any:

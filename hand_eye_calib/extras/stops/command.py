@@ -5,9 +5,11 @@ Input is a file with the samples of an arm, two files whose rows belong together
 """
 
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -36,8 +38,13 @@ from hand_eye_calib.offline.cli.options import (
 )
 from hand_eye_calib.offline.cli.reading import read_files, refuse_repeated_paths
 
+# Result, origin of the data in plain values, and functions that draw figures of the report.
+SolvedInput: TypeAlias = tuple[
+    Calibration, Document, Sequence[Callable[[Calibration], list[Any]]]
+]
 
-def solved(arguments: Namespace) -> tuple[Calibration, Document]:
+
+def solved(arguments: Namespace) -> SolvedInput:
     """Calibrate from the stops that the arguments name.
 
     Returns
@@ -45,6 +52,8 @@ def solved(arguments: Namespace) -> tuple[Calibration, Document]:
     result : Calibration
     sources : Document
         Files and numbers of poses, for the result file.
+    pictures : sequence of callable
+        Functions that draw further figures of the report from the result.
     """
     options = options_from(arguments)
     config = CalibratorConfig.from_options(options)
@@ -58,7 +67,7 @@ def solved(arguments: Namespace) -> tuple[Calibration, Document]:
         result = calibrate_arm(
             samples.robot, samples.tracking, config, samples.frames, setup
         )
-        return result, {"samples": _input(paths[0], len(samples.robot))}
+        return result, {"samples": _input(paths[0], len(samples.robot))}, ()
     if len(paths) != 2:
         raise ConfigError(
             "--order none takes two trajectory files, or the samples of an arm"
@@ -70,7 +79,7 @@ def solved(arguments: Namespace) -> tuple[Calibration, Document]:
 
 def _from_two_files(
     arguments: Namespace, config: CalibratorConfig, options: Options
-) -> tuple[Calibration, Document]:
+) -> SolvedInput:
     """Calibrate an arm or two sensors from two files whose rows belong together."""
     if arguments.parent_angles:
         parent = _robot(arguments)
@@ -85,12 +94,12 @@ def _from_two_files(
         )
     else:
         result = calibrate_stops(parent.poses, child.poses, config)
-    return result, _inputs(arguments, len(parent), len(child))
+    return result, _inputs(arguments, len(parent), len(child)), ()
 
 
 def _from_images(
     arguments: Namespace, config: CalibratorConfig, options: Options
-) -> tuple[Calibration, Document]:
+) -> SolvedInput:
     """Calibrate an arm from poses of its hand and a folder with images of a target.
 
     A single path is a folder that contains both.
@@ -124,7 +133,15 @@ def _from_images(
         config,
         setup=arguments.setup,
     )
-    return result, _inputs(arguments, len(hand), len(detections.images))
+    figures_of_corners = partial(
+        TARGET_IMAGES["corners"]().figures_of_corners,
+        detections=detections,
+        camera=finder.camera,
+        names=[image.name for image in images],
+        read=lambda number: target_images.read_image(images[number]),
+    )
+    inputs = _inputs(arguments, len(hand), len(detections.images))
+    return result, inputs, [figures_of_corners]
 
 
 def _read(

@@ -2,10 +2,10 @@
 
 import argparse
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.core.base.errors import ConfigError, printable
 from hand_eye_calib.core.base.plain import Document
@@ -54,6 +54,7 @@ def deliver(
     arguments: argparse.Namespace,
     snapshot: "Snapshot | None" = None,
     bag: Path | None = None,
+    pictures: Sequence[Callable[[Calibration], list[Any]]] = (),
 ) -> int:
     """Print a calibration, save it with ``--out``, and return the exit code.
 
@@ -67,6 +68,8 @@ def deliver(
         Poses and options of the calibration; None for the stops of an arm.
     bag : pathlib.Path, optional
         Bag whose transforms may contain the frame of ``--base-frame``.
+    pictures : sequence of callable
+        Functions that draw further figures of the report from the calibration.
     """
     if (arguments.installed or arguments.base_frame) and not calibration.status.failure:
         calibration = _with_robot(calibration, arguments, bag)
@@ -89,7 +92,9 @@ def deliver(
         if arguments.out and calibration.motion_residuals:
             from hand_eye_calib.offline.cli.reporting import write_report
 
-            write_report(arguments.out, calibration, snapshot, inputs)
+            write_report(
+                arguments.out, calibration, snapshot, inputs, pictures=pictures
+            )
     return end([calibration])
 
 

@@ -1,9 +1,9 @@
 """Write ``report.html`` for a calibration or for a session of the node."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.spelling import Road
@@ -24,6 +24,7 @@ def write_report(
     snapshot: "Snapshot | None",
     inputs: Document,
     road: Road = Road.TERMINAL,
+    pictures: Sequence[Callable[[Calibration], list[Any]]] = (),
 ) -> None:
     """Write the report of a result into a directory, and print its path.
 
@@ -37,10 +38,12 @@ def write_report(
         Origin of the data, such as paths and topics, in plain values.
     road : Road
         Road of the user, which has its own spelling of options.
+    pictures : sequence of callable
+        Functions that draw further figures from the result.
     """
     from hand_eye_calib.offline.report.report import render
 
-    write_page(directory, lambda: render(calibration, snapshot, inputs, road))
+    write_page(directory, lambda: render(calibration, snapshot, inputs, road, pictures))
 
 
 def write_page(directory: Path, page: Callable[[], str]) -> None:

@@ -1,6 +1,6 @@
 """Write ``report.html``: one self-contained page with the extrinsic, its sigma and the evidence."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cache, partial
@@ -39,7 +39,7 @@ from hand_eye_calib.core.results.records import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.core.results.verdict import shown
 from hand_eye_calib.offline.report.evidence import Evidence, gather, summarise
 from hand_eye_calib.offline.report.figures import figures_of
-from hand_eye_calib.offline.report.style import LOOK
+from hand_eye_calib.offline.report.style import LOOK, Drawn
 from hand_eye_calib.offline.report.views import figure_of_views
 
 # Sign of each tone. A tone is also a class in page.css.
@@ -133,6 +133,7 @@ def render(
     snapshot: Snapshot | None,
     inputs: Document | None = None,
     road: Road = Road.TERMINAL,
+    pictures: Sequence[Callable[[Calibration], list[Drawn]]] = (),
 ) -> str:
     """Return the report of a result as HTML.
 
@@ -145,6 +146,8 @@ def render(
         Origin of the data, such as paths and topics, in plain values.
     road : Road
         Road of the user, which has its own spelling of options.
+    pictures : sequence of callable
+        Functions that draw further figures from the result, such as images of an arm's target.
     """
     inputs = inputs or {}
     command = calibration.static_transform_command()
@@ -161,9 +164,11 @@ def render(
         if isinstance(value, str)
     ]
     evidence = gather(calibration, snapshot) if snapshot else None
-    pictures = []
-    for draw in REPORT_PICTURES.values():
-        pictures += draw(calibration, snapshot)
+    drawings = []
+    for draw in pictures:
+        drawings += draw(calibration)
+    for draw_of_recording in REPORT_PICTURES.values():
+        drawings += draw_of_recording(calibration, snapshot)
     advice = ""
     if evidence and calibration.verdict is not Verdict.DO_NOT_USE:
         advice = what_is_missing(evidence.excitation, calibration)
@@ -200,7 +205,7 @@ def render(
         target=_targets(calibration),
         reasons=shown(calibration.reasons),
         figures=figures_of(calibration, evidence),
-        pictures=pictures,
+        pictures=drawings,
         top_figures=_TOP_FIGURES,
         **_data(calibration, snapshot, evidence, inputs, road),
     )
