@@ -7,6 +7,7 @@ the browser's process. https://chromedevtools.github.io/devtools-protocol/
 import itertools
 import json
 import os
+import re
 import select
 import shutil
 import subprocess
@@ -191,3 +192,15 @@ class Browser:
             self._unread += data
         message, _, self._unread = self._unread.partition(b"\0")
         return json.loads(message)
+
+
+def printed_pages(page, folder):
+    """Number of pages on which the browser prints a page; the test is skipped without a browser."""
+    program = next(filter(None, map(shutil.which, PROGRAMS)), None)
+    if program is None:
+        pytest.skip("Chromium is not installed: apt-get install chromium")
+    pdf = folder / "printed.pdf"
+    options = ("--headless", "--no-sandbox", "--disable-gpu", "--no-pdf-header-footer")
+    arguments = [program, *options, f"--print-to-pdf={pdf}", page.as_uri()]
+    subprocess.run(arguments, check=True, capture_output=True, timeout=PATIENCE_S)
+    return len(re.findall(rb"/Type /Page\b", pdf.read_bytes()))

@@ -4,6 +4,7 @@ import re
 from dataclasses import replace
 from functools import cache, partial
 
+import browser
 import numpy as np
 import pytest
 from bag_making import ODOMETRY, POINTS, cloud_message, pose_message, write_messages
@@ -139,6 +140,12 @@ def test_the_drawn_dots_of_both_colours_coincide_after(recorded):
     before, after = medians
     # A dot has a size of 1 and a panel of 280 units.
     assert after < 2.0 < 5.0 < before
+
+
+def test_a_report_with_clouds_is_printed_on_two_pages(recorded, tmp_path):
+    page = recorded[1].report(tmp_path / "report.html")
+    assert 'id="figure-clouds"' in page.read_text(encoding="utf-8")
+    assert browser.printed_pages(page, tmp_path) == 2
 
 
 def test_the_installed_transform_is_before(recorded):

@@ -4,6 +4,7 @@ import base64
 import re
 from functools import partial
 
+import browser
 import numpy as np
 import pytest
 from bag_making import JAZZY, header, write_messages
@@ -568,6 +569,7 @@ def test_the_worst_stop_is_drawn_first_and_named(arm_images, capsys):
             assert np.ptp(near.astype(int)) > 100
     assert far[0] > 6.0 > 3.0 > max(far[1:])
     assert sum(map(len, tiles)) < 400_000
+    assert browser.printed_pages(out / "report.html", folder) == 2
 
 
 def test_poses_that_the_result_does_not_use_as_they_are_have_no_picture(arm_images):

@@ -4,8 +4,6 @@ alone.
 
 import dataclasses
 import re
-import shutil
-import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -228,6 +226,8 @@ def test_results_of_positions_and_rates_have_a_page_of_what_they_show(partial, n
     if name == "rates":
         of_positions = ("views", "trajectories", "coordinates")
         shown = [figure for figure in shown if figure not in of_positions]
+    else:
+        shown.insert(1, "track")
     assert [attributes["id"] for attributes in page.all("figure")] == [
         f"figure-{figure}" for figure in shown
     ]
@@ -567,26 +567,17 @@ def test_an_unknown_direction_between_axes_is_drawn_as_it_is():
         assert abs(along @ expected) == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("of", ["poses", "stops"])
 def test_a_report_is_printed_on_two_pages_and_with_its_details_if_they_are_open(
-    tmp_path,
+    tmp_path, of
 ):
-    program = next(filter(None, map(shutil.which, browser.PROGRAMS)), None)
-    if program is None:
-        pytest.skip("no browser")
-    result = hec.calibrate("sample:lidar.tum", "sample:camera.tum")
+    if of == "poses":
+        result = hec.calibrate("sample:lidar.tum", "sample:camera.tum")
+    else:
+        samples = hec.read_arm_samples("sample:arm.yaml")
+        result = hec.calibrate_arm(samples.robot, samples.tracking)
     page = result.report(tmp_path / "report.html")
-    assert printed_pages(program, page, tmp_path) == 2
+    assert browser.printed_pages(page, tmp_path) == 2
     opened = page.read_text(encoding="utf-8").replace("<details>", "<details open>")
     page.write_text(opened, encoding="utf-8")
-    assert printed_pages(program, page, tmp_path) > 2
-
-
-def printed_pages(program, page, folder):
-    """Number of pages on which a browser prints a page."""
-    pdf = folder / "printed.pdf"
-    options = ("--headless", "--no-sandbox", "--disable-gpu", "--no-pdf-header-footer")
-    arguments = [program, *options, f"--print-to-pdf={pdf}", page.as_uri()]
-    subprocess.run(
-        arguments, check=True, capture_output=True, timeout=browser.PATIENCE_S
-    )
-    return len(re.findall(rb"/Type /Page\b", pdf.read_bytes()))
+    assert browser.printed_pages(page, tmp_path) > 2

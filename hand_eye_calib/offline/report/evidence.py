@@ -233,11 +233,11 @@ def _paths_of_positions(
         T_oriented_point = calibration.T_parent_child
         positions = se3.translation_of(pose_pairs.Ts_cw_c)
     measured = positions - positions[0]
-    computed = _moved_onto(measured, se3.translation_of(poses @ T_oriented_point))
-    return measured, computed, _moved_onto(measured, se3.translation_of(poses))
+    computed = moved_onto(measured, se3.translation_of(poses @ T_oriented_point))
+    return measured, computed, moved_onto(measured, se3.translation_of(poses))
 
 
-def _moved_onto(measured: FloatArray, path: FloatArray) -> FloatArray:
+def moved_onto(measured: FloatArray, path: FloatArray) -> FloatArray:
     """Move a path (N, 3) onto a measured path (N, 3) by the best rotation and by the mean."""
     center = measured.mean(axis=0)
     path = path - path.mean(axis=0)
@@ -287,6 +287,30 @@ def _angles(
     measured_rad = np.vstack([np.zeros(3), np.cumsum(steps_rad, axis=0)])
     errors_rad = se3.rotations_between(measured, computed)
     return measured_rad, measured_rad + errors_rad
+
+
+def turning_part(path: FloatArray, times_s: FloatArray, least_s: float) -> slice:
+    """Return the part of a path (N, 3) in which the sensor turns most.
+
+    It is the part with the largest ratio of its length to the distance of its ends, among parts
+    that are not shorter than half the median. Its duration is a tenth of that of the path, or
+    ``least_s`` if that is longer.
+    """
+    duration_s = max(times_s[-1] / 10, least_s)
+    ends = np.searchsorted(times_s, times_s + duration_s)
+    starts = np.flatnonzero(ends < len(times_s))
+    if not len(starts):
+        return slice(0, len(times_s))
+    ends = ends[starts]
+    # Steps between poses that are apart sum the motion, not the noise.
+    stride = max(1, round(_MIN_PATH_STEP_S / median(np.diff(times_s))))
+    way = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path[::stride], axis=0), axis=1))]
+    travelled = np.interp(times_s, times_s[::stride], way)
+    lengths = travelled[ends] - travelled[starts]
+    chords = np.linalg.norm(path[ends] - path[starts], axis=1)
+    is_long = 2 * lengths >= median(lengths)
+    row = int(np.argmax(np.where(is_long, lengths / (chords + 0.1 * lengths), 0.0)))
+    return slice(int(starts[row]), int(ends[row]) + 1)
 
 
 def _is_upright(poses: FloatArray) -> bool:

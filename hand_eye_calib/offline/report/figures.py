@@ -15,7 +15,12 @@ from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.text import amount, angle, length, listing, share
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
 from hand_eye_calib.core.results.records import Residuals
-from hand_eye_calib.offline.report.evidence import Evidence, StreamView
+from hand_eye_calib.offline.report.evidence import (
+    Evidence,
+    StreamView,
+    moved_onto,
+    turning_part,
+)
 from hand_eye_calib.offline.report.style import (
     BAD,
     CHILD,
@@ -62,6 +67,10 @@ def figures_of(calibration: Calibration, evidence: Evidence | None) -> list[Draw
         evidence = None
     if calibration.measured != "rotations":
         figures.append(figure_of_views([calibration], titles))
+        if evidence and evidence.without_lever_arm is not None:
+            figures.append(
+                _figure_of_track(calibration, evidence, evidence.without_lever_arm)
+            )
         if evidence:
             figures.append(_figure_of_paths(calibration, evidence))
         if "stops" in calibration.parts:
@@ -279,6 +288,84 @@ def _figure_of_coordinates(calibration: Calibration, evidence: Evidence) -> Draw
     return as_drawn(figure, "coordinates", title, caption, lines)
 
 
+class _Positions(NamedTuple):
+    """Measured and computed positions (N, 3), m, and the names of both sensors.
+
+    ``sensor`` has measured the positions. They are computed from the poses of ``other``.
+    """
+
+    measured: FloatArray
+    computed: FloatArray
+    sensor: str
+    other: str
+
+    @classmethod
+    def of(cls, calibration: Calibration, evidence: Evidence) -> "_Positions":
+        child = calibration.child_frame
+        parent = calibration.parent_frame
+        if evidence.has_positions_of_parent:
+            return cls(evidence.parent, evidence.child, parent, child)
+        return cls(evidence.child, evidence.parent, child, parent)
+
+
+@page_style()
+def _figure_of_track(
+    calibration: Calibration, evidence: Evidence, without_lever_arm: FloatArray
+) -> Drawn:
+    """Draw the sharpest turn of the track enlarged, and its distances from computed positions.
+
+    ``without_lever_arm`` (N, 3) are the positions of the other sensor, m. In the turn, both
+    computed paths are moved onto the measured one, so that drift is not visible.
+    """
+    measured, computed, sensor, other = _Positions.of(calibration, evidence)
+    part = turning_part(measured, evidence.times_s, LOOK.min_turn_s)
+    turn = measured[part]
+    colours = (CHILD, PARENT)
+    if evidence.has_positions_of_parent:
+        colours = (PARENT, CHILD)
+    paths = (
+        (moved_onto(turn, without_lever_arm[part]), MUTED, f"{other}, no lever arm"),
+        (moved_onto(turn, computed[part]), colours[1], f"{other}, through the result"),
+    )
+    factor, unit = _time_axis(evidence.times_s[-1])
+    times = evidence.times_s[part] * factor
+    across = int(np.argmin(np.ptp(measured, axis=0)))
+    first, second = (axis for axis in range(3) if axis != across)
+    figure, (plane, side) = make_panels(3.75, 1, 2)
+    distances = []
+    for path, colour, label in paths:
+        plane.plot(
+            path[:, first], path[:, second], color=colour, label=plain_label(label)
+        )
+        distances_m = np.linalg.norm(path - turn, axis=1)
+        distances.append(length(float(np.median(distances_m))))
+        side.plot(times, 100 * distances_m, color=colour)
+    rows = _downsample(len(turn), LOOK.max_dots)
+    dots = turn[rows]
+    plane.plot(
+        dots[:, first],
+        dots[:, second],
+        "o",
+        color=colours[0],
+        ms=3.5,
+        label=plain_label(sensor),
+    )
+    axes = ("x (m)", "y (m)", "z (m)")
+    plane.set(title="From above" if across == 2 else "In the plane of motion")
+    plane.set(xlabel=axes[first], ylabel=axes[second])
+    plane.set_aspect("equal", adjustable="datalim")
+    side.set(title="Distance from the measured positions")
+    side.set(xlabel=f"time ({unit})", ylabel="distance (cm)", ylim=(0, None))
+    caption = (
+        f"A turn of the track, enlarged. Dots: measured positions of {sensor}. The line "
+        f"computed from the poses of {other} and the result should go through the dots. Half of "
+        f"the time, it is within {distances[1]} of them; without a lever arm, within "
+        f"{distances[0]}."
+    )
+    lines, _ = plane.get_legend_handles_labels()
+    return as_drawn(figure, "track", "The positions in a turn", caption, lines)
+
+
 @page_style()
 def _figure_of_positions(
     calibration: Calibration, evidence: Evidence, without_lever_arm: FloatArray
@@ -287,13 +374,7 @@ def _figure_of_positions(
 
     The differences are those with the result, and those ``without_lever_arm`` (N, 3), m.
     """
-    sensor = calibration.child_frame
-    other = calibration.parent_frame
-    measured = evidence.child
-    computed = evidence.parent
-    if evidence.has_positions_of_parent:
-        sensor, other = other, sensor
-        measured, computed = computed, measured
+    measured, computed, sensor, other = _Positions.of(calibration, evidence)
     before = without_lever_arm - measured
     after = computed - measured
     nothing = np.full_like(measured, np.nan)

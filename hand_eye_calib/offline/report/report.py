@@ -69,7 +69,7 @@ _AXIS_NAMES = {
 # Frames of sensors that have no name of their own.
 _DEFAULT_FRAMES = ("parent_sensor", "child_sensor")
 # Names of the figures at the top of the page. All other figures are in the section Evidence.
-_TOP_FIGURES = ("views", "trajectories")
+_TOP_FIGURES = ("views", "track", "trajectories")
 
 _FOLDER = Path(__file__).parent / "templates"
 _TEMPLATES = jinja2.Environment(

@@ -68,6 +68,10 @@ class Look(NamedTuple):
         Largest number of points of a line, and of single dots.
     max_coordinate_points : int
         Largest number of points of a line of one coordinate over time.
+    min_turn_s : float
+        Shortest duration (s) of the part of a path that is drawn enlarged.
+    max_dots : int
+        Largest number of dots along an enlarged line.
     max_vehicles : int
         Largest number of vehicles on the page of a batch.
     """
@@ -83,6 +87,8 @@ class Look(NamedTuple):
     min_in_view: float = 0.1
     max_points: int = 1000
     max_coordinate_points: int = 400
+    min_turn_s: float = 10.0
+    max_dots: int = 60
     max_vehicles: int = 4
 
 
