@@ -125,7 +125,7 @@ def ethz(folder: Path) -> Iterator[Row]:
         A = hand[[i for _, i, _ in fitted]]
         B = eye[[row for _, _, row in fitted]]
         started = time.process_time()
-        fit = solve(Stops(A, B))
+        fit = solve(Stops(A, B, has_target=True))
         seconds.append(time.process_time() - started)
         A = hand[[i for _, i, _ in held]]
         B = eye[[row for _, _, row in held]]

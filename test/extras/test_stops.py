@@ -570,6 +570,34 @@ def test_only_clear_outliers_are_reported(random, error_m, codes):
     assert [finding.code for finding in result.findings] == codes
 
 
+@pytest.mark.parametrize(("tilt_deg", "codes"), [(2.0, []), (25.0, ["outliers"])])
+@pytest.mark.parametrize("setup", ["hand", "beside"])
+def test_a_tilt_of_a_target_seen_from_the_front_is_not_reported(
+    random, setup, tilt_deg, codes
+):
+    n = 40
+    views = random.normal(size=(n, 2))
+    views *= np.radians(25.0) / np.linalg.norm(views, axis=1, keepdims=True)
+    views[7] = [np.radians(tilt_deg), 0.0]
+    vectors = np.column_stack([views, np.zeros(n)])
+    tracking = se3.from_rotation_translation(
+        se3.rotation_exp(vectors) @ np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.8]
+    )
+    X, Z = poses(random, 2, 0.3, 1.0)
+    robot = Z @ se3.inverse(X @ tracking)
+    if setup == "beside":
+        robot = X @ tracking @ se3.inverse(Z)
+    tracking = tracking @ se3.exp(random.normal(size=(n, 6)) * 1e-3)
+    # The mirror image of a view from the front.
+    mirrored = se3.rotation_exp(np.radians([-4.0, 0.0, 0.0]))
+    tracking[7, :3, :3] = mirrored @ tracking[7, :3, :3]
+
+    result = calibrate_arm(robot, tracking, setup=setup)
+
+    assert [row.number for row in result.stops.rows if not row.is_used] == [8]
+    assert [finding.code for finding in result.findings] == codes
+
+
 def test_two_stops_are_too_few(random):
     for n in (0, 1, 2):
         with pytest.raises(NotEnoughDataError, match="at least 3"):

@@ -17,16 +17,16 @@ from hand_eye_calib.core.base.errors import (
     require_type,
 )
 from hand_eye_calib.core.base.option import option_name
-from hand_eye_calib.core.base.text import listing, shown_value
-from hand_eye_calib.core.checks.findings import Finding, Severity, finding
+from hand_eye_calib.core.base.text import shown_value
+from hand_eye_calib.core.checks.findings import Finding, finding
 from hand_eye_calib.core.engine.estimation import calibration_of
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import pose_stack
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.records import Residuals
 from hand_eye_calib.extras.stops.checks import MIN_LEAD
-from hand_eye_calib.extras.stops.closed_form import Stops
 from hand_eye_calib.extras.stops.next_stops import advice_in_words, next_stops
+from hand_eye_calib.extras.stops.outliers import check_left_out
 from hand_eye_calib.extras.stops.robot_world import MIN_STOPS, RobotWorld
 from hand_eye_calib.extras.stops.rough_fit import StopPoses
 from hand_eye_calib.extras.stops.solving import SetupFit, SolvedStops, solve_checked
@@ -59,17 +59,6 @@ _MAX_BASE_RATIO = 0.5
 # An unobservable direction (unit vector of translation and rotation) is one of the rotation if its
 # rotation part is longer than this.
 _ROTATION_PART = 0.5
-
-# Squared Mahalanobis distance (six values) of a stop above which an outlier is reported. Outliers
-# below it are left out silently: tilts of a target seen from the front have errors that are some
-# times larger than those of other views. Measured on simulated images of three targets.
-_MIN_REPORTED_SQUARED = 225.0
-
-# Share of reported outliers above which the verdict is USE WITH CARE.
-_MAX_LEFT_OUT = 0.1
-
-# Largest number of outliers that a message lists.
-_MAX_LISTED = 8
 
 
 def calibrate_stops(
@@ -374,43 +363,6 @@ def _check_distances(setup_fit: SetupFit, frames: Mapping[str, str]) -> list[Fin
     return [finding("reading", what=what)]
 
 
-def _check_left_out(fit: RobotWorld, stops: Stops) -> list[Finding]:
-    """Return a finding with the numbers (from 1) of the stops that are clear outliers, if any."""
-    is_clear = (fit.weights == 0.0) & (
-        _squared_distances(fit, stops) > _MIN_REPORTED_SQUARED
-    )
-    numbers = [str(row + 1) for row in np.flatnonzero(is_clear)]
-    count = len(numbers)
-    if count == 0:
-        return []
-    if count > _MAX_LISTED:
-        numbers = [*numbers[:_MAX_LISTED], f"{count - _MAX_LISTED} more"]
-    is_large = count > _MAX_LEFT_OUT * len(stops)
-    return [
-        finding(
-            "outlier_stops",
-            severity=Severity.WARNING if is_large else Severity.NOTE,
-            count=count,
-            n_stops=len(stops),
-            numbers=f"{'stop' if count == 1 else 'stops'} {listing(numbers)}",
-        )
-    ]
-
-
-def _squared_distances(fit: RobotWorld, stops: Stops) -> FloatArray:
-    """Return the squared Mahalanobis distance (N,) of each stop to its prediction.
-
-    The errors are those in the frame of the child, or in that of its world if they are smaller.
-    """
-    predicted = (
-        se3.inverse(fit.T_world_world) @ stops.Ts_world_parent @ fit.T_parent_child
-    )
-    measured = se3.inverse(stops.Ts_world_child)
-    errors = se3.log(np.stack([measured @ predicted, predicted @ measured]))
-    levels = np.repeat([fit.level_m, fit.level_rad], 3)
-    return np.asarray(np.sum((errors / levels) ** 2, axis=2).min(axis=0))
-
-
 # ------------------------------------------------------------------ the result
 
 
@@ -446,7 +398,7 @@ def _calibration_of(
     stops = solved.setup_fit.stops
     config = solved.config
     if solved.is_usable:
-        solved = solved.adding(*_check_left_out(fit, stops))
+        solved = solved.adding(*check_left_out(fit, stops))
     X = fit.T_parent_child
     Z = fit.T_world_world
     covariance_X = fit.covariance[:6, :6]

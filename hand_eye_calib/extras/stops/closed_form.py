@@ -6,7 +6,7 @@ using the Kronecker product*, Journal of Mechanisms and Robotics 5(3), 2013, eq.
 follow from ``R_A_i t_X - t_Z = R_Z t_B_i - t_A_i`` by linear least squares.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,16 +33,23 @@ class Stops:
         A_i: poses of the parent sensor in its world.
     Ts_world_child : (N, 4, 4) array
         B_i: poses of the child sensor in its world.
+    has_target : bool
+        True if the child is a camera and its world a flat target, whose normal is the z axis.
     """
 
     Ts_world_parent: FloatArray
     Ts_world_child: FloatArray
+    has_target: bool = False
 
     def __len__(self) -> int:
         return len(self.Ts_world_parent)
 
     def __getitem__(self, rows: IntArray | BoolArray) -> "Stops":
-        return Stops(self.Ts_world_parent[rows], self.Ts_world_child[rows])
+        return replace(
+            self,
+            Ts_world_parent=self.Ts_world_parent[rows],
+            Ts_world_child=self.Ts_world_child[rows],
+        )
 
 
 def closest_rotations(

@@ -1,6 +1,6 @@
 """Fit of X and Z from stops with several sources of error.
 
-The error of a stop, ``xi_i = Log(B_i^-1 Z^-1 A_i X)`` in the frame of the child, is a sum of four
+The error of a stop, ``xi_i = Log(B_i^-1 Z^-1 A_i X)`` in the frame of the child, is a sum of
 independent errors:
 
 - a position across the line of sight from the child to the origin of its world, such as errors of
@@ -8,7 +8,9 @@ independent errors:
 - a position along the line of sight: the distance of a target is measured worse than its direction;
 - a rotation about the origin of the child, such as that of a robot's hand;
 - a rotation about the origin of the child's world, such as that of a target in a camera. This
-  rotation moves the child.
+  rotation moves the child;
+- for a flat target, a tilt: such a rotation about an axis across the line of sight, which is larger
+  for views from the front (:mod:`hand_eye_calib.extras.stops.flat_target`).
 
 Their variances are estimated by restricted maximum likelihood: D. A. Harville, *Maximum likelihood
 approaches to variance component estimation*, JASA 72, 1977. Each iteration is the update of
@@ -25,6 +27,10 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.stats import student_weights
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.stops.closed_form import Stops
+from hand_eye_calib.extras.stops.flat_target import sines_of_views, usual_sine
+
+# Sources that are positions, the first ones; the others are rotations.
+_N_POSITION_SOURCES = 2
 
 # Prior standard deviation of the logarithm of each variance: a factor of 4.5. Measured on stops of
 # simulated arms.
@@ -78,7 +84,7 @@ def fit_components(
     degrees: float,
     linearise: Linearise,
 ) -> ComponentsFit:
-    """Fit X, Z and the variances of the four sources of error.
+    """Fit X, Z and the variances of the sources of error.
 
     Parameters
     ----------
@@ -97,9 +103,7 @@ def fit_components(
     """
     X, Z = start
     sources = _covariances_of_sources(stops)
-    # Begin with equal halves: errors of positions across and along the line of sight, and errors of
-    # rotations about both origins.
-    prior = 0.5 * np.repeat(variances, 2)
+    prior = _prior_components(variances, len(sources))
     components = prior
     for _ in range(_MAX_ROUNDS):
         errors, jacobian = linearise(stops, X, Z)
@@ -150,7 +154,7 @@ def fit_linear(
     weights: FloatArray,
     degrees: float,
 ) -> LinearFit:
-    """Fit P values and the variances of the four sources of error.
+    """Fit P values and the variances of the sources of error.
 
     Parameters
     ----------
@@ -161,7 +165,7 @@ def fit_linear(
         As for :func:`fit_components`.
     """
     sources = _covariances_of_sources(stops)
-    prior = 0.5 * np.repeat(variances, 2)
+    prior = _prior_components(variances, len(sources))
     components = prior
     lengths = np.sqrt(np.einsum("nij,nij->j", jacobian, jacobian) + MIN_VARIANCE)
     columns = jacobian / lengths
@@ -191,7 +195,7 @@ def fit_linear(
 
 @dataclass(frozen=True)
 class _Iteration:
-    """Step of the P values, and the terms that update the variances of the K = 4 sources.
+    """Step of the P values, and the terms that update the variances of the K sources.
 
     Attributes
     ----------
@@ -227,7 +231,7 @@ def _iteration(
 ) -> _Iteration:
     """Return one iteration at errors (N, 6) and their derivatives (N, 6, P).
 
-    ``components`` (4,) are the variances of the sources, ``sources`` (4, N, 6, 6) the covariances
+    ``components`` (K,) are the variances of the sources, ``sources`` (K, N, 6, 6) the covariances
     with variance 1.
     """
     covariances = np.tensordot(components, sources, 1) + MIN_VARIANCE * np.eye(6)
@@ -255,7 +259,7 @@ def _updated(
     quadratic: FloatArray,
     expected: FloatArray,
 ) -> FloatArray:
-    """Return the variances (4,) after one iteration of the MM algorithm with the prior."""
+    """Return the variances (K,) after one iteration of the MM algorithm with the prior."""
     # Derivative of the prior's log density, times two.
     pull = 2.0 * np.log(prior / components) / _PRIOR_SIGMA**2
     upwards = np.maximum(pull, 0.0)
@@ -272,20 +276,46 @@ def _updated(
     return np.maximum(np.sqrt(squared), MIN_VARIANCE)
 
 
+def _prior_components(variances: FloatArray, n_sources: int) -> FloatArray:
+    """Return the prior means (K,) of the variances of all sources.
+
+    ``variances`` (2,) are those of positions and rotations. The first two sources are positions,
+    the others rotations.
+    """
+    n_rotations = n_sources - _N_POSITION_SOURCES
+    return 0.5 * np.repeat(variances, [_N_POSITION_SOURCES, n_rotations])
+
+
 def _covariances_of_sources(stops: Stops) -> FloatArray:
-    """Return the covariances (4, N, 6, 6) of the errors by each source with variance 1."""
+    """Return the covariances (K, N, 6, 6) of the errors by each source with variance 1."""
     n = len(stops)
     to_world = se3.translation_of(se3.inverse(stops.Ts_world_child))
     lengths = np.linalg.norm(to_world, axis=1, keepdims=True)
     sight = to_world / np.maximum(lengths, np.sqrt(MIN_VARIANCE))
     along = sight[:, :, None] * sight[:, None, :]
-    levers = se3.skew(to_world)
+    across = np.eye(3) - along
     covariances = np.zeros((4, n, 6, 6))
-    covariances[0, :, :3, :3] = np.eye(3) - along
+    covariances[0, :, :3, :3] = across
     covariances[1, :, :3, :3] = along
     covariances[2, :, 3:, 3:] = np.eye(3)
-    covariances[3, :, :3, :3] = levers @ np.swapaxes(levers, 1, 2)
-    covariances[3, :, :3, 3:] = levers
-    covariances[3, :, 3:, :3] = np.swapaxes(levers, 1, 2)
-    covariances[3, :, 3:, 3:] = np.eye(3)
+    covariances[3] = _about_world(np.broadcast_to(np.eye(3), (n, 3, 3)), to_world)
+    if not stops.has_target:
+        return covariances
+    variances = usual_sine(stops) ** 2 / sines_of_views(stops.Ts_world_child) ** 2
+    tilts = _about_world(variances[:, None, None] * across, to_world)
+    return np.concatenate([covariances, tilts[None]])
+
+
+def _about_world(rotations: FloatArray, to_world: FloatArray) -> FloatArray:
+    """Return covariances (N, 6, 6) of errors that rotate about the origin of the child's world.
+
+    ``rotations`` (N, 3, 3) are the covariances of the rotations, ``to_world`` (N, 3) the positions
+    of this origin, both in the frame of the child.
+    """
+    levers = se3.skew(to_world)
+    covariances = np.empty((len(rotations), 6, 6))
+    covariances[:, :3, :3] = levers @ rotations @ np.swapaxes(levers, 1, 2)
+    covariances[:, :3, 3:] = levers @ rotations
+    covariances[:, 3:, :3] = rotations @ np.swapaxes(levers, 1, 2)
+    covariances[:, 3:, 3:] = rotations
     return covariances

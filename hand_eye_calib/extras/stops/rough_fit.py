@@ -93,7 +93,7 @@ class StopPoses:
             B = se3.inverse(B)
         if mistakes.is_inverse:
             A = se3.inverse(A)
-        return Stops(A, B)
+        return Stops(A, B, has_target=self.is_arm)
 
 
 @dataclass(frozen=True)

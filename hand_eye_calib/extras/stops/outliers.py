@@ -1,0 +1,67 @@
+"""Report stops that are clear outliers of the fit."""
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.text import listing
+from hand_eye_calib.core.checks.findings import Finding, Severity, finding
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.extras.stops.closed_form import Stops
+from hand_eye_calib.extras.stops.flat_target import sines_of_views, usual_sine
+from hand_eye_calib.extras.stops.robot_world import RobotWorld
+
+# Squared Mahalanobis distance (six values) of a stop above which an outlier is reported. Outliers
+# below it are left out silently: errors of a target's pose differ by some times between views.
+# Measured on simulated images of three targets.
+_MIN_REPORTED_SQUARED = 225.0
+
+# Share of reported outliers above which the verdict is USE WITH CARE.
+_MAX_LEFT_OUT = 0.1
+
+# Largest number of outliers that a message lists.
+_MAX_LISTED = 8
+
+
+def check_left_out(fit: RobotWorld, stops: Stops) -> list[Finding]:
+    """Return a finding with the numbers (from 1) of the stops that are clear outliers, if any."""
+    distances = _squared_distances(fit, stops)
+    is_clear = (fit.weights == 0.0) & (distances > _MIN_REPORTED_SQUARED)
+    numbers = [str(row + 1) for row in np.flatnonzero(is_clear)]
+    count = len(numbers)
+    if count == 0:
+        return []
+    if count > _MAX_LISTED:
+        numbers = [*numbers[:_MAX_LISTED], f"{count - _MAX_LISTED} more"]
+    is_large = count > _MAX_LEFT_OUT * len(stops)
+    return [
+        finding(
+            "outlier_stops",
+            severity=Severity.WARNING if is_large else Severity.NOTE,
+            count=count,
+            n_stops=len(stops),
+            numbers=f"{'stop' if count == 1 else 'stops'} {listing(numbers)}",
+        )
+    ]
+
+
+def _squared_distances(fit: RobotWorld, stops: Stops) -> FloatArray:
+    """Return the squared Mahalanobis distance (N,) of each stop to its prediction.
+
+    The errors are those in the frame of the child, or in that of its world if they are smaller.
+    """
+    predicted = (
+        se3.inverse(fit.T_world_world) @ stops.Ts_world_parent @ fit.T_parent_child
+    )
+    measured = se3.inverse(stops.Ts_world_child)
+    errors = se3.log(np.stack([measured @ predicted, predicted @ measured]))
+    squared = np.sum(errors.reshape(2, len(stops), 2, 3) ** 2, axis=3)
+    positions, rotations = np.moveaxis(squared, 2, 0)
+    if stops.has_target:
+        # The angle of a view is the predicted or the measured one, whichever is larger. A rotation
+        # that is wrong by more than this angle is no error of a view from the front.
+        sines = np.maximum(
+            sines_of_views(predicted), sines_of_views(stops.Ts_world_child)
+        )
+        rotations = rotations * np.minimum(sines / usual_sine(stops), 1.0) ** 2
+    distances = positions / fit.level_m**2 + rotations / fit.level_rad**2
+    return np.asarray(distances.min(axis=0))
