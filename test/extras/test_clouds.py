@@ -17,6 +17,7 @@ from hand_eye_calib.core.geometry.frames import Extrinsic
 from hand_eye_calib.extras.clouds import merging
 from hand_eye_calib.extras.clouds.figure import figures_of_clouds
 from hand_eye_calib.formats.bags.reader import PoseBag
+from hand_eye_calib.offline.cli.main import main
 
 # Noise of a range (m), as the machines have it.
 RANGE_NOISE_M = 0.02
@@ -41,7 +42,10 @@ def write_bag(path, topics=("/a/points", "/b/points"), raised_m=0.0, storage="mc
     """Write the bag of the machine; ``raised_m`` raises the points of the child."""
     drive, clouds = machine()
     messages = []
-    for topic, stream in (("/a", drive.parent), ("/b", drive.child)):
+    # A third sensor has no clouds.
+    third = replace(drive.child, sensor_frame="camera")
+    streams = (("/a", drive.parent), ("/b", drive.child), ("/c", third))
+    for topic, stream in streams:
         rows = se3.to_rows(stream.poses)
         for stamp_ns, row in zip(stream.stamps_ns.tolist(), rows, strict=True):
             make = pose_message(ODOMETRY, stamp_ns, row, "odom", stream.sensor_frame)
@@ -146,6 +150,20 @@ def test_a_report_with_clouds_is_printed_on_two_pages(recorded, tmp_path):
     page = recorded[1].report(tmp_path / "report.html")
     assert 'id="figure-clouds"' in page.read_text(encoding="utf-8")
     assert browser.printed_pages(page, tmp_path) == 2
+
+
+def test_a_rig_has_a_picture_of_each_pair_of_lidars(tmp_path):
+    bag = write_bag(tmp_path / "bag")
+    rig = ["rig", str(bag), "--topics", "/a", "/b", "/c"]
+    assert main([*rig, "--out", str(tmp_path / "out")]) == 0
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert re.findall(r'<figure[^>]*id="figure-(\w[^"]*)"', page) == [
+        "views",
+        "clouds-1",
+    ]
+    parent, child = [dots_of(page, colour)[1] for colour in ("parent", "child")]
+    distances = np.linalg.norm(parent[:, None] - child, axis=2).min(axis=0)
+    assert np.median(distances) < 2.0
 
 
 def test_the_installed_transform_is_before(recorded):

@@ -190,9 +190,11 @@ LIVE_READINGS: Registry[Callable[[str, str], Any]] = Registry("kind of live mess
 #: a folder, and "corners" draws the corners of the target on the images.
 TARGET_IMAGES: Registry[Callable[[], Any]] = Registry("reader of images of a target")
 
-#: Functions ``draw(calibration, snapshot)`` that return further figures of the report, a list of
-#: ``Drawn`` of ``offline/report/style.py``.
-REPORT_PICTURES: Registry[Callable[[Any, Any], Any]] = Registry("picture of the report")
+#: Functions ``draw(calibration, snapshot, suffix)`` that return further figures of the report: a
+#: list of ``Drawn`` of ``offline/report/style.py``. The names of the figures end in ``suffix``.
+REPORT_PICTURES: Registry[Callable[[Any, Any, str], Any]] = Registry(
+    "picture of the report"
+)
 
 #: Functions ``read(path, content, options)`` that read trajectory files of other programs. They
 #: return None for a file of another format.

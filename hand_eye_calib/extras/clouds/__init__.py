@@ -10,7 +10,7 @@ def register() -> None:
     REPORT_PICTURES["clouds"] = _figures
 
 
-def _figures(calibration: Any, snapshot: Any) -> Any:
+def _figures(calibration: Any, snapshot: Any, suffix: str) -> Any:
     from hand_eye_calib.extras.clouds.figure import figures_of_clouds
 
-    return figures_of_clouds(calibration, snapshot)
+    return figures_of_clouds(calibration, snapshot, suffix)

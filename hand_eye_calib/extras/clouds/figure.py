@@ -32,7 +32,6 @@ from hand_eye_calib.offline.report.style import (
     plain_label,
 )
 
-_TITLE = "The clouds of both sensors, merged"
 # Half the thickness (m) of the slice of the view from the side.
 _HALF_SLICE_M = 1.5
 # Points of the view from above are higher than the ground by this (m). Rings on the ground would
@@ -48,23 +47,29 @@ _MIN_SHARED = 0.05
 
 
 def figures_of_clouds(
-    calibration: Calibration, snapshot: Snapshot | None
+    calibration: Calibration, snapshot: Snapshot | None, suffix: str = ""
 ) -> list[Drawn]:
     """Return the figure of the merged clouds as a list, which is empty without clouds.
 
-    If the clouds cannot be read, the figure is a text with the reason.
+    The name of the figure ends in ``suffix``. If the clouds cannot be read, the figure is a text
+    with the reason.
     """
     if snapshot is None or calibration.has_failed:
         return []
     try:
         merged = merge(calibration, snapshot)
     except InputError as error:
-        return [Drawn("clouds", _TITLE, f"The clouds cannot be read: {error}.", "")]
-    return [] if merged is None else [_drawn(calibration, merged)]
+        caption = f"The clouds cannot be read: {error}."
+        return [Drawn(f"clouds{suffix}", _title(calibration), caption, "")]
+    return [] if merged is None else [_drawn(calibration, merged, f"clouds{suffix}")]
+
+
+def _title(calibration: Calibration) -> str:
+    return f"Clouds of {calibration.parent_frame} and {calibration.child_frame}, merged"
 
 
 @page_style()
-def _drawn(calibration: Calibration, merged: MergedClouds) -> Drawn:
+def _drawn(calibration: Calibration, merged: MergedClouds, name: str) -> Drawn:
     """Draw two views from above and two from the side; before is left, after is right."""
     figure, panels = make_panels(5.3, 2, 2, gap=0.12, height_ratios=(2.6, 1.0))
     has_installed = installed_transform(calibration) is not None
@@ -95,12 +100,13 @@ def _drawn(calibration: Calibration, merged: MergedClouds) -> Drawn:
     above[0].set_ylabel(f"{names[0]}: y (m)")
     side[0].set_ylabel(f"{names[1]}: z (m)")
     lines = []
-    for colour, name in (
+    for colour, sensor in (
         (PARENT, calibration.parent_frame),
         (CHILD, calibration.child_frame),
     ):
-        lines.append(Line2D([], [], color=colour, label=plain_label(name)))
-    drawn = as_drawn(figure, "clouds", _TITLE, _caption(calibration, merged), lines)
+        lines.append(Line2D([], [], color=colour, label=plain_label(sensor)))
+    caption = _caption(calibration, merged)
+    drawn = as_drawn(figure, name, _title(calibration), caption, lines)
     # A dot is a line without length: "M x y L x y" becomes the shorter "Mx yh0".
     svg = re.sub(r"M ([\d.-]+ [\d.-]+) \nL \1 \n?", r"M\1h0", drawn.svg)
     return replace(drawn, svg=svg)

@@ -50,10 +50,10 @@ def calibrate_rig(arguments: argparse.Namespace, restore_urls: "RestoreUrls") ->
     inputs = restore_urls(readings.inputs) | {"options": options_from(arguments)}
     if arguments.label:
         inputs["labels"] = dict(arguments.label)
+    snapshots: dict[str, Snapshot] = {}
+    complete = partial(_completed, arguments, snapshots)
     with waiting_for(f"solving for {len(sensors)} sensors"):
-        rig = of_rig.calibrated(
-            sensors, inputs["options"], partial(_completed, arguments)
-        )
+        rig = of_rig.calibrated(sensors, inputs["options"], complete)
     rig = rig.with_warnings(restore_urls(readings.warnings))
     if arguments.out:
         kept = keep_earlier_results(arguments.out)
@@ -68,18 +68,26 @@ def calibrate_rig(arguments: argparse.Namespace, restore_urls: "RestoreUrls") ->
         if arguments.out:
             from hand_eye_calib.extras.rig.page import write_rig_report
 
-            write_rig_report(arguments.out, rig, readings.names)
+            write_rig_report(arguments.out, rig, readings.names, snapshots=snapshots)
     return end(rig.calibrations)
 
 
-def _completed(arguments: argparse.Namespace, snapshot: "Snapshot") -> "Snapshot":
-    """Return the snapshot of two sensors with the measurements beside motion of a bag."""
+def _completed(
+    arguments: argparse.Namespace,
+    snapshots: "dict[str, Snapshot]",
+    snapshot: "Snapshot",
+) -> "Snapshot":
+    """Return the snapshot of two sensors with the measurements beside motion of a bag.
+
+    It is stored in ``snapshots`` by the frame of the child.
+    """
     if not arguments.topics:
         return snapshot
     without = switched_off(vars(arguments))
     snapshot, notes = with_measurements(snapshot, arguments.paths, without)
     for text in notes:
         note(f"{snapshot.child_frame} in {snapshot.parent_frame}: {text}")
+    snapshots[snapshot.child_frame] = snapshot
     return snapshot
 
 

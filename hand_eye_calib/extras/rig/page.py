@@ -1,10 +1,12 @@
 """Report of a rig: the poses of its sensors, and the closure errors."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from hand_eye_calib.core.base.registry import REPORT_PICTURES
 from hand_eye_calib.core.base.spelling import Road
 from hand_eye_calib.core.engine.session_result import SessionResult
+from hand_eye_calib.core.engine.snapshot import Snapshot
 from hand_eye_calib.core.results.document import printed_numbers, transforms_of
 from hand_eye_calib.extras.rig.rig import RigCalibration, calibrate_rig
 from hand_eye_calib.formats.results import save_rig
@@ -21,15 +23,34 @@ def write_rig_report(
     rig: RigCalibration,
     names: Sequence[str],
     road: Road = Road.TERMINAL,
+    snapshots: Mapping[str, Snapshot] | None = None,
 ) -> None:
-    """Write the report of a rig; ``names`` are the files, topics or frames of its sensors."""
-    write_page(directory, lambda: render_rig(rig, names, road))
+    """Write the report of a rig; the arguments are those of :func:`render_rig`."""
+    write_page(directory, lambda: render_rig(rig, names, road, snapshots))
 
 
 def render_rig(
-    rig: RigCalibration, inputs: Sequence[str], road: Road = Road.TERMINAL
+    rig: RigCalibration,
+    inputs: Sequence[str],
+    road: Road = Road.TERMINAL,
+    snapshots: Mapping[str, Snapshot] | None = None,
 ) -> str:
-    """Return the report of a rig as HTML; ``inputs`` are the files, topics or frames."""
+    """Return the report of a rig as HTML.
+
+    Parameters
+    ----------
+    rig : RigCalibration
+    inputs : sequence of str
+        Files, topics or frames of the sensors.
+    road : Road
+    snapshots : mapping of str to Snapshot, optional
+        Streams of the first sensor and of each other sensor, by the frame of the other sensor.
+    """
+    figures = [figure_of_views(rig.calibrations)]
+    for number, calibration in enumerate(rig.calibrations, 1):
+        snapshot = (snapshots or {}).get(calibration.child_frame)
+        for draw in REPORT_PICTURES.values():
+            figures += draw(calibration, snapshot, f"-{number}")
     return page(
         Path(__file__).with_name("rig.html"),
         TONES[rig.verdict.value],
@@ -42,7 +63,7 @@ def render_rig(
             printed_numbers(transforms_of(calibration)["T_parent_child"], (), "±")
             for calibration in rig.calibrations
         ],
-        figures=[figure_of_views(rig.calibrations)],
+        figures=figures,
     )
 
 

@@ -168,7 +168,7 @@ def render(
     for draw in pictures:
         drawings += draw(calibration)
     for draw_of_recording in REPORT_PICTURES.values():
-        drawings += draw_of_recording(calibration, snapshot)
+        drawings += draw_of_recording(calibration, snapshot, "")
     advice = ""
     if evidence and calibration.verdict is not Verdict.DO_NOT_USE:
         advice = what_is_missing(evidence.excitation, calibration)
