@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 import hand_eye_calib as hec
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
+from hand_eye_calib.extras.partial.position_columns import posterior_smoothing
 from reproduction import part_faults
 from reproduction.coverage import classes
 
@@ -106,7 +107,19 @@ def test_positions_too_few_to_detect_smoothing_are_to_be_used_with_care():
     assert result.verdict is not hec.Verdict.USE
 
 
-def test_the_covariance_contains_smoothing_that_is_too_weak_for_a_finding():
+def test_the_posterior_of_smoothing_lies_between_zero_and_the_estimate():
+    clear = posterior_smoothing(0.02, 0.001)
+    assert clear.mean_s2 == pytest.approx(0.02, rel=0.02)
+    assert clear.variance_s4**0.5 == pytest.approx(0.001, rel=0.02)
+    vague = posterior_smoothing(0.02, 0.2)
+    assert abs(vague.mean_s2) < 0.0002
+    # Without information, the variance is that of the prior: 80 % of 2e-3, 20 % of 1e-2.
+    prior_s4 = 0.8 * 0.002**2 + 0.2 * 0.01**2
+    assert vague.variance_s4 == pytest.approx(prior_s4, rel=0.05)
+    assert posterior_smoothing(-0.02, 0.001).mean_s2 == pytest.approx(-clear.mean_s2)
+
+
+def test_smoothing_that_is_too_weak_for_a_finding_is_removed_from_the_lever_arm():
     recording = part_faults.positions("drone_slam", "clean", SEED)
     path = recording.child.poses[:, :3, 3]
     smoothed = gaussian_filter1d(path, 2.0, axis=0, mode="nearest")  # 0.1 s, 5e-3 s^2
@@ -116,6 +129,8 @@ def test_the_covariance_contains_smoothing_that_is_too_weak_for_a_finding():
     result = hec.calibrate(recording.parent, child, **part_faults.WIDE)
     assert codes(result) == []
     assert part_faults.largest_ratio("positions", result, recording.truth) < 2.5
+    # The smoothing shifts the lever arm along z by 5 cm.
+    assert result.T_parent_child[2, 3] == pytest.approx(recording.truth[2], abs=0.03)
 
 
 # Faults of rates and rotations, and the code of the finding on machines that move in other ways.

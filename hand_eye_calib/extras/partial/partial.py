@@ -103,11 +103,26 @@ class _Paths:
             self.poses, self.positions, solution.lever_arm, solution.scale
         )
 
-    def open_covariance(self, solution: of_positions.LeverArmSolution) -> FloatArray:
-        """Return the covariance (3, 3), m^2, that possible faults add to the lever arm."""
+    def without_smoothing(
+        self, solution: of_positions.LeverArmSolution
+    ) -> tuple[of_positions.LeverArmSolution, FloatArray]:
+        """Return the solution without the effect of estimated smoothing.
+
+        The second value is the covariance (3, 3), m^2, that possible faults add to the lever arm.
+        """
         scaled = solution.scale * self.positions
         fitted = fit_positions(self.stamps_ns, self.poses, scaled, solution.lever_arm)
-        return fitted.open_covariance if fitted else np.zeros((3, 3))
+        if fitted is None:
+            return solution, np.zeros((3, 3))
+        smoothing = fitted.smoothing
+        by_response = solution.by_response
+        # Smoothing c is a response of -c.
+        lever_arm = solution.lever_arm - smoothing.mean_s2 * by_response
+        of_smoothing = smoothing.variance_s4 * np.outer(by_response, by_response)
+        return (
+            replace(solution, lever_arm=lever_arm),
+            fitted.open_covariance + of_smoothing,
+        )
 
     def child_scale(self, scale: float) -> float:
         """Return the scale of the child for a scale of the positions."""
@@ -148,9 +163,10 @@ def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calib
             "no lever arm fits these positions: they jump, or belong to another body; compare both "
             "paths"
         ) from None
+    solution, of_faults = paths.without_smoothing(solution)
     T = se3.from_rotation_translation(np.eye(3), sign * solution.lever_arm)
     assessment = covariance.assess_lever_arm(
-        paths.poses, solution, T, solution.covariance, paths.open_covariance(solution)
+        paths.poses, solution, T, solution.covariance, of_faults
     )
     fused = fuse(assessment, config.prior())
     findings = _check_path(solution, fused, paths, "scale" in config.given)

@@ -12,10 +12,12 @@ The orientations are updated from the positions until they settle. The search st
 the recording, each aligned on its own.
 
 Errors that act like a lever arm are parameters beside it, with the prior of usual sensors: a scale
-and a direction of the odometry's path, and a time offset. The response of positions to acceleration
-is only in the covariance: on recorded drones even its sign depends on the frequency. A drone tilts
-to accelerate. Positions with a response kappa (s^2), for instance smoothed ones, move the vertical
-lever arm by kappa g.
+and a direction of the odometry's path, and a time offset. A drone tilts to accelerate. Positions
+with a response kappa (s^2) to acceleration, for instance smoothed ones, move the vertical lever arm
+by kappa g. This model cannot estimate the response well: above about 0.8 Hz the accelerations of a
+drone are mostly noise of the odometry, which looks like smoothed positions. The response is only in
+the covariance here, and :attr:`LeverArmSolution.by_response` is the change of the lever arm for a
+response that :mod:`~hand_eye_calib.extras.partial.position_columns` estimates.
 """
 
 from __future__ import annotations
@@ -88,12 +90,15 @@ class LeverArmSolution(ModelSolution):
         Position of the antenna (m) in the axes of the sensor with poses.
     covariance : (3, 3) array
         Covariance under the model, with the misfit.
+    by_response : (3,) array
+        Change of the lever arm (m) for a response of positions to acceleration of 1 s^2.
     imprecise : (N,) bool array
         Positions that are left out, because their neighbourhood is far less precise than the best.
     """
 
     lever_arm: FloatArray
     covariance: FloatArray
+    by_response: FloatArray
     imprecise: BoolArray
 
     def describe(self, stamps_ns: IntArray) -> Noise:
@@ -450,6 +455,7 @@ def _solution(
     return LeverArmSolution(
         lever_arm=se3.translation_of(state.X) + normal.step[:3],
         covariance=covariance[:3, :3] + np.outer(shift, shift) + lasting * np.eye(3),
+        by_response=_by_response(posterior.products),
         parameters=parameters,
         parameter_sigmas=sigmas,
         scale=first_scale * (1.0 + float(parameters[increments.SCALE])),
@@ -472,6 +478,14 @@ def _solved(products: FloatArray) -> FloatArray:
     """Products (..., 9, 9) of the lever arm, the parameters solved with it, and the residuals."""
     response = 3 + len(_SHARED)
     return np.delete(np.delete(products, response, axis=-2), response, axis=-1)
+
+
+def _by_response(products: FloatArray) -> FloatArray:
+    """Return the change (3,) of the lever arm for a unit response, from products (10, 10)."""
+    response = 3 + len(_SHARED)
+    information = products[:response, :response]
+    with_response = products[:response, response]
+    return np.asarray(-np.linalg.solve(information, with_response)[:3], dtype=float)
 
 
 def _accelerations(
