@@ -60,7 +60,7 @@ def _stop(arguments: argparse.Namespace) -> str:
     tables = []
     rules = ""
     for name, recordings in (
-        ("simulated", stop.simulated(arguments.seeds)),
+        ("simulated", stop.simulated(arguments.seeds, arguments.first_seed)),
         ("real", stop.real(_rigs(arguments))),
     ):
         tasks = {recorded.name: (recorded,) for recorded in recordings}

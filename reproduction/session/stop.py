@@ -128,16 +128,17 @@ class Stop:
     seconds: float = np.nan
     # Time since which all errors had been within their targets.
     earliest_s: float = np.nan
-    # Shares of the times left before the end that were within a factor of two, by their number.
+    # Reported times left before the end, and those within a factor of two.
     n_times: int = 0
     n_good_times: int = 0
 
 
-def simulated(seeds: int) -> Iterator[Recorded]:
+def simulated(seeds: int, first_seed: int = 0) -> Iterator[Recorded]:
     """So many recordings of each class; twice as many of a kind that has one class."""
     for kind, classes in KINDS.items():
         for name, duration_s in classes.items():
-            for seed in range(seeds * 2 // len(classes)):
+            n_seeds = seeds * 2 // len(classes)
+            for seed in range(first_seed, first_seed + n_seeds):
                 key = (_KEY, seed, sorted(CLASSES).index(name))
                 made = simulate(replace(CLASSES[name], duration_s=duration_s), key)
                 truth = Truth.within(made.T_parent_child, 0.0, 0.0)
@@ -229,7 +230,8 @@ def _stops(recorded: Recorded, steps: Sequence[Step], factor: float) -> Iterator
         if progress.done:
             end = index
             break
-        times.append((step.seen.motion_s, progress.seconds_left))
+        if np.isfinite(progress.seconds_left):
+            times.append((step.seen.motion_s, progress.seconds_left))
     stop = _stop(recorded, "", steps, factor, end)
     if end is None:
         yield replace(stop, is_stuck=is_stuck)

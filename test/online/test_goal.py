@@ -158,13 +158,32 @@ def test_the_motion_of_the_last_minute_counts_if_it_is_better():
     poor = result(sigmas_m=(0.004, 0.004, 1.0))
     for motion_s in np.arange(200.0, 300.0, 10.0):
         goal.add(poor, seen(motion_s, FLAT))
-    # Half of the information of z within the last 80 s.
+    # Half of the information of z within the last 30 s.
     better = result(sigmas_m=(0.004, 0.004, 0.02 * np.sqrt(2.0)))
     progress = goal.add(better, seen(320.0), newest_motion=seen(60.0, (0.5, 9.0, 90.0)))
-    assert progress.axes["z"].seconds_left == pytest.approx(90.0)
+    assert progress.axes["z"].seconds_left == pytest.approx(30.0)
     assert progress.sentence == (
-        "Go on for about 3 min, z takes longest. This motion is right, more of it."
+        "Go on for about 2 min, z takes longest. This motion is right, more of it."
     )
+
+
+def test_there_is_no_time_left_before_20_s_of_motion():
+    goal = Goal(TARGETS)
+    early = goal.add(result(sigmas_m=(0.004, 0.04, 0.004)), seen(19.0))
+    assert early.seconds_left == np.inf
+    assert "y is not determined well enough yet" in early.sentence
+    assert np.isfinite(goal.add(result(sigmas_m=0.04), seen(21.0)).seconds_left)
+
+
+def test_a_motion_that_does_not_help_has_no_long_time_left():
+    hidden = result(sigmas_m=(0.004, 0.004, 0.05))
+    flat = Goal(TARGETS).add(hidden, seen(60.0, FLAT))
+    assert flat.seconds_left == np.inf
+    assert flat.sentence.startswith("z is not determined well enough yet. Tilt ")
+    assert not flat.will_not_get_there
+    ramps = seen(60.0, (0.5, 9.0, 90.0))
+    on_ramps = Goal(TARGETS).add(hidden, seen(60.0, FLAT), newest_motion=ramps)
+    assert np.isfinite(on_ramps.seconds_left)
 
 
 def test_the_motion_is_not_to_be_changed_while_the_motion_asked_for_is_driven():

@@ -43,6 +43,14 @@ _MAX_CONFIRMATION_S = 75.0
 # Shortest motion (s) of a session in which the motion may be called useless for an axis.
 _MIN_MOTION_TO_JUDGE_S = 30.0
 
+# Shortest motion (s) from which a rate of information is computed: about the time between two
+# ramps, at which the information of a vehicle jumps.
+_MIN_RATE_S = 30.0
+
+# Longest time left (s) that is reported for a motion that does not help the limiting axis. A longer
+# time is no estimate: it ends as soon as the motion is changed as the advice says.
+_MAX_TIME_OF_POOR_MOTION_S = 240.0
+
 # Values (s) to which a reported time left is rounded. Beyond the last finite step, the present
 # motion cannot reach the target.
 _STEPS_S = np.array([0.0, 15, 30, 60, 90, 120, 180, 240, 360, 600, 900, 1200, np.inf])
@@ -267,21 +275,26 @@ class Goal:
         """Return the times (6,) of further motion (s) until each axis is within its target.
 
         The information of an axis is the inverse of its variance. It is assumed to grow at the
-        average rate of the session, or at that of the last minute if this rate is higher, because
-        the motion may have improved.
+        average rate of the session, or at the highest rate since one of the last results, because
+        the motion may have improved. A time is infinite as long as the motion is too short for an
+        estimate.
         """
-        oldest = self._results[0]
         motion_s = self._results[-1].motion_s
-        # Information, as a share of what the target needs, at the newest and the oldest result.
+        # Information, as a share of what the target needs.
         share = 1.0 / np.maximum(ratios, 1.0)
-        oldest_ratios = self._variance_ratios(newest, oldest.sigmas_measured)
-        oldest_share = 1.0 / np.maximum(oldest_ratios, 1.0)
-        rate = share / max(motion_s, 1e-6)
-        minute_s = motion_s - oldest.motion_s
-        if minute_s >= _MIN_CONFIRMATION_S:
-            rate = np.maximum(rate, (share - oldest_share) / minute_s)
+        rate = np.zeros(6)
+        if motion_s >= _MIN_CONFIRMATION_S:
+            rate = share / motion_s
+        for result in self._results:
+            further_s = motion_s - result.motion_s
+            if further_s < _MIN_RATE_S:
+                break
+            earlier = self._variance_ratios(newest, result.sigmas_measured)
+            earlier_share = 1.0 / np.maximum(earlier, 1.0)
+            rate = np.maximum(rate, (share - earlier_share) / further_s)
         left_s = np.full(6, np.inf)
         np.divide(1.0 - share, rate, out=left_s, where=rate > 0.0)
+        left_s[share >= 1.0] = 0.0
         return left_s
 
     def _progress_before_goal(
@@ -364,6 +377,8 @@ class Goal:
         else:
             if is_helpful:
                 motion = "This motion is right, more of it"
+            elif progress.seconds_left > _MAX_TIME_OF_POOR_MOTION_S:
+                progress = replace(progress, seconds_left=np.inf)
             if np.isfinite(progress.seconds_left):
                 left = duration(progress.seconds_left)
                 sentence = (

@@ -215,7 +215,8 @@ def _displacement(difference: Difference) -> str:
 def _silence(state: NodeState, silent_s: float) -> Headline:
     """Return the headline of a node that no longer sends its state."""
     text = (
-        f"No message from the node for {silent_s:.0f} s. If it has died, start it again"
+        f"No message from the node for {silent_s:.0f} s. Wait if the computer is busy. "
+        "If the node has died, start it again"
     )
     if state.journal and state.journal.directory:
         text += ", with journal:=resume"
