@@ -86,6 +86,12 @@ def capital(text: str) -> str:
     return f"{text[:1].upper()}{text[1:]}"
 
 
+def in_sentences(message: str) -> str:
+    """Return a message of one line as sentences, which end where it has a colon or semicolon."""
+    parts = re.split("[:;] ", message)
+    return " ".join(f"{capital(part)}." for part in parts)
+
+
 def axes_in_words(axes: Sequence[str]) -> str:
     """List axes in words, such as "x and the rotation about z" for x and yaw."""
     names = [axis for axis in axes if axis not in ABOUT]

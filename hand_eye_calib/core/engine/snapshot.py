@@ -302,8 +302,8 @@ class Snapshot:
                 "between them"
             )
         return (
-            f"{needed} from {counts} that overlap for {common_s:.2f} s; "
-            "record longer, or raise max_gap if a stream is slower than that"
+            f"{needed}: {counts} overlap for {common_s:.2f} s; record longer, or raise max_gap for "
+            "a slow stream"
         )
 
 

@@ -17,7 +17,7 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.base.plain import plain
 from hand_eye_calib.core.base.spelling import Road
-from hand_eye_calib.core.base.text import duration, parse_targets
+from hand_eye_calib.core.base.text import duration, in_sentences, parse_targets
 from hand_eye_calib.core.engine.attempts import with_options
 from hand_eye_calib.core.engine.calibrator import Calibrator
 from hand_eye_calib.core.engine.snapshot import Snapshot
@@ -358,7 +358,8 @@ class SolveCycle:
         """Return which motion is missing; if none, why the newest solve has failed."""
         missing = "" if is_too_little(self._motion) else what_is_missing(self._motion)
         failure = self._failure.what if self._failure is not None else ""
-        return missing or failure
+        advice = missing or failure
+        return advice if advice.endswith(".") or not advice else in_sentences(advice)
 
     def _with_warnings(self, calibration: Calibration) -> Calibration:
         """Return a calibration with findings and warnings of the session; log the warnings."""
