@@ -27,7 +27,7 @@ from hand_eye_calib.online.live import cycle as module
 from hand_eye_calib.online.live.cycle import SolveCycle
 from hand_eye_calib.online.live.log import NodeLog
 from hand_eye_calib.online.live.session import LiveSession
-from hand_eye_calib.online.live.solving import Answer
+from hand_eye_calib.online.live.solving import Answer, Failure
 from hand_eye_calib.online.live.state import Broadcast, Level, NodeState
 
 TARGETS = (0.02,) * 3 + (0.005,) * 3
@@ -160,6 +160,25 @@ def test_a_first_result_takes_20_s_of_motion_or_a_rotation_of_30_deg(
             "Move the sensors for 20 s, or turn them by 30 deg. So far: 19 s and 29 deg."
         )
         assert cycle.goal.progress.sentence == text
+
+
+@pytest.mark.parametrize(
+    ("answer", "sentence"),
+    [
+        (
+            Answer(0, 0.1, seen(25.0, (0.5, 0.5, 90.0)), failure=Failure("no")),
+            "x, y and z cannot be determined from the motion so far. "
+            "Tighter curves to both sides help most. Tilt ",
+        ),
+        (
+            Answer(0, 0.1, failure=Failure("3 pairs: 9 poses; record longer")),
+            "3 pairs. 9 poses. Record longer.",
+        ),
+    ],
+)
+def test_what_a_failed_solve_lacks_is_said_in_short_sentences(cycle, answer, sentence):
+    cycle.conclude(answer)
+    assert cycle.goal.progress.sentence.startswith(sentence)
 
 
 def test_a_solve_that_fails_says_so_and_changes_nothing(cycle):

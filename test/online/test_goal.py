@@ -175,7 +175,7 @@ def test_there_is_no_time_left_before_20_s_of_motion():
     assert np.isfinite(goal.add(result(sigmas_m=0.04), seen(21.0)).seconds_left)
 
 
-def test_a_motion_that_does_not_help_has_no_long_time_left():
+def test_a_motion_that_does_not_observe_an_axis_has_no_time_left():
     hidden = result(sigmas_m=(0.004, 0.004, 0.05))
     flat = Goal(TARGETS).add(hidden, seen(60.0, FLAT))
     assert flat.seconds_left == np.inf

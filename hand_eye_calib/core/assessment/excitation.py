@@ -8,7 +8,7 @@ import numpy as np
 from hand_eye_calib.core.assessment.covariance import hidden_axes, lever_arm_products
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.stats import median, quantile
-from hand_eye_calib.core.base.text import axes_in_words, listing
+from hand_eye_calib.core.base.text import axes_in_words
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict
@@ -218,7 +218,7 @@ def helpful_motion(axes: Sequence[str], seen: Excitation) -> str:
     """
     hints = [_motion_for(axis, seen) for axis in axes]
     different_hints = dict.fromkeys(hints)
-    return listing([*different_hints])
+    return "; ".join(different_hints)
 
 
 def _motion_for(name: str, seen: Excitation) -> str:

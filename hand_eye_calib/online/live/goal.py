@@ -40,16 +40,9 @@ from hand_eye_calib.online.live.progress import AXIS_KEYS, AxisProgress, Progres
 _MIN_CONFIRMATION_S = 20.0
 _MAX_CONFIRMATION_S = 75.0
 
-# Shortest motion (s) of a session in which the motion may be called useless for an axis.
+# Shortest motion (s) of a session in which the motion may be called useless for an axis, and
+# between two results from which a rate of information is computed. Ramps are about this time apart.
 _MIN_MOTION_TO_JUDGE_S = 30.0
-
-# Shortest motion (s) from which a rate of information is computed: about the time between two
-# ramps, at which the information of a vehicle jumps.
-_MIN_RATE_S = 30.0
-
-# Longest time left (s) that is reported for a motion that does not help the limiting axis. A longer
-# time is no estimate: it ends as soon as the motion is changed as the advice says.
-_MAX_TIME_OF_POOR_MOTION_S = 240.0
 
 # Values (s) to which a reported time left is rounded. Beyond the last finite step, the present
 # motion cannot reach the target.
@@ -287,7 +280,7 @@ class Goal:
             rate = share / motion_s
         for result in self._results:
             further_s = motion_s - result.motion_s
-            if further_s < _MIN_RATE_S:
+            if further_s < _MIN_MOTION_TO_JUDGE_S:
                 break
             earlier = self._variance_ratios(newest, result.sigmas_measured)
             earlier_share = 1.0 / np.maximum(earlier, 1.0)
@@ -377,7 +370,8 @@ class Goal:
         else:
             if is_helpful:
                 motion = "This motion is right, more of it"
-            elif progress.seconds_left > _MAX_TIME_OF_POOR_MOTION_S:
+            elif _turns_about(newest_motion, axis):
+                # No rotation observes the axis: its time ends as soon as the motion is changed.
                 progress = replace(progress, seconds_left=np.inf)
             if np.isfinite(progress.seconds_left):
                 left = duration(progress.seconds_left)
@@ -481,6 +475,11 @@ def _is_helpful(motion: Excitation, axis: str) -> bool:
     index = AXES.index(axis) % 3
     others = [other for other in range(3) if other not in (index, main)]
     return bool(motion.rotation[others].max() >= MIN_ROTATION)
+
+
+def _turns_about(motion: Excitation, axis: str) -> bool:
+    """Whether most rotation of the motion is about an axis, such as z for a vehicle."""
+    return int(np.argmax(motion.rotation)) == AXES.index(axis) % 3
 
 
 def _too_small_in_words(axis: str, target: float, allowance: float) -> str:
