@@ -506,19 +506,7 @@ def compare_page(page, state):
     if page.verdict != verdict:
         yield f"verdict {page.verdict!r} on the page, {verdict!r} in the state"
     if progress and progress.axes and not state.extrinsic.contradicted:
-        full = [share >= 1.0 for share in page.shares.values()]
-        within = [
-            progress.axes[key].sigma <= progress.axes[key].target
-            for key in AXIS_KEYS.values()
-        ]
-        by_hand = [progress.axes[key].seconds_left == 0 for key in AXIS_KEYS.values()]
-        if any(a != (b or c) for a, b, c in zip(full, within, by_hand, strict=True)):
-            yield f"full bars {full}, axes within their target {within}"
-        if progress.done and not all(full):
-            yield "DONE with a bar that is not full"
-        is_confirming = "onfirm" in page.headline
-        if all(full) and page.word == "GO ON" and not is_confirming:
-            yield f"all bars are full, and the page says {page.headline!r}"
+        yield from compare_bars(page, progress)
     if result and state.standing is not Standing.REFUTED:
         for axis in "xyz":
             value = result.pose[axis]
@@ -534,6 +522,25 @@ def compare_page(page, state):
     is_early = motion_s < MIN_MOTION_S and rotation_deg < MIN_ROTATION_DEG
     if is_early and page.word in ("CHANGE THE MOTION", "DONE"):
         yield f"{page.word} after {motion_s:.0f} s and {rotation_deg:.0f} deg"
+
+
+def compare_bars(page, progress):
+    """Yield contradictions between the bars of the page and the progress of the session."""
+    full = [share >= 1.0 for share in page.shares.values()]
+    within = [
+        progress.axes[key].sigma <= progress.axes[key].target
+        for key in AXIS_KEYS.values()
+    ]
+    by_hand = [progress.axes[key].seconds_left == 0 for key in AXIS_KEYS.values()]
+    if any(a != (b or c) for a, b, c in zip(full, within, by_hand, strict=True)):
+        yield f"full bars {full}, axes within their target {within}"
+    if "motion is right" in page.headline and "not with this motion" in page.html:
+        yield f"a bar contradicts {page.headline!r}"
+    if progress.done and not all(full):
+        yield "DONE with a bar that is not full"
+    is_confirming = "onfirm" in page.headline
+    if all(full) and page.word == "GO ON" and not is_confirming:
+        yield f"all bars are full, and the page says {page.headline!r}"
 
 
 def compare_topics(witness, state, now_s):

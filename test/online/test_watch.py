@@ -351,7 +351,7 @@ def test_bars_show_the_share_of_the_information_and_the_time_left():
     [
         (INF, INF, Tone.UNKNOWN, "not seen yet", 0.0),
         (INF, 30.0, Tone.UNKNOWN, "out of reach", 0.0),  # as roll of an antenna
-        (0.08, INF, Tone.ACT, "not with this motion", 0.0625),
+        (0.08, INF, Tone.ACT, "not enough yet", 0.0625),
         (0.018, 0.0, Tone.GOOD, "enough", 1.0),
         (0.0, 0.0, Tone.GOOD, "enough", 1.0),
         (0.08, 300.0, Tone.ACT, "5 min left", 0.0625),
@@ -361,6 +361,12 @@ def test_an_axis_in_words(sigma, left_s, tone, word, share):
     row = AxisProgress(sigma=sigma, target=0.02, seconds_left=left_s)
     bar = view_of(state(axes={"z": row})).bars[2]
     assert (bar.tone, bar.word, bar.share) == (tone, word, pytest.approx(share))
+
+
+def test_an_axis_that_this_motion_does_not_determine():
+    row = AxisProgress(sigma=0.08, target=0.02, seconds_left=INF)
+    stuck = view_of(state(axes={"z": row}, at={"will_not_get_there": True}))
+    assert stuck.bars[2].word == "not with this motion"
 
 
 def test_the_pose_has_the_angles_as_printed_with_their_own_standard_deviations():

@@ -372,7 +372,9 @@ class Goal:
                 motion = "This motion is right, more of it"
             elif _turns_about(newest_motion, axis):
                 # No rotation observes the axis: its time ends as soon as the motion is changed.
-                progress = replace(progress, seconds_left=np.inf)
+                row = replace(row, seconds_left=np.inf)
+                axes = {**progress.axes, AXIS_KEYS[axis]: row}
+                progress = replace(progress, seconds_left=np.inf, axes=axes)
             if np.isfinite(progress.seconds_left):
                 left = duration(progress.seconds_left)
                 sentence = (

@@ -87,7 +87,8 @@ def _progress_in_words(
         return Tone.UNKNOWN, "of faulty streams"
     if row.seconds_left == 0:
         return Tone.GOOD, "enough"
-    word = "not with this motion"
+    will_fail = session.progress.will_not_get_there
+    word = "not with this motion" if will_fail else "not enough yet"
     if math.isfinite(row.seconds_left):
         word = f"{duration(row.seconds_left)} left"
     is_limiting = session.progress.limiting_axis == AXIS_KEYS[axis]
