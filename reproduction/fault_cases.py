@@ -124,9 +124,8 @@ def with_quats(stream: Trajectory, quats: FloatArray) -> Trajectory:
 
 def at_stamps(stamps_ns: Any, poses: FloatArray) -> Trajectory:
     """Poses in the order of their stamps; of equal ones the first."""
-    stamps_ns, first = np.unique(
-        np.asarray(stamps_ns).astype(np.int64), return_index=True
-    )
+    whole_ns = np.asarray(stamps_ns).astype(np.int64)
+    stamps_ns, first = np.unique(whole_ns, return_index=True)
     return Trajectory(stamps_ns, poses[first])
 
 
@@ -144,9 +143,12 @@ def noisy(stream: Trajectory, metres: float, random: Random) -> Trajectory:
 
 def filtered(values: FloatArray, stamps_ns: Any, tau_s: float) -> FloatArray:
     """Values (N, ...) after a first-order low-pass filter."""
+    intervals_s = np.diff(stamps_ns) * 1e-9
+    gains = 1.0 - np.exp(-intervals_s / tau_s)
     out = values.copy()
-    for k, share in enumerate(1.0 - np.exp(-np.diff(stamps_ns) * 1e-9 / tau_s)):
-        out[k + 1] = out[k] + share * (values[k + 1] - out[k])
+    for k, gain in enumerate(gains):
+        change = values[k + 1] - out[k]
+        out[k + 1] = out[k] + gain * change
     return out
 
 
@@ -155,20 +157,26 @@ def filtered_positions(stream: Trajectory, tau_s: float) -> FloatArray:
 
 
 def filtered_rotations(stream: Trajectory, tau_s: float) -> FloatArray:
-    rotations = stream.poses[:, :3, :3].copy()
-    for k, share in enumerate(1.0 - np.exp(-np.diff(stream.stamps_ns) * 1e-9 / tau_s)):
-        step = se3.rotation_log(rotations[k].T @ stream.poses[k + 1, :3, :3])
-        rotations[k + 1] = rotations[k] @ se3.rotation_exp(share * step)
+    intervals_s = np.diff(stream.stamps_ns) * 1e-9
+    gains = 1.0 - np.exp(-intervals_s / tau_s)
+    measured = stream.poses[:, :3, :3]
+    rotations = measured.copy()
+    for k, gain in enumerate(gains):
+        change = rotations[k].T @ measured[k + 1]
+        step = gain * se3.rotation_log(change)
+        rotations[k + 1] = rotations[k] @ se3.rotation_exp(step)
     return rotations
 
 
 def upright(stream: Trajectory, share: float = 1.0) -> Trajectory:
     """A stream with a share less of roll and pitch."""
-    return turned(stream, angles_of(stream) * [1.0, 1.0 - share, 1.0 - share])
+    remaining = 1.0 - share
+    return turned(stream, angles_of(stream) * [1.0, remaining, remaining])
 
 
 def higher(stream: Trajectory, factor: float) -> Trajectory:
-    return with_parts(stream, positions=positions_of(stream) * [1.0, 1.0, factor])
+    positions = positions_of(stream) * [1.0, 1.0, factor]
+    return with_parts(stream, positions=positions)
 
 
 def delayed(stream: Trajectory, delay_s: float) -> FloatArray:
@@ -191,9 +199,8 @@ def copied(
     parent: Trajectory, child: Trajectory, noise: float, random: Random
 ) -> Streams:
     world = se3.exp(random.standard_normal(6))
-    return parent, noisy(
-        Trajectory(parent.stamps_ns, world @ parent.poses), noise, random
-    )
+    copy = Trajectory(parent.stamps_ns, world @ parent.poses)
+    return parent, noisy(copy, noise, random)
 
 
 @_both("S2", "child positions from the parent", (0.01, 0.003, 0.0), "m noise",
@@ -202,21 +209,28 @@ def fused(
     parent: Trajectory, child: Trajectory, noise: float, random: Random
 ) -> Streams:
     """Positions from the parent's, turned by the rotation that both orientations give."""
-    child = child[
-        (child.stamps_ns >= parent.stamps_ns[0])
-        & (child.stamps_ns <= parent.stamps_ns[-1])
-    ]
+    is_shared = child.stamps_ns >= parent.stamps_ns[0]
+    is_shared &= child.stamps_ns <= parent.stamps_ns[-1]
+    child = child[is_shared]
     at_child = parent.at(child.stamps_ns)
-    steps = (
-        se3.rotation_log(np.swapaxes(poses[:-1], 1, 2) @ poses[1:])
-        for poses in (at_child[::10, :3, :3], child.poses[::10, :3, :3])
-    )
-    X = Rotation.align_vectors(*steps)[0].as_matrix()
+    parent_rotations = at_child[:, :3, :3]
+    child_rotations = child.poses[:, :3, :3]
+    parent_steps = _rotation_steps(parent_rotations[::10])
+    child_steps = _rotation_steps(child_rotations[::10])
+    X = Rotation.align_vectors(parent_steps, child_steps)[0].as_matrix()
+
     # The child's world in the parent's, from the orientations at the start and a common origin.
-    turned = child.poses[0, :3, :3] @ X.T @ at_child[0, :3, :3].T
-    positions = (at_child[:, :3, 3] - at_child[0, :3, 3]) @ turned.T
+    turned = child_rotations[0] @ X.T @ parent_rotations[0].T
+    travelled = at_child[:, :3, 3] - at_child[0, :3, 3]
+    positions = travelled @ turned.T
     positions += noise * random.standard_normal(positions.shape)
     return parent, with_parts(child, positions=positions)
+
+
+def _rotation_steps(rotations: FloatArray) -> FloatArray:
+    """Rotation vectors (N-1, 3) from each of the rotations (N, 3, 3) to the next."""
+    back = np.swapaxes(rotations[:-1], 1, 2)
+    return se3.rotation_log(back @ rotations[1:])
 
 
 @_child("S3", "two sensors, one world", (0.03, 0.1, 0.3), "m", "interleaved")
@@ -227,7 +241,8 @@ def interleaved(child: Trajectory, metres: float, _: Random) -> Trajectory:
 @_child("S3b", "two sensors, two worlds", (0.1, 0.3, 3.0), "m", "interleaved")
 def in_two_worlds(child: Trajectory, metres: float, _: Random) -> Trajectory:
     poses = child.poses.copy()
-    poses[1::2] = se3.exp(np.r_[metres, 0, 0, 0, 0, 0.2]) @ poses[1::2] @ beside(metres)
+    world = se3.exp(np.array([metres, 0.0, 0.0, 0.0, 0.0, 0.2]))
+    poses[1::2] = world @ poses[1::2] @ beside(metres)
     return posed(child, poses)
 
 
@@ -238,15 +253,16 @@ def low_passed(child: Trajectory, tau_s: float, _: Random) -> Trajectory:
 
 @_child("S4b", "positions late", _SECONDS, "s", _POSITIONS)
 def late_positions(child: Trajectory, delay_s: float, _: Random) -> Trajectory:
-    return with_parts(child, positions=delayed(child, delay_s)[:, :3, 3])
+    poses = delayed(child, delay_s)
+    return with_parts(child, positions=poses[:, :3, 3])
 
 
 @_child("S5", "positions smoothed, no delay", _SECONDS, "s", _POSITIONS)
 def smoothed(child: Trajectory, tau_s: float, _: Random) -> Trajectory:
     ahead = filtered_positions(child, tau_s)
-    return with_parts(
-        child, positions=filtered(ahead[::-1], -child.stamps_ns[::-1], tau_s)[::-1]
-    )
+    backwards_ns = -child.stamps_ns[::-1]
+    back = filtered(ahead[::-1], backwards_ns, tau_s)
+    return with_parts(child, positions=back[::-1])
 
 
 _child(
@@ -268,8 +284,11 @@ def yaw_gain(child: Trajectory, gain: float, _: Random) -> Trajectory:
     """About the vehicle's vertical: the main axis of rotation in the child's frame."""
     steps = se3.inverse(child.poses[:-1]) @ child.poses[1:]
     vectors = se3.rotation_log(steps[:, :3, :3])
-    axis = np.linalg.eigh(vectors.T @ vectors)[1][:, -1]
-    steps[:, :3, :3] = se3.rotation_exp(vectors + gain * np.outer(vectors @ axis, axis))
+    moments = vectors.T @ vectors
+    _, axes = np.linalg.eigh(moments)
+    axis = axes[:, -1]
+    about_axis = np.outer(vectors @ axis, axis)
+    steps[:, :3, :3] = se3.rotation_exp(vectors + gain * about_axis)
     poses = [child.poses[0]]
     for step in steps:
         poses.append(poses[-1] @ step)
@@ -281,7 +300,9 @@ def loosened(child: Trajectory, degrees: float, random: Random) -> Trajectory:
     """By so many degrees and 2.5 cm for each."""
     axes = random.standard_normal((2, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    shift = se3.exp(np.r_[0.025 * degrees * axes[0], np.radians(degrees) * axes[1]])
+    translation = 0.025 * degrees * axes[0]
+    rotation = np.radians(degrees) * axes[1]
+    shift = se3.exp(np.concatenate([translation, rotation]))
     return moved_at(child, slice(len(child) // 2, None), shift)
 
 
@@ -292,7 +313,8 @@ _child("S9", "scale", (0.005, 0.01, 0.02), "", "scale")(
 
 @_child("S10", "mirrored axis", _THREE, "(axis)", "axes left_handed")
 def mirrored(child: Trajectory, axis: float, _: Random) -> Trajectory:
-    signs = np.where(np.arange(3) == int(axis), -1.0, 1.0)
+    is_mirrored = np.arange(3) == int(axis)
+    signs = np.where(is_mirrored, -1.0, 1.0)
     return with_parts(child, positions=positions_of(child) * signs)
 
 
@@ -307,28 +329,28 @@ def as_float32(
 ) -> Streams:
     """Far from the origin, both streams on one map."""
     origin = np.array([metres, 9.0 * metres, 0.0])
-    on_map = [
-        (positions_of(stream) + origin).astype(np.float32) for stream in (parent, child)
-    ]
-    return (
-        with_parts(parent, positions=on_map[0].astype(float)),
-        with_parts(child, positions=on_map[1].astype(float)),
-    )
+    streams = []
+    for stream in (parent, child):
+        on_map = (positions_of(stream) + origin).astype(np.float32)
+        streams.append(with_parts(stream, positions=on_map.astype(float)))
+    return streams[0], streams[1]
 
 
 @_both("S12", "both scalar first", (0.0,), "", "quaternion_order")
 def scalar_first(
     parent: Trajectory, child: Trajectory, _: float, random: Random
 ) -> Streams:
-    quats = [
-        np.roll(se3.to_quat_xyzw(stream.poses), 1, axis=1) for stream in (parent, child)
-    ]
-    return with_quats(parent, quats[0]), with_quats(child, quats[1])
+    streams = []
+    for stream in (parent, child):
+        quats_wxyz = np.roll(se3.to_quat_xyzw(stream.poses), 1, axis=1)
+        streams.append(with_quats(stream, quats_wxyz))
+    return streams[0], streams[1]
 
 
 @_child("S13", "inverse poses under noise", (0.003, 0.02, 0.05), "m noise", "inverse")
 def inverted(child: Trajectory, noise: float, random: Random) -> Trajectory:
-    return posed(child, se3.inverse(noisy(child, noise, random).poses))
+    poses = noisy(child, noise, random).poses
+    return posed(child, se3.inverse(poses))
 
 
 @_child(
@@ -349,10 +371,12 @@ _child("clock", "child's clock", (0.02, 0.05, 0.2), "s", "time_offset")(
 @_child("S15", "jumps", (0.003, 0.01, 0.03), "share", "jumps")
 def jumping(child: Trajectory, share: float, random: Random) -> Trajectory:
     """Lasting, of some 30 cm."""
-    shifts = np.zeros((len(child), 3))
-    at = random.integers(len(child), size=round(share * len(child)))
-    shifts[at] = 0.3 * random.standard_normal((len(at), 3))
-    return with_parts(child, positions=positions_of(child) + np.cumsum(shifts, axis=0))
+    count = len(child)
+    shifts = np.zeros((count, 3))
+    rows = random.integers(count, size=round(share * count))
+    shifts[rows] = 0.3 * random.standard_normal((len(rows), 3))
+    lasting = np.cumsum(shifts, axis=0)
+    return with_parts(child, positions=positions_of(child) + lasting)
 
 
 @_child("U4", "child restarted half-way", (0.0, 1.0, 10.0), "s gap")
@@ -362,8 +386,9 @@ def restarted(child: Trajectory, gap_s: float, _: Random) -> Trajectory:
     poses = child.poses.copy()
     poses[half:] = se3.inverse(poses[half]) @ poses[half:]
     since_ns = child.stamps_ns - child.stamps_ns[half]
-    gone = (since_ns > 0) & (since_ns < gap_s * 1e9)
-    return Trajectory(child.stamps_ns[~gone], poses[~gone])
+    is_gone = (since_ns > 0) & (since_ns < gap_s * 1e9)
+    is_kept = ~is_gone
+    return Trajectory(child.stamps_ns[is_kept], poses[is_kept])
 
 
 @_both("U7", "parent's orientations smoothed", _SECONDS, "s",
@@ -373,7 +398,8 @@ def smooth_parent(
 ) -> Streams:
     """Low-passed and shifted back by the delay."""
     smooth = with_parts(parent, filtered_rotations(parent, tau_s))
-    return with_parts(parent, delayed(smooth, -tau_s)[:, :3, :3]), child
+    poses = delayed(smooth, -tau_s)
+    return with_parts(parent, poses[:, :3, :3]), child
 
 
 @_both("U10", "two recordings, remounted", (1.0, 2.0, 5.0), "deg")
@@ -386,17 +412,20 @@ def remounted(
     streams = []
     for stream in (parent, remount):
         is_late = stream.stamps_ns >= half_ns
+        world = se3.exp(random.standard_normal(6))
         poses = stream.poses.copy()
-        poses[is_late] = se3.exp(random.standard_normal(6)) @ poses[is_late]
-        streams.append(Trajectory(stream.stamps_ns + 60_000_000_000 * is_late, poses))
+        poses[is_late] = world @ poses[is_late]
+        stamps_ns = stream.stamps_ns + 60_000_000_000 * is_late
+        streams.append(Trajectory(stamps_ns, poses))
     return streams[0], streams[1]
 
 
 @_child("U11", "poses held", (0.1, 0.2, 0.5), "s")
 def held(child: Trajectory, interval_s: float, _: Random) -> Trajectory:
     """A slow source published fast: each pose is repeated until there is a new one."""
-    steps = (seconds_of(child) / interval_s).astype(int)
-    first = np.unique(steps, return_index=True)[1]
+    elapsed_s = seconds_of(child)
+    steps = (elapsed_s / interval_s).astype(int)
+    _, first = np.unique(steps, return_index=True)
     return posed(child, child.poses[first[steps]])
 
 
@@ -411,9 +440,8 @@ def exchanged(
         before = first[first.stamps_ns < from_ns]
         after = second[second.stamps_ns >= from_ns]
         stamps_ns = np.concatenate([before.stamps_ns, after.stamps_ns])
-        streams.append(
-            Trajectory(stamps_ns, np.concatenate([before.poses, after.poses]))
-        )
+        poses = np.concatenate([before.poses, after.poses])
+        streams.append(Trajectory(stamps_ns, poses))
     return streams[0], streams[1]
 
 
@@ -428,31 +456,36 @@ _child("V2", "child's orientations late", (0.02, 0.05, 0.1), "s", "position_cloc
 
 @_child("V4", "heading drifts", (1.0, 5.0, 20.0), "deg/min")
 def heading_drift(child: Trajectory, degrees: float, _: Random) -> Trajectory:
-    minutes = (child.stamps_ns - child.stamps_ns[0]) / 60e9
+    elapsed_ns = child.stamps_ns - child.stamps_ns[0]
+    minutes = elapsed_ns / 60e9
+    yaw = np.radians(degrees) * minutes
+    turns = se3.rotation_exp(np.outer(yaw, [0.0, 0.0, 1.0]))
     worlds = np.tile(np.eye(4), (len(child), 1, 1))
-    worlds[:, :3, :3] = se3.rotation_exp(
-        np.outer(np.radians(degrees) * minutes, [0.0, 0.0, 1.0])
-    )
+    worlds[:, :3, :3] = turns
     return posed(child, worlds @ child.poses)
 
 
 @_child("V6", "stamps scatter", (0.005, 0.02, 0.05), "s")
 def jittered(child: Trajectory, sigma_s: float, random: Random) -> Trajectory:
-    jitter_ns = np.round(1e9 * sigma_s * random.standard_normal(len(child)))
+    standard = random.standard_normal(len(child))
+    jitter_ns = np.round(1e9 * sigma_s * standard)
     return at_stamps(child.stamps_ns + jitter_ns, child.poses)
 
 
 @_child("V8", "child swings on its mount", (0.2, 1.0, 5.0), "deg")
 def swinging(child: Trajectory, degrees: float, _: Random) -> Trajectory:
     """About one axis, once in seven seconds."""
-    angles = np.radians(degrees) * np.sin(2 * np.pi * seconds_of(child) / 7.0)
+    phases = 2 * np.pi * seconds_of(child) / 7.0
+    angles = np.radians(degrees) * np.sin(phases)
     swing = se3.rotation_exp(np.outer(angles, [0.0, 1.0, 0.0]))
-    return with_parts(child, child.poses[:, :3, :3] @ swing)
+    rotations = child.poses[:, :3, :3]
+    return with_parts(child, rotations @ swing)
 
 
 @_child("W2", "left-handed axes", _THREE, "(axis)")
 def mirrored_world(child: Trajectory, axis: float, _: Random) -> Trajectory:
-    mirror = np.diag(np.where(np.arange(4) == int(axis), -1.0, 1.0))
+    is_mirrored = np.arange(4) == int(axis)
+    mirror = np.diag(np.where(is_mirrored, -1.0, 1.0))
     return Trajectory(child.stamps_ns, mirror @ child.poses @ mirror)
 
 
@@ -461,16 +494,21 @@ def stuck(child: Trajectory, seconds: float, _: Random) -> Trajectory:
     """It goes on where it is then."""
     first = len(child) // 2
     since_ns = child.stamps_ns - child.stamps_ns[first]
+    is_stuck = (since_ns >= 0) & (since_ns < seconds * 1e9)
     poses = child.poses.copy()
-    poses[(since_ns >= 0) & (since_ns < seconds * 1e9)] = poses[first]
+    poses[is_stuck] = poses[first]
     return posed(child, poses)
 
 
 @_child("W4", "few digits", (3.0, 2.0, 1.0), "digits")
 def few_digits(child: Trajectory, digits: float, _: Random) -> Trajectory:
     step = 10.0 ** -int(digits)
-    quats = np.round(se3.to_quat_xyzw(child.poses) / step) * step
-    positions = np.round(positions_of(child) / step) * step
+
+    def rounded(values: FloatArray) -> FloatArray:
+        return np.round(values / step) * step
+
+    quats = rounded(se3.to_quat_xyzw(child.poses))
+    positions = rounded(positions_of(child))
     return Trajectory(child.stamps_ns, se3.from_quat_xyzw(positions, quats))
 
 
@@ -479,24 +517,29 @@ def relocalised(child: Trajectory, metres: float, random: Random) -> Trajectory:
     """The child's world jumps by so much, and by as many tenths of a radian."""
     elapsed_s = seconds_of(child)
     poses = child.poses.copy()
-    for start_s in np.arange(_BETWEEN_JUMPS_S, elapsed_s[-1], _BETWEEN_JUMPS_S):
-        sizes = metres * np.repeat([1.0, 0.1], 3)
-        later = elapsed_s >= start_s
-        poses[later] = se3.exp(sizes * random.standard_normal(6)) @ poses[later]
+    sizes = metres * np.repeat([1.0, 0.1], 3)
+    starts_s = np.arange(_BETWEEN_JUMPS_S, elapsed_s[-1], _BETWEEN_JUMPS_S)
+    for start_s in starts_s:
+        is_later = elapsed_s >= start_s
+        jump = se3.exp(sizes * random.standard_normal(6))
+        poses[is_later] = jump @ poses[is_later]
     return posed(child, poses)
 
 
 @_child("W6", "published again", (0.005, 0.02, 0.05), "s later")
 def republished(child: Trajectory, late_s: float, _: Random) -> Trajectory:
-    stamps_ns = np.concatenate([child.stamps_ns, child.stamps_ns + round(late_s * 1e9)])
-    return at_stamps(stamps_ns, np.concatenate([child.poses, child.poses]))
+    late_ns = child.stamps_ns + round(late_s * 1e9)
+    stamps_ns = np.concatenate([child.stamps_ns, late_ns])
+    poses = np.concatenate([child.poses, child.poses])
+    return at_stamps(stamps_ns, poses)
 
 
 @_child("W7", "clock too fast", (100.0, 1000.0, 5000.0), "ppm")
 def fast_clock(child: Trajectory, ppm: float, _: Random) -> Trajectory:
     """It is right half-way."""
-    from_middle = child.stamps_ns - child.stamps_ns[len(child) // 2]
-    late_ns = np.round(1e-6 * ppm * from_middle).astype(np.int64)
+    middle_ns = child.stamps_ns[len(child) // 2]
+    since_ns = child.stamps_ns - middle_ns
+    late_ns = np.round(1e-6 * ppm * since_ns).astype(np.int64)
     return Trajectory(child.stamps_ns + late_ns, child.poses)
 
 
@@ -505,22 +548,26 @@ def heightless(
     parent: Trajectory, child: Trajectory, which: float, _: Random
 ) -> Streams:
     """The parent's, those of both, and both upright besides."""
-    flat = higher(parent, 0.0), higher(child, 0.0)
+    flat_parent = higher(parent, 0.0)
+    flat_child = higher(child, 0.0)
     if which == 0.0:
-        return flat[0], child
-    return flat if which == 1.0 else (upright(flat[0]), upright(flat[1]))
+        return flat_parent, child
+    if which == 1.0:
+        return flat_parent, flat_child
+    return upright(flat_parent), upright(flat_child)
 
 
 @_child("W10", "stamps of arrival, in bursts", (0.1, 0.3, 1.0), "s")
 def in_bursts(child: Trajectory, seconds: float, _: Random) -> Trajectory:
     """The poses are held back, come together, and have stamps of when they came."""
+    start_ns = child.stamps_ns[0]
     interval_ns = round(seconds * 1e9)
-    bursts = (child.stamps_ns - child.stamps_ns[0]) // interval_ns
-    order = np.arange(len(child)) - np.searchsorted(bursts, bursts)
-    came_ns = (bursts + 1) * interval_ns + np.round(order * _TOGETHER_S * 1e9).astype(
-        np.int64
-    )
-    return at_stamps(child.stamps_ns[0] + came_ns, child.poses)
+    bursts = (child.stamps_ns - start_ns) // interval_ns
+    ends_ns = (bursts + 1) * interval_ns
+    place_in_burst = np.arange(len(child)) - np.searchsorted(bursts, bursts)
+    behind_ns = np.round(place_in_burst * _TOGETHER_S * 1e9)
+    arrival_ns = ends_ns + behind_ns.astype(np.int64)
+    return at_stamps(start_ns + arrival_ns, child.poses)
 
 
 @_child(
@@ -548,7 +595,8 @@ _child("X3", "heights in another unit", (1.02, 1.1, 3.28084), "", "axis_scale")(
 @_child("X4", "heights of a barometer", (0.3, 1.0, 3.0), "s", "axis_lag axis_scale")
 def late_heights(stream: Trajectory, tau_s: float, _: Random) -> Trajectory:
     positions = positions_of(stream).copy()
-    positions[:, 2] = filtered(positions[:, 2], stream.stamps_ns, tau_s)
+    heights = positions[:, 2]
+    positions[:, 2] = filtered(heights, stream.stamps_ns, tau_s)
     return with_parts(stream, positions=positions)
 
 
@@ -558,9 +606,12 @@ _child("X5", "heights constant", (0.0,), "", "axis_scale")(
 
 
 def _group(initials: str) -> tuple[Fault, ...]:
-    return tuple(
-        fault for fault in _ALL if fault.code.replace("clock", "S")[0] in initials
-    )
+    faults = []
+    for fault in _ALL:
+        initial = fault.code.replace("clock", "S")[0]
+        if initial in initials:
+            faults.append(fault)
+    return tuple(faults)
 
 
 FAULTS = _group("S")

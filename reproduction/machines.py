@@ -88,23 +88,25 @@ def simulate_machine(
     Ts_world_base = _poses(rng, driven, noise, ramp_rad)
     slips = _slip_of_wheels(rng, driven.yaw_rate, slip * noise * duration_s)
     parameters, rates = _wheels(machine, rng, driven, 1.0 + slips)
-    every = round(_WHEELS_S / _STEP_S)
-    n_rows = len(times_s) // every
-    means = rates[: n_rows * every].reshape(n_rows, every, -1).mean(axis=1)
+
+    stride = round(_WHEELS_S / _STEP_S)
+    n_rows = len(times_s) // stride
+    whole_rates = rates[: n_rows * stride]
+    means = whole_rates.reshape(n_rows, stride, -1).mean(axis=1)
     sigmas = 0.01 * np.abs(means).max(axis=0)
     if machine in ("steering", "tricycle", "articulated"):
         sigmas[1] = 0.002
-    values = means + noise * sigmas * rng.standard_normal(means.shape)
-    wheel_times_s = np.asarray(
-        (np.arange(n_rows) + 0.5) * _WHEELS_S - _STEP_S, dtype=float
-    )
+    standard = rng.standard_normal(means.shape)
+    middles = np.arange(n_rows) + 0.5
+    wheel_times_s = np.asarray(middles * _WHEELS_S - _STEP_S, dtype=float)
+
     T_base_sensor = _mount(rng)
     rows = np.arange(0, len(times_s), round(0.1 / _STEP_S))
     poses = _measured(rng, Ts_world_base[rows] @ T_base_sensor, noise)
     clock_s = 0.02
     return Machine(
         stamps_ns=_stamps_ns(wheel_times_s),
-        values=values,
+        values=means + noise * sigmas * standard,
         measures=_DATA.get(machine, machine),
         sensor=Trajectory(_stamps_ns(times_s[rows] - clock_s), poses, "lidar"),
         T_base_sensor=T_base_sensor,
@@ -122,28 +124,36 @@ def _course(
 ) -> Course:
     """Return the motion of the axle, which slips outwards in curves."""
     phases = rng.uniform(0, 2 * np.pi, 3)
-    speed = 0.8 + 0.15 * np.sin(2 * np.pi * times_s / 23 + phases[0])
-    speed += 0.1 * np.sin(2 * np.pi * times_s / 7.1 + phases[1])
-    wave = np.sin(2 * np.pi * times_s / 14 + phases[2])
+
+    def wave(period_s: float, phase: float) -> FloatArray:
+        return np.sin(2 * np.pi * times_s / period_s + phase)
+
+    speed = 0.8 + 0.15 * wave(23, phases[0])
+    speed += 0.1 * wave(7.1, phases[1])
+    bends = wave(14, phases[2])
+    ripple = np.sin(times_s)
+    from_middle_s = times_s - times_s[-1] / 2.0
     curvatures = {
-        "eights": 0.9 * wave,
-        "wide": 0.3 * wave,
-        "straight": 0.002 * np.sin(times_s),
-        "circle": 0.7 + 0.003 * np.sin(times_s),
-        "bend": 0.7 * np.exp(-(((times_s - times_s[-1] / 2.0) / 2.0) ** 2)),
-        "left": 0.5 + 0.4 * wave,
+        "eights": 0.9 * bends,
+        "wide": 0.3 * bends,
+        "straight": 0.002 * ripple,
+        "circle": 0.7 + 0.003 * ripple,
+        "bend": 0.7 * np.exp(-((from_middle_s / 2.0) ** 2)),
+        "left": 0.5 + 0.4 * bends,
     }
     if course == "spin":
-        yaw_rate = 0.5 * wave
-        speed = 0.002 * np.sin(times_s)
+        yaw_rate = 0.5 * bends
+        speed = 0.002 * ripple
     else:
         yaw_rate = curvatures[course] * speed
-    slip_angle = abs(rng.normal(0.0, 0.005)) * speed * yaw_rate
+
+    slip = abs(rng.normal(0.0, 0.005))
+    slip_angle = slip * speed * yaw_rate
     left_speed = -slip_angle * speed
     if machine == "omni":
         left_speed = np.zeros(len(times_s))
         if course == "eights":
-            left_speed = 0.4 * np.sin(2 * np.pi * times_s / 11 + rng.uniform(0, 6))
+            left_speed = 0.4 * wave(11, rng.uniform(0, 6))
     return Course(speed, left_speed, yaw_rate)
 
 
@@ -158,34 +168,44 @@ def _poses(
     """
     speed, left_speed, yaw_rate = driven
     # The vehicle pitches as the floor below it rises and falls.
-    pitch = ramp_rad * np.sin(2 * np.pi * np.cumsum(speed) * _STEP_S / _RAMP_M)
+
+    phases = 2 * np.pi * np.cumsum(speed) * _STEP_S / _RAMP_M
+    pitch = ramp_rad * np.sin(phases)
     headings = np.cumsum(yaw_rate / np.cos(pitch)) * _STEP_S
-    middle = headings - yaw_rate * _STEP_S / 2
+    middle_headings = headings - yaw_rate * _STEP_S / 2
+
+    # Horizontal velocities and positions are complex numbers x + iy.
     ahead = speed * np.cos(pitch)
-    places = np.cumsum((ahead + 1j * left_speed) * np.exp(1j * middle)) * _STEP_S
-    heights = -np.cumsum(speed * np.sin(pitch)) * _STEP_S
+    velocities = (ahead + 1j * left_speed) * np.exp(1j * middle_headings)
+    places = np.cumsum(velocities) * _STEP_S
+    climbs = speed * np.sin(pitch)
+    heights = -np.cumsum(climbs) * _STEP_S
+
     decay = np.exp(-_STEP_S / 0.3)
-    shocks = np.sqrt(1 - decay**2) * rng.standard_normal((len(speed), 3))
-    bumps = (
-        noise * lfilter([1.0], [1.0, -decay], shocks, axis=0) * [0.004, 0.004, 0.003]
-    )
-    roll = bumps[:, 0] + noise * 0.01 * speed * yaw_rate
-    rotations = se3.rotation_from_rpy(
-        np.column_stack([roll, pitch + bumps[:, 1], headings])
-    )
+    standard = rng.standard_normal((len(speed), 3))
+    shocks = np.sqrt(1 - decay**2) * standard
+    correlated = lfilter([1.0], [1.0, -decay], shocks, axis=0)
+    bumps = noise * correlated * [0.004, 0.004, 0.003]
+    lean = noise * 0.01 * speed * yaw_rate
+    roll = bumps[:, 0] + lean
+    angles = np.column_stack([roll, pitch + bumps[:, 1], headings])
     positions = np.column_stack([places.real, places.imag, heights + bumps[:, 2]])
-    return se3.from_rotation_translation(rotations, positions)
+    return se3.from_rotation_translation(se3.rotation_from_rpy(angles), positions)
 
 
 def _slip_of_wheels(
     rng: np.random.Generator, yaw_rate: FloatArray, slipping_s: float
 ) -> FloatArray:
     """Return the share (N, 2) by which two wheels turn too fast: bursts in curves."""
-    slip = np.zeros((len(yaw_rate), 2))
-    for start in rng.integers(0, len(yaw_rate), size=int(slipping_s / 8)):
-        if abs(yaw_rate[start]) > 0.3 * np.abs(yaw_rate).max():
-            end = start + int(rng.uniform(0.2, 1.0) / _STEP_S)
-            slip[start:end, rng.integers(2)] += rng.uniform(0.03, 0.2)
+    n_rows = len(yaw_rate)
+    slip = np.zeros((n_rows, 2))
+    least_rate = 0.3 * np.abs(yaw_rate).max()
+    for start in rng.integers(0, n_rows, size=int(slipping_s / 8)):
+        if abs(yaw_rate[start]) > least_rate:
+            length_s = rng.uniform(0.2, 1.0)
+            end = start + int(length_s / _STEP_S)
+            wheel = rng.integers(2)
+            slip[start:end, wheel] += rng.uniform(0.03, 0.2)
     return slip
 
 
@@ -201,29 +221,29 @@ def _wheels(
         if machine == "skid":
             # Tracks slip when the machine turns, more in tight curves.
             half_turn *= 1.5 + 0.3 * np.abs(yaw_rate)
-        wheels = np.column_stack(
-            [(speed - half_turn) / left, (speed + half_turn) / right]
-        )
+        left_rate = (speed - half_turn) / left
+        right_rate = (speed + half_turn) / right
+        wheels = np.column_stack([left_rate, right_rate])
         return [left, right, track], wheels * slip
+
     factor = off[0]
     wheelbase = 1.2 * off[2]
     offset = np.radians(1.0) * rng.choice([-1.0, 1.0])
-    angle = np.arctan2(wheelbase * yaw_rate, speed)
-    if machine == "steering":
-        car = np.column_stack([speed / factor * slip[:, 0], angle + offset])
-        return [factor, wheelbase, offset], car
+    if machine == "omni":
+        rates = np.column_stack([speed, left_speed, yaw_rate]) / off
+        rates[:, :2] *= slip
+        return list(off), rates
+    parameters = [factor, wheelbase, offset]
+    if machine == "articulated":
+        return parameters, _articulated(driven, factor, wheelbase, slip)
+
+    wheel_speed = speed
     if machine == "tricycle":
         # The driven wheel is the steered wheel.
         wheel_speed = np.hypot(speed, wheelbase * yaw_rate)
-        tricycle = np.column_stack([wheel_speed / factor * slip[:, 0], angle + offset])
-        return [factor, wheelbase, offset], tricycle
-    if machine == "articulated":
-        return [factor, wheelbase, offset], _articulated(
-            driven, factor, wheelbase, slip
-        )
-    rates = np.column_stack([speed, left_speed, yaw_rate]) / off
-    rates[:, :2] *= slip
-    return list(off), rates
+    measured_speed = wheel_speed / factor * slip[:, 0]
+    angle = np.arctan2(wheelbase * yaw_rate, speed)
+    return parameters, np.column_stack([measured_speed, angle + offset])
 
 
 def _articulated(
@@ -235,29 +255,34 @@ def _articulated(
     joint, and a length l of both parts.
     """
     length = wheelbase / 2.0
-    angle = np.zeros(len(driven.speed))
-    for row in range(len(angle) - 1):
-        joint = angle[row]
-        turn = driven.yaw_rate[row] * length * (1.0 + np.cos(joint))
-        rate = (turn - driven.speed[row] * np.sin(joint)) / length
-        angle[row + 1] = joint + rate * _STEP_S
-    return np.column_stack([driven.speed / factor * slip[:, 0], angle])
+    angles = np.zeros(len(driven.speed))
+    for row in range(len(angles) - 1):
+        angle = angles[row]
+        turn = driven.yaw_rate[row] * length * (1.0 + np.cos(angle))
+        sideways = driven.speed[row] * np.sin(angle)
+        rate = (turn - sideways) / length
+        angles[row + 1] = angle + rate * _STEP_S
+    measured_speed = driven.speed / factor * slip[:, 0]
+    return np.column_stack([measured_speed, angles])
 
 
 def _mount(rng: np.random.Generator) -> FloatArray:
     """Return a pose of a sensor that is level to some degrees."""
-    xyz = [rng.uniform(-0.3, 1.0), rng.uniform(-0.4, 0.4), rng.uniform(0.2, 1.5)]
-    rpy = [*rng.normal(0, 0.03, 2), rng.uniform(-np.pi, np.pi)]
-    return se3.from_rotation_translation(se3.rotation_from_rpy(rpy), xyz)
+    x = rng.uniform(-0.3, 1.0)
+    y = rng.uniform(-0.4, 0.4)
+    z = rng.uniform(0.2, 1.5)
+    roll, pitch = rng.normal(0, 0.03, 2)
+    yaw = rng.uniform(-np.pi, np.pi)
+    rotation = se3.rotation_from_rpy([roll, pitch, yaw])
+    return se3.from_rotation_translation(rotation, [x, y, z])
 
 
 def _measured(rng: np.random.Generator, poses: FloatArray, noise: float) -> FloatArray:
     """Return poses with drift, 4 mm and 0.06 deg of noise."""
-    drift = (
-        noise
-        * rng.standard_normal((len(poses) - 1, 6))
-        * np.repeat([0.0007, 0.0001], 3)
-    )
-    white = noise * rng.standard_normal((len(poses), 6)) * np.repeat([0.004, 0.001], 3)
-    steps = se3.inverse(poses[:-1]) @ poses[1:] @ se3.exp(drift)
+    drift_sigmas = np.repeat([0.0007, 0.0001], 3)
+    white_sigmas = np.repeat([0.004, 0.001], 3)
+    drift = noise * rng.standard_normal((len(poses) - 1, 6)) * drift_sigmas
+    white = noise * rng.standard_normal((len(poses), 6)) * white_sigmas
+    true_steps = se3.inverse(poses[:-1]) @ poses[1:]
+    steps = true_steps @ se3.exp(drift)
     return se3.chained(steps) @ se3.exp(white)

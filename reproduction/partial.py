@@ -77,78 +77,98 @@ def simulated_positions(
     """Poses of the odometry, positions of the antenna, and the lever arm (3,)."""
     machine = MACHINES[name]
     seeds = (seed, sorted(MACHINES).index(name))
-    motion_rng, mount_rng, odometry_rng, rng = np.random.default_rng(seeds).spawn(4)
+    generators = np.random.default_rng(seeds).spawn(4)
+    motion_rng, mount_rng, odometry_rng, rng = generators
     motion = machine.motion(motion_rng, machine.duration_s)
     lever_arm = machine.lever_m * mount_rng.standard_normal(3) * [1.0, 1.0, 0.7]
+
     step_s = 1.0 / machine.rate_hz
     n_poses = round(machine.duration_s * machine.rate_hz)
     times_s: FloatArray = step_s * np.arange(n_poses, dtype=np.float64)
-    true_poses = motion.at(times_s)
-    twists = motion.twists(times_s)
-    poses = draw(machine.odometry, true_poses, twists, step_s, odometry_rng).poses
+    poses = _odometry(machine.odometry, motion, times_s, step_s, odometry_rng)
+
     n_fixes = round((machine.duration_s - 1.0) * _FIXES_HZ)
     fixes_s: FloatArray = (np.arange(n_fixes, dtype=np.float64) + 0.25) / _FIXES_HZ
     Ts = motion.at(fixes_s)
     yaw = mount_rng.uniform(-np.pi, np.pi)
-    positions = (Ts[:, :3, :3] @ lever_arm + Ts[:, :3, 3]) @ se3.rotation_exp(
-        np.r_[0, 0, yaw]
-    )
+    world = se3.rotation_exp(np.array([0.0, 0.0, yaw]))
+    positions = (Ts[:, :3, :3] @ lever_arm + Ts[:, :3, 3]) @ world
     positions += _FIXED_M * rng.standard_normal(positions.shape)
     positions += _float_errors(fixes_s, rng)
-    kept = _received(len(fixes_s), rng)
-    return (
-        Trajectory(stamps_ns(times_s), poses),
-        Trajectory.from_positions(stamps_ns(fixes_s[kept]), positions[kept]),
-        lever_arm,
-    )
+    is_received = _received(len(fixes_s), rng)
+    stamps = stamps_ns(fixes_s[is_received])
+    child = Trajectory.from_positions(stamps, positions[is_received])
+    return Trajectory(stamps_ns(times_s), poses), child, lever_arm
+
+
+def _odometry(
+    errors: SensorErrors,
+    motion: motions.Motion,
+    times_s: FloatArray,
+    step_s: float,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Measured poses (N, 4, 4) of a motion."""
+    true_poses = motion.at(times_s)
+    twists = motion.twists(times_s)
+    return draw(errors, true_poses, twists, step_s, rng).poses
 
 
 def _float_errors(times_s: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Errors (N, 3) of float solutions; zero where the solution is fixed."""
     errors = np.zeros((len(times_s), 3))
     stay = np.exp(-1.0 / (_FIXES_HZ * _FLOAT_TAU_S))
-    n_floats = round(_FLOATS_PER_MIN * times_s[-1] / 60.0)
-    for start_s in rng.uniform(0.0, times_s[-1] - _FLOAT_S[1], n_floats):
-        inside = (times_s >= start_s) & (times_s < start_s + rng.uniform(*_FLOAT_S))
+    change = np.sqrt(1.0 - stay**2)
+    end_s = times_s[-1]
+    n_floats = round(_FLOATS_PER_MIN * end_s / 60.0)
+    starts_s = rng.uniform(0.0, end_s - _FLOAT_S[1], n_floats)
+    for start_s in starts_s:
+        length_s = rng.uniform(*_FLOAT_S)
+        is_float = (times_s >= start_s) & (times_s < start_s + length_s)
         error = rng.standard_normal(3)
-        for row in np.flatnonzero(inside):
-            errors[row] = _FLOAT_M * (error + 0.1 * rng.standard_normal(3))
-            error = stay * error + np.sqrt(1.0 - stay**2) * rng.standard_normal(3)
+        for row in np.flatnonzero(is_float):
+            white = 0.1 * rng.standard_normal(3)
+            errors[row] = _FLOAT_M * (error + white)
+            error = stay * error + change * rng.standard_normal(3)
     return errors
 
 
 def _received(count: int, rng: np.random.Generator) -> BoolArray:
     """Which of the fixes arrive (N,)."""
     received = np.ones(count, dtype=bool)
-    for start in np.flatnonzero(rng.random(count) < _OUTAGES_HZ / _FIXES_HZ):
-        received[start : start + round(_FIXES_HZ * rng.uniform(*_OUTAGE_S))] = False
+    is_start = rng.random(count) < _OUTAGES_HZ / _FIXES_HZ
+    for start in np.flatnonzero(is_start):
+        length_s = rng.uniform(*_OUTAGE_S)
+        end = start + round(_FIXES_HZ * length_s)
+        received[start:end] = False
     return received
 
 
 def _covers(ratios: FloatArray) -> str:
     """Share of errors over their sigmas that the 90 % interval covers."""
-    return f"{np.mean(np.abs(ratios) < QUANTILE_90):.0%}"
+    is_covered = np.abs(ratios) < QUANTILE_90
+    return f"{np.mean(is_covered):.0%}"
 
 
 def position_rows(n_seeds: int) -> Iterator[dict[str, object]]:
     """Rows of the table of simulated receivers."""
     for name in MACHINES:
         errors = []
-        stated = []
+        sigmas = []
         for seed in range(n_seeds):
             parent, child, lever_arm = simulated_positions(name, seed)
             result = hec.calibrate(parent, child)
             errors.append(result.T_parent_child[:3, 3] - lever_arm)
-            stated.append(result.sigmas_measured[:3])
-        is_determined = np.isfinite(stated)
+            sigmas.append(result.sigmas_measured[:3])
+        ratios = np.array(errors) / np.array(sigmas)
+        median_errors = np.median(np.abs(errors), axis=0)
+        median_sigmas = np.median(sigmas, axis=0)
         yield {
             "Machine": name,
             "Recordings": n_seeds,
-            "Median error x, y, z (cm)": triple(
-                np.median(np.abs(errors), axis=0), 100.0
-            ),
-            "Median sigma x, y, z (cm)": triple(np.median(stated, axis=0), 100.0),
-            "Covers": _covers((np.array(errors) / np.array(stated))[is_determined]),
+            "Median error x, y, z (cm)": triple(median_errors, 100.0),
+            "Median sigma x, y, z (cm)": triple(median_sigmas, 100.0),
+            "Covers": _covers(ratios[np.isfinite(sigmas)]),
         }
 
 
@@ -157,21 +177,24 @@ def simulated_rates(
 ) -> tuple[Trajectory, Trajectory, FloatArray]:
     """Poses of the parent, rates of the child, the rotation (3, 3) between them."""
     kind, errors = _TURNING[name]
-    motion_rng, mount_rng, parent_rng, child_rng = np.random.default_rng(seed).spawn(4)
+    generators = np.random.default_rng(seed).spawn(4)
+    motion_rng, mount_rng, parent_rng, child_rng = generators
     motion = kind(motion_rng, duration_s)
-    rotation = se3.rotation_exp(mount_rng.uniform(-np.pi, np.pi, 3) / np.sqrt(3))
+    rotation_vector = mount_rng.uniform(-np.pi, np.pi, 3) / np.sqrt(3)
+    rotation = se3.rotation_exp(rotation_vector)
     times_s: FloatArray = np.arange(round(duration_s * rate_hz)) / rate_hz
-    poses = draw(
-        errors, motion.at(times_s), motion.twists(times_s), 1 / rate_hz, parent_rng
-    ).poses
-    fine_s: FloatArray = np.arange(round(duration_s * _RATES_HZ)) / _RATES_HZ
+    poses = _odometry(errors, motion, times_s, 1 / rate_hz, parent_rng)
+    parent = Trajectory(stamps_ns(times_s), poses)
+
+    n_rates = round(duration_s * _RATES_HZ)
+    fine_s: FloatArray = np.arange(n_rates) / _RATES_HZ
     rates = motion.twists(fine_s)[:, 3:] @ rotation
     rates += _BIAS * child_rng.standard_normal(3)
     rates += _RATE_NOISE * child_rng.standard_normal(rates.shape)
     steps = child_rng.standard_normal(rates.shape) / np.sqrt(_RATES_HZ)
     rates += _BIAS_WALK * np.cumsum(steps, axis=0)
     child = Trajectory.from_rates(stamps_ns(fine_s - _LATE_S), rates)
-    return Trajectory(stamps_ns(times_s), poses), child, rotation
+    return parent, child, rotation
 
 
 def rate_rows(n_seeds: int) -> Iterator[dict[str, object]]:
@@ -199,12 +222,11 @@ def rate_rows(n_seeds: int) -> Iterator[dict[str, object]]:
 
 def run(arguments: argparse.Namespace) -> int:
     """Make the tables; returns the exit code."""
-    name, rows = (
-        ("rates", rate_rows)
-        if arguments.what == "rates"
-        else ("receivers", position_rows)
-    )
-    show(arguments.page, {name: markdown_table(rows(arguments.seeds))})
+    if arguments.what == "rates":
+        tables = {"rates": markdown_table(rate_rows(arguments.seeds))}
+    else:
+        tables = {"receivers": markdown_table(position_rows(arguments.seeds))}
+    show(arguments.page, tables)
     return 0
 
 

@@ -76,27 +76,31 @@ def clean(platform: str, seed: int) -> Streams:
     """Two independent odometries of a platform, with stamps of their own."""
     kind = PLATFORMS[platform]
     seeds = (seed, sorted(PLATFORMS).index(platform), 902)
-    motion_rng, mount_rng, parent_rng, child_rng = np.random.default_rng(seeds).spawn(4)
+    generators = np.random.default_rng(seeds).spawn(4)
+    motion_rng, mount_rng, parent_rng, child_rng = generators
     motion = kind.motion(motion_rng, kind.duration_s)
     rotation = se3.rotation_exp(mount_rng.uniform(-1.7, 1.7, 3))
     lever_arm = kind.lever_m * mount_rng.standard_normal(3) * [1.0, 1.0, 0.7]
     X = se3.from_rotation_translation(rotation, lever_arm)
-    streams = []
     errors, rate_hz = _CHILDREN[platform]
     # Seconds at the start and the end that only the parent has.
     margin_s = 0.3 + 0.37 / rate_hz
-    for errors_of_sensor, hz, mount, start_s, rng in (
-        (kind.odometry, kind.rate_hz, np.eye(4), 0.0, parent_rng),
-        (errors, rate_hz, X, margin_s, child_rng),
-    ):
-        n_poses = round((kind.duration_s - 1.0 - 2.0 * start_s) * hz)
+
+    def measured(
+        errors: SensorErrors, hz: float, mount: FloatArray, start_s: float, rng: _Random
+    ) -> Trajectory:
+        length_s = kind.duration_s - 1.0 - 2.0 * start_s
+        n_poses = round(length_s * hz)
         times_s: FloatArray = start_s + np.arange(n_poses) / hz
-        twists = motion.twists(times_s) @ se3.adjoint(se3.inverse(mount)).T
-        drawn = draw(
-            errors_of_sensor, motion.at(times_s) @ mount, twists, 1.0 / hz, rng
-        )
-        streams.append(Trajectory(stamps_ns(times_s), drawn.poses))
-    return Streams(streams[0], streams[1], X)
+        to_sensor = se3.adjoint(se3.inverse(mount))
+        twists = motion.twists(times_s) @ to_sensor.T
+        poses = motion.at(times_s) @ mount
+        drawn = draw(errors, poses, twists, 1.0 / hz, rng)
+        return Trajectory(stamps_ns(times_s), drawn.poses)
+
+    parent = measured(kind.odometry, kind.rate_hz, np.eye(4), 0.0, parent_rng)
+    child = measured(errors, rate_hz, X, margin_s, child_rng)
+    return Streams(parent, child, X)
 
 
 def _posed(streams: Streams, child: FloatArray) -> Streams:
@@ -109,9 +113,12 @@ def interpolated(rate_hz: float) -> _Damage:
     def damage(streams: Streams, _: _Random) -> Streams:
         poses = streams.child.poses.copy()
         rows = np.arange(len(poses))
-        measured = rows[:: max(round(1.0 / (rate_hz * streams.child.interval_s)), 2)]
+        interval_s = streams.child.interval_s
+        stride = max(round(1.0 / (rate_hz * interval_s)), 2)
+        measured = rows[::stride]
         for axis in range(3):
-            poses[:, axis, 3] = np.interp(rows, measured, poses[measured, axis, 3])
+            values = poses[measured, axis, 3]
+            poses[:, axis, 3] = np.interp(rows, measured, values)
         return _posed(streams, poses)
 
     return damage
@@ -123,12 +130,17 @@ def at_constant_velocity(fix_hz: float) -> _Damage:
     def damage(streams: Streams, _: _Random) -> Streams:
         poses = streams.child.poses
         interval_s = streams.child.interval_s
+        stride = round(1.0 / (fix_hz * interval_s))
+        n_velocity = round(_VELOCITY_S / interval_s)
         rows = np.arange(len(poses))
-        fixes = rows - rows % round(1.0 / (fix_hz * interval_s))
-        before = np.maximum(fixes - round(_VELOCITY_S / interval_s), 0)
+        since_fix = rows % stride
+        fixes = rows - since_fix
+        before = np.maximum(fixes - n_velocity, 0)
+        n_steps = np.maximum(fixes - before, 1)
         twists = se3.log(se3.inverse(poses[before]) @ poses[fixes])
-        twists /= np.maximum(fixes - before, 1)[:, None]
-        return _posed(streams, poses[fixes] @ se3.exp(twists * (rows - fixes)[:, None]))
+        twists /= n_steps[:, None]
+        predicted = se3.exp(twists * since_fix[:, None])
+        return _posed(streams, poses[fixes] @ predicted)
 
     return damage
 
@@ -138,12 +150,13 @@ def by_imu(fix_hz: float) -> _Damage:
 
     def damage(streams: Streams, random: _Random) -> Streams:
         bias = _IMU_BIAS * random.standard_normal(6)
+        interval_s = streams.child.interval_s
         rows = np.arange(len(streams.child))
-        n_between = round(1.0 / (fix_hz * streams.child.interval_s))
-        since_s = (rows % n_between)[:, None] * streams.child.interval_s
-        errors = np.concatenate(
-            [0.5 * bias[:3] * since_s**2, bias[3:] * since_s], axis=1
-        )
+        stride = round(1.0 / (fix_hz * interval_s))
+        since_s = (rows % stride)[:, None] * interval_s
+        translations = 0.5 * bias[:3] * since_s**2
+        rotations = bias[3:] * since_s
+        errors = np.concatenate([translations, rotations], axis=1)
         return _posed(streams, streams.child.poses @ se3.exp(errors))
 
     return damage
@@ -153,12 +166,13 @@ def late(scatter_s: float) -> _Damage:
     """Stamps of the child are those of arrival, after delays and in order."""
 
     def damage(streams: Streams, random: _Random) -> Streams:
-        stamps = streams.child.stamps_ns + np.round(
-            1e9 * random.exponential(scatter_s, len(streams.child))
-        ).astype(np.int64)
-        together_ns = round(1e9 * _TOGETHER_S) * np.arange(len(stamps))
-        stamps = np.maximum.accumulate(stamps - together_ns) + together_ns
-        return streams._replace(child=replace(streams.child, stamps_ns=stamps))
+        count = len(streams.child)
+        delays_ns = np.round(1e9 * random.exponential(scatter_s, count))
+        arrival_ns = streams.child.stamps_ns + delays_ns.astype(np.int64)
+        # Stamps increase by at least the shortest time between two.
+        least_ns = round(1e9 * _TOGETHER_S) * np.arange(count)
+        stamps_ns = np.maximum.accumulate(arrival_ns - least_ns) + least_ns
+        return streams._replace(child=replace(streams.child, stamps_ns=stamps_ns))
 
     return damage
 
@@ -170,9 +184,8 @@ def computed(noise_m: float) -> _Damage:
         poses = streams.parent.at(streams.child.stamps_ns, straight=True)
         noise = noise_m * random.standard_normal((len(poses), 6))
         noise[:, 3:] *= 0.5
-        return _posed(
-            streams, poses @ streams.T_parent_child @ _WRONG_MOUNT @ se3.exp(noise)
-        )
+        sensor_poses = poses @ streams.T_parent_child @ _WRONG_MOUNT
+        return _posed(streams, sensor_poses @ se3.exp(noise))
 
     return damage
 
@@ -184,7 +197,9 @@ def _filtered(stream: Trajectory, aims: FloatArray, tau_s: float) -> Trajectory:
     poses = [aims[0]]
     for step, aim in zip(steps, aims[1:], strict=True):
         predicted = poses[-1] @ step
-        poses.append(predicted @ se3.exp(gain * se3.log(se3.inverse(predicted) @ aim)))
+        innovation = se3.log(se3.inverse(predicted) @ aim)
+        correction = se3.exp(gain * innovation)
+        poses.append(predicted @ correction)
     return replace(stream, poses=np.array(poses))
 
 
@@ -223,7 +238,9 @@ def faulty(platform: str, fault: str, seed: int) -> Streams:
     streams = clean(platform, seed)
     if fault == "clean":
         return streams
-    return FAULTS[fault][0](streams, np.random.default_rng((seed, 903)))
+    damage, _ = FAULTS[fault]
+    random = np.random.default_rng((seed, 903))
+    return damage(streams, random)
 
 
 def largest_ratio(result: Calibration, truth: FloatArray) -> float:
@@ -232,10 +249,12 @@ def largest_ratio(result: Calibration, truth: FloatArray) -> float:
     The standard deviation includes the allowance for constant errors.
     """
     T = result.T_parent_child
-    turned = se3.rotation_log(T[:3, :3] @ truth[:3, :3].T)
-    errors = np.concatenate([T[:3, 3] - truth[:3, 3], turned])
+    translation = T[:3, 3] - truth[:3, 3]
+    rotation = se3.rotation_log(T[:3, :3] @ truth[:3, :3].T)
+    errors = np.concatenate([translation, rotation])
     is_known = np.isfinite(result.sigmas)
-    return float(np.abs(errors[is_known] / result.sigmas[is_known]).max(initial=0.0))
+    ratios = errors[is_known] / result.sigmas[is_known]
+    return float(np.abs(ratios).max(initial=0.0))
 
 
 def rows(faults: Sequence[str], seeds: Sequence[int]) -> Iterator[dict[str, object]]:

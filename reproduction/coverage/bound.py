@@ -74,7 +74,9 @@ def cramer_rao_bound(sides: Sequence[Side], child: FloatArray, dt: float) -> Flo
     dt : float
         Time between poses, s.
     """
-    return _inverted(normal_equations(sides, child, dt))[:6, :6]
+    information = normal_equations(sides, child, dt)
+    covariance = _inverted(information)
+    return covariance[:6, :6]
 
 
 def ideal_estimate(
@@ -89,8 +91,12 @@ def ideal_estimate(
     z : (N, 6) array
         What the recording shows, see the module.
     """
-    gram = normal_equations(sides, child, dt, z)
-    return (_inverted(gram[:-1, :-1]) @ gram[:-1, -1])[:6]
+    equations = normal_equations(sides, child, dt, z)
+    information = equations[:-1, :-1]
+    right_side = equations[:-1, -1]
+    covariance = _inverted(information)
+    estimate = covariance @ right_side
+    return estimate[:6]
 
 
 def normal_equations(
@@ -99,46 +105,51 @@ def normal_equations(
     """Information on xi, behind it on the pose of the worlds if odometry does not drift, and the
     right-hand side as last column if z is given.
     """
-    white = sum(
-        (s.to_error @ s.drawn.white @ s.to_error.T for s in sides), np.zeros((6, 6))
-    )
-    walk = sum(
-        (s.to_error @ s.drawn.walk @ s.to_error.T for s in sides), np.zeros((6, 6))
-    )
-    latents = [latent for side in sides for latent in _latents(side, dt)]
-    columns = [np.tile(np.eye(6), (len(child), 1, 1))]
+    n_poses = len(child)
+    white: FloatArray = np.zeros((6, 6))
+    walk: FloatArray = np.zeros((6, 6))
+    latents = []
+    for side in sides:
+        to_error = side.to_error
+        white = white + to_error @ side.drawn.white @ to_error.T
+        walk = walk + to_error @ side.drawn.walk @ to_error.T
+        latents += _latents(side, dt)
+
+    columns = [np.tile(np.eye(6), (n_poses, 1, 1))]
     if walk.any():
         steps = se3.inverse(child[:-1]) @ child[1:]
-        space = _drifting(se3.adjoint(se3.inverse(steps)), _inverted(walk), latents)
+        adjoints = se3.adjoint(se3.inverse(steps))
+        space = _drifting(adjoints, _inverted(walk), latents)
     else:
-        columns.append(se3.adjoint(se3.inverse(child) @ child[len(child) // 2]))
-        space = _stationary(len(child), latents)
+        middle = child[n_poses // 2]
+        to_middle = se3.inverse(child) @ middle
+        columns.append(se3.adjoint(to_middle))
+        space = _stationary(n_poses, latents)
     if z is not None:
         columns.append(z[:, :, None])
-    return _eliminated(_inverted(white), np.concatenate(columns, axis=2), space)
+    all_columns = np.concatenate(columns, axis=2)
+    return _eliminated(_inverted(white), all_columns, space)
 
 
 def _latents(side: Side, dt: float) -> list[_Latent]:
     errors = side.errors
     Ts = side.Ts
-    G = side.to_error
-    nowhere = np.zeros((len(Ts) - 1, 6, 6))
-    latents = [
-        _Latent(
-            _phi(dt, process.tau_s),
-            process.sigma**2,
-            G @ directions(process, Ts),
-            nowhere,
-        )
-        for process in errors.slow
-    ]
+    to_error = side.to_error
+    n_poses = len(Ts)
+    not_in_step = np.zeros((n_poses - 1, 6, 6))
+    latents = []
+    for process in errors.slow:
+        phi = _phi(dt, process.tau_s)
+        in_pose = to_error @ directions(process, Ts)
+        latents.append(_Latent(phi, process.sigma**2, in_pose, not_in_step))
     if errors.scale is not None:
         sigma, tau_s = errors.scale
-        columns = scale_columns(se3.inverse(Ts[:-1]) @ Ts[1:]) @ G.T
-        nowhere = np.zeros((len(Ts), 6, 1))
-        latents.append(
-            _Latent(_phi(dt, tau_s), np.array([sigma**2]), nowhere, columns[:, :, None])
-        )
+        variances = np.array([sigma**2])
+        steps = se3.inverse(Ts[:-1]) @ Ts[1:]
+        in_step = scale_columns(steps) @ to_error.T
+        not_in_pose = np.zeros((n_poses, 6, 1))
+        phi = _phi(dt, tau_s)
+        latents.append(_Latent(phi, variances, not_in_pose, in_step[:, :, None]))
     return latents
 
 
@@ -150,40 +161,47 @@ def _drifting(
     adjoints: FloatArray, walk_inverse: FloatArray, latents: list[_Latent]
 ) -> _StateSpace:
     """States (d, latents), d a random walk of unknown start."""
-    count = len(adjoints)
+    n_steps = len(adjoints)
     size = 6 + sum(len(latent.variances) for latent in latents)
-    F = np.zeros((count, size, size))
-    Q_inverse = np.zeros((count, size, size))
+    F = np.zeros((n_steps, size, size))
+    Q_inverse = np.zeros((n_steps, size, size))
+    first = np.zeros((size, size))
+    in_poses = [np.tile(np.eye(6), (n_steps + 1, 1, 1))]
     F[:, :6, :6] = adjoints
     Q_inverse[:, :6, :6] = walk_inverse
-    first = np.zeros((size, size))
-    at = 6
+    start = 6
     for latent in latents:
-        block = slice(at, at + len(latent.variances))
+        n_states = len(latent.variances)
+        block = slice(start, start + n_states)
+        innovation_variances = (1.0 - latent.phi**2) * latent.variances
         F[:, :6, block] = latent.in_step
-        F[:, block, block] = latent.phi * np.eye(len(latent.variances))
-        Q_inverse[:, block, block] = _inverse((1.0 - latent.phi**2) * latent.variances)
+        F[:, block, block] = latent.phi * np.eye(n_states)
+        Q_inverse[:, block, block] = _inverse(innovation_variances)
         first[block, block] = _inverse(latent.variances)
-        at = block.stop
-    d = np.tile(np.eye(6), (count + 1, 1, 1))
-    H = np.concatenate([d, *(latent.in_pose for latent in latents)], axis=2)
+        in_poses.append(latent.in_pose)
+        start = block.stop
+    H = np.concatenate(in_poses, axis=2)
     return _StateSpace(H, F, Q_inverse, first)
 
 
 def _stationary(count: int, latents: list[_Latent]) -> _StateSpace:
     """States (latents) alone, none of them in the increments."""
-    nothing = np.zeros(0)
-    phi = np.concatenate(
-        [nothing, *(0.0 * latent.variances + latent.phi for latent in latents)]
-    )
-    variances = np.concatenate([nothing, *(latent.variances for latent in latents)])
+    phis = [np.zeros(0)]
+    variances = [np.zeros(0)]
+    in_poses = [np.zeros((count, 6, 0))]
+    for latent in latents:
+        phis.append(np.full(len(latent.variances), latent.phi))
+        variances.append(latent.variances)
+        in_poses.append(latent.in_pose)
+    phi = np.concatenate(phis)
+    variance = np.concatenate(variances)
+    innovation_variance = (1.0 - phi**2) * variance
+    steps = (count - 1, 1, 1)
     return _StateSpace(
-        np.concatenate(
-            [np.zeros((count, 6, 0)), *(latent.in_pose for latent in latents)], axis=2
-        ),
-        np.tile(np.diag(phi), (count - 1, 1, 1)),
-        np.tile(_inverse((1.0 - phi**2) * variances), (count - 1, 1, 1)),
-        _inverse(variances),
+        H=np.concatenate(in_poses, axis=2),
+        F=np.tile(np.diag(phi), steps),
+        Q_inverse=np.tile(_inverse(innovation_variance), steps),
+        first=_inverse(variance),
     )
 
 
@@ -192,35 +210,44 @@ def _inverted(matrices: FloatArray) -> FloatArray:
 
 
 def _inverse(variances: FloatArray) -> FloatArray:
-    return np.diag(1.0 / np.maximum(variances, _LEAST_VARIANCE))
+    bounded = np.maximum(variances, _LEAST_VARIANCE)
+    return np.diag(1.0 / bounded)
 
 
 def _eliminated(
     weights: FloatArray, columns: FloatArray, space: _StateSpace
 ) -> FloatArray:
     """Gram matrix (p, p) of columns (N, 6, p) after eliminating the states."""
+    n_columns = columns.shape[2]
     gram = np.einsum("nji,njk,nkl->il", columns, weights, columns, optimize=True)
-    if not space.H.shape[2]:
+    n_states = space.H.shape[2]
+    if n_states == 0:
         return gram
+
     weighted = np.swapaxes(space.H, 1, 2) @ weights
     diagonal = weighted @ space.H
     diagonal[0] += space.first
     diagonal[1:] += space.Q_inverse
-    diagonal[:-1] += np.swapaxes(space.F, 1, 2) @ space.Q_inverse @ space.F
-    coupling = (weighted @ columns).reshape(-1, columns.shape[2])
-    factor = cholesky_banded(_banded(diagonal, -space.Q_inverse @ space.F), lower=True)
-    return gram - coupling.T @ cho_solve_banded((factor, True), coupling)
+    F_transposed = np.swapaxes(space.F, 1, 2)
+    diagonal[:-1] += F_transposed @ space.Q_inverse @ space.F
+    below = -space.Q_inverse @ space.F
+
+    coupling = weighted @ columns
+    coupling = coupling.reshape(-1, n_columns)
+    factor = cholesky_banded(_banded(diagonal, below), lower=True)
+    solution = cho_solve_banded((factor, True), coupling)
+    return gram - coupling.T @ solution
 
 
 def _banded(diagonal: FloatArray, below: FloatArray) -> FloatArray:
     """Lower band storage of a symmetric block tridiagonal matrix."""
-    count, size, _ = diagonal.shape
-    bands = np.zeros((2 * size, count * size))
+    n_poses, size, _ = diagonal.shape
+    bands = np.zeros((2 * size, n_poses * size))
+    end = (n_poses - 1) * size
     for column in range(size):
         for row in range(size):
             if row >= column:
                 bands[row - column, column::size] = diagonal[:, row, column]
-            bands[size + row - column, column : (count - 1) * size : size] = below[
-                :, row, column
-            ]
+            band = size + row - column
+            bands[band, column:end:size] = below[:, row, column]
     return bands

@@ -66,30 +66,32 @@ def simulate(
 
     Another ``noise_seed`` gives other errors of the sensors on the same drive.
     """
-    motion_rng, mount_rng, parent_rng, child_rng = np.random.default_rng(seed).spawn(4)
+    generators = np.random.default_rng(seed).spawn(4)
+    motion_rng, mount_rng, parent_rng, child_rng = generators
     if noise_seed is not None:
         parent_rng, child_rng = np.random.default_rng(noise_seed).spawn(2)
     dt = 1.0 / kind.rate_hz
-    times_s: FloatArray = dt * np.arange(
-        round(kind.duration_s * kind.rate_hz), dtype=np.float64
-    )
+    n_poses = round(kind.duration_s * kind.rate_hz)
+    times_s: FloatArray = dt * np.arange(n_poses, dtype=np.float64)
     motion = kind.motion(motion_rng, kind.duration_s)
     drawn = _mount(mount_rng, kind.lever_m)
     X = drawn if T_parent_child is None else T_parent_child
-    Ts = motion.at(times_s)
+
+    Ts_parent = motion.at(times_s)
+    Ts_child = Ts_parent @ X
     twists = motion.twists(times_s)
     to_child = se3.adjoint(se3.inverse(X))
-    parent = draw(kind.parent, Ts, twists, dt, parent_rng)
-    child = draw(kind.child, Ts @ X, twists @ to_child.T, dt, child_rng)
+    parent = draw(kind.parent, Ts_parent, twists, dt, parent_rng)
+    child = draw(kind.child, Ts_child, twists @ to_child.T, dt, child_rng)
     child_poses = se3.inverse(_world(mount_rng)) @ child.poses
+    stamps = stamps_ns(times_s)
+    parent_side = Side(kind.parent, parent, Ts_parent, to_child)
+    child_side = Side(kind.child, child, Ts_child, -np.eye(6))
     return Simulated(
-        parent=Trajectory(stamps_ns(times_s), parent.poses, "parent", "parent_odom"),
-        child=Trajectory(stamps_ns(times_s), child_poses, "child", "child_odom"),
+        parent=Trajectory(stamps, parent.poses, "parent", "parent_odom"),
+        child=Trajectory(stamps, child_poses, "child", "child_odom"),
         T_parent_child=X,
-        sides=(
-            Side(kind.parent, parent, Ts, to_child),
-            Side(kind.child, child, Ts @ X, -np.eye(6)),
-        ),
+        sides=(parent_side, child_side),
         dt=dt,
     )
 
@@ -101,21 +103,23 @@ def stamps_ns(times_s: FloatArray) -> IntArray:
 
 def make(name: str, seed: int) -> Simulated:
     """The recording of a class by this seed."""
-    return simulate(CLASSES[name], (seed, sorted(CLASSES).index(name)))
+    class_number = sorted(CLASSES).index(name)
+    return simulate(CLASSES[name], (seed, class_number))
 
 
 def _mount(rng: np.random.Generator, lever_m: float) -> FloatArray:
     """Any rotation, and a translation of this length, mostly level."""
     direction = rng.standard_normal(3) * [1.0, 1.0, 0.5]
+    length = np.linalg.norm(direction)
     rotation = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
-    return se3.from_rotation_translation(
-        rotation, lever_m * direction / np.linalg.norm(direction)
-    )
+    return se3.from_rotation_translation(rotation, lever_m * direction / length)
 
 
 def _world(rng: np.random.Generator) -> FloatArray:
-    rotation = Rotation.from_euler("ZYX", rng.uniform(-1.0, 1.0, 3)).as_matrix()
-    return se3.from_rotation_translation(rotation, rng.uniform(-2.0, 2.0, 3))
+    angles = rng.uniform(-1.0, 1.0, 3)
+    rotation = Rotation.from_euler("ZYX", angles).as_matrix()
+    position = rng.uniform(-2.0, 2.0, 3)
+    return se3.from_rotation_translation(rotation, position)
 
 
 def _slow(

@@ -33,7 +33,8 @@ _MOST_POSES = 2500
 def make(name: str, *seeds: int) -> Simulated:
     """The recording of a motion by these seeds."""
     key = (*seeds, MIXED.index(name))
-    return simulate(drawn_class(name, np.random.default_rng(key)), key)
+    kind = drawn_class(name, np.random.default_rng(key))
+    return simulate(kind, key)
 
 
 def drawn_class(name: str, rng: np.random.Generator) -> RecordingClass:
@@ -58,12 +59,10 @@ def drawn_class(name: str, rng: np.random.Generator) -> RecordingClass:
 def _drawn_errors(
     rng: np.random.Generator, size: float, by_metre: bool
 ) -> SensorErrors:
-    errors = SensorErrors(
-        white=sigmas(
-            _between(rng, 0.0005, 0.006) * size * _by_axis(rng),
-            _between(rng, 0.02, 0.25) * (0.3 if by_metre else 1.0) * _by_axis(rng),
-        )
-    )
+    rotation_factor = 0.3 if by_metre else 1.0
+    metres = _between(rng, 0.0005, 0.006) * size * _by_axis(rng)
+    degrees = _between(rng, 0.02, 0.25) * rotation_factor * _by_axis(rng)
+    errors = SensorErrors(white=sigmas(metres, degrees))
     if rng.random() < 0.55:
         errors = _drifting(errors, rng, size, by_metre)
     if rng.random() < 0.5:
@@ -71,13 +70,14 @@ def _drawn_errors(
     if rng.random() < 0.4:
         errors = _slow(errors, rng, (2.0, 40.0), (0.005 * size, 0.05 * size), True)
     if rng.random() < 0.2:
-        errors = replace(
-            errors, scale=(_between(rng, 0.002, 0.015), _between(rng, 5.0, 60.0))
-        )
+        sigma = _between(rng, 0.002, 0.015)
+        tau_s = _between(rng, 5.0, 60.0)
+        errors = replace(errors, scale=(sigma, tau_s))
     if rng.random() < 0.15:
         errors = replace(errors, jitter_s=_between(rng, 0.0005, 0.004))
     if rng.random() < 0.25:
-        errors = replace(errors, tail=_TAILS[rng.integers(len(_TAILS))])
+        tail = _TAILS[rng.integers(len(_TAILS))]
+        errors = replace(errors, tail=tail)
     if rng.random() < 0.12:
         errors = replace(errors, jumps_per_s=0.05, jump=sigmas(0.05 * size, 0.5))
     return errors
@@ -89,7 +89,8 @@ def _drifting(
     metres = _between(rng, 0.001, 0.01) * size * _by_axis(rng)
     degrees = _between(rng, 0.01, 0.08) * _by_axis(rng)
     if by_metre:
-        return replace(errors, walk_by_metre=sigmas(metres / 2, degrees / 4))
+        walk_by_metre = sigmas(metres / 2, degrees / 4)
+        return replace(errors, walk_by_metre=walk_by_metre)
     return replace(errors, walk=sigmas(metres, degrees))
 
 
@@ -100,8 +101,9 @@ def _slow(
     metres: tuple[float, float],
     in_world: bool,
 ) -> SensorErrors:
-    sigma = sigmas(_between(rng, *metres), _between(rng, 0.03, 0.3))
-    process = GaussMarkov(_between(rng, *tau_s), sigma, in_world)
+    sigma_m = _between(rng, *metres)
+    sigma_deg = _between(rng, 0.03, 0.3)
+    process = GaussMarkov(_between(rng, *tau_s), sigmas(sigma_m, sigma_deg), in_world)
     return replace(errors, slow=(*errors.slow, process))
 
 

@@ -23,16 +23,18 @@ class Motion:
 
     def at(self, times_s: FloatArray) -> FloatArray:
         """Poses (M, 4, 4) at times (M,), s: geodesics between the poses of the grid."""
-        places = (np.asarray(times_s) + _MARGIN_S) * _RATE
-        k = np.clip(places.astype(int), 0, len(self.poses) - 2)
-        return se3.interpolate(self.poses[k], self.poses[k + 1], places - k)
+        rows = (np.asarray(times_s) + _MARGIN_S) * _RATE
+        k = np.clip(rows.astype(int), 0, len(self.poses) - 2)
+        share = rows - k
+        return se3.interpolate(self.poses[k], self.poses[k + 1], share)
 
     def twists(self, times_s: FloatArray) -> FloatArray:
         """Twists (M, 6) in the body's frame at times (M,): m/s and rad/s."""
-        step = 1.0 / _RATE
-        before = self.at(times_s - step)
-        after = self.at(times_s + step)
-        return se3.log(se3.inverse(before) @ after) / (2.0 * step)
+        step_s = 1.0 / _RATE
+        before = self.at(times_s - step_s)
+        after = self.at(times_s + step_s)
+        steps = se3.inverse(before) @ after
+        return se3.log(steps) / (2.0 * step_s)
 
 
 # Time (s) from one ramp to the next of a vehicle that drives what the node asks for.
@@ -40,9 +42,9 @@ RAMP_PERIOD_S = 31.0
 
 
 def _grid(duration_s: float) -> FloatArray:
-    return (
-        np.arange(round((duration_s + 2 * _MARGIN_S) * _RATE) + 1) / _RATE - _MARGIN_S
-    )
+    length_s = duration_s + 2 * _MARGIN_S
+    n_rows = round(length_s * _RATE) + 1
+    return np.arange(n_rows) / _RATE - _MARGIN_S
 
 
 def _waves(
@@ -53,12 +55,26 @@ def _waves(
     waves: int = 6,
 ) -> FloatArray:
     """Sums of sines (N, columns) of standard deviation 1, frequencies log-uniform in a band."""
-    frequencies = band_hz[0] * (band_hz[1] / band_hz[0]) ** rng.random((waves, columns))
-    phases = rng.uniform(0.0, 2 * np.pi, (waves, columns))
-    weights = rng.uniform(0.5, 1.5, (waves, columns))
-    weights *= np.sqrt(2.0 / np.sum(weights**2, axis=0))
+    lowest_hz, highest_hz = band_hz
+    shape = (waves, columns)
+    frequencies = lowest_hz * (highest_hz / lowest_hz) ** rng.random(shape)
+    phases = rng.uniform(0.0, 2 * np.pi, shape)
+    weights = rng.uniform(0.5, 1.5, shape)
+    powers = np.sum(weights**2, axis=0)
+    weights *= np.sqrt(2.0 / powers)
     angles = 2 * np.pi * frequencies * times[:, None, None] + phases
-    return np.sum(weights * np.sin(angles), axis=1)
+    sines = np.sin(angles)
+    return np.sum(weights * sines, axis=1)
+
+
+def _wave(
+    rng: np.random.Generator,
+    times: FloatArray,
+    band_hz: tuple[float, float],
+    waves: int = 6,
+) -> FloatArray:
+    """Sum of sines (N,) as of :func:`_waves`."""
+    return _waves(rng, times, 1, band_hz, waves)[:, 0]
 
 
 def _smooth_steps(
@@ -69,12 +85,12 @@ def _smooth_steps(
     smooth_s: float,
 ) -> FloatArray:
     """A level (N,) drawn anew every hold_s or so, smoothed."""
-    ends = np.cumsum(
-        rng.uniform(0.5, 1.5, int(np.ptp(times) / hold_s * 2) + 4) * hold_s
-    )
-    drawn = levels(len(ends) + 1)
-    values = drawn[np.searchsorted(ends, times - times[0])]
-    return gaussian_filter1d(values, smooth_s * _RATE, mode="nearest")
+    n_levels = int(np.ptp(times) / hold_s * 2) + 4
+    holds_s = rng.uniform(0.5, 1.5, n_levels) * hold_s
+    ends = np.cumsum(holds_s)
+    drawn = levels(n_levels + 1)
+    rows = np.searchsorted(ends, times - times[0])
+    return gaussian_filter1d(drawn[rows], smooth_s * _RATE, mode="nearest")
 
 
 def _from_euler(ypr: FloatArray, positions: FloatArray) -> FloatArray:
@@ -85,10 +101,12 @@ def _from_euler(ypr: FloatArray, positions: FloatArray) -> FloatArray:
 def hand_held(rng: np.random.Generator, duration_s: float) -> Motion:
     """A person waves a rig about all axes while walking slowly through a room."""
     times = _grid(duration_s)
+    walk_m = np.array([1.0, 1.0, 0.15])
+    angle_sizes = np.array([0.5, 0.3, 0.3])
     positions = 0.12 * _waves(rng, times, 3, (0.25, 1.2))
-    positions += np.array([1.0, 1.0, 0.15]) * _waves(rng, times, 3, (0.02, 0.08), 3)
-    angles = np.array([0.5, 0.3, 0.3]) * _waves(rng, times, 3, (0.15, 0.9))
-    angles[:, 0] += 0.8 * _waves(rng, times, 1, (0.01, 0.05), 3)[:, 0]
+    positions += walk_m * _waves(rng, times, 3, (0.02, 0.08), 3)
+    angles = angle_sizes * _waves(rng, times, 3, (0.15, 0.9))
+    angles[:, 0] += 0.8 * _wave(rng, times, (0.01, 0.05), 3)
     return Motion(_from_euler(angles, positions))
 
 
@@ -102,22 +120,17 @@ def _ground_vehicle(
 ) -> Motion:
     """A vehicle that moves along its own x axis; bumps (N, 3): extra roll, pitch (rad), heave."""
     heading = np.cumsum(yaw_rate) / _RATE
-    velocity = speed[:, None] * np.stack(
-        [
-            np.cos(heading) * np.cos(slope),
-            np.sin(heading) * np.cos(slope),
-            np.sin(slope),
-        ],
-        axis=-1,
+    level = np.cos(slope)
+    ahead = np.stack(
+        [np.cos(heading) * level, np.sin(heading) * level, np.sin(slope)], axis=-1
     )
+    velocity = speed[:, None] * ahead
     positions = np.cumsum(velocity, axis=0) / _RATE
     positions[:, 2] += bumps[:, 2]
-    return Motion(
-        _from_euler(
-            np.column_stack([heading, bumps[:, 1] - slope, bank + bumps[:, 0]]),
-            positions,
-        )
-    )
+    pitch = bumps[:, 1] - slope
+    roll = bank + bumps[:, 0]
+    angles = np.column_stack([heading, pitch, roll])
+    return Motion(_from_euler(angles, positions))
 
 
 def car(rng: np.random.Generator, duration_s: float) -> Motion:
@@ -126,18 +139,25 @@ def car(rng: np.random.Generator, duration_s: float) -> Motion:
     The speed is about 9 m/s, with limits of 2 and 18 m/s.
     """
     times = _grid(duration_s)
-    speed = np.clip(9.0 + 3.5 * _waves(rng, times, 1, (0.01, 0.06))[:, 0], 2.0, 18.0)
-    bends = _smooth_steps(
-        rng, times, 6.0, lambda size: rng.normal(0.0, 0.18, size), 0.8
-    )
-    junctions = rng.choice([-0.45, 0.0, 0.0, 0.45], size=int(duration_s / 4) + 4)
-    turns = _smooth_steps(
-        rng, times, 5.0, lambda size: rng.choice(junctions, size), 0.6
-    )
-    slope = np.radians(2.5) * _waves(rng, times, 1, (0.02, 0.1))[:, 0]
-    bank = np.radians(1.2) * _waves(rng, times, 1, (0.03, 0.15))[:, 0]
-    bumps = np.array([0.006, 0.005, 0.015]) * _waves(rng, times, 3, (0.5, 1.5))
-    return _ground_vehicle(times, speed, bends + turns, slope, bank, bumps)
+    speed = 9.0 + 3.5 * _wave(rng, times, (0.01, 0.06))
+    speed = np.clip(speed, 2.0, 18.0)
+
+    def bends(size: int) -> FloatArray:
+        return rng.normal(0.0, 0.18, size)
+
+    bend_rate = _smooth_steps(rng, times, 6.0, bends, 0.8)
+    n_junctions = int(duration_s / 4) + 4
+    junctions = rng.choice([-0.45, 0.0, 0.0, 0.45], size=n_junctions)
+
+    def turns(size: int) -> FloatArray:
+        return rng.choice(junctions, size)
+
+    turn_rate = _smooth_steps(rng, times, 5.0, turns, 0.6)
+    slope = np.radians(2.5) * _wave(rng, times, (0.02, 0.1))
+    bank = np.radians(1.2) * _wave(rng, times, (0.03, 0.15))
+    bump_sizes = np.array([0.006, 0.005, 0.015])
+    bumps = bump_sizes * _waves(rng, times, 3, (0.5, 1.5))
+    return _ground_vehicle(times, speed, bend_rate + turn_rate, slope, bank, bumps)
 
 
 def agv(rng: np.random.Generator, duration_s: float, ramps: bool = True) -> Motion:
@@ -146,21 +166,41 @@ def agv(rng: np.random.Generator, duration_s: float, ramps: bool = True) -> Moti
     Without ``ramps`` the floor is flat and has no bumps.
     """
     times = _grid(duration_s)
-    speed = _smooth_steps(
-        rng, times, 8.0, lambda size: rng.uniform(0.4, 1.4, size), 0.7
-    )
-    yaw_rate = _smooth_steps(
-        rng, times, 5.0, lambda size: rng.normal(0.0, 0.35, size), 0.5
-    )
+    speed = _uniform_steps(rng, times, (0.4, 1.4))
+    yaw_rate = _turns_of_agv(rng, times)
     flat = np.zeros_like(times)
-    slope = flat
-    if ramps:
-        degrees = [0.0, 0.0, 0.0, 3.0, 6.0, -3.0, -6.0]
-        slope = _smooth_steps(
-            rng, times, 5.0, lambda size: rng.choice(np.radians(degrees), size), 0.4
-        )
-    bumps = _bumps_of_agv(rng, times, slope) if ramps else np.zeros((len(times), 3))
+    if not ramps:
+        bumps = np.zeros((len(times), 3))
+        return _ground_vehicle(times, speed, yaw_rate, flat, flat, bumps)
+
+    slopes = np.radians([0.0, 0.0, 0.0, 3.0, 6.0, -3.0, -6.0])
+
+    def drawn_slopes(size: int) -> FloatArray:
+        return rng.choice(slopes, size)
+
+    slope = _smooth_steps(rng, times, 5.0, drawn_slopes, 0.4)
+    bumps = _bumps_of_agv(rng, times, slope)
     return _ground_vehicle(times, speed, yaw_rate, slope, flat, bumps)
+
+
+def _uniform_steps(
+    rng: np.random.Generator, times: FloatArray, limits: tuple[float, float]
+) -> FloatArray:
+    """Speed (N,) of an automated guided vehicle, m/s: uniform between limits."""
+
+    def speeds(size: int) -> FloatArray:
+        return rng.uniform(*limits, size)
+
+    return _smooth_steps(rng, times, 8.0, speeds, 0.7)
+
+
+def _turns_of_agv(rng: np.random.Generator, times: FloatArray) -> FloatArray:
+    """Yaw rate (N,) of an automated guided vehicle, rad/s."""
+
+    def yaw_rates(size: int) -> FloatArray:
+        return rng.normal(0.0, 0.35, size)
+
+    return _smooth_steps(rng, times, 5.0, yaw_rates, 0.5)
 
 
 def _bumps_of_agv(
@@ -169,7 +209,7 @@ def _bumps_of_agv(
     """Extra roll, pitch (rad) and heave (N, 3) on a slope (N,) (rad) that is not quite straight."""
     bumps = np.zeros((len(times), 3))
     bumps[:, :2] = np.radians(0.25) * _waves(rng, times, 2, (0.3, 1.0))
-    bumps[:, 0] += slope * 0.25 * _waves(rng, times, 1, (0.03, 0.1))[:, 0]
+    bumps[:, 0] += slope * 0.25 * _wave(rng, times, (0.03, 0.1))
     return bumps
 
 
@@ -181,18 +221,18 @@ def agv_on_request(
     A ramp of 7 deg takes 8 s, up and down in turn. Before ``flat_s``, there are no ramps.
     """
     times = _grid(duration_s)
-    speed = _smooth_steps(
-        rng, times, 8.0, lambda size: rng.uniform(0.6, 1.4, size), 0.7
-    )
-    yaw_rate = _smooth_steps(
-        rng, times, 5.0, lambda size: rng.normal(0.0, 0.35, size), 0.5
-    )
-    ramps, since_s = np.divmod(times + rng.uniform(0.0, RAMP_PERIOD_S), RAMP_PERIOD_S)
-    share = np.clip(np.minimum(since_s, 8.0 - since_s), 0.0, 1.0)
-    slope = np.radians(7.0) * share * np.where(ramps % 2, 1.0, -1.0)
+    speed = _uniform_steps(rng, times, (0.6, 1.4))
+    yaw_rate = _turns_of_agv(rng, times)
+    start_s = rng.uniform(0.0, RAMP_PERIOD_S)
+    ramp_numbers, since_s = np.divmod(times + start_s, RAMP_PERIOD_S)
+    until_s = 8.0 - since_s
+    share = np.clip(np.minimum(since_s, until_s), 0.0, 1.0)
+    signs = np.where(ramp_numbers % 2, 1.0, -1.0)
+    slope = np.radians(7.0) * share * signs
     slope[times < flat_s] = 0.0
+    level = np.zeros_like(times)
     bumps = _bumps_of_agv(rng, times, slope)
-    return _ground_vehicle(times, speed, yaw_rate, slope, np.zeros_like(times), bumps)
+    return _ground_vehicle(times, speed, yaw_rate, slope, level, bumps)
 
 
 def flat_agv(rng: np.random.Generator, duration_s: float) -> Motion:
@@ -203,57 +243,78 @@ def flat_agv(rng: np.random.Generator, duration_s: float) -> Motion:
 def excavator(rng: np.random.Generator, duration_s: float) -> Motion:
     """The cab of an excavator: it slews to and fro, rocks, and now and then drives a little."""
     times = _grid(duration_s)
-    slewing = _smooth_steps(
-        rng, times, 4.0, lambda size: rng.normal(0.0, 0.5, size), 0.5
-    )
+
+    def slewing_rates(size: int) -> FloatArray:
+        return rng.normal(0.0, 0.5, size)
+
+    def speeds(size: int) -> FloatArray:
+        return rng.choice([0.0, 0.0, 0.0, 0.6, -0.6], size)
+
+    def steering_rates(size: int) -> FloatArray:
+        return rng.normal(0.0, 0.8, size)
+
+    slewing = _smooth_steps(rng, times, 4.0, slewing_rates, 0.5)
     tilt = np.radians(2.0) * _waves(rng, times, 2, (0.1, 0.6))
     tilt += np.radians(4.0) * _waves(rng, times, 2, (0.01, 0.05), 3)
-    speeds = [0.0, 0.0, 0.0, 0.6, -0.6]
-    speed = _smooth_steps(rng, times, 6.0, lambda size: rng.choice(speeds, size), 0.6)
-    steering = _smooth_steps(
-        rng, times, 6.0, lambda size: rng.normal(0.0, 0.8, size), 0.5
+    speed = _smooth_steps(rng, times, 6.0, speeds, 0.6)
+    steering = _smooth_steps(rng, times, 6.0, steering_rates, 0.5)
+
+    is_driving = speed != 0
+    heading = np.cumsum(0.15 * is_driving * steering) / _RATE
+    velocity = np.column_stack(
+        [speed * np.cos(heading), speed * np.sin(heading), 0.02 * speed]
     )
-    heading = np.cumsum(0.15 * (speed != 0) * steering) / _RATE
-    velocity = np.stack(
-        [speed * np.cos(heading), speed * np.sin(heading), 0.02 * speed], axis=-1
-    )
-    positions = np.cumsum(velocity, axis=0) / _RATE + 0.01 * _waves(
-        rng, times, 3, (0.3, 1.0)
-    )
+    path = np.cumsum(velocity, axis=0) / _RATE
+    positions = path + 0.01 * _waves(rng, times, 3, (0.3, 1.0))
     yaw = heading + np.cumsum(slewing) / _RATE
-    return Motion(_from_euler(np.column_stack([yaw, tilt]), positions))
+    angles = np.column_stack([yaw, tilt])
+    return Motion(_from_euler(angles, positions))
 
 
 def drone(rng: np.random.Generator, duration_s: float) -> Motion:
     """A multicopter: its tilt makes its acceleration, its yaw follows slowly."""
     times = _grid(duration_s)
-    positions = np.array([3.0, 3.0, 0.7]) * _waves(rng, times, 3, (0.03, 0.16))
-    positions += np.array([0.3, 0.3, 0.1]) * _waves(rng, times, 3, (0.2, 0.5))
-    acceleration = np.gradient(np.gradient(positions, axis=0), axis=0) * _RATE**2
-    acceleration = gaussian_filter1d(acceleration, 0.05 * _RATE, axis=0)
-    up = acceleration + np.array([0.0, 0.0, 9.81])
-    up /= np.linalg.norm(up, axis=1, keepdims=True)
-    yaw = 1.2 * _waves(rng, times, 1, (0.02, 0.2))[:, 0]
-    ahead = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=-1)
+    slow_m = np.array([3.0, 3.0, 0.7])
+    fast_m = np.array([0.3, 0.3, 0.1])
+    positions = slow_m * _waves(rng, times, 3, (0.03, 0.16))
+    positions += fast_m * _waves(rng, times, 3, (0.2, 0.5))
+    up = _thrust_directions(positions)
+    yaw = 1.2 * _wave(rng, times, (0.02, 0.2))
+    ahead = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)])
     leftward = np.cross(up, ahead)
     leftward /= np.linalg.norm(leftward, axis=1, keepdims=True)
-    rotations = np.stack([np.cross(leftward, up), leftward, up], axis=-1)
+    forward = np.cross(leftward, up)
+    rotations = np.stack([forward, leftward, up], axis=-1)
     return Motion(se3.from_rotation_translation(rotations, positions))
+
+
+def _thrust_directions(positions: FloatArray) -> FloatArray:
+    """Unit vectors (N, 3) of the thrust that moves a multicopter along positions (N, 3)."""
+    velocity = np.gradient(positions, axis=0)
+    acceleration = np.gradient(velocity, axis=0) * _RATE**2
+    acceleration = gaussian_filter1d(acceleration, 0.05 * _RATE, axis=0)
+    gravity = np.array([0.0, 0.0, 9.81])
+    up = acceleration + gravity
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    return up
 
 
 def arm(rng: np.random.Generator, duration_s: float) -> Motion:
     """A robot arm: a camera goes from view to view of a target and stops at each."""
     times = _grid(duration_s)
-    views = int(np.ptp(times) / 2.5) + 3
-    aims = np.column_stack(
-        [
-            rng.uniform(-0.25, 0.25, (views, 3)),
-            rng.uniform(-1.0, 1.0, (views, 3)) * [0.45, 0.45, 0.9],
-        ]
-    )
-    place = (times - times[0]) / 2.5
-    k = place.astype(int)
-    s = np.clip((place - k) / 0.8, 0.0, 1.0)[:, None]
-    values = aims[k] + (aims[k + 1] - aims[k]) * s**3 * (10 - 15 * s + 6 * s**2)
+    view_s = 2.5
+    n_views = int(np.ptp(times) / view_s) + 3
+    angle_limits = [0.45, 0.45, 0.9]
+    positions = rng.uniform(-0.25, 0.25, (n_views, 3))
+    vectors = rng.uniform(-1.0, 1.0, (n_views, 3)) * angle_limits
+    views = np.column_stack([positions, vectors])
+
+    progress = (times - times[0]) / view_s
+    k = progress.astype(int)
+    # The arm moves for 0.8 of the time, smoothly, and then rests.
+    s = np.clip((progress - k) / 0.8, 0.0, 1.0)[:, None]
+    smooth = 10 - 15 * s + 6 * s**2
+    change = views[k + 1] - views[k]
+    values = views[k] + change * s**3 * smooth
     rotations = se3.rotation_exp(values[:, 3:])
     return Motion(se3.from_rotation_translation(rotations, values[:, :3]))

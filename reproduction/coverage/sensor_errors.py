@@ -15,9 +15,9 @@ from hand_eye_calib.core.geometry import se3
 
 def sigmas(metres: float | FloatArray, degrees: float | FloatArray) -> FloatArray:
     """Standard deviations (6,) of (rho, phi), in m and rad."""
-    return np.concatenate(
-        [np.full(3, 1.0) * metres, np.radians(np.full(3, 1.0) * degrees)]
-    )
+    translation = np.full(3, 1.0) * metres
+    rotation = np.radians(np.full(3, 1.0) * degrees)
+    return np.concatenate([translation, rotation])
 
 
 def _no_error() -> FloatArray:
@@ -46,10 +46,13 @@ class Tail:
     def draw(self, rng: np.random.Generator, count: int, dt: float) -> FloatArray:
         """Factors (N,)."""
         if self.kind == "student":
-            return np.sqrt(self.factor / rng.chisquare(self.factor, count))
+            chi_squared = rng.chisquare(self.factor, count)
+            return np.sqrt(self.factor / chi_squared)
         if self.kind == "spikes":
-            return np.where(rng.random(count) < self.share, self.factor, 1.0)
-        return np.where(_bursts(rng, count, self.share, 1.0 / dt), self.factor, 1.0)
+            is_worse = rng.random(count) < self.share
+        else:
+            is_worse = _bursts(rng, count, self.share, 1.0 / dt)
+        return np.where(is_worse, self.factor, 1.0)
 
     def information(self) -> float:
         """Fisher information of the location of a 6-dimensional error, over that of the Gaussian
@@ -66,13 +69,15 @@ def _bursts(
     rng: np.random.Generator, count: int, share: float, length: float
 ) -> BoolArray:
     """Whether each pose (N,) lies in a burst; bursts last ``length`` poses on average."""
-    inside = False
+    is_inside = False
     flags = np.empty(count, dtype=bool)
     leave = 1.0 / length
     enter = share / (1.0 - share) / length
-    for i, draw in enumerate(rng.random(count)):
-        inside = bool(draw >= leave if inside else draw < enter)
-        flags[i] = inside
+    for row, drawn in enumerate(rng.random(count)):
+        stays = drawn >= leave
+        enters = drawn < enter
+        is_inside = bool(stays if is_inside else enters)
+        flags[row] = is_inside
     return flags
 
 
@@ -80,15 +85,19 @@ def mixture_information(share: float, factor: float, dimensions: int = 6) -> flo
     """Fisher information of the location of (1 - share) N(0, I) + share N(0, factor^2 I), per
     dimension, by an integral over the radius.
     """
-    r = np.linspace(1e-6, 8.0 * factor + 8.0, 400_000)
-    core = (1.0 - share) * np.exp(-0.5 * r**2)
-    wide = share * factor**-dimensions * np.exp(-0.5 * (r / factor) ** 2)
+    radius = np.linspace(1e-6, 8.0 * factor + 8.0, 400_000)
+    core = (1.0 - share) * np.exp(-0.5 * radius**2)
+    height = share * factor**-dimensions
+    wide = height * np.exp(-0.5 * (radius / factor) ** 2)
     density = core + wide
-    slope = r * (core + wide / factor**2)
-    seen = density > 1e-300
-    weight = r[seen] ** (dimensions - 1)
-    total = np.sum(weight * density[seen])
-    information = np.sum(weight * slope[seen] ** 2 / density[seen])
+    slope = radius * (core + wide / factor**2)
+
+    is_seen = density > 1e-300
+    density = density[is_seen]
+    slope = slope[is_seen]
+    surface = radius[is_seen] ** (dimensions - 1)
+    total = np.sum(surface * density)
+    information = np.sum(surface * slope**2 / density)
     return float(information / total / dimensions)
 
 
@@ -146,16 +155,21 @@ def draw(
         Time between poses, s.
     rng : numpy.random.Generator
     """
-    jump_rng, walk_rng, scale_rng, tail_rng, white_rng, slow_rng = rng.spawn(6)
+    generators = rng.spawn(6)
+    jump_rng, walk_rng, scale_rng, tail_rng, white_rng, slow_rng = generators
     steps = se3.inverse(Ts[:-1]) @ Ts[1:]
     variances = _walk_variances(errors, steps, dt, jump_rng)
-    increments = np.sqrt(variances) * walk_rng.standard_normal((len(steps), 6))
+    standard = walk_rng.standard_normal((len(steps), 6))
+    increments = np.sqrt(variances) * standard
     increments += _scale_errors(errors, steps, dt, scale_rng)
     white, covariances = _white(errors, twists, dt, tail_rng, white_rng)
     for process in errors.slow:
         white = white + _slow(process, Ts, dt, slow_rng)
-    poses = _integrated(Ts[0], steps @ se3.exp(increments)) @ se3.exp(white)
-    return DrawnErrors(poses, covariances, variances[:, :, None] * np.eye(6))
+    measured_steps = steps @ se3.exp(increments)
+    drifting = _integrated(Ts[0], measured_steps)
+    poses = drifting @ se3.exp(white)
+    walk = variances[:, :, None] * np.eye(6)
+    return DrawnErrors(poses, covariances, walk)
 
 
 def _white(
@@ -166,56 +180,63 @@ def _white(
     rng: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray]:
     """White errors (N, 6) and their inverse Fisher information (N, 6, 6)."""
-    factors = np.ones(len(twists))
-    factors_known = np.ones(len(twists))
-    if errors.tail is not None:
-        factors = errors.tail.draw(tail_rng, len(twists), dt)
-        factors_known = (
-            factors**2
-            if errors.tail.kind == "bursts"
-            else factors_known / errors.tail.information()
-        )
-    drawn = factors[:, None] * errors.white * rng.standard_normal((len(twists), 6))
-    drawn += errors.jitter_s * twists * rng.standard_normal((len(twists), 1))
-    covariances = factors_known[:, None, None] * np.diag(errors.white**2)
-    return drawn, covariances + errors.jitter_s**2 * twists[:, :, None] * twists[
-        :, None, :
-    ]
+    count = len(twists)
+    factors = np.ones(count)
+    variance_factors = np.ones(count)
+    tail = errors.tail
+    if tail is not None:
+        factors = tail.draw(tail_rng, count, dt)
+        if tail.kind == "bursts":
+            variance_factors = factors**2
+        else:
+            variance_factors = variance_factors / tail.information()
+
+    standard = rng.standard_normal((count, 6))
+    drawn = factors[:, None] * errors.white * standard
+    drawn += errors.jitter_s * twists * rng.standard_normal((count, 1))
+    covariances = variance_factors[:, None, None] * np.diag(errors.white**2)
+    products = errors.jitter_s**2 * twists[:, :, None] * twists[:, None, :]
+    return drawn, covariances + products
 
 
 def _walk_variances(
     errors: SensorErrors, steps: FloatArray, dt: float, rng: np.random.Generator
 ) -> FloatArray:
     """Variances (N-1, 6) of the increments' white errors."""
-    lengths = np.linalg.norm(steps[:, :3, 3], axis=1)
-    jumped = rng.random(len(steps)) < errors.jumps_per_s * dt
-    by_metre = errors.walk_by_metre**2 * lengths[:, None]
-    return errors.walk**2 * dt + by_metre + jumped[:, None] * errors.jump**2
+    lengths_m = np.linalg.norm(steps[:, :3, 3], axis=1)
+    is_jump = rng.random(len(steps)) < errors.jumps_per_s * dt
+    by_time = errors.walk**2 * dt
+    by_metre = errors.walk_by_metre**2 * lengths_m[:, None]
+    by_jump = is_jump[:, None] * errors.jump**2
+    return by_time + by_metre + by_jump
 
 
 def _scale_errors(
     errors: SensorErrors, steps: FloatArray, dt: float, rng: np.random.Generator
 ) -> FloatArray:
     """Errors (N-1, 6) of the increments that a drifting scale makes."""
+    n_steps = len(steps)
     if errors.scale is None:
-        return np.zeros((len(steps), 6))
+        return np.zeros((n_steps, 6))
     sigma, tau_s = errors.scale
-    return scale_columns(steps) * (
-        sigma * _markov(len(steps), 1, np.exp(-dt / tau_s), rng)
-    )
+    phi = np.exp(-dt / tau_s)
+    scales = sigma * _markov(n_steps, 1, phi, rng)
+    return scale_columns(steps) * scales
 
 
 def scale_columns(steps: FloatArray) -> FloatArray:
     """Errors (N-1, 6) of increments (N-1, 4, 4) per unit of relative scale."""
-    rho = np.einsum("nji,nj->ni", steps[:, :3, :3], steps[:, :3, 3])
+    rotations = steps[:, :3, :3]
+    translations = steps[:, :3, 3]
+    rho = np.einsum("nji,nj->ni", rotations, translations)
     return np.concatenate([rho, np.zeros_like(rho)], axis=1)
 
 
 def _integrated(start: FloatArray, steps: FloatArray) -> FloatArray:
     poses = np.empty((len(steps) + 1, 4, 4))
     poses[0] = start
-    for i, step in enumerate(steps):
-        poses[i + 1] = poses[i] @ step
+    for row, step in enumerate(steps):
+        poses[row + 1] = poses[row] @ step
     return poses
 
 
@@ -224,22 +245,28 @@ def _markov(
 ) -> FloatArray:
     """Stationary first-order processes (N, columns) of variance 1."""
     values = rng.standard_normal((count, columns))
-    values[1:] *= np.sqrt(1.0 - phi**2)
-    for i in range(1, count):
-        values[i] += phi * values[i - 1]
+    innovation_sigma = np.sqrt(1.0 - phi**2)
+    values[1:] *= innovation_sigma
+    for row in range(1, count):
+        values[row] += phi * values[row - 1]
     return values
 
 
 def _slow(
     process: GaussMarkov, Ts: FloatArray, dt: float, rng: np.random.Generator
 ) -> FloatArray:
-    values = process.sigma * _markov(len(Ts), 6, np.exp(-dt / process.tau_s), rng)
-    return np.einsum("nij,nj->ni", directions(process, Ts), values)
+    phi = np.exp(-dt / process.tau_s)
+    standard = _markov(len(Ts), 6, phi, rng)
+    values = process.sigma * standard
+    matrices = directions(process, Ts)
+    return np.einsum("nij,nj->ni", matrices, values)
 
 
 def directions(process: GaussMarkov, Ts: FloatArray) -> FloatArray:
     """Matrices (N, 6, 6) from a process to errors in the sensor's frame."""
     matrices = np.tile(np.eye(6), (len(Ts), 1, 1))
     if process.in_world:
-        matrices[:, :3, :3] = matrices[:, 3:, 3:] = np.swapaxes(Ts[:, :3, :3], 1, 2)
+        to_body = np.swapaxes(Ts[:, :3, :3], 1, 2)
+        matrices[:, :3, :3] = to_body
+        matrices[:, 3:, 3:] = to_body
     return matrices
