@@ -285,7 +285,7 @@ def yaw_gain(child: Trajectory, gain: float, _: Random) -> Trajectory:
     steps = se3.inverse(child.poses[:-1]) @ child.poses[1:]
     vectors = se3.rotation_log(steps[:, :3, :3])
     moments = vectors.T @ vectors
-    _, axes = np.linalg.eigh(moments)
+    axes = np.linalg.eigh(moments)[1]
     axis = axes[:, -1]
     about_axis = np.outer(vectors @ axis, axis)
     steps[:, :3, :3] = se3.rotation_exp(vectors + gain * about_axis)
@@ -425,7 +425,7 @@ def held(child: Trajectory, interval_s: float, _: Random) -> Trajectory:
     """A slow source published fast: each pose is repeated until there is a new one."""
     elapsed_s = seconds_of(child)
     steps = (elapsed_s / interval_s).astype(int)
-    _, first = np.unique(steps, return_index=True)
+    first = np.unique(steps, return_index=True)[1]
     return posed(child, child.poses[first[steps]])
 
 

@@ -69,11 +69,13 @@ def closure(
 ) -> tuple[float, float]:
     """Root mean squares of the angles (deg) and distances (mm) between ``A X`` and ``Z B``."""
     from_left = Ts_a @ X
-    right = Z @ Ts_b
-    turned = np.swapaxes(from_left[:, :3, :3], 1, 2) @ right[:, :3, :3]
-    angle_deg = np.degrees(np.sqrt(np.mean(se3.rotation_angle(turned) ** 2)))
-    apart = np.sum((from_left[:, :3, 3] - right[:, :3, 3]) ** 2, axis=1)
-    return float(angle_deg), 1e3 * float(np.sqrt(np.mean(apart)))
+    from_right = Z @ Ts_b
+    back = np.swapaxes(from_left[:, :3, :3], 1, 2)
+    angles = se3.rotation_angle(back @ from_right[:, :3, :3])
+    angle_deg = np.degrees(np.sqrt(np.mean(angles**2)))
+    apart = from_left[:, :3, 3] - from_right[:, :3, 3]
+    squares = np.sum(apart**2, axis=1)
+    return float(angle_deg), 1e3 * float(np.sqrt(np.mean(squares)))
 
 
 def closure_of_motions(
@@ -88,8 +90,37 @@ def closure_of_motions(
 
 def _matrices(path: Path) -> FloatArray:
     rows = np.loadtxt(path, delimiter=",", ndmin=2)
-    quat = rows[:, 4:8] / np.linalg.norm(rows[:, 4:8], axis=1, keepdims=True)
-    return np.asarray(se3.from_quat_xyzw(rows[:, 1:4], quat))
+    quats = rows[:, 4:8]
+    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    return np.asarray(se3.from_quat_xyzw(rows[:, 1:4], quats))
+
+
+@dataclass(frozen=True, order=True)
+class _Stop:
+    """Rows of a stop in the files of hand and camera."""
+
+    name: str
+    hand: int
+    eye: int
+
+
+def _nearest_stops(hand_s: FloatArray, eye_s: FloatArray) -> list[_Stop]:
+    """Pair stamps (s) of the camera with the nearest of the hand; keep the closest of each hand.
+
+    Stops are ordered by name, as in the published splits.
+    """
+    best: dict[int, tuple[float, int]] = {}
+    for row, stamp_s in enumerate(eye_s):
+        distances_s = np.abs(hand_s - stamp_s)
+        nearest = int(np.argmin(distances_s))
+        distance_s = float(distances_s[nearest])
+        closest_s, _ = best.get(nearest, (np.inf, 0))
+        if distance_s <= _WITHIN_S and distance_s < closest_s:
+            best[nearest] = (distance_s, row)
+    stops = []
+    for hand, (_, eye) in best.items():
+        stops.append(_Stop(f"ethz-absolute-{hand:05d}-{eye:05d}", hand, eye))
+    return sorted(stops)
 
 
 def ethz(folder: Path) -> Iterator[Row]:
@@ -99,41 +130,33 @@ def ethz(folder: Path) -> Iterator[Row]:
     files = [folder / "asl_robot_arm" / f"{start}_{name}" for name in names]
     hand_s, eye_s = (np.loadtxt(file, delimiter=",")[:, 0] for file in files)
     hand, eye = (_matrices(file) for file in files)
-    best: dict[int, tuple[float, int]] = {}
-    for row, stamp_s in enumerate(eye_s):
-        nearest = int(np.argmin(np.abs(hand_s - stamp_s)))
-        apart_s = abs(float(hand_s[nearest] - stamp_s))
-        if apart_s <= _WITHIN_S and apart_s < best.get(nearest, (np.inf, 0))[0]:
-            best[nearest] = (apart_s, row)
-    pairs = sorted(
-        (f"ethz-absolute-{i:05d}-{row:05d}", i, row) for i, (_, row) in best.items()
-    )
+    stops = _nearest_stops(hand_s, eye_s)
     motions = []
     poses = []
     seconds = []
-    same = 0
+    n_same = 0
     for seed, beginning in enumerate(_DIGESTS):
-        order = list(range(len(pairs)))
+        order = list(range(len(stops)))
         random.Random(seed).shuffle(order)
-        held, fitted = (
-            [pairs[k] for k in sorted(stops)] for stops in (order[:16], order[16:48])
-        )
-        name = hashlib.sha256(
-            "\n".join(pair[0] for pair in fitted).encode()
-        ).hexdigest()
-        same += name.startswith(beginning)
-        A = hand[[i for _, i, _ in fitted]]
-        B = eye[[row for _, _, row in fitted]]
+        held_out = [stops[k] for k in sorted(order[:16])]
+        fitted = [stops[k] for k in sorted(order[16:48])]
+        names_of_stops = "\n".join(stop.name for stop in fitted)
+        name = hashlib.sha256(names_of_stops.encode()).hexdigest()
+        n_same += name.startswith(beginning)
+
+        A = hand[[stop.hand for stop in fitted]]
+        B = eye[[stop.eye for stop in fitted]]
         started = time.process_time()
         fit = solve(Stops(A, B, has_target=True))
         seconds.append(time.process_time() - started)
-        A = hand[[i for _, i, _ in held]]
-        B = eye[[row for _, _, row in held]]
+
+        A = hand[[stop.hand for stop in held_out]]
+        B = eye[[stop.eye for stop in held_out]]
         X = fit.T_parent_child
-        Z = fit.T_world_world
         motions.append(closure_of_motions(X, A, B))
-        poses.append(closure(A, X, Z, B))
-    source = f"{names[0]} {digest(files[0])}, {same} of 5 splits"
+        poses.append(closure(A, X, fit.T_world_world, B))
+
+    source = f"{names[0]} {digest(files[0])}, {n_same} of 5 splits"
     text = "{:.4f} deg, {:.3f} mm"
     ours = text.format(*np.mean(motions, axis=0))
     published = text.format(0.8672, 13.821)
@@ -142,13 +165,8 @@ def ethz(folder: Path) -> Iterator[Row]:
     ours = text.format(*np.mean(poses, axis=0))
     published = text.format(0.6247, 10.779)
     yield Row("ETHZ arm", "closure of A X = Z B", ours, published, source)
-    yield Row(
-        "ETHZ arm",
-        "time of a solve",
-        f"{1e3 * np.median(seconds):.0f} ms",
-        "30 ms",
-        source,
-    )
+    ours = f"{1e3 * np.median(seconds):.0f} ms"
+    yield Row("ETHZ arm", "time of a solve", ours, "30 ms", source)
 
 
 def camodocal(folder: Path) -> Iterator[Row]:
@@ -158,10 +176,11 @@ def camodocal(folder: Path) -> Iterator[Row]:
     A = samples.robot
     B = samples.tracking
     X = solve(Stops(A, B)).T_parent_child
-    motions = [se3.inverse(Ts[:-1]) @ Ts[1:] for Ts in (A, B)]
-    angle_deg, apart_mm = closure(motions[0], X, X, motions[1])
+    motions_a = se3.inverse(A[:-1]) @ A[1:]
+    motions_b = se3.inverse(B[:-1]) @ B[1:]
+    angle_deg, distance_mm = closure(motions_a, X, X, motions_b)
     figure = "closure between neighbours"
-    ours = f"{angle_deg:.2f} deg, {apart_mm:.2f} mm"
+    ours = f"{angle_deg:.2f} deg, {distance_mm:.2f} mm"
     source = f"{path.name} {digest(path)}"
     yield Row("CamOdoCal's example", figure, ours, "7.82 deg, 36.97 mm", source)
 
@@ -170,21 +189,31 @@ def moveit(folder: Path) -> Iterator[Row]:
     """The samples of MoveIt's tests, eye to hand: the camera in the robot's base."""
     path = folder / "independent" / "moveit_samples" / "pose_samples.json"
     samples = read_arm_samples(path)
-    T_base_camera = solve(Stops(samples.robot, samples.tracking)).T_world_world
+    fit = solve(Stops(samples.robot, samples.tracking))
+    T_base_camera = fit.T_world_world
     published = Rotation.from_euler("XYZ", [0.230, -2.540, 1.950]).as_matrix()
     turned = published.T @ T_base_camera[:3, :3]
+    angle_deg = np.degrees(se3.rotation_angle(turned))
     values = " ".join(f"{value:.4f}" for value in T_base_camera[:3, 3])
-    ours = (
-        f"{values}, {np.degrees(se3.rotation_angle(turned)):.2f} deg from the published"
-    )
+    figure = "camera in the robot's base, m"
+    ours = f"{values}, {angle_deg:.2f} deg from the published"
     text = "0.659 -0.249 0.830, to 1 %; angles to 0.01 rad: rounding makes 0.29 deg rms"
-    yield Row(
-        "MoveIt",
-        "camera in the robot's base, m",
-        ours,
-        text,
-        f"{path.name} {digest(path)}",
-    )
+    yield Row("MoveIt", figure, ours, text, f"{path.name} {digest(path)}")
+
+
+def _chi_square_per_degree(
+    Zs: FloatArray, weights: FloatArray, covariance: FloatArray
+) -> float:
+    """Chi-square of poses (K, 4, 4) about their weighted mean, per degree of freedom.
+
+    ``weights`` (K, 6, 6) are the inverse covariances of the poses, ``covariance`` (6, 6) that of
+    the mean.
+    """
+    errors = se3.log(se3.inverse(Zs[0]) @ Zs)
+    errors -= covariance @ np.einsum("kij,kj->i", weights, errors)
+    total = float(np.einsum("ki,kij,kj->", errors, weights, errors))
+    n_degrees = 6.0 * (len(Zs) - 1)
+    return total / n_degrees
 
 
 def wise(folder: Path) -> Iterator[Row]:
@@ -195,10 +224,8 @@ def wise(folder: Path) -> Iterator[Row]:
     started = time.process_time()
     for path in files:
         _, camera = (int(number) for number in re.findall(r"\d+", path.name))
-        A, B = (
-            _poses_wxyz(path.with_name(path.name.replace("_A", side)))
-            for side in ("_A", "_B")
-        )
+        A = _poses_wxyz(path)
+        B = _poses_wxyz(path.with_name(path.name.replace("_A", "_B")))
         n_stops += len(A)
         if len(A) < _MIN_STOPS:
             continue
@@ -206,26 +233,23 @@ def wise(folder: Path) -> Iterator[Row]:
         if not fit.undetermined().size:
             fits_of_camera[camera].append(fit)
     seconds = time.process_time() - started
-    sigmas_m = []
+
+    sigmas_mm = []
     chi2 = []
     for fits in fits_of_camera.values():
-        weights = np.linalg.inv([fit.covariance[6:, 6:] for fit in fits])
+        covariances = [fit.covariance[6:, 6:] for fit in fits]
+        weights = np.asarray(np.linalg.inv(covariances), dtype=np.float64)
         covariance = np.linalg.inv(weights.sum(axis=0))
-        sigmas_m.append(np.sqrt(np.diag(covariance))[:3].mean())
-        if len(fits) == 1:
-            continue
-        Zs = np.array([fit.T_world_world for fit in fits])
-        apart = se3.log(se3.inverse(Zs[0]) @ Zs)
-        apart -= covariance @ np.einsum("kij,kj->i", weights, apart)
-        whole = float(np.einsum("ki,kij,kj->", apart, weights, apart))
-        chi2.append(whole / (6.0 * (len(fits) - 1)))
-    ours = (
-        f"{seconds:.1f} s, sigma {1e3 * min(sigmas_m):.1f}-{1e3 * max(sigmas_m):.1f} mm"
-    )
+        sigmas = np.sqrt(np.diag(covariance))
+        sigmas_mm.append(1e3 * sigmas[:3].mean())
+        if len(fits) > 1:
+            Zs = np.array([fit.T_world_world for fit in fits])
+            chi2.append(_chi_square_per_degree(Zs, weights, covariance))
+
+    ours = f"{seconds:.1f} s, sigma {min(sigmas_mm):.1f}-{max(sigmas_mm):.1f} mm"
     figure = f"{n_stops} stops, {len(fits_of_camera)} cameras: mean of the poses from their tags"
-    yield Row(
-        "Wise et al.", figure, ours, "none readable", f"{len(files)} pairs of files"
-    )
+    source = f"{len(files)} pairs of files"
+    yield Row("Wise et al.", figure, ours, "none readable", source)
     figure = f"poses of a camera from tags of {_MIN_STOPS} stops and more, chi-square per degree"
     ours = f"{np.median(chi2):.1f} ({min(chi2):.1f}-{max(chi2):.1f})"
     yield Row("Wise et al.", figure, ours, "", f"median of {len(chi2)} cameras")
@@ -233,9 +257,8 @@ def wise(folder: Path) -> Iterator[Row]:
 
 def _poses_wxyz(path: Path) -> FloatArray:
     rows = np.loadtxt(path, delimiter=",", ndmin=2)
-    return np.asarray(
-        se3.from_quat_xyzw(rows[:, 4:7], np.roll(rows[:, :4], -1, axis=1))
-    )
+    quats_xyzw = np.roll(rows[:, :4], -1, axis=1)
+    return np.asarray(se3.from_quat_xyzw(rows[:, 4:7], quats_xyzw))
 
 
 def shrimp_sensors(folder: Path) -> tuple[hec.Trajectory, ...]:
@@ -294,14 +317,14 @@ def shrimp(folder: Path, n_segments: int) -> Iterator[Row]:
 def _shrimp_trajectory(path: Path, name: str) -> hec.Trajectory:
     data: Any = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=False)[name]
     steps = np.asarray(data.T_Skm1_Sk, dtype=float)
-    moved = se3.inverse(
-        se3.from_rotation_translation(se3.rotation_exp(steps[:, 3:]), steps[:, :3])
-    )
+    rotations = se3.rotation_exp(steps[:, 3:])
+    moved = se3.inverse(se3.from_rotation_translation(rotations, steps[:, :3]))
     poses = np.broadcast_to(np.eye(4), moved.shape).copy()
     for k in range(1, len(moved)):
         poses[k] = poses[k - 1] @ moved[k]
     poses[:, :3, :3] = se3.nearest_rotation(poses[:, :3, :3])
-    return hec.Trajectory(np.asarray(data.time, dtype=np.int64) * 1000, poses)
+    stamps_ns = np.asarray(data.time, dtype=np.int64) * 1000
+    return hec.Trajectory(stamps_ns, poses)
 
 
 def ntu_viral(folder: Path) -> Iterator[Row]:
@@ -313,9 +336,8 @@ def ntu_viral(folder: Path) -> Iterator[Row]:
     precisions = []
     for flight in ("eee_01", "nya_01", "sbs_01"):
         parent = hec.read_trajectory(data / f"{flight}_odometry.csv", "csv")
-        child = hec.read_trajectory(
-            data / f"{flight}_leica_pose.csv", "csv", measures="positions"
-        )
+        prism_file = data / f"{flight}_leica_pose.csv"
+        child = hec.read_trajectory(prism_file, "csv", measures="positions")
         result = hec.calibrate(
             parent, child, child_measures="positions", time_offset="estimate"
         )
@@ -323,14 +345,17 @@ def ntu_viral(folder: Path) -> Iterator[Row]:
         sigmas = result.sigmas[:3]
         offsets.append(offset)
         precisions.append(1.0 / result.sigmas_measured[:3] ** 2)
-        ours = " ".join(f"{value:.4f}" for value in offset)
+
+        values = " ".join(f"{value:.4f}" for value in offset)
         sigmas_mm = " ".join(f"{1e3 * sigma:.1f}" for sigma in sigmas)
         z = np.max(np.abs(offset - published) / sigmas)
-        ours = f"{ours} +/- {sigmas_mm} mm, {result.verdict.value}, largest z {z:.1f}"
+        ours = f"{values} +/- {sigmas_mm} mm, {result.verdict.value}, largest z {z:.1f}"
         yield Row(f"NTU VIRAL {flight}", "prism x y z m", ours, text, "CAD")
+
     weights = np.stack(precisions)
     mean = np.sum(weights * offsets, axis=0) / weights.sum(axis=0)
-    chi2 = float(np.sum(weights * (np.stack(offsets) - mean) ** 2)) / 6.0
+    deviations = np.stack(offsets) - mean
+    chi2 = float(np.sum(weights * deviations**2)) / 6.0
     figure = "chi-square between flights, per degree, without the floor that they share"
     yield Row("NTU VIRAL", figure, f"{chi2:.2f}", "", "3 flights")
 

@@ -89,39 +89,42 @@ def tasks_of(
     tasks: list[_Task] = [
         ("simulated", scores.class_row, name, method, seeds) for name in CLASSES
     ]
-    if folder is not None and (folder / "valimaki2023").is_dir():
-        tasks += [
-            (
-                "levels",
-                scores.level_row,
-                folder / "valimaki2023",
-                dataset,
-                level,
-                method,
-            )
-            for dataset in SIMULATED
-            for level in LEVELS[dataset]
-        ]
+    if folder is not None:
+        tasks += _tasks_of_levels(method, folder / "valimaki2023")
     for rig in rigs:
-        names = list(rig.recordings)
-        if rig.is_refused:
-            tasks += [
-                ("refused", scores.refused_row, rig, name, method) for name in names
-            ]
-            continue
-        if rig.truth is not None:
-            tasks += [
-                ("known answer", scores.truth_row, rig, name, method) for name in names
-            ]
-        if len(names) > 1:
-            tasks.append(("rig", scores.scatter_row, rig, method))
-        if rig.is_cut:
-            tasks += [("parts", scores.parts_row, rig, name, method) for name in names]
+        tasks += _tasks_of_rig(method, rig)
     by_name = {rig.name: rig for rig in rigs}
     if set(CYCLE) <= set(by_name):
-        tasks.append(
-            ("cycle", scores.cycle_row, {name: by_name[name] for name in CYCLE}, method)
-        )
+        cycle = {name: by_name[name] for name in CYCLE}
+        tasks.append(("cycle", scores.cycle_row, cycle, method))
+    return tasks
+
+
+def _tasks_of_levels(method: str, folder: Path) -> list[_Task]:
+    """Levels of the published simulated data; none if the folder is absent."""
+    if not folder.is_dir():
+        return []
+    return [
+        ("levels", scores.level_row, folder, dataset, level, method)
+        for dataset in SIMULATED
+        for level in LEVELS[dataset]
+    ]
+
+
+def _tasks_of_rig(method: str, rig: Rig) -> list[_Task]:
+    """Measures of the recordings of a real rig."""
+    names = list(rig.recordings)
+    if rig.is_refused:
+        return [("refused", scores.refused_row, rig, name, method) for name in names]
+    tasks: list[_Task] = []
+    if rig.truth is not None:
+        tasks += [
+            ("known answer", scores.truth_row, rig, name, method) for name in names
+        ]
+    if len(names) > 1:
+        tasks.append(("rig", scores.scatter_row, rig, method))
+    if rig.is_cut:
+        tasks += [("parts", scores.parts_row, rig, name, method) for name in names]
     return tasks
 
 

@@ -77,17 +77,22 @@ class Row:
     def value(self, kind: str) -> float:
         """A measure; NaN if it was not taken."""
         cases = self.cases.get(kind)
-        return KINDS[kind][1](_groups(cases)) if cases else float("nan")
+        if not cases:
+            return float("nan")
+        _, statistic = KINDS[kind]
+        return statistic(_groups(cases))
 
 
 def pooled(table: str, name: str, method: str, rows: Iterable[Row]) -> Row:
     """All cases of the rows of a table as one row."""
     cases: dict[str, dict[str, float]] = {}
-    for row in (row for row in rows if (row.table, row.method) == (table, method)):
+    for row in rows:
+        if (row.table, row.method) != (table, method):
+            continue
         for kind, figures in row.cases.items():
-            cases.setdefault(kind, {}).update(
-                {f"{row.name}/{key}": value for key, value in figures.items()}
-            )
+            pool = cases.setdefault(kind, {})
+            for key, value in figures.items():
+                pool[f"{row.name}/{key}"] = value
     return Row(table, name, method, cases)
 
 
@@ -95,5 +100,6 @@ def _groups(cases: Mapping[str, float]) -> list[FloatArray]:
     """Values by what their keys have before the last slash."""
     groups: dict[str, list[float]] = {}
     for key, value in cases.items():
-        groups.setdefault(key.rpartition("/")[0], []).append(value)
+        group, _, _ = key.rpartition("/")
+        groups.setdefault(group, []).append(value)
     return [np.array(values) for values in groups.values()]

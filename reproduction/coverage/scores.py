@@ -92,22 +92,27 @@ def _class_case(
 
 def _covers(xi: FloatArray, result: Calibration) -> dict[str, float]:
     """The share of the components in their intervals, if there are any."""
-    if not np.isfinite(result.covariance_measured).all():
+    covariance = result.covariance_measured
+    if not np.isfinite(covariance).all():
         return {}
-    within = np.abs(xi) < _REACH * np.sqrt(np.diag(result.covariance_measured))
-    return {"covers": float(within.mean())}
+    sigmas = np.sqrt(np.diag(covariance))
+    is_within = np.abs(xi) < _REACH * sigmas
+    return {"covers": float(is_within.mean())}
 
 
 def level_row(folder: Path, dataset: str, level: float | None, method: str) -> Row:
     """Errors on the published trajectories of a level."""
+    levels = None if level is None else [level]
     cases = {}
-    for case in load_simulated(folder, [dataset], None if level is None else [level]):
+    for case in load_simulated(folder, [dataset], levels):
         result = answer(case.parent, case.child, METHODS[method])
-        if result is not None:
-            xi = se3.log(se3.inverse(result.T_parent_child) @ case.T_parent_child)
-            e_at, e_aR = absolute_errors(result.T_parent_child, case.T_parent_child)
-            sizes = {"mm": 1e3 * e_at, "deg": float(np.degrees(e_aR))}
-            cases[case.name] = sizes | _covers(xi, result)
+        if result is None:
+            continue
+        T_true = case.T_parent_child
+        xi = se3.log(se3.inverse(result.T_parent_child) @ T_true)
+        e_at, e_aR = absolute_errors(result.T_parent_child, T_true)
+        sizes = {"mm": 1e3 * e_at, "deg": float(np.degrees(e_aR))}
+        cases[case.name] = sizes | _covers(xi, result)
     return _row("levels", " ".join(path_to(dataset, level)), method, cases)
 
 
@@ -117,9 +122,11 @@ def _squared(xi: FloatArray, covariance: FloatArray) -> float:
 
 def truth_row(rig: Rig, name: str, method: str) -> Row:
     """Error of a real recording against the known answer, over the axes that both know."""
-    result = _of_rig(rig, name, method)
     assert rig.truth is not None
-    cases = {} if result is None else truth_cases(result, rig.truth)
+    result = _of_rig(rig, name, method)
+    cases = {}
+    if result is not None:
+        cases = truth_cases(result, rig.truth)
     return Row("known answer", _name_of(rig, name), method, cases)
 
 
@@ -132,28 +139,36 @@ def truth_cases(result: Calibration, truth: Truth) -> dict[str, dict[str, float]
     # A rotation whose axis is not known to the truth has no small rotation vector.
     if not np.isfinite(truth.sigmas[3:]).all():
         error[3:] = _angle_differences(result.T_parent_child, truth.T_parent_child)
+
     sigmas = np.where(is_comparable, result.sigmas_measured, 1.0)
-    with_floor = np.where(is_comparable, result.sigmas, 1.0)
-    apart = np.where(is_comparable, np.abs(error), 0.0)
-    of_truth = np.where(is_comparable, truth.sigmas, 0.0)
+    sigmas_with_floor = np.where(is_comparable, result.sigmas, 1.0)
+    sigmas_of_truth = np.where(is_comparable, truth.sigmas, 0.0)
+    sigmas_of_both = np.hypot(sigmas, sigmas_of_truth)
+    size = np.where(is_comparable, np.abs(error), 0.0)
+
+    def covers(limits: FloatArray) -> dict[str, float]:
+        return _by_axis(size < _REACH * limits, is_comparable)
+
+    metres = float(np.linalg.norm(size[:3]))
+    radians = np.linalg.norm(size[3:])
     cases = {
-        "mm": {"": 1e3 * float(np.linalg.norm(apart[:3]))},
-        "z": {"": float(np.max(apart / sigmas))},
-        "covers": _by_axis(apart < _REACH * sigmas, is_comparable),
-        "covers_floor": _by_axis(apart < _REACH * with_floor, is_comparable),
-        "covers_truth": _by_axis(
-            apart < _REACH * np.hypot(sigmas, of_truth), is_comparable
-        ),
+        "mm": {"": 1e3 * metres},
+        "z": {"": float(np.max(size / sigmas))},
+        "covers": covers(sigmas),
+        "covers_floor": covers(sigmas_with_floor),
+        "covers_truth": covers(sigmas_of_both),
     }
     if is_comparable[3:].any():
-        cases["deg"] = {"": float(np.degrees(np.linalg.norm(apart[3:])))}
+        cases["deg"] = {"": float(np.degrees(radians))}
     return cases
 
 
 def _angle_differences(T: FloatArray, T_truth: FloatArray) -> FloatArray:
     """Differences (3,) of roll, pitch and yaw, rad."""
-    angles = se3.rotation_to_rpy(T[:3, :3]) - se3.rotation_to_rpy(T_truth[:3, :3])
-    return (angles + np.pi) % (2.0 * np.pi) - np.pi
+    rpy = se3.rotation_to_rpy(T[:3, :3])
+    true_rpy = se3.rotation_to_rpy(T_truth[:3, :3])
+    differences = rpy - true_rpy
+    return (differences + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def _knows(result: Calibration) -> BoolArray:
@@ -168,9 +183,8 @@ def refused_row(rig: Rig, name: str, method: str) -> Row:
     """Whether a recording that leaves something open is refused: no answer, or not an OK one."""
     result = _of_rig(rig, name, method)
     is_refused = result is None or result.status is not SolveStatus.OK
-    return Row(
-        "refused", _name_of(rig, name), method, {"refused": {"": float(is_refused)}}
-    )
+    cases = {"refused": {"": float(is_refused)}}
+    return Row("refused", _name_of(rig, name), method, cases)
 
 
 def scatter_row(rig: Rig, method: str) -> Row:
@@ -183,16 +197,15 @@ def parts_row(rig: Rig, name: str, method: str) -> Row:
     """Scatter between halves and between thirds of a recording over their stated sigmas."""
     whole = _of_rig(rig, name, method)
     cases: dict[str, float] = {}
-    for count, label in PARTS.items() if whole is not None else ():
-        assert whole is not None
-        parts = rig.recordings[name].parts(count, whole.time_offset_s)
-        options = {**rig.options, **METHODS[method]}
-        answers = [
-            answer(recording.parent, recording.child, options) for recording in parts
-        ]
-        cases |= {
-            f"{label} {key}": value for key, value in _scatter_cases(answers).items()
-        }
+    if whole is None:
+        return Row("parts", _name_of(rig, name), method, {"scatter": cases})
+    options = {**rig.options, **METHODS[method]}
+    for count, label in PARTS.items():
+        answers = []
+        for part in rig.recordings[name].parts(count, whole.time_offset_s):
+            answers.append(answer(part.parent, part.child, options))
+        for key, value in _scatter_cases(answers).items():
+            cases[f"{label} {key}"] = value
     return Row("parts", _name_of(rig, name), method, {"scatter": cases})
 
 
@@ -205,17 +218,18 @@ def _scatter_cases(answers: Sequence[Calibration | None]) -> dict[str, float]:
         return {}
     is_comparable = np.logical_and.reduce([_knows(result) for result in good])
     sigmas = np.array([result.sigmas_measured for result in good])
-    off = np.array(
-        [deviation(result.T_parent_child, good[0].T_parent_child) for result in good]
-    )
-    stated = (np.where(is_comparable, sigmas, 1.0) ** 2).mean(axis=0)
-    ratios = off.var(axis=0, ddof=1) / stated
-    return {
-        f"{axis}/{freedom}": float(ratios[k])
-        for k, axis in enumerate(AXES)
-        if is_comparable[k]
-        for freedom in range(len(good) - 1)
-    }
+    variances = np.where(is_comparable, sigmas, 1.0) ** 2
+    first = good[0].T_parent_child
+    deviations = np.array([deviation(result.T_parent_child, first) for result in good])
+    ratios = deviations.var(axis=0, ddof=1) / variances.mean(axis=0)
+
+    cases = {}
+    for row, axis in enumerate(AXES):
+        if not is_comparable[row]:
+            continue
+        for freedom in range(len(good) - 1):
+            cases[f"{axis}/{freedom}"] = float(ratios[row])
+    return cases
 
 
 def cycle_row(rigs: Mapping[str, Rig], method: str) -> Row:
@@ -225,11 +239,12 @@ def cycle_row(rigs: Mapping[str, Rig], method: str) -> Row:
     if len(good) < len(results):
         return Row("cycle", "tango", method, {})
     xi, covariance = misclosure(good)
-    metres, radians = (float(np.linalg.norm(axes)) for axes in (xi[:3], xi[3:]))
-    sizes = {"mm": 1e3 * metres, "deg": float(np.degrees(radians))}
+    metres = float(np.linalg.norm(xi[:3]))
+    radians = float(np.linalg.norm(xi[3:]))
     cases = {
-        kind: {"": value}
-        for kind, value in (sizes | {"chi2": _squared(xi, covariance)}).items()
+        "mm": {"": 1e3 * metres},
+        "deg": {"": float(np.degrees(radians))},
+        "chi2": {"": _squared(xi, covariance)},
     }
     return Row("cycle", "tango", method, cases)
 

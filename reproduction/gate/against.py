@@ -45,36 +45,48 @@ _90_PERCENT = 1.645
 
 def solved(cases: list[Case], package: Path, options: dict[str, Any]) -> list[Any]:
     """Answers of the version of the package in a folder."""
+    asked = []
+    for case in cases:
+        streams = [(stream.stamps_ns, stream.poses) for stream in case.streams]
+        asked.append((streams, case.options | options))
     with tempfile.TemporaryDirectory() as folder:
-        cases_file, answers_file = (
-            str(Path(folder) / name) for name in ("given", "found")
-        )
-        asked = [
-            (
-                [(stream.stamps_ns, stream.poses) for stream in case.streams],
-                case.options | options,
-            )
-            for case in cases
-        ]
-        Path(cases_file).write_bytes(pickle.dumps(asked))
+        cases_file = Path(folder) / "given"
+        answers_file = Path(folder) / "found"
+        cases_file.write_bytes(pickle.dumps(asked))
         environment = os.environ | {"PYTHONPATH": str(package)}
-        command = [sys.executable, "-c", _SOLVE, cases_file, answers_file]
+        command = [sys.executable, "-c", _SOLVE, str(cases_file), str(answers_file)]
         subprocess.run(command, check=True, env=environment, cwd=folder)
-        return list(pickle.loads(Path(answers_file).read_bytes()))
+        return list(pickle.loads(answers_file.read_bytes()))
 
 
 def _sizes(case: Case, answer: Any, is_determined: BoolArray) -> FloatArray:
     """Errors of translation and rotation; half of what the truth is not known to counts."""
     is_determined = is_determined & np.isfinite(case.sigmas)
-    squares = np.where(
-        is_determined,
-        deviation(answer[0], case.T_parent_child) ** 2 + 0.25 * case.sigmas**2,
-        0.0,
-    )
-    parts = slice(0, 3), slice(3, 6)
-    return np.array(
-        [np.sqrt(squares[p].sum()) if is_determined[p].any() else np.nan for p in parts]
-    )
+    errors = deviation(answer[0], case.T_parent_child)
+    squares = errors**2 + 0.25 * case.sigmas**2
+    sizes = []
+    for axes in (slice(0, 3), slice(3, 6)):
+        is_used = is_determined[axes]
+        total = np.where(is_used, squares[axes], 0.0).sum()
+        sizes.append(np.sqrt(total) if is_used.any() else np.nan)
+    return np.array(sizes)
+
+
+def _error_ratios(
+    cases: list[Case], own_answers: list[Any], answers: list[Any]
+) -> FloatArray:
+    """Geometric means of our errors of translation and rotation over those of other answers."""
+    logs = []
+    for case, own, other in zip(cases, own_answers, answers, strict=True):
+        if own is None or other is None:
+            continue
+        ratios = _sizes(case, own, own[3]) / _sizes(case, other, own[3])
+        logs.append(np.log(ratios))
+    return np.exp(np.nanmean(logs, axis=0)) if logs else np.full(2, np.nan)
+
+
+def _per_cent(flags: list[bool]) -> str:
+    return f"{100 * np.mean(flags):.0f} %" if flags else ""
 
 
 def row(
@@ -83,38 +95,39 @@ def row(
     """Figures of the recordings of one family."""
     cells = {"recordings": str(len(cases))}
     for name, answers in others.items():
-        logs = [
-            np.log(_sizes(case, answer, answer[3]) / _sizes(case, other, answer[3]))
-            for case, answer, other in zip(cases, own_answers, answers, strict=True)
-            if answer is not None and other is not None
-        ]
-        ratios = np.exp(np.nanmean(logs, axis=0)) if logs else [np.nan] * 2
+        ratios = _error_ratios(cases, own_answers, answers)
         cells[f"over {name}"] = " ".join(f"{ratio:.2f}" for ratio in ratios)
-    inside: list[list[bool]] = [[], []]
-    squares = []
+
+    is_inside: list[bool] = []
+    is_inside_with_floor: list[bool] = []
+    over_bound = []
     nees = []
     for case, answer in zip(cases, own_answers, strict=True):
         if answer is None:
             continue
-        to_parent = np.kron(np.eye(2), answer[0][:3, :3])
-        off = deviation(answer[0], case.T_parent_child)
-        is_comparable = answer[3] & np.isfinite(case.sigmas)
-        for index, covariance in enumerate(answer[1:3]):
+        T, measured, whole, is_known = answer
+        to_parent = np.kron(np.eye(2), T[:3, :3])
+        errors = deviation(T, case.T_parent_child)
+        is_comparable = is_known & np.isfinite(case.sigmas)
+        for flags, covariance in ((is_inside, measured), (is_inside_with_floor, whole)):
             variances = np.diag(to_parent @ covariance @ to_parent.T) + case.sigmas**2
-            inside[index] += [
-                *(np.abs(off) < _90_PERCENT * np.sqrt(variances))[is_comparable]
-            ]
-        if case.bound is not None and answer[3].all():
-            xi = to_parent.T @ off
-            squares.append(xi @ np.linalg.solve(case.bound, xi))
-            nees.append(xi @ np.linalg.solve(answer[1], xi))
-    cells["in 90 %"], cells["with floor"] = (
-        f"{100 * np.mean(values):.0f} %" if values else "" for values in inside
-    )
-    if squares:
-        cells["over bound"] = f"{np.sqrt(np.median(squares) / MEDIAN_6):.2f}"
+            is_covered = np.abs(errors) < _90_PERCENT * np.sqrt(variances)
+            flags += [*is_covered[is_comparable]]
+        if case.bound is not None and is_known.all():
+            xi = to_parent.T @ errors
+            over_bound.append(xi @ np.linalg.solve(case.bound, xi))
+            nees.append(xi @ np.linalg.solve(measured, xi))
+
+    cells["in 90 %"] = _per_cent(is_inside)
+    cells["with floor"] = _per_cent(is_inside_with_floor)
+    if over_bound:
+        cells["over bound"] = f"{np.sqrt(np.median(over_bound) / MEDIAN_6):.2f}"
         cells["NEES"] = f"{np.median(nees):.1f}"
     return cells
+
+
+def _chosen(values: list[Any], rows: list[int]) -> list[Any]:
+    return [values[row] for row in rows]
 
 
 def table(cases: list[Case], package: Path, against: Path) -> str:
@@ -128,18 +141,16 @@ def table(cases: list[Case], package: Path, against: Path) -> str:
     families = [*dict.fromkeys(case.family for case in cases)]
     for family in (*families, "all"):
         which = [i for i, case in enumerate(cases) if family in ("all", case.family)]
-        rows.append(
-            {"family": family}
-            | row(
-                [cases[i] for i in which],
-                [own_answers[i] for i in which],
-                {name: [answers[i] for i in which] for name, answers in others.items()},
-            )
+
+        others_of_family = {
+            name: _chosen(answers, which) for name, answers in others.items()
+        }
+        figures = row(
+            _chosen(cases, which), _chosen(own_answers, which), others_of_family
         )
-    columns = [*dict.fromkeys(name for cells_of_row in rows for name in cells_of_row)]
-    return markdown_table(
-        [
-            {name: cells_of_row.get(name, "") for name in columns}
-            for cells_of_row in rows
-        ]
-    )
+        rows.append({"family": family} | figures)
+
+    columns: dict[str, str] = {}
+    for cells in rows:
+        columns |= dict.fromkeys(cells, "")
+    return markdown_table([columns | cells for cells in rows])

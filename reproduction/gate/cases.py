@@ -62,7 +62,8 @@ def real_cases(
     option_names: Container[str] = ("time_offset",),
 ) -> Iterator[Case]:
     """Recordings with a known answer, with some of their options, and random pieces of each."""
-    for rig in real_rigs(folder)[0]:
+    rigs, _ = real_rigs(folder)
+    for rig in rigs:
         if rig.truth is None or rig.is_refused or rig.name == "boreas":
             continue
         options = {
@@ -70,14 +71,13 @@ def real_cases(
         }
         family = rig.name if "kitti" in rig.name else rig.name.split("_")[0]
         for name, recording in rig.recordings.items():
-            streams = recording.parent, recording.child
-            for number, streams_of_case in enumerate(
-                [streams, *_pieces(recording, pieces, rng)]
-            ):
+            whole = (recording.parent, recording.child)
+            streams_of_cases = [whole, *_pieces(recording, pieces, rng)]
+            for number, streams in enumerate(streams_of_cases):
                 yield Case(
                     family=family,
                     name=f"{rig.name} {name} {number}",
-                    streams=streams_of_case,
+                    streams=streams,
                     options=options,
                     T_parent_child=rig.truth.T_parent_child,
                     sigmas=rig.truth.sigmas,
@@ -90,12 +90,16 @@ def _pieces(
     """Random pieces of a recording; those with too few poses are left out."""
     parent = recording.parent
     child = recording.child
+    log_shares = np.log(_SHARES)
     first_ns = max(parent.stamps_ns[0], child.stamps_ns[0])
-    length_ns = min(parent.stamps_ns[-1], child.stamps_ns[-1]) - first_ns
+    last_ns = min(parent.stamps_ns[-1], child.stamps_ns[-1])
+    length_ns = last_ns - first_ns
     for _ in range(count):
-        share = np.exp(rng.uniform(*np.log(_SHARES)))
-        start_ns = first_ns + int(rng.uniform(0.0, 1.0 - share) * length_ns)
+        share = np.exp(rng.uniform(*log_shares))
+        start = rng.uniform(0.0, 1.0 - share)
+        start_ns = first_ns + int(start * length_ns)
         end_ns = start_ns + int(share * length_ns)
-        piece = between(parent, start_ns, end_ns), between(child, start_ns, end_ns)
-        if min(map(len, piece)) >= _FEWEST_POSES:
-            yield piece
+        parent_piece = between(parent, start_ns, end_ns)
+        child_piece = between(child, start_ns, end_ns)
+        if min(len(parent_piece), len(child_piece)) >= _FEWEST_POSES:
+            yield parent_piece, child_piece
