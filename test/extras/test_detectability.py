@@ -1,5 +1,6 @@
 """Smallest errors that a recording contradicts: linear injections against those into streams."""
 
+import pickle
 from dataclasses import replace
 from html import unescape
 
@@ -88,6 +89,13 @@ def test_a_shift_that_the_stream_check_does_not_report_is_not_stated(
     # The allowance contains the open delay of a stream since.
     assert sizes.errors == pytest.approx(result.detectability.errors, rel=0.05)
     assert {*sizes.shifts.values()} == {np.inf}
+
+
+def test_shifts_are_injected_when_read_or_sent(result, pose_pairs, monkeypatch):
+    sizes = injection.detectability(result, pose_pairs)
+    monkeypatch.setattr(injection, "slow_suspects", lambda *_: [])
+    sent = pickle.loads(pickle.dumps(sizes.shifts))
+    assert sent == dict.fromkeys(AXES, np.inf)
 
 
 def test_no_size_is_below_what_sigma_makes_detectable(result, pose_pairs):

@@ -22,10 +22,12 @@ odometry is the same in both halves; the allowance stands for it.
 shift of size a along the unit vector u. The likelihood ratio of the stream checks
 (:mod:`hand_eye_calib.core.assessment.moved`) yields a first size from the evidence.
 Then shifts of this size are really injected, and the stream check is asked. The size grows until
-the check reports the shift. Nothing is solved again.
+the check reports the shift. Nothing is solved again. The injections take longer than the rest, so
+they wait until the sizes of the shifts are read.
 """
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -47,6 +49,7 @@ from hand_eye_calib.extras.detectability.record import (
     FOUND_SHARE,
     SIGMAS,
     Detectability,
+    SizesAtFirstUse,
 )
 
 # Number of random splits.
@@ -138,13 +141,12 @@ def detectability(result: Calibration, pose_pairs: PosePairs) -> Detectability:
     of_streams = [*_OF_X, _TIME_OFFSET, _SCALE]
     errors_of_streams = _smallest_errors(blocks, of_streams, R, sigmas, allowance)
     is_known = [dof.verdict in _BY_MOTION for dof in result.observability_measured]
-    shifts = _first_shifts(blocks, R)
-    for axis in range(6):
-        if is_known[axis]:
-            shifts[axis] = _smallest_reported(pose_pairs, X, axis, shifts[axis])
+    first_shifts = _first_shifts(blocks, R)
     return Detectability(
         errors=_by_axis(errors[:6], is_known),
-        shifts=_by_axis(shifts, is_known),
+        shifts=SizesAtFirstUse(
+            partial(_reported_shifts, pose_pairs, X, first_shifts, is_known)
+        ),
         time_offset_s=float(errors_of_streams[_TIME_OFFSET]),
         scale=float(errors_of_streams[_SCALE]),
     )
@@ -294,6 +296,21 @@ def _first_shifts(blocks: Blocks, R: FloatArray) -> FloatArray:
     sizes = np.full(6, np.inf)
     np.divide(threshold, squares, out=sizes, where=squares > 0.0)
     return np.maximum(_WEIGHT_FACTOR * np.sqrt(sizes), _LEAST_SHIFT)
+
+
+def _reported_shifts(
+    pose_pairs: PosePairs, X: FloatArray, first: FloatArray, is_known: list[bool]
+) -> dict[str, float]:
+    """Return the smallest shifts that the stream check reports, by axis.
+
+    ``first`` (6,) are the first sizes that are tried; ``is_known`` marks the axes that the motion
+    determines. The other parameters are those of :func:`_smallest_reported`.
+    """
+    shifts = first.copy()
+    for axis in range(6):
+        if is_known[axis]:
+            shifts[axis] = _smallest_reported(pose_pairs, X, axis, first[axis])
+    return _by_axis(shifts, is_known)
 
 
 def _smallest_reported(

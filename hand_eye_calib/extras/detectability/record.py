@@ -1,8 +1,9 @@
 """Smallest errors that a recording contradicts, as a part of results and as a rule."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from hand_eye_calib.core.base.text import (
@@ -29,6 +30,44 @@ _SIGMAS_OF_SHARE = 1.645
 # Size of the control error, as a multiple of the error that the standard deviation makes
 # detectable. The largest ratio of 60 simulated recordings without faults is 2.4.
 _CONTROL = 3.0
+
+
+class SizesAtFirstUse(Mapping[str, float]):
+    """Sizes by axis, which are computed when the first of them is read.
+
+    Most results are used without these sizes, and they take longer than a solve of DNLO. A copy
+    for another process is a plain dictionary.
+
+    Parameters
+    ----------
+    compute : callable
+        ``compute()`` returns the sizes by axis.
+    """
+
+    def __init__(self, compute: Callable[[], Mapping[str, float]]) -> None:
+        self._compute = compute
+
+    @cached_property
+    def _sizes(self) -> dict[str, float]:
+        sizes = dict(self._compute())
+        # The poses in the function are not needed any more.
+        del self._compute
+        return sizes
+
+    def __getitem__(self, axis: str) -> float:
+        return self._sizes[axis]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._sizes)
+
+    def __len__(self) -> int:
+        return len(self._sizes)
+
+    def __repr__(self) -> str:
+        return repr(self._sizes)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return dict, (self._sizes,)
 
 
 @dataclass(frozen=True)
