@@ -230,6 +230,7 @@ def test_good_streams_are_left_alone(streams):
         (False, 0.0, 1.0, 1),
         (False, 0.3, 1.0, 1),
         (False, 0.0, 1000.0, 2),
+        (False, 0.3, 1.02, 1),
         (False, 0.3, 1000.0, 2),
         (True, 0.3, 1.0, 3),
     ],

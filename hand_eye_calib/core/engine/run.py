@@ -14,6 +14,7 @@ command line, Python, the node, batches and rigs call :func:`run`, or :func:`rev
 result already.
 """
 
+import math
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 from typing import TypeAlias
@@ -26,6 +27,7 @@ from hand_eye_calib.core.checks import units
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.clock_and_scale import offset_values
 from hand_eye_calib.core.checks.findings import (
+    LIMITS,
     Finding,
     Severity,
     gravest_first,
@@ -216,7 +218,10 @@ def _on_another_clock(snapshot: Snapshot) -> Attempt | None:
         return None
     # If conventions or units are wrong, the streams are first solved without a repair: the message
     # of the repair contains the verdict of this solve.
-    if fit.has_own_unit or fit.unexplained > HOLDS:
+    # A smaller difference of lengths is no wrong unit: the noise model estimates it as a scale.
+    scale_error = abs(math.log(fit.scale))
+    is_other_unit = fit.has_own_unit and scale_error >= LIMITS["scale"].error
+    if is_other_unit or fit.unexplained > HOLDS:
         return None
     offset = refine_time_offset(*snapshot.streams, preliminary, snapshot.max_gap_s)
     other = replace(
