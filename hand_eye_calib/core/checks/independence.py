@@ -545,8 +545,10 @@ def _alignment(points: FloatArray, others: FloatArray) -> tuple[FloatArray, Floa
     """
     weights = np.ones(len(points))
     for _ in range(ROUNDS):
-        from_mean = points - np.average(points, axis=0, weights=weights)
-        others_from_mean = others - np.average(others, axis=0, weights=weights)
+        # np.average takes longer than the rest of a round for the few points of a window.
+        shares = weights / weights.sum()
+        from_mean = points - shares @ points
+        others_from_mean = others - shares @ others
         R = se3.nearest_rotation((weights[:, None] * from_mean).T @ others_from_mean)
         distances_m = np.linalg.norm(from_mean - others_from_mean @ R.T, axis=1)
         usual_m = 2.0 * median(distances_m) + 1e-9

@@ -124,7 +124,9 @@ class Columns(WithArrays):
     """Base of dataclasses with arrays of equally many rows; the first field is an array."""
 
     def __len__(self) -> int:
-        return len(self.columns[0])
+        # The name of the first field: a tuple of all columns takes longer, and loops ask often.
+        first = next(iter(self.__dataclass_fields__))
+        return len(getattr(self, first))
 
     def __getitem__(self, index: slice | NDArray[Any]) -> Self:
         """Return a selection of the rows, by a slice, a mask or an array of indices."""
