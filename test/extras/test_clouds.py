@@ -84,7 +84,9 @@ def distances_from_walls(merged, points, low, high):
     drive, _ = machine()
     parent = drive.parent
     instants_ns = merging._instants(parent, drive.child)
-    T_picture_world, _ = merging._axes_of_picture(parent, instants_ns[0])
+    T_picture_world, _ = merging._axes_of_picture(
+        parent, instants_ns[0], np.empty((0, 3))
+    )
     # Odometry begins at the identity.
     T_world = (drive.Ts_world_base[0] @ drive.T_base_parent) @ se3.inverse(
         T_picture_world
@@ -195,6 +197,20 @@ def test_clouds_without_overlap_are_said_to_prove_nothing(tmp_path):
     result = hec.calibrate(path, parent_topic="/a", child_topic="/b", ground="off")
     (figure,) = figures_of_clouds(result, result.recording)
     assert "proves nothing" in figure.caption
+
+
+def test_walls_are_parallel_to_an_axis_of_the_picture_if_a_sensor_moves_in_all_directions():
+    rng = np.random.default_rng(5)
+    # Floor and two walls of a room, with few points on the floor.
+    floor = np.column_stack([rng.uniform(-3, 3, (400, 2)), np.full(400, -1.0)])
+    wall = np.column_stack([np.full(900, 3.0), rng.uniform(-3, 3, (900, 2))])
+    other = np.column_stack(
+        [rng.uniform(-3, 3, 800), np.full(800, -3.0), rng.uniform(-3, 3, 800)]
+    )
+    room = np.vstack([floor, wall, other]) + 0.005 * rng.standard_normal((2100, 3))
+    R = se3.rotation_from_rpy([0.3, -0.4, 1.0])
+    axis = merging._axis_of_surfaces(room @ R.T, np.array([0.0, 0.0, 1.0]))
+    assert np.degrees(np.arccos(axis @ R[:, 2])) < 0.5
 
 
 def test_one_lidar_alone_has_no_picture(tmp_path):

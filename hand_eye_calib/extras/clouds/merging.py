@@ -62,7 +62,7 @@ class _Cloud(NamedTuple):
 class MergedClouds:
     """Scans of both sensors in the axes of the picture (m).
 
-    The origin is the parent's position at its first scan, and x is the parent's x axis.
+    The origin is the parent's position at its first scan, and x is near the parent's x axis.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class MergedClouds:
     before, after : (M, 3) arrays
         Points of the child, before the calibration and through the result.
     is_upright : bool
-        Whether z is the normal of the plane of motion; otherwise it is z of the parent.
+        Whether z is the normal of the plane of motion; otherwise it is an axis of the surfaces.
     turn_rad : float
         Largest angle between two poses of the parent at its scans.
     """
@@ -110,11 +110,12 @@ def merge(calibration: Calibration, snapshot: Snapshot) -> MergedClouds | None:
     own, other = [_within(cloud, parent) for cloud in clouds]
     if not (len(own.points) and len(other.points)):
         return None
-    T_picture_world, is_upright = _axes_of_picture(parent, instants_ns[0])
+    own_in_world = _placed(own, parent, np.eye(4))
+    T_picture_world, is_upright = _axes_of_picture(parent, instants_ns[0], own_in_world)
     installed = installed_transform(calibration)
     T_before = np.eye(4) if installed is None else installed
     in_picture = [
-        _placed(own, parent, np.eye(4)),
+        own_in_world,
         _placed(other, parent, T_before),
         _placed(other, parent, calibration.T_parent_child),
     ]
@@ -145,21 +146,31 @@ def distances_from_surfaces(surfaces: FloatArray, points: FloatArray) -> FloatAr
     ``surfaces`` (N, 3) are points of the surfaces. The distance of a point without a plane nearby
     is NaN.
     """
-    distances = np.full(len(points), np.nan)
+    means, normals = _planes(surfaces, points)
+    return np.abs(np.einsum("ni,ni->n", points - means, normals))
+
+
+def _planes(surfaces: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the means and the normals (M, 3) of the planes of surfaces near points (M, 3).
+
+    They are NaN without a plane nearby.
+    """
+    means = np.full((len(points), 3), np.nan)
+    normals = np.full((len(points), 3), np.nan)
     if len(surfaces) < TUNING.n_neighbours:
-        return distances
+        return means, normals
     nearest_m, rows = cKDTree(surfaces).query(
         points, TUNING.n_neighbours, distance_upper_bound=TUNING.reach_m
     )
-    is_near = np.isfinite(nearest_m).all(axis=1)
-    neighbours = surfaces[rows[is_near]]
-    means = neighbours.mean(axis=1)
-    offsets = neighbours - means[:, None]
+    near = np.flatnonzero(np.isfinite(nearest_m).all(axis=1))
+    neighbours = surfaces[rows[near]]
+    centers = neighbours.mean(axis=1)
+    offsets = neighbours - centers[:, None]
     variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))
-    from_planes = np.einsum("ni,ni->n", points[is_near] - means, axes[:, :, 0])
     is_flat = variances[:, 0] < TUNING.max_flat * variances[:, 1]
-    distances[is_near] = np.where(is_flat, np.abs(from_planes), np.nan)
-    return distances
+    means[near[is_flat]] = centers[is_flat]
+    normals[near[is_flat]] = axes[is_flat, :, 0]
+    return means, normals
 
 
 # ------------------------------------------------------------------ scans
@@ -291,14 +302,34 @@ def _moved(T: FloatArray, points: FloatArray) -> FloatArray:
     return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 
 
-def _axes_of_picture(parent: Trajectory, stamp_ns: int) -> tuple[FloatArray, bool]:
+def _axis_of_surfaces(surfaces: FloatArray, direction: FloatArray) -> FloatArray:
+    """Return the principal axis (3,) of the normals of surfaces (N, 3) nearest to a direction.
+
+    Without planes, it is any axis of the world.
+    """
+    every = -(-len(surfaces) // TUNING.max_points)
+    _, normals = _planes(surfaces, surfaces[::every])
+    normals = normals[np.isfinite(normals).all(axis=1)]
+    _, axes = np.linalg.eigh(normals.T @ normals)
+    cosines = axes.T @ direction
+    nearest = int(np.argmax(np.abs(cosines)))
+    return np.asarray(np.copysign(1.0, cosines[nearest]) * axes[:, nearest])
+
+
+def _axes_of_picture(
+    parent: Trajectory, stamp_ns: int, surfaces: FloatArray
+) -> tuple[FloatArray, bool]:
     """Return the transform (4, 4) from the parent's world to the picture.
 
-    The second value is whether z of the picture is the normal of the plane of motion.
+    The second value is whether z of the picture is the normal of the plane of motion. Otherwise it
+    is an axis of the surfaces (N, 3), near z of the parent: walls are parallel to it, or
+    perpendicular.
     """
     T_world_parent = parent.at(np.array([stamp_ns]))[0]
     normal = upward_normal(parent.poses)
-    up = T_world_parent[:3, 2] if normal is None else normal
+    up = normal
+    if up is None:
+        up = _axis_of_surfaces(surfaces, T_world_parent[:3, 2])
     left = np.cross(up, T_world_parent[:3, 0])
     left /= np.linalg.norm(left)
     axes = np.column_stack([np.cross(left, up), left, up])
