@@ -377,6 +377,8 @@ def test_poses_wrong_by_themselves_are_bridged():
     solution = estimator.solve(stamps(150), parent, child)
     np.testing.assert_array_equal(np.flatnonzero(solution.spikes), spikes)
     np.testing.assert_array_equal(np.flatnonzero(solution.jumps), [99])
+    steps = [19, 20, 40, 41, 42, 79, 80, 99, 119, 120]
+    np.testing.assert_array_equal(np.flatnonzero(solution.left_out), steps)
     undisturbed = estimator.solve(stamps(150), *noisy_drive(4, white=(0.002, 0.002)))
     np.testing.assert_allclose(
         solution.T_parent_child, undisturbed.T_parent_child, atol=2e-3

@@ -361,7 +361,7 @@ class TestCommand:
     def test_good_streams(self, files, capsys):
         assert main(["check", *files(*drive())]) == 0
         out, err = capsys.readouterr()
-        assert out.startswith("USE: no fault found in these streams.\n")
+        assert out.startswith("No fault found in these streams; calibrate states")
         assert "500" in out
         assert err == ""
 

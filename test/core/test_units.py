@@ -138,6 +138,9 @@ class TestResult:
         answered = hec.calibrate(parent, child, reference="B5", parent_scale=0.3048)
         np.testing.assert_allclose(answered.T_parent_child, expected, atol=0.01)
         assert not any(finding.makes_unusable for finding in answered.findings)
+        assert (
+            "all lengths of the result are 3.281 times as long" in answered.warnings[0]
+        )
         scaled = hec.calibrate(parent, child, reference="B5", scale="estimate")
         assert not any(finding.makes_unusable for finding in scaled.findings)
 

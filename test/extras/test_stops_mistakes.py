@@ -344,6 +344,7 @@ class TestOptions:
             ("method", "dnlo"),
             ("reference", "B1"),
             ("time_offset", 1.0),
+            ("time_offset", 0.0),
             ("max_gap", 2.0),
         ],
     )
@@ -678,3 +679,31 @@ def test_targets_detected_mirrored_at_half_of_the_stops_are_left_out():
     assert result.verdict is hec.Verdict.USE_WITH_CARE
     error = se3.log(se3.inverse(result.T_parent_child) @ truth)
     assert np.linalg.norm(error[:3]) < WITHIN_M
+
+
+@pytest.mark.parametrize(
+    ("options", "advice"),
+    [
+        (
+            [],
+            "leave --parent-invert out, or give --child-invert poses (target) as well",
+        ),
+        (
+            ["--child-invert", "none"],
+            "leave --parent-invert out, or give --child-invert",
+        ),
+    ],
+)
+def test_the_place_in_the_file_is_held_against_inverse_poses(options, advice, capsys):
+    """The sample file says eye_in_hand. The option that was given is not advised again."""
+    command = ["arm", "sample:arm.yaml", "--parent-invert", "poses", *options]
+    assert main(command) == 3
+    out = " ".join(capsys.readouterr().out.split())
+    assert (
+        "DO NOT USE: the stops fit a camera beside the robot, not one on the hand"
+        in out
+    )
+    assert "give --setup beside; or, if the camera is on the hand" in out
+    assert advice in out
+    beside = ["--child-invert", "poses", "--setup", "beside"]
+    assert main(["arm", "sample:arm.yaml", *beside]) == 0

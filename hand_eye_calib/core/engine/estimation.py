@@ -430,7 +430,7 @@ def _of_model(
         method="adaptive",
         reference="increments",
         pairs=motion_pairs(pose_pairs.Ts_pw_p, Ts_cw_c, "B1"),
-        weights=(~solution.jumps).astype(float),
+        weights=(~solution.left_out).astype(float),
         stamps_ns=stamps_ns,
         config=config,
         method_reason=reason,

@@ -40,6 +40,11 @@ from hand_eye_calib.core.engine.attempts import STREAM_REPAIRS, Attempt, with_op
 from hand_eye_calib.core.engine.kinds import kind_of
 from hand_eye_calib.core.engine.poses import INVERSIONS
 from hand_eye_calib.core.engine.snapshot import MOST_MOVED_S, UNASKED_S, Snapshot
+from hand_eye_calib.core.engine.solved_values import (
+    note_on_unit,
+    with_solved_offset,
+    with_solved_scale,
+)
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
 
@@ -120,6 +125,8 @@ def run(
         best = Attempt(snapshot.estimate(cross_check=False), snapshot)
     else:
         best = _solved_and_checked(snapshot, checks, report)
+        if note := note_on_unit(snapshot):
+            best = best.with_messages(best.options, (note, *best.messages))
     report(1.0, "done")
     return best
 
@@ -432,29 +439,8 @@ def _unit_doubts(
             is_exact = finding.evidence["is_exact"] or is_near
             severity = Severity.ERROR if is_exact else Severity.WARNING
             doubt = replace(finding, severity=severity, options={})
-            doubts.append(_with_solved_scale(doubt, calibration))
+            doubts.append(with_solved_scale(doubt, calibration))
     return tuple(doubts)
-
-
-def _with_solved_scale(finding: Finding, calibration: Calibration) -> Finding:
-    """Return a finding about the scale with the scale of a result; other findings unchanged."""
-    if finding.code not in ("scale", "unit_or_scale") or not calibration.scale_sigma:
-        return finding
-    scale = {"scale": calibration.scale, "sigma": calibration.scale_sigma}
-    return replace(finding, values={**finding.values, **scale})
-
-
-def _with_solved_offset(finding: Finding, calibration: Calibration) -> Finding:
-    """Return a finding about the clock offset with the time offset of a result; others unchanged.
-
-    The offset of the check has no noise model, so that it differs from the estimated one.
-    """
-    if finding.key != "time_offset" or not calibration.time_offset_sigma_s:
-        return finding
-    values = offset_values(calibration.time_offset_s)
-    values |= {"sigma_s": calibration.time_offset_sigma_s, "beyond": ""}
-    options = {"time_offset": values["total_s"]}
-    return replace(finding, values={**finding.values, **values}, options=options)
 
 
 def _with_estimate_warnings(
@@ -463,7 +449,7 @@ def _with_estimate_warnings(
     """Return the attempt with a warning about each option that was set because of findings."""
     calibration = attempt.calibration
     reasons = {
-        name: _with_solved_scale(finding, calibration).what
+        name: with_solved_scale(finding, calibration).what
         for finding in findings
         for name in finding.options
     }
@@ -532,8 +518,8 @@ def examine(snapshot: Snapshot) -> tuple[Finding, ...]:
     best = _best(Attempt(calibration, snapshot, result), (), None)
     if estimates <= {*best.options}:
         findings = tuple(
-            _with_solved_offset(
-                _with_solved_scale(issue, best.calibration), best.calibration
+            with_solved_offset(
+                with_solved_scale(issue, best.calibration), best.calibration
             )
             for issue in findings
         )

@@ -121,6 +121,11 @@ class ModelSolution:
     objective: float
     converged: bool
 
+    @property
+    def left_out(self) -> BoolArray:
+        """Increments (n,) that are jumps, or that begin or end at an outlier pose."""
+        return self.jumps | self.spikes[1:] | self.spikes[:-1]
+
     def events(self, stamps_ns: IntArray) -> list[str]:
         """Return sentences about jumps and outliers, with the times (s) of the first five."""
         stamps_s = np.asarray(stamps_ns * 1e-9, dtype=np.float64)

@@ -147,8 +147,8 @@ CONTRADICTED_TARGETS = 2.0
 FEWEST_INLIERS = 0.7
 
 # The same share for the adaptive method. It is larger, because the noise model of this method
-# rejects only outliers.
-FEWEST_OF_MODEL = 0.9
+# rejects only outliers. A tenth of all poses as outliers spoils a fifth of the pairs.
+FEWEST_OF_MODEL = 0.8
 
 # Kinds of the rules that report a limit of the recording. All other rules report a suspicion.
 _KINDS = dict.fromkeys(

@@ -78,7 +78,8 @@ def run(arguments: argparse.Namespace) -> int:
         with waiting_for(f"reading {arguments.installed}"):
             installed = open_installed(arguments.installed)(*frames)
     comparison = compare(results, installed, distinct_names(arguments.results))
-    print_result(_lines(comparison, results[0]), comparison if arguments.json else None)
+    lines = _lines(comparison, results[0], arguments.installed)
+    print_result(lines, comparison if arguments.json else None)
     if not arguments.installed:
         note(*_repeated_recordings(arguments.results))
     return {"same": 0, "moved": 4}.get(comparison.verdict, 3)
@@ -97,11 +98,16 @@ def _repeated_recordings(paths: Sequence[str]) -> Iterator[str]:
             )
 
 
-def _lines(comparison: "Comparison", result: "Calibration") -> Iterator[str]:
-    """Yield the lines of a comparison for a terminal."""
+def _lines(
+    comparison: "Comparison", result: "Calibration", installed: str | None
+) -> Iterator[str]:
+    """Yield the lines of a comparison for a terminal.
+
+    ``installed`` is the transform that the results are compared with, as the user typed it.
+    """
     yield f"Mount of {result.child_frame} on {result.parent_frame}: {comparison.sentence}"
     for difference in comparison.differences:
-        title = f"{difference.second} minus {difference.first}"
+        title = f"{difference.second} minus {installed or difference.first}"
         if len(comparison.differences) > 1:
             title = f"{title}: {difference.sentence}"
         yield title

@@ -343,7 +343,7 @@ def estimate_rotation(
         reference="increments",
         measured="rotations",
         pairs=motion_pairs(Ts_pw_p, Ts_cw_c, "B1"),
-        weights=(~solution.jumps).astype(float),
+        weights=(~solution.left_out).astype(float),
         stamps_ns=stamps_ns,
         config=config,
         opinions=opinions,

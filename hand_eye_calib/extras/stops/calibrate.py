@@ -29,7 +29,12 @@ from hand_eye_calib.extras.stops.next_stops import advice_in_words, next_stops
 from hand_eye_calib.extras.stops.outliers import check_left_out
 from hand_eye_calib.extras.stops.robot_world import MIN_STOPS, RobotWorld
 from hand_eye_calib.extras.stops.rough_fit import StopPoses
-from hand_eye_calib.extras.stops.solving import SetupFit, SolvedStops, solve_checked
+from hand_eye_calib.extras.stops.solving import (
+    SetupFit,
+    SolvedStops,
+    inversions_in_words,
+    solve_checked,
+)
 from hand_eye_calib.extras.stops.stop_table import StopTable, stop_table
 from hand_eye_calib.extras.stops.worlds import SETUPS, Worlds
 from hand_eye_calib.offline.calibrate import prior_fields
@@ -215,8 +220,8 @@ def _calibrated_arm(
     warnings = list(solved.warnings)
     if solved.is_usable and not config.given >= _INVERSIONS:
         if not setup:
-            warnings.append(_setup_in_words(setup_fit))
-        solved = solved.adding(*_check_distances(setup_fit, named))
+            warnings.append(_setup_in_words(setup_fit, config))
+        solved = solved.adding(*_check_distances(setup_fit, named, config))
     return _calibration_of(
         solved, warnings, _frames_of_arm(named, setup_fit.is_inverse)
     )
@@ -260,11 +265,10 @@ def _checked(
     config = config or CalibratorConfig()
     for name in sorted(config.given - _OBEYED):
         field = CalibratorConfig.__dataclass_fields__[name]
-        value = getattr(config, name)
-        if value != field.default and not name.startswith(_OBEYED_GROUPS):
+        if not name.startswith(_OBEYED_GROUPS):
             raise ConfigError(
-                f"{option_name(field)} {value} has no meaning for stops, which have no order and "
-                "one solver; leave it out"
+                f"{option_name(field)} {getattr(config, name)} has no meaning for "
+                "stops, which have no order and one solver; leave it out"
             )
     if config.measured not in ("poses", "rotations"):
         raise ConfigError(
@@ -326,16 +330,18 @@ def _is_copy(fit: RobotWorld) -> bool:
     )
 
 
-def _setup_in_words(setup_fit: SetupFit) -> str:
+def _setup_in_words(setup_fit: SetupFit, config: CalibratorConfig) -> str:
     """Return the assumed place of the camera as text, with the options for inverse poses."""
     place = SETUPS["beside" if setup_fit.is_inverse else "hand"]
     return (
-        f"read as a camera {place}; if that is wrong, one side or both have inverse poses: give "
-        "parent_invert poses (robot), child_invert poses (target), or both; or exchange both sides"
+        f"read as a camera {place}; if that is wrong, one side or both have inverse poses: "
+        f"{inversions_in_words(config)}; or exchange both sides"
     )
 
 
-def _check_distances(setup_fit: SetupFit, frames: Mapping[str, str]) -> list[Finding]:
+def _check_distances(
+    setup_fit: SetupFit, frames: Mapping[str, str], config: CalibratorConfig
+) -> list[Finding]:
     """Return a finding if distances of camera and target suggest inverse poses.
 
     They do if the camera or target on the hand is far from the hand, while its counterpart is near
@@ -360,7 +366,7 @@ def _check_distances(setup_fit: SetupFit, frames: Mapping[str, str]) -> list[Fin
         f"{moving} would be {on_hand_m:.2g} m from {frames['hand']}, {fixed} {from_base_m:.2g} m "
         f"from {frames['base']}"
     )
-    return [finding("reading", what=what)]
+    return [finding("reading", what=what, todo=inversions_in_words(config))]
 
 
 # ------------------------------------------------------------------ the result

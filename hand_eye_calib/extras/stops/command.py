@@ -63,7 +63,7 @@ def solved(arguments: Namespace) -> SolvedInput:
         return _from_images(arguments, config, options)
     if len(paths) == 1:
         samples = read_arm_samples(paths[0])
-        setup = arguments.setup
+        setup = arguments.setup or samples.setup
         result = calibrate_arm(
             samples.robot, samples.tracking, config, samples.frames, setup
         )

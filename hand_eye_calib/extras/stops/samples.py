@@ -72,6 +72,10 @@ _OPENCV_FRAMES = {
 }
 
 
+# Place of the camera by easy_handeye's ``calibration_type``.
+_SETUPS = {"eye_in_hand": "hand", "eye_on_base": "beside"}
+
+
 @dataclass(frozen=True)
 class ArmSamples:
     """Samples of an arm: at N stops, the pose of the hand and that of the target.
@@ -84,6 +88,8 @@ class ArmSamples:
         Poses of the target in the camera.
     frames : mapping of str to str
         Names of the frames by the keys base, hand, camera and target; empty if the file has none.
+    setup : {"hand", "beside"} or None
+        Place of the camera that the file states; None if it states none.
 
     Raises
     ------
@@ -94,6 +100,7 @@ class ArmSamples:
     robot: FloatArray
     tracking: FloatArray
     frames: Mapping[str, str]
+    setup: str | None = None
 
     def __post_init__(self) -> None:
         if len(self.robot) != len(self.tracking):
@@ -140,7 +147,7 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
 def _listed_samples(path: str | Path, document: Any) -> ArmSamples:
     """Return the samples of a document that lists the stops one by one (MoveIt, easy_handeye)."""
     frames: dict[str, str] = {}
-    is_inverse = False
+    setup = None
     if isinstance(document, Mapping) and "samples" in document:
         parameters = document.get("parameters") or {}
         frames = {
@@ -148,8 +155,7 @@ def _listed_samples(path: str | Path, document: Any) -> ArmSamples:
             for name, key in _FRAMES.items()
             if parameters.get(key)
         }
-        # For eye_on_base, easy_handeye stores the pose of the base in the hand as ``robot``.
-        is_inverse = parameters.get("calibration_type") == "eye_on_base"
+        setup = _SETUPS.get(str(parameters.get("calibration_type")))
         document = document["samples"]
     elif isinstance(document, Mapping):
         document = [*_numbered_pairs(document)]
@@ -160,9 +166,10 @@ def _listed_samples(path: str | Path, document: Any) -> ArmSamples:
         with located(f"{path}, sample {number}"):
             poses.append([pose_of(value) for value in _both_poses(sample)])
     robot, tracking = np.swapaxes(poses, 0, 1)
-    if is_inverse:
+    # For a camera beside the robot, easy_handeye stores the pose of the base in the hand.
+    if setup == "beside":
         robot = se3.inverse(robot)
-    return ArmSamples(robot, tracking, frames)
+    return ArmSamples(robot, tracking, frames, setup)
 
 
 def _stacked_samples(stacks: Mapping[str, FloatArray]) -> ArmSamples:

@@ -117,6 +117,20 @@ class _Repaired:
     warnings: list[str]
 
 
+def inversions_in_words(config: CalibratorConfig) -> str:
+    """Return as text which options for inverse poses of an arm the user can still give."""
+    sides = {"parent_invert": "robot", "child_invert": "target"}
+    given = [name for name in sides if getattr(config, name) == "poses"]
+    others = [
+        f"{name} poses ({side})" for name, side in sides.items() if name not in given
+    ]
+    if not given:
+        return f"give {', '.join(others)}, or both"
+    if not others:
+        return f"leave {' or '.join(given)} out, or both"
+    return f"leave {given[0]} out, or give {others[0]} as well"
+
+
 def solve_checked(
     poses: StopPoses, config: CalibratorConfig, setup: str | None = None
 ) -> SolvedStops:
@@ -146,7 +160,14 @@ def solve_checked(
     setup_fit = _likelier_setup(poses, repaired.rough_scale, setup)
     if setup and setup_fit.lead < -MIN_LEAD:
         other = "hand" if setup_fit.is_inverse else "beside"
-        findings.insert(0, finding("setup", place=SETUPS[setup], other=SETUPS[other]))
+        contradiction = finding(
+            "setup",
+            place=SETUPS[setup],
+            other=SETUPS[other],
+            setup=other,
+            todo=inversions_in_words(config),
+        )
+        findings.insert(0, contradiction)
     setup_fit = _with_checked_scale(setup_fit, repaired, setup)
     findings = _with_movement(poses, setup_fit, findings)
     findings += _check_unknown(poses, setup_fit.fit, findings)

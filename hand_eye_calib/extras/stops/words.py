@@ -65,8 +65,8 @@ WORDS = {
     ),
     "setup": FindingWords(
         "the stops fit a camera {other}, not one {place}",
-        "leave setup out; or, if one side or both have inverse poses, give parent_invert poses "
-        "(robot), child_invert poses (target), or both",
+        "give setup {setup}; or, if the camera is {place}, one side or both have inverse poses: "
+        "{todo}",
     ),
     "copied_stops": FindingWords(
         "the poses of the target are those of the robot: the camera and the target would be at the "
@@ -95,8 +95,7 @@ WORDS = {
     ),
     "reading": FindingWords(
         "{what}: probably one side or both have inverse poses, or parent and child are exchanged",
-        "if the robot's poses are inverse, give parent_invert poses; if the target's are, give "
-        "child_invert poses; if none are, give parent_invert none and child_invert none",
+        "{todo}; if none are inverse, give parent_invert none and child_invert none",
         code="inverse",
     ),
     "turning_about_one_axis": FindingWords(

@@ -273,10 +273,9 @@ def _table_of_topics(document: "Document") -> list[str]:
             " ".join(row["frames"]),
         ]
         lines.append(_ROW.format(*cells).rstrip())
-    advice = (
-        "--parent-topic and --child-topic accept a topic with "
-        "poses, or frames of /tf: odom:lidar"
-    )
+    advice = "--parent-topic and --child-topic accept a topic with poses"
+    if any("TFMessage" in (row["type"] or "") for row in document["topics"]):
+        advice += ", or frames of /tf: odom:lidar"
     if not any(row["count"] for row in document["topics"]):
         advice = "the bag has no messages: record again"
     lines.append(advice)

@@ -178,7 +178,9 @@ def _verdict(findings: "Sequence[Finding]") -> str:
 
     serious = [finding for finding in findings if finding.severity.value != "note"]
     if not serious:
-        return f"{Verdict.USE.value}: no fault found in these streams."
+        return (
+            "No fault found in these streams; calibrate states how good the result is."
+        )
     errors = [finding for finding in serious if finding.makes_unusable]
     verdict = Verdict.DO_NOT_USE if errors else Verdict.USE_WITH_CARE
     if all(finding.options for finding in serious):

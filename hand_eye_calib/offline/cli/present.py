@@ -24,7 +24,13 @@ from hand_eye_calib.core.results.document import (
     usable_numbers,
 )
 from hand_eye_calib.core.results.parts import advice_of, facts_of, part
-from hand_eye_calib.core.results.records import ROTATIONS, TRANSLATIONS
+from hand_eye_calib.core.results.records import (
+    AXES,
+    ROTATIONS,
+    TRANSLATIONS,
+    SolveStatus,
+    has_error,
+)
 from hand_eye_calib.core.results.verdict import shown
 from hand_eye_calib.offline.cli.options import (
     Exit,
@@ -243,6 +249,8 @@ def _extrinsic_lines(calibration: Calibration, with_details: bool) -> list[str]:
     for name, (source, target) in frames.items():
         if name not in transforms:
             continue
+        if name in extra and {*calibration.hidden} == {*AXES}:
+            continue
         out_of_reach = () if name in extra else calibration.out_of_reach
         lines.append(
             f"{source} in {target}: maps coordinates of {source} into {target}"
@@ -329,7 +337,10 @@ def next_steps(
             steps.append(
                 f"measure {listing(axes)} by hand, then add {priors} with your values"
             )
-    steps += advice_of(calibration)
+    # If streams contradict each other or a prior, more of the same data does not help.
+    is_contradicted = calibration.status is SolveStatus.CONTRADICTED
+    if not is_contradicted and not has_error(calibration.findings):
+        steps += advice_of(calibration)
     if options:
         steps.append(command_with(arguments.typed, options))
     return steps

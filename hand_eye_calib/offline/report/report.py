@@ -368,7 +368,7 @@ def _data(
         else {}
     )
     rows = []
-    for name in ("parent", "child"):
+    for name in ("parent", "child", "samples"):
         if name in streams or name in inputs:
             rows.append(_stream(name, inputs.get(name, {}), streams.get(name)))
     return {

@@ -1,0 +1,52 @@
+"""Findings and notes about clock offset and lengths, with the values of the solution."""
+
+from dataclasses import replace
+
+from hand_eye_calib.core.checks.clock_and_scale import offset_values
+from hand_eye_calib.core.checks.findings import Finding
+from hand_eye_calib.core.checks.streams import is_too_fast, is_too_slow
+from hand_eye_calib.core.engine.snapshot import Snapshot
+from hand_eye_calib.core.results.calibration import Calibration
+
+
+def with_solved_scale(finding: Finding, calibration: Calibration) -> Finding:
+    """Return a finding about the scale with the scale of a result; other findings unchanged."""
+    if finding.code not in ("scale", "unit_or_scale") or not calibration.scale_sigma:
+        return finding
+    scale = {"scale": calibration.scale, "sigma": calibration.scale_sigma}
+    return replace(finding, values={**finding.values, **scale})
+
+
+def with_solved_offset(finding: Finding, calibration: Calibration) -> Finding:
+    """Return a finding about the clock offset with the time offset of a result; others unchanged.
+
+    The offset of the check has no noise model, so that it differs from the estimated one.
+    """
+    if finding.key != "time_offset" or not calibration.time_offset_sigma_s:
+        return finding
+    values = offset_values(calibration.time_offset_s)
+    values |= {"sigma_s": calibration.time_offset_sigma_s, "beyond": ""}
+    options = {"time_offset": values["total_s"]}
+    return replace(finding, values={**finding.values, **values}, options=options)
+
+
+def note_on_unit(snapshot: Snapshot) -> str:
+    """Return a note that a scale of the child explains the lengths as well as a unit does.
+
+    A unit of the parent and a scale of the child leave the same residuals, but lengths of the
+    result differ by the factor. The note is empty if the user has set no unit of the parent or a
+    scale of the child, or if the motion excludes metres.
+    """
+    config = snapshot.config
+    factor = config.parent_scale
+    is_unit_given = "parent_scale" in config.given and factor != 1.0
+    if not is_unit_given or "scale" in config.given:
+        return ""
+    as_metres = snapshot.streams[0].scaled(1.0 / factor)
+    if is_too_fast(as_metres) or is_too_slow(as_metres):
+        return ""
+    return (
+        f"the parent's lengths were multiplied by {factor:g}, as given. If they are metres, and "
+        "the child has a scale of its own, give scale estimate instead: then all lengths of the "
+        f"result are {1.0 / factor:.4g} times as long, and the streams agree as well"
+    )
