@@ -207,7 +207,7 @@ def test_motion_that_hides_a_direction_is_published_with_a_warning(start_node, p
     assert answer.message.startswith("USE WITH CARE: all but z; measure z by hand")
     reason = (
         "z cannot be determined from this motion; measure it "
-        "by hand and give a prior: prior.z "
+        "by hand and give a prior, such as prior.z "
     )
     node.wait_for_log("[WARN]", reason)
     np.testing.assert_allclose(
