@@ -62,10 +62,17 @@ class Course(NamedTuple):
 #: Courses of a machine. Only figures of eight, tight or wide, determine x, y and yaw.
 COURSES = ("eights", "wide", "straight", "circle", "bend", "left", "spin")
 
-#: Kinds of wheel data of the machines, and of data that no model describes: ``skid`` has tracks
-#: that slip more in tight curves, and ``articulated`` has the angle of its joint as steering angle.
-MACHINES = ("wheels", "steering", "tricycle", "omni", "skid", "articulated")
-_DATA = {"skid": "wheels", "articulated": "steering"}
+#: Kinds of wheel data of the machines, and further machines: ``mecanum`` has the odometry of four
+#: mecanum wheels. Two have data that no model describes: ``skid`` has tracks that slip more in
+#: tight curves, and ``articulated`` has the angle of its joint as steering angle.
+MACHINES = ("wheels", "steering", "tricycle", "omni", "mecanum", "skid", "articulated")
+_DATA = {"mecanum": "omni", "skid": "wheels", "articulated": "steering"}
+
+# Sum of half the wheelbase and half the track of a machine with mecanum wheels (m).
+_MECANUM_M = 0.6
+# Signs of the motions of its wheels (front left, front right, rear left, rear right) in four times
+# its motion (forward, left, turn).
+_MECANUM = np.array([[1, 1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]])
 
 
 def simulate_machine(
@@ -86,7 +93,8 @@ def simulate_machine(
     times_s = np.arange(0.0, duration_s + 1.0, _STEP_S, dtype=float)
     driven = _course(course, machine, rng, times_s)
     Ts_world_base = _poses(rng, driven, noise, ramp_rad)
-    slips = _slip_of_wheels(rng, driven.yaw_rate, slip * noise * duration_s)
+    n_wheels = 4 if machine == "mecanum" else 2
+    slips = _slip_of_wheels(rng, driven.yaw_rate, slip * noise * duration_s, n_wheels)
     parameters, rates = _wheels(machine, rng, driven, 1.0 + slips)
 
     stride = round(_WHEELS_S / _STEP_S)
@@ -150,7 +158,7 @@ def _course(
     slip = abs(rng.normal(0.0, 0.005))
     slip_angle = slip * speed * yaw_rate
     left_speed = -slip_angle * speed
-    if machine == "omni":
+    if machine in ("omni", "mecanum"):
         left_speed = np.zeros(len(times_s))
         if course == "eights":
             left_speed = 0.4 * wave(11, rng.uniform(0, 6))
@@ -194,17 +202,17 @@ def _poses(
 
 
 def _slip_of_wheels(
-    rng: np.random.Generator, yaw_rate: FloatArray, slipping_s: float
+    rng: np.random.Generator, yaw_rate: FloatArray, slipping_s: float, n_wheels: int
 ) -> FloatArray:
-    """Return the share (N, 2) by which two wheels turn too fast: bursts in curves."""
+    """Return the share (N, n_wheels) by which wheels turn too fast: bursts in curves."""
     n_rows = len(yaw_rate)
-    slip = np.zeros((n_rows, 2))
+    slip = np.zeros((n_rows, n_wheels))
     least_rate = 0.3 * np.abs(yaw_rate).max()
     for start in rng.integers(0, n_rows, size=int(slipping_s / 8)):
         if abs(yaw_rate[start]) > least_rate:
             length_s = rng.uniform(0.2, 1.0)
             end = start + int(length_s / _STEP_S)
-            wheel = rng.integers(2)
+            wheel = rng.integers(n_wheels)
             slip[start:end, wheel] += rng.uniform(0.03, 0.2)
     return slip
 
@@ -233,6 +241,12 @@ def _wheels(
         rates = np.column_stack([speed, left_speed, yaw_rate]) / off
         rates[:, :2] *= slip
         return list(off), rates
+    if machine == "mecanum":
+        # Rollers slip sideways.
+        multipliers = [factor, factor * off[1], factor / off[2]]
+        motion = np.column_stack([speed, left_speed, yaw_rate]) / multipliers
+        wheels = (motion * [1.0, 1.0, _MECANUM_M]) @ _MECANUM * slip
+        return multipliers, wheels @ _MECANUM.T / [4.0, 4.0, 4.0 * _MECANUM_M]
     parameters = [factor, wheelbase, offset]
     if machine == "articulated":
         return parameters, _articulated(driven, factor, wheelbase, slip)

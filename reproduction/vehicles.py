@@ -18,8 +18,8 @@ from reproduction.machines import Machine, simulate_machine
 from reproduction.partial import QUANTILE_90
 from reproduction.writing import counted, markdown_table, seed_of, show
 
-# Models of wheels, and "driving" for a sensor without wheel data.
-_MODELS = ("wheels", "steering", "tricycle", "omni", "driving")
+# Machines, and "driving" for a sensor without wheel data.
+_MODELS = ("wheels", "steering", "tricycle", "omni", "mecanum", "driving")
 _DEGENERATE = ("straight", "circle", "bend", "left", "spin")
 # Drives that disturb the estimate: machine, course, factor of the slips, and slope of ramps (deg).
 _DISTURBED = {

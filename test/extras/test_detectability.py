@@ -11,9 +11,13 @@ import hand_eye_calib as hec
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.parts import facts_of
-from hand_eye_calib.core.results.records import AXES
+from hand_eye_calib.core.results.records import AXES, DofVerdict
 from hand_eye_calib.extras.detectability import injection
 from hand_eye_calib.extras.detectability.injection import evidence_of
+from hand_eye_calib.extras.detectability.record import (
+    DetectabilityPart,
+    find_undetectable,
+)
 from hand_eye_calib.offline.cli.main import main
 
 ALL_COLUMNS = list(range(8))
@@ -190,3 +194,29 @@ def test_details_and_report_state_it(capsys, tmp_path):
             "half of the recording contradicts such an error in nine of ten trials"
             in text
         )
+
+
+def test_sizes_that_are_unlimited_are_not_in_the_sentences(result):
+    unlimited = dict.fromkeys(AXES, np.inf)
+    sizes = replace(result.detectability, errors=unlimited, shifts=unlimited)
+    assert DetectabilityPart().facts(sizes, result) == []
+    assert DetectabilityPart().facts(None, result) == []
+    only_x = replace(
+        sizes, errors=unlimited | {"x": 0.0123}, time_offset_s=0.004, scale=np.inf
+    )
+    (fact,) = DetectabilityPart().facts(only_x, result)
+    assert "1.2 cm along x" in fact
+    assert "clocks" not in fact
+
+
+def test_a_prior_is_no_reason_for_care(result):
+    """A prior determines more than the motion can contradict."""
+    nothing_shows = replace(result.detectability, errors=dict.fromkeys(AXES, 1.0))
+    by_prior = [
+        replace(dof, verdict=DofVerdict.PRIOR) for dof in result.observability_measured
+    ]
+    with_prior = replace(result, observability_measured=tuple(by_prior))
+    doubted = result.with_part("detectability", nothing_shows)
+    assert list(find_undetectable(doubted))
+    accepted = with_prior.with_part("detectability", nothing_shows)
+    assert not list(find_undetectable(accepted))

@@ -2,6 +2,7 @@
 
 import json
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.extras.vehicle import solving
 from hand_eye_calib.extras.vehicle.joints import middle_angle
 from hand_eye_calib.extras.vehicle.live import live_reading
 from hand_eye_calib.formats.bags.writer import write_streams
@@ -648,3 +650,32 @@ def test_twists_of_a_bag(tmp_path):
     )
     result = hec.load(tmp_path / "out")
     assert np.abs(pose_errors(result, drive.T_base_sensor))[:2].max() < 0.01
+
+
+# ------------------------------------------------------------------ ramps
+
+
+@pytest.mark.parametrize(
+    ("period", "is_counted"),
+    [(28.5, True), (4.0, False)],
+    ids=["rhythm of the curves", "another rhythm"],
+)
+def test_ramps_in_the_rhythm_of_the_curves_widen_roll(period, is_counted):
+    windows = np.arange(360)
+    motions = np.zeros((360, 6))
+    motions[:, 5] = 0.3 * np.sin(2 * np.pi * windows / 28.0)
+    residuals = np.zeros((360, 6))
+    residuals[:, 4] = 0.01 * np.sin(2 * np.pi * windows / period)
+    drive = SimpleNamespace(measured=lambda _: motions, components=range(6))
+    fit = SimpleNamespace(residuals=residuals, T_base_sensor=np.eye(4))
+    sigma = np.sqrt(solving._variance_of_ramps(drive, fit))
+    # Without a phase in common, the regression of equal rhythms is 1/30 over the root of 2.
+    assert sigma == pytest.approx(is_counted * 0.0236, abs=0.006)
+
+
+def test_mecanum_wheels_turn_as_the_machine_moves():
+    still = simulate_machine(4, "mecanum", duration_s=30.0, noise=0.0)
+    forward, left, turn = still.values.T * np.array(still.parameters)[:, None]
+    assert forward == pytest.approx(0.8, abs=0.3)
+    assert np.abs(left).max() == pytest.approx(0.4, abs=0.01)
+    assert np.abs(turn).max() == pytest.approx(0.9 * 0.9, abs=0.2)

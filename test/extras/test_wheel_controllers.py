@@ -6,6 +6,7 @@ import yaml
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.extras.vehicle import kinds
 from hand_eye_calib.extras.vehicle.controllers import controller_of, controller_text
 from hand_eye_calib.extras.vehicle.parameters import VehicleParameter, VehicleParameters
 from hand_eye_calib.extras.vehicle.wheels import MODELS
@@ -214,6 +215,28 @@ def test_revolutions_per_minute_are_doubted():
 
 
 @pytest.mark.parametrize(
+    ("radius", "separation", "is_doubted"),
+    [
+        (0.033, 0.287, False),
+        (0.3 * np.pi / 30.0, 1.0, True),
+        (0.1 * 2 * np.pi, 0.5, True),
+    ],
+    ids=["TurtleBot", "large wheel in rpm", "small wheel in revolutions"],
+)
+def test_a_radius_is_judged_beside_the_track(radius, separation, is_doubted):
+    findings = kinds._check_size(wheels_of("wheels", [radius, radius, separation]))
+    assert [item.code for item in findings] == ["unusual_radius"] * is_doubted
+
+
+@pytest.mark.parametrize("measures", ["wheel_odometry", "omni"])
+@pytest.mark.parametrize(("multiplier", "is_doubted"), [(1.05, False), (0.8, True)])
+def test_odometry_is_compared_with_the_nominal_radius(measures, multiplier, is_doubted):
+    wheels = wheels_of(measures, [multiplier, 1.0, 1.0], nominal_radius_m=0.1)
+    findings = kinds._check_size(wheels)
+    assert [item.code for item in findings] == ["radius_not_nominal"] * is_doubted
+
+
+@pytest.mark.parametrize(
     ("factor", "unit"), [(30.0 / np.pi, "rpm"), (0.5, "gear ratio")]
 )
 def test_a_radius_that_is_not_nominal_is_doubted(factor, unit):
@@ -237,7 +260,7 @@ def test_odometry_in_another_unit_is_doubted():
 
 @pytest.mark.parametrize("option", ["nominal_radius", "nominal_separation"])
 def test_sizes_of_wheels_need_wheel_data(option):
-    with pytest.raises(ConfigError, match="needs wheel data"):
+    with pytest.raises(ConfigError, match="needs parent_measures wheels"):
         hec.calibrate(
             DRIVE.sensor,
             hec.Trajectory(DRIVE.sensor.stamps_ns, DRIVE.sensor.poses, "b"),

@@ -7,12 +7,15 @@ import signal
 import subprocess
 import sys
 import time
+from html import unescape
 from types import SimpleNamespace
 
 import pytest
 from ros_harness import PATIENCE_S, RELIABLE_INPUTS, drive
 
+import hand_eye_calib as hec
 from hand_eye_calib.core.base.plain import json_text
+from hand_eye_calib.core.results.parts import facts_of
 from hand_eye_calib.online.live.state import JournalState, Level, NodeState
 from hand_eye_calib.online.ros.watcher import Watcher
 from hand_eye_calib.online.watch.board import Board, state_of
@@ -113,6 +116,13 @@ def test_a_person_sees_the_session_from_the_first_message_to_done(
     shown = events.getresponse().readline().decode()
     assert "pose of camera in lidar" in shown
     assert "DONE" in shown
+    # The state, the page and the saved result state the same smallest errors.
+    saved = hec.load(tmp_path / "out")
+    errors, shifts = facts_of(saved)
+    assert "An error of the result would have shown from" in errors
+    assert errors in unescape(shown)
+    assert shifts in unescape(shown)
+    assert saved.detectability.errors["x"] < 0.2
 
     node.stop()
     watch.wait_for("✓ ENDED: The node has ended. The result was saved at")

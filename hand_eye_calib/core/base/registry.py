@@ -212,6 +212,10 @@ OUT_OF_REACH: Registry[tuple[str, ...]] = Registry("kind of streams")
 #: name of the kind.
 KINDS: Registry[Callable[[], Any]] = Registry("kind of streams")
 
+#: Kinds of data that alone obey an option, by the field name of the option. The default of such an
+#: option means unknown.
+KINDS_OF_OPTIONS: Registry[str] = Registry("option of one kind of streams")
+
 #: Functions that return the sentences of findings
 #: (:class:`hand_eye_calib.core.checks.words.FindingWords`) by the key of the finding.
 FINDING_WORDS: Registry[Callable[[], Any]] = Registry("sentences of findings")

@@ -11,12 +11,9 @@ from typing import Any
 
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError
-from hand_eye_calib.core.base.registry import KINDS
+from hand_eye_calib.core.base.registry import KINDS, KINDS_OF_OPTIONS, MEASURES
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.results.calibration import Calibration
-
-# Options that only vehicles obey; 0 for unknown values.
-_OF_WHEELS = ("nominal_radius", "nominal_separation")
 
 
 @dataclass(frozen=True)
@@ -61,11 +58,10 @@ class Kind:
         ConfigError
             The message contains the name and the value of the option.
         """
-        for name in _OF_WHEELS:
-            if getattr(config, name) and config.measured != "vehicle":
-                raise ConfigError(
-                    f"{name} needs wheel data, see the option parent_measures"
-                )
+        for name, kind in KINDS_OF_OPTIONS.items():
+            if getattr(config, name) and kind != config.measured:
+                words = [word for word in MEASURES if MEASURES[word].kind == kind]
+                raise ConfigError(f"{name} needs parent_measures {' or '.join(words)}")
         for name, values in self.allowed.items():
             value = getattr(config, name)
             if value not in values:

@@ -9,6 +9,7 @@ from hand_eye_calib.core.base.registry import (
     FILE_READERS,
     FINDING_WORDS,
     KINDS,
+    KINDS_OF_OPTIONS,
     LIVE_READINGS,
     MEASURES,
     OUT_OF_REACH,
@@ -40,6 +41,8 @@ def register() -> None:
     OUT_OF_REACH["vehicle_alone"] = ("y", "z")
     OUT_OF_REACH["vehicle_alone_2d"] = ("y", "z", "roll", "pitch")
     KINDS["vehicle"] = _vehicle
+    KINDS_OF_OPTIONS["nominal_radius"] = "vehicle"
+    KINDS_OF_OPTIONS["nominal_separation"] = "vehicle"
     RESULT_PARTS["wheels"] = _parameters
     FINDING_WORDS["vehicle"] = _words
     FILE_READERS["wheels"] = _wheels

@@ -92,6 +92,11 @@ _ON_THE_SPOT = 0.2
 
 # Radii of wheels (m) that are usual, from a small robot to a truck.
 _USUAL_RADII_M = (0.02, 1.25)
+# Lengths beside which the radius of a wheel is judged.
+_LENGTHS = ("wheel_separation", "wheelbase")
+# Usual radii as shares of these lengths: 0.08 (bus) and 0.11 (car, TurtleBot) to 0.5 (tractor). A
+# usual wheel with a speed in rpm seems to be 9.5 times too small.
+_USUAL_RADII = (0.055, 0.8)
 # Factors of the odometry of wheels that are usual: a wrong radius, but no other unit.
 _USUAL_MULTIPLIERS = (0.5, 2.0)
 # Logarithm of the ratio of two radii that is usual: tyre pressure, wear and load change a radius by
@@ -281,30 +286,49 @@ def _calibration(
 
 def _check_size(wheels: VehicleParameters) -> tuple[Finding, ...]:
     """Return the finding about a wheel of an unusual size, if there is one."""
-    radius = wheels.radius
     # Odometry has a multiplier of the radius, or of the forward motion.
-    ratio = radius or wheels.parameters[0].value
+    size = wheels.radius or wheels.parameters[0].value
     nominal = wheels.nominal_radius_m
-    if radius and nominal:
-        ratio = radius / (1.0 if wheels.is_factor else nominal)
+    if nominal:
+        is_ratio = wheels.is_factor or not wheels.radius
+        ratio = size if is_ratio else size / nominal
         if abs(np.log(ratio)) < _USUAL_DEVIATION:
             return ()
-        cause = _cause_of(ratio)
         return (
             finding(
                 "radius_not_nominal",
-                radius=radius,
+                radius=ratio * nominal,
                 ratio=ratio,
                 nominal=nominal,
-                cause=cause,
+                cause=_cause_of(ratio),
             ),
         )
-    lowest, highest = _USUAL_RADII_M if radius else _USUAL_MULTIPLIERS
-    if lowest <= ratio <= highest:
+    if wheels.radius:
+        return (
+            ()
+            if _is_usual_radius(wheels)
+            else (finding("unusual_radius", radius=size),)
+        )
+    lowest, highest = _USUAL_MULTIPLIERS
+    if lowest <= size <= highest:
         return ()
-    if radius:
-        return (finding("unusual_radius", radius=radius),)
-    return (finding("unusual_multiplier", ratio=ratio, cause=_cause_of(ratio)),)
+    return (finding("unusual_multiplier", ratio=size, cause=_cause_of(size)),)
+
+
+def _is_usual_radius(wheels: VehicleParameters) -> bool:
+    """Return whether the radius of the wheels is usual, also beside their track or wheelbase."""
+    lowest, highest = _USUAL_RADII_M
+    if not lowest <= wheels.radius <= highest:
+        return False
+    if wheels.is_factor:
+        return True
+    for parameter in wheels.parameters:
+        if parameter.name in _LENGTHS:
+            lowest, highest = _USUAL_RADII
+            return (
+                lowest * parameter.value <= wheels.radius <= highest * parameter.value
+            )
+    return True
 
 
 def _cause_of(ratio: float) -> str:

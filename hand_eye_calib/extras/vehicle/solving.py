@@ -21,7 +21,8 @@ the tail of this distribution, where the wheels slip, have weight 0. The covaria
   detected: 3/20, and for the size of a wheel the share that follows from its signal and noise;
 - the square of the bias of x and y that noise of the turns may cause;
 - the square of the bias of roll and y of a body that leans outwards, if most curves have the same
-  direction.
+  direction;
+- the variance of roll and y from ramps in the rhythm of the curves.
 """
 
 from collections.abc import Sequence
@@ -62,9 +63,12 @@ _FIXED_SIGMA = 1e-6
 # (m/s^2): the roll gradient of cars is 3 to 7 deg per g.
 _LEAN = 0.01
 
-# Height (m) of the sensor over the axis about which the body leans: a leaning body moves the sensor
-# sideways by the height times the angle. The height itself is out of reach.
+# Height (m) of the sensor over the axle: a body that leans or pitches moves the sensor by the
+# height times the angle. The height itself is out of reach.
 _HEIGHT = 1.0
+
+# Index of pitch in e.
+_PITCH = 4
 
 # Number of blocks of the jackknife. A block lasts some seconds, longer than a slip of the wheels.
 BLOCKS = 30
@@ -287,7 +291,32 @@ def fit_drive(drive: Drive, longer: Drive, fixed: Sequence[int]) -> Fit:
     covariance[TILT[0], TILT[0]] += lean**2
     if Y not in fixed:
         covariance[Y, Y] += (_HEIGHT * lean) ** 2
+    if TILT[0] not in fixed:
+        ramps = _variance_of_ramps(drive, fit)
+        covariance[TILT[0], TILT[0]] += ramps
+        if Y not in fixed:
+            covariance[Y, Y] += _HEIGHT**2 * ramps
     return replace(fit, covariance=covariance)
+
+
+def _variance_of_ramps(drive: Drive, fit: Fit) -> float:
+    """Return the variance of roll (rad^2) from ramps that look like a tilted mount.
+
+    If the mount rolls, each turn has a share of pitch. A vehicle that pitches on ramps in the
+    rhythm of its curves looks the same. The ramps could have come earlier or later in the drive, so
+    the regression of the pitch on the turns scatters as over all shifts in time. The mean square
+    over all shifts is a sum over frequencies (A. V. Oppenheim, R. W. Schafer, *Discrete-time signal
+    processing*, 2009, section 8.6). The mean square for white noise is subtracted, because the
+    jackknife contains it.
+    """
+    turns = drive.measured(fit.T_base_sensor)[:, 5]
+    pitches = fit.residuals[:, list(drive.components).index(_PITCH)]
+    powers = np.abs(np.fft.fft([turns, pitches])) ** 2
+    of_turns = turns @ turns + _MIN_VARIANCE
+    of_all_shifts = powers[0] @ powers[1] / len(turns) ** 2
+    of_white_noise = of_turns * (pitches @ pitches) / len(turns)
+    excess = max(float(of_all_shifts - of_white_noise), 0.0)
+    return float(excess / of_turns**2)
 
 
 def _shares_of_unweighted(drive: Drive, fit: Fit) -> FloatArray:
