@@ -42,14 +42,18 @@ def recordings_of(seed, count, unknown_z=False):
     """Extrinsics (N, 4, 4) of one rig as a calibration finds them, and covariances (N, 6, 6)."""
     random = np.random.default_rng(seed)
     X = se3.exp(np.array([0.4, -0.2, 0.7, 0.3, -1.2, 0.6]))
+    sizes = np.repeat([0.003, 0.001], 3)
+    least_variances = np.diag(np.repeat([1e-6, 1e-8], 3))
     Ts = []
     covariances = []
     for _ in range(count):
-        root = random.normal(size=(6, 6)) * np.r_[np.full(3, 0.003), np.full(3, 0.001)]
-        covariance = root @ root.T + np.diag([1e-6] * 3 + [1e-8] * 3)
-        T = X @ se3.exp(random.multivariate_normal(np.zeros(6), covariance))
+        root = random.normal(size=(6, 6)) * sizes
+        covariance = root @ root.T + least_variances
+        error = random.multivariate_normal(np.zeros(6), covariance)
+        T = X @ se3.exp(error)
         if unknown_z:
-            up = T[2, :3].copy()  # of the parent, in the child
+            # The upward axis of the parent, in the child.
+            up = T[2, :3].copy()
             covariance[:3, :3] += 9.0 * np.outer(up, up)
             T[2, 3] = 0.0
         Ts.append(T)

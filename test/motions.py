@@ -115,14 +115,19 @@ def geodetic(positions, origin):
     """Latitudes and longitudes (deg) and heights (m) of positions (N, 3) east, north and up of an
     origin (deg, deg, m) within some kilometres: what LocalOrigin gives, the other way round.
     """
-    place = LocalOrigin()
-    place.geodetic = *np.radians(origin[:2]), origin[2]
-    per_radian_m = 6.37e6 * np.array([np.cos(place.geodetic[0]), 1.0, 0.0]) + [0, 0, 1]
-    points = np.tile(place.geodetic, (len(positions), 1))
-    for _ in range(10):  # each leaves less than a hundredth of the error
-        missing = (positions - place.local(*points.T)) / per_radian_m
+    latitude, longitude = np.radians(origin[:2])
+    start = np.array([latitude, longitude, origin[2]])
+    local_origin = LocalOrigin()
+    local_origin.geodetic = latitude, longitude, origin[2]
+    # Metres per radian east and north, per metre up.
+    scales = np.array([6.37e6 * np.cos(latitude), 6.37e6, 1.0])
+    points = np.tile(start, (len(positions), 1))
+    # Each round leaves less than a hundredth of the error.
+    for _ in range(10):
+        missing = (positions - local_origin.local(*points.T)) / scales
         points += missing[:, [1, 0, 2]]
-    return *np.degrees(points[:, :2].T), points[:, 2]
+    latitudes, longitudes, heights = points.T
+    return np.degrees(latitudes), np.degrees(longitudes), heights
 
 
 def read_trajectory_file(path, format="tum", **options):

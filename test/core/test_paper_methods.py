@@ -27,9 +27,10 @@ def pairs_of(Ts_parenti_parentj, Ts_childi_childj):
 
 def random_pairs(noise=0.0, n_poses=25):
     """Motions of about 1 m and 0.5 rad, with noise (m and rad) on both sensors' poses."""
-    poses = wandering_poses(n_poses, step_m=0.6, step_rad=0.4)
-    child = disturbed(child_of(poses, TRUTH, np.eye(4)), 2, noise, noise)
-    return motion_pairs(disturbed(poses, 1, noise, noise), child, "B1")
+    true_poses = wandering_poses(n_poses, step_m=0.6, step_rad=0.4)
+    parent = disturbed(true_poses, 1, noise, noise)
+    child = disturbed(child_of(true_poses, TRUTH, np.eye(4)), 2, noise, noise)
+    return motion_pairs(parent, child, "B1")
 
 
 def split(T):
@@ -53,13 +54,16 @@ def noisy():
 def test_relative_errors_of_a_pair_worked_out_by_hand():
     # The parent turns a quarter about z and moves by (1, 0, 0); X only shifts by (2, 0, 0): R_A t +
     # t_A - R t_B - t = (-1, 2, 0) - t_B.
-    quarter = se3.exp(np.array([0, 0, 0, 0, 0, np.pi / 2]))
-    A = se3.from_rotation_translation(quarter[:3, :3], [1.0, 0.0, 0.0])
-    B = se3.from_rotation_translation(
-        se3.exp(np.array([0, 0, 0, 0, 0, np.pi / 2 - 0.25]))[:3, :3], [-1.0, 2.0, 3.0]
-    )
+    # The parent turns a quarter about z and moves by (1, 0, 0); X only shifts by (2, 0, 0): R_A t +
+    # t_A - R t_B - t = (-1, 2, 0) - t_B.
+    quarter = se3.rotation_exp(np.array([0, 0, np.pi / 2]))
+    less = se3.rotation_exp(np.array([0, 0, np.pi / 2 - 0.25]))
+    A = se3.from_rotation_translation(quarter, [1.0, 0.0, 0.0])
+    B = se3.from_rotation_translation(less, [-1.0, 2.0, 3.0])
     X = se3.from_rotation_translation(np.eye(3), [2.0, 0.0, 0.0])
+
     e_rt, e_rR = relative_errors(pairs_of([A], [B]), X)
+
     assert e_rt == pytest.approx(3.0, abs=1e-14)
     assert e_rR == pytest.approx(0.25, abs=1e-14)
 
@@ -90,39 +94,54 @@ def test_park_aligns_the_rotation_vectors(noisy):
 
 def test_rotation_is_never_a_reflection():
     # Rotation vectors in a plane leave the sign of the third axis to the determinant.
-    twists = [[0.3, 0.1, 0.2, 0.5, 0.0, 0.0], [0.1, -0.3, 0.4, 0.0, 0.4, 0.0]]
-    motions = se3.exp(np.array([*twists, [0.2, 0.2, 0.1, 0.3, 0.3, 0.0]]))
-    pairs = pairs_of(motions, se3.inverse(TRUTH) @ motions @ TRUTH)
-    np.testing.assert_allclose(
-        all_pairs.solve_park(pairs).T_parent_child, TRUTH, atol=1e-12
+    # Rotation vectors in a plane leave the sign of the third axis to the determinant.
+    twists = np.array(
+        [
+            [0.3, 0.1, 0.2, 0.5, 0.0, 0.0],
+            [0.1, -0.3, 0.4, 0.0, 0.4, 0.0],
+            [0.2, 0.2, 0.1, 0.3, 0.3, 0.0],
+        ]
     )
+    motions = se3.exp(twists)
+    pairs = pairs_of(motions, se3.inverse(TRUTH) @ motions @ TRUTH)
+
+    solution = all_pairs.solve_park(pairs)
+
+    np.testing.assert_allclose(solution.T_parent_child, TRUTH, atol=1e-12)
+
+
+def unit_axes(Ts):
+    """Unit rotation axes (K, 3) of motions (K, 4, 4)."""
+    rotvecs = se3.rotation_log(Ts[:, :3, :3])
+    return rotvecs / np.linalg.norm(rotvecs, axis=1, keepdims=True)
 
 
 def test_zhuang_ends_where_the_written_out_cost_is_lowest(noisy):
     """Eqs 14-16, with z the rotation's axis times the tangent of half its angle."""
-    axes = []
-    turns = []
-    for Ts in (noisy.Ts_parenti_parentj, noisy.Ts_childi_childj):
-        rotvecs = se3.rotation_log(Ts[:, :3, :3])
-        axes.append(rotvecs / np.linalg.norm(rotvecs, axis=1, keepdims=True))
-    turns = noisy.Ts_parenti_parentj[:, :3, :3] - np.eye(3)
+    parent = noisy.Ts_parenti_parentj
+    child = noisy.Ts_childi_childj
+    parent_axes = unit_axes(parent)
+    child_axes = unit_axes(child)
+    turns = parent[:, :3, :3] - np.eye(3)
 
     def cost(parameters):
         z, t = np.split(parameters, 2)
         minus = np.eye(3) - se3.skew(z)
         plus = np.eye(3) + se3.skew(z)
-        f = axes[0] @ minus.T - axes[1] @ plus.T
-        ahead = turns @ t + noisy.Ts_parenti_parentj[:, :3, 3]
-        g = ahead @ minus.T - noisy.Ts_childi_childj[:, :3, 3] @ plus.T
+        f = parent_axes @ minus.T - child_axes @ plus.T
+        ahead = turns @ t + parent[:, :3, 3]
+        g = ahead @ minus.T - child[:, :3, 3] @ plus.T
         return np.sum(f**2) + np.sum(g**2)
 
     rotation, translation = split(zhuang.solve(noisy).T_parent_child)
     rotvec = se3.rotation_log(rotation)
     angle = np.linalg.norm(rotvec)
-    parameters = np.r_[np.tan(angle / 2) * rotvec / angle, translation]
-    np.testing.assert_allclose(
-        minimize(cost, parameters, tol=1e-10).x, parameters, atol=1e-5
-    )
+    z = np.tan(angle / 2) * rotvec / angle
+    parameters = np.concatenate([z, translation])
+
+    lowest = minimize(cost, parameters, tol=1e-10)
+
+    np.testing.assert_allclose(lowest.x, parameters, atol=1e-5)
 
 
 def test_ali_minimises_the_translation_residual_over_rotations(noisy):

@@ -77,32 +77,31 @@ LEVELS = np.random.default_rng(2).uniform(-1.0, 1.0, N_LEVELS)
 def dense_covariance(space, levels):
     """Return V (6 n, 6 n) by its definition, also for increments without information."""
     variances = np.exp(levels)
-    n, _, d = space.h0.shape
+    n_steps, _, d = space.h0.shape
     prior = np.zeros((N_POSES, d, N_POSES, d))
     for pose in range(N_POSES):
-        bases = [basis[pose if len(basis) > 1 else 0] for basis in space.white_bases]
-        white = sum(
-            variance * basis for variance, basis in zip(variances, bases, strict=False)
-        )
+        white = np.zeros((6, 6))
+        for variance, basis in zip(variances, space.white_bases, strict=False):
+            white = white + variance * basis[pose if len(basis) > 1 else 0]
         prior[pose, :6, pose, :6] = white / space.weights[pose]
-    times = np.r_[0.0, np.cumsum(space.intervals_s)]
-    for state, group in enumerate(np.repeat(range(len(SIZES)), SIZES), start=6):
+
+    times_s = np.r_[0.0, np.cumsum(space.intervals_s)]
+    distances_s = np.abs(times_s[:, None] - times_s)
+    groups = np.repeat(range(len(SIZES)), SIZES)
+    for state, group in enumerate(groups, start=6):
         variance, tau_s = variances[5 + 2 * group : 7 + 2 * group]
-        prior[:, state, :, state] = variance * np.exp(
-            -np.abs(times[:, None] - times) / tau_s
-        )
-    entries = np.zeros((n, 6, N_POSES, d))
-    for i in range(n):
-        entries[i, :, i + 1, :6], entries[i, :, i + 1, 6:] = (
-            np.eye(6),
-            space.h1_processes[i],
-        )
-        entries[i, :, i] = -space.h0[i]
-    entries = entries.reshape(6 * n, -1)
+        prior[:, state, :, state] = variance * np.exp(-distances_s / tau_s)
+
+    entries = np.zeros((n_steps, 6, N_POSES, d))
+    for step in range(n_steps):
+        entries[step, :, step + 1, :6] = np.eye(6)
+        entries[step, :, step + 1, 6:] = space.h1_processes[step]
+        entries[step, :, step] = -space.h0[step]
+    entries = entries.reshape(6 * n_steps, -1)
+    prior = prior.reshape(N_POSES * d, -1)
     walk = variances[3] * space.walk_bases[0] + variances[4] * space.walk_bases[1]
-    return entries @ prior.reshape(N_POSES * d, -1) @ entries.T + np.kron(
-        np.diag(space.walk_factors), walk
-    )
+    of_walk = np.kron(np.diag(space.walk_factors), walk)
+    return entries @ prior @ entries.T + of_walk
 
 
 def dense_loss(space, levels):
@@ -251,28 +250,33 @@ def test_parts_add_what_a_recording_that_ends_there_would_know():
 def test_block_tridiagonal_algebra_is_that_of_the_dense_matrix(n):
     random = np.random.default_rng(0)
     d = 4
-    diagonal = random.normal(size=(n, d, d))
-    diagonal = diagonal @ np.swapaxes(diagonal, 1, 2) + 20 * np.eye(d)
+    root = random.normal(size=(n, d, d))
+    diagonal = root @ np.swapaxes(root, 1, 2) + 20 * np.eye(d)
     below = random.normal(size=(n - 1, d, d))
     matrix = np.zeros((n, d, n, d))
     for k in range(n):
         matrix[k, :, k] = diagonal[k]
     for k in range(n - 1):
-        matrix[k + 1, :, k], matrix[k, :, k + 1] = below[k], below[k].T
+        matrix[k + 1, :, k] = below[k]
+        matrix[k, :, k + 1] = below[k].T
     matrix = matrix.reshape(n * d, n * d)
+    inverse = np.linalg.inv(matrix)
+    right = random.normal(size=(n, d, 3))
+    flat_right = right.reshape(n * d, 3)
 
     factor = Factor(diagonal, below)
-    right = random.normal(size=(n, d, 3))
-    flat = right.reshape(n * d, 3)
-    inverse = np.linalg.inv(matrix)
     whitened = factor.whiten(right)
     solved = factor.restore(whitened).reshape(n * d, 3)
-    np.testing.assert_allclose(solved, inverse @ flat, atol=1e-12)
-    squares = whitened.reshape(n * d, 3).T @ whitened.reshape(n * d, 3)
-    np.testing.assert_allclose(squares, flat.T @ inverse @ flat, rtol=1e-12, atol=1e-12)
-    assert factor.log_determinant == pytest.approx(np.linalg.slogdet(matrix)[1])
-    blocks = inverse.reshape(n, d, n, d)
     on_diagonal, below_diagonal = factor.selected_inverse
+
+    np.testing.assert_allclose(solved, inverse @ flat_right, atol=1e-12)
+    flat_whitened = whitened.reshape(n * d, 3)
+    squares = flat_whitened.T @ flat_whitened
+    expected = flat_right.T @ inverse @ flat_right
+    np.testing.assert_allclose(squares, expected, rtol=1e-12, atol=1e-12)
+    _, log_determinant = np.linalg.slogdet(matrix)
+    assert factor.log_determinant == pytest.approx(log_determinant)
+    blocks = inverse.reshape(n, d, n, d)
     assert on_diagonal.shape == (n, d, d)
     assert below_diagonal.shape == (n - 1, d, d)
     for k in range(n):

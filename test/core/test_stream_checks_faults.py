@@ -220,22 +220,29 @@ class TestGrid:
 
 def straight_at(stream, stamps_ns):
     """Poses at other stamps as TF interpolates them: along lines, and by slerp."""
-    after = np.clip(np.searchsorted(stream.stamps_ns, stamps_ns), 1, len(stream) - 1)
-    spans = np.diff(stream.stamps_ns)[after - 1]
-    share = ((stamps_ns - stream.stamps_ns[after - 1]) / spans)[:, None]
-    start = stream.poses[after - 1]
+    after = np.searchsorted(stream.stamps_ns, stamps_ns)
+    after = np.clip(after, 1, len(stream) - 1)
+    before = after - 1
+    start_ns = stream.stamps_ns[before]
+    span_ns = stream.stamps_ns[after] - start_ns
+    share = ((stamps_ns - start_ns) / span_ns)[:, None]
+
+    start = stream.poses[before]
     end = stream.poses[after]
-    turns = se3.rotation_log(np.swapaxes(start[:, :3, :3], 1, 2) @ end[:, :3, :3])
-    return se3.from_rotation_translation(
-        start[:, :3, :3] @ se3.rotation_exp(share * turns),
-        start[:, :3, 3] + share * (end[:, :3, 3] - start[:, :3, 3]),
-    )
+    start_rotations = start[:, :3, :3]
+    back = np.swapaxes(start_rotations, 1, 2)
+    turns = se3.rotation_log(back @ end[:, :3, :3])
+    rotations = start_rotations @ se3.rotation_exp(share * turns)
+    moves = end[:, :3, 3] - start[:, :3, 3]
+    positions = start[:, :3, 3] + share * moves
+    return se3.from_rotation_translation(rotations, positions)
 
 
 def rounded(poses, digits):
     quats = np.round(se3.to_quat_xyzw(poses), digits)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
-    return se3.from_quat_xyzw(np.round(poses[:, :3, 3], digits), quats)
+    positions = np.round(poses[:, :3, 3], digits)
+    return se3.from_quat_xyzw(positions, quats)
 
 
 class TestOneStreamComputedFromTheOther:
@@ -331,12 +338,13 @@ def fused(parent, child, X, tau_s):
     """The parent's odometry, corrected towards the child's poses through the mount ``X``."""
     aims = child.at(parent.stamps_ns) @ se3.inverse(X)
     steps = se3.inverse(parent.poses[:-1]) @ parent.poses[1:]
-    gain = 1.0 - np.exp(-np.diff(parent.stamps_ns).mean() * 1e-9 / tau_s)
+    interval_s = np.diff(parent.stamps_ns).mean() * 1e-9
+    gain = 1.0 - np.exp(-interval_s / tau_s)
     poses = [aims[0]]
     for step, aim in zip(steps, aims[1:], strict=True):
         predicted = poses[-1] @ step
-        off = se3.log(se3.inverse(predicted) @ aim)
-        poses.append(predicted @ se3.exp(gain * off))
+        innovation = se3.log(se3.inverse(predicted) @ aim)
+        poses.append(predicted @ se3.exp(gain * innovation))
     return Trajectory(parent.stamps_ns, np.array(poses))
 
 
@@ -480,7 +488,8 @@ def products_of(steps, sigma=0.01):
 
 def parts(seed, size):
     noise = np.random.default_rng(seed).normal(0.0, 0.01, (20, 6))
-    return noise + np.where(np.arange(20)[:, None] < 8, 0.0, size * SHIFT)
+    is_before = np.arange(20)[:, None] < 8
+    return noise + np.where(is_before, 0.0, size * SHIFT)
 
 
 def test_a_shift_between_parts_counts_with_half_of_it():

@@ -30,9 +30,10 @@ def lasting_errors(seed, n_poses, sigma, tau_poses):
     """Return Gauss-Markov errors (N, 6)."""
     random = np.random.default_rng(seed)
     phi = np.exp(-1.0 / tau_poses)
+    innovation = np.sqrt(1.0 - phi**2)
     errors = sigma * random.normal(size=(n_poses, 6))
     for k in range(1, n_poses):
-        errors[k] = phi * errors[k - 1] + np.sqrt(1.0 - phi**2) * errors[k]
+        errors[k] = phi * errors[k - 1] + innovation * errors[k]
     return errors
 
 
@@ -40,13 +41,16 @@ def drive():
     """Return poses with time-correlated errors, heavy tails, outliers, a jump, scale and delay."""
     random = np.random.default_rng(3)
     parent = wandering_poses(N_POSES, 3)
-    child = child_of(parent) @ se3.exp(lasting_errors(4, N_POSES, 0.01, 15))
+    lasting = lasting_errors(4, N_POSES, 0.01, 15)
+    child = child_of(parent) @ se3.exp(lasting)
     child[:, :3, 3] /= 1.02
     child[200:, :3, 3] += [0.3, -0.2, 0.1]
     for pose in (40, 41, 90, 301):
-        child[pose] = child[pose] @ se3.exp(random.normal(0.0, 0.2, 6))
+        outlier = se3.exp(random.normal(0.0, 0.2, 6))
+        child[pose] = child[pose] @ outlier
     tails = np.sqrt(3.0 / random.chisquare(3, (N_POSES, 1)))
-    child = child @ se3.exp(tails * random.normal(0.0, 0.002, (N_POSES, 6)))
+    noise = tails * random.normal(0.0, 0.002, (N_POSES, 6))
+    child = child @ se3.exp(noise)
     return disturbed(parent, 6, 1e-3, 1e-3), child
 
 
@@ -54,8 +58,10 @@ def bursts():
     """Return poses whose white noise is ten times as large during a part of the recording."""
     random = np.random.default_rng(5)
     parent = wandering_poses(N_POSES, 5)
-    sigmas = np.where(np.arange(N_POSES) % 60 < 20, 0.01, 0.001)[:, None]
-    child = child_of(parent) @ se3.exp(sigmas * random.normal(size=(N_POSES, 6)))
+    is_burst = np.arange(N_POSES) % 60 < 20
+    sigmas = np.where(is_burst, 0.01, 0.001)[:, None]
+    noise = sigmas * random.normal(size=(N_POSES, 6))
+    child = child_of(parent) @ se3.exp(noise)
     return disturbed(parent, 7, 1e-3, 1e-3), child
 
 
@@ -73,7 +79,8 @@ def sideways():
     parent = planar_poses(N_POSES)
     child = child_of(parent)
     steps = se3.inverse(child[:-1]) @ child[1:]
-    steps[:, 1, 3] += 0.05 * np.linalg.norm(steps[:, :3, 3], axis=1)
+    lengths_m = np.linalg.norm(steps[:, :3, 3], axis=1)
+    steps[:, 1, 3] += 0.05 * lengths_m
     child = walked(steps, child[0])
     return disturbed(parent, 9, 1e-3, 1e-3), disturbed(child, 10, 1e-3, 1e-3)
 
@@ -85,8 +92,8 @@ def heavy_walk():
     child = child_of(parent)
     tails = np.sqrt(2.5 / random.chisquare(2.5, (N_POSES - 1, 1)))
     drift = se3.exp(tails * random.normal(0.0, 2e-3, (N_POSES - 1, 6)))
-    child = walked(se3.inverse(child[:-1]) @ child[1:] @ drift, child[0])
-    return parent, child
+    steps = se3.inverse(child[:-1]) @ child[1:] @ drift
+    return parent, walked(steps, child[0])
 
 
 def antenna():
@@ -95,13 +102,16 @@ def antenna():
     poses = wandering_poses(N_POSES, 11)
     drift = np.zeros((N_POSES - 1, 6))
     drift[:, 3:] = 2e-3 * random.normal(size=(N_POSES - 1, 3))
-    odometry = walked(se3.inverse(poses[:-1]) @ poses[1:] @ se3.exp(drift))
-    measured = poses[:, :3, :3] @ [0.8, -0.5, 1.2] + poses[:, :3, 3]
-    measured += 0.01 * random.normal(size=(N_POSES, 3))
-    measured += lasting_errors(12, N_POSES, 0.02, 15)[:, :3]
-    measured[150:180] += 0.3 * random.normal(size=(30, 3))
-    measured[250:] += [0.5, 0.2, -0.3]
-    return odometry, measured
+    steps = se3.inverse(poses[:-1]) @ poses[1:] @ se3.exp(drift)
+    odometry = walked(steps)
+
+    lever_arm = [0.8, -0.5, 1.2]
+    positions = poses[:, :3, :3] @ lever_arm + poses[:, :3, 3]
+    positions += 0.01 * random.normal(size=(N_POSES, 3))
+    positions += lasting_errors(12, N_POSES, 0.02, 15)[:, :3]
+    positions[150:180] += 0.3 * random.normal(size=(30, 3))
+    positions[250:] += [0.5, 0.2, -0.3]
+    return odometry, positions
 
 
 POSES = {
