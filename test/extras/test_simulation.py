@@ -57,24 +57,28 @@ def test_sensors_at_different_rates_are_on_one_body():
 
 
 def test_vehicle_drives_at_its_speed_and_turns_within_its_limit():
-    fast = {"terrain_height": 0.0, "poses": 2001, "parent_rate": 100.0}
-    config = dataclasses.replace(options.DriveConfig(), **fast)
+    config = dataclasses.replace(
+        options.DriveConfig(), terrain_height=0.0, poses=2001, parent_rate=100.0
+    )
+
     poses = simulate_drive(7, config).parent.poses
+
+    moves = np.diff(poses[:, :3, 3], axis=0)
     yaw = np.unwrap(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
     yaw_rates = np.diff(yaw) * 100.0
-    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    np.testing.assert_allclose(steps, 0.005, rtol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(moves, axis=1), 0.005, rtol=1e-4)
     assert np.abs(yaw_rates).max() <= 2.0 + 1e-9
     # Held for half a second: 50 steps; a change falls into one step or between two.
-    changes = np.flatnonzero(np.abs(np.diff(yaw_rates)) > 1e-6)
-    assert 38 <= len(changes) <= 80
-    assert abs(yaw_rates[::50].mean()) < 0.6
-    assert 0.9 < yaw_rates[::50].std() < 1.4  # uniform over +/-2: 1.155
+    is_change = np.abs(np.diff(yaw_rates)) > 1e-6
+    assert 38 <= np.count_nonzero(is_change) <= 80
+    drawn_rates = yaw_rates[::50]
+    assert abs(drawn_rates.mean()) < 0.6
+    # Uniform over +/-2: 1.155.
+    assert 0.9 < drawn_rates.std() < 1.4
     # It moves where it looks.
-    heading = np.arctan2(np.diff(poses[:, 1, 3]), np.diff(poses[:, 0, 3]))
-    np.testing.assert_allclose(
-        np.exp(1j * heading), np.exp(0.5j * (yaw[:-1] + yaw[1:])), atol=1e-9
-    )
+    heading = np.arctan2(moves[:, 1], moves[:, 0])
+    half_way = 0.5 * (yaw[:-1] + yaw[1:])
+    np.testing.assert_allclose(np.exp(1j * heading), np.exp(1j * half_way), atol=1e-9)
 
 
 # --- against the published trajectories -----------------------------------------------
@@ -95,20 +99,21 @@ def published_runs(folder, level):
 
 def test_published_drives_lie_on_our_terrain_with_our_attitude(published_folder):
     for parent, _ in published_runs(published_folder, "noise/noise_0.000000"):
-        x = parent[:, 0, 3]
-        y = parent[:, 1, 3]
+        x, y, height = parent[:, :3, 3].T
+        to_body = np.swapaxes(parent[:, :3, :3], 1, 2)
+        yaw, pitch, roll = Rotation.from_matrix(to_body).as_euler("ZYX").T
+
         z, slope_x, slope_y = surface(options.DriveConfig(), x, y)
-        np.testing.assert_allclose(parent[:, 2, 3], z, atol=1e-12)
-        normals = np.stack([-slope_x, -slope_y, np.ones_like(z)], axis=-1)
+
+        np.testing.assert_allclose(height, z, atol=1e-12)
+        normals = np.column_stack([-slope_x, -slope_y, np.ones_like(z)])
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-        yaw, pitch, roll = (
-            Rotation.from_matrix(np.swapaxes(parent[:, :3, :3], 1, 2)).as_euler("ZYX").T
-        )
         np.testing.assert_allclose(np.sin(pitch), normals[:, 0], atol=0.01)
         np.testing.assert_allclose(np.sin(roll), normals[:, 1], atol=0.01)
         # Circular arcs: a chord points half-way between the headings at its ends.
         chords = np.arctan2(np.diff(y), np.diff(x))
-        half_way = yaw[:-1] + 0.5 * np.angle(np.exp(1j * np.diff(yaw)))
+        turns = np.angle(np.exp(1j * np.diff(yaw)))
+        half_way = yaw[:-1] + 0.5 * turns
         np.testing.assert_allclose(
             np.exp(1j * chords), np.exp(1j * half_way), atol=1e-9
         )

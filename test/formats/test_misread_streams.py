@@ -190,14 +190,24 @@ def test_orientations_of_positions_from_the_centre_of_the_earth(tmp_path, frame)
 
 
 def test_axes_of_places_are_those_of_their_latitude():
-    lat, lon = np.radians([[52.2, -33.5, 0.0], [9.7, -70.25, 0.0]])
-    eccentricity_2 = (2.0 - 1.0 / 298.257223563) / 298.257223563
-    normal = 6_378_137.0 / np.sqrt(1.0 - eccentricity_2 * np.sin(lat) ** 2)
-    positions = np.c_[
-        (normal + 600.0) * np.cos(lat) * np.cos(lon),
-        (normal + 600.0) * np.cos(lat) * np.sin(lon),
-        ((1.0 - eccentricity_2) * normal + 600.0) * np.sin(lat),
-    ]
+    lat = np.radians([52.2, -33.5, 0.0])
+    lon = np.radians([9.7, -70.25, 0.0])
+    height_m = 600.0
+    flattening = 1.0 / 298.257223563
+    eccentricity_2 = (2.0 - flattening) * flattening
+    normal_m = 6_378_137.0 / np.sqrt(1.0 - eccentricity_2 * np.sin(lat) ** 2)
+    x = np.cos(lat) * np.cos(lon)
+    y = np.cos(lat) * np.sin(lon)
+    z = np.sin(lat)
+    positions = np.column_stack(
+        [
+            (normal_m + height_m) * x,
+            (normal_m + height_m) * y,
+            ((1.0 - eccentricity_2) * normal_m + height_m) * z,
+        ]
+    )
+
     up = axes_of_places(positions)[:, :, 2]
-    expected = np.c_[np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]
+
+    expected = np.column_stack([x, y, z])
     np.testing.assert_allclose(up, expected, atol=1e-9)
