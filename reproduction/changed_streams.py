@@ -1,0 +1,123 @@
+"""Streams with other poses: filtered, delayed, turned, noisy. The parts of faults."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.trajectory import Trajectory
+
+Random = np.random.Generator
+
+
+def with_parts(
+    stream: Trajectory,
+    rotations: FloatArray | None = None,
+    positions: FloatArray | None = None,
+) -> Trajectory:
+    """The stream with other orientations (N, 3, 3) or positions (N, 3)."""
+    poses = stream.poses.copy()
+    if rotations is not None:
+        poses[:, :3, :3] = rotations
+    if positions is not None:
+        poses[:, :3, 3] = positions
+    return posed(stream, poses)
+
+
+def posed(stream: Trajectory, poses: FloatArray) -> Trajectory:
+    return dataclasses.replace(stream, poses=poses)
+
+
+def moved_at(stream: Trajectory, where: Any, transforms: FloatArray) -> Trajectory:
+    """The stream with some of its poses multiplied from the right."""
+    poses = stream.poses.copy()
+    poses[where] = poses[where] @ transforms
+    return posed(stream, poses)
+
+
+def positions_of(stream: Trajectory) -> FloatArray:
+    return stream.poses[:, :3, 3]
+
+
+def angles_of(stream: Trajectory) -> FloatArray:
+    """Yaw, pitch and roll (N, 3), rad."""
+    return Rotation.from_matrix(stream.poses[:, :3, :3]).as_euler("ZYX")
+
+
+def turned(stream: Trajectory, angles: FloatArray) -> Trajectory:
+    """The stream with other yaw, pitch and roll (N, 3)."""
+    return with_parts(stream, Rotation.from_euler("ZYX", angles).as_matrix())
+
+
+def with_quats(stream: Trajectory, quats: FloatArray) -> Trajectory:
+    return Trajectory(stream.stamps_ns, se3.from_quat_xyzw(positions_of(stream), quats))
+
+
+def at_stamps(stamps_ns: Any, poses: FloatArray) -> Trajectory:
+    """Poses in the order of their stamps; of equal ones the first."""
+    whole_ns = np.asarray(stamps_ns).astype(np.int64)
+    stamps_ns, first = np.unique(whole_ns, return_index=True)
+    return Trajectory(stamps_ns, poses[first])
+
+
+def seconds_of(stream: Trajectory) -> FloatArray:
+    """Times (N,) since the first pose, s."""
+    return (stream.stamps_ns - stream.stamps_ns[0]) * 1e-9
+
+
+def noisy(stream: Trajectory, metres: float, random: Random) -> Trajectory:
+    """White noise of so many metres, and twice as many radians."""
+    xi = metres * random.standard_normal((len(stream), 6))
+    xi[:, 3:] *= 2.0
+    return posed(stream, stream.poses @ se3.exp(xi))
+
+
+def filtered(values: FloatArray, stamps_ns: Any, tau_s: float) -> FloatArray:
+    """Values (N, ...) after a first-order low-pass filter."""
+    intervals_s = np.diff(stamps_ns) * 1e-9
+    gains = 1.0 - np.exp(-intervals_s / tau_s)
+    out = values.copy()
+    for k, gain in enumerate(gains):
+        change = values[k + 1] - out[k]
+        out[k + 1] = out[k] + gain * change
+    return out
+
+
+def filtered_positions(stream: Trajectory, tau_s: float) -> FloatArray:
+    return filtered(positions_of(stream), stream.stamps_ns, tau_s)
+
+
+def filtered_rotations(stream: Trajectory, tau_s: float) -> FloatArray:
+    intervals_s = np.diff(stream.stamps_ns) * 1e-9
+    gains = 1.0 - np.exp(-intervals_s / tau_s)
+    measured = stream.poses[:, :3, :3]
+    rotations = measured.copy()
+    for k, gain in enumerate(gains):
+        change = rotations[k].T @ measured[k + 1]
+        step = gain * se3.rotation_log(change)
+        rotations[k + 1] = rotations[k] @ se3.rotation_exp(step)
+    return rotations
+
+
+def upright(stream: Trajectory, share: float = 1.0) -> Trajectory:
+    """A stream with a share less of roll and pitch."""
+    remaining = 1.0 - share
+    return turned(stream, angles_of(stream) * [1.0, remaining, remaining])
+
+
+def higher(stream: Trajectory, factor: float) -> Trajectory:
+    positions = positions_of(stream) * [1.0, 1.0, factor]
+    return with_parts(stream, positions=positions)
+
+
+def delayed(stream: Trajectory, delay_s: float) -> FloatArray:
+    """Poses (N, 4, 4) as they were so long before."""
+    return stream.shifted(delay_s).at(stream.stamps_ns, extrapolate=True)
+
+
+def beside(metres: float) -> FloatArray:
+    """Pose of another sensor beside the child."""
+    return se3.from_rotation_translation(np.eye(3), [metres, 0.0, 0.0])
