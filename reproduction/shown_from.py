@@ -136,7 +136,10 @@ def _errors_found(
     blocks = injection.evidence_of(pairs, X)
     sigmas, allowance = injection.sigmas_of(result)
     columns = [*range(6)]
-    columns += [6] * bool(result.time_offset_sigma_s) + [7] * bool(result.scale_sigma)
+    if result.time_offset_sigma_s:
+        columns.append(6)
+    if result.scale_sigma:
+        columns.append(7)
     scatter, differences = injection.trials(blocks, columns, R, sigmas)
     trial = rng.integers(len(differences))
     signs = rng.choice([-1.0, 1.0], 8)

@@ -375,16 +375,15 @@ def _fit(
     # Expected information of the Student-t likelihood: Lange, Little, Taylor 1989, section 4.
     rows *= np.sqrt((degrees + 6.0) / (degrees + 8.0) * rests / weights)[:, None, None]
     fisher = _products(rows)[:-1, :-1]
-    objective = 1.5 * n * np.log(variances).sum()
-    objective += 0.5 * (degrees + 6.0) * rests @ np.log1p(distances / degrees)
+    is_outlier = distances >= _OUTLIER_SQUARED
+    log_tails = rests @ np.log1p(distances / degrees)
+    objective = 1.5 * n * np.log(variances).sum() + 0.5 * (degrees + 6.0) * log_tails
     fit = RobotWorld(
         T_parent_child=X,
         T_world_world=Z,
         covariance=np.zeros((_N_VALUES, _N_VALUES)),
         information=fisher,
-        weights=np.where(
-            distances < _OUTLIER_SQUARED, np.minimum(weights / rests, 1.0), 0.0
-        ),
+        weights=np.where(is_outlier, 0.0, np.minimum(weights / rests, 1.0)),
         level_m=float(np.sqrt(variances[0])),
         level_rad=float(np.sqrt(variances[1])),
         objective=float(objective),

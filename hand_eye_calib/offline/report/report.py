@@ -158,22 +158,7 @@ def render(
     )
     parent = printable(calibration.parent_frame)
     child = printable(calibration.child_frame)
-    by_hand = [
-        value
-        for value in usable_numbers(calibration).values()
-        if isinstance(value, str)
-    ]
     evidence = gather(calibration, snapshot) if snapshot else None
-    drawings = []
-    for draw in pictures:
-        drawings += draw(calibration)
-    for draw_of_recording in REPORT_PICTURES.values():
-        drawings += draw_of_recording(calibration, snapshot, "")
-    advice = ""
-    if evidence and calibration.verdict is not Verdict.DO_NOT_USE:
-        advice = what_is_missing(evidence.excitation, calibration)
-    if calibration.verdict is not Verdict.USE:
-        advice = "; ".join(filter(None, [advice, *advice_of(calibration)]))
     parent_is_positions = evidence is not None and evidence.has_positions_of_parent
     return page(
         _FOLDER / "report.html",
@@ -188,27 +173,64 @@ def render(
         child=child,
         rotating=child if parent_is_positions else parent,
         kind=_kind_of_result(calibration),
-        directions=[*transforms_of(calibration).values()][:2],
-        others=_other_transforms(calibration),
         stops=calibration.parts.get("stops"),
-        numbers_of=partial(
-            printed_numbers, out_of_reach=calibration.out_of_reach, sign="±"
-        ),
-        parts_of=parts_of_sigmas,
-        angles_of=partial(angles_in_words, result=calibration),
-        axes=list(_axes(calibration)),
-        allowance=spelled(allowance_in_words(calibration), road),
         facts=facts_of(calibration, "stops"),
-        advice=advice,
+        advice=_advice(calibration, evidence),
         command=command,
-        unknown=text.listing(by_hand),
+        unknown=text.listing(_numbers_by_hand(calibration)),
         target=_targets(calibration),
         reasons=shown(calibration.reasons),
         figures=figures_of(calibration, evidence),
-        pictures=drawings,
+        pictures=_drawn(calibration, snapshot, pictures),
         top_figures=_TOP_FIGURES,
+        **_numbers(calibration, road),
         **_data(calibration, snapshot, evidence, inputs, road),
     )
+
+
+def _numbers(calibration: Calibration, road: Road) -> dict[str, Any]:
+    """Return the transforms of a result, and the functions that write their numbers."""
+    return {
+        "directions": [*transforms_of(calibration).values()][:2],
+        "others": _other_transforms(calibration),
+        "numbers_of": partial(
+            printed_numbers, out_of_reach=calibration.out_of_reach, sign="±"
+        ),
+        "parts_of": parts_of_sigmas,
+        "angles_of": partial(angles_in_words, result=calibration),
+        "axes": list(_axes(calibration)),
+        "allowance": spelled(allowance_in_words(calibration), road),
+    }
+
+
+def _drawn(
+    calibration: Calibration,
+    snapshot: Snapshot | None,
+    pictures: Sequence[Callable[[Calibration], list[Drawn]]],
+) -> list[Drawn]:
+    """Return the further figures of a result: those of the caller, and those of extras."""
+    drawings = []
+    for draw in pictures:
+        drawings += draw(calibration)
+    for draw_of_recording in REPORT_PICTURES.values():
+        drawings += draw_of_recording(calibration, snapshot, "")
+    return drawings
+
+
+def _advice(calibration: Calibration, evidence: Evidence | None) -> str:
+    """Return what the user should do next: motion that is missing, and what the reasons ask for."""
+    advice = []
+    if evidence and calibration.verdict is not Verdict.DO_NOT_USE:
+        advice.append(what_is_missing(evidence.excitation, calibration))
+    if calibration.verdict is not Verdict.USE:
+        advice += advice_of(calibration)
+    return "; ".join(filter(None, advice))
+
+
+def _numbers_by_hand(calibration: Calibration) -> list[str]:
+    """Return the names of the numbers that the user must measure by hand."""
+    numbers = usable_numbers(calibration).values()
+    return [number for number in numbers if isinstance(number, str)]
 
 
 def render_brief(calibration: Calibration) -> str:
