@@ -212,10 +212,27 @@ class TestGrid:
             == f"the {stream} stream's positions are multiples of {step_m:g} m"
         )
 
-    def test_steady_motion_is_no_grid(self):
-        poses = np.tile(np.eye(4), (300, 1, 1))
-        poses[:, 0, 3] = 0.25 * np.arange(300)
-        assert check_stream(Trajectory(np.arange(300) * 10**8, poses), "child") == []
+    @pytest.mark.parametrize("n_parked", [0, 100, 1000])
+    @pytest.mark.parametrize("n_drives", [1, 6])
+    def test_steady_motion_is_no_grid_even_if_it_stops(self, n_parked, n_drives):
+        is_step = np.tile(np.repeat([1.0, 0.0], [300, n_parked]), n_drives)
+        poses = np.tile(np.eye(4), (len(is_step), 1, 1))
+        poses[:, 0, 3] = 0.25 * np.cumsum(is_step)
+        stream = Trajectory(np.arange(len(is_step)) * 10**8, poses)
+
+        codes = [finding.code for finding in check_stream(stream, "child")]
+
+        assert "coarse_positions" not in codes
+
+    @pytest.mark.parametrize("speed_m_s", [0.2, 0.7])
+    def test_rounded_positions_of_steady_motion_are_a_grid(self, speed_m_s):
+        stamps_ns = np.arange(600) * 10**8
+        poses = np.tile(np.eye(4), (600, 1, 1))
+        poses[:, 0, 3] = np.round(speed_m_s * stamps_ns * 1e-9 / 0.1) * 0.1
+
+        findings = check_stream(Trajectory(stamps_ns, poses), "child")
+
+        assert "coarse_positions" in [finding.code for finding in findings]
 
 
 def straight_at(stream, stamps_ns):

@@ -70,11 +70,12 @@ _ON_GRID = 0.98
 _GRID_TOLERANCE = 0.06
 # Differences above this multiple of the step are skipped.
 _MAX_MULTIPLE = 200.0
-# Steady motion has equal differences as well. A stream that nearly always moves must therefore have
-# this number of different multiples.
+# Steady motion has equal differences as well. A stream whose motion is rarely interrupted must
+# therefore have this number of different multiples.
 _MIN_DIFFERENT = 5
-# A stream nearly always moves if more than this share of its differences is not zero.
-_MAX_MOVING = 0.9
+# Rounding interrupts slow motion: zeros follow at least this share of the other differences. A
+# vehicle that drives steadily and then parks is interrupted once.
+_MIN_INTERRUPTED = 0.1
 
 # Highest speed (m/s) of a vehicle that calibrates its sensors by motion: the speed of sound.
 _FASTEST = 340.0
@@ -221,13 +222,16 @@ def _interleaved(trajectory: Trajectory) -> float:
 def _grid_step(values: FloatArray) -> float:
     """Return the step (m) if nearly all differences of values (N,) are its multiples, else 0."""
     steps = np.abs(np.diff(values))
-    differences = steps[steps > SAME_POSE]
+    is_moving = steps > SAME_POSE
+    differences = steps[is_moving]
     if len(differences) < _MIN_GRID:
         return 0.0
     step = float(differences.min())
     multiples = differences / step
     n_different = len(np.unique(np.round(multiples)))
-    if n_different < _MIN_DIFFERENT and len(differences) > _MAX_MOVING * len(steps):
+    n_interruptions = np.count_nonzero(is_moving[:-1] & ~is_moving[1:])
+    is_steady = n_interruptions < _MIN_INTERRUPTED * len(differences)
+    if is_steady and n_different < _MIN_DIFFERENT:
         return 0.0
     from_multiple = np.abs(multiples - np.round(multiples))
     are_small = multiples < _MAX_MULTIPLE
