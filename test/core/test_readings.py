@@ -23,6 +23,7 @@ from hand_eye_calib.core.noise.readings import loss_difference
 from hand_eye_calib.formats.trajectory_files.reading import read_trajectory
 from reproduction.coverage import mixed
 from reproduction.coverage.classes import make
+from reproduction.pose_faults import faulty, largest_ratio
 
 BOTH = {"parent_invert": "poses", "child_invert": "poses"}
 NONE = {"parent_invert": "none", "child_invert": "none"}
@@ -173,6 +174,17 @@ class TestUnclear:
         assert not any(finding.makes_unusable for finding in result.findings)
         is_right = errors(result, arm)[0] < 0.05
         assert is_right == (options == BOTH)
+
+    @pytest.mark.parametrize("seed", [339200, 5519])
+    def test_late_stamps_alone_do_not_make_poses_inverse(self, seed):
+        # Stamps of arrival of a swinging cab look like noise of inverse poses.
+        late = faulty("excavator", "stamps of arrival, 30 ms", seed)
+
+        result = hec.calibrate(late.parent, late.child)
+
+        assert largest_ratio(result, late.T_parent_child) < 3.3
+        assert result.verdict is not hec.Verdict.USE
+        assert "arrival" in [finding.code for finding in result.findings]
 
 
 @pytest.mark.parametrize(
