@@ -229,7 +229,7 @@ class TestFiles:
         assert "x, y and z are not estimated" in capsys.readouterr().out
         assert main(["check", *files]) == 0
         out = capsys.readouterr().out
-        assert out.startswith("USE: no fault found")
+        assert out.startswith("No fault found in these streams")
         assert "none" in next(
             line for line in out.splitlines() if line.startswith("child  ")
         )

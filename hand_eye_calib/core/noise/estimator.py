@@ -316,7 +316,7 @@ class AdaptiveSolution(ModelSolution):
             sentences.append(
                 f"bias of the angular rates, along the child's axes: {about} deg/s"
             )
-        elif "time" in systematic and offset_s is not None:
+        if "time" in systematic and offset_s is not None:
             value = f"{offset_s + self.time_offset_s:.4f} +/- {self.time_offset_sigma_s:.4f} s"
             sentences.append(
                 f"the time offset is {value}, refined from {offset_s:.4f} s"
