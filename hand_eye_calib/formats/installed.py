@@ -83,7 +83,7 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
         return lambda parent_frame, child_frame: Extrinsic(T, text)
     if (path / FILE_NAME).exists():
         path = path / FILE_NAME
-    if path.suffix == ".tum":
+    if path.suffix in (".tum", ".txt"):
         T = _only_pose(path)
         return lambda parent_frame, child_frame: Extrinsic(T, text)
     if path.suffix in _DESCRIPTIONS:

@@ -631,6 +631,19 @@ def test_the_sample_in_the_package_gives_its_true_extrinsic(capsys):
     np.testing.assert_allclose(matrix, truth, atol=0.005)
 
 
+@pytest.mark.parametrize("name", ["truth.tum", "T_S2_S1.txt"])
+def test_the_truth_of_a_simulation_is_compared_whatever_its_ending(
+    tmp_path, capsys, name
+):
+    sample = Path(hec.__file__).parent / "sample" / "truth.tum"
+    (tmp_path / name).write_bytes(sample.read_bytes())
+    result = str(tmp_path / "result")
+    main(["calibrate", "sample:lidar.tum", "sample:camera.tum", "--out", result])
+
+    assert main(["compare", result, "--with", str(tmp_path / name)]) == 0
+    assert "same" in capsys.readouterr().out
+
+
 # ---- the program around the commands
 
 

@@ -201,9 +201,7 @@ def _figure_of_paths(calibration: Calibration, evidence: Evidence) -> Drawn:
             points[:, first], points[:, second], label=plain_label(label), **look
         )
         side.plot(evidence.times_s[rows] * factor, points[:, across], **look)
-    plane.plot(
-        *evidence.parent[0, [first, second]], "o", color=INK, ms=6, label="start"
-    )
+    plane.plot(*evidence.parent[0, [first, second]], "o", color=INK, ms=6)
     axes = ("x (m)", "y (m)", "z (m)")
     is_level = across == 2
     plane.set(title="From above" if is_level else "In the plane of motion")
@@ -226,6 +224,7 @@ def _figure_of_paths(calibration: Calibration, evidence: Evidence) -> Drawn:
     )
     if calibration.verdict is not Verdict.DO_NOT_USE:
         caption += " That is mostly drift and jumps of the odometry, not an error of the result."
+    caption += " The dot is the start."
     lines, _ = plane.get_legend_handles_labels()
     title = "Both trajectories, aligned"
     return as_drawn(figure, "trajectories", title, caption, lines)
