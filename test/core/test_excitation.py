@@ -125,7 +125,8 @@ def test_a_vehicle_is_told_to_drive_over_a_ramp():
         as_trajectory(poses), as_trajectory(child_of(poses)), reference="B5"
     )
     assert excitation.what_is_missing(seen, recorded) == (
-        f"{advice}, or record the clouds of two lidars and run calibrate on the bag"
+        f"{advice}, or, if both sensors are lidars, record their clouds and run "
+        "calibrate on the bag"
     )
 
 

@@ -388,7 +388,7 @@ class TestCommand:
         assert main(["check", *jumping]) == 0
         out, err = capsys.readouterr()
         assert re.search(r"^note +jumps", out, re.MULTILINE)
-        assert "no fault found" in out
+        assert "No fault found" in out
         assert err == ""
         assert main(["check", *jumping, "--method", "park"]) == 0
         out, err = capsys.readouterr()

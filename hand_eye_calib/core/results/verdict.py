@@ -150,6 +150,9 @@ FEWEST_INLIERS = 0.7
 # rejects only outliers. A tenth of all poses as outliers spoils a fifth of the pairs.
 FEWEST_OF_MODEL = 0.8
 
+# The same share of the windows of a vehicle. The outliers are slips, which do not spoil neighbours.
+FEWEST_OF_WINDOWS = 0.9
+
 # Kinds of the rules that report a limit of the recording. All other rules report a suspicion.
 _KINDS = dict.fromkeys(
     ("nothing_known", "unobservable", "unconfirmed", "target", "floor"),
@@ -418,8 +421,7 @@ def _few_inliers(result: Result) -> Iterator[Ground]:
         # A finding names the stops that were rejected.
         return
     share = result.n_inliers / max(result.n_pairs, 1)
-    uses_reference = METHODS[result.method].uses_reference
-    if share < (FEWEST_INLIERS if uses_reference else FEWEST_OF_MODEL):
+    if share < _fewest_inliers(result):
         text = f"{1 - share:.0%} of the motion pairs were rejected as outliers"
         advice = "find out why the odometry jumps, and record again"
         if result.reference == "windows":
@@ -429,6 +431,14 @@ def _few_inliers(result: Result) -> Iterator[Ground]:
                 "drive more slowly in curves, on a floor with grip, and record again"
             )
         yield Ground(text, advice)
+
+
+def _fewest_inliers(result: Result) -> float:
+    """Return the smallest share of inliers that is no reason for care."""
+    if result.reference == "windows":
+        return FEWEST_OF_WINDOWS
+    uses_reference = METHODS[result.method].uses_reference
+    return FEWEST_INLIERS if uses_reference else FEWEST_OF_MODEL
 
 
 _FLOOR_ADVICE = (
@@ -569,7 +579,8 @@ _OWN_RULES = (
         "outliers",
         _CARE,
         f"more than {1 - FEWEST_INLIERS:.0%} of the motion pairs are outliers; "
-        f"more than {1 - FEWEST_OF_MODEL:.0%} with method adaptive",
+        f"more than {1 - FEWEST_OF_MODEL:.0%} with method adaptive; a vehicle slips for more than "
+        f"{1 - FEWEST_OF_WINDOWS:.0%} of the time",
         _few_inliers,
     ),
     Rule(

@@ -26,7 +26,6 @@ from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.differences import path_derivatives, stencil
-from hand_eye_calib.core.noise.tuning import TUNING
 from hand_eye_calib.extras.partial.columns import (
     Column,
     Fit,
@@ -42,6 +41,8 @@ _WINDOW_S = 10.0
 # positions is longer, the interval is the step.
 _STEP_S = 0.2
 
+# Prior standard deviation (s^2) of the smoothing of sound streams, as in `Tuning.of_positions`.
+_USUAL_S2 = 2e-3
 # Prior of smoothing: its standard deviation (s^2) for faulty streams, and their share. Chosen on
 # simulated machines with filters of 0.05 to 0.2 s. Usual streams have that of the noise model.
 _FAULTY_S2 = 0.01
@@ -153,8 +154,7 @@ def posterior_smoothing(smoothing_s2: float, sigma_s2: float) -> Smoothing:
     smoothing_s2, sigma_s2 : float
         Estimate and its standard deviation.
     """
-    usual_s2 = TUNING.of_positions[-1]
-    prior_variances = np.array([usual_s2**2, _FAULTY_S2**2])
+    prior_variances = np.array([_USUAL_S2**2, _FAULTY_S2**2])
     variances = prior_variances + sigma_s2**2
     logs = np.log([1.0 - _FAULTY_SHARE, _FAULTY_SHARE])
     logs -= 0.5 * (np.log(variances) + smoothing_s2**2 / variances)
