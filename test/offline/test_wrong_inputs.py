@@ -34,6 +34,9 @@ TABLE = """
 1 | calibrate nan.tum camera.tum | all 600 rows are empty, zero or not finite
 1 | calibrate far.tum camera.tum | line 1: position (1e+12,
 1 | calibrate same_stamp.tum camera.tum | 600 poses have 5 different stamps; write all digits
+1 | calibrate float32.tum camera.tum | are the same (numbers of 32 bits have steps of 128 s here)
+1 | calibrate degrees.csv camera.tum | yaw_rad reaches 358.8, more than one turn (2 pi rad)
+1 | calibrate tilt.csv camera.tum | pitch_rad reaches 12, more than one turn
 1 | calibrate cells.tum camera.tum | for the timestamp
 1 | calibrate nohead.csv camera.tum | name the 4 with --columns
 1 | calibrate kitti.txt camera.tum --parent-times times.txt | 20 poses, but times.txt has 2 stamps
@@ -43,7 +46,7 @@ TABLE = """
 1 | calibrate junk.mcap | repair it with 'mcap recover'
 1 | calibrate junk.db3 | repair it with sqlite3's '.recover'
 1 | calibrate junk.bag | repair it with 'rosbag reindex'
-1 | calibrate cut.mcap | it ends in the middle of a record
+1 | calibrate cut.mcap | kind (it ends in the middle of a record, and no message before
 2 | calibrate drive.mcap camera.tum | drive.mcap is a bag, and another path is not
 1 | calibrate drive.mcap --parent-topic /lidar/odo | did you mean /lidar/odometry?
 1 | calibrate drive.mcap --parent-topic /a --child-topic /a | no topic /a in
@@ -59,6 +62,9 @@ TABLE = """
 2 | calibrate lidar.tum camera.tum --method best | --method: must be one of auto, dnlo
 2 | calibrate lidar.tum camera.tum --reference D5 | must be auto, A, B<n> such as B5
 2 | calibrate lidar.tum camera.tum --time-offset yes | must be estimate or a number in s; got 'yes'
+2 | calibrate lidar.tum camera.tum --time-offset 35ms | got '35ms'; write 0.035
+2 | calibrate lidar.tum camera.tum --max-gap "100 ms" | got '100 ms'; write 0.1
+2 | calibrate lidar.tum camera.tum --method dnol | did you mean dnlo or dnl?
 2 | calibrate lidar.tum camera.tum --scale 0 | --scale: must be at least
 2 | calibrate lidar.tum camera.tum --prior z=1.85 | with its standard deviation; got '1.85'
 2 | calibrate lidar.tum camera.tum --prior h=1+/-0.1 | AXIS one of x, y, z, roll, pitch, yaw
@@ -113,6 +119,8 @@ TABLE = """
 2 | arm lidar.tum camera.tum --parent-angles kuca | did you mean kuka?
 2 | arm sample:arm.yaml --setup besides | did you mean beside?
 2 | batch folder | no bag matches folder/**: expected folders with a metadata.yaml
+2 | batch lidar.tum | lidar.tum is not a bag, and batch takes bags: for trajectory files
+2 | batch lidar.tum camera.tum --vehicle x | use calibrate PARENT CHILD
 2 | batch lidar*.tumx | for trajectory files, use calibrate PARENT CHILD
 2 | check lidar.tum camera.tum --child-topic /a | --child-topic applies to bags only
 1 | info robot.urdf | robot.urdf is a robot description, not a saved result
@@ -213,8 +221,24 @@ def write_poses(folder):
     }
     for name, table in poses.items():
         np.savetxt(folder / f"{name}.tum", table, fmt="%.9f")
+    short = rows.copy()
+    short[:, 0] = short[:, 0].astype(np.float32)
+    np.savetxt(folder / "float32.tum", short, fmt="%.3f")
+    # Angles in degrees under names of radians: a yaw that passes 360, and a pitch.
+    angles = np.zeros((len(rows), 3))
+    angles[:, 2] = np.arange(len(rows)) * 1.2 % 360.0
+    write_angles(folder / "degrees.csv", rows, angles)
+    angles[:, 1:] = [12.0, 0.0]
+    write_angles(folder / "tilt.csv", rows, angles)
     text = (folder / "lidar.tum").read_text()
     (folder / "cells.tum").write_text(text.replace("1", "abc", 1))
+
+
+def write_angles(path, rows, angles):
+    """Write the stamps and positions of rows with angles in columns named as radians."""
+    header = "t,x,y,z,roll_rad,pitch_rad,yaw_rad"
+    table = np.c_[rows[:, :4], angles]
+    np.savetxt(path, table, fmt="%.9f", delimiter=",", header=header, comments="")
 
 
 @pytest.mark.parametrize(
@@ -250,6 +274,17 @@ def test_an_option_of_dnlo_has_a_note_with_another_method(run):
     )
     _, out, _ = run("calibrate", *paths, "--threshold", "0.5", "--method", "dnlo")
     assert "has no effect" not in out
+
+
+def test_a_yaw_that_counts_turns_is_read_in_radians_with_a_note(tmp_path):
+    rows = np.loadtxt(local_path("sample:lidar.tum"))
+    angles = np.zeros((len(rows), 3))
+    angles[:, 2] = np.linspace(0.0, 40.0, len(rows))
+    write_angles(tmp_path / "turns.csv", rows, angles)
+    with pytest.warns(UserWarning, match="yaw_rad reaches 40 rad, more than one turn"):
+        trajectory = hec.read_trajectory(tmp_path / "turns.csv", "auto")
+    rotation = Rotation.from_matrix(trajectory.poses[-1, :3, :3])
+    np.testing.assert_allclose(np.sin(rotation.magnitude()), abs(np.sin(40.0)))
 
 
 def test_a_folder_may_be_called_sample():
@@ -289,6 +324,14 @@ IN_PYTHON = {
     "words as poses": (
         lambda: hec.robot_poses("abc", "kuka"),
         "rows must be numbers; got str",
+    ),
+    "a method with two letters swapped": (
+        lambda: hec.CalibratorConfig(method="dnol"),
+        "got 'dnol'; did you mean dnlo or dnl?",
+    ),
+    "an offset with its unit": (
+        lambda: hec.CalibratorConfig(time_offset="-35 ms"),
+        "time_offset must be estimate or a number in s; got '-35 ms'; write -0.035",
     ),
     "a misspelt robot": (
         lambda: hec.robot_poses([[0.0] * 6], "kuca"),

@@ -3,11 +3,12 @@
 import contextlib
 import dataclasses
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar, Self, TypeAlias
 
 from hand_eye_calib.core.base.errors import ConfigError
-from hand_eye_calib.core.base.text import frame_name, shown_value
+from hand_eye_calib.core.base.text import FACTORS_TO_SI, frame_name, shown_value
 
 OptionValue: TypeAlias = bool | int | float | str
 #: Values of options by their public names. The dataclass of the options checks their types.
@@ -17,6 +18,8 @@ OptionField: TypeAlias = dataclasses.Field[Any]
 #: Whole numbers must be smaller than this, so that they fit into signed integers of 64 bits.
 LARGEST_INT = 1 << 63
 
+# A number and its unit, such as 35ms or -0.1 s.
+_NUMBER_WITH_UNIT = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\w+)")
 _GROUPS = ("keyframe", "prior", "target")
 _TYPE_NAMES = {
     bool: "true or false",
@@ -77,11 +80,42 @@ def option_name(field: OptionField) -> str:
 
 
 def did_you_mean(word: str, candidates: Iterable[str]) -> str:
-    """Return ``; did you mean X?`` with the most similar candidate; empty if none is similar."""
+    """Return ``; did you mean X?`` with the most similar candidates; empty if none is similar.
+
+    Two candidates are named if both need the smallest number of edits.
+    """
     import difflib
 
-    close = difflib.get_close_matches(word, list(candidates), n=1, cutoff=0.6)
-    return f"; did you mean {close[0]}?" if close else ""
+    similar = difflib.get_close_matches(word, list(candidates), n=3, cutoff=0.6)
+    if not similar:
+        return ""
+    n_edits = {candidate: _count_edits(word, candidate) for candidate in similar}
+    fewest = min(n_edits.values())
+    nearest = [candidate for candidate in similar if n_edits[candidate] == fewest]
+    # A candidate with the same letters comes first: letters are swapped more often than added.
+    nearest.sort(key=lambda candidate: sorted(candidate) != sorted(word))
+    return f"; did you mean {' or '.join(nearest[:2])}?"
+
+
+def _count_edits(word: str, other: str) -> int:
+    """Count the edits between two words: letters added, removed, replaced or swapped.
+
+    The number is the distance of optimal string alignment. A swap exchanges two adjacent letters.
+    """
+    # Distances between the beginnings of both words, by their lengths.
+    distances = {(row, 0): row for row in range(len(word) + 1)}
+    distances |= {(0, column): column for column in range(len(other) + 1)}
+    for row, letter in enumerate(word, 1):
+        for column, other_letter in enumerate(other, 1):
+            replaced = distances[row - 1, column - 1] + (letter != other_letter)
+            removed = distances[row - 1, column] + 1
+            added = distances[row, column - 1] + 1
+            distance = min(replaced, removed, added)
+            is_longer = row > 1 and column > 1
+            if is_longer and word[row - 2 : row] == other[column - 2 : column][::-1]:
+                distance = min(distance, distances[row - 2, column - 2] + 1)
+            distances[row, column] = distance
+    return distances[len(word), len(other)]
 
 
 def _of_python(value: object) -> object:
@@ -110,7 +144,8 @@ def check_value(field: OptionField, value: object) -> OptionValue:
     if kind is float:
         value = _as_float(value, has_words=bool(words))
     if type(value) is not kind or not isinstance(value, bool | int | float):
-        hint = did_you_mean(str(value), words)
+        hint = _without_unit(value, field.metadata["unit"])
+        hint = hint or did_you_mean(str(value), words)
         raise ConfigError(
             f"{name} must be {_expected(field)}; got {shown_value(value)}{hint}"
         )
@@ -132,6 +167,18 @@ def _expected(field: OptionField) -> str:
     if option_name(field).startswith("prior."):
         return f"{expected} with its standard deviation, such as '1.85+/-0.02'"
     return f"{expected} in {unit}" if unit else expected
+
+
+def _without_unit(value: object, unit: str) -> str:
+    """Return ``; write 0.035`` for a text such as ``35ms``; empty if it has another form.
+
+    ``unit`` is the unit of the option.
+    """
+    match = _NUMBER_WITH_UNIT.fullmatch(value) if isinstance(value, str) else None
+    factors = FACTORS_TO_SI.get(unit, {})
+    if match is None or match[2] not in factors:
+        return ""
+    return f"; write {float(match[1]) * factors[match[2]]:.9g}"
 
 
 def _as_float(value: object, has_words: bool) -> object:

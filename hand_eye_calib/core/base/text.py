@@ -217,10 +217,11 @@ _MAX_CHARACTERS = 80
 AXIS_UNITS = dict.fromkeys(("x", "y", "z"), "m") | dict.fromkeys(
     ("roll", "pitch", "yaw"), "rad"
 )
-# Factors from the units that a user may type to m or rad.
-_IN_SI = {
+#: Factors from the units that a user may type to m, rad or s.
+FACTORS_TO_SI = {
     "m": {"m": 1.0, "cm": 0.01, "mm": 0.001},
     "rad": {"rad": 1.0, "deg": math.pi / 180},
+    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
 }
 _QUANTITY = re.compile(
     r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)(m|cm|mm|rad|deg)?"
@@ -400,7 +401,7 @@ def quantities(
 def _quantity(name: str, unit: str, word: str) -> float:
     """Return the number of a word in ``unit`` (m or rad); see :func:`quantities`."""
     match = _QUANTITY.fullmatch(word)
-    factors = _IN_SI[unit]
+    factors = FACTORS_TO_SI[unit]
     unit_of_word = _unit_of(word) or unit
     if not match or unit_of_word not in factors:
         allowed = " or ".join(factors)

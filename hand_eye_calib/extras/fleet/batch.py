@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.base.plain import json_text
 from hand_eye_calib.core.base.text import counted, listing, shown_value
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
@@ -22,7 +22,7 @@ from hand_eye_calib.extras.fleet import work
 from hand_eye_calib.extras.fleet.records import is_in_headline
 from hand_eye_calib.extras.fleet.together import together
 from hand_eye_calib.extras.fleet.work import Outcome, Row, Task, outcomes, tasks_of
-from hand_eye_calib.formats.bags.patterns import matching
+from hand_eye_calib.formats.bags.patterns import is_other_file, matching
 from hand_eye_calib.formats.results import save_result, save_text
 from hand_eye_calib.offline.beside_motion import switched_off
 from hand_eye_calib.offline.cli.options import (
@@ -49,10 +49,21 @@ def run_batch(arguments: argparse.Namespace) -> int:
     """Calibrate from many recordings; return the exit code.
 
     A recording that fails becomes a row with its error.
+
+    Raises
+    ------
+    ConfigError
+        If no bag matches, or if all paths are files of another kind.
     """
     title = " ".join(arguments.batch)
     with waiting_for(f"looking for {title}"):
-        groups = [[bag] for pattern in arguments.batch for bag in matching(pattern)]
+        paths = [path for pattern in arguments.batch for path in matching(pattern)]
+    if all(is_other_file(path) for path in paths):
+        raise ConfigError(
+            f"{paths[0]} is not a bag, and batch takes bags: for trajectory files, use calibrate "
+            "PARENT CHILD, or calibrate_many in Python"
+        )
+    groups = [[path] for path in paths]
     done = _all_done(groups, arguments.vehicle or "", arguments)
     vehicles = _vehicles(done, arguments.out)
     if arguments.out:

@@ -15,6 +15,7 @@ from mcap.stream_reader import StreamReader
 
 from hand_eye_calib.formats import files
 from hand_eye_calib.formats.bags.storage import (
+    DamageError,
     Message,
     MessageKind,
     Span,
@@ -98,7 +99,7 @@ class McapFile(Storage):
 
         Raises
         ------
-        ValueError
+        DamageError
             If the file is damaged and contains no readable message.
         """
         schemas = {}
@@ -117,9 +118,12 @@ class McapFile(Storage):
             self.span_ns = min(times_ns), max(times_ns)
             seconds = (self.span_ns[1] - self.span_ns[0]) * 1e-9
             recovered = f"{len(times_ns)} messages over {seconds:.1f} s were recovered"
-            self.losses = [f"{loss}; {recovered}" for loss in self.losses]
+            self.losses = [
+                f"it is truncated or damaged ({loss}); the rest is lost; {recovered}"
+                for loss in self.losses
+            ]
         elif self.losses:
-            raise ValueError(
+            raise DamageError(
                 f"{self.losses[0]}, and no message before can be read"
             ) from reason
 
@@ -156,7 +160,7 @@ class McapFile(Storage):
     def _records(self, losses: list[str]) -> Iterator[Any]:
         """Iterate over all records of the file, or over those before the damage.
 
-        A line about the damage is appended to ``losses``.
+        The reason of the damage is appended to ``losses``.
         """
         position = self._stream.seek(0)
         try:
@@ -166,9 +170,7 @@ class McapFile(Storage):
         except MemoryError:
             raise
         except Exception as error:
-            losses.append(
-                f"it is truncated or damaged ({reason_of(error)}); the rest is lost"
-            )
+            losses.append(reason_of(error))
             if isinstance(error, EOFError):
                 # The file is cut off. Reading the records of its last chunk ends in an error, too.
                 with suppress(Exception):

@@ -37,6 +37,11 @@ def matching(pattern: str) -> list[str]:
     return paths
 
 
+def is_other_file(path: str) -> bool:
+    """Whether a path is a file, but not of a bag."""
+    return Path(path).is_file() and Path(path).suffix not in (*_SUFFIXES, ".zstd")
+
+
 def _local_bags(pattern: str) -> list[str]:
     """Return the paths on this computer that match a pattern; a plain path is not checked."""
     if not has_magic(pattern) or Path(pattern).exists():

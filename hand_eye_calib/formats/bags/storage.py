@@ -88,6 +88,10 @@ def printable_name(name: str) -> str:
     return printable(name[: files.LONGEST_NAME])
 
 
+class DamageError(ValueError):
+    """Error for a damaged file without a readable message; its text is the whole reason."""
+
+
 class Storage(ABC):
     """Storage file that is open for reading until ``opened`` is closed.
 
@@ -282,8 +286,13 @@ def _rosbag1_message(chunk: bytes, start: int) -> bytes:
 
 
 def reason_of(error: BaseException) -> str:
-    """Return the type and the text of an error in one line."""
+    """Return the type and the text of an error in one line.
+
+    The text of an EOFError or a DamageError is clear without the type.
+    """
     words = " ".join(str(error).split())
+    if isinstance(error, EOFError | DamageError) and words:
+        return words
     return f"{type(error).__name__}: {words}".rstrip(".: ")
 
 

@@ -268,7 +268,10 @@ def _in_si(table: Table, names: Sequence[str], kind: str) -> FloatArray:
             lambda row: f"found {kind} {magnitudes[row]:.4g}; repair its source",
         )
     if units:
-        return values * factors[units.pop()]
+        unit = units.pop()
+        if unit == "rad":
+            _refuse_degrees(table, names, values)
+        return values * factors[unit]
     # The first two units are those of columns without a unit.
     first, second, *_ = factors
     largest = float(magnitudes.max())
@@ -280,6 +283,39 @@ def _in_si(table: Table, names: Sequence[str], kind: str) -> FloatArray:
             f"such as {names[-1]}_{unit.replace('/', '_')}"
         )
     return values * factors[unit]
+
+
+def _refuse_degrees(table: Table, names: Sequence[str], values: FloatArray) -> None:
+    """Raise an InputError if columns that are named as radians probably contain degrees.
+
+    Angles of more than one turn are degrees, except for a yaw or heading, which may count turns
+    without a jump. A jump of more than one turn is in degrees. Without a jump, a note is added.
+
+    Parameters
+    ----------
+    table : Table
+    names : sequence of str
+        Quantities of k columns.
+    values : (N, k) array
+        Their numbers.
+    """
+    jumps = np.abs(np.diff(values, axis=0, prepend=values[:1]))
+    for name, column, jump in zip(names, values.T, jumps.T, strict=True):
+        largest = np.abs(column).max()
+        if largest <= _LARGEST_ANGLE_RAD:
+            continue
+        in_degrees = f"name the column {name}_deg"
+        column_name = table.names[table.at[name]]
+        if name in ("yaw", "heading") and jump.max() <= _LARGEST_ANGLE_RAD:
+            table.guess(
+                f"{column_name} reaches {largest:.4g} rad, more than one turn; if it is "
+                f"in degrees, {in_degrees}"
+            )
+            continue
+        raise InputError(
+            f"{table.path}: {column_name} reaches {largest:.4g}, more than one turn (2 pi "
+            f"rad): probably degrees; then {in_degrees}, else write angles from -pi to pi"
+        )
 
 
 # ---- orientations

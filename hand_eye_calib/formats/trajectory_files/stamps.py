@@ -29,6 +29,8 @@ _END_OF_PACKED = Decimal(21_000_101_000_000)
 # Stamps have lost their last digits if at least this share of the poses have moved, but have the
 # stamp of the pose before.
 _COARSE_SHARE = 0.25
+# Stamps can be numbers of 32 bits if these have at least this step (s): since 1970, it is 128 s.
+_SHORT_STEP_S = 1e-3
 # Poses are equal if no number of them differs by more than this: rounding.
 _SAME = 1e-12
 
@@ -140,16 +142,33 @@ def refuse_coarse(table: Table, stamps_ns: IntArray, values: FloatArray) -> None
         return
     different = np.unique(stamps_ns)
     if len(different) == 1:
-        problem = "are all the same"
-    elif (different % _NS).any():
-        problem = f"have steps of {(np.diff(different) * 1e-9).min():.4g} s"
+        problem = f"of all {len(stamps_ns)} poses are the same"
     else:
-        problem = "have whole seconds only"
+        steps = "whole seconds only"
+        if (different % _NS).any():
+            steps = f"steps of {(np.diff(different) * 1e-9).min():.4g} s"
+        problem = (
+            f"have {steps}: {len(stamps_ns)} poses have {len(different)} different "
+            "stamps"
+        )
+    advice = "write all digits (%.9f instead of %g or %e)"
+    if step_s := _step_of_32_bits(different):
+        problem += f" (numbers of 32 bits have steps of {step_s:.4g} s here)"
+        advice += ", and numbers of 64 bits (float64)"
     raise InputError(
-        f"{table.path}: the timestamps {problem}: {len(stamps_ns)} poses have "
-        f"{len(different)} different stamps; write all digits (%.9f instead "
-        "of %g or %e), or set `times`"
+        f"{table.path}: the timestamps {problem}; {advice}, or set `times`"
     )
+
+
+def _step_of_32_bits(different: IntArray) -> float:
+    """Return the spacing (s) of numbers of 32 bits if the stamps can be such numbers; 0 if not.
+
+    ``different`` are the different stamps, sorted. Between some of them there is only one step.
+    """
+    step_s = float(np.spacing(np.float32(different[-1] / _NS)))
+    is_multiple = not (different % max(1, round(step_s * _NS))).any()
+    are_adjacent = len(different) == 1 or np.diff(different).min() < 2.0 * step_s * _NS
+    return step_s if step_s >= _SHORT_STEP_S and is_multiple and are_adjacent else 0.0
 
 
 def in_order(
