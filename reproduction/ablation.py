@@ -1,8 +1,10 @@
-"""``python -m reproduction.ablation``: what each part of the adaptive estimator gains, by families
-of recordings: with each part switched off in turn, the error over that of the whole estimator.
+"""``python -m reproduction.ablation``: measure what each part of the adaptive estimator gains.
 
-The simulated platforms, their noise and their seeds are drawn anew at every run, so that nobody can
-tune to them. A part earns its place if families that it was not made for are better with it.
+The parts are switched off in turn. The table contains the error without a part divided by the error
+of the full estimator, by families of recordings.
+
+Every run draws new simulated platforms, noise and seeds, so that nobody can tune the estimator to
+them. A part is kept if it improves recordings of other families than those that it was made for.
 """
 
 import dataclasses
@@ -24,22 +26,28 @@ from reproduction.coverage.mixed import MIXED, make
 from reproduction.recordings import Rig, real_rigs
 from reproduction.writing import markdown_table, seed_of, show, study_parser
 
-# Families of rigs by the beginnings of their names; the others are families of their own.
+# Families of rigs. The name of a rig contains its family; any other rig is a family of its own.
 _FAMILIES = ("kitti", "euroc", "zxl19", "tango")
 
-# Errors (m, rad) below this are rounding: noise-free recordings tell nothing.
+# Errors (m, rad) below this are rounding. Recordings without noise are left out of the ratios.
 _ROUNDING = 1e-4
 
-# A recording that a variant cannot solve counts as that many times as far off.
-_FAILED = 3.0
+# Ratio of errors (variant over full estimator) for a recording that the variant cannot solve.
+_RATIO_OF_FAILURE = 3.0
+
+# Smallest ratio of errors: a ratio of zero has no logarithm.
+_MIN_RATIO = 1e-3
+
+# Half width of a 90 % interval, in standard deviations.
+_HALF_WIDTH_90 = 1.645
 
 
-def _with(**numbers: object) -> dict[str, Any]:
-    """Other numbers of the search."""
-    return {"tuning": dataclasses.replace(TUNING, **numbers)}  # type: ignore[arg-type]
+def _with(**constants: object) -> dict[str, Any]:
+    """Return options of the estimator in which these constants replace the usual ones."""
+    return {"tuning": dataclasses.replace(TUNING, **constants)}  # type: ignore[arg-type]
 
 
-# Options of ``estimator.solve`` that switch one part off.
+# Options of ``estimator.solve`` that switch a part off, by the name of the part.
 VARIANTS: dict[str, dict[str, Any]] = {
     "outliers": {"without": ("outliers", "tails")},
     "heavy tails": {"without": ("tails",)},
@@ -49,15 +57,27 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "bias": {"systematic": ("scale", "time")},
     "scale": {"systematic": ("bias", "time")},
     "time": {"systematic": ("scale", "bias")},
-    "biases that X can be told from": _with(max_sigma_growth=1e6),
-    "fewer poses of a target": _with(strides=()),
-    "following X": _with(max_rounds=1),
-    "all poses for the noise": _with(most_poses=10**6),
+    "rejection of biases like X": _with(max_sigma_growth=1e6),
+    "strides for a noisy target": _with(strides=()),
+    "iteration of outliers and X": _with(max_rounds=1),
+    "subset of poses for noise": _with(most_poses=10**6),
 }
 
 
 class Case(NamedTuple):
-    """One recording, aligned: its truth and how well that is known (6,), infinite where not."""
+    """A recording with pose pairs on one clock and in one unit, and its true extrinsic.
+
+    Attributes
+    ----------
+    family : str
+    poses : PosePairs
+    is_clock_free : bool
+        Whether the time offset was estimated from the recording.
+    T_parent_child : (4, 4) array
+        True extrinsic.
+    sigmas : (6,) array
+        Standard deviations (m, rad) of the true extrinsic; infinite on unknown axes.
+    """
 
     family: str
     poses: PosePairs
@@ -67,7 +87,7 @@ class Case(NamedTuple):
 
 
 def real_cases(folder: Path | None) -> Iterator[Case]:
-    """Recordings with a known answer."""
+    """Yield the real recordings whose extrinsic is known; none without a folder."""
     for rig in real_rigs(folder)[0] if folder else ():
         if rig.truth is None or rig.is_refused:
             continue
@@ -89,7 +109,10 @@ def _real_case(rig: Rig, parent: Any, child: Any) -> Case:
 
 
 def simulated_cases(seed: int, repeats: int) -> Iterator[Case]:
-    """Random platforms: motion, rate, lever arm and noise drawn from the seed."""
+    """Yield recordings of random platforms: motion, rate, lever arm and noise are drawn.
+
+    ``repeats`` is the number of recordings of each kind of platform.
+    """
     for name in MIXED:
         for number in range(repeats):
             drive = make(name, seed, number)
@@ -100,15 +123,25 @@ def simulated_cases(seed: int, repeats: int) -> Iterator[Case]:
 
 
 class Outcome(NamedTuple):
-    """Errors in m and rad, NaN where the truth is not known, and shares (6,) of sigma."""
+    """Errors of an estimate.
+
+    Attributes
+    ----------
+    errors : (2,) array
+        Translation error (m) and rotation error (rad); NaN if no axis of the truth is known.
+    in_sigmas : (k,) array
+        Absolute errors on the k known axes, divided by their standard deviations.
+    """
 
     errors: FloatArray
     in_sigmas: FloatArray
 
 
 def outcome(case: Case, options: dict[str, Any]) -> Outcome | None:
-    """How far the estimator is off; None if it fails. Half of what the truth is not known to counts
-    as an error of all variants.
+    """Return the errors of the estimator with these options; None if it fails.
+
+    Half of the truth's standard deviation is added to the error, as a square. An improvement below
+    this uncertainty is chance, and so does not change the ratio much.
     """
     poses = case.poses
     try:
@@ -121,35 +154,32 @@ def outcome(case: Case, options: dict[str, Any]) -> Outcome | None:
         )
     except (np.linalg.LinAlgError, ValueError):
         return None
-    off = deviation(solution.T_parent_child, case.T_parent_child)
+    deviations = deviation(solution.T_parent_child, case.T_parent_child)
     to_parent = np.kron(np.eye(2), solution.T_parent_child[:3, :3])
     variances = np.diag(to_parent @ solution.cov_parent_child_in_child @ to_parent.T)
-    is_determined = np.isfinite(case.sigmas)
-    squares = np.where(
-        is_determined,
-        off**2 + 0.25 * np.where(is_determined, case.sigmas, 0.0) ** 2,
-        0.0,
-    )
-    sizes = [
-        np.sqrt(squares[axes].sum()) if is_determined[axes].any() else np.nan
-        for axes in (slice(0, 3), slice(3, 6))
-    ]
-    in_sigmas = np.abs(off) / np.sqrt(
-        variances + np.where(is_determined, case.sigmas, np.inf) ** 2
-    )
-    return Outcome(np.array(sizes), in_sigmas[is_determined])
+    is_known = np.isfinite(case.sigmas)
+    known_sigmas = np.where(is_known, case.sigmas, 0.0)
+    squares = np.where(is_known, deviations**2 + 0.25 * known_sigmas**2, 0.0)
+    errors = np.full(2, np.nan)
+    for index, axes in enumerate((slice(0, 3), slice(3, 6))):
+        if is_known[axes].any():
+            errors[index] = np.sqrt(squares[axes].sum())
+    in_sigmas = np.abs(deviations) / np.sqrt(variances + known_sigmas**2)
+    return Outcome(errors, in_sigmas[is_known])
 
 
 def table(cases: Sequence[Case]) -> str:
-    """A row for every variant: error over that of the whole estimator by family, translation and
-    rotation; geometric mean over all families, and over all but the one it gains most in.
+    """Return a table of error ratios with a row for every part that is switched off.
+
+    See :func:`_row` for the columns.
     """
-    whole = [outcome(case, {}) for case in cases]
-    rows = [_row("nothing", cases, whole, whole, 0.0)]
+    references = [outcome(case, {}) for case in cases]
+    rows = [_row("nothing", cases, references, references, 0.0)]
     for name, options in VARIANTS.items():
         started = time.process_time()
         outcomes = [outcome(case, options) for case in cases]
-        rows.append(_row(name, cases, outcomes, whole, time.process_time() - started))
+        seconds = time.process_time() - started
+        rows.append(_row(name, cases, outcomes, references, seconds))
     return markdown_table(rows)
 
 
@@ -157,49 +187,61 @@ def _row(
     name: str,
     cases: Sequence[Case],
     outcomes: Sequence[Outcome | None],
-    whole: Sequence[Outcome | None],
+    references: Sequence[Outcome | None],
     seconds: float,
 ) -> dict[str, str]:
-    logs: dict[str, list[FloatArray]] = {}
-    inside = []
-    for case, outcome_of_case, reference in zip(cases, outcomes, whole, strict=True):
+    """Return the row of a variant: its errors divided by those of the full estimator.
+
+    For each family, the row contains the geometric means of the ratios of translation and rotation
+    errors. Then follow the geometric mean over all families, the same mean without the family of
+    the largest ratio, the share of true values in 90 % intervals, and the time.
+
+    Parameters
+    ----------
+    name : str
+        Name of the part that is switched off.
+    cases : sequence of Case
+    outcomes, references : sequence of Outcome or None
+        Outcomes of the variant and of the full estimator for each case; None if it failed.
+    seconds : float
+        Processor time of the variant, s.
+    """
+    log_ratios: dict[str, list[FloatArray]] = {}
+    are_inside: list[bool] = []
+    for case, result, reference in zip(cases, outcomes, references, strict=True):
         if reference is None or np.nanmax(reference.errors) < _ROUNDING:
             continue
-        ratios = (
-            np.full(2, _FAILED)
-            if outcome_of_case is None
-            else outcome_of_case.errors / reference.errors
-        )
-        logs.setdefault(case.family, []).append(np.log(np.maximum(ratios, 1e-3)))
-        inside += (
-            [] if outcome_of_case is None else [*(outcome_of_case.in_sigmas < 1.645)]
-        )
-    means = {
-        family: np.mean(ratios_of_family, axis=0)
-        for family, ratios_of_family in logs.items()
-    }
-    by_family = [float(np.nanmean(mean)) for mean in means.values()]
-    others = sorted(by_family)[:-1]
-    return {
-        "Without": name,
-        **{
-            family: " ".join(f"{np.exp(x):.2f}" for x in mean)
-            for family, mean in means.items()
-        },
-        "All": f"{np.exp(np.mean(by_family)):.3f}",
-        "All but its best": f"{np.exp(np.mean(others)):.3f}",
-        "In 90 %": f"{100 * np.mean(inside):.0f} %",
+        ratios = np.full(2, _RATIO_OF_FAILURE)
+        if result is not None:
+            ratios = result.errors / reference.errors
+            are_inside += (result.in_sigmas < _HALF_WIDTH_90).tolist()
+        log_ratios_of_family = log_ratios.setdefault(case.family, [])
+        log_ratios_of_family.append(np.log(np.maximum(ratios, _MIN_RATIO)))
+    row = {"Without": name}
+    gains = []
+    for family, log_ratios_of_family in log_ratios.items():
+        mean = np.mean(log_ratios_of_family, axis=0)
+        row[family] = " ".join(f"{ratio:.2f}" for ratio in np.exp(mean))
+        gains.append(float(np.nanmean(mean)))
+    without_largest = sorted(gains)[:-1]
+    return row | {
+        "All": f"{np.exp(np.mean(gains)):.3f}",
+        "All but the largest gain": f"{np.exp(np.mean(without_largest)):.3f}",
+        "In 90 %": f"{100 * np.mean(are_inside):.0f} %",
         "s": f"{seconds:.0f}",
     }
 
 
 def main() -> None:
-    """Draw, solve and print."""
+    """Draw recordings, solve them with all variants, and print the table."""
     parser = study_parser("reproduction.ablation", __doc__)
     parser.add_argument(
-        "--repeats", type=int, default=10, help="recordings of each platform"
+        "--repeats",
+        type=int,
+        default=10,
+        help="recordings of each kind of platform",
     )
-    parser.add_argument("--seed", type=int, help="default: another one at every run")
+    parser.add_argument("--seed", type=int, help="default: a new seed at every run")
     arguments = parser.parse_args()
     seed = seed_of(arguments.seed)
     cases = [

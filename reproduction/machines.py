@@ -220,7 +220,10 @@ def _slip_of_wheels(
 def _wheels(
     machine: str, rng: np.random.Generator, driven: Course, slip: FloatArray
 ) -> tuple[list[float], FloatArray]:
-    """Return true parameters 2 to 3 % off, and what the wheels measure (N, channels)."""
+    """Return the true parameters of the wheels, and what the wheels measure (N, channels).
+
+    The true parameters differ from the nominal ones at random, by 2 to 3 % (1 sigma).
+    """
     speed, left_speed, yaw_rate = driven
     off = 1.0 + rng.normal(0.0, [0.02, 0.02, 0.03])
     if machine in ("wheels", "skid"):

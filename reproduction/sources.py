@@ -22,7 +22,10 @@ class PublishedSource:
     runs = published.N_RUNS
 
     def cases(self, dataset: str, level: float | None) -> list[Case]:
-        """List of Case of a data set at a level; None for those without levels."""
+        """Return the cases of a data set at a level.
+
+        ``level`` is None for data sets without levels.
+        """
         if dataset == "kitti_short":
             return [published.load_kitti_short(self.folder)]
         if dataset == "kitti_long":
@@ -34,8 +37,14 @@ class PublishedSource:
 
 @dataclass(frozen=True)
 class SimulatedSource:
-    """Drives like the published ones, made by our simulator; every one appears at every level, as
-    in the paper.
+    """Simulated drives like the published ones; all drives appear at all levels, as in the paper.
+
+    Attributes
+    ----------
+    seed : int
+        Seed of all drives.
+    runs : int
+        Number of drives.
     """
 
     seed: int = 0
@@ -44,7 +53,10 @@ class SimulatedSource:
     datasets = published.SIMULATED
 
     def cases(self, dataset: str, level: float | None) -> list[Case]:
-        """List of Case of a data set at a level; without published results."""
+        """Return the cases of a data set at a level. The cases have no published results.
+
+        ``level`` is None for data sets without levels.
+        """
         noise = _noise(dataset, level)
         cases = []
         for number in range(self.runs):
@@ -58,6 +70,7 @@ Source = PublishedSource | SimulatedSource
 
 
 def _noise(dataset: str, level: float | None) -> NoiseConfig:
+    """Return the noise of a data set at a level; the paper's mixture if there are no levels."""
     if level is None:
         return MIXTURE
     if dataset == "noise":

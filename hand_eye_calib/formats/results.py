@@ -16,7 +16,7 @@ from xml.sax.saxutils import quoteattr
 
 from hand_eye_calib.core.base.errors import InputError, located, printable, require_type
 from hand_eye_calib.core.base.registry import RESULT_METHODS
-from hand_eye_calib.core.base.spelling import Road
+from hand_eye_calib.core.base.spelling import Interface
 from hand_eye_calib.core.base.version import version_of
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
 from hand_eye_calib.core.results.document import (
@@ -367,7 +367,7 @@ def _remarks(calibration: Judged) -> list[str]:
     remarks = [
         calibration.headline,
         *(
-            f"{reason.sentence}: {reason.advice_on(Road.NODE)}"
+            f"{reason.sentence}: {reason.advice_on(Interface.NODE)}"
             for reason in calibration.reasons
         ),
         f"Pose of {child} in {parent}: maps coordinates of {child} into {parent}.",

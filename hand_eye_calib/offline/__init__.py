@@ -59,11 +59,11 @@ def _plot(result: Any, ax: Any) -> Any:
 
 
 def _report(result: Any, path: Path) -> Path:
-    from hand_eye_calib.core.base.spelling import Road
+    from hand_eye_calib.core.base.spelling import Interface
     from hand_eye_calib.formats.results import save_text
     from hand_eye_calib.offline.report.report import render
 
-    return save_text(path, render(result, result.recording, road=Road.PYTHON))
+    return save_text(path, render(result, result.recording, interface=Interface.PYTHON))
 
 
 def _html(result: Any) -> str:

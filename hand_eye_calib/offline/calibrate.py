@@ -17,7 +17,7 @@ from hand_eye_calib.core.base.errors import (
     require_type,
 )
 from hand_eye_calib.core.base.option import option_name
-from hand_eye_calib.core.base.spelling import Road, spelled
+from hand_eye_calib.core.base.spelling import Interface, spelled
 from hand_eye_calib.core.base.text import AXIS_UNITS, Prior, shown_value
 from hand_eye_calib.core.engine.cross_check import (
     answers_of_halves,
@@ -163,7 +163,7 @@ def calibrate(
             warnings.warn(text, UserWarning, stacklevel=2)
     result = run(snapshot, checks=checks, progress=progress)
     in_python = tuple(
-        spelled(text, Road.PYTHON) for text in result.calibration.warnings
+        spelled(text, Interface.PYTHON) for text in result.calibration.warnings
     )
     return replace(result.calibration, warnings=in_python, recording=result.snapshot)
 

@@ -37,7 +37,7 @@ class Motion:
         return se3.log(steps) / (2.0 * step_s)
 
 
-# Time (s) from one ramp to the next of a vehicle that drives what the node asks for.
+# A vehicle that follows the advice of the node drives over a ramp at this interval (s).
 RAMP_PERIOD_S = 31.0
 
 

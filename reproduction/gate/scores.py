@@ -1,4 +1,4 @@
-"""Scores of answers: errors over their bound, and whether stated intervals hold the truth."""
+"""Scores of answers: errors over their bound, and whether stated intervals contain the truth."""
 
 from dataclasses import dataclass
 
@@ -28,15 +28,15 @@ class Score:
     ``errors`` are those of translation and rotation, over the bound if there is one, otherwise in
     mm and deg; empty if an axis of a simulated recording is missing. ``robust_errors`` are the
     errors of robust least squares on the same recording, in the same units. ``over_bound`` and
-    ``nees``
-    are squared errors (6 degrees of freedom) under the bound and under the measured covariance.
+    ``nees`` are squared Mahalanobis distances of the errors (6 degrees of freedom) for the bound
+    and for the measured covariance.
     ``inside`` counts true values in measured 90 % intervals, ``inside_allowance`` those in
     intervals with the allowance, out of ``axes``.
     """
 
     family: str
     name: str
-    # Empty: no answer.
+    # Verdict of the answer; empty if there is no answer.
     verdict: str
     errors: tuple[float, ...] = ()
     robust_errors: tuple[float, ...] = ()
@@ -45,7 +45,8 @@ class Score:
     axes: int = 0
     inside: int = 0
     inside_allowance: int = 0
-    # USE, although an axis is outside its 99.9 % interval or the motion does not show it.
+    # Whether the verdict is USE, although an axis is outside its 99.9 % interval or the recording
+    # must be refused.
     is_wrong: bool = False
 
 
@@ -96,10 +97,11 @@ def score(case: Case) -> Score:
 def _errors_of(
     case: Case, result: Calibration, is_observed: BoolArray
 ) -> tuple[float, ...]:
-    """Errors of translation and rotation, over the bound if there is one, otherwise in mm and deg.
+    """Return the errors of translation and rotation of an answer to a case.
 
-    Axes that the answer to be scored does not observe do not count in real recordings. A simulated
-    recording has no errors then.
+    Errors are divided by the bound of a simulated recording. A real recording has no bound: its
+    errors are in mm and deg. Only the axes in ``is_observed`` (6,) are compared with the truth of a
+    real recording. For a simulated recording with an unobserved axis, the tuple is empty.
     """
     errors = deviation(result.T_parent_child, case.T_parent_child)
     if case.bound is None:
@@ -116,7 +118,7 @@ def _errors_of(
 
 
 def _to_parent(result: Calibration) -> FloatArray:
-    """Rotation (6, 6) of errors from the child's axes to the parent's axes."""
+    """Return the rotation (6, 6) of errors from the child's axes to the parent's axes."""
     return np.asarray(np.kron(np.eye(2), result.T_parent_child[:3, :3]))
 
 
@@ -126,13 +128,15 @@ def score_simulated(family: str, seed: int, number: int) -> Score:
 
 
 def _squared(errors: FloatArray, covariance: FloatArray) -> float:
+    """Return the squared Mahalanobis distance of errors."""
     return float(errors @ np.linalg.solve(covariance, errors))
 
 
 def _sizes(errors: FloatArray, truth_sigmas: FloatArray) -> tuple[float, ...]:
-    """Translation (mm) and rotation (deg), without a part of which the truth knows no axis.
+    """Return the sizes of the translation error (mm) and of the rotation error (deg).
 
-    Half of the truth's own standard deviation counts as error: below it, gains are luck.
+    A part is left out if no axis of its truth is known. Half of the truth's standard deviation is
+    added in quadrature, because smaller improvements are chance.
     """
     known_sigmas = np.where(np.isfinite(truth_sigmas), truth_sigmas, 0.0)
     squares = errors**2 + 0.25 * known_sigmas**2

@@ -1,8 +1,9 @@
-"""Is a session that has reached its goal good enough, and how much sooner might it have ended?
+"""Study of the end of a session: is its result within the target, and could it have ended sooner?
 
-Every recording is cut off after ever longer times. Each part is calibrated, and the goal judges the
-results in turn, as in the node. The error against the truth is known where the goal is reached.
-Other rules for the end of a session are applied to the same results.
+The parts of a recording begin with the recording and have increasing lengths. Each part is
+calibrated, and the goal judges the results in turn, as in the node. At the part that reaches the
+goal, the error is computed against the truth. Other rules for the end of a session are applied to
+the same results.
 """
 
 from __future__ import annotations
@@ -35,26 +36,39 @@ KINDS = {
     "drone": {"drone_gnss_vio": 180.0, "drone_two_vios": 180.0},
     "arm": {"arm_target": 180.0},
 }
+# Default target of each axis: 2 cm and 0.3 deg (m, rad).
 TARGET = np.r_[np.full(3, 0.02), np.full(3, 0.00524)]
+# Factors of the default target that are tried.
 FACTORS = (0.5, 1.0, 2.0)
 
 # First end (s) of the parts of a recording, and their interval (s) in the first two minutes.
 _FIRST_S = 20.0
 _INTERVAL_S = 5.0
 _FINE_UNTIL_S = 120.0
-# Later interval (s), and as a share of the time.
+# Interval after the first two minutes: the larger of this time (s) ...
 _LATER_INTERVAL_S = 10.0
+# ... and this share of the time so far.
 _LATER_SHARE = 0.06
 
-# Key of the recordings' random numbers.
+# First number of the seeds of all recordings.
 _KEY = 57
 
 
 class Rule(NamedTuple):
     """A rule for the end of a session.
 
-    All standard deviations are below a share of their targets, at all results of a further motion.
-    This motion is a share of the motion before it, within limits (s).
+    The session ends if all standard deviations remain within a share of their targets for a further
+    time of motion. This time is a share of the motion until the standard deviations came within
+    their targets, and is limited.
+
+    Attributes
+    ----------
+    of_target : float
+        Share of the targets.
+    of_motion : float
+        Share of the motion before.
+    shortest_s, longest_s : float
+        Limits of the further time of motion, s.
     """
 
     of_target: float
@@ -89,7 +103,7 @@ RULES = [
 
 
 class Recorded(NamedTuple):
-    """A recording with a known answer, and what a user would give."""
+    """A recording with a known extrinsic, and the options that a user would set."""
 
     name: str
     kind: str
@@ -99,8 +113,17 @@ class Recorded(NamedTuple):
 
 
 class Step(NamedTuple):
-    """A part of a recording: its end (s), the error (6,) along and about the parent's axes, and
-    what the session is told.
+    """Result of a part of a recording.
+
+    Attributes
+    ----------
+    end_s : float
+        End of the part after the start of the recording, s.
+    error : (6,) array
+        Error along and about the parent's axes (m, rad).
+    calibration : Calibration
+    seen : Excitation
+        Motion of the part.
     """
 
     end_s: float
@@ -111,30 +134,49 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True)
 class Stop:
-    """How the session of a recording ended with a target."""
+    """End of the session of a recording, for a target and a rule.
+
+    Attributes
+    ----------
+    kind : str
+        Kind of motion, or name of a real rig.
+    rule : str
+        Text of an entry of RULES; empty for the rule of the node.
+    factor : float
+        Factor of the default target.
+    is_stuck : bool
+        Whether the session did not reach the target, after the message that this motion will not
+        reach it.
+    is_done : bool
+        Whether the rule ended the session. The next three values are NaN otherwise.
+    worst : float
+        Largest ratio of an error to its target at the end. The uncertainty of the truth is
+        subtracted from the error.
+    seconds : float
+        End of the session, s.
+    earliest_s : float
+        Start (s) of the time during which all errors were within their targets until the end; NaN
+        if an error exceeds its target at the end.
+    n_times : int
+        Number of reports of the time left, before the end.
+    n_good_times : int
+        Number of these reports within a factor of two of the true time left.
+    """
 
     kind: str
-    # Of RULES; empty for the rule of the node.
     rule: str
-    # Of the default targets.
     factor: float
-    # Whether the user was told that this motion will not reach the target, and this was right.
     is_stuck: bool
     is_done: bool = False
-    # The next three are of sessions that were told to stop. Largest error over its target, less the
-    # uncertainty of the truth.
     worst: float = np.nan
-    # Time of the stop.
     seconds: float = np.nan
-    # Time since which all errors had been within their targets.
     earliest_s: float = np.nan
-    # Reported times left before the end, and those within a factor of two.
     n_times: int = 0
     n_good_times: int = 0
 
 
 def simulated(seeds: int, first_seed: int = 0) -> Iterator[Recorded]:
-    """So many recordings of each class; twice as many of a kind that has one class."""
+    """Yield ``seeds`` recordings of each class; twice as many for a kind with only one class."""
     for kind, classes in KINDS.items():
         for name, duration_s in classes.items():
             n_seeds = seeds * 2 // len(classes)
@@ -152,7 +194,7 @@ def simulated(seeds: int, first_seed: int = 0) -> Iterator[Recorded]:
 
 
 def real(rigs: Sequence[Rig]) -> Iterator[Recorded]:
-    """The recordings of rigs whose answer is known."""
+    """Yield the recordings of rigs whose extrinsic is known."""
     for rig in rigs:
         if rig.truth is not None:
             for name, recording in rig.recordings.items():
@@ -162,7 +204,7 @@ def real(rigs: Sequence[Rig]) -> Iterator[Recorded]:
 
 
 def stops(recorded: Recorded) -> list[dict[str, Any]]:
-    """Plain values of a :class:`Stop` for every factor of the target, and for every rule."""
+    """Return a :class:`Stop`, as a dictionary, for every factor of the target and every rule."""
     steps = list(_steps(recorded))
     return [
         vars(stop) for factor in FACTORS for stop in _stops(recorded, steps, factor)
@@ -170,7 +212,7 @@ def stops(recorded: Recorded) -> list[dict[str, Any]]:
 
 
 def _ends_s(duration_s: float) -> list[float]:
-    """Ends (s) of the parts of a recording."""
+    """Return the ends (s) of the parts of a recording."""
     ends_s = [min(_FIRST_S, duration_s)]
     while ends_s[-1] < duration_s:
         step_s = _INTERVAL_S
@@ -181,14 +223,15 @@ def _ends_s(duration_s: float) -> list[float]:
 
 
 def _steps(recorded: Recorded) -> Iterator[Step]:
-    """Calibrations of the parts; those that cannot be solved are left out."""
+    """Yield the results of the parts. Parts that cannot be solved are left out."""
     options: dict[str, Any] = dict(recorded.options)
     of_axes = prior_fields(options.pop("prior", {}))
     options |= {name.replace("_", ".", 1): value for name, value in of_axes.items()}
     options = {"max_pairs": CalibratorConfig.max_pairs, **options}
     streams = recorded.recording.parent, recorded.recording.child
     of_parent, of_child = (stream.stamps_ns[[0, -1]] for stream in streams)
-    # Clocks of their own: the child's part is the same share of its recording.
+    # Streams on the same clock are cut at the same stamp. If the clocks differ, the child's part is
+    # the same share of its recording as the parent's.
     if abs(of_child[0] - of_parent[0]) < 10 * 10**9:
         of_child = of_parent
     duration_s = float(np.ptp(of_parent) * 1e-9)
@@ -211,14 +254,14 @@ def _steps(recorded: Recorded) -> Iterator[Step]:
 
 
 def until(trajectory: Trajectory, stamp_ns: int) -> Trajectory:
-    """The poses up to a stamp (ns), three at least."""
+    """Return the poses up to a stamp (ns), at least three."""
     return trajectory[
         : max(int(np.searchsorted(trajectory.stamps_ns, stamp_ns, side="right")), 3)
     ]
 
 
 def _stops(recorded: Recorded, steps: Sequence[Step], factor: float) -> Iterator[Stop]:
-    """Let the goal, and each rule, judge the results of a recording in turn."""
+    """Yield the ends of the session: by the goal of the node, then by each of RULES."""
     goal = Goal(factor * TARGET)
     is_stuck = False
     # Motion (s) and time left (s) of each result.
@@ -245,7 +288,7 @@ def _stops(recorded: Recorded, steps: Sequence[Step], factor: float) -> Iterator
 
 
 def end_of(rule: Rule, steps: Sequence[Step], factor: float) -> int | None:
-    """Index of the part after which a rule ends the session."""
+    """Return the index of the part after which a rule ends the session; None if it does not."""
     targets = rule.of_target * factor * TARGET
     since_s = None
     for index, step in enumerate(steps):
@@ -265,7 +308,7 @@ def end_of(rule: Rule, steps: Sequence[Step], factor: float) -> int | None:
 def _stop(
     recorded: Recorded, rule: str, steps: Sequence[Step], factor: float, end: int | None
 ) -> Stop:
-    """The end of a session after a part; None for a session that goes on."""
+    """Return the end of a session after the part ``end``, which is None if no part ends it."""
     if end is None:
         return Stop(recorded.kind, rule, factor, is_stuck=False)
     worst = [
@@ -286,15 +329,20 @@ def _stop(
 
 
 def _worst(error: FloatArray, truth_sigmas: FloatArray, factor: float) -> float:
-    """Largest error over target; where the truth is known to less than that, it says nothing."""
+    """Return the largest ratio of an error to its target.
+
+    Twice the standard deviation of the truth is subtracted from each error. Axes without a known
+    truth are left out.
+    """
     unsure = 2.0 * truth_sigmas
     excess = np.where(np.isfinite(unsure), np.maximum(np.abs(error) - unsure, 0.0), 0.0)
     return float((excess / (factor * TARGET)).max())
 
 
 def table(stops: Sequence[Stop], which: str) -> str:
-    """A row for all recordings with each target; of simulated ones, with the default targets, one
-    for each kind, too.
+    """Return a table with a row for each target.
+
+    For simulated recordings and the default target, each kind of motion has a row, too.
     """
     rows = []
     for factor in FACTORS:
@@ -309,7 +357,7 @@ def table(stops: Sequence[Stop], which: str) -> str:
 
 
 def rules_table(stops: Sequence[Stop]) -> str:
-    """A row for the rule of the node, and for each other rule."""
+    """Return a table with a row for the rule of the node and for each of RULES."""
     rows = []
     for rule in dict.fromkeys(stop.rule for stop in stops):
         row: dict[str, object] = {"rule": rule or "**of the node**"}

@@ -524,17 +524,17 @@ class TestFullMotion:
         )
 
 
-@pytest.mark.parametrize("road", ["Python", "command", "YAML", "page"])
+@pytest.mark.parametrize("interface", ["Python", "command", "YAML", "page"])
 def test_centimetres_that_were_typed_without_a_unit_are_asked_about(
-    road, tmp_path, capsys
+    interface, tmp_path, capsys
 ):
     paths = motions.write_pair(tmp_path, *flat_drive())
     expected = "prior.z needs a unit: -22"
-    if road == "Python":
+    if interface == "Python":
         with pytest.raises(ConfigError, match=expected):
             calibrate(*flat_drive(), prior={"z": (-22.0, 2.0)})
         return
-    if road == "page":
+    if interface == "page":
         with pytest.raises(ConfigError, match=expected):
             CalibratorConfig(prior_z=prior_as_typed("z", "-22", "2"))
         assert prior_as_typed("z", "-22 ", "2cm") == "-22+/-2cm"
@@ -543,7 +543,7 @@ def test_centimetres_that_were_typed_without_a_unit_are_asked_about(
         assert prior_as_typed("yaw", "-90", "2") == "-90deg+/-2deg"
         return
     options = ["--prior", "z=-22+/-2"]
-    if road == "YAML":
+    if interface == "YAML":
         file = tmp_path / "options.yaml"
         file.write_text("prior.z: -22+/-2\n", encoding="utf-8")
         options = ["--config", str(file)]

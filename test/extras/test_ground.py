@@ -537,13 +537,13 @@ def test_pairs_of_a_rig_read_the_ground_of_the_first_sensor_once(tmp_path, monke
     assert reads == ["lidar", "rear", "rear"]
 
 
-# ------------------------------------------------------------------- all roads
+# ------------------------------------------------------------------- all interfaces and commands
 
 TOPICS = ("--parent-topic", "/a", "--child-topic", "/b")
 
 
 def by_command(*words):
-    """A road: a command with the bag, which saves its result."""
+    """Calibrate by a command with the bag, which saves its result."""
 
     def run(bag, out, ground):
         main([*words, str(bag), *TOPICS, "--out", str(out), "--ground", ground])
@@ -596,7 +596,7 @@ def by_python(bag, out, ground):
     return hec.calibrate(bag, parent_topic="/a", child_topic="/b", ground=ground)
 
 
-ROADS = {
+INTERFACES = {
     "calibrate": by_command("calibrate"),
     "replay": by_command("replay"),
     "batch": by_batch,
@@ -616,11 +616,11 @@ def bag_of_lidars(tmp_path_factory):
 
 @pytest.mark.filterwarnings("ignore:ground from")
 @pytest.mark.parametrize("ground", ["auto", "off"])
-@pytest.mark.parametrize("road", ROADS)
-def test_every_road_uses_the_ground_of_a_bag(
-    road, ground, bag_of_lidars, tmp_path, no_figures
+@pytest.mark.parametrize("interface", INTERFACES)
+def test_every_interface_uses_the_ground_of_a_bag(
+    interface, ground, bag_of_lidars, tmp_path, no_figures
 ):
-    result = ROADS[road](bag_of_lidars, tmp_path / "out", ground)
+    result = INTERFACES[interface](bag_of_lidars, tmp_path / "out", ground)
     assert result.hidden == ([] if ground == "auto" else ["z"])
 
 

@@ -20,7 +20,7 @@ from result_making import NAMES, calibration, dofs, written_finding
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.assessment.comparison import with_comparison
-from hand_eye_calib.core.base.spelling import Road
+from hand_eye_calib.core.base.spelling import Interface
 from hand_eye_calib.core.base.text import amount, change, with_sigma
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry import se3
@@ -192,7 +192,7 @@ def test_what_is_unobservable_is_said_first_with_what_to_do(planar):
     verdict = page.text[: page.text.index("Pose of lidar in camera Maps")]
     for reason in calibration.reasons:
         assert reason.sentence.lower() in verdict.lower()
-        assert reason.advice_on(Road.TERMINAL) in verdict
+        assert reason.advice_on(Interface.TERMINAL) in verdict
     assert "USE WITH CARE All but z; measure z by hand" in verdict
     assert "z cannot be determined from this motion" in verdict
     assert re.search(r"Motion: .*z cannot be determined", verdict)

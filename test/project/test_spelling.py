@@ -1,4 +1,4 @@
-"""Messages name options as the road of the user spells them: command line, Python or node."""
+"""Messages spell options for the interface of the user: command line, Python or node."""
 
 import ast
 import inspect
@@ -13,7 +13,7 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.registry import FINDING_WORDS
 from hand_eye_calib.core.base.spelling import (
     PLACEHOLDER,
-    Road,
+    Interface,
     spelled,
     spelled_options,
     with_options,
@@ -66,16 +66,16 @@ SPELLINGS = {
 def test_an_option_in_a_message_is_spelled_as_its_road_does(text):
     typed, in_python = SPELLINGS[text]
     assert as_typed(text) == typed
-    assert spelled(text, Road.PYTHON) == in_python
-    assert spelled(text, Road.NODE) == text
+    assert spelled(text, Interface.PYTHON) == in_python
+    assert spelled(text, Interface.NODE) == text
 
 
 def test_options_are_joined_as_their_road_does():
     options = {"prior.z": "VALUE+/-SIGMA", "scale": "estimate", "prior.x": "1.5+/-0.1"}
-    assert spelled_options(options.items(), Road.PYTHON) == (
+    assert spelled_options(options.items(), Interface.PYTHON) == (
         'scale="estimate", prior={"z": (0.50, 0.02), "x": (1.5, 0.1)}'
     )
-    assert spelled_options(options.items(), Road.NODE) == (
+    assert spelled_options(options.items(), Interface.NODE) == (
         "prior.z 0.50+/-0.02, scale estimate, prior.x 1.5+/-0.1"
     )
 
@@ -98,12 +98,14 @@ def test_the_options_of_each_finding_exist_on_all_roads(key, flags):
     assert not re.search("--[a-z]", text), "the engine writes public names"
     assert {*re.findall(r"--[a-z][a-z-]*", as_typed(text))} <= flags
     parameters = {*inspect.signature(hec.calibrate).parameters, "setup"}
-    assert {*re.findall(r"(\w+)=", spelled(text, Road.PYTHON))} <= parameters
+    assert {*re.findall(r"(\w+)=", spelled(text, Interface.PYTHON))} <= parameters
     for name in CalibratorConfig.by_name():
         if "_" in name or "." in name:
             pattern = rf"(?<![\w.]){re.escape(name)}(?![\w.])"
             assert not re.search(pattern, as_typed(text))
-            assert "." not in name or not re.search(pattern, spelled(text, Road.PYTHON))
+            assert "." not in name or not re.search(
+                pattern, spelled(text, Interface.PYTHON)
+            )
 
 
 def test_each_reason_for_unknown_axes_names_a_prior_that_python_accepts():
@@ -119,12 +121,12 @@ def test_each_reason_for_unknown_axes_names_a_prior_that_python_accepts():
     assert {*prior} == {*reason.axes}
     again = hec.calibrate(parent, child, checks=False, prior=prior)
     assert not again.hidden
-    assert "such as --prior z=0.50+/-0.02" in reason.advice_on(Road.TERMINAL)
+    assert "such as --prior z=0.50+/-0.02" in reason.advice_on(Interface.TERMINAL)
 
 
 def test_an_option_in_an_advice_is_not_repeated():
     options = {"scale": "estimate", "prior.yaw": PLACEHOLDER, "max_gap": 2.0}
-    text = with_options("give scale estimate, and a prior", options, Road.TERMINAL)
+    text = with_options("give scale estimate, and a prior", options, Interface.TERMINAL)
     assert text == (
         "give --scale estimate, and a prior: --max-gap 2.0, such as --prior yaw=90deg+/-2deg"
     )

@@ -17,8 +17,8 @@ from hand_eye_calib.core.base.option import check_value
 Pairs: TypeAlias = Iterable[tuple[str, object]]
 
 
-class Road(Enum):
-    """Way on which a user gives options: command line, Python, or YAML files and parameters."""
+class Interface(Enum):
+    """Interface for options: command line, Python, or YAML files and ROS parameters."""
 
     TERMINAL = "terminal"
     PYTHON = "python"
@@ -46,10 +46,10 @@ _OPTION_IN_TEXT = re.compile(
 _PLAIN_PRIOR = re.compile(r"(-?[\d.]+)\+/-([\d.]+)")
 
 
-def spelled(text: str, road: Road, others: Iterable[str] = ()) -> str:
-    """Return a message of the engine with its options as a user of the road spells them.
+def spelled(text: str, interface: Interface, others: Iterable[str] = ()) -> str:
+    """Return a message of the engine with its options in the spelling of an interface.
 
-    ``others`` are names of further options of the road that messages contain.
+    ``others`` are names of further options of the interface that messages contain.
     """
 
     def option(match: re.Match[str]) -> str:
@@ -58,23 +58,23 @@ def spelled(text: str, road: Road, others: Iterable[str] = ()) -> str:
         if name not in _FIELDS and name not in _CHOICES and name not in others:
             return match[0]
         if value is None:
-            return _name_alone(name, road)
+            return _name_alone(name, interface)
         if _is_value(name, value):
-            return spelled_options([(name, value)], road)
-        return f"{_name_alone(name, road)} {value}"
+            return spelled_options([(name, value)], interface)
+        return f"{_name_alone(name, interface)} {value}"
 
-    return text if road is Road.NODE else _OPTION_IN_TEXT.sub(option, text)
+    return text if interface is Interface.NODE else _OPTION_IN_TEXT.sub(option, text)
 
 
-def spelled_options(options: Pairs, road: Road) -> str:
-    """Return pairs of public option name and value as a user of the road gives them.
+def spelled_options(options: Pairs, interface: Interface) -> str:
+    """Return pairs of public option name and value in the spelling of an interface.
 
     An example replaces the value of a prior that the user has to measure.
     """
     options = [(name, _example_of(name, value)) for name, value in options]
-    if road is Road.TERMINAL:
+    if interface is Interface.TERMINAL:
         return " ".join(_typed(name, value) for name, value in options)
-    if road is Road.NODE:
+    if interface is Interface.NODE:
         return ", ".join(f"{name} {value}" for name, value in options)
     arguments = []
     priors = []
@@ -83,28 +83,32 @@ def spelled_options(options: Pairs, road: Road) -> str:
         if group == "prior":
             priors.append(f'"{axis}": {_prior_of_python(str(value))}')
         else:
-            arguments.append(f"{_name_alone(name, road)}={_value_of_python(value)}")
+            arguments.append(
+                f"{_name_alone(name, interface)}={_value_of_python(value)}"
+            )
     if priors:
         arguments.append(f"prior={{{', '.join(priors)}}}")
     return ", ".join(arguments)
 
 
-def with_options(advice: str, options: Mapping[str, object], road: Road) -> str:
-    """Return an advice with the options that it needs, as a user of the road gives them.
+def with_options(
+    advice: str, options: Mapping[str, object], interface: Interface
+) -> str:
+    """Return an advice with the options that it needs, in the spelling of an interface.
 
     Options that the advice contains are not repeated.
     """
-    text = spelled(advice, road)
+    text = spelled(advice, interface)
     ready, measured = {}, {}
     for name, value in options.items():
         if value == PLACEHOLDER:
             measured[name] = value
-        elif spelled_options([(name, value)], road) not in text:
+        elif spelled_options([(name, value)], interface) not in text:
             ready[name] = value
     if ready:
-        text = f"{text}: {spelled_options(ready.items(), road)}"
+        text = f"{text}: {spelled_options(ready.items(), interface)}"
     if measured:
-        text = f"{text}, such as {spelled_options(measured.items(), road)}"
+        text = f"{text}, such as {spelled_options(measured.items(), interface)}"
     return text
 
 
@@ -139,14 +143,14 @@ def _is_value(name: str, text: str) -> bool:
 
 def _typed(name: str, value: object) -> str:
     """Return an option and its value, such as ``--max-gap 0.2`` or ``--prior z=1.85+/-0.02``."""
-    typed = _name_alone(name, Road.TERMINAL)
+    typed = _name_alone(name, Interface.TERMINAL)
     return f"{typed}={value}" if name.startswith("prior.") else f"{typed} {value}"
 
 
-def _name_alone(name: str, road: Road) -> str:
+def _name_alone(name: str, interface: Interface) -> str:
     """Return an option without value, such as ``--max-gap``, ``--prior z`` or ``prior["z"]``."""
     group, _, axis = name.partition(".")
-    if road is Road.TERMINAL:
+    if interface is Interface.TERMINAL:
         return f"--prior {axis}" if group == "prior" else f"--{name}".translate(_DASHES)
     return f'prior["{axis}"]' if group == "prior" else name.replace(".", "_")
 

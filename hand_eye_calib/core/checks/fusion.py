@@ -10,8 +10,8 @@ true mount. A filter of time constant T pulls the difference E of the child's po
 
     E_k = Ad_k^-1 N_k D,        N_k = r (N_(k-1) + Ad_k - Ad_(k-1)),        r = exp(-dt / T).
 
-N is a high-pass filter of ``Ad``. The constant D of the mount is estimated for each of some T by a
-robust regression. D is zero without such a filter. The same regressors result if the filter
+N is a high-pass filter of ``Ad``. A robust regression estimates the constant D of the mount,
+for several values of T. D is zero without such a filter. The same regressors result if the filter
 corrects the parent by the child, or both streams by a third stream.
 """
 
@@ -54,16 +54,17 @@ _CERTAIN_SHARE = 0.35
 
 
 class _Fit(NamedTuple):
-    """Difference D of the true mount from the assumed mount, for a filter.
+    """Error D of the mount that a filter with a time constant assumes.
 
     Attributes
     ----------
     time_constant_s : float
         Time constant of the filter, s.
     mount_change : (6,) array
-        D: translation (m) and rotation vector (rad), in the child's axes.
+        D, which leads from the assumed to the true mount: translation (m) and rotation vector
+        (rad), in the child's axes.
     translation_sigmas, rotation_sigmas : float
-        Both parts of D in their standard deviations.
+        Sizes of the translation and of the rotation of D, in their standard deviations.
     share : float
         Share of the squared residuals that D explains.
     """
@@ -117,8 +118,8 @@ def check_correction(
     Returns
     -------
     Finding or None
-        An error if the filter explains most of what the streams differ by. Otherwise a warning,
-        which counts only if no other fault was found.
+        An error if the filter explains most of the difference between the streams. Otherwise a
+        warning, which is used only if no other fault was found.
     """
     best = _best_fit(pose_pairs, T_parent_child)
     if best is None or not (best.is_turned or best.is_shifted):
@@ -208,10 +209,10 @@ class _Regressors:
         return perturbations[self._end] - at_start
 
     def usual_errors(self) -> FloatArray:
-        """Return the regressors (K, 6, 10) of errors that are no filter.
+        """Return the regressors (K, 6, 10) of errors that have other causes than a filter.
 
-        These are an error of the extrinsic (6), a clock offset, a scale, and a delay of the
-        positions of the child or of the parent after their orientations.
+        The errors are an error of the extrinsic (6), a clock offset, a scale, a delay of the
+        child's positions after its orientations, and the same delay of the parent.
         """
         mount = np.eye(6) - self._to_end
         steps = se3.log(se3.inverse(self._poses[:-1]) @ self._poses[1:])
@@ -232,7 +233,11 @@ class _Regressors:
         return np.concatenate([mount, of_motions], axis=2)
 
     def filtered(self, time_constant_s: float) -> FloatArray:
-        """Return the regressors (K, 6, 6) of D for a filter of a time constant (s)."""
+        """Return the regressors (K, 6, 6) of D, the error of the assumed mount.
+
+        The regressors are those for a filter with this time constant (s), which pulls one stream
+        towards the other.
+        """
         kept = np.exp(-median(np.diff(self._seconds)) / time_constant_s)
         # The lower half of an adjoint repeats its rotation.
         upper = self._adjoints[:, :3]

@@ -46,8 +46,9 @@ _ROUNDING_RAD = 0.01 * np.radians(0.08)
 # The residual must also be below this share of the rotation angle between the poses.
 _SMALL_SHARE = 0.005
 
-# Interpolation adds errors. Therefore only poses nearest in time to a pose of the other stream are
-# compared: a hundredth of all poses, but at least the first and at most the second number.
+# Interpolation adds errors. Therefore only those poses are compared whose time to a pose of the
+# other stream is smallest: a hundredth of all poses, but at least the first number. If there are
+# more than the second number, every k-th is used, so that at most the second number remains.
 _NEAREST = (40, 300)
 
 # Noise that both streams share is measured in the upper half of their spectra.
@@ -170,7 +171,8 @@ def _second_half(computed: Trajectory, source: Trajectory) -> Trajectory:
 def _residual_at_nearest(computed: Trajectory, source: Trajectory) -> float:
     """Return the residual angle (rad) between the rotations of both streams.
 
-    Poses of ``computed`` are used for which a pose of ``source`` is nearest in time.
+    Only the poses of ``computed`` with the smallest time to a pose of ``source`` are used, a
+    hundredth of all (see _NEAREST).
     """
     rows = _within(computed, source)
     stamps_ns = computed.stamps_ns[rows]

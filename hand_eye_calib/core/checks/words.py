@@ -169,8 +169,8 @@ WORDS = {
         "that are clockwise from north heading, all others yaw",
     ),
     "euler_order": FindingWords(
-        "{whose} orientations seem to be angles about turning axes, roll about x first, that were "
-        "read as angles about fixed axes",
+        "{whose} orientations seem to be intrinsic angles (about the turned axes, roll first) that "
+        "were read as angles about fixed axes",
         "write quaternions, or roll, pitch and yaw about the fixed axes x, y and z (REP 103)",
     ),
     "motions": FindingWords(
@@ -278,7 +278,7 @@ WORDS = {
     "rotation_gain": FindingWords(
         "the child rotates {gain:.4f} +/- {sigma:.4f} times as far as the parent about ({axis}) in "
         "the parent sensor's frame",
-        "calibrate that scale first",
+        "calibrate the gyroscope or the wheel base first",
         "a gyroscope or wheel base with a wrong scale, in either stream",
     ),
     "turns": FindingWords(
@@ -308,7 +308,7 @@ WORDS = {
         "about {axis} of its world",
         "give positions and orientations in one and the same world",
         "magnetic declination or grid convergence in one of them, or poses that were fused with "
-        "the other sensor's through a wrong transform",
+        "those of the other sensor by a wrong transform",
     ),
     "model_scale": FindingWords(
         "the child's lengths are {size} % {than} than the parent's; the result allows for it",
@@ -325,7 +325,7 @@ WORDS = {
     "smoothed": FindingWords(
         "{whose} {part} are smoothed over about {smoothing_s:.2f} s, the other's are not: this "
         "displaces poses by about {shift_m:.2g} m, and the translation by as much or more",
-        "use the poses before that filter",
+        "use the poses before the smoothing filter",
         "a low-pass or smoothing filter",
         code="smoothed_{part}",
     ),

@@ -31,11 +31,14 @@ def with_solved_offset(finding: Finding, calibration: Calibration) -> Finding:
 
 
 def note_on_unit(snapshot: Snapshot) -> str:
-    """Return a note that a scale of the child explains the lengths as well as a unit does.
+    """Return a note that the parent's lengths may be metres, and the child's scale may be wrong.
 
-    A unit of the parent and a scale of the child leave the same residuals, but lengths of the
-    result differ by the factor. The note is empty if the user has set no unit of the parent or a
-    scale of the child, or if the motion excludes metres.
+    The streams agree equally well with a unit of the parent and with a scale of the child, but the
+    lengths of the two results differ by a factor. The note is empty in these cases:
+
+    - the user set the child's scale;
+    - the user set no unit of the parent;
+    - the parent would be too fast or too slow if its lengths were metres.
     """
     config = snapshot.config
     factor = config.parent_scale
@@ -47,6 +50,6 @@ def note_on_unit(snapshot: Snapshot) -> str:
         return ""
     return (
         f"the parent's lengths were multiplied by {factor:g}, as given. If they are metres, and "
-        "the child has a scale of its own, give scale estimate instead: then all lengths of the "
-        f"result are {1.0 / factor:.4g} times as long, and the streams agree as well"
+        "the child's scale is wrong, give scale estimate instead: all lengths of the result are "
+        f"then {1.0 / factor:.4g} times as long, and the streams agree equally well"
     )

@@ -14,7 +14,7 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.plain import Document, from_plain, plain
 from hand_eye_calib.core.base.registry import FINDING_WORDS
-from hand_eye_calib.core.base.spelling import Road, with_options
+from hand_eye_calib.core.base.spelling import Interface, with_options
 from hand_eye_calib.core.geometry.trajectory import Columns
 
 # Motion pairs with more weight than this count as inliers.
@@ -198,13 +198,13 @@ class Finding:
     @property
     def what_to_do(self) -> str:
         """The advice with its options, as a Python program gives them."""
-        return self.advice_on(Road.PYTHON)
+        return self.advice_on(Interface.PYTHON)
 
-    def advice_on(self, road: Road) -> str:
-        """Return the advice with its options, as a user of the road gives them."""
+    def advice_on(self, interface: Interface) -> str:
+        """Return the advice with its options, in the spelling of an interface."""
         if self.severity is Severity.NOTE and self.code not in _NOTES_WITH_ADVICE:
             return NO_ACTION
-        return with_options(self.advice, self.options, road)
+        return with_options(self.advice, self.options, interface)
 
     @property
     def cause(self) -> str:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from hand_eye_calib.core.base.config import METHODS
 from hand_eye_calib.core.base.registry import EXTRA_RULES
-from hand_eye_calib.core.base.spelling import PLACEHOLDER, Road, with_options
+from hand_eye_calib.core.base.spelling import PLACEHOLDER, Interface, with_options
 from hand_eye_calib.core.base.text import (
     amount,
     axes_in_words,
@@ -98,11 +98,11 @@ class Reason:
     @property
     def what_to_do(self) -> str:
         """The advice with its options, as a Python program gives them."""
-        return self.advice_on(Road.PYTHON)
+        return self.advice_on(Interface.PYTHON)
 
-    def advice_on(self, road: Road) -> str:
-        """Return the advice with its options, as a user of the road gives them."""
-        return with_options(self.advice, self.options, road)
+    def advice_on(self, interface: Interface) -> str:
+        """Return the advice with its options, in the spelling of an interface."""
+        return with_options(self.advice, self.options, interface)
 
     @property
     def is_finding(self) -> bool:
@@ -160,8 +160,8 @@ _KINDS = dict.fromkeys(
 )
 _NO_FAULT = "a limit of the recording, no fault was found"
 
-# Words of the rules "halves" and "methods": which estimates disagree, words before the standard
-# deviations of the result, and what the user should do.
+# Texts of the rules "halves" and "methods", in three parts: which estimates disagree, the
+# introduction to the standard deviations of the result, and what the user should do.
 _CONTRADICTION_TEXTS = {
     "halves": (
         "the two halves of the recording disagree",

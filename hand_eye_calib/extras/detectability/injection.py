@@ -21,9 +21,9 @@ odometry is the same in both halves; the allowance stands for it.
 *Shifts of the mount.* The child's poses after a time in the middle are moved by ``exp(a u)``: a
 shift of size a along the unit vector u. The likelihood ratio of the stream checks
 (:mod:`hand_eye_calib.core.assessment.moved`) yields a first size from the evidence.
-Then shifts of this size are really injected, and the stream check is asked. The size grows until
-the check reports the shift. Nothing is solved again. The injections take longer than the rest, so
-they wait until the sizes of the shifts are read.
+Then shifts of this size are injected, and the stream check runs. The size grows until the check
+reports the shift. X is not estimated again. The injections take longer than the rest. Therefore
+they wait until a caller reads the sizes of the shifts.
 """
 
 from dataclasses import replace
@@ -70,8 +70,8 @@ _LEAST_SECONDS = 2 * _JACKKNIFE_BLOCKS[0]
 # noise anew, with the shift. In fresh draws of 30 simulated drives, the check needed factors of 1.3
 # (median) and 1.6 (90 % of shifts).
 _WEIGHT_FACTOR = 1.6
-# Smallest shift (m or rad) that is stated. The check does not report smaller ones than its limit;
-# its estimate of a shift has an error, too.
+# Smallest shift (m or rad) that is stated. The check does not report a shift below its limit, and
+# the estimate of the shift by the check has an error, too.
 _LEAST_SHIFT = _SIGMA_MARGIN * LIMITS["mount_moved"].note
 # Shifts that the stream check must report: time as a share of the recording, and sign.
 _INJECTED = ((0.42, 1.0), (0.58, -1.0))
@@ -79,7 +79,7 @@ _INJECTED = ((0.42, 1.0), (0.58, -1.0))
 _GROWTH = 1.4
 _N_SIZES = 4
 
-# Time (s) between a pose and those that its velocity is the difference of.
+# The velocity of a pose is the difference of the poses this time (s) before and after.
 _VELOCITY_STEP_S = 0.1
 
 # Larger errors (m, rad) are not stated, because the residuals are not linear in them.
@@ -119,13 +119,13 @@ def on_clock_of(result: Calibration, snapshot: Snapshot) -> PosePairs:
 
 
 def detectability(result: Calibration, pose_pairs: PosePairs) -> Detectability:
-    """Return the smallest errors that a recording contradicts.
+    """Return the smallest errors that a recording reveals.
 
     Parameters
     ----------
     result : Calibration
     pose_pairs : PosePairs
-        Its poses on one clock, in one unit of length.
+        Poses of the recording on one clock, in one unit of length.
     """
     X = result.T_parent_child
     blocks = evidence_of(pose_pairs, X)
@@ -138,9 +138,11 @@ def detectability(result: Calibration, pose_pairs: PosePairs) -> Detectability:
     sigmas, allowance = sigmas_of(result)
     R = se3.rotation_of(X)
     errors = _smallest_errors(blocks, [*_OF_X, *estimated], R, sigmas, allowance)
+    # Time offset and scale are stated even if the solve did not estimate them.
     of_streams = [*_OF_X, _TIME_OFFSET, _SCALE]
     errors_of_streams = _smallest_errors(blocks, of_streams, R, sigmas, allowance)
     is_known = [dof.verdict in _BY_MOTION for dof in result.observability_measured]
+    # Sizes of shifts that are tried first. They grow until the stream check reports the shift.
     first_shifts = _first_shifts(blocks, R)
     return Detectability(
         errors=_by_axis(errors[:6], is_known),

@@ -61,11 +61,11 @@ def verticals_of_bag(
         topics = (parent, child)
         has_imu = any(bag.topics[topic].type == _IMU for topic in topics)
         # A lidar needs a wider lane if the other sensor is an IMU.
-        beside: Source = "gravity" if has_imu else "ground"
+        other_source: Source = "gravity" if has_imu else "ground"
     tracks = []
     for topic, stream in zip(topics, snapshot.streams, strict=True):
         try:
-            tracks.append(_track_of_bag(tuple(paths), topic, stream, beside))
+            tracks.append(_track_of_bag(tuple(paths), topic, stream, other_source))
         except (InputError, NotEnoughDataError) as error:
             return (), [f"ground and gravity are not used: {topic}: {error}"]
     sources = []
@@ -105,25 +105,28 @@ def _topic_of(names: StreamFrames, topics_of: Mapping[str, str]) -> str:
 
 @lru_cache(maxsize=2)
 def _track_of_bag(
-    paths: tuple[Path, ...], topic: str, stream: Trajectory, beside: Source
+    paths: tuple[Path, ...], topic: str, stream: Trajectory, other_source: Source
 ) -> VerticalTrack:
-    """Return the vertical by a topic of a bag. All pairs of a rig share that of the first sensor.
+    """Return the vertical from a topic of a bag.
+
+    The result is cached, because all pairs of a rig need the vertical of the first sensor.
 
     The parameters are those of :func:`vertical_track`.
     """
     with PoseBag(*paths) as bag:
-        return vertical_track(bag, topic, stream, beside)
+        return vertical_track(bag, topic, stream, other_source)
 
 
 def vertical_track(
-    bag: PoseBag, topic: str, stream: Trajectory, beside: Source
+    bag: PoseBag, topic: str, stream: Trajectory, other_source: Source
 ) -> VerticalTrack:
     """Return the vertical from the clouds or IMU data of a topic.
 
-    ``stream`` has the poses of the sensor, and ``beside`` is what the other sensor measures.
+    ``stream`` contains the poses of the sensor. ``other_source`` is the quantity that the other
+    sensor measures.
     """
     if bag.topics[topic].type == POINTS_TYPE:
-        return ground_from_clouds(_clouds(bag, topic), stream, beside)
+        return ground_from_clouds(_clouds(bag, topic), stream, other_source)
     stamps_ns = []
     forces = []
     for message in _messages(bag, topic, 0):

@@ -54,7 +54,9 @@ PLANES = ((1, 2), (0, 2), (0, 1))
 
 
 class _Motion(NamedTuple):
-    """Columns of one stream in windows (W, K), in the world of the reference.
+    """Motion of a stream in W windows of K samples, as columns of the regression.
+
+    Vectors are in the axes of the world of the reference stream.
 
     Attributes
     ----------
@@ -138,11 +140,11 @@ class RotationFit(Fit):
 
     @property
     def _usual_covariance(self) -> FloatArray:
-        """Covariance (3, 3), rad^2, with usual sizes of gains and shears that are not significant.
+        """Covariance (3, 3) of the rotation, rad^2, for faults of usual size.
 
-        About an axis without turns, the rates are only noise, and their instrument is weak.
-        Estimates of gains and shears are arbitrary then. Their prior standard deviations replace
-        them.
+        About an axis without turns, the rates are only noise: a weak instrumental variable.
+        Estimates of gains and shears are then arbitrary. Therefore the prior standard deviations of
+        gains and shears replace estimates that are not significant.
         """
         weak: list[int] = []
         prior_sigmas: list[float] = []

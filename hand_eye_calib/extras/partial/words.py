@@ -56,13 +56,13 @@ WORDS = {
     "gain_of_axis": FindingWords(
         "{whose} rotations about its {axis} axis are {gain:.4f} +/- {sigma:.4f} times the true "
         "ones",
-        "calibrate that scale first",
+        "calibrate the scale of this axis of the gyroscope first",
         "a gyroscope with a wrong scale",
         code="rotation_gain",
     ),
     "smoothed_rotations": FindingWords(
         "{whose} {part} are smoothed over about {smoothing_s:.2f} s, the other's are not",
-        "use the {part} before that filter",
+        "use the {part} before the smoothing filter",
         "a low-pass or smoothing filter",
         severity=Severity.WARNING,
         code="smoothed_{part}",
@@ -92,7 +92,7 @@ WORDS = {
     ),
     "inverse_rotations": FindingWords(
         "the orientations of {name} are inverted, or their quaternions are in the order w x y z",
-        "correct that stream by its option (such as child_invert orientations, or child_quaternion "
+        "correct the stream by an option (such as child_invert orientations, or child_quaternion "
         "wxyz)",
         code="inverse_orientation",
     ),

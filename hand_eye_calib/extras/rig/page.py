@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from hand_eye_calib.core.base.registry import REPORT_PICTURES
-from hand_eye_calib.core.base.spelling import Road
+from hand_eye_calib.core.base.spelling import Interface
 from hand_eye_calib.core.engine.session_result import SessionResult
 from hand_eye_calib.core.engine.snapshot import Snapshot
 from hand_eye_calib.core.results.document import printed_numbers, transforms_of
@@ -22,17 +22,17 @@ def write_rig_report(
     directory: Path,
     rig: RigCalibration,
     names: Sequence[str],
-    road: Road = Road.TERMINAL,
+    interface: Interface = Interface.TERMINAL,
     snapshots: Mapping[str, Snapshot] | None = None,
 ) -> None:
     """Write the report of a rig; the arguments are those of :func:`render_rig`."""
-    write_page(directory, lambda: render_rig(rig, names, road, snapshots))
+    write_page(directory, lambda: render_rig(rig, names, interface, snapshots))
 
 
 def render_rig(
     rig: RigCalibration,
     inputs: Sequence[str],
-    road: Road = Road.TERMINAL,
+    interface: Interface = Interface.TERMINAL,
     snapshots: Mapping[str, Snapshot] | None = None,
 ) -> str:
     """Return the report of a rig as HTML.
@@ -42,7 +42,7 @@ def render_rig(
     rig : RigCalibration
     inputs : sequence of str
         Files, topics or frames of the sensors.
-    road : Road
+    interface : Interface
     snapshots : mapping of str to Snapshot, optional
         Streams of the first sensor and of each other sensor, by the frame of the other sensor.
     """
@@ -56,7 +56,7 @@ def render_rig(
         TONES[rig.verdict.value],
         rig.verdict.value,
         "",
-        road,
+        interface,
         rig=rig,
         inputs=inputs,
         poses=[
@@ -96,4 +96,4 @@ def write_session_rig(directory: Path, session: SessionResult) -> None:
     rig = calibrate_rig(sensors, {name: options[name] for name in names})
     inputs = {**session.inputs, "sensors": list(rig.sensors)}
     save_rig(rig.to_dict(), rig.calibrations, directory / "rig", inputs)
-    write_rig_report(directory / "rig", rig, rig.sensors, Road.NODE)
+    write_rig_report(directory / "rig", rig, rig.sensors, Interface.NODE)

@@ -5,8 +5,9 @@ from hand_eye_calib.core.results.records import Severity
 
 WORDS = {
     "not_closed": FindingWords(
-        "the results for {first}, {second} and {third}, two at a time, differ around the loop by "
-        "{distance_mm:.1f} mm and {rotation_deg:.2f} deg, more than their uncertainty allows",
+        "the three pairwise results of {first}, {second} and {third} do not close: around the loop "
+        "they leave {distance_mm:.1f} mm and {rotation_deg:.2f} deg, more than their uncertainty "
+        "allows",
         "tighten the mounts of these sensors and record again; compare their scales",
         "a sensor that moved on its mount, or a scale that changed during the recording",
         severity=Severity.WARNING,

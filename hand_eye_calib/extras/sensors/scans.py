@@ -194,7 +194,8 @@ class ScanReading(Reading):
         self._scans = list[Scan]()
         # Range error of each ring, m.
         self._too_far_m = np.zeros(TUNING.n_rings)
-        # Sums over points for the range errors: cosine times distance (m), and squared cosine.
+        # Sums over points for the range errors: c times distance from the plane (m), and squared c.
+        # The factor c is the cosine between the ray and the normal of the plane.
         self._sums = np.zeros((2, TUNING.n_rings))
 
     def take(self, run: Run) -> None:
@@ -250,7 +251,8 @@ class ScanReading(Reading):
             size_m = TUNING.voxel_share * np.median(ranges)
             self._voxel_m = float(np.clip(size_m, *TUNING.voxel_limits_m))
         else:
-            # Predict the pose: the last motion continues. The second scan has the first pose.
+            # Predict the pose: the last motion continues. The second scan starts from the pose of
+            # the first, because there is no motion yet.
             last = self._poses[-1]
             before = self._poses[-2:][0]
             self._poses.append(last @ se3.inverse(before) @ last)

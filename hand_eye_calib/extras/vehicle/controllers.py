@@ -66,7 +66,9 @@ def _of_odometry(wheels: VehicleParameters) -> Controller:
     """
     radius, separation, curvature = (parameter.value for parameter in wheels.parameters)
     half = 0.5 * curvature * radius * separation * wheels.nominal_separation_m
-    remarks = ["Multipliers: of the values with which the odometry was recorded"]
+    remarks = [
+        "Multiply the values with which the odometry was recorded by these factors"
+    ]
     if not wheels.nominal_separation_m:
         remarks.append(
             f"The path of equal radii bends by {fixed(curvature, _DECIMALS)} 1/m; for a multiplier "

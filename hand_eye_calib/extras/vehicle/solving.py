@@ -67,7 +67,7 @@ _LEAN = 0.01
 # height times the angle. The height itself is out of reach.
 _HEIGHT = 1.0
 
-# Index of pitch in e.
+# Index of pitch in the residual e.
 _PITCH = 4
 
 # Number of blocks of the jackknife. A block lasts some seconds, longer than a slip of the wheels.
@@ -88,7 +88,8 @@ _SHARE_OF_UNWEIGHTED = 0.15
 # Sizes of slips, as shares of the speed of a wheel: tyres and rollers slip by 5 to 20 % in curves,
 # and a slip covers only a part of a window.
 _SLIPS = np.array([0.02, 0.05, 0.1])
-# Largest share of slip that is not detected; near 1, nothing is known about the bias.
+# Largest share of slip that is not detected. Near a share of 1, the bias that slip causes in the
+# parameters of the wheels has no limit.
 _MAX_UNDETECTED = 0.75
 # Factor of the argument of a logistic function that is close to the normal distribution.
 _LOGISTIC = 1.702
@@ -389,15 +390,18 @@ def _solve(
     sigmas: FloatArray,
     is_weighted: bool = True,
 ) -> Fit:
-    """Minimise the weighted squares of e and of the priors, by Gauss-Newton steps.
+    """Minimise the weighted squares of the residuals e and of the prior deviations.
+
+    The method is Gauss-Newton. See the module for e.
 
     Parameters
     ----------
     drive : Drive
     start : (4, 4) array
-        First pose, which is also the mean of its prior.
+        Pose from which the iteration starts; also the mean of its prior. Five of its six
+        components are unknowns, because z is not estimated.
     others : (U - 5,) array
-        First values of the other unknowns, which are also the means of their priors.
+        Values from which the other unknowns start; also the means of their priors.
     sigmas : (U,) array
         Prior standard deviations of all unknowns.
     is_weighted : bool

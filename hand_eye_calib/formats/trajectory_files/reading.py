@@ -324,9 +324,12 @@ def _rows_without_stamps(tables: Sequence[Table], pair_by: str) -> list[IntArray
         indices.append({key: index for index, key in enumerate(keys)})
     common = sorted(set.intersection(*map(set, indices)))
     if not common:
-        n_names = [len(table.rows) for table in tables]
+        n_names = []
+        for table, index_of in zip(tables, indices, strict=True):
+            n_names.append(f"{len(index_of):,} in {table.path}")
         raise InputError(
-            f"no image has a name that is in all files; found {n_names} names; pair by time or row"
+            f"no name of an image is in all files; names found: {listing(n_names)}; "
+            "pair by time or row"
         )
     return [np.array([index_of[key] for key in common]) for index_of in indices]
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hand_eye_calib.core.base.errors import ConfigError
-from hand_eye_calib.core.base.spelling import Road
+from hand_eye_calib.core.base.spelling import Interface
 from hand_eye_calib.core.base.text import angle, length
 from hand_eye_calib.offline.cli import options
 from hand_eye_calib.offline.cli.options import (
@@ -202,7 +202,7 @@ def _finding_lines(findings: "Sequence[Finding]") -> Iterator[str]:
         if mark != "note":
             mark = mark.upper()
         yield f"{mark:<8} {finding.code:<17} {finding.stream}"
-        advice = finding.advice_on(Road.TERMINAL)
+        advice = finding.advice_on(Interface.TERMINAL)
         if advice == NO_ACTION:
             yield from wrapped(f"{finding.what}; {advice}", "    ", "    ")
             continue

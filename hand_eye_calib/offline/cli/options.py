@@ -26,7 +26,7 @@ from hand_eye_calib.core.base.option import (
     check_value,
     did_you_mean,
 )
-from hand_eye_calib.core.base.spelling import Road, spelled, spelled_options
+from hand_eye_calib.core.base.spelling import Interface, spelled, spelled_options
 from hand_eye_calib.core.base.text import quantities
 from hand_eye_calib.formats.files import local_path
 
@@ -124,7 +124,7 @@ def flag(name: str) -> str:
 
 def typed_options(options: Iterable[tuple[str, object]]) -> str:
     """Return pairs of public option name and value as a user types them on the command line."""
-    return spelled_options(options, Road.TERMINAL)
+    return spelled_options(options, Interface.TERMINAL)
 
 
 def command_with(typed: Sequence[str], options: Options) -> str:
@@ -163,7 +163,7 @@ def as_typed(text: str) -> str:
     Messages of the engine contain public option names: ``raise max_gap`` becomes ``raise
     --max-gap``.
     """
-    return spelled(text, Road.TERMINAL, _OPTIONS_OF_READERS)
+    return spelled(text, Interface.TERMINAL, _OPTIONS_OF_READERS)
 
 
 def note(*texts: object) -> None:

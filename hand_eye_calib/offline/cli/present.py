@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.core.base.errors import ConfigError, printable
 from hand_eye_calib.core.base.plain import Document
-from hand_eye_calib.core.base.spelling import PLACEHOLDER, Road
+from hand_eye_calib.core.base.spelling import PLACEHOLDER, Interface
 from hand_eye_calib.core.base.text import frame_name, listing, with_sigma
 from hand_eye_calib.core.checks.findings import LIMITS
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, Verdict
@@ -291,7 +291,7 @@ def verdict_lines(calibration: Calibration) -> Iterator[str]:
         # If the headline contains the sentence of the first reason, only the advice follows.
         if number or reason not in in_headline:
             yield from wrapped(reason.sentence, "- ", "  ")
-        yield from wrapped(reason.advice_on(Road.TERMINAL), "  -> ", "     ")
+        yield from wrapped(reason.advice_on(Interface.TERMINAL), "  -> ", "     ")
     for warning in calibration.warnings:
         yield from wrapped(f"Note: {warning}", "", "  ")
 

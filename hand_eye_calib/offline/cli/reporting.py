@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.core.base.plain import Document
-from hand_eye_calib.core.base.spelling import Road
+from hand_eye_calib.core.base.spelling import Interface
 from hand_eye_calib.core.engine.session_result import SessionResult
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.formats.results import save_text
@@ -23,7 +23,7 @@ def write_report(
     calibration: Calibration,
     snapshot: "Snapshot | None",
     inputs: Document,
-    road: Road = Road.TERMINAL,
+    interface: Interface = Interface.TERMINAL,
     pictures: Sequence[Callable[[Calibration], list[Any]]] = (),
 ) -> None:
     """Write the report of a result into a directory, and print its path.
@@ -36,14 +36,16 @@ def write_report(
         Poses and options of the result; None for the stops of an arm.
     inputs : dict
         Origin of the data, such as paths and topics, in plain values.
-    road : Road
-        Road of the user, which has its own spelling of options.
+    interface : Interface
+        Interface of the user, which decides the spelling of options.
     pictures : sequence of callable
         Functions that draw further figures from the result.
     """
     from hand_eye_calib.offline.report.report import render
 
-    write_page(directory, lambda: render(calibration, snapshot, inputs, road, pictures))
+    write_page(
+        directory, lambda: render(calibration, snapshot, inputs, interface, pictures)
+    )
 
 
 def write_page(directory: Path, page: Callable[[], str]) -> None:
@@ -67,4 +69,6 @@ def write_session_report(directory: Path, session: SessionResult) -> None:
     checked = check(session.snapshot, session.calibration)
     calibration = replace(session.calibration, findings=checked.findings)
     save_result(calibration, directory, session.inputs)
-    write_report(directory, calibration, session.snapshot, session.inputs, Road.NODE)
+    write_report(
+        directory, calibration, session.snapshot, session.inputs, Interface.NODE
+    )

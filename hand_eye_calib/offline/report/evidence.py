@@ -221,8 +221,9 @@ def _paths_of_positions(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return three paths (N, 3) of the sensor with positions, m.
 
-    The first path is measured. The second is computed from the poses of the other sensor and the
-    result, the third from these poses alone. All paths begin at the first measured position.
+    The first path is measured, and begins at 0. The second path is computed from the poses of the
+    other sensor and the result, the third path from these poses alone. Both are fitted to the
+    measured path by a rotation and a translation.
     """
     if parent_is_positions:
         poses = pose_pairs.Ts_cw_c
@@ -238,7 +239,7 @@ def _paths_of_positions(
 
 
 def moved_onto(measured: FloatArray, path: FloatArray) -> FloatArray:
-    """Move a path (N, 3) onto a measured path (N, 3) by the best rotation and by the mean."""
+    """Fit a path (N, 3) to a measured path (N, 3) by the best rotation and translation."""
     center = measured.mean(axis=0)
     path = path - path.mean(axis=0)
     rotation = se3.nearest_rotation((measured - center).T @ path)
@@ -250,8 +251,8 @@ def _paths_of_poses(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the path (N, 3) of the parent as measured, and as computed from the child's stream.
 
-    The computed path is moved onto the measured one by the mean rotation between the worlds and by
-    the median difference.
+    The measured path begins at 0. The computed path is fitted to it by the mean rotation between
+    the worlds and by the median difference.
     """
     Ts_cw_p = pose_pairs.Ts_cw_c @ calibration.T_child_parent
     parent = se3.translation_of(pose_pairs.Ts_pw_p)

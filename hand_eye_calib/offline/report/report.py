@@ -16,7 +16,7 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import printable
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.registry import REPORT_PICTURES
-from hand_eye_calib.core.base.spelling import Road, spelled, spelled_options
+from hand_eye_calib.core.base.spelling import Interface, spelled, spelled_options
 from hand_eye_calib.core.base.version import version_of
 from hand_eye_calib.core.engine.snapshot import Snapshot
 from hand_eye_calib.core.geometry import se3
@@ -98,7 +98,7 @@ def page(
     tone: str,
     verdict: str,
     sentence: str,
-    road: Road = Road.TERMINAL,
+    interface: Interface = Interface.TERMINAL,
     **values: Any,
 ) -> str:
     """Return a page as HTML. Every page begins with a verdict.
@@ -112,8 +112,8 @@ def page(
         One or two words.
     sentence : str
         The verdict in a sentence.
-    road : Road
-        Road of the user, which has its own spelling of options.
+    interface : Interface
+        Interface of the user, which decides the spelling of options.
     **values
         Other variables of the template.
     """
@@ -123,8 +123,8 @@ def page(
         mark=MARKS[tone],
         marks=MARKS,
         verdict=verdict,
-        sentence=text.capital(spelled(sentence, road)),
-        road=road,
+        sentence=text.capital(spelled(sentence, interface)),
+        interface=interface,
     )
 
 
@@ -132,7 +132,7 @@ def render(
     calibration: Calibration,
     snapshot: Snapshot | None,
     inputs: Document | None = None,
-    road: Road = Road.TERMINAL,
+    interface: Interface = Interface.TERMINAL,
     pictures: Sequence[Callable[[Calibration], list[Drawn]]] = (),
 ) -> str:
     """Return the report of a result as HTML.
@@ -144,8 +144,8 @@ def render(
         Poses and options of the result; None for the stops of an arm.
     inputs : dict, optional
         Origin of the data, such as paths and topics, in plain values.
-    road : Road
-        Road of the user, which has its own spelling of options.
+    interface : Interface
+        Interface of the user, which decides the spelling of options.
     pictures : sequence of callable
         Functions that draw further figures from the result, such as images of an arm's target.
     """
@@ -165,7 +165,7 @@ def render(
         TONES[calibration.verdict.value],
         calibration.verdict.value,
         calibration.sentence,
-        road,
+        interface,
         calibration=calibration,
         at_distance=_at_distance(calibration),
         document=calibration.to_dict(),
@@ -183,12 +183,12 @@ def render(
         figures=figures_of(calibration, evidence),
         pictures=_drawn(calibration, snapshot, pictures),
         top_figures=_TOP_FIGURES,
-        **_numbers(calibration, road),
-        **_data(calibration, snapshot, evidence, inputs, road),
+        **_numbers(calibration, interface),
+        **_data(calibration, snapshot, evidence, inputs, interface),
     )
 
 
-def _numbers(calibration: Calibration, road: Road) -> dict[str, Any]:
+def _numbers(calibration: Calibration, interface: Interface) -> dict[str, Any]:
     """Return the transforms of a result, and the functions that write their numbers."""
     return {
         "directions": [*transforms_of(calibration).values()][:2],
@@ -199,7 +199,7 @@ def _numbers(calibration: Calibration, road: Road) -> dict[str, Any]:
         "parts_of": parts_of_sigmas,
         "angles_of": partial(angles_in_words, result=calibration),
         "axes": list(_axes(calibration)),
-        "allowance": spelled(allowance_in_words(calibration), road),
+        "allowance": spelled(allowance_in_words(calibration), interface),
     }
 
 
@@ -240,7 +240,7 @@ def render_brief(calibration: Calibration) -> str:
         calibration=calibration,
         numbers=printed_numbers(transform, calibration.out_of_reach, "±"),
         parts=parts_of_sigmas(transform),
-        allowance=spelled(allowance_in_words(calibration), Road.PYTHON),
+        allowance=spelled(allowance_in_words(calibration), Interface.PYTHON),
         views=figure_of_views([calibration]),
     )
 
@@ -372,7 +372,7 @@ def _data(
     snapshot: Snapshot | None,
     evidence: Evidence | None,
     inputs: Document,
-    road: Road,
+    interface: Interface,
 ) -> Document:
     """Return the variables of the section "Data and solution" of the template."""
     defaults = CalibratorConfig().to_options()
@@ -398,7 +398,7 @@ def _data(
         "summary": {
             **summary(calibration),
             "Poses": f"{calibration.n_poses:,} {kind}",
-            "Options": spelled_options(changed, road) or "defaults",
+            "Options": spelled_options(changed, interface) or "defaults",
             "Written": f"{now}, hand_eye_calib {version_of()}; extrinsic.yaml has the rest",
         },
         "streams": rows,

@@ -16,7 +16,7 @@ from hand_eye_calib.core.assessment.excitation import Excitation, what_is_missin
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.base.plain import plain
-from hand_eye_calib.core.base.spelling import Road
+from hand_eye_calib.core.base.spelling import Interface
 from hand_eye_calib.core.base.text import duration, in_sentences, parse_targets
 from hand_eye_calib.core.engine.attempts import with_options
 from hand_eye_calib.core.engine.calibrator import Calibrator
@@ -214,7 +214,7 @@ class SolveCycle:
             remedy = (
                 ", or remove it" if result.status is SolveStatus.CONTRADICTED else ""
             )
-            return f"{reason.sentence}; {reason.advice_on(Road.NODE)}{remedy}"
+            return f"{reason.sentence}; {reason.advice_on(Interface.NODE)}{remedy}"
         if failure is None or self._failing_since_s is None:
             return ""
         now_s = time.monotonic()
@@ -449,7 +449,7 @@ class SolveCycle:
             progress.done or progress.will_not_get_there or calibration.status.failure
         )
         for reason in calibration.reasons:
-            text = f"{reason.sentence}; {reason.advice_on(Road.NODE)}"
+            text = f"{reason.sentence}; {reason.advice_on(Interface.NODE)}"
             texts.append(text)
             # The stream checks have logged the findings.
             if is_final and not reason.is_finding:

@@ -8,7 +8,7 @@ import numpy as np
 from hand_eye_calib.core.assessment.excitation import Excitation
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
-from hand_eye_calib.core.base.spelling import Road
+from hand_eye_calib.core.base.spelling import Interface
 from hand_eye_calib.core.base.text import duration, listing
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.calibration import Calibration
@@ -150,7 +150,7 @@ def state_of_result(result: Calibration, age_s: float) -> ResultState:
         verdict=result.verdict.value,
         status=result.status.value,
         reasons=tuple(
-            f"{reason.sentence}: {reason.advice_on(Road.NODE)}"
+            f"{reason.sentence}: {reason.advice_on(Interface.NODE)}"
             for reason in result.reasons
         ),
         pose=as_printed(np.where(np.isfinite(sigmas), pose, np.nan)),

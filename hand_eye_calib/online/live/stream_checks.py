@@ -30,9 +30,9 @@ RAW_POSE_CODES = frozenset({"leap", "interleaved", "frozen", "coarse_positions"}
 class StreamChecks:
     """Findings of the stream checks of a session.
 
-    An error counts at once. Any other finding counts if two checks in a row report it, because
-    odometry may be wrong by some per cent over a short recording. An error in the received poses
-    counts until the end of the session, because the session keeps these poses.
+    The session reports an error at once. It reports any other finding after two checks in a row,
+    because odometry may be wrong by some per cent over a short recording. It reports an error in
+    the received poses until its end, because the session keeps these poses.
     """
 
     def __init__(self, log: NodeLog) -> None:
@@ -43,11 +43,11 @@ class StreamChecks:
         """Begin a new session without findings."""
         self._result: CheckResult | None = None
         self._checked_at_s = 0.0
-        # Codes and streams of the findings of the last check.
-        self._reported: set[tuple[str, str]] = set()
-        # Findings that count, by code and stream.
+        # Codes and streams of the findings of the last check, without notes.
+        self._of_last_check: set[tuple[str, str]] = set()
+        # Findings that the session reports, by code and stream.
         self._faults: dict[tuple[str, str], Finding] = {}
-        # Those of them that are errors in the received poses.
+        # Reported errors in the received poses, by code and stream.
         self._pose_errors: dict[tuple[str, str], Finding] = {}
 
     def follow(self, config: CalibratorConfig) -> None:
@@ -60,21 +60,24 @@ class StreamChecks:
         self._pose_errors = errors
 
     def take(self, result: CheckResult) -> None:
-        """Store the result of a check, and log findings that begin or cease to count."""
+        """Store the result of a check, and log findings that appear or disappear.
+
+        The class states when the session reports a finding.
+        """
         before = self._faults
         self._result = result
         self._checked_at_s = time.monotonic()
-        reported = {
+        of_this_check = {
             (finding.code, finding.stream): finding
             for finding in result.findings
             if finding.severity is not Severity.NOTE
         }
         self._faults = {
             key: finding
-            for key, finding in reported.items()
-            if finding.makes_unusable or key in self._reported
+            for key, finding in of_this_check.items()
+            if finding.makes_unusable or key in self._of_last_check
         }
-        self._reported = set(reported)
+        self._of_last_check = set(of_this_check)
         for key, finding in self._faults.items():
             if finding.makes_unusable and finding.code in RAW_POSE_CODES:
                 self._pose_errors[key] = finding
@@ -95,11 +98,11 @@ class StreamChecks:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings that count, the gravest first."""
+        """Findings that the session reports, the gravest first."""
         return tuple(self._faults.values())
 
     def faults(self) -> tuple[str, ...]:
-        """Return a line for each finding that counts, with the parameters to set."""
+        """Return a line for each reported finding, with the parameters to set."""
         return tuple(map(_in_parameters, self.findings))
 
     def state(self) -> ChecksState:
