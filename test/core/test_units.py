@@ -139,7 +139,8 @@ class TestResult:
         np.testing.assert_allclose(answered.T_parent_child, expected, atol=0.01)
         assert not any(finding.makes_unusable for finding in answered.findings)
         assert (
-            "all lengths of the result are 3.281 times as long" in answered.warnings[0]
+            "all lengths of the result are then 3.281 times as long"
+            in answered.warnings[0]
         )
         scaled = hec.calibrate(parent, child, reference="B5", scale="estimate")
         assert not any(finding.makes_unusable for finding in scaled.findings)
