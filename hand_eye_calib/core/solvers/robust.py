@@ -265,7 +265,7 @@ def _covariance(
     # The weight of a pair decreases as its residual grows. The weighted Hessian does not contain
     # this term of the second derivative.
     curvature = 2.0 / 3.0 / _CAUCHY_UNIT**2 * np.einsum("pki,pkj->ij", scores, scores)
-    n_poses = int(pairs.j[-1] - pairs.i[0])
+    n_poses = int(pairs.j.max() - pairs.i.min())
     motion = median(pairs.j - pairs.i)
     # Correlation time in poses, then in pairs.
     n_correlated_poses = max(_CORRELATED_SHARE * n_poses, _CORRELATED_MOTIONS * motion)
