@@ -83,15 +83,10 @@ def choose(
     ]
     options = [_options_of(findings) for findings in findings_of_readings]
     difference = _loss_difference(pairs_of(options[0]), pairs_of(options[1]))
-    index = decide(readings, difference)
+    has_late_stamps = any(suspect.code == "arrival" for suspect in result.findings)
+    index = decide(readings, difference, has_late_stamps)
     # Whether the first reading inverts no stream.
     can_be_right = readings.hypotheses[0].is_uninverted
-    has_late_stamps = any(suspect.code == "arrival" for suspect in result.findings)
-    if index == 1 and can_be_right and has_late_stamps and readings.by_shape <= 0:
-        # Stamps of arrival move each pose along its path, which looks like noise of the inverse
-        # poses. An excavator with such stamps was read as inverse, 5 m off. So the noise alone does
-        # not decide against the streams as they are.
-        index = None
     doubts: tuple[Finding, ...] = ()
     if index is None:
         answers = [answer_with(reading_options) for reading_options in options]
@@ -111,7 +106,9 @@ def choose(
     )
 
 
-def decide(readings: Readings, difference: float) -> int | None:
+def decide(
+    readings: Readings, difference: float, has_late_stamps: bool = False
+) -> int | None:
     """Return the index of the right reading; None if noise and shape do not decide clearly.
 
     Parameters
@@ -119,12 +116,20 @@ def decide(readings: Readings, difference: float) -> int | None:
     readings : Readings
     difference : float
         Loss of the second reading minus the loss of the first.
+    has_late_stamps : bool
+        Whether the stamps of a stream are those of arrival.
     """
     by_noise = 0
     if abs(difference) > CLEAR_NOISE:
         by_noise = -int(np.sign(difference))
     choice = _vote(readings, by_noise)
-    if choice == 0 and readings.hypotheses[0].is_uninverted:
+    can_be_right = readings.hypotheses[0].is_uninverted
+    if choice == 1 and can_be_right and has_late_stamps and readings.by_shape <= 0:
+        # Late stamps move each pose along its path, which looks like the noise of inverse poses.
+        # Without the shape, the noise then does not decide against the streams as given. An
+        # excavator with such stamps was read as inverse, 5 m off.
+        return None
+    if choice == 0 and can_be_right:
         # Without a clear vote, the streams stay as they are if no criterion supports an inversion.
         is_inversion_supported = readings.shape >= 0.0 or by_noise > 0
         choice = 0 if is_inversion_supported else -1

@@ -26,6 +26,7 @@ from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.differences import path_derivatives, stencil
+from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 from hand_eye_calib.extras.partial.columns import (
     Column,
     Fit,
@@ -41,8 +42,6 @@ _WINDOW_S = 10.0
 # positions is longer, the interval is the step.
 _STEP_S = 0.2
 
-# Prior standard deviation (s^2) of the smoothing of sound streams, as in `Tuning.of_positions`.
-_USUAL_S2 = 2e-3
 # Prior of smoothing: its standard deviation (s^2) for faulty streams, and their share. Chosen on
 # simulated machines with filters of 0.05 to 0.2 s. Usual streams have that of the noise model.
 _FAULTY_S2 = 0.01
@@ -146,15 +145,20 @@ class Smoothing(NamedTuple):
     variance_s4: float
 
 
-def posterior_smoothing(smoothing_s2: float, sigma_s2: float) -> Smoothing:
+def posterior_smoothing(
+    smoothing_s2: float, sigma_s2: float, tuning: Tuning = TUNING
+) -> Smoothing:
     """Return the smoothing given its estimate and the prior.
 
     Parameters
     ----------
     smoothing_s2, sigma_s2 : float
         Estimate and its standard deviation.
+    tuning : Tuning
+        Its last prior of positions is that of the smoothing of usual streams.
     """
-    prior_variances = np.array([_USUAL_S2**2, _FAULTY_S2**2])
+    usual_s2 = tuning.of_positions[-1]
+    prior_variances = np.array([usual_s2**2, _FAULTY_S2**2])
     variances = prior_variances + sigma_s2**2
     logs = np.log([1.0 - _FAULTY_SHARE, _FAULTY_SHARE])
     logs -= 0.5 * (np.log(variances) + smoothing_s2**2 / variances)
