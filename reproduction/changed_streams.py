@@ -69,7 +69,7 @@ def seconds_of(stream: Trajectory) -> FloatArray:
 
 
 def noisy(stream: Trajectory, metres: float, random: Random) -> Trajectory:
-    """White noise of so many metres, and twice as many radians."""
+    """Add white noise of ``metres``, and of twice this number of radians."""
     xi = metres * random.standard_normal((len(stream), 6))
     xi[:, 3:] *= 2.0
     return posed(stream, stream.poses @ se3.exp(xi))

@@ -190,14 +190,20 @@ def cloud_message(typestore, stamp_ns, points, frame, names="xyz"):
         for at, name in enumerate(names)
     ]
     rows = np.ascontiguousarray(points, dtype="<f4")
+    return cloud_of_rows(typestore, stamp_ns, rows, fields, frame)
+
+
+def cloud_of_rows(typestore, stamp_ns, rows, fields, frame):
+    """A PointCloud2 of rows that are laid out as its fields state."""
+    (point_step, *_) = rows.strides
     return typestore.types[POINTS](
         header=header(typestore, stamp_ns, frame),
         height=1,
         width=len(rows),
         fields=fields,
         is_bigendian=False,
-        point_step=12,
-        row_step=12 * len(rows),
+        point_step=point_step,
+        row_step=point_step * len(rows),
         data=rows.view(np.uint8).ravel(),
         is_dense=True,
     )

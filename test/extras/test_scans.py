@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from bag_making import header, write_messages
+from bag_making import cloud_of_rows, write_messages
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -103,17 +103,7 @@ def cloud(typestore, stamp_ns, points, times, frame, of_time="time"):
         field(name=name, offset=int(layout.fields[name][1]), datatype=code, count=1)
         for name, code in zip(layout.names, (7, 7, 7, kind[0]), strict=True)
     ]
-    return typestore.types[POINTS](
-        header=header(typestore, stamp_ns, frame),
-        height=1,
-        width=len(points),
-        fields=fields,
-        is_bigendian=False,
-        point_step=24,
-        row_step=24 * len(points),
-        data=rows.view(np.uint8).ravel(),
-        is_dense=True,
-    )
+    return cloud_of_rows(typestore, stamp_ns, rows, fields, frame)
 
 
 def test_two_lidars_from_their_points(tmp_path, capsys, no_figures):

@@ -78,8 +78,8 @@ NEEDING = {
 def expected(tmp_path_factory):
     """The result of the sample recording with all extras, as plain values.
 
-    In a process of its own, like the results it is compared with: what other tests loaded into
-    this one can change the order of sums, and so the last digit.
+    It comes from a new process, as do the results that are compared with it. Modules that other
+    tests have loaded can change the order of sums, and so the last digit.
     """
     out = tmp_path_factory.mktemp("all") / "out"
     command = [sys.executable, "-m", "hand_eye_calib", "calibrate"]

@@ -41,8 +41,8 @@ _ABOVE_GROUND_M = 0.5
 _OUTSIDE = 0.01
 # Number of cells along an axis of a view. A view draws one dot in each cell.
 _CELLS = 250
-# Smallest share of the child's points near surfaces of the parent. Below it the clouds hardly
-# overlap, and a distance between them has no meaning.
+# Smallest share of the child's points near surfaces of the parent. With a smaller share, the clouds
+# hardly overlap, and a distance between them has no meaning.
 _MIN_SHARED = 0.05
 
 

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from hand_eye_calib.core.base.registry import REPORT_PICTURES
 from hand_eye_calib.core.base.spelling import Interface
 from hand_eye_calib.core.engine.session_result import SessionResult
 from hand_eye_calib.core.engine.snapshot import Snapshot
@@ -11,7 +10,7 @@ from hand_eye_calib.core.results.document import printed_numbers, transforms_of
 from hand_eye_calib.extras.rig.rig import RigCalibration, calibrate_rig
 from hand_eye_calib.formats.results import save_rig
 from hand_eye_calib.offline.cli.reporting import write_page
-from hand_eye_calib.offline.report.report import TONES, page
+from hand_eye_calib.offline.report.report import TONES, page, pictures_of_extras
 from hand_eye_calib.offline.report.views import figure_of_views
 
 # Default name of a child sensor's frame. In a rig, such a sensor gets the name of its stream.
@@ -49,8 +48,7 @@ def render_rig(
     figures = [figure_of_views(rig.calibrations)]
     for number, calibration in enumerate(rig.calibrations, 1):
         snapshot = (snapshots or {}).get(calibration.child_frame)
-        for draw in REPORT_PICTURES.values():
-            figures += draw(calibration, snapshot, f"-{number}")
+        figures += pictures_of_extras(calibration, snapshot, f"-{number}")
     return page(
         Path(__file__).with_name("rig.html"),
         TONES[rig.verdict.value],

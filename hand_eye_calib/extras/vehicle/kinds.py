@@ -304,11 +304,9 @@ def _check_size(wheels: VehicleParameters) -> tuple[Finding, ...]:
             ),
         )
     if wheels.radius:
-        return (
-            ()
-            if _is_usual_radius(wheels)
-            else (finding("unusual_radius", radius=size),)
-        )
+        if _is_usual_radius(wheels):
+            return ()
+        return (finding("unusual_radius", radius=size),)
     lowest, highest = _USUAL_MULTIPLIERS
     if lowest <= size <= highest:
         return ()

@@ -37,9 +37,14 @@ def matching(pattern: str) -> list[str]:
     return paths
 
 
+def has_suffix_of_bag(path: Path) -> bool:
+    """Whether the name of a path ends as that of a file of a bag, which may be compressed."""
+    return path.suffix in (*_SUFFIXES, ".zstd")
+
+
 def is_other_file(path: str) -> bool:
     """Whether a path is a file, but not of a bag."""
-    return Path(path).is_file() and Path(path).suffix not in (*_SUFFIXES, ".zstd")
+    return Path(path).is_file() and not has_suffix_of_bag(Path(path))
 
 
 def _local_bags(pattern: str) -> list[str]:

@@ -18,6 +18,7 @@ from hand_eye_calib.core.engine.run import run
 from hand_eye_calib.core.engine.snapshot import Snapshot, whole_snapshot
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.formats.bags.patterns import has_suffix_of_bag
 from hand_eye_calib.offline.cli.options import (
     FILE_OPTIONS,
     STREAMS,
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
 
 # Options that only the method dnlo uses.
 _OPTIONS_OF_DNLO = ("threshold", "min_inlier_fraction")
-# Endings of the files of a bag.
-_BAG_SUFFIXES = (".bag", ".db3", ".mcap", ".zstd")
 
 
 @dataclass
@@ -131,27 +130,21 @@ def refuse_repeated_paths(paths: Sequence[Path | str]) -> None:
 def _refuse_folders_without_bag(folders: Sequence[Path]) -> None:
     """Raise a ConfigError if a folder contains no file of a bag."""
     for folder in folders:
-        if folder.is_dir() and not any(map(_looks_like_file_of_bag, folder.iterdir())):
+        if folder.is_dir() and not any(map(has_suffix_of_bag, folder.iterdir())):
             raise ConfigError(
                 f"{folder} is a folder without a bag: pass a trajectory file of each sensor, or a "
                 "bag"
             )
 
 
-def _looks_like_file_of_bag(path: Path) -> bool:
-    return path.suffix in _BAG_SUFFIXES
-
-
 def is_plain_file(path: Path | str) -> bool:
     """Return whether a path is an existing file that does not have the name of a bag."""
-    return (
-        isinstance(path, Path) and path.is_file() and not _looks_like_file_of_bag(path)
-    )
+    return isinstance(path, Path) and path.is_file() and not has_suffix_of_bag(path)
 
 
 def _looks_like_bag(path: Path) -> bool:
     """Whether a path is a folder or a bag's file, by its name."""
-    return _looks_like_file_of_bag(path) or path.is_dir()
+    return has_suffix_of_bag(path) or path.is_dir()
 
 
 # ----------------------------------------------------------------------- files

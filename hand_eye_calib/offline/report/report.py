@@ -212,9 +212,17 @@ def _drawn(
     drawings = []
     for draw in pictures:
         drawings += draw(calibration)
-    for draw_of_recording in REPORT_PICTURES.values():
-        drawings += draw_of_recording(calibration, snapshot, "")
-    return drawings
+    return drawings + pictures_of_extras(calibration, snapshot)
+
+
+def pictures_of_extras(
+    calibration: Calibration, snapshot: Snapshot | None, suffix: str = ""
+) -> list[Drawn]:
+    """Return the figures of all extras; their names end in ``suffix``."""
+    figures = []
+    for draw in REPORT_PICTURES.values():
+        figures += draw(calibration, snapshot, suffix)
+    return figures
 
 
 def _advice(calibration: Calibration, evidence: Evidence | None) -> str:
