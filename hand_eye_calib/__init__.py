@@ -31,8 +31,8 @@ _MODULES = {
     "Calibration": "hand_eye_calib.core.results.calibration",
     "Residuals": "hand_eye_calib.core.results.records",
     "SolveStatus": "hand_eye_calib.core.results.records",
-    "Reason": "hand_eye_calib.core.results.verdict",
-    "Verdict": "hand_eye_calib.core.results.verdict",
+    "Reason": "hand_eye_calib.core.results.reasons",
+    "Verdict": "hand_eye_calib.core.results.reasons",
     "compare": "hand_eye_calib.core.assessment.comparison",
 }
 

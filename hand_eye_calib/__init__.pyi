@@ -6,10 +6,10 @@ from hand_eye_calib.core.base.errors import HandEyeCalibError as HandEyeCalibErr
 from hand_eye_calib.core.engine.calibrator import Calibrator as Calibrator
 from hand_eye_calib.core.geometry.trajectory import Trajectory as Trajectory
 from hand_eye_calib.core.results.calibration import Calibration as Calibration
+from hand_eye_calib.core.results.reasons import Reason as Reason
+from hand_eye_calib.core.results.reasons import Verdict as Verdict
 from hand_eye_calib.core.results.records import Residuals as Residuals
 from hand_eye_calib.core.results.records import SolveStatus as SolveStatus
-from hand_eye_calib.core.results.verdict import Reason as Reason
-from hand_eye_calib.core.results.verdict import Verdict as Verdict
 from hand_eye_calib.extras.fleet.together import calibrate_many as calibrate_many
 from hand_eye_calib.extras.fleet.together import (
     calibrate_together as calibrate_together,

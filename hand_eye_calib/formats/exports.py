@@ -21,8 +21,9 @@ from hand_eye_calib.core.base.errors import ConfigError, InputError, printable
 from hand_eye_calib.core.base.text import axes_in_words
 from hand_eye_calib.core.base.version import version_of
 from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.results.reasons import Verdict
 from hand_eye_calib.core.results.records import AXES
-from hand_eye_calib.core.results.verdict import Judged, Verdict
+from hand_eye_calib.core.results.verdict import Judged
 from hand_eye_calib.formats.results import launch_text, xacro_text
 
 # Beginnings of words in the names of frames, by the kind of sensor. The kinds are sorted by their

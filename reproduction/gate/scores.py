@@ -7,7 +7,7 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.geometry.se3 import deviation
 from hand_eye_calib.core.results.calibration import Calibration
-from hand_eye_calib.core.results.verdict import Verdict
+from hand_eye_calib.core.results.reasons import Verdict
 from reproduction.coverage.measures import MEDIAN_3
 from reproduction.coverage.scores import answer
 from reproduction.gate.cases import Case, simulated_case

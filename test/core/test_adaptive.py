@@ -22,7 +22,7 @@ import hand_eye_calib as hec
 from hand_eye_calib.core.assessment.covariance import assess_adaptive
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import deviation
-from hand_eye_calib.core.noise import estimator, increments, partwise, stages
+from hand_eye_calib.core.noise import estimator, fit, increments, partwise
 from hand_eye_calib.core.noise.noise_model import CENTRES
 from hand_eye_calib.core.noise.tuning import TUNING
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
@@ -411,7 +411,7 @@ def test_a_long_recording_is_solved_in_parts(monkeypatch):
     )
     child[300:, :3, 3] += [0.5, -0.3, 0.2]
     whole = estimator.solve(stamps(900), parent, child)
-    for module in (partwise, stages):
+    for module in (partwise, fit):
         monkeypatch.setattr(module, "MAX_POSES", 200)
     in_parts = estimator.solve(stamps(900), parent, child)
     sigmas = np.sqrt(np.diag(whole.cov_parent_child_in_child))

@@ -12,10 +12,10 @@ from result_making import NAMES, dofs, written_finding
 from result_making import good_calibration as good
 from source_code import ROOT
 
-from hand_eye_calib.core.results import verdict as rules
 from hand_eye_calib.core.results.calibration import Calibration, SolveStatus, Verdict
 from hand_eye_calib.core.results.records import AxisScatter, Severity
-from hand_eye_calib.core.results.verdict import RULES
+from hand_eye_calib.core.results.rules import RULES
+from hand_eye_calib.core.results.verdict import shown
 from hand_eye_calib.extras.detectability.record import Detectability
 from hand_eye_calib.extras.fleet.records import Together
 from hand_eye_calib.extras.ground.part import GroundAxis, GroundResult
@@ -221,8 +221,8 @@ def test_the_gravest_reason_comes_first_and_decides():
         "target",
     ]
     assert result.headline == "DO NOT USE: lengths are in mm"
-    assert [reason.rule for reason in rules.shown(result.reasons)] == ["error_finding"]
-    assert len(rules.shown(good(**CASES["target"] | CASES["outliers"]).reasons)) == 2
+    assert [reason.rule for reason in shown(result.reasons)] == ["error_finding"]
+    assert len(shown(good(**CASES["target"] | CASES["outliers"]).reasons)) == 2
 
 
 def test_an_axis_that_is_not_shown_does_not_spoil_the_others():

@@ -62,6 +62,7 @@ def test_a_wrong_call_fails_the_type_check_and_a_right_one_passes(tmp_path):
     of_arguments = {
         "hand_eye_calib.core.base.arrays",
         "hand_eye_calib.core.results.result",
+        "hand_eye_calib.core.results.verdict",
     }
     of_arguments |= {"hand_eye_calib.core.engine.run"}
     of_arguments |= {

@@ -115,7 +115,7 @@ class Measure(NamedTuple):
 
 
 class ExtraRule(NamedTuple):
-    """Rule of the verdict that an extra adds, see ``core/results/verdict.py``.
+    """Rule of the verdict that an extra adds, see ``core/results/rules.py``.
 
     Attributes
     ----------

@@ -26,6 +26,7 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.noise import stages
+from hand_eye_calib.core.noise.fit import Fit, Problem, Workspace
 from hand_eye_calib.core.noise.increments import SYSTEMATIC, Streams, parameter_columns
 from hand_eye_calib.core.noise.noise_model import CENTRES
 from hand_eye_calib.core.noise.outliers import Outliers, bridge_outliers
@@ -67,8 +68,8 @@ def loss_difference(
     fits = []
     for Ts_pw_p, Ts_cw_c in (first, second):
         streams = Streams(stamps_s, Ts_pw_p, Ts_cw_c)[::stride]
-        problem = stages.Problem(streams, parameter_columns(SYSTEMATIC))
-        workspace = stages.Workspace(problem)
+        problem = Problem(streams, parameter_columns(SYSTEMATIC))
+        workspace = Workspace(problem)
         fit = stages.noise(workspace, stages.start(problem))
         fits.append(stages.outliers(workspace, fit))
         workspaces.append(workspace)
@@ -82,9 +83,7 @@ def loss_difference(
     return losses[1] - losses[0]
 
 
-def _smallest_loss(
-    workspace: stages.Workspace, start: stages.Fit, outliers: Outliers
-) -> float:
+def _smallest_loss(workspace: Workspace, start: Fit, outliers: Outliers) -> float:
     """Return the smallest loss of a reading over all centres of rotation noise.
 
     ``start`` is a fit of this reading. The search does not use the poses and increments in
@@ -112,7 +111,7 @@ def _smallest_loss(
     return min(_loss(workspace, best), _loss(workspace, stages.polish(workspace, best)))
 
 
-def _loss(workspace: stages.Workspace, fit: stages.Fit) -> float:
+def _loss(workspace: Workspace, fit: Fit) -> float:
     """Return the restricted negative log likelihood, including the constant of the prior."""
     prior_sigmas = fit.sigmas[workspace.problem.columns]
     return workspace.posterior(fit).loss + float(np.log(prior_sigmas).sum())

@@ -18,13 +18,14 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import inverse_covariance, sigmas_in_parent
 from hand_eye_calib.core.results import document, stored
 from hand_eye_calib.core.results.parts import part
+from hand_eye_calib.core.results.reasons import Verdict
 from hand_eye_calib.core.results.records import (
     AXES,
     DofObservability,
     DofVerdict,
     SolveStatus,
 )
-from hand_eye_calib.core.results.verdict import Judged, Verdict
+from hand_eye_calib.core.results.verdict import Judged
 
 if TYPE_CHECKING:
     import pandas as pd

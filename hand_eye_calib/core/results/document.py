@@ -23,6 +23,7 @@ from hand_eye_calib.core.geometry.se3 import (
     sigmas_rpy,
 )
 from hand_eye_calib.core.results.parts import ExtraTransform, all_parts, part
+from hand_eye_calib.core.results.reasons import Reason, Verdict
 from hand_eye_calib.core.results.records import (
     AXES,
     ROTATIONS,
@@ -30,7 +31,7 @@ from hand_eye_calib.core.results.records import (
     by_hand,
 )
 from hand_eye_calib.core.results.result import Result
-from hand_eye_calib.core.results.verdict import Judged, Reason, Verdict
+from hand_eye_calib.core.results.verdict import Judged
 
 FORMAT = "hand_eye_calib/extrinsic"
 # A change that an older reader cannot understand raises the version. In version 1, covariance and

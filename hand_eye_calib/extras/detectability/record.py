@@ -15,8 +15,8 @@ from hand_eye_calib.core.base.text import (
 )
 from hand_eye_calib.core.results.axes import target_of
 from hand_eye_calib.core.results.parts import Part
+from hand_eye_calib.core.results.reasons import Ground
 from hand_eye_calib.core.results.records import AXES, DofVerdict
-from hand_eye_calib.core.results.verdict import Ground
 
 #: An injected error is contradicted above this many standard deviations: textbook, 1 of 370.
 SIGMAS = 3.0

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from hand_eye_calib.core.results.verdict import Ground
+from hand_eye_calib.core.results.reasons import Ground
 
 
 @dataclass(frozen=True, kw_only=True)

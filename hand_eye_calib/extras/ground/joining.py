@@ -27,7 +27,7 @@ from hand_eye_calib.core.geometry.se3 import sigmas_in_parent
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, SolveStatus
 from hand_eye_calib.core.results.records import AXES, ROTATIONS, TRANSLATIONS
-from hand_eye_calib.core.results.verdict import CONTRADICTED_SIGMAS
+from hand_eye_calib.core.results.rules import CONTRADICTED_SIGMAS
 from hand_eye_calib.extras.ground.part import GroundAxis, GroundResult
 from hand_eye_calib.extras.ground.tracks import VerticalTrack
 

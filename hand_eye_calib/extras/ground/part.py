@@ -12,8 +12,9 @@ import numpy as np
 
 from hand_eye_calib.core.base.text import listing, with_sigma
 from hand_eye_calib.core.results.parts import Part
+from hand_eye_calib.core.results.reasons import Ground
 from hand_eye_calib.core.results.records import ROTATIONS
-from hand_eye_calib.core.results.verdict import CONTRADICTED_SIGMAS, Ground
+from hand_eye_calib.core.results.rules import CONTRADICTED_SIGMAS
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,7 @@ from hand_eye_calib.core.noise import increments
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs, motion_pairs
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.core.results.records import Residuals
+from hand_eye_calib.extras.partial import position_windows
 from hand_eye_calib.extras.partial import positions as of_positions
 from hand_eye_calib.extras.partial.position_columns import fit_positions
 from hand_eye_calib.extras.partial.rate_bias import RateBias
@@ -99,7 +100,7 @@ class _Paths:
 
     def unexplained_share(self, solution: of_positions.LeverArmSolution) -> float:
         """Return the share of the path of the positions that a lever arm does not explain."""
-        return of_positions.unexplained_share(
+        return position_windows.unexplained_share(
             self.poses, self.positions, solution.lever_arm, solution.scale
         )
 
@@ -132,7 +133,7 @@ class _Paths:
 def unexplained_path(pose_pairs: PosePairs, config: CalibratorConfig) -> float:
     """Return the share of the path of the positions that the best lever arm does not explain."""
     paths = _Paths.of(pose_pairs, config)
-    return of_positions.unexplained_at_start(paths.poses, paths.positions)
+    return position_windows.unexplained_at_start(paths.poses, paths.positions)
 
 
 def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:

@@ -23,7 +23,8 @@ from hand_eye_calib.core.pairing.motion_pairs import PosePairs, synchronise
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.extras.partial.copies import COPIED_SHARE, as_errors, copied
 from hand_eye_calib.extras.partial.position_columns import PositionFit, fit_positions
-from hand_eye_calib.extras.partial.positions import solve, unexplained_share
+from hand_eye_calib.extras.partial.position_windows import unexplained_share
+from hand_eye_calib.extras.partial.positions import solve
 from hand_eye_calib.extras.partial.suspects import Suspect, most_significant
 
 # A coordinate of a lever arm is zero if it is below this distance (m).

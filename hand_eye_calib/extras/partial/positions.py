@@ -28,7 +28,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
-from hand_eye_calib.core.base.stats import robust_weights
 from hand_eye_calib.core.base.text import angle, length
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.noise import increments, reml
@@ -57,6 +56,7 @@ from hand_eye_calib.core.noise.stages import sample
 from hand_eye_calib.core.noise.state_space import Posterior, StateSpace
 from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 from hand_eye_calib.core.results.records import Noise
+from hand_eye_calib.extras.partial.position_windows import fit_windows
 
 # Index of a parameter that poses do not have: response of the positions less the odometry to
 # acceleration (s^2). It is not solved with the other parameters.
@@ -64,17 +64,6 @@ RESPONSE = increments.N_SYSTEMATIC
 
 # Log variance (rad^2) of orientations without bounds.
 _ANY_ROTATION = math.log(100.0)
-
-# Largest number of steps of the start.
-_START_STEPS = 50
-# The start ends if the lever arm changes by less than this (m).
-_START_SETTLED_M = 1e-6
-# Prior information for a lever arm of zero at the start, as a share of that of an axis: for motion
-# that does not reveal the lever arm.
-_PULL_TO_ZERO = 1e-6
-
-# Number of parts of a recording whose paths are compared on their own.
-_PATH_PARTS = 10
 
 # Parameters that are solved with the lever arm.
 _SHARED = [increments.SCALE, *increments.BIAS, increments.TIME]
@@ -152,7 +141,9 @@ def solve(
         Whether to estimate the scale between both worlds.
     tuning : Tuning
     """
-    lever_arm, scale, rotations = _start(Ts_pw_p, positions, with_scale, tuning.window)
+    lever_arm, scale, rotations = fit_windows(
+        Ts_pw_p, positions, with_scale, tuning.window
+    )
     stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
     Ts = se3.from_rotation_translation(rotations, scale * positions)
     streams = increments.Streams(stamps_s, Ts_pw_p, Ts)
@@ -515,107 +506,3 @@ def _accelerations(
     is_near = spans_s < tuning.longest_span_factor * 4 * k * interval_s
     accelerations[middle, :3] = np.where(is_near, se3.times(to_body, in_world), 0.0)
     return accelerations
-
-
-def _start(
-    Ts_pw_p: FloatArray, positions: FloatArray, with_scale: bool, window: int
-) -> tuple[FloatArray, float, FloatArray]:
-    """Fit windows of the recording, each aligned on its own, with robust weights.
-
-    The model in a window is ``scale A^T p = R lever_arm + t`` with the position p, the alignment A
-    of the window, and the pose (R, t). Positions are rows in the code: ``p^T A``.
-
-    Returns
-    -------
-    lever_arm : (3,) array
-    scale : float
-        1 unless asked for.
-    orientations : (N, 3, 3) array
-        Of the other sensor in the world of the positions, window by window.
-    """
-    lever_arm = np.zeros(3)
-    scale = 1.0
-    size = min(window, len(positions))
-    rotations = _windows(se3.rotation_of(Ts_pw_p), size)
-    path = _windows(se3.translation_of(Ts_pw_p), size)
-    measured = _windows(positions, size)
-    of_windows = np.einsum("nkij,nkil->njl", rotations, rotations)
-    information = of_windows + _PULL_TO_ZERO * size * np.eye(3)
-    for _ in range(_START_STEPS):
-        predicted = rotations @ lever_arm + path
-        alignments = _rotations(measured, predicted)
-        rotated = measured @ alignments
-        if with_scale:
-            products = (rotated * predicted).sum(axis=(1, 2))
-            squares = (rotated**2).sum(axis=(1, 2))
-            scales = np.divide(
-                products, squares, np.zeros_like(products), where=squares > 0.0
-            )
-            # Paths that do not move have no scale.
-            scale = float(np.median(scales)) or 1.0
-        residuals = scale * rotated - path
-        errors = np.sqrt(
-            ((residuals - rotations @ lever_arm) ** 2).sum(axis=2).mean(axis=1)
-        )
-        weights = robust_weights("cauchy", (errors / (np.median(errors) + 1e-12)) ** 2)
-        score = np.einsum("n,nkij,nki->j", weights, rotations, residuals)
-        previous = lever_arm
-        lever_arm = np.linalg.solve(np.einsum("n,njl->jl", weights, information), score)
-        if np.abs(lever_arm - previous).max() < _START_SETTLED_M:
-            break
-    window_of_pose = np.minimum(np.arange(len(positions)) // size, len(alignments) - 1)
-    return lever_arm, scale, alignments[window_of_pose] @ se3.rotation_of(Ts_pw_p)
-
-
-def unexplained_at_start(
-    Ts_pw_p: FloatArray, positions: FloatArray, tuning: Tuning = TUNING
-) -> float:
-    """Return the share of the path that the lever arm of the start does not explain.
-
-    The lever arm of the start ignores the noise model, so it is fast. The scale is 1. The arguments
-    are those of :func:`unexplained_share`.
-    """
-    lever_arm, scale, _ = _start(Ts_pw_p, positions, False, tuning.window)
-    return unexplained_share(Ts_pw_p, positions, lever_arm, scale)
-
-
-def unexplained_share(
-    Ts_pw_p: FloatArray, positions: FloatArray, lever_arm: FloatArray, scale: float
-) -> float:
-    """Return the share of the path of positions that poses and a lever arm do not explain.
-
-    The share is the median over tenths of the recording, each aligned on its own.
-
-    Parameters
-    ----------
-    Ts_pw_p : (N, 4, 4) array
-    positions : (N, 3) array
-    lever_arm : (3,) array
-    scale : float
-        Of the positions.
-
-    Returns
-    -------
-    float
-        1 if nothing moves.
-    """
-    predicted = se3.rotation_of(Ts_pw_p) @ lever_arm + se3.translation_of(Ts_pw_p)
-    size = max(len(positions) // _PATH_PARTS, min(_PATH_PARTS, len(positions)))
-    expected = _windows(predicted, size)
-    measured = _windows(scale * positions, size)
-    residuals = measured @ _rotations(measured, expected) - expected
-    usual_residual = np.median((residuals**2).sum(axis=(1, 2)))
-    usual_path = np.median((measured**2).sum(axis=(1, 2)))
-    return float(np.sqrt(usual_residual / usual_path)) if usual_path else 1.0
-
-
-def _windows(values: FloatArray, size: int) -> FloatArray:
-    """Values (n, size, ...) of windows of values (N, ...), minus the mean of their window."""
-    whole = len(values) // size * size
-    windows = values[:whole].reshape(-1, size, *values.shape[1:])
-    return windows - windows.mean(axis=1, keepdims=True)
-
-
-def _rotations(measured: FloatArray, predicted: FloatArray) -> FloatArray:
-    """Rotations (n, 3, 3) from predicted to measured positions (n, k, 3) of centred windows."""
-    return se3.nearest_rotation(np.einsum("nki,nkj->nij", measured, predicted))

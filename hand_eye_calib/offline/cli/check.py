@@ -174,7 +174,7 @@ def _stream_lines(
 
 def _verdict(findings: "Sequence[Finding]") -> str:
     """Return the verdict that a calibration would get, and what to do, in one sentence."""
-    from hand_eye_calib.core.results.verdict import Verdict
+    from hand_eye_calib.core.results.reasons import Verdict
 
     serious = [finding for finding in findings if finding.severity.value != "note"]
     if not serious:

@@ -1,0 +1,234 @@
+"""Data and state of the search for X, noise model, outliers and systematic errors.
+
+:class:`Problem` contains the data. :class:`Fit` is one state of the search. Both are immutable.
+:class:`Workspace` stores the factorisation of the last fit. The stages of the search are in
+:mod:`~hand_eye_calib.core.noise.stages`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hand_eye_calib.core.base.arrays import FloatArray, IntArray
+from hand_eye_calib.core.base.stats import median
+from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.noise.increments import (
+    N_SYSTEMATIC,
+    Course,
+    Streams,
+    course_of,
+    linearise,
+)
+from hand_eye_calib.core.noise.noise_model import (
+    ROTATION,
+    NoiseModel,
+    increment_levels,
+)
+from hand_eye_calib.core.noise.normal import prior_products
+from hand_eye_calib.core.noise.outliers import (
+    Outliers,
+    bridge_outliers,
+)
+from hand_eye_calib.core.noise.partwise import MAX_POSES, PartwisePosterior
+from hand_eye_calib.core.noise.state_space import WHITE, Posterior, StateSpace
+from hand_eye_calib.core.noise.tuning import TUNING, Tuning
+
+# Longest accepted step of the translation of X (m). No lever arm is that long.
+_MAX_STEP_M = 1000.0
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Data of a search: poses of two sensors, and which parameters to estimate.
+
+    Attributes
+    ----------
+    streams : Streams
+    columns : list of int
+        Indices of the systematic errors in the model, see
+        :data:`~hand_eye_calib.core.noise.increments.PARAMETERS`.
+    is_clock_free : bool
+        Whether the time offset was estimated from the same poses. It is certainly among the
+        systematic errors then.
+    without : frozenset of str
+        Names of the stages that are skipped.
+    tuning : Tuning
+    """
+
+    streams: Streams
+    columns: list[int]
+    is_clock_free: bool = False
+    without: frozenset[str] = frozenset()
+    tuning: Tuning = TUNING
+
+    def prior(self, fit: Fit) -> FloatArray:
+        """Return the prior of the parameters as products (p + 1, p + 1)."""
+        values = fit.parameters[self.columns]
+        return prior_products(values, fit.sigmas[self.columns], 7 + len(values))
+
+    def space(self, fit: Fit, kept: IntArray | None = None) -> StateSpace:
+        """Return the state space at a fit, of all poses or of the subset ``kept`` (indices)."""
+        if kept is not None:
+            fit = fit.at_poses(kept, self.tuning.burst[-1])
+        linearisation = linearise(
+            fit.poses, fit.course, fit.T, fit.parameters, self.columns, fit.error
+        )
+        return fit.model.state_space(
+            fit.poses,
+            linearisation,
+            fit.course.twists,
+            fit.T,
+            np.where(fit.outliers.spikes, 0.0, fit.weights),
+            fit.outliers.jumps,
+            self.prior(fit),
+        )
+
+    def course(self, T_parent_child: FloatArray, levels: FloatArray) -> Course:
+        """Return the motion of the child, smoothed as much as the noise levels (m,) require."""
+        noise_m = float(np.exp(0.5 * increment_levels(levels)[0]))
+        return course_of(self.streams, T_parent_child, self.tuning.caution * noise_m**2)
+
+    def is_noisy(self, fit: Fit) -> bool:
+        """Return whether rotation noise exceeds a share of the usual rotation between poses."""
+        turns = se3.rotation_angle(se3.rotation_of(self.streams.motions_p))
+        return bool(
+            np.exp(0.5 * fit.levels[ROTATION]) > self.tuning.noisy_share * median(turns)
+        )
+
+
+class Workspace:
+    """Problem with a cache: the posterior of the last fit.
+
+    Attributes
+    ----------
+    problem : Problem
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        # Only one posterior is stored, because the posterior of a long recording is large.
+        self._fit: Fit | None = None
+        self._posterior: Posterior | PartwisePosterior | None = None
+
+    def posterior(self, fit: Fit) -> Posterior | PartwisePosterior:
+        """Return the posterior of all poses at a fit; the same fit again costs nothing."""
+        if self._posterior is None or self._fit is not fit:
+            # Release the memory of the stored posterior before the next one is computed.
+            self._posterior = None
+            self._posterior = self._new_posterior(fit)
+            self._fit = fit
+        return self._posterior
+
+    def _new_posterior(self, fit: Fit) -> Posterior | PartwisePosterior:
+        problem = self.problem
+        n_poses = len(problem.streams)
+        if n_poses <= MAX_POSES:
+            return Posterior(problem.space(fit), fit.levels)
+
+        def space_of(poses: IntArray) -> StateSpace:
+            return problem.space(fit, poses)
+
+        return PartwisePosterior(space_of, n_poses, problem.prior(fit), fit.levels)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit:
+    """State of a search.
+
+    Attributes
+    ----------
+    poses : Streams
+        Poses for linearisation: the errors estimated so far were removed, and outlier poses were
+        replaced by :func:`~hand_eye_calib.core.noise.outliers.bridge_outliers`.
+    error : (N, 6) array
+        Errors c that were removed from the poses.
+    course : Course
+        Smoothed motion of the child.
+    T : (4, 4) array
+        X, which is T_parent_child.
+    model : NoiseModel
+    levels : (m,) array
+        Levels of the model: log variances and log time constants.
+    outliers : Outliers
+    weights : (N,) array
+        Weights of white errors; other than 1 only if white errors have heavy tails.
+    sigmas : (8,) array
+        Prior standard deviations of systematic errors.
+    has_heavy_tails : bool
+        Whether white errors have heavy tails.
+    parameters : (8,) array
+        Estimates of systematic errors, see
+        :data:`~hand_eye_calib.core.noise.increments.PARAMETERS`.
+    """
+
+    poses: Streams
+    error: FloatArray
+    course: Course
+    T: FloatArray
+    model: NoiseModel
+    levels: FloatArray
+    outliers: Outliers
+    weights: FloatArray
+    sigmas: FloatArray
+    has_heavy_tails: bool = False
+    parameters: FloatArray = field(default_factory=lambda: np.zeros(N_SYSTEMATIC))
+
+    def at_poses(self, kept: IntArray, longest_gap: int) -> Fit:
+        """Return the fit for a subset of poses (indices), see :meth:`Outliers.across`."""
+        return replace(
+            self,
+            poses=self.poses[kept],
+            error=self.error[kept],
+            course=self.course[kept],
+            outliers=self.outliers.across(kept, longest_gap),
+            weights=self.weights[kept],
+        )
+
+    def moved(self, step: FloatArray, columns: list[int]) -> Fit:
+        """Return the fit after a step of the parameters beta.
+
+        ``step`` (6 + k,) contains xi, then changes of the k systematic errors in ``columns``. X
+        does not change if its step is longer than any lever arm: then the step is noise along a
+        direction that the motion hardly excites.
+        """
+        parameters = self.parameters.copy()
+        parameters[columns] += step[6:]
+        if np.linalg.norm(step[:3]) >= _MAX_STEP_M:
+            return replace(self, parameters=parameters)
+        return replace(self, T=self.T @ se3.exp(step[:6]), parameters=parameters)
+
+    def corrected(self, streams: Streams, states: FloatArray) -> Fit:
+        """Return the fit with poses from which the estimated errors are removed.
+
+        White errors are split between both sensors in proportion to their covariances. All other
+        errors, and errors of outlier poses, are split in halves. The covariances of white noise do
+        not apply to them: an error of centimetres, split by covariances of millimetres, would
+        become large and opposite rotations of both sensors.
+
+        Parameters
+        ----------
+        streams : Streams
+            Measured poses.
+        states : (N, d) array
+            Expected states, see :mod:`~hand_eye_calib.core.noise.state_space`.
+        """
+        spikes = self.outliers.spikes
+        T = self.T
+        white_error = np.where(spikes[:, None], 0.0, states[:, :WHITE])
+        error = states[:, :WHITE] + self.model.process_errors(states, self.poses, T)
+        other_error = error - white_error
+        shares = self.model.shares(self.levels, self.poses, T)
+        # Ad(X^-1) a of the parent, and b of the child, with c = Ad(X^-1) a - b.
+        white_of_parent = se3.times(shares, white_error)
+        of_parent = white_of_parent + 0.5 * other_error
+        of_child = white_of_parent - white_error - 0.5 * other_error
+        measured = bridge_outliers(streams, T, spikes)
+        # The adjoint converts the error of the parent to the parent's frame.
+        poses = Streams(
+            streams.stamps_s,
+            measured.Ts_pw_p @ se3.exp(-of_parent @ se3.adjoint(T).T),
+            measured.Ts_cw_c @ se3.exp(-of_child),
+        )
+        return replace(self, poses=poses, error=error)
