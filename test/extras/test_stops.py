@@ -195,6 +195,66 @@ def test_files_of_other_tools(written, both_poses, tmp_path):
     assert read.frames == frames
 
 
+def calib_of_easy_handeye2(kind):
+    names = {"robot_base_frame": "link0", "tracking_base_frame": "camera"}
+    return json.dumps({"parameters": {"calibration_type": kind, **names}})
+
+
+@pytest.mark.parametrize("folder", ["samples", "calibrations"])
+@pytest.mark.parametrize("kind", ["eye_on_base", "eye_in_hand"])
+def test_the_calibration_of_the_same_name_states_the_place_of_the_camera(
+    folder, kind, both_poses, tmp_path
+):
+    for name in ("samples", "calibrations"):
+        (tmp_path / name).mkdir()
+    path = tmp_path / "samples" / "arm.samples"
+    path.write_text(easy_handeye2(both_poses))
+    calibration = tmp_path / folder / "arm.calib"
+    calibration.write_text(calib_of_easy_handeye2(kind))
+    (tmp_path / folder / "other.calib").write_text("not: read: ]")
+    read = read_arm_samples(path)
+    is_beside = kind == "eye_on_base"
+    robot = se3.inverse(both_poses[0]) if is_beside else both_poses[0]
+    np.testing.assert_allclose(read.robot, robot, atol=1e-12)
+    np.testing.assert_allclose(read.tracking, both_poses[1], atol=1e-12)
+    assert read.setup == ("beside" if is_beside else "hand")
+    assert read.frames == {"base": "link0", "camera": "camera"}
+    assert read.calibration == calibration
+
+
+def test_a_calibration_is_not_read_if_the_samples_state_the_place(both_poses, tmp_path):
+    document = json.loads(easy_handeye2(both_poses))
+    document["parameters"]["calibration_type"] = "eye_in_hand"
+    path = tmp_path / "arm.samples"
+    path.write_text(json.dumps(document))
+    (tmp_path / "arm.calib").write_text(calib_of_easy_handeye2("eye_on_base"))
+    read = read_arm_samples(path)
+    assert read.setup == "hand"
+    assert read.calibration is None
+
+
+def test_the_command_names_the_calibration_that_states_the_place(
+    tmp_path, capsys, no_figures
+):
+    random = np.random.default_rng(5)
+    hand = se3.exp(random.normal(size=(12, 6)))
+    camera_in_base = se3.exp(np.array([1.0, 0.1, 0.5, 0.2, -0.3, 0.4]))
+    target_in_hand = se3.exp(np.array([0.02, 0.0, 0.1, 0.1, 0.2, 0.0]))
+    tracking = se3.inverse(camera_in_base) @ hand @ target_in_hand
+    path = tmp_path / "arm.samples"
+    path.write_text(easy_handeye2([se3.inverse(hand), tracking]))
+    (tmp_path / "arm.calib").write_text(calib_of_easy_handeye2("eye_on_base"))
+    main(["calibrate", str(path), "--json"])
+    printed = capsys.readouterr()
+    assert "place of the camera and names of frames: " in printed.err
+    assert "arm.calib" in printed.err
+    result = json.loads(printed.out)
+    assert result["parent_frame"] == "link0"
+    np.testing.assert_allclose(
+        result["T_parent_child"]["matrix"], camera_in_base, atol=1e-6
+    )
+
+
 def test_the_report_of_an_arm_states_the_error_of_a_near_object(tmp_path):
     assert main(["calibrate", "sample:arm.yaml", "--out", str(tmp_path / "arm")]) == 0
     page = (tmp_path / "arm" / "report.html").read_text()

@@ -63,6 +63,8 @@ def solved(arguments: Namespace) -> SolvedInput:
         return _from_images(arguments, config, options)
     if len(paths) == 1:
         samples = read_arm_samples(paths[0])
+        if samples.calibration is not None:
+            note(f"place of the camera and names of frames: {samples.calibration}")
         setup = arguments.setup or samples.setup
         result = calibrate_arm(
             samples.robot, samples.tracking, config, samples.frames, setup

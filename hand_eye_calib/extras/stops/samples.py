@@ -4,7 +4,8 @@ Files that are read:
 
 - MoveIt's calibration: YAML of ``effector_wrt_world`` and ``object_wrt_sensor``, or JSON of pairs
   of matrices;
-- easy_handeye and easy_handeye2;
+- easy_handeye and easy_handeye2. Names of frames and the place of the camera are in the samples, or
+  in the calibration of the same name;
 - pairs ``T1_0``, ``T2_0``, ... in a FileStorage of OpenCV;
 - the stacks ``robot`` and ``tracking`` of an ``.npz``;
 - the arguments of OpenCV's ``calibrateHandEye`` by their names, in any of these files;
@@ -72,7 +73,14 @@ _OPENCV_FRAMES = {
 }
 
 
-# Place of the camera by easy_handeye's ``calibration_type``.
+# Folder of easy_handeye2's calibrations, beside that of its samples, and the ending of their names.
+_CALIBRATIONS = "calibrations"
+_CALIBRATION_ENDING = ".calib"
+
+_CALIBRATION = "a calibration of easy_handeye2, in YAML"
+
+# Key of the type of a calibration in files of easy_handeye, and the place of the camera by it.
+_TYPE = "calibration_type"
 _SETUPS = {"eye_in_hand": "hand", "eye_on_base": "beside"}
 
 
@@ -90,6 +98,8 @@ class ArmSamples:
         Names of the frames by the keys base, hand, camera and target; empty if the file has none.
     setup : {"hand", "beside"} or None
         Place of the camera that the file states; None if it states none.
+    calibration : Path or None
+        Further file that states ``frames`` and ``setup``; None if the samples state them.
 
     Raises
     ------
@@ -101,6 +111,7 @@ class ArmSamples:
     tracking: FloatArray
     frames: Mapping[str, str]
     setup: str | None = None
+    calibration: Path | None = None
 
     def __post_init__(self) -> None:
         if len(self.robot) != len(self.tracking):
@@ -146,16 +157,14 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
 
 def _listed_samples(path: str | Path, document: Any) -> ArmSamples:
     """Return the samples of a document that lists the stops one by one (MoveIt, easy_handeye)."""
-    frames: dict[str, str] = {}
-    setup = None
+    parameters: Mapping[str, Any] = {}
+    calibration = None
     if isinstance(document, Mapping) and "samples" in document:
-        parameters = document.get("parameters") or {}
-        frames = {
-            name: parameters[key]
-            for name, key in _FRAMES.items()
-            if parameters.get(key)
-        }
-        setup = _SETUPS.get(str(parameters.get("calibration_type")))
+        parameters = _parameters_of(document)
+        if not parameters.get(_TYPE):
+            calibration = _calibration_beside(Path(path))
+        if calibration is not None:
+            parameters = _parameters_of(read_yaml(calibration, _CALIBRATION))
         document = document["samples"]
     elif isinstance(document, Mapping):
         document = [*_numbered_pairs(document)]
@@ -166,10 +175,32 @@ def _listed_samples(path: str | Path, document: Any) -> ArmSamples:
         with located(f"{path}, sample {number}"):
             poses.append([pose_of(value) for value in _both_poses(sample)])
     robot, tracking = np.swapaxes(poses, 0, 1)
+    frames = {
+        name: parameters[key] for name, key in _FRAMES.items() if parameters.get(key)
+    }
+    setup = _SETUPS.get(str(parameters.get(_TYPE)))
     # For a camera beside the robot, easy_handeye stores the pose of the base in the hand.
     if setup == "beside":
         robot = se3.inverse(robot)
-    return ArmSamples(robot, tracking, frames, setup)
+    return ArmSamples(robot, tracking, frames, setup, calibration)
+
+
+def _parameters_of(document: Any) -> Mapping[str, Any]:
+    """Return the parameters of a document of easy_handeye: names of frames, type of calibration."""
+    parameters = document.get("parameters") if isinstance(document, Mapping) else None
+    return parameters if isinstance(parameters, Mapping) else {}
+
+
+def _calibration_beside(samples: Path) -> Path | None:
+    """Return easy_handeye2's calibration with the name of the samples; None if there is none.
+
+    It is in the folder of the samples, or in the folder ``calibrations`` beside that folder. The
+    samples of easy_handeye2 have empty parameters.
+    """
+    name = samples.with_suffix(_CALIBRATION_ENDING).name
+    folder = samples.absolute().parent
+    files = (folder / name, folder.parent / _CALIBRATIONS / name)
+    return next((file for file in files if file.is_file()), None)
 
 
 def _stacked_samples(stacks: Mapping[str, FloatArray]) -> ArmSamples:
