@@ -474,9 +474,8 @@ def kill(folder, kills):
         lost_s.append(
             (newest_ns - min(newest(journal, stream) for stream in STREAMS)) * 1e-9
         )
-        unchanged += (
-            before.items() <= fingerprints(output).items()
-        )  # the node adds its own
+        # The node adds its own topics.
+        unchanged += before.items() <= fingerprints(output).items()
         load_result(output)
     code, _ = node.stop(15)
     peer.close()

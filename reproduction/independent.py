@@ -276,9 +276,8 @@ def shrimp(folder: Path, n_segments: int) -> Iterator[Row]:
     truth = np.eye(4)
     truth[:3, 3] = _SHRIMP[:3]
     truth[:3, :3] = se3.rotation_exp(_SHRIMP[3:])
-    truth = se3.inverse(
-        truth
-    )  # published as the pose of the navigation system in the lidar
+    # The published mount is the pose of the navigation system in the lidar.
+    truth = se3.inverse(truth)
     generator = np.random.default_rng()
     start_ns, end_ns = velodyne.stamps_ns[[0, -1]]
     for seconds, published in _SHRIMP_PUBLISHED.items():

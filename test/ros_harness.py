@@ -62,9 +62,8 @@ def values_of(status):
 def free_domain():
     """A domain id whose first participant's port nobody listens on."""
     for candidate in itertools.islice(_domains, 100):
-        domain = (
-            1 + candidate % 100
-        )  # above 101, the ports run into those of Linux for clients
+        # Above 101, the ports overlap with those that Linux gives to clients.
+        domain = 1 + candidate % 100
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             try:
                 probe.bind(("", 7410 + 250 * domain))
@@ -187,10 +186,11 @@ class NodeProcess:
     def __init__(self, domain, log_file, ros_arguments, before="", fresh=False):
         self._log_file = log_file
         if not any("report:=" in str(argument) for argument in ros_arguments):
+            # A solve takes the processor for seconds.
             ros_arguments = [
                 *ros_arguments,
                 "-p report:=false",
-            ]  # it takes a processor for seconds
+            ]
         words = [
             word for argument in ros_arguments for word in str(argument).split(" ", 1)
         ]

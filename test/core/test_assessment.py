@@ -173,9 +173,8 @@ class TestFloor:
 
     def test_neither_stops_nor_jumps_count_for_the_usual_speed(self):
         stamps_ns = np.arange(600) * 100_000_000
-        x = 0.2 * np.clip(
-            np.arange(600) - 300, 0, None
-        )  # half of the time at rest, then 2 m/s
+        # Half of the time at rest, then 2 m/s.
+        x = 0.2 * np.clip(np.arange(600) - 300, 0, None)
         x[500:] += 40.0
         positions = np.column_stack([x, 0.0 * x, 0.0 * x])
         assert common_mode.usual_speed(stamps_ns, positions) == pytest.approx(2.0)

@@ -152,9 +152,8 @@ def test_the_evidence_of_a_shift_is_that_of_the_difference_of_both_answers(rows)
 
 
 def test_a_shift_from_values_known_exactly_is_the_answer_since():
-    table = np.array(
-        [[4.0, 0.0, 8.0], [0.0, 0.0, 0.0]]
-    )  # 4 (x - 2) = 0, nothing about y
+    # 4 (x - 2) = 0; y is not determined.
+    table = np.array([[4.0, 0.0, 8.0], [0.0, 0.0, 0.0]])
     shift = shift_evidence(table, np.array([0.5, 7.0]), np.zeros((2, 2)))
     assert shift.tolist() == [[4.0, 0.0, 6.0], [0.0, 0.0, 0.0]]
 

@@ -191,9 +191,8 @@ def test_a_scale_that_was_given_is_left_by_the_noise_model_too(streams):
 
 
 def test_a_clock_that_was_given_as_right_is_left_by_the_noise_model_too(late):
-    shifted = replace(
-        late, buffered_child=late.buffered_child.shifted(0.04)
-    )  # 0.01 s remain
+    # An offset of 0.01 s remains.
+    shifted = replace(late, buffered_child=late.buffered_child.shifted(0.04))
     estimated = hec.calibrate(late.buffered_parent, shifted.buffered_child)
     assert estimated.time_offset_s == pytest.approx(0.01, abs=0.003)
     result = hec.calibrate(

@@ -94,9 +94,8 @@ def test_a_batch_on_all_cores_goes_on_where_it_stopped(
         "note: 3 recordings are not compared with each other: set --vehicle to the"
         in err
     )
-    assert re.search(
-        r"note: [1-4] of 4: drive[0-2]: USE", err
-    )  # a line for each in a pipe
+    # A pipe gets a line for each recording.
+    assert re.search(r"note: [1-4] of 4: drive[0-2]: USE", err)
     saved = load_result(out_dir / "drive1")
     np.testing.assert_allclose(saved.T_parent_child, T_PARENT_CHILD, atol=1e-3)
     assert (out_dir / "drive1" / "static_transform.launch.py").exists()
@@ -284,9 +283,8 @@ def test_rows_and_page_have_every_recording_and_the_vehicle(
     assert not any(row[4] for row in rows_of(page))
     assert "The 3 recordings agree within their standard deviations" in page
     assert (tmp_path / "1" / "vehicles" / "truck" / "extrinsic.yaml").exists()
-    monkeypatch.setattr(
-        batch_run, "together", lambda results: 1 / 0
-    )  # is not called again
+    # The recordings are not compared a second time.
+    monkeypatch.setattr(batch_run, "together", lambda results: 1 / 0)
     assert run(*fleet, *more, "--out", tmp_path / "1")[0] == 1
     assert (tmp_path / "1" / "index.html").read_text(encoding="utf-8") == page
 

@@ -234,9 +234,8 @@ def test_results_that_all_scatter_more_than_stated_accuse_none():
     assert len(excesses) >= 19
     assert min(excesses) > 1.5
     assert max(excesses) < 2.5
-    assert (
-        agreement_of(*results_of(0, 12, factor=0.001)).kind == "differ"
-    )  # of no one mount
+    # The errors are far above these sigmas: the mounts differ.
+    assert agreement_of(*results_of(0, 12, factor=0.001)).kind == "differ"
 
 
 def test_a_single_result_and_one_that_knows_nothing():

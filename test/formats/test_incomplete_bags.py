@@ -29,9 +29,8 @@ def killed_recording(folder, journal_mode, kept_in_file):
     database.execute("VACUUM")
     database.execute(f"PRAGMA journal_mode={journal_mode}")
     database.execute("PRAGMA wal_autocheckpoint=0")
-    if (
-        journal_mode == "DELETE"
-    ):  # in the middle of a transaction that has reached the disk
+    # In the middle of a transaction that is on the disk.
+    if journal_mode == "DELETE":
         database.execute("PRAGMA cache_size=1")
         database.execute("BEGIN")
     else:

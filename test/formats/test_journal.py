@@ -50,9 +50,8 @@ def resumed(directory, limits=None):
 
 @pytest.mark.parametrize("n_poses", [60, 600])
 def test_a_resumed_session_is_the_session(tmp_path, n_poses):
-    limits = BufferLimits(
-        capacity=400, pairing_starts=200
-    )  # pairs are made of 600 poses
+    # Pairs are made of 600 poses.
+    limits = BufferLimits(capacity=400, pairing_starts=200)
     calibrator = Calibrator(CONFIG, limits)
     writer = JournalWriter(tmp_path / "journal", BOTH)
     calibrator.set_frame("parent", "lidar")

@@ -183,9 +183,8 @@ def test_damaged_inputs_end_in_an_answer_or_in_one_line(
     finally:
         faulthandler.cancel_dump_traceback_later()
     assert not [*(tmp_path / "TMPDIR").iterdir()]
-    if (
-        N_INPUTS > 24
-    ):  # in a process of its own; not ru_maxrss, which is that of who started it
+    # Memory is measured in a process of its own. ru_maxrss would be that of its parent.
+    if N_INPUTS > 24:
         peak = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
         assert int(peak[1]) / 1024 < LARGEST_MB
     assert {code in (0, 3) for code in codes} == {True, False}, codes

@@ -74,10 +74,11 @@ def test_a_journal_gives_what_a_bag_gives_with_the_options_of_its_session(
     code, out, err = run(tmp_path / folder, "--reference", "B5", "--json")
     document = json.loads(out)
     assert (code, err) == (0, "")
+    # Options on the command line override those of the session.
     assert (document["method"], document["reference"]) == (
         "park",
         "B5",
-    )  # what is typed goes first
+    )
     assert document["inputs"]["child"]["topic"] == "/b"
     assert document["inputs"]["journal"] == str(tmp_path / "live" / "journal")
     of_bag = run(bag, *STREAMS, "--method", "park", "--reference", "B5", "--json")[1]

@@ -272,9 +272,8 @@ def test_the_newest_of_equally_good_results_is_kept():
         newest = result(sigmas_m=sigma_m)
         goal.add(newest, seen(motion_s))
         assert goal.best is newest
-    goal.add(
-        result(sigmas_m=0.0055), seen(88.0)
-    )  # a quarter worse than the best there was
+    # A quarter worse than the best result so far.
+    goal.add(result(sigmas_m=0.0055), seen(88.0))
     assert goal.best is newest
 
 

@@ -336,9 +336,8 @@ def test_bars_show_the_share_of_the_information_and_the_time_left():
         True,
         False,
     ]
-    assert bars["z"].share == pytest.approx(
-        0.25
-    )  # twice the target: a quarter of the information
+    # Twice the target is a quarter of the information.
+    assert bars["z"].share == pytest.approx(0.25)
     assert (bars["z"].tone, bars["z"].word) == (Tone.ACT, "25 s left")
     assert (bars["z"].sigma, bars["yaw"].sigma) == (
         "± 4 cm of 2 cm",

@@ -171,10 +171,11 @@ def test_one_class_from_end_to_end(tmp_path, monkeypatch, capsys):
     assert 0.3 < row_of["hand_white"].value("bound") < 3.0
     assert row_of["flat_agv"].value("refused") == 1.0
     assert set(row_of["all classes"].cases["bound"]) == {"hand_white/0", "hand_white/1"}
+    # Rows differ in their arguments.
     assert [*study.in_parallel(max, [(1, 2), (3, 4, 5)], 2)] == [
         2,
         5,
-    ]  # rows differ in arguments
+    ]
     monkeypatch.delenv("HAND_EYE_CALIB_DATA", raising=False)
     monkeypatch.setattr(study, "measure", lambda *_: rows)
     files = [tmp_path / name for name in ("page.md", "rows.csv")]

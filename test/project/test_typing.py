@@ -65,10 +65,11 @@ def test_a_wrong_call_fails_the_type_check_and_a_right_one_passes(tmp_path):
         "hand_eye_calib.core.results.verdict",
     }
     of_arguments |= {"hand_eye_calib.core.engine.run"}
+    # The modules of Prior and OptionSet.
     of_arguments |= {
         "hand_eye_calib.core.base.text",
         "hand_eye_calib.core.base.option",
-    }  # Prior, OptionSet
+    }
     followed = [hec.__name__, *sorted(public | of_arguments), "numpy", "numpy.*"]
     config.write_text(
         "[mypy]\nfollow_imports = skip\n"

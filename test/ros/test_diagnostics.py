@@ -306,9 +306,8 @@ class TestStreamChecks:
 
         def is_told(document):
             result = document.extrinsic.result
-            is_whole = document.extrinsic.n_poses == len(
-                stamps_ns
-            )  # solves come before the last pose
+            # Solves begin before the last pose.
+            is_whole = document.extrinsic.n_poses == len(stamps_ns)
             return (
                 result
                 and is_whole

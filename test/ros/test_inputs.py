@@ -59,9 +59,8 @@ def test_unusable_messages_are_refused_by_topic_and_poison_nothing(start_node, p
 def test_a_sensor_frame_without_a_name_is_named_by_default_or_by_parameter(
     start_node, peer
 ):
-    publishers = peer.publishers(
-        Odometry, PoseStamped
-    )  # an empty name, and no place for one
+    # The messages of Odometry have an empty name; PoseStamped has no place for one.
+    publishers = peer.publishers(Odometry, PoseStamped)
     for options, names in (
         ([], ("parent_sensor", "child_sensor")),
         (["-p parent_frame:=lidar"], ("lidar", "child_sensor")),

@@ -182,9 +182,8 @@ def test_two_nodes_do_not_share_a_directory(start_node, peer, tmp_path):
     assert second.log == f"calibrator: {line} choose another directory\n"
     first.process.kill()
     first.wait()
-    third = start_node(
-        "-p solve_period:=0.2", *into(used)
-    )  # a node that was killed keeps nothing
+    # A node that was killed stores nothing.
+    third = start_node("-p solve_period:=0.2", *into(used))
     third.wait_for_log("no pose yet on /parent_odom")
 
 

@@ -129,9 +129,8 @@ def frame_is_used(start_node, peer, tmp_path, stream, text):
 
 def type_is_used(start_node, peer, tmp_path, stream):
     node = start_node(*QUIET, f"-p {stream}_type:=geometry_msgs/msg/PoseStamped")
-    node.wait_for_log(
-        f"subscribed to /{stream}_odom (geometry_msgs/msg/PoseStamped)"
-    )  # though nobody publishes
+    # The node subscribes although nobody publishes.
+    node.wait_for_log(f"subscribed to /{stream}_odom (geometry_msgs/msg/PoseStamped)")
     peer.wait_matched(peer.publisher(PoseStamped, f"{stream}_odom"))
 
 

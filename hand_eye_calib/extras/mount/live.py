@@ -65,9 +65,8 @@ class MountWatch:
         calibrator = self._session.calibrator
         pairs = calibrator.take_pairs()
         pairs = pairs[pairs.stamps_ns > self._last_ns]
-        if self._monitor is None and len(
-            pairs
-        ):  # the frames are known from the first pair on
+        # The frames are known from the first pair on.
+        if self._monitor is None and len(pairs):
             snapshot = calibrator.snapshot()
             installed = self._installed(snapshot.parent_frame, snapshot.child_frame)
             if installed is not None:

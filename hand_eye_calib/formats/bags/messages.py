@@ -381,7 +381,8 @@ class Run(NamedTuple):
             except (
                 AttributeError,
                 TypeError,
-            ) as error:  # a message in JSON may have any fields
+            ) as error:
+                # A message in JSON may have any fields.
                 raise self.unreadable(error) from error
 
     def unreadable(self, error: Exception) -> InputError:
