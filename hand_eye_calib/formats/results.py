@@ -311,6 +311,11 @@ def load_result(path: str | Path) -> Calibration:
             f"{path} is a robot description, not a saved result: pass it to compare RESULT --with "
             f"{path.name}, or to --installed"
         )
+    if path.suffix in (".tum", ".txt", ".csv") and path.exists():
+        raise InputError(
+            f"{path} is a file of poses, not a saved result: calibrate PARENT CHILD --out DIR "
+            f"saves a result in DIR; then compare DIR --with {path.name} compares it with one pose"
+        )
     try:
         document = read_yaml(path)
     except UnreadableYamlError as error:

@@ -312,6 +312,26 @@ def test_a_vehicle_whose_recordings_differ_is_no_good_exit(run, tmp_path, monkey
     assert "1 vehicle: 1 DO NOT USE" in out
 
 
+@pytest.mark.usefixtures("no_processes")
+def test_a_vehicle_with_one_recording_has_a_result_too(run, tmp_path):
+    for number, vehicle in enumerate("ab"):
+        write_drive(tmp_path / "fleet" / vehicle / "monday", 60, number)
+    options = [*STREAMS, "--reference", "B5", "--no-report", "--jobs", "1"]
+    fleet = ["--batch", tmp_path / "fleet", "--vehicle", "fleet/{vehicle}/*"]
+    code, out, _ = run(*fleet, *options, "--out", tmp_path / "out")
+    assert code == 0
+    assert re.search(r"2 vehicles: 2 USE\b.*\na: USE.*\nb: USE", out)
+    for vehicle in "ab":
+        assert (tmp_path / "out" / "vehicles" / vehicle / "extrinsic.yaml").exists()
+
+
+@pytest.mark.parametrize(("by", "code"), [(0.0, 0), (0.02, 4)])
+def test_recordings_of_a_vehicle_that_contradict_each_other_exit_as_moved(by, code):
+    outcomes = fleet_outcomes("a", 6, 1, shift=(4, 5), by=by)
+    result = together({item.row["name"]: item.calibration for item in outcomes})
+    assert batch_run._code_of_vehicle(result) == code
+
+
 @pytest.mark.parametrize("name", [" =cmd()", "＝1+1", "a;=cmd()"])
 def test_a_cell_cannot_become_a_formula(tmp_path, name):
     (outcome,) = fleet_outcomes("truck", 1, 1)

@@ -261,9 +261,11 @@ def test_a_page_of_a_fleet_needs_digests_of_every_vehicle(session, tmp_path):
     write_digest(tmp_path / "a", session)
     (tmp_path / "b").mkdir()
     with pytest.raises(
-        ConfigError, match="needs digests, which the monitor writes.*b has none"
+        ConfigError, match="--fleet needs digests.*b has none: the node writes"
     ):
         compare_digests(
             arguments(tmp_path / "a", tmp_path / "b", fleet=tmp_path / "page.html")
         )
     assert not (tmp_path / "page.html").exists()
+    with pytest.raises(ConfigError, match="no digests: .*digests has none"):
+        compare_digests(arguments(tmp_path / "b" / "digests"))

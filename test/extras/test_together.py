@@ -9,12 +9,16 @@ import real_data
 from fleet_making import recordings_of
 from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
 from result_making import SHIFTED_FROM as X
-from result_making import shift, written_finding
+from result_making import SIGMAS, shift, written_finding
 from result_making import shifted as result
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.assessment.agreement import agreement_of
-from hand_eye_calib.core.assessment.comparison import compare, with_comparison
+from hand_eye_calib.core.assessment.comparison import (
+    compare,
+    scatters_in_words,
+    with_comparison,
+)
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import Extrinsic
@@ -272,6 +276,19 @@ def test_results_that_scatter_by_their_sigmas_are_the_same_and_the_power_is_told
     np.testing.assert_allclose(
         values(pair_difference),
         deviation(result(seed=2).T_parent_child, result(seed=1).T_parent_child),
+    )
+
+
+def test_a_comparison_names_the_scatter_that_its_sigmas_contain():
+    in_hand = result(seed=1)
+    of_vehicle = result(seed=2, sigmas=SIGMAS * [1, 1, 9, 1, 1, 1])
+    assert scatters_in_words([in_hand, in_hand]) == (
+        "+/- contains the usual scatter between recordings, which is assumed to be 8 mm and 0.12 "
+        "deg, as for a sensor that turns about all axes"
+    )
+    text = scatters_in_words([in_hand, of_vehicle])
+    assert text.endswith(
+        "; and 2 cm and 0.1 deg, as for a vehicle, because one of x, y, z is much less certain"
     )
 
 

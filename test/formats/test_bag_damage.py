@@ -252,11 +252,10 @@ def test_paths_that_are_no_bag(tmp_path):
     for suffix in ("bag", "mcap", "db3"):
         (tmp_path / f"empty.{suffix}").touch()
         (tmp_path / f"text.{suffix}").write_text("this is not a bag\n" * 100)
-        for kind in ("empty", "text"):
-            message = (
-                f"{kind}.{suffix}: it is truncated, damaged or of an unsupported kind"
-            )
-            messages[f"{kind}.{suffix}"] = message
+        messages[f"empty.{suffix}"] = f"empty.{suffix}: it is empty, 0 bytes"
+        messages[f"text.{suffix}"] = (
+            f"text.{suffix}: it is truncated, damaged or of an unsupported kind"
+        )
     for name, message in messages.items():
         assert re.search(message, *read(tmp_path / name)[1]), name
 

@@ -11,6 +11,7 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 IMAGE = "sensor_msgs/msg/Image"
 FIX = "sensor_msgs/msg/NavSatFix"
 IMU = "sensor_msgs/msg/Imu"
+JOINTS = "sensor_msgs/msg/JointState"
 BOTH = ("parent", "child")
 
 
@@ -96,6 +97,12 @@ def test_the_stream_that_is_not_named_is_chosen_alone():
             (),
             "only one topic has poses, /lidar/odometry",
             {"parent_topic": "/lidar/odometry", "child_topic": "/fix"},
+        ),
+        (
+            [LIDAR, ("/joint_states", JOINTS, 900)],
+            (),
+            "/joint_states may be the other stream",
+            {"parent_topic": "/joint_states", "child_topic": "/lidar/odometry"},
         ),
         (
             [LIDAR, ("/log", "std_msgs/msg/String", 5)],

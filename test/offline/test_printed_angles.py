@@ -101,6 +101,23 @@ def calibration(rotation, sigmas_deg):
     )
 
 
+def test_with_an_unknown_yaw_the_sigmas_about_the_other_axes_are_printed():
+    # The rotation by 90 deg exchanges the axes of roll and pitch with those of the parent.
+    rotation = se3.rotation_from_rpy(np.radians([0.0, 0.0, 90.0]))
+    sigmas_deg = (0.9, 0.5, 360.0)
+    covariance = covariance_about_parent(rotation, sigmas_deg)
+    sigmas = np.r_[0.01, 0.02, 0.03, np.radians(sigmas_deg)]
+    sigmas[5] = np.inf
+    result = made(
+        T_parent_child=transform(rotation),
+        covariance_measured=covariance,
+        status=SolveStatus.UNOBSERVABLE,
+        observability_measured=dofs(sigmas, ["yaw"]),
+    )
+    text = " ".join(" ".join(as_lines(result)).split())
+    assert "about the axes x and y the rotation is good to 0.9 deg and 0.5 deg" in text
+
+
 def test_a_result_has_the_sigmas_of_its_printed_numbers_in_both_directions():
     result = calibration(LIDAR_CAMERA, (0.57, 0.028, 0.1))
     document = result.to_dict()

@@ -121,10 +121,11 @@ TABLE = """
 2 | batch folder | no bag matches folder/**: expected folders with a metadata.yaml
 2 | batch lidar.tum | lidar.tum is not a bag, and batch takes bags: for trajectory files
 2 | batch lidar.tum camera.tum --vehicle x | use calibrate PARENT CHILD
-2 | batch lidar*.tumx | for trajectory files, use calibrate PARENT CHILD
+2 | batch lidar*.tumx | no file matches lidar*.tumx: check the folder and the name
+2 | batch LIDAR*.tum | no file matches LIDAR*.tum: did you mean lidar.tum? Upper and lower
 2 | check lidar.tum camera.tum --child-topic /a | --child-topic applies to bags only
 1 | info robot.urdf | robot.urdf is a robot description, not a saved result
-1 | info lidar.tum | not a saved result: expected format
+1 | info lidar.tum | a file of poses, not a saved result: calibrate PARENT CHILD --out DIR
 1 | info torn.yaml | torn.yaml is not readable YAML
 1 | compare torn.yaml --with robot.urdf | restore the file, or calibrate again
 1 | compare saved | or one and the installed transform (--with

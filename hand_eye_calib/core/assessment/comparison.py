@@ -9,7 +9,7 @@ import numpy as np
 
 from hand_eye_calib.core.assessment.agreement import Agreement, agreement_of
 from hand_eye_calib.core.assessment.change import UNKNOWN, Change, moved
-from hand_eye_calib.core.assessment.moved import scatter_of_recordings
+from hand_eye_calib.core.assessment.moved import scatter_in_words, scatter_of_recordings
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import InputError, require_type
 from hand_eye_calib.core.base.text import listing
@@ -207,6 +207,15 @@ def _difference(first: _Named, second: tuple[str, Calibration]) -> Difference:
 def _is_from_motion(extrinsic: Calibration | Extrinsic) -> bool:
     """Return whether an extrinsic was estimated from the motion of the same sensors."""
     return isinstance(extrinsic, Calibration) or extrinsic.is_calibration
+
+
+def scatters_in_words(results: Sequence[Calibration]) -> str:
+    """Explain the scatter between recordings that the standard deviations of a comparison have."""
+    texts = [scatter_in_words(_covariances(result)[0]) for result in results]
+    return (
+        "+/- contains the usual scatter between recordings, which is assumed to be "
+        + "; and ".join(dict.fromkeys(texts))
+    )
 
 
 def _covariances(extrinsic: Calibration | Extrinsic) -> FloatArray:

@@ -94,10 +94,24 @@ def scatter_of_recordings(covariance: FloatArray) -> FloatArray:
     Add it to ``covariance``, the covariance (6, 6) of the result of one recording. The translation
     part of ``covariance`` decides whether the rig counts as a vehicle.
     """
-    variances = np.linalg.eigvalsh(covariance[:3, :3])
-    is_vehicle = variances[2] > _VEHICLE_SIGMA_RATIO**2 * variances[1]
+    is_vehicle = counts_as_vehicle(covariance)
     sigmas = _SCATTER_OF_VEHICLES if is_vehicle else _SCATTER_IN_HAND
     return np.diag(sigmas**2)
+
+
+def counts_as_vehicle(covariance: FloatArray) -> bool:
+    """Whether one translation is much less certain than the others, by a covariance (6, 6)."""
+    variances = np.linalg.eigvalsh(covariance[:3, :3])
+    return bool(variances[2] > _VEHICLE_SIGMA_RATIO**2 * variances[1])
+
+
+def scatter_in_words(covariance: FloatArray) -> str:
+    """Explain the scatter between recordings for a result with a covariance (6, 6)."""
+    scatter = np.sqrt(np.diag(scatter_of_recordings(covariance)))
+    sizes = f"{length(scatter[0])} and {angle(scatter[3])}"
+    if counts_as_vehicle(covariance):
+        return f"{sizes}, as for a vehicle, because one of x, y, z is much less certain"
+    return f"{sizes}, as for a sensor that turns about all axes"
 
 
 def shift_covariance(

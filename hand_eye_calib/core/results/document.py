@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.base.plain import Document, plain
 from hand_eye_calib.core.base.text import (
     amount,
@@ -349,31 +349,47 @@ def angles_in_words(transform: Notation, result: Result) -> str:
 
     Near a pitch of 90 deg, roll and yaw vary together: a small rotation changes both by much.
     Angles are about fixed axes, one after the other. So their standard deviations may be others
-    than those about the axes of the target.
+    than those about the axes of the target. Unknown axes are ignored.
     """
-    rotation_rad = float(result.sigmas[3:].max())
+    sigmas_rad = result.sigmas[3:]
+    sigmas_deg = np.asarray(transform.sigma_rpy_deg)
+    # Near a pitch of 90 deg, angles are unknown although the rotation is known.
+    are_known = np.isfinite(sigmas_rad)
+    if not are_known.all():
+        are_known &= np.isfinite(sigmas_deg)
+    if not are_known.any():
+        return ""
+    rotation_rad = float(sigmas_rad[are_known].max())
     # Angles that are printed to the digits of the rotation need no explanation.
-    excess_deg = float(np.max(transform.sigma_rpy_deg)) - math.degrees(rotation_rad)
+    excess_deg = float(sigmas_deg[are_known].max()) - math.degrees(rotation_rad)
     if not round(excess_deg, 1) > 0.0:
-        return _about_axes_in_words(transform)
+        return _about_axes_in_words(transform, are_known)
     return (
         f"roll and yaw vary together at pitch {transform.rpy_deg[1]:.0f} deg; the rotation itself "
         f"is good to {amount('roll', rotation_rad)}"
     )
 
 
-def _about_axes_in_words(transform: Notation) -> str:
-    """Return the standard deviations about x, y and z if those of the angles differ from them."""
-    about_deg = transform.sigma_about_deg
-    ratios = transform.sigma_rpy_deg / about_deg
-    if not np.isfinite(ratios).all() or np.abs(np.log(ratios)).max() < _SAME_ANGLES:
+def _about_axes_in_words(transform: Notation, are_known: BoolArray) -> str:
+    """Return the standard deviations about x, y and z if those of the angles differ from them.
+
+    ``are_known`` (3,) says which axes are determined; the others are left out.
+    """
+    about_deg = np.asarray(transform.sigma_about_deg)
+    are_known = are_known & np.isfinite(about_deg)
+    ratios = np.asarray(transform.sigma_rpy_deg)[are_known] / about_deg[are_known]
+    if not len(ratios) or not np.isfinite(ratios).all():
         return ""
-    sizes = listing(
-        [amount("roll", math.radians(sigma)) for sigma in about_deg.tolist()]
-    )
+    if np.abs(np.log(ratios)).max() < _SAME_ANGLES:
+        return ""
+    axes = np.array(TRANSLATIONS)[are_known].tolist()
+    sizes = [
+        amount("roll", math.radians(sigma)) for sigma in about_deg[are_known].tolist()
+    ]
+    word = "axes" if len(axes) > 1 else "axis"
     return (
-        "roll, pitch and yaw are turns one after the other; about the axes x, y and z the rotation "
-        f"is good to {sizes}"
+        f"roll, pitch and yaw are turns one after the other; about the {word} {listing(axes)} "
+        f"the rotation is good to {listing(sizes)}"
     )
 
 

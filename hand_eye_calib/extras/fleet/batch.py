@@ -19,13 +19,14 @@ from hand_eye_calib.core.base.plain import json_text
 from hand_eye_calib.core.base.text import counted, listing, shown_value
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
 from hand_eye_calib.extras.fleet import work
-from hand_eye_calib.extras.fleet.records import is_in_headline
+from hand_eye_calib.extras.fleet.records import CONTRADICTIONS, is_in_headline
 from hand_eye_calib.extras.fleet.together import together
 from hand_eye_calib.extras.fleet.work import Outcome, Row, Task, outcomes, tasks_of
 from hand_eye_calib.formats.bags.patterns import is_other_file, matching
 from hand_eye_calib.formats.results import save_result, save_text
 from hand_eye_calib.offline.beside_motion import switched_off
 from hand_eye_calib.offline.cli.options import (
+    Exit,
     note,
     options_from,
     sources_from,
@@ -87,8 +88,16 @@ def run_batch(arguments: argparse.Namespace) -> int:
             "vehicle in their paths, such as 'fleet/{vehicle}/*'"
         )
     codes = [outcome.code for outcome in done]
-    codes += [exit_code(result) for result in vehicles.values()]
+    codes += [_code_of_vehicle(result) for result in vehicles.values()]
     return gravest_code(codes)
+
+
+def _code_of_vehicle(result: Calibration) -> int:
+    """Return the exit code of a vehicle: MOVED if its recordings contradict each other."""
+    together = result.parts.get("together")
+    if together and together.kind in CONTRADICTIONS:
+        return max(exit_code(result), Exit.MOVED)
+    return exit_code(result)
 
 
 def _print_json(
@@ -231,9 +240,10 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
 def _vehicles(
     done: Sequence[Outcome], directory: Path | None
 ) -> dict[str, Calibration]:
-    """Return the common result of each vehicle with several recordings, by the vehicle's name.
+    """Return the result of each vehicle by its name.
 
-    The result of an earlier run with the same recordings is reused.
+    The result of a single recording is that of its vehicle. Several recordings have a common
+    result; that of an earlier run with the same recordings is reused.
     """
     groups: dict[str, list[Outcome]] = {}
     for outcome in done:
@@ -241,8 +251,6 @@ def _vehicles(
             groups.setdefault(outcome.row["vehicle"], []).append(outcome)
     results: dict[str, Calibration] = {}
     for vehicle, group in sorted(groups.items()):
-        if len(group) == 1:
-            continue
         texts = "\n".join(outcome.text for outcome in group)
         digest = hashlib.sha256(texts.encode()).hexdigest()
         task = Task(
@@ -252,13 +260,15 @@ def _vehicles(
         if earlier:
             results[vehicle] = earlier.calibration
             continue
-        try:
-            results[vehicle] = together(
-                {outcome.row["name"]: outcome.calibration for outcome in group}
-            )
-        except InputError as error:
-            note(f"{vehicle} has no common result: {error}")
-            continue
+        recordings = {outcome.row["name"]: outcome.calibration for outcome in group}
+        if len(recordings) == 1:
+            (results[vehicle],) = recordings.values()
+        else:
+            try:
+                results[vehicle] = together(recordings)
+            except InputError as error:
+                note(f"{vehicle} has no common result: {error}")
+                continue
         if directory:
             _store(task, Outcome.of(task, None, results[vehicle]), directory)
     return results
@@ -278,7 +288,11 @@ def _write_rows_and_page(
     linked = {
         row["name"] for row in rows if (directory / row["name"] / REPORT).exists()
     }
-    save_text(directory / page, render_batch(title, rows, vehicles, linked))
+    # The rows of the page contain the results of vehicles with a single recording.
+    with_several = {
+        name: result for name, result in vehicles.items() if "together" in result.parts
+    }
+    save_text(directory / page, render_batch(title, rows, with_several, linked))
     for name in (work.TABLE, page):
         note(f"wrote {directory / name}")
 

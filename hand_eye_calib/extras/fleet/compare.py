@@ -10,6 +10,7 @@ from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.base.registry import COMPARISONS
 from hand_eye_calib.core.base.text import amount, distinct_names
 from hand_eye_calib.offline.cli.options import (
+    Exit,
     add_json_argument,
     note,
     print_result,
@@ -55,8 +56,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Compare results; return the exit code."""
-    from hand_eye_calib.core.assessment.comparison import compare
+    from hand_eye_calib.core.assessment.comparison import compare, scatters_in_words
     from hand_eye_calib.formats.results import load_result
+    from hand_eye_calib.offline.cli.present import wrapped
 
     for compare_others in COMPARISONS.values():
         code = compare_others(arguments)
@@ -78,11 +80,13 @@ def run(arguments: argparse.Namespace) -> int:
         with waiting_for(f"reading {arguments.installed}"):
             installed = open_installed(arguments.installed)(*frames)
     comparison = compare(results, installed, distinct_names(arguments.results))
-    lines = _lines(comparison, results[0], arguments.installed)
+    lines = [*_lines(comparison, results[0], arguments.installed)]
+    lines += wrapped(scatters_in_words(results), "", "  ")
     print_result(lines, comparison if arguments.json else None)
     if not arguments.installed:
         note(*_repeated_recordings(arguments.results))
-    return {"same": 0, "moved": 4}.get(comparison.verdict, 3)
+    codes = {"same": Exit.GOOD, "moved": Exit.MOVED}
+    return codes.get(comparison.verdict, Exit.NOT_ALL)
 
 
 def _repeated_recordings(paths: Sequence[str]) -> Iterator[str]:

@@ -64,6 +64,9 @@ RULES = {
     "recordings": ("one off", "scatter"),
 }
 
+#: Kinds of agreement of recordings that contradict each other.
+CONTRADICTIONS = ("differ", "moved", "one off")
+
 # Advice by kind of agreement.
 _ADVICE = {
     "differ": "record once more: three recordings reveal which one is off",

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.text import amount, distinct_names
-from hand_eye_calib.extras.mount.digest import read_digests
+from hand_eye_calib.extras.mount.digest import FOLDER, read_digests
 from hand_eye_calib.extras.mount.history import History
 from hand_eye_calib.formats.results import save_text
 from hand_eye_calib.offline.cli.options import note, print_result
@@ -47,8 +47,19 @@ def compare_digests(arguments: argparse.Namespace) -> int | None:
 
 def _histories_of_mount(paths: list[Path]) -> list[History]:
     """Return the history of the mount whose digests are in all paths; nothing without digests."""
+    for path in paths:
+        if path.name == FOLDER and not path.exists():
+            raise ConfigError(f"no digests: {_no_digests(path)}")
     sessions = read_digests(paths)
     return [] if sessions is None else [History.of(sessions)]
+
+
+def _no_digests(path: Path) -> str:
+    """Return the sentence about a path without digests: the cause, and what writes digests."""
+    return (
+        f"{path} has none: the node writes them into {FOLDER}/ of its output_directory if monitor "
+        "and installed are set"
+    )
 
 
 def _histories_of_fleet(paths: list[Path]) -> list[History]:
@@ -57,9 +68,7 @@ def _histories_of_fleet(paths: list[Path]) -> list[History]:
     for path in paths:
         sessions = read_digests([path])
         if sessions is None:
-            raise ConfigError(
-                f"--fleet needs digests, which the monitor writes to digests/; {path} has none"
-            )
+            raise ConfigError(f"--fleet needs digests; {_no_digests(path)}")
         histories.append(History.of(sessions))
     return histories
 

@@ -78,7 +78,8 @@ def run(arguments: argparse.Namespace) -> int:
     recording = read_recording([bag_path], TOPICS, {})
     offline = recording.snapshot.estimate()
     note(
-        f"2/4 calibrated offline; playing the bag to the live node at {PLAY_SPEED:g} times speed"
+        f"2/4 calibrated offline; playing the bag to the live node at {PLAY_SPEED:g} times "
+        "speed, after the node has started"
     )
     # Robots on the network must not receive simulated odometry.
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"

@@ -38,7 +38,8 @@ TUM format:
   {PARENT_FILE}  trajectory of sensor 1, the parent, in its own world
   {CHILD_FILE}  trajectory of sensor 2, the child, in its own world
   {TRUTH_FILE}  the true extrinsic, one pose: the child sensor in the parent sensor's frame
-  bag, bag.bag   with --bag: topics {PARENT_TOPIC} and {CHILD_TOPIC} (nav_msgs/msg/Odometry)"""
+  bag            with --bag mcap or sqlite3, bag.bag with --bag rosbag1: topics {PARENT_TOPIC}
+                 and {CHILD_TOPIC} (nav_msgs/msg/Odometry)"""
 
 # Short help that fits on one screen.
 _BRIEF = f"""\

@@ -275,7 +275,8 @@ def _calibration(
     )
     wheels = VehicleParameters(
         tuple(parameters),
-        slip_share=float(np.mean(fit.weights == 0.0)),
+        # The share in the reason of the verdict is the same.
+        slip_share=1.0 - result.n_inliers / max(result.n_pairs, 1),
         measures=config.parent_measures,
         nominal_radius_m=config.nominal_radius,
         nominal_separation_m=config.nominal_separation,

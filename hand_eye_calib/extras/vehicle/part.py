@@ -35,7 +35,7 @@ class WheelPart(Part):
             if parameter.name.endswith("wheel_radius") and not value.is_factor:
                 unit = " m"
             lines.append(f"{parameter.name}: {value_and_sigma}{unit}")
-        return [*lines, f"the wheels slip {value.slip_share:.1%} of the time"]
+        return [*lines, f"the wheels slip {value.slip_share:.0%} of the time"]
 
     def files(self, value: VehicleParameters, result: Any) -> dict[str, str]:
         """Return the parameter file of a controller; empty for an unknown kind of wheels."""

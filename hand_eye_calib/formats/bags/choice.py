@@ -157,6 +157,9 @@ def choose(
         # A topic of the same sensor cannot be the other stream.
         frame = sensors[0].frame
         partners = [topic for topic in topics if frame_of(topic.name) != frame]
+    if n_missing == 1:
+        # Wheels are always the parent, which the user may have named already.
+        partners = [topic for topic in partners if topic.type != messages.JOINTS_TYPE]
     raise _unclear(
         topics, [sensor.topic for sensor in sensors], missing, edges, partners
     )
@@ -220,8 +223,17 @@ def _problem_and_sources(
         return problem, [topic.name for topic in sensors]
     if sensors:
         partners = [*_of_types(topics, {_FIX}), *clouds, *_of_types(topics, {_IMU})]
-        names = [topic.name for topic in (sensors[0], *partners)]
-        return f"only one topic has poses, {sensors[0]}", names + pairs
+        wheels = _of_types(topics, {messages.JOINTS_TYPE})
+        names = [topic.name for topic in (sensors[0], *partners)] + pairs
+        problem = f"only one topic has poses, {sensors[0]}"
+        if len(names) == 1 and wheels:
+            problem += (
+                f". Unless they are computed from wheels, {wheels[0].name} may be the "
+                "other stream"
+            )
+            # Wheels are the parent.
+            names = [wheels[0].name, *names]
+        return problem, names
     if len(pairs) >= n_missing:
         listed = shortened(listing(pairs), _LONGEST_LIST)
         return f"no topic has poses, but transforms have: {listed}", pairs

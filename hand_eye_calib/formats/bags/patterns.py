@@ -1,5 +1,6 @@
 """Find the bags in a folder, or those that match a pattern with ``*``."""
 
+from fnmatch import fnmatchcase
 from glob import glob, has_magic
 from pathlib import Path
 
@@ -29,12 +30,34 @@ def matching(pattern: str) -> list[str]:
             pattern = str(Path(pattern) / "**")
         paths = _local_bags(pattern)
     if not paths:
-        raise ConfigError(
-            f"no bag matches {pattern}: expected folders with a metadata.yaml, or files that end "
-            f"in {', '.join(_SUFFIXES)}; for trajectory files, use calibrate PARENT CHILD, or "
-            "calibrate_many in Python"
-        )
+        raise ConfigError(_no_match(pattern))
     return paths
+
+
+def _no_match(pattern: str) -> str:
+    """Return the message for a pattern without a match: what was expected, and what is there."""
+    path = Path(pattern)
+    if has_magic(path.name) and path.suffix and path.suffix not in _SUFFIXES:
+        advice = "check the folder and the name"
+        if names := _names_in_other_case(path):
+            advice = f"did you mean {names[0]}? Upper and lower case differ"
+        return f"no file matches {pattern}: {advice}"
+    return (
+        f"no bag matches {pattern}: expected folders with a metadata.yaml, or files that end "
+        f"in {', '.join(_SUFFIXES)}; for trajectory files, use calibrate PARENT CHILD, or "
+        "calibrate_many in Python"
+    )
+
+
+def _names_in_other_case(pattern: Path) -> list[str]:
+    """Return the files that match a pattern if upper and lower case are ignored."""
+    if has_magic(str(pattern.parent)) or not pattern.parent.is_dir():
+        return []
+    return sorted(
+        str(path)
+        for path in pattern.parent.iterdir()
+        if fnmatchcase(path.name.lower(), pattern.name.lower())
+    )
 
 
 def has_suffix_of_bag(path: Path) -> bool:

@@ -9,7 +9,7 @@ from hand_eye_calib.formats.exports import role_of
 
 # Words in the names of topics, from the likeliest parent to the likeliest child. The empty word is
 # for topics without any of the other words.
-_WORDS = ("parent", "base", "lidar", "", "child")
+_WORDS = ("parent", "joint", "base", "lidar", "", "child")
 
 # Words that many names of frames contain, so that a common word does not mean the same sensor.
 _COMMON_WORDS = {"link", "frame", "sensor", "optical", "base"}

@@ -129,6 +129,10 @@ class Storage(ABC):
         self._repair = REPAIRS[file.suffix]
         # Kind of the messages of each connection or channel, by its number in the file.
         self._kinds: dict[int, MessageKind] = {}
+        if not file.stat().st_size:
+            raise InputError(
+                f"cannot read bag {paths[0]}: it is empty, 0 bytes; copy it again, or record again"
+            )
         with self._guarded():
             self._open(opened)
 

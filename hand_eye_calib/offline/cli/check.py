@@ -94,7 +94,9 @@ def run(arguments: argparse.Namespace) -> int:
             "streams": summaries,
             "findings": [item.to_dict() for item in findings],
         }
-    lines = [_verdict(findings), "", *_finding_lines(findings), ""]
+    lines = [_verdict(findings), ""]
+    if findings:
+        lines += [*_finding_lines(findings), ""]
     lines += _stream_lines(sources, streams)
     print_result(lines, document)
     if findings and findings[0].makes_unusable:
@@ -132,7 +134,10 @@ def _read_streams(
     paths = arguments.paths
     is_bag = reading.are_bags(paths)
     if len(paths) != (1 if is_bag else 2):
-        raise ConfigError(f"expected one bag or two trajectory files; got {len(paths)}")
+        raise ConfigError(
+            f"expected one bag or two trajectory files; got {len(paths)}: for example, "
+            "hand_eye_calib check sample:lidar.tum sample:camera.tum"
+        )
     if not is_bag:
         options.refuse_options_of_bags(arguments)
         names = dict(zip(STREAMS, map(str, paths), strict=True))
@@ -195,8 +200,6 @@ def _finding_lines(findings: "Sequence[Finding]") -> Iterator[str]:
     from hand_eye_calib.core.results.records import NO_ACTION
     from hand_eye_calib.offline.cli.present import wrapped
 
-    if not findings:
-        yield "No findings."
     for finding in findings:
         mark = finding.severity.value
         if mark != "note":

@@ -32,8 +32,9 @@ examples:
   hand_eye_calib calibrate my_bag --out result   calibrate from a bag, with report.html
   hand_eye_calib COMMAND --help                  a command in short; --help all: every option
 
-exit codes: 0 good, 1 bad input or failed, 2 wrong usage, 3 solved but something is
-unobservable or the verdict is DO NOT USE, 4 compare: the sensor has moved"""
+exit codes: 0 good, 1 bad input, not converged or a prior contradicted, 2 wrong usage, 3 solved
+but an axis is unobservable or the verdict is DO NOT USE, 4 compare, batch: the sensor has moved,
+130 interrupted"""
 
 # Endings of the names of Python packages that belong to ROS 2.
 _ROS_SUFFIXES = ("rclpy", "_msgs", "_srvs", "_interfaces", "tf2_ros")
@@ -50,8 +51,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        The exit code: 0 good; 1 bad input or failed; 2 wrong usage; 3 solved, but something is
-        unobservable or the verdict is DO NOT USE; 130 interrupted.
+        The exit code: 0 good; 1 bad input, not converged or a prior contradicted; 2 wrong usage; 3
+        solved, but an axis is unobservable or the verdict is DO NOT USE; 4 moved; 130
+        interrupted.
 
     Raises
     ------

@@ -97,14 +97,15 @@ class Exit(IntEnum):
     """Exit codes of the commands.
 
     FAILED also means bad input. NOT_ALL means that a solve succeeded, but an axis is unobservable
-    or the verdict is DO NOT USE. INTERRUPTED and BROKEN_PIPE are the codes that a shell reports for
-    SIGINT and SIGPIPE.
+    or the verdict is DO NOT USE. MOVED means that results differ. INTERRUPTED and BROKEN_PIPE are
+    the codes that a shell reports for SIGINT and SIGPIPE.
     """
 
     GOOD = 0
     FAILED = 1
     USAGE = 2
     NOT_ALL = 3
+    MOVED = 4
     INTERRUPTED = 130
     BROKEN_PIPE = 141
 

@@ -58,6 +58,10 @@ class StreamSummary:
     rotation_rad: float | None
 
 
+# Kinds of trajectories whose orientations are measured.
+_WITH_ROTATION = ("poses", "rotations", "rates")
+
+
 def summarise(trajectory: Trajectory) -> StreamSummary:
     """Summarise a trajectory of at least two poses."""
     intervals_s = np.diff(trajectory.stamps_ns) * 1e-9
@@ -65,13 +69,15 @@ def summarise(trajectory: Trajectory) -> StreamSummary:
     steps = np.linalg.norm(np.diff(se3.translation_of(poses), axis=0), axis=1)
     rotations = se3.rotation_of(poses)
     angles = se3.rotation_angle(se3.relative_rotations(rotations[:-1], rotations[1:]))
+    # The columns of other kinds, such as the angles of wheels, are no orientations.
+    measures_rotation = trajectory.measures in _WITH_ROTATION
     return StreamSummary(
         poses=len(trajectory),
         duration_s=trajectory.duration_s,
         rate_hz=float(1.0 / median(intervals_s)),
         longest_interval_s=float(intervals_s.max()),
         path_m=float(steps.sum()) if trajectory.has_positions else None,
-        rotation_rad=float(angles.sum()) if trajectory.has_rotations else None,
+        rotation_rad=float(angles.sum()) if measures_rotation else None,
     )
 
 

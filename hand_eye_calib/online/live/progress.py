@@ -72,4 +72,6 @@ class Progress:
 
 def details(goal: Progress, result: object) -> list[str]:
     """Return the lines about the session that the terminal prints with a result."""
+    if goal.done:
+        return [f"the session reached its goal: {goal.precision}"]
     return [f"the session: {goal.sentence}"]
