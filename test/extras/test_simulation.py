@@ -210,3 +210,13 @@ def test_command_overwrites_nothing(tmp_path, run):
     assert (code, len(error.splitlines())) == (1, 1)
     assert "not empty" in error
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_recordings_of_one_mount_have_the_extrinsic_of_the_first(run, tmp_path):
+    for name, more in (("one", ["--same-mount"]), ("two", [])):
+        run("simulate", "--out", tmp_path / name, "--runs", 2, *more)
+        truths = [
+            read_trajectory(tmp_path / name / folder / "T_S2_S1.txt", "tum").poses
+            for folder in ("run_01", "run_02")
+        ]
+        assert np.array_equal(*truths) == bool(more)

@@ -105,6 +105,7 @@ def simulate_drive(
     seed: int | Sequence[int],
     config: options.DriveConfig = options.PUBLISHED_DRIVE,
     noise: options.NoiseConfig = _NO_NOISE,
+    T_parent_child: FloatArray | None = None,
 ) -> SimulatedDrive:
     """Simulate one drive.
 
@@ -115,6 +116,8 @@ def simulate_drive(
         too; the levels of ``noise`` multiply them.
     config : DriveConfig
     noise : NoiseConfig
+    T_parent_child : (4, 4) array, optional
+        The true extrinsic; random by default.
 
     Returns
     -------
@@ -133,7 +136,8 @@ def simulate_drive(
         se3.from_quat_xyzw(np.zeros(3), extrinsic_rng.standard_normal(4))
     )
     offset = extrinsic_rng.uniform(-_LARGEST_OFFSET_M, _LARGEST_OFFSET_M, 3)
-    T_parent_child = se3.from_rotation_translation(rotation, offset)
+    if T_parent_child is None:
+        T_parent_child = se3.from_rotation_translation(rotation, offset)
     # Pose of the child's world: yaw, pitch, roll (rad) and translation (m) are differences of two
     # uniform random numbers each.
     angles, translation = extrinsic_rng.uniform(size=(2, 3)) - extrinsic_rng.uniform(

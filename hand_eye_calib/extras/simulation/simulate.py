@@ -46,6 +46,7 @@ _BRIEF = f"""\
 most used options:
   --out DIR         directory to make; it must be empty or not exist
   --runs N          number of recordings
+  --same-mount      all recordings have one extrinsic, as those of one vehicle
   --seed SEED       the same seed gives the same recordings
   --drive hilly     two minutes outdoors in place of the paper's ten seconds
   --mixture         the noise of the paper: errors, jumps and drift
@@ -69,6 +70,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="number of recordings. Default: 1",
     )
+    same_mount = "all recordings have the extrinsic of the first, as those of one vehicle"
+    add("--same-mount", action="store_true", help=same_mount)
     seed = "the same seed gives the same recordings. Default: 0"
     add("--seed", type=at_least(0), default=0, help=seed)
     bag = "also write a bag of every recording, in this storage format"
@@ -108,8 +111,11 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.out / f"run_{number:0{digits}}"
         for number in range(1, arguments.runs + 1)
     ]
+    mount = None
     for number, folder in with_progress(enumerate(folders), len(folders), "simulating"):
-        drive = simulate_drive((arguments.seed, number), config, noise)
+        drive = simulate_drive((arguments.seed, number), config, noise, mount)
+        if arguments.same_mount:
+            mount = drive.T_parent_child
         _make_empty(folder)
         write_trajectory(folder / PARENT_FILE, drive.parent)
         write_trajectory(folder / CHILD_FILE, drive.child)

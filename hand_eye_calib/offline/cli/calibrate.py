@@ -52,7 +52,7 @@ most used options:
   --parent-topic, --child-topic TOPIC   pose topics of the bag, if it has more than two
   --out DIR                     save the result, the files for ROS and report.html
   --time-offset estimate        the sensors' clocks differ
-  --scale auto                  the child's lengths have no unit (a single camera)
+  --scale estimate              the child's lengths have no unit (a single camera)
   --prior z=1.85+/-0.02         a value that was measured by hand, in m (yaw=-90deg+/-2deg)
   --installed SOURCE            compare with a URDF, an earlier result or a bag's /tf_static
   --json                        print one JSON document

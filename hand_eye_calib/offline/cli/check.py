@@ -39,7 +39,7 @@ PATH:
 most used options:
   --parent-topic, --child-topic TOPIC   pose topics of the bag, if it has more than two
   --time-offset estimate   the sensors' clocks differ
-  --scale auto             the child's lengths have no unit (a single camera)
+  --scale estimate         the child's lengths have no unit (a single camera)
   --json                   print one JSON document
 
 {_EPILOG}"""
