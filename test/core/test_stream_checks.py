@@ -11,10 +11,11 @@ import pytest
 from faults import FAULTS, frozen, inverted, mirrored, reordered, with_swapped_axes
 
 from hand_eye_calib.core.alignment.similarity import EXPLAINED, fit_similarity
-from hand_eye_calib.core.alignment.time_offset import estimate_time_offset
+from hand_eye_calib.core.alignment.time_offset import TimeOffset, estimate_time_offset
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.checks import hypotheses
 from hand_eye_calib.core.checks.check import check_streams
+from hand_eye_calib.core.checks.clock_and_scale import check_offset
 from hand_eye_calib.core.checks.findings import Severity
 from hand_eye_calib.core.checks.hypothesis import HOLDS
 from hand_eye_calib.core.checks.streams import check_frozen, check_stream, frozen_share
@@ -475,3 +476,18 @@ def test_a_short_lever_arm_is_zero_only_if_it_cannot_be_longer_than_2_mm():
     def test_a_listing_of_files_is_refused_in_one_line(self, files, capsys):
         assert main(["calibrate", *files(*drive()), "--list"]) == 1
         assert "is a trajectory file, which has none" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("offset_s", "added_s", "key", "option"),
+    [
+        (-0.0351, 0.035, "needless_time_offset", 0.0),
+        (-0.0331, 0.035, "time_offset", 0.0019),
+        (0.02, 0.0, "time_offset", 0.02),
+    ],
+)
+def test_an_offset_that_worsens_the_clocks_is_omitted(offset_s, added_s, key, option):
+    offset = TimeOffset(seconds=offset_s, sigma_s=0.00012)
+    (found,) = check_offset(offset, added_s)
+    assert (found.key, found.code) == (key, "time_offset")
+    assert found.options == {"time_offset": pytest.approx(option)}

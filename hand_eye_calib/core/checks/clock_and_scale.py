@@ -8,12 +8,14 @@ import numpy as np
 from hand_eye_calib.core.alignment.similarity import SimilarityFit
 from hand_eye_calib.core.alignment.time_offset import TimeOffset
 from hand_eye_calib.core.base.text import with_sigma
-from hand_eye_calib.core.checks.findings import Finding, graded
+from hand_eye_calib.core.checks.findings import Finding, finding, graded
 from hand_eye_calib.core.checks.stream_pair import StreamPair
 from hand_eye_calib.core.checks.units import in_other_units
 
 # Code of rounded positions, whose severity depends on the unit of length.
 ROUNDED = "coarse_positions"
+# Largest clock offset (s) that counts as none: half of the last printed digit of milliseconds.
+_NO_OFFSET_S = 0.0005
 
 
 def check_offset(offset: TimeOffset, added_s: float) -> list[Finding]:
@@ -27,7 +29,13 @@ def check_offset(offset: TimeOffset, added_s: float) -> list[Finding]:
     clocks_differ = graded(
         "time_offset", "child", offset.seconds, offset.sigma_s, **values
     )
-    return [clocks_differ] if clocks_differ else []
+    if not clocks_differ:
+        return []
+    if added_s and abs(values["total_s"]) <= max(3.0 * offset.sigma_s, _NO_OFFSET_S):
+        values["options"] = {"time_offset": 0.0}
+        severity = clocks_differ.severity
+        return [finding("needless_time_offset", "child", severity, **values)]
+    return [clocks_differ]
 
 
 def offset_values(offset_s: float, added_s: float = 0.0) -> dict[str, Any]:

@@ -223,7 +223,12 @@ WORDS = {
     ),
     "time_offset": FindingWords(
         "the child's clock is {size_s:.4f} +/- {sigma_s:.2g} s {direction} the parent's{beyond}",
-        "set the offset to {total_s} s, or have it estimated",
+        "have the offset estimated (time_offset estimate), or set it",
+    ),
+    "needless_time_offset": FindingWords(
+        "the child's clock is {size_s:.4f} +/- {sigma_s:.2g} s {direction} the parent's{beyond}",
+        "omit the offset, because the clocks agree without it",
+        code="time_offset",
     ),
     "large_time_offset": FindingWords(
         "the child's clock is {size_s:.2f} s {direction} the parent's, and no offset was given",

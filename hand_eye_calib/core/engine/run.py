@@ -584,6 +584,8 @@ def _certain(
 
 def options_to_solve(finding: Finding) -> Options:
     """Return the options of a finding for a solve; offset and scale are estimated in the solve."""
-    if finding.code in _ESTIMATED_CODES:
+    # A clock offset of 0 needs no estimation.
+    is_zero = finding.options == {"time_offset": 0.0}
+    if finding.code in _ESTIMATED_CODES and not is_zero:
         return dict.fromkeys(finding.options, "estimate")
     return finding.options

@@ -70,7 +70,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="number of recordings. Default: 1",
     )
-    same_mount = "all recordings have the extrinsic of the first, as those of one vehicle"
+    same_mount = (
+        "all recordings have the extrinsic of the first, as those of one vehicle"
+    )
     add("--same-mount", action="store_true", help=same_mount)
     seed = "the same seed gives the same recordings. Default: 0"
     add("--seed", type=at_least(0), default=0, help=seed)
