@@ -12,6 +12,7 @@ import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
 
@@ -317,12 +318,42 @@ def _do_inliers_agree(sample: StopPoses, fit: RoughFit) -> bool:
 def _check_axes(sample: StopPoses, fit: RoughFit) -> Finding | None:
     """Return a finding if positions of one side have permuted or flipped axes.
 
-    Such axes must be clearly likelier than the best other hypothesis, whose fit is ``fit``.
+    Such axes must be clearly likelier than the best other hypothesis, whose fit is ``fit``, by the
+    rough fits or by full solves. Strong noise hides the difference from the rough fits.
     """
     if fit.unexplained_share < SMALL_UNEXPLAINED:
         return None
-    best = None
-    largest = fit.log_likelihood + min_certain_gain(len(sample))
+    likelier = [
+        other
+        for other in _fits_with_other_axes(sample)
+        if other.fit.log_likelihood > fit.log_likelihood + MIN_LEAD
+    ]
+    if not likelier:
+        return None
+    best = max(likelier, key=lambda other: other.fit.log_likelihood)
+    enough = min_certain_gain(len(sample))
+    gain = best.fit.log_likelihood - fit.log_likelihood
+    if gain <= enough:
+        gain = _objective(sample, fit) - _objective(best.poses, best.fit)
+    if gain <= enough:
+        return None
+    return finding("axes", best.stream, detail=_axes_in_words(best.axes))
+
+
+class _OtherAxes(NamedTuple):
+    """Stops whose positions of one side have other axes, with their rough fit.
+
+    ``axes`` (3, 3) permute and flip the axes of the positions of ``stream``.
+    """
+
+    stream: str
+    axes: FloatArray
+    poses: StopPoses
+    fit: RoughFit
+
+
+def _fits_with_other_axes(sample: StopPoses) -> Iterator[_OtherAxes]:
+    """Yield the stops with other axes of either side whose rough fits explain most of them."""
     for is_inverse in sample.possible_inversions:
         mistakes = Mistakes(is_inverse=is_inverse)
         if rough_fit(sample, mistakes).rotation_share > MAX_UNEXPLAINED:
@@ -332,14 +363,10 @@ def _check_axes(sample: StopPoses, fit: RoughFit) -> Finding | None:
             turned = se3.from_rotation_translation(
                 se3.rotation_of(Ts), se3.translation_of(Ts) @ axes.T
             )
-            other = rough_fit(sample.with_side(stream, turned), mistakes)
-            if (
-                other.log_likelihood > largest
-                and other.unexplained_share < MAX_UNEXPLAINED
-            ):
-                best = finding("axes", stream, detail=_axes_in_words(axes))
-                largest = other.log_likelihood
-    return best
+            poses = sample.with_side(stream, turned)
+            fit = rough_fit(poses, mistakes)
+            if fit.unexplained_share < MAX_UNEXPLAINED:
+                yield _OtherAxes(stream, axes, poses, fit)
 
 
 def _other_axes() -> Iterator[FloatArray]:
