@@ -20,52 +20,71 @@ def pose(position, rotation_vector):
 def arm(place, seed=0, n=20, noise_m=0.0005):
     """Poses of the hand in the base, of the target in the camera, and where the camera is."""
     random = np.random.default_rng(seed)
-    turns = se3.rotation_exp(random.normal(size=(n, 3)) * 0.35)
+    rotation_vectors = random.normal(size=(n, 3)) * 0.35
+    turns = se3.rotation_exp(rotation_vectors)
     down = se3.rotation_exp(np.array([3.0, 0.05, 0.1]))
-    positions = np.array([0.45, 0.0, 0.4]) + random.normal(size=(n, 3)) * 0.1
+    home = np.array([0.45, 0.0, 0.4])
+    positions = home + random.normal(size=(n, 3)) * 0.1
     robot = se3.from_rotation_translation(down @ turns, positions)
-    noise = se3.exp(random.normal(size=(n, 6)) * noise_m * np.repeat([1.0, 2.0], 3))
+    sigmas = noise_m * np.repeat([1.0, 2.0], 3)
+    noise = se3.exp(random.normal(size=(n, 6)) * sigmas)
+
     if place == ON_HAND:
         camera = pose((0.06, -0.03, 0.09), (0.1, -0.05, 1.5))
         target = pose((0.5, 0.05, 0.02), (0.0, 0.0, 0.4))
-        return robot, se3.inverse(robot @ camera) @ target @ noise, camera
-    camera = pose((1.1, 0.2, 0.8), (-1.2, 1.4, -0.6))
-    target = pose((0.02, 0.0, 0.1), (0.1, 0.2, 0.3))
-    return robot, se3.inverse(camera) @ robot @ target @ noise, camera
+        target_in_camera = se3.inverse(robot @ camera) @ target
+    else:
+        camera = pose((1.1, 0.2, 0.8), (-1.2, 1.4, -0.6))
+        target = pose((0.02, 0.0, 0.1), (0.1, 0.2, 0.3))
+        target_in_camera = se3.inverse(camera) @ robot @ target
+    return robot, target_in_camera @ noise, camera
 
 
 def scaled(Ts, factor):
-    return se3.from_rotation_translation(Ts[:, :3, :3], factor * Ts[:, :3, 3])
+    Ts_scaled = Ts.copy()
+    Ts_scaled[:, :3, 3] *= factor
+    return Ts_scaled
 
 
 def scalar_first(Ts):
     """Poses as they are read if quaternions w x y z are taken for x y z w."""
     rows = se3.to_rows(Ts)
-    return se3.from_quat_xyzw(rows[:, :3], np.roll(rows[:, 3:], 1, axis=1))
+    positions = rows[:, :3]
+    quats_wxyz = np.roll(rows[:, 3:], 1, axis=1)
+    return se3.from_quat_xyzw(positions, quats_wxyz)
 
 
 def with_rotations(Ts, rotations):
-    return se3.from_rotation_translation(rotations, Ts[:, :3, 3])
+    positions = Ts[:, :3, 3]
+    return se3.from_rotation_translation(rotations, positions)
 
 
 def transposed_rotations(Ts):
-    return with_rotations(Ts, np.swapaxes(Ts[:, :3, :3], 1, 2))
+    rotations = Ts[:, :3, :3]
+    transposed = np.swapaxes(rotations, 1, 2)
+    return with_rotations(Ts, transposed)
 
 
 def angles_as_vectors(Ts):
-    return with_rotations(Ts, se3.rotation_exp(se3.rotation_to_rpy(Ts[:, :3, :3])))
+    angles = se3.rotation_to_rpy(Ts[:, :3, :3])
+    rotations = se3.rotation_exp(angles)
+    return with_rotations(Ts, rotations)
 
 
 def flipped(Ts):
-    return se3.from_rotation_translation(Ts[:, :3, :3], Ts[:, :3, 3] * [1.0, -1.0, 1.0])
+    Ts_flipped = Ts.copy()
+    Ts_flipped[:, 1, 3] *= -1.0
+    return Ts_flipped
 
 
 def without_middle(Ts):
-    return np.delete(Ts, len(Ts) // 2, axis=0)
+    middle = len(Ts) // 2
+    return np.delete(Ts, middle, axis=0)
 
 
 def never_moved(Ts):
-    return np.repeat(Ts[:1], len(Ts), axis=0)
+    count = len(Ts)
+    return np.repeat(Ts[:1], count, axis=0)
 
 
 def stale(Ts):

@@ -36,8 +36,12 @@ def bag_path(folder, storage, name="bag"):
 
 def storage_file(path):
     """The file that holds the messages of a bag."""
-    files = (file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
-    return path if path.is_file() else next(files)
+    if path.is_file():
+        return path
+    for file in path.iterdir():
+        if file.suffix in (".mcap", ".db3"):
+            return file
+    raise FileNotFoundError(path)
 
 
 class Pose(NamedTuple):
@@ -53,8 +57,10 @@ class Pose(NamedTuple):
 
 def poses_of(bag, parent="/a", child="/b"):
     """The poses of an open bag one by one."""
-    columns = [column.tolist() for column in vars(bag.poses(parent, child)).values()]
-    return [Pose(*row[:4], tuple(row[4]), row[5]) for row in zip(*columns, strict=True)]
+    poses = bag.poses(parent, child)
+    columns = [column.tolist() for column in vars(poses).values()]
+    rows = zip(*columns, strict=True)
+    return [Pose(*row[:4], tuple(row[4]), row[5]) for row in rows]
 
 
 def all_poses(path, parent="/a", child="/b"):
@@ -77,10 +83,11 @@ def write_compressed(path, streams, storage="mcap", mode="STORAGE"):
 
 def header(typestore, stamp_ns, frame):
     extra = {"seq": 0} if typestore is NOETIC else {}
-    stamp = typestore.types["builtin_interfaces/msg/Time"](
-        *divmod(int(stamp_ns), 10**9)
-    )
-    return typestore.types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame, **extra)
+    time_type = typestore.types["builtin_interfaces/msg/Time"]
+    header_type = typestore.types["std_msgs/msg/Header"]
+    seconds, nanoseconds = divmod(int(stamp_ns), 10**9)
+    stamp = time_type(seconds, nanoseconds)
+    return header_type(stamp=stamp, frame_id=frame, **extra)
 
 
 def pose(typestore, matrix, kind="Pose"):
@@ -118,15 +125,22 @@ def pose_message(message_type, stamp_ns, values, world="map", sensor="sensor"):
 
     def make(typestore):
         def made(name, *parts):
-            return typestore.types[f"geometry_msgs/msg/{name}"](*parts)
+            geometry_type = typestore.types[f"geometry_msgs/msg/{name}"]
+            return geometry_type(*parts)
 
         row = [float(value) for value in values]
-        parts = (made("Pose", made("Point", *row[:3]), made("Quaternion", *row[3:])),)
+        position = made("Point", *row[:3])
+        orientation = made("Quaternion", *row[3:])
+        pose = made("Pose", position, orientation)
+        parts = (pose,)
         if message_type == ODOMETRY:
             zero = made("Vector3", 0.0, 0.0, 0.0)
-            twist = made("TwistWithCovariance", made("Twist", zero, zero), np.zeros(36))
-            parts = (sensor, made("PoseWithCovariance", *parts, np.zeros(36)), twist)
-        return typestore.types[message_type](header(typestore, stamp_ns, world), *parts)
+            no_motion = made("Twist", zero, zero)
+            twist = made("TwistWithCovariance", no_motion, np.zeros(36))
+            pose = made("PoseWithCovariance", pose, np.zeros(36))
+            parts = (sensor, pose, twist)
+        stamped_header = header(typestore, stamp_ns, world)
+        return typestore.types[message_type](stamped_header, *parts)
 
     return make
 

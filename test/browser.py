@@ -86,7 +86,8 @@ class Browser:
 
     def call(self, method, **parameters):
         """Return the result of a command."""
-        return self._reply(self._send(method, parameters))
+        number = self._send(method, parameters)
+        return self._reply(number)
 
     def evaluate(self, expression):
         """Return the value of a JavaScript expression; a promise is awaited."""
@@ -101,7 +102,8 @@ class Browser:
 
     def wait_for(self, condition):
         """Wait until a condition in JavaScript is true; it may change with the page only."""
-        self.evaluate(WHEN.replace("CONDITION", condition))
+        script = WHEN.replace("CONDITION", condition)
+        self.evaluate(script)
 
     def open(self, address, script=""):
         """Open a page in a new tab, to which all later commands go.
@@ -154,7 +156,8 @@ class Browser:
 
     def fill(self, selector, text):
         """Type a text into a field."""
-        self.evaluate(f"document.querySelector({json.dumps(selector)}).select()")
+        quoted = json.dumps(selector)
+        self.evaluate(f"document.querySelector({quoted}).select()")
         self.call("Input.insertText", text=text)
 
     def _send(self, method, parameters):
@@ -171,7 +174,8 @@ class Browser:
         return message["result"]
 
     def _wait_for_event(self, method):
-        return self._wait(lambda message: message.get("method") == method)["params"]
+        event = self._wait(lambda message: message.get("method") == method)
+        return event["params"]
 
     def _wait(self, is_wanted):
         """Return the first message that is wanted; the other messages wait."""
@@ -196,11 +200,19 @@ class Browser:
 
 def printed_pages(page, folder):
     """Number of pages on which the browser prints a page; the test is skipped without a browser."""
-    program = next(filter(None, map(shutil.which, PROGRAMS)), None)
+    programs = filter(None, map(shutil.which, PROGRAMS))
+    program = next(programs, None)
     if program is None:
         pytest.skip("Chromium is not installed: apt-get install chromium")
     pdf = folder / "printed.pdf"
-    options = ("--headless", "--no-sandbox", "--disable-gpu", "--no-pdf-header-footer")
-    arguments = [program, *options, f"--print-to-pdf={pdf}", page.as_uri()]
+    arguments = [
+        program,
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--no-pdf-header-footer",
+        f"--print-to-pdf={pdf}",
+        page.as_uri(),
+    ]
     subprocess.run(arguments, check=True, capture_output=True, timeout=PATIENCE_S)
     return len(re.findall(rb"/Type /Page\b", pdf.read_bytes()))

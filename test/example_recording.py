@@ -42,75 +42,95 @@ def make(folder: Path) -> None:
 
     INS, antenna and IMU are where the camera is.
     """
-    drive = simulate_drive(7, HILLY_DRIVE).parent[:_POSES]
-    lidar = _noisy(drive.stamps_ns, drive.poses, 1, "lidar", "odom")
-    camera = _noisy(drive.stamps_ns, drive.poses @ T_LIDAR_CAMERA, 2, "camera", "vo")
-    hec.write_trajectory(folder / "lidar.tum", lidar)
-    hec.write_trajectory(folder / "camera.tum", camera)
-    np.savetxt(
-        folder / "camera.csv", _rows(camera, scalar_first=True), "%.9f", delimiter=","
-    )
-    imu_ns, rates = _rates(camera)
-    places = _geodetic(camera)
-    _write_bag(folder / "my_drive", lidar, camera, places, (imu_ns, rates))
-    _write_ins(folder / "ins.csv", camera, places)
-    times = camera.stamps_ns[:, None] * 1e-9
-    _write_csv(
-        folder / "gnss.csv",
-        "time,latitude,longitude,height",
-        np.hstack([times, places]),
-    )
-    robot = simulate_machine(7, duration_s=60.0)
-    hec.write_trajectory(folder / "robot_lidar.tum", robot.sensor)
-    columns = np.column_stack([robot.stamps_ns * 1e-9, robot.values])
-    _write_csv(folder / "wheels.csv", "time,left,right", columns)
-    columns = np.column_stack([imu_ns * 1e-9, rates])
-    _write_csv(folder / "imu.csv", "time,wx,wy,wz", columns)
-
-    arm = wandering_poses(_POSES, seed=3)
-    stamps_ns = drive.stamps_ns
-    hec.write_trajectory(folder / "flange.tum", _noisy(stamps_ns, arm, 3))
-    hec.write_trajectory(
-        folder / "camera_on_arm.tum", _noisy(stamps_ns, arm @ T_LIDAR_CAMERA, 4)
-    )
-
-    camera_on_arm = disturbed(arm @ T_LIDAR_CAMERA, 5, 1e-3, 5e-4)
-    stops = zip(
-        arm[::10].tolist(), se3.inverse(camera_on_arm[::10]).tolist(), strict=True
-    )
-    (folder / "samples.yaml").write_text(json.dumps(list(stops)), encoding="utf-8")
-
+    lidar, camera = _write_drive(folder)
+    _write_machine(folder)
+    _write_arm(folder, lidar.stamps_ns)
     (folder / "robot.urdf").write_text(_ROBOT, encoding="utf-8")
+
     result = hec.calibrate(lidar, camera, method="dnlo", reference="B5")
     for name in ("result", "monday", "tuesday", "wednesday"):
         hec.save(result, folder / name)
 
 
+def _write_drive(folder):
+    """Write the streams of a vehicle; return those of lidar and camera."""
+    drive = simulate_drive(7, HILLY_DRIVE).parent[:_POSES]
+    lidar = _noisy(drive.stamps_ns, drive.poses, 1, "lidar", "odom")
+    camera = _noisy(drive.stamps_ns, drive.poses @ T_LIDAR_CAMERA, 2, "camera", "vo")
+    hec.write_trajectory(folder / "lidar.tum", lidar)
+    hec.write_trajectory(folder / "camera.tum", camera)
+    rows = _rows(camera, scalar_first=True)
+    np.savetxt(folder / "camera.csv", rows, "%.9f", delimiter=",")
+
+    imu_ns, rates = _rates(camera)
+    places = _geodetic(camera)
+    _write_bag(folder / "my_drive", lidar, camera, places, (imu_ns, rates))
+    _write_ins(folder / "ins.csv", camera, places)
+    columns = _after_times(camera.stamps_ns, places)
+    _write_csv(folder / "gnss.csv", "time,latitude,longitude,height", columns)
+    columns = _after_times(imu_ns, rates)
+    _write_csv(folder / "imu.csv", "time,wx,wy,wz", columns)
+    return lidar, camera
+
+
+def _write_machine(folder):
+    """Write the lidar's poses and the wheel speeds of a machine."""
+    robot = simulate_machine(7, duration_s=60.0)
+    hec.write_trajectory(folder / "robot_lidar.tum", robot.sensor)
+    columns = _after_times(robot.stamps_ns, robot.values)
+    _write_csv(folder / "wheels.csv", "time,left,right", columns)
+
+
+def _write_arm(folder, stamps_ns):
+    """Write the poses of a flange and of a camera on an arm, and samples of their stops."""
+    flange = wandering_poses(_POSES, seed=3)
+    camera = flange @ T_LIDAR_CAMERA
+    hec.write_trajectory(folder / "flange.tum", _noisy(stamps_ns, flange, 3))
+    hec.write_trajectory(folder / "camera_on_arm.tum", _noisy(stamps_ns, camera, 4))
+
+    noisy_camera = disturbed(camera, 5, 1e-3, 5e-4)
+    flange_stops = flange[::10].tolist()
+    camera_stops = se3.inverse(noisy_camera[::10]).tolist()
+    samples = list(zip(flange_stops, camera_stops, strict=True))
+    (folder / "samples.yaml").write_text(json.dumps(samples), encoding="utf-8")
+
+
+def _after_times(stamps_ns, values):
+    """Columns of times (s) and values."""
+    times_s = stamps_ns * 1e-9
+    return np.column_stack([times_s, values])
+
+
 def _noisy(stamps_ns, poses, seed, sensor="", world=""):
-    return hec.Trajectory(stamps_ns, disturbed(poses, seed, 1e-3, 5e-4), sensor, world)
+    noisy_poses = disturbed(poses, seed, 1e-3, 5e-4)
+    return hec.Trajectory(stamps_ns, noisy_poses, sensor, world)
 
 
 def _rows(trajectory, scalar_first):
+    times_s = trajectory.stamps_ns * 1e-9
+    positions = trajectory.poses[:, :3, 3]
     quats = se3.to_quat_xyzw(trajectory.poses)
-    quats = np.roll(quats, 1, axis=1) if scalar_first else quats
-    return np.column_stack(
-        [trajectory.stamps_ns * 1e-9, trajectory.poses[:, :3, 3], quats]
-    )
+    if scalar_first:
+        quats = np.roll(quats, 1, axis=1)
+    return np.column_stack([times_s, positions, quats])
 
 
 def _rates(trajectory):
     """Stamps between the poses, and the mean angular rates there."""
     rotations = Rotation.from_matrix(trajectory.poses[:, :3, :3])
+    increments = rotations[:-1].inv() * rotations[1:]
     steps_ns = np.diff(trajectory.stamps_ns)
-    turned = (rotations[:-1].inv() * rotations[1:]).as_rotvec()
-    return trajectory.stamps_ns[:-1] + steps_ns // 2, turned / (steps_ns * 1e-9)[
-        :, None
-    ]
+    steps_s = steps_ns * 1e-9
+    rates = increments.as_rotvec() / steps_s[:, None]
+    stamps_ns = trajectory.stamps_ns[:-1] + steps_ns // 2
+    return stamps_ns, rates
 
 
 def _geodetic(trajectory):
     """Latitude, longitude (deg) and height (m) of every position."""
-    return np.transpose(geodetic(trajectory.poses[:, :3, 3], (60.17, 24.94, 20.0)))
+    positions = trajectory.poses[:, :3, 3]
+    origin = (60.17, 24.94, 20.0)
+    return np.transpose(geodetic(positions, origin))
 
 
 def _write_bag(path, lidar, camera, places, rates):

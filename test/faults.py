@@ -10,15 +10,17 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory
 
 def reordered(stream):
     """Quaternions written w x y z and read as x y z w."""
-    quats = np.roll(se3.to_quat_xyzw(stream.poses), 1, axis=1)
-    return Trajectory(
-        stream.stamps_ns, se3.from_quat_xyzw(stream.poses[:, :3, 3], quats)
-    )
+    positions = stream.poses[:, :3, 3]
+    quats_xyzw = se3.to_quat_xyzw(stream.poses)
+    quats_wxyz = np.roll(quats_xyzw, 1, axis=1)
+    poses = se3.from_quat_xyzw(positions, quats_wxyz)
+    return Trajectory(stream.stamps_ns, poses)
 
 
 def inverted(stream):
     """Poses of the world in the sensor."""
-    return dataclasses.replace(stream, poses=se3.inverse(stream.poses))
+    inverse_poses = se3.inverse(stream.poses)
+    return dataclasses.replace(stream, poses=inverse_poses)
 
 
 def frozen(stream, share=0.6):
@@ -39,9 +41,11 @@ def with_swapped_axes(stream, order=(1, 0, 2)):
 def mirrored(stream):
     """Left-handed axes for positions and orientations alike."""
     mirror = np.diag([1.0, -1.0, 1.0])
+    rotations = stream.poses[:, :3, :3]
+    positions = stream.poses[:, :3, 3]
     poses = stream.poses.copy()
-    poses[:, :3, :3] = mirror @ poses[:, :3, :3] @ mirror
-    poses[:, :3, 3] = poses[:, :3, 3] @ mirror
+    poses[:, :3, :3] = mirror @ rotations @ mirror
+    poses[:, :3, 3] = positions @ mirror
     return dataclasses.replace(stream, poses=poses)
 
 

@@ -33,9 +33,11 @@ def always_dies(task):
 
 def never_ends(task):
     """Work that writes the number of its process into a pipe and then waits."""
-    with open(task.options["pipe"], "w") as pipe:
+    path = task.options["pipe"]
+    with open(path, "w") as pipe:
         print(os.getpid(), file=pipe)
-    threading.Event().wait()
+    forever = threading.Event()
+    forever.wait()
 
 
 def recordings_of(seed, count, unknown_z=False):

@@ -22,4 +22,5 @@ def machine(place="yard", noise=1.0):
 
 def errors_of(result, drive):
     """Errors along (m) and about (rad) the axes of the parent."""
-    return np.abs(se3.deviation(result.T_parent_child, drive.T_parent_child))
+    deviation = se3.deviation(result.T_parent_child, drive.T_parent_child)
+    return np.abs(deviation)

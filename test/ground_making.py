@@ -96,61 +96,61 @@ class Machine:
 
     def _mount(self, position: list[float], tilt_deg: float) -> FloatArray:
         rng = self.rng
-        angles = np.radians(
-            [*rng.uniform(-tilt_deg, tilt_deg, 2), rng.uniform(-180, 180)]
-        )
+        roll_deg, pitch_deg = rng.uniform(-tilt_deg, tilt_deg, 2)
+        yaw_deg = rng.uniform(-180, 180)
+        angles = np.radians([roll_deg, pitch_deg, yaw_deg])
+        rotation = se3.rotation_from_rpy(angles)
         offset = np.add(position, rng.uniform(-0.3, 0.3, 3))
-        return se3.from_rotation_translation(se3.rotation_from_rpy(angles), offset)
+        return se3.from_rotation_translation(rotation, offset)
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Height of the ground (m)."""
         place = self.place
         z = place.slope * x - place.crown * np.abs(y)
-        z = z + place.ramp * np.clip(x - 2.0, 0.0, 8.0)
+        on_ramp_m = np.clip(x - 2.0, 0.0, 8.0)
+        z = z + place.ramp * on_ramp_m
+        amplitude_m = place.bump_m / 2
         for (along_x, along_y), phase in zip(self.waves, self.phases, strict=True):
-            z = z + place.bump_m / 2 * np.sin(along_x * x + along_y * y + phase)
+            angle = along_x * x + along_y * y + phase
+            z = z + amplitude_m * np.sin(angle)
         return z
 
     def _drive(self) -> FloatArray:
-        rng, t = self.rng, self.times_s
+        rng = self.rng
+        t = self.times_s
         if self.place.is_road:
             x, y = road_course(t, rng)
         else:
-            slow = 2 * np.pi * t / rng.uniform(38, 46) + rng.uniform(0, 2 * np.pi)
-            x = rng.uniform(11, 15) * np.sin(slow)
-            y = rng.uniform(4.5, 5.8) * np.sin(2 * slow) + rng.uniform(-0.5, 0.5)
+            x, y = yard_course(t, rng)
         heading = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
-        cos, sin = np.cos(heading), np.sin(heading)
-        corners = []
-        # Front left, front right, rear left and rear right wheel (m).
-        for ahead, left in ((0.8, 0.5), (0.8, -0.5), (-0.8, 0.5), (-0.8, -0.5)):
-            corners.append(
-                self.height(x + cos * ahead - sin * left, y + sin * ahead + cos * left)
-            )
-        front_left, front_right, rear_left, rear_right = corners
+        heights = self._wheel_heights(x, y, heading)
+        front_left, front_right, rear_left, rear_right = heights
         pitch = (rear_left + rear_right - front_left - front_right) / 2 / 1.6
         roll = (front_left + rear_left - front_right - rear_right) / 2 / 1.0
-        shaking = np.radians(0.15) * self.noise * _smooth_noise(rng, len(t), 60)
-        sway = np.radians(0.15) * self.noise * _smooth_noise(rng, len(t), 60)
-        angles = np.column_stack(
-            [np.arctan(roll) + sway, np.arctan(pitch) + shaking, heading]
-        )
-        z = np.mean(corners, axis=0) + 0.004 * self.noise * _smooth_noise(
-            rng, len(t), 40
-        )
-        return se3.from_rotation_translation(
-            se3.rotation_from_rpy(angles), np.column_stack([x, y, z])
-        )
+
+        amplitude = np.radians(0.15) * self.noise
+        shaking = amplitude * _smooth_noise(rng, len(t), 60)
+        sway = amplitude * _smooth_noise(rng, len(t), 60)
+        heave_m = 0.004 * self.noise * _smooth_noise(rng, len(t), 40)
+        roll_angle = np.arctan(roll) + sway
+        pitch_angle = np.arctan(pitch) + shaking
+        angles = np.column_stack([roll_angle, pitch_angle, heading])
+        rotations = se3.rotation_from_rpy(angles)
+        z = np.mean(heights, axis=0) + heave_m
+        positions = np.column_stack([x, y, z])
+        return se3.from_rotation_translation(rotations, positions)
 
     def _poses(self, T_base_sensor: FloatArray) -> FloatArray:
         """Poses of a sensor in its own world, with noise and drift."""
-        Ts = self.Ts_world_base[::POSE_STEPS] @ T_base_sensor
         rng = self.rng
+        Ts = self.Ts_world_base[::POSE_STEPS] @ T_base_sensor
         steps = se3.inverse(Ts[:-1]) @ Ts[1:]
-        sigmas = self.noise * np.repeat([0.001, np.radians(0.015)], 3)
-        steps = steps @ se3.exp(sigmas * rng.standard_normal((len(steps), 6)))
-        white = self.noise * np.repeat([0.004, np.radians(0.05)], 3)
-        return se3.chained(steps) @ se3.exp(white * rng.standard_normal((len(Ts), 6)))
+        drift_sigmas = self.noise * np.repeat([0.001, np.radians(0.015)], 3)
+        drift = drift_sigmas * rng.standard_normal((len(steps), 6))
+        drifting = se3.chained(steps @ se3.exp(drift))
+        white_sigmas = self.noise * np.repeat([0.004, np.radians(0.05)], 3)
+        white = white_sigmas * rng.standard_normal((len(Ts), 6))
+        return drifting @ se3.exp(white)
 
     def _trajectory(self, T_base_sensor: FloatArray, frame: str) -> Trajectory:
         stamps_ns = START_NS + np.round(self.times_s[::POSE_STEPS] * 1e9).astype(
@@ -168,6 +168,20 @@ class Machine:
     def child(self) -> Trajectory:
         return self._trajectory(self.T_base_child, "rear")
 
+    def _wheel_heights(
+        self, x: FloatArray, y: FloatArray, heading: FloatArray
+    ) -> list[FloatArray]:
+        """Heights of the ground under the wheels: front left and right, rear left and right."""
+        cos = np.cos(heading)
+        sin = np.sin(heading)
+        heights = []
+        # Positions of the wheels in the frame of the base (m).
+        for ahead, left in ((0.8, 0.5), (0.8, -0.5), (-0.8, 0.5), (-0.8, -0.5)):
+            wheel_x = x + cos * ahead - sin * left
+            wheel_y = y + sin * ahead + cos * left
+            heights.append(self.height(wheel_x, wheel_y))
+        return heights
+
     def clouds(
         self, T_base_sensor: FloatArray, stride: int = 10
     ) -> Iterator[tuple[int, FloatArray]]:
@@ -176,21 +190,22 @@ class Machine:
         n_columns = 360 if self.rings == 16 else 256
         lowest, highest = ELEVATIONS[self.rings]
         elevations = np.radians(np.linspace(lowest, highest, self.rings))
-        wrong_deg = self.noise * (rng.normal(0, 0.05, self.rings) + rng.normal(0, 0.05))
+        ring_errors_deg = rng.normal(0, 0.05, self.rings)
+        common_error_deg = rng.normal(0, 0.05)
+        elevation_errors_deg = self.noise * (ring_errors_deg + common_error_deg)
         bias_m = self.noise * rng.normal(0, 0.01)
-        rays = _rays(elevations + np.radians(wrong_deg), n_columns)
-        stated = _rays(elevations, n_columns)
+        stated_rays = _rays(elevations, n_columns)
+        true_rays = _rays(elevations + np.radians(elevation_errors_deg), n_columns)
+
         for row in range(0, len(self.times_s), POSE_STEPS * stride):
             T = self.Ts_world_base[row] @ T_base_sensor
-            ranges = self._ranges(T[:3, 3], rays @ T[:3, :3].T)
-            ranges = (
-                ranges + bias_m + self.noise * 0.02 * rng.standard_normal(len(ranges))
-            )
-            hit = ranges < REACH_M
-            yield (
-                START_NS + round(self.times_s[row] * 1e9),
-                ranges[hit, None] * stated[hit],
-            )
+            ranges = self._ranges(T[:3, 3], true_rays @ T[:3, :3].T)
+            white_m = self.noise * 0.02 * rng.standard_normal(len(ranges))
+            ranges = ranges + bias_m + white_m
+            is_hit = ranges < REACH_M
+            points = ranges[is_hit, None] * stated_rays[is_hit]
+            stamp_ns = START_NS + round(self.times_s[row] * 1e9)
+            yield stamp_ns, points
 
     def _ranges(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         distances = self._ground_ranges(origin, directions)
@@ -209,34 +224,51 @@ class Machine:
     def _ground_ranges(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """Ranges of the ground along rays, by fixed-point iteration on its height."""
         down = directions[:, 2]
-        falling = down < -0.01
+        is_falling = down < -0.01
         grass = self.place.grass_m * self.rng.standard_normal(len(down))
         clearance = origin[2] - self.height(origin[0], origin[1])
-        distances = np.where(falling, clearance / np.maximum(-down, 0.01), REACH_M)
+        distances = clearance / np.maximum(-down, 0.01)
+        distances = np.where(is_falling, distances, REACH_M)
+        slowest_fall = np.maximum(-down, 0.1)
         for _ in range(12):
             distances = np.minimum(distances, REACH_M)
             points = origin + distances[:, None] * directions
-            excess = points[:, 2] - self.height(points[:, 0], points[:, 1]) - grass
-            change = excess / np.maximum(-down, 0.1)
-            distances = np.where(
-                falling, np.maximum(distances + 0.8 * change, 0.0), REACH_M
-            )
+            x, y, z = points.T
+            excess = z - self.height(x, y) - grass
+            change = excess / slowest_fall
+            distances = np.maximum(distances + 0.8 * change, 0.0)
+            distances = np.where(is_falling, distances, REACH_M)
         return distances
 
     def accelerations(self, T_base_sensor: FloatArray) -> tuple[IntArray, FloatArray]:
         """Stamps (ns) and specific forces (N, 3), m/s^2, of an accelerometer at 100 Hz."""
         rng = self.rng
         Ts = self.Ts_world_base @ T_base_sensor
+        rotations = Ts[:, :3, :3]
         positions = Ts[:, :3, 3]
-        accelerations = np.gradient(
-            np.gradient(positions, STEP_S, axis=0), STEP_S, axis=0
-        )
-        forces = np.einsum(
-            "nji,nj->ni", Ts[:, :3, :3], np.add(accelerations, [0, 0, g])
-        )
+        velocities = np.gradient(positions, STEP_S, axis=0)
+        accelerations = np.gradient(velocities, STEP_S, axis=0)
+        forces_in_world = np.add(accelerations, [0, 0, g])
+        forces = np.einsum("nji,nj->ni", rotations, forces_in_world)
         forces += self.noise * rng.normal(0, 0.02, 3)
         forces += self.noise * 0.2 * rng.standard_normal(forces.shape)
-        return START_NS + np.round(self.times_s * 1e9).astype(np.int64), forces
+        stamps_ns = START_NS + np.round(self.times_s * 1e9).astype(np.int64)
+        return stamps_ns, forces
+
+
+def yard_course(
+    t: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Positions on a figure of eight."""
+    period_s = rng.uniform(38, 46)
+    start = rng.uniform(0, 2 * np.pi)
+    phase = 2 * np.pi * t / period_s + start
+    length_m = rng.uniform(11, 15)
+    width_m = rng.uniform(4.5, 5.8)
+    offset_m = rng.uniform(-0.5, 0.5)
+    x = length_m * np.sin(phase)
+    y = width_m * np.sin(2 * phase) + offset_m
+    return x, y
 
 
 def road_course(
@@ -247,12 +279,13 @@ def road_course(
     straight_m = rng.uniform(56, 68)
     lane_m = rng.uniform(2.3, 2.8)
     step_m = speed * STEP_S
-    is_turning = (speed * t) % (straight_m + np.pi * lane_m) > straight_m
-    heading = (
-        np.cumsum(gaussian_filter1d(is_turning.astype(float), 30)) * step_m / lane_m
-    )
-    x = np.cumsum(np.cos(heading)) * step_m - straight_m / 2
-    return x, np.cumsum(np.sin(heading)) * step_m - lane_m
+    round_m = straight_m + np.pi * lane_m
+    is_turning = (speed * t) % round_m > straight_m
+    turning = gaussian_filter1d(is_turning.astype(float), 30)
+    heading = np.cumsum(turning) * step_m / lane_m
+    x = np.cumsum(np.cos(heading)) * step_m
+    y = np.cumsum(np.sin(heading)) * step_m
+    return x - straight_m / 2, y - lane_m
 
 
 def _rays(elevations: FloatArray, n_columns: int) -> FloatArray:
@@ -260,8 +293,11 @@ def _rays(elevations: FloatArray, n_columns: int) -> FloatArray:
     azimuths = 2 * np.pi * np.arange(n_columns) / n_columns
     elevation, azimuth = np.meshgrid(elevations, azimuths, indexing="ij")
     level = np.cos(elevation)
-    columns = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
-    return np.stack(columns, axis=-1).reshape(-1, 3)
+    x = level * np.cos(azimuth)
+    y = level * np.sin(azimuth)
+    z = np.sin(elevation)
+    directions = np.stack([x, y, z], axis=-1)
+    return directions.reshape(-1, 3)
 
 
 def _smooth_noise(rng: np.random.Generator, count: int, steps: int) -> FloatArray:

@@ -20,17 +20,17 @@ _HOME = np.eye(4)
 
 def walked(steps, first=_HOME):
     """(N + 1, 4, 4) poses that follow the first one by N steps."""
-    return np.array(list(accumulate([first, *steps], np.matmul)))
+    poses = accumulate([first, *steps], np.matmul)
+    return np.array(list(poses))
 
 
 def wandering_poses(n_poses, seed=0, step_m=0.1, step_rad=0.08):
     """(N, 4, 4) poses of a random walk in six degrees of freedom, smooth over about ten poses."""
     random = np.random.default_rng(seed)
     kernel = np.ones(10) / np.sqrt(10)
-    steps = np.apply_along_axis(
-        np.convolve, 0, random.normal(size=(n_poses + 9, 6)), kernel, mode="valid"
-    )
-    steps *= np.r_[np.full(3, step_m), np.full(3, step_rad)]
+    white = random.normal(size=(n_poses + 9, 6))
+    steps = np.apply_along_axis(np.convolve, 0, white, kernel, mode="valid")
+    steps *= np.repeat([step_m, step_rad], 3)
     return walked(se3.exp(steps[1:]))
 
 
@@ -38,12 +38,11 @@ def planar_poses(n_poses, seed=0):
     """(N, 4, 4) poses of a vehicle on flat ground: x, y and yaw only."""
     random = np.random.default_rng(seed)
     yaw = np.cumsum(random.normal(0, 0.08, n_poses))
-    position = np.cumsum(
-        0.1 * np.c_[np.cos(yaw), np.sin(yaw), np.zeros(n_poses)], axis=0
-    )
-    return se3.from_rotation_translation(
-        se3.rotation_exp(np.c_[np.zeros((n_poses, 2)), yaw]), position
-    )
+    zero = np.zeros(n_poses)
+    forward = np.c_[np.cos(yaw), np.sin(yaw), zero]
+    positions = np.cumsum(0.1 * forward, axis=0)
+    rotations = se3.rotation_exp(np.c_[zero, zero, yaw])
+    return se3.from_rotation_translation(rotations, positions)
 
 
 def child_of(Ts_pw_p, T_parent_child=T_PARENT_CHILD, T_cw_pw=None):
@@ -58,19 +57,19 @@ def child_of(Ts_pw_p, T_parent_child=T_PARENT_CHILD, T_cw_pw=None):
 
 def disturbed(poses, seed, sigma_m, sigma_rad):
     """Poses with white noise in their own frames."""
-    noise = (
-        np.random.default_rng(seed).normal(size=(len(poses), 6))
-        * np.r_[np.full(3, sigma_m), np.full(3, sigma_rad)]
-    )
+    random = np.random.default_rng(seed)
+    sigmas = np.repeat([sigma_m, sigma_rad], 3)
+    noise = random.normal(size=(len(poses), 6)) * sigmas
     return poses @ se3.exp(noise)
 
 
 def smooth_poses(times_s):
     """(N, 4, 4) poses on a smooth curve in all six degrees of freedom."""
     k = np.arange(1, 7)
-    return se3.exp(
-        np.sin(times_s[:, None] * (0.5 + 0.15 * k) + k) * np.repeat([3.0, 0.8], 3)
-    )
+    frequencies = 0.5 + 0.15 * k
+    amplitudes = np.repeat([3.0, 0.8], 3)
+    phases = times_s[:, None] * frequencies + k
+    return se3.exp(np.sin(phases) * amplitudes)
 
 
 def as_trajectory(poses, rate_hz=10.0, start_ns=1_700_000_000_000_000_000, **frames):
@@ -92,17 +91,19 @@ def noisy_pair(poses, seed, *noise, rate_hz=10.0, mount=T_PARENT_CHILD):
 
 def write_pair(folder, parent, child):
     """Paths of two text files with the trajectories."""
-    paths = [str(folder / "parent.tum"), str(folder / "child.tum")]
-    for path, trajectory in zip(paths, (parent, child), strict=True):
-        write_trajectory(path, trajectory)
-    return paths
+    parent_path = str(folder / "parent.tum")
+    child_path = str(folder / "child.tum")
+    write_trajectory(parent_path, parent)
+    write_trajectory(child_path, child)
+    return [parent_path, child_path]
 
 
 def messages(stream, trajectory):
     """What the engine is given for each pose."""
+    stamps_ns = trajectory.stamps_ns.tolist()
     positions = trajectory.poses[:, :3, 3].tolist()
-    quats = se3.to_quat_xyzw(trajectory.poses)
-    poses = zip(trajectory.stamps_ns.tolist(), positions, quats.tolist(), strict=True)
+    quats = se3.to_quat_xyzw(trajectory.poses).tolist()
+    poses = zip(stamps_ns, positions, quats, strict=True)
     return [(stream, *pose) for pose in poses]
 
 

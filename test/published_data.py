@@ -38,14 +38,17 @@ def data_folder():
 
 def kitti_short():
     """KITTI 2011_09_30_drive_0027: parent lidar, child grey camera (Välimäki et al. 2023, 5)."""
-    return published.load_kitti_short(data_folder() / "valimaki2023")
+    folder = data_folder() / "valimaki2023"
+    return published.load_kitti_short(folder)
 
 
 def kitti_long():
     """KITTI 2011_10_03_drive_0027: parent grey camera, child colour camera (the same)."""
-    return published.load_kitti_long(data_folder() / "valimaki2023")
+    folder = data_folder() / "valimaki2023"
+    return published.load_kitti_long(folder)
 
 
 def simulated(datasets=published.SIMULATED, levels=None):
     """The simulated cases, 38 for every data set and level (Välimäki et al. 2023, section 4)."""
-    return published.load_simulated(data_folder() / "valimaki2023", datasets, levels)
+    folder = data_folder() / "valimaki2023"
+    return published.load_simulated(folder, datasets, levels)

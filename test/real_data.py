@@ -49,7 +49,8 @@ class Recording:
 
     def corrected(self):
         """The child with the known offset and scale taken out."""
-        return self.child.shifted(self.time_offset_s).scaled(self.scale)
+        on_parent_clock = self.child.shifted(self.time_offset_s)
+        return on_parent_clock.scaled(self.scale)
 
 
 def tango_pairs():
@@ -74,8 +75,9 @@ def robot_arm(which):
     """An arm's hand against a camera: "complete" is real, with gross jumps; "sim" turns about
     nearly one axis.
     """
-    rig = {"complete": "robot_arm", "sim": "robot_arm about one axis"}[which]
-    return _of_rig("asl_robot_arm", rig, f"arm {which}", _ARM_OFFSETS_S[which])
+    rigs = {"complete": "robot_arm", "sim": "robot_arm about one axis"}
+    offset_s = _ARM_OFFSETS_S[which]
+    return _of_rig("asl_robot_arm", rigs[which], f"arm {which}", offset_s)
 
 
 def stops(seed):
@@ -84,17 +86,25 @@ def stops(seed):
     """
     arm = robot_arm("complete")
     hand_ns = arm.parent.stamps_ns
-    best = {}
+    # Nearest camera pose of each hand pose, with the time between both.
+    nearest = {}
     for eye, stamp_ns in enumerate(arm.child.stamps_ns):
         hand = int(np.argmin(np.abs(hand_ns - stamp_ns)))
         apart_ns = abs(int(hand_ns[hand] - stamp_ns))
         if apart_ns <= 11_000_000:
-            best[hand] = min(best.get(hand, (apart_ns, eye)), (apart_ns, eye))
-    pairs = sorted((hand, eye) for hand, (_, eye) in best.items())
+            candidate = (apart_ns, eye)
+            nearest[hand] = min(nearest.get(hand, candidate), candidate)
+    pairs = []
+    for hand in sorted(nearest):
+        _, eye = nearest[hand]
+        pairs.append((hand, eye))
+
     order = list(range(len(pairs)))
     random.Random(seed).shuffle(order)
-    hands, eyes = zip(*(pairs[index] for index in sorted(order[16:48])), strict=True)
-    return arm.parent.poses[list(hands)], arm.child.poses[list(eyes)]
+    chosen = [pairs[index] for index in sorted(order[16:48])]
+    hands = [hand for hand, _ in chosen]
+    eyes = [eye for _, eye in chosen]
+    return arm.parent.poses[hands], arm.child.poses[eyes]
 
 
 def eye_to_hand():
@@ -104,15 +114,20 @@ def eye_to_hand():
     path = data_folder() / "independent" / "moveit_samples" / "pose_samples.json"
     if not path.exists():
         pytest.skip(f"{path} is absent")
-    rows = np.array(json.loads(path.read_text(encoding="utf-8")), dtype=float)
-    return tuple(se3.inverse(rows[:, stream].reshape(-1, 4, 4)) for stream in range(2))
+    samples = json.loads(path.read_text(encoding="utf-8"))
+    rows = np.array(samples, dtype=float)
+    hand = rows[:, 0].reshape(-1, 4, 4)
+    camera = rows[:, 1].reshape(-1, 4, 4)
+    return se3.inverse(hand), se3.inverse(camera)
 
 
 def thinned(stream, interval_s):
     """Poses at least about so far apart."""
+    interval_ns = (interval_s - 0.02) * 1e9
     keep = [0]
     for index, stamp_ns in enumerate(stream.stamps_ns):
-        if stamp_ns - stream.stamps_ns[keep[-1]] >= (interval_s - 0.02) * 1e9:
+        previous_ns = stream.stamps_ns[keep[-1]]
+        if stamp_ns - previous_ns >= interval_ns:
             keep.append(index)
     return stream[np.array(keep)]
 
@@ -121,10 +136,14 @@ def zxl19(bag, child):
     """INS against lidar odometry ("LO") or a monocular camera of unknown scale ("VO") on a road
     vehicle, bags 1 to 3.
     """
-    rig = {"LO": "zxl19_lidar", "VO": "zxl19_camera"}[child]
-    scale = {1: 3.34, 2: 3.76, 3: 2.66}[bag] if child == "VO" else 1.0
+    rigs = {"LO": "zxl19_lidar", "VO": "zxl19_camera"}
+    scale = 1.0
+    if child == "VO":
+        scales = {1: 3.34, 2: 3.76, 3: 2.66}
+        scale = scales[bag]
     offset = _ZXL19_OFFSETS_S[child][bag - 1]
-    return _of_rig("zxl19", rig, f"zxl19 {bag} {child}", offset, scale, f"bag{bag}")
+    name = f"zxl19 {bag} {child}"
+    return _of_rig("zxl19", rigs[child], name, offset, scale, f"bag{bag}")
 
 
 def boreas():
@@ -140,15 +159,17 @@ SIMPLE_KITTI_TRUTH = SIMPLE_KITTI.T_parent_child
 def euroc(estimate, flight):
     """Visual-inertial odometry of a flight ("vio_stereo", "v2_01"), and the truth of camera 0."""
     folder = data_folder() / "euroc_vio"
-    files = (folder / f"{estimate}_{flight}.tum", folder / f"cam0_truth_{flight}.tum")
-    return Recording(f"euroc {estimate} {flight}", *map(read_trajectory, files))
+    odometry = read_trajectory(folder / f"{estimate}_{flight}.tum")
+    truth = read_trajectory(folder / f"cam0_truth_{flight}.tum")
+    return Recording(f"euroc {estimate} {flight}", odometry, truth)
 
 
 def simple_kitti(drive):
     """Lidar odometry of a road vehicle, camera axes, and the truth with an extrinsic of its own."""
     folder = data_folder() / "simple_kitti"
-    files = (folder / f"odometry_{drive}.tum", folder / f"truth_{drive}.tum")
-    return Recording(f"simple_kitti {drive}", *map(read_trajectory, files))
+    odometry = read_trajectory(folder / f"odometry_{drive}.tum")
+    truth = read_trajectory(folder / f"truth_{drive}.tum")
+    return Recording(f"simple_kitti {drive}", odometry, truth)
 
 
 def kitti(which):
@@ -175,6 +196,7 @@ def all_recordings():
 
 def _of_rig(folder, rig, name, offset_s=0.0, scale=1.0, which="whole"):
     """A recording of :mod:`reproduction.recordings` with what is known about it."""
-    rigs = {rig.name: rig for rig in rigs_of(data_folder(), folder)}
-    recording = rigs[rig].recordings[which]
+    rigs = rigs_of(data_folder(), folder)
+    (rig_of_name,) = (candidate for candidate in rigs if candidate.name == rig)
+    recording = rig_of_name.recordings[which]
     return Recording(name, recording.parent, recording.child, offset_s, scale)

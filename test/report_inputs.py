@@ -20,4 +20,5 @@ def calibrated(capsys, *arguments):
     """Exit code, document (None after an error) and what was written to stderr."""
     code = main(["calibrate", *arguments, "--json"])
     out, err = capsys.readouterr()
-    return code, json.loads(out) if out else None, err
+    document = json.loads(out) if out else None
+    return code, document, err

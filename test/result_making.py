@@ -61,26 +61,27 @@ SHIFTED_FROM = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
 
 def shifted(shift=(0,) * 6, hidden="", sigmas=SIGMAS, seed=None, **fields):
     """A result whose axes along and about the parent's are off by a shift, and by noise."""
-    noise = (
-        np.zeros(6)
-        if seed is None
-        else np.random.default_rng(seed).normal(size=6) * sigmas
-    )
+    noise = np.zeros(6)
+    if seed is not None:
+        random = np.random.default_rng(seed)
+        noise = random.normal(size=6) * sigmas
     off = np.asarray(shift, dtype=float) + noise
     T = SHIFTED_FROM.copy()
     T[:3, :3] = se3.rotation_exp(off[3:]) @ T[:3, :3]
     T[:3, 3] += off[:3]
+
     to_child = np.kron(np.eye(2), T[:3, :3].T)
-    fields = {
-        "status": SolveStatus.OK,
-        "observability_measured": dofs(sigmas, [hidden]),
-    } | fields
-    covariance = to_child @ np.diag(sigmas**2) @ to_child.T
+    variances = np.diag(sigmas**2)
+    covariance = to_child @ variances @ to_child.T
+    fields.setdefault("status", SolveStatus.OK)
+    fields.setdefault("observability_measured", dofs(sigmas, [hidden]))
     return calibration(T_parent_child=T, covariance_measured=covariance, **fields)
 
 
 def shift(axis, size):
-    return np.eye(6)[NAMES.index(axis)] * size
+    vector = np.zeros(6)
+    vector[NAMES.index(axis)] = size
+    return vector
 
 
 def good_calibration(**changes):
@@ -96,7 +97,9 @@ def good_calibration(**changes):
 
 def seen(motion_s, rotation_deg=(40.0, 30.0, 60.0)):
     """A motion that shows much."""
-    return Excitation(100, np.radians(rotation_deg), np.zeros((3, 3)), 10.0, motion_s)
+    rotation = np.radians(rotation_deg)
+    cross_terms = np.zeros((3, 3))
+    return Excitation(100, rotation, cross_terms, 10.0, motion_s)
 
 
 def written_finding(code, severity, what, advice="convert them", **fields):

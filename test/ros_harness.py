@@ -3,6 +3,7 @@
 import gc
 import inspect
 import itertools
+import math
 import multiprocessing
 import multiprocessing.forkserver
 import os
@@ -79,17 +80,18 @@ def drive(n_poses=120, period_ns=100_000_000, start_ns=START_NS, sigma_rad=5e-5)
     """Stamps and poses of both sensors on a rig that turns about all axes. Without noise they would
     be one stream computed from the other.
     """
-    s = np.arange(n_poses) * period_ns * 1e-9
-    turns = np.sin(np.outer(s, [0.7, 0.9, 0.4]) + np.array([0.0, 1.0, 0.0])) * [
-        0.5,
-        0.4,
-        0.8,
-    ]
-    places = np.stack([s, 2.0 * np.sin(0.5 * s), 0.5 * np.cos(0.8 * s)], axis=1)
-    Ts_pw_p = se3.from_rotation_translation(se3.rotation_exp(turns), places)
+    elapsed_ns = period_ns * np.arange(n_poses)
+    s = elapsed_ns * 1e-9
+    angles = np.outer(s, [0.7, 0.9, 0.4]) + np.array([0.0, 1.0, 0.0])
+    rotations = se3.rotation_exp(np.sin(angles) * [0.5, 0.4, 0.8])
+    y = 2.0 * np.sin(0.5 * s)
+    z = 0.5 * np.cos(0.8 * s)
+    positions = np.stack([s, y, z], axis=1)
+    Ts_pw_p = se3.from_rotation_translation(rotations, positions)
     T_cw_pw = se3.exp(np.array([5.0, -3.0, 1.0, 0.3, 0.1, 2.0]))
-    Ts_cw_c = disturbed(T_cw_pw @ Ts_pw_p @ T_PARENT_CHILD, 1, 5e-5, sigma_rad)
-    return start_ns + period_ns * np.arange(n_poses), Ts_pw_p, Ts_cw_c
+    Ts_cw_c = T_cw_pw @ Ts_pw_p @ T_PARENT_CHILD
+    Ts_cw_c = disturbed(Ts_cw_c, 1, 5e-5, sigma_rad)
+    return start_ns + elapsed_ns, Ts_pw_p, Ts_cw_c
 
 
 def message(kind, stamp_ns, T_world_sensor, sensor_frame):
@@ -115,9 +117,11 @@ def parts_of(message):
 
 def matrix(transform):
     """(4, 4) array of a TransformStamped."""
-    t = transform.transform.translation
-    q = transform.transform.rotation
-    return se3.from_quat_xyzw([t.x, t.y, t.z], [q.x, q.y, q.z, q.w])
+    translation = transform.transform.translation
+    rotation = transform.transform.rotation
+    position = [translation.x, translation.y, translation.z]
+    quat_xyzw = [rotation.x, rotation.y, rotation.z, rotation.w]
+    return se3.from_quat_xyzw(position, quat_xyzw)
 
 
 # Most of a start is importing: nodes are forked from a process that has imported their modules. The
@@ -241,9 +245,12 @@ class NodeProcess:
         """Send signals, 50 ms apart; exit code and seconds it took."""
         start = time.monotonic()
         for number, next_signal in enumerate(signals or [signal.SIGINT]):
-            time.sleep(0.05 * (number > 0))
+            if number > 0:
+                time.sleep(0.05)
             self.process.send_signal(next_signal)
-        return self.process.wait(PATIENCE_S), time.monotonic() - start
+        code = self.process.wait(PATIENCE_S)
+        duration_s = time.monotonic() - start
+        return code, duration_s
 
     def kill(self):
         """End it at once where it still runs."""
@@ -348,17 +355,21 @@ class Peer:
 
     def call(self, kind, name, request=None):
         """Answer of a service."""
-        asked = []
+        futures = []
+        last_s = -math.inf
 
         def answered():
+            nonlocal last_s
             # An answer is lost where the server has not discovered the client yet: then ask once
             # more.
-            if not asked or time.monotonic() > asked[-1][0] + 3.0:
-                asked.append((time.monotonic(), self.ask(kind, name, request)))
-            return any(future.done() for _, future in asked)
+            if time.monotonic() > last_s + 3.0:
+                last_s = time.monotonic()
+                futures.append(self.ask(kind, name, request))
+            return any(future.done() for future in futures)
 
         self.spin_until(answered, f"the answer of {name}")
-        return next(future.result() for _, future in asked if future.done())
+        done = [future for future in futures if future.done()]
+        return done[0].result()
 
     def trigger(self, name):
         """Answer of a service, asked again while a solve goes on."""

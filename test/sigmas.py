@@ -5,7 +5,8 @@ import numpy as np
 
 def nees(error, covariance):
     """Return the normalised error squared: chi-square with a degree of freedom for each axis."""
-    return error @ np.linalg.solve(covariance, error)
+    weighted_error = np.linalg.solve(covariance, error)
+    return error @ weighted_error
 
 
 def assert_nees(values, low, high, average=np.mean):
@@ -15,12 +16,12 @@ def assert_nees(values, low, high, average=np.mean):
 
 def assert_errors_over_sigmas(ratios, low, high):
     """Judge the root mean square of errors divided by their standard deviations."""
-    _assert_within(np.sqrt(np.mean(np.square(ratios))), low, high, "errors over sigmas")
+    mean_square = np.mean(np.square(ratios))
+    ratio = np.sqrt(mean_square)
+    _assert_within(ratio, low, high, "errors over sigmas")
 
 
 def _assert_within(average, low, high, quantity):
-    size = "large" if average < low else "small"
-    text = (
-        f"sigmas are too {size}: {quantity} {average:.2f}, expected {low:g} to {high:g}"
-    )
-    assert low < average < high, text
+    figures = f"{quantity} {average:.2f}, expected {low:g} to {high:g}"
+    assert average > low, f"sigmas are too large: {figures}"
+    assert average < high, f"sigmas are too small: {figures}"

@@ -15,5 +15,7 @@ def machine(measures="wheels", course="eights", duration_s=120.0, noise=1.0):
 
 def pose_errors(result, truth):
     """Errors of x, y (m) and of the rotations (rad) about the axes of the base."""
-    turn = result.T_parent_child[:3, :3] @ truth[:3, :3].T
-    return np.append((result.T_parent_child - truth)[:2, 3], se3.rotation_log(turn))
+    T = result.T_parent_child
+    position_error = T[:2, 3] - truth[:2, 3]
+    rotation_error = T[:3, :3] @ truth[:3, :3].T
+    return np.append(position_error, se3.rotation_log(rotation_error))

@@ -15,6 +15,7 @@ from motions import (
     noisy_pair,
     wandering_poses,
 )
+from numpy.testing import assert_allclose
 
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import InputError, NotEnoughDataError
@@ -38,11 +39,11 @@ def drive(n_poses=200, seed=0):
 def test_python_function_finds_the_truth_at_different_rates():
     parent, child = drive()
     result = calibrate(parent, child, reference="B3")
-    np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=1e-6)
+    assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=1e-6)
     assert result.status is SolveStatus.OK
     assert (result.method, result.reference, result.backend) == ("dnlo", "B3", "fast")
     assert result.n_pairs == result.n_poses - 3 == result.n_inliers
-    np.testing.assert_allclose(
+    assert_allclose(
         result.T_parent_child @ result.T_child_parent, np.eye(4), atol=1e-12
     )
 
@@ -69,7 +70,7 @@ def test_adaptive_describes_the_noise():
     parent, child = drive()
     noisy = dataclasses.replace(child, poses=disturbed(child.poses, 1, 0.002, 0.002))
     result = calibrate(parent, noisy, method="adaptive")
-    np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=0.01)
+    assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=0.01)
     assert result.status is SolveStatus.OK
     assert result.noise.systematic == "none"
     assert result.noise.translation_white_m == pytest.approx(0.002, rel=0.3)
@@ -94,7 +95,7 @@ def test_time_offset_and_scale_are_applied_to_the_child():
     parent, child = drive()
     late = dataclasses.replace(child.shifted(-12.5), poses=child.scaled(1 / 2.5).poses)
     result = calibrate(parent, late, reference="B3", time_offset=12.5, scale=2.5)
-    np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=1e-6)
+    assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=1e-6)
     assert (result.time_offset_s, result.scale) == (12.5, 2.5)
 
 
@@ -216,9 +217,7 @@ def test_every_pose_is_paired_once_and_memory_stays_small(child_every):
     calibrator = play(by_stamp(parent, child), max_gap=1.0)
     assert np.array_equal(calibrator.snapshot().pose_pairs.stamps_ns, child.stamps_ns)
     assert len(calibrator.snapshot().unpaired[0]) < 150
-    np.testing.assert_allclose(
-        calibrator.estimate().T_parent_child, T_PARENT_CHILD, atol=1e-6
-    )
+    assert_allclose(calibrator.estimate().T_parent_child, T_PARENT_CHILD, atol=1e-6)
     assert not calibrator.add_pose(
         "parent", parent.stamps_ns[0] + 1, [0.0] * 3, [0.0, 0, 0, 1]
     )
@@ -294,9 +293,7 @@ def test_the_informative_pairs_are_kept_not_the_newest():
     assert len(stamps_ns) <= 1500
     assert (stamps_ns <= parent.stamps_ns[1199]).sum() > 900
     result = calibrator.estimate()
-    np.testing.assert_allclose(
-        result.T_parent_child[:3, 3], T_PARENT_CHILD[:3, 3], atol=2e-3
-    )
+    assert_allclose(result.T_parent_child[:3, 3], T_PARENT_CHILD[:3, 3], atol=2e-3)
 
 
 def test_the_time_offset_a_snapshot_found_is_taken_over(monkeypatch):

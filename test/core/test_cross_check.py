@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 from motions import as_trajectory, child_of, disturbed, walked, wandering_poses
+from numpy.testing import assert_allclose
 from result_making import good_calibration
 
 import hand_eye_calib as hec
@@ -207,7 +208,7 @@ def test_an_axis_that_no_other_reference_reveals_is_weak_and_used_with_care():
     assert reason.sentence.startswith("only the noise model determines z to ")
     assert shown.T_parent_child[2, 3] == pytest.approx(0.3, abs=0.03)
     assert all(row.is_confirmed for row in shown.cross_check.values())
-    np.testing.assert_allclose(alone.T_parent_child[:2, 3], [0.6, -0.3], atol=0.02)
+    assert_allclose(alone.T_parent_child[:2, 3], [0.6, -0.3], atol=0.02)
 
 
 def scattered(axis="z", **columns):
@@ -266,9 +267,7 @@ def test_a_body_that_rocks_on_its_springs_reveals_no_height(method):
         rocking = calibrate(*on_springs(seed, 0.2), method=method)
         assert "z" in rocking.unobservable()
         assert np.isinf(rocking.sigmas[2])
-        np.testing.assert_allclose(
-            rocking.T_parent_child[:2, 3], [0.6, -0.3], atol=0.05
-        )
+        assert_allclose(rocking.T_parent_child[:2, 3], [0.6, -0.3], atol=0.05)
 
 
 def test_ramps_reveal_the_height_of_a_body_on_springs():

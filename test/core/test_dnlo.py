@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from motions import T_PARENT_CHILD, child_of, disturbed, wandering_poses
+from numpy.testing import assert_allclose
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.geometry import se3
@@ -31,7 +32,7 @@ def test_truncation_is_the_optimum_over_the_weights(fraction):
     weights, objectives = dnlo.truncate(costs, 0.01, fraction * 15)
     for row in range(4):
         assert weights[row].sum() >= fraction * 15 - 1e-9
-        np.testing.assert_allclose(
+        assert_allclose(
             objectives[row],
             brute_force_objective(costs[row], 0.01, fraction * 15),
             rtol=1e-9,
@@ -50,7 +51,7 @@ def jumpy_pairs():
 
 def test_outliers_are_rejected_and_reported(jumpy_pairs):
     solution = dnlo.solve(jumpy_pairs, threshold=0.01, min_inlier_fraction=0.3)
-    np.testing.assert_allclose(solution.T_parent_child, T_PARENT_CHILD, atol=0.02)
+    assert_allclose(solution.T_parent_child, T_PARENT_CHILD, atol=0.02)
     costs = all_pairs.pair_costs(jumpy_pairs, solution.T_parent_child)
     assert np.array_equal(solution.weights > 0.5, costs < 0.01)
     assert solution.converged
@@ -66,7 +67,7 @@ def test_many_pairs_are_sampled_for_the_search_only():
     child = disturbed(child_of(parent), 1, 0.001, 0.001)
     child[700:, :3, 3] += 5.0
     solution = Method("dnlo").solve(motion_pairs(parent, child, "B2"))
-    np.testing.assert_allclose(solution.T_parent_child, T_PARENT_CHILD, atol=2e-3)
+    assert_allclose(solution.T_parent_child, T_PARENT_CHILD, atol=2e-3)
 
 
 def test_leaving_pairs_out_agrees_with_solving_without_them(jumpy_pairs):
@@ -86,7 +87,7 @@ def test_ipopt_and_the_fast_backend_agree(method, jumpy_pairs):
     ipopt = Method(method, min_inlier_fraction=0.3, backend="ipopt").solve(jumpy_pairs)
     assert fast.objective <= ipopt.objective * (1 + 1e-9)
     if abs(fast.objective - ipopt.objective) < 1e-6 * ipopt.objective:
-        np.testing.assert_allclose(fast.T_parent_child, ipopt.T_parent_child, atol=1e-5)
+        assert_allclose(fast.T_parent_child, ipopt.T_parent_child, atol=1e-5)
 
 
 @pytest.fixture
@@ -101,7 +102,7 @@ def test_condensed_costs_are_the_matrix_costs(pairs):
         se3.exp(np.array([30.0, -4.0, 2.0, 2.0, 1.0, -1.0])),
     ):
         condensed_costs = quadratic_form.condense(pairs) @ quadratic_form.monomials(T)
-        np.testing.assert_allclose(
+        assert_allclose(
             condensed_costs, all_pairs.pair_costs(pairs, T), rtol=1e-12, atol=1e-12
         )
 
@@ -118,7 +119,7 @@ def test_the_minimum_is_where_no_small_step_goes_down(pairs):
     for direction in np.vstack([np.eye(6), -np.eye(6)]):
         assert total(step * direction) > total(np.zeros(6))
     assert converged.all()
-    np.testing.assert_allclose(values.min(), total(np.zeros(6)), rtol=1e-9)
+    assert_allclose(values.min(), total(np.zeros(6)), rtol=1e-9)
 
 
 def test_gauss_newton_steps_reach_the_minimum(pairs):
@@ -127,7 +128,7 @@ def test_gauss_newton_steps_reach_the_minimum(pairs):
     stepped = T @ se3.exp(np.array([0.05, -0.02, 0.01, 0.05, 0.02, -0.03]))
     for _ in range(12):
         stepped = quadratic_form.gauss_newton_step(Q[None], stepped)
-    np.testing.assert_allclose(stepped, T, atol=1e-8)
+    assert_allclose(stepped, T, atol=1e-8)
 
 
 HALF_TURNS = np.array(

@@ -4,7 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+from findings import codes_of
 from motions import as_trajectory, child_of, noisy_pair, planar_poses, wandering_poses
+from numpy.testing import assert_allclose
 
 from hand_eye_calib.core.assessment import excitation
 from hand_eye_calib.core.assessment.covariance import hidden_axes, lever_arm_products
@@ -46,13 +48,13 @@ def test_it_does_not_depend_on_the_world_and_hardly_on_the_number_of_poses():
     poses = wandering_poses(400)
     seen = seen_in(poses)
     moved = seen_in(se3.exp(np.array([5.0, 3.0, -2.0, 0.4, 1.0, -2.0])) @ poses)
-    np.testing.assert_allclose(moved.rotation, seen.rotation, atol=1e-9)
+    assert_allclose(moved.rotation, seen.rotation, atol=1e-9)
     many = seen_in(
         as_trajectory(poses).at(
             np.linspace(*as_trajectory(poses).stamps_ns[[0, -1]], 4000).astype(np.int64)
         )
     )
-    np.testing.assert_allclose(many.rotation, seen.rotation, rtol=0.2)
+    assert_allclose(many.rotation, seen.rotation, rtol=0.2)
 
 
 @pytest.mark.parametrize("n_poses", [0, 1, 20])
@@ -159,7 +161,7 @@ def test_verdict_finding_and_hint_agree(pitch_rad, hidden):
     poses = se3.from_rotation_translation(rotation, position)
     parent, child = noisy_pair(poses, 1, 1e-4, 1e-5)
     result = calibrate(parent, child, reference="B10")
-    codes = [finding.code for finding in check_streams(parent, child).findings]
+    codes = codes_of(check_streams(parent, child).findings)
     seen = excitation.excitation(PosePairs(parent.stamps_ns, parent.poses, child.poses))
     assert ("z" in result.unobservable()) is hidden
     assert ("one_axis" in codes) is hidden

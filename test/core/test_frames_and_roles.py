@@ -18,6 +18,7 @@ from bag_making import (
     write_messages,
 )
 from motions import T_PARENT_CHILD, child_of, wandering_poses
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig
@@ -115,9 +116,7 @@ def test_a_camera_that_observes_a_fixed_marker_is_the_child(
     ]
     document, _ = calibrated(capsys, path, *options)
     assert frames_of(document) == ("tool0", "camera")
-    np.testing.assert_allclose(
-        document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6
-    )
+    assert_allclose(document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6)
     beginning = "the child sensor is now camera, because"
     assert [text for text in document["warnings"] if text.startswith(beginning)]
 
@@ -166,9 +165,9 @@ def test_a_camera_beside_an_arm_that_sees_a_marker_on_the_hand_is_named_by_both_
     )
     assert (as_it_is.parent_frame, as_it_is.child_frame) == ("tool0", "aruco_marker")
     assert (inverse.parent_frame, inverse.child_frame) == ("base_link", "camera")
-    np.testing.assert_allclose(as_it_is.T_parent_child, T_PARENT_CHILD, atol=1e-6)
+    assert_allclose(as_it_is.T_parent_child, T_PARENT_CHILD, atol=1e-6)
     T_base_camera = POSES[0] @ T_PARENT_CHILD @ se3.inverse(CHILD[0])
-    np.testing.assert_allclose(inverse.T_parent_child, T_base_camera, atol=1e-6)
+    assert_allclose(inverse.T_parent_child, T_base_camera, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", [ODOMETRY, POSE_STAMPED])
@@ -191,7 +190,7 @@ def test_a_live_session_and_its_journal_name_the_camera_too(tmp_path, kind):
             engines.add_pose(stream, stamp_ns, fields.position, fields.quat_xyzw)
     result = engines["child"].snapshot().estimate(cross_check=False)
     assert (result.parent_frame, result.child_frame) == ("tool0", "camera")
-    np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=1e-6)
+    assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=1e-6)
 
 
 # ---- names that contradict the streams
@@ -206,7 +205,7 @@ def test_frames_given_the_other_way_round_choose_the_topics(tmp_path, capsys):
     assert "parent is /camera/odometry, child is /lidar/odometry" in err
     assert frames_of(document) == ("camera", "lidar")
     inverse = se3.inverse(T_PARENT_CHILD)
-    np.testing.assert_allclose(document["T_parent_child"]["matrix"], inverse, atol=1e-6)
+    assert_allclose(document["T_parent_child"]["matrix"], inverse, atol=1e-6)
     topics = ["--parent-topic", "/lidar/odometry", "--child-topic", "/camera/odometry"]
     assert main(["calibrate", str(path), *topics, *names]) == 1
     error = capsys.readouterr().err
@@ -348,8 +347,8 @@ def test_options_trees_results_and_installed_poses_have_no_slash(tmp_path):
     assert NodeConfig(base_frame="/base_footprint").base_frame == "base_footprint"
     tree = FrameTree()
     tree.add("/base_link", "/camera", T_PARENT_CHILD)
-    np.testing.assert_array_equal(tree.pose("base_link", "camera"), T_PARENT_CHILD)
-    np.testing.assert_array_equal(tree.pose("/base_link", "/camera"), T_PARENT_CHILD)
+    assert_array_equal(tree.pose("base_link", "camera"), T_PARENT_CHILD)
+    assert_array_equal(tree.pose("/base_link", "/camera"), T_PARENT_CHILD)
     parent = Trajectory(STAMPS_NS, POSES, "/base_link")
     child = Trajectory(STAMPS_NS, CHILD, "/camera")
     result = hec.calibrate(parent, child, reference="B5", checks=False)
@@ -360,7 +359,7 @@ def test_options_trees_results_and_installed_poses_have_no_slash(tmp_path):
     file = tmp_path / "extrinsic.yaml"
     file.write_text(yaml.safe_dump(old))
     installed = open_installed(str(file))("base_link", "camera")
-    np.testing.assert_allclose(installed.T_parent_child, T_PARENT_CHILD, atol=1e-6)
+    assert_allclose(installed.T_parent_child, T_PARENT_CHILD, atol=1e-6)
     urdf = tmp_path / "robot.urdf"
     urdf.write_text(
         '<robot name="r"><link name="/base_link"/><link name="/camera"/>'

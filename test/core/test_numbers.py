@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.stats import chi, chi2, norm
 
 from hand_eye_calib.core.base import stats
@@ -62,7 +63,7 @@ def test_a_fifth_of_wrong_rows_hardly_changes_a_robust_regression(kind, within):
     assert np.abs(plain - values).max() > 0.05
     slopes, lengths = stats.robust_regression(kind, rows, targets, 20, median)
     assert slopes == pytest.approx(values, abs=within)
-    np.testing.assert_allclose(lengths, np.linalg.norm(rows @ slopes - targets, axis=1))
+    assert_allclose(lengths, np.linalg.norm(rows @ slopes - targets, axis=1))
 
 
 def test_a_robust_regression_without_evidence_for_a_value_leaves_it_zero():

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from motions import T_PARENT_CHILD, as_trajectory, child_of, walked, wandering_poses
+from numpy.testing import assert_allclose
 
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.geometry import se3
@@ -46,7 +47,7 @@ def test_anything_else_is_not_a_reference(reference):
 def test_every_motion_pair_fulfils_ax_xb():
     parent = wandering_poses(40)
     pairs = motion_pairs(parent, child_of(parent), "C10")
-    np.testing.assert_allclose(
+    assert_allclose(
         pairs.Ts_parenti_parentj @ T_PARENT_CHILD,
         T_PARENT_CHILD @ pairs.Ts_childi_childj,
         atol=1e-12,
@@ -91,7 +92,7 @@ def test_nothing_is_extrapolated_and_no_gap_is_bridged():
     paired = synchronise(parent, child, max_gap_s=0.5)
     seconds = (paired.stamps_ns - child.stamps_ns[0]) * 1e-9
     # the parent runs from 0.25 s to 3.24 s, with nothing between 1.24 s and 1.95 s
-    np.testing.assert_allclose(
+    assert_allclose(
         seconds, np.r_[np.arange(0.3, 1.25, 0.1), np.arange(2.0, 2.95, 0.1)], atol=1e-9
     )
     assert len(synchronise(parent, child, max_gap_s=0.8)) == 27

@@ -5,6 +5,7 @@ pair.
 import numpy as np
 import pytest
 from motions import child_of, disturbed, wandering_poses
+from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
@@ -85,7 +86,7 @@ def test_park_aligns_the_rotation_vectors(noisy):
         for T in (noisy.Ts_parenti_parentj, noisy.Ts_childi_childj)
     ]
     expected, _ = Rotation.align_vectors(*rotvecs)
-    np.testing.assert_allclose(
+    assert_allclose(
         all_pairs.solve_park(noisy).T_parent_child[:3, :3],
         expected.as_matrix(),
         atol=1e-12,
@@ -107,7 +108,7 @@ def test_rotation_is_never_a_reflection():
 
     solution = all_pairs.solve_park(pairs)
 
-    np.testing.assert_allclose(solution.T_parent_child, TRUTH, atol=1e-12)
+    assert_allclose(solution.T_parent_child, TRUTH, atol=1e-12)
 
 
 def unit_axes(Ts):
@@ -141,7 +142,7 @@ def test_zhuang_ends_where_the_written_out_cost_is_lowest(noisy):
 
     lowest = minimize(cost, parameters, tol=1e-10)
 
-    np.testing.assert_allclose(lowest.x, parameters, atol=1e-5)
+    assert_allclose(lowest.x, parameters, atol=1e-5)
 
 
 def test_ali_minimises_the_translation_residual_over_rotations(noisy):
@@ -156,7 +157,7 @@ def test_ali_minimises_the_translation_residual_over_rotations(noisy):
     assert solution.objective == pytest.approx(
         squared_translation_residual(noisy, rotation, translation), rel=1e-12
     )
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     random = np.random.default_rng(1)
     minima = [
         minimize(cost, random.uniform(-1.5, 1.5, 6), tol=1e-12).fun for _ in range(5)

@@ -6,7 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from faults import inverted, reordered
+from findings import codes_of
 from motions import as_trajectory, child_of, wandering_poses
+from numpy.testing import assert_allclose
 from published_data import data_folder
 
 import hand_eye_calib as hec
@@ -164,8 +166,8 @@ class TestUnclear:
         assert finding.code == "inverse_both"
         answers = re.findall(r"x (\S+), y (\S+), z (\S+) m", finding.what)
         places = [[float(number) for number in answer] for answer in answers]
-        np.testing.assert_allclose(places[0], result.T_parent_child[:3, 3], atol=0.1)
-        np.testing.assert_allclose(places[1], arm.T_parent_child[:3, 3], atol=0.02)
+        assert_allclose(places[0], result.T_parent_child[:3, 3], atol=0.1)
+        assert_allclose(places[1], arm.T_parent_child[:3, 3], atol=0.02)
         assert abs(finding.evidence["difference"]) < 20.0
 
     @pytest.mark.parametrize("options", [NONE, BOTH])
@@ -184,7 +186,7 @@ class TestUnclear:
 
         assert largest_ratio(result, late.T_parent_child) < 3.3
         assert result.verdict is not hec.Verdict.USE
-        assert "arrival" in [finding.code for finding in result.findings]
+        assert "arrival" in codes_of(result.findings)
 
 
 @pytest.mark.parametrize(
@@ -197,7 +199,7 @@ def test_right_streams_are_not_solved_twice(name, monkeypatch):
         lambda *poses: pytest.fail("compared"),
     )
     result = hec.calibrate(drive.parent, drive.child)
-    assert "inverse_both" not in {finding.code for finding in result.findings}
+    assert "inverse_both" not in codes_of(result.findings)
 
 
 class TestStrangers:
@@ -220,7 +222,7 @@ class TestStrangers:
         child = read_trajectory(folder / "falcon5_vicon.csv", repair=True)
         result = hec.calibrate(parent, child, time_offset="estimate")
         expected = [-0.007, -0.034, -0.055]
-        np.testing.assert_allclose(result.T_parent_child[:3, 3], expected, atol=0.011)
+        assert_allclose(result.T_parent_child[:3, 3], expected, atol=0.011)
         assert any(text.startswith("repaired") for text in result.warnings)
 
 

@@ -12,6 +12,7 @@ from motions import (
     planar_poses,
     wandering_poses,
 )
+from numpy.testing import assert_allclose
 from sigmas import assert_nees, nees
 
 import hand_eye_calib as hec
@@ -71,10 +72,8 @@ class TestSolver:
         parent = planar_poses(200)
         mount = se3.from_rotation_translation(np.eye(3), [0.4, -0.2, 0.7])
         solution = solve(motion_pairs(parent, child_of(parent, mount), "B3"))
-        np.testing.assert_allclose(
-            np.abs(solution.unseen[:, 0]), [0, 0, 1, 0, 0, 0], atol=1e-6
-        )
-        np.testing.assert_allclose(solution.T_parent_child[:2], mount[:2], atol=1e-6)
+        assert_allclose(np.abs(solution.unseen[:, 0]), [0, 0, 1, 0, 0, 0], atol=1e-6)
+        assert_allclose(solution.T_parent_child[:2], mount[:2], atol=1e-6)
 
     def test_the_stride_with_the_smallest_covariance_is_taken(self):
         parent, child = noisy_poses(3)
@@ -110,7 +109,7 @@ class TestSecondOpinions:
         )
         expected = np.zeros(6)
         expected[axis] = 0.1
-        np.testing.assert_allclose(added_sigmas(far, opinions), expected, atol=0.01)
+        assert_allclose(added_sigmas(far, opinions), expected, atol=0.01)
 
     def test_answers_that_are_less_certain_add_nothing(self):
         answer, opinions = answer_and_opinions(seed=2)
@@ -143,7 +142,7 @@ class TestSecondOpinions:
         path = "hand_eye_calib.core.engine.estimation.excess_covariance"
         monkeypatch.setattr(path, lambda *_: 0.05**2 * np.eye(6))
         widened = hec.calibrate(*streams, method="adaptive")
-        np.testing.assert_allclose(
+        assert_allclose(
             widened.sigmas_measured, np.hypot(usual.sigmas_measured, 0.05), rtol=0.1
         )
         # The comparison states the standard deviation without second opinions.

@@ -7,6 +7,7 @@ import dataclasses
 import motions
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from sigmas import assert_errors_over_sigmas
 
 from hand_eye_calib.core.alignment.rate_correlation import correlate_rates
@@ -68,7 +69,7 @@ def test_every_method_takes_it(method):
     result = calibrate(*streams(scale=2.0, noise=0.0005), **options)
     assert result.scale == pytest.approx(2.0, rel=0.005)
     assert 0 < result.scale_sigma < 0.01
-    np.testing.assert_allclose(result.T_parent_child, motions.T_PARENT_CHILD, atol=0.02)
+    assert_allclose(result.T_parent_child, motions.T_PARENT_CHILD, atol=0.02)
 
 
 def test_auto_estimates_only_where_the_streams_call_for_it():
@@ -247,7 +248,7 @@ class TestInTheEngine:
         again = type(estimated).from_dict(estimated.to_dict())
         assert again.time_offset_sigma_s == estimated.time_offset_sigma_s
         fixed = calibrate(parent, child, time_offset=estimated.time_offset_s, **options)
-        np.testing.assert_array_equal(fixed.T_parent_child, estimated.T_parent_child)
+        assert_array_equal(fixed.T_parent_child, estimated.T_parent_child)
         assert fixed.time_offset_sigma_s == 0.0
         assert (
             np.linalg.eigvalsh(
@@ -271,9 +272,7 @@ class TestInTheEngine:
         assert snapshot.time_offset.seconds == pytest.approx(0.2, abs=0.002)
         result = snapshot.estimate()
         assert result.time_offset_s == snapshot.time_offset.seconds
-        np.testing.assert_allclose(
-            result.T_parent_child, motions.T_PARENT_CHILD, atol=0.02
-        )
+        assert_allclose(result.T_parent_child, motions.T_PARENT_CHILD, atol=0.02)
 
     def test_streams_that_cannot_be_aligned_do_not_fill_the_memory(self):
         calibrator = Calibrator(

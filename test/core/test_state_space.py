@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from hand_eye_calib.core.base.blocks import Blocks
 from hand_eye_calib.core.geometry import se3
@@ -122,8 +123,8 @@ def test_the_likelihood_is_that_of_the_dense_covariance():
     loss, step, covariance = dense_loss(space, LEVELS)
     posterior = Posterior(space, LEVELS)
     assert posterior.loss == pytest.approx(loss, rel=1e-11, abs=1e-9)
-    np.testing.assert_allclose(posterior.normal.step, step, atol=1e-9)
-    np.testing.assert_allclose(posterior.normal.covariance, covariance, atol=1e-9)
+    assert_allclose(posterior.normal.step, step, atol=1e-9)
+    assert_allclose(posterior.normal.covariance, covariance, atol=1e-9)
 
 
 def test_the_likelihood_stays_exact_where_there_is_hardly_any_walk_or_white_noise():
@@ -151,7 +152,7 @@ def test_a_parameter_without_information_changes_no_derivative():
         / (2 * step)
         for change in step * np.eye(N_LEVELS)
     ]
-    np.testing.assert_allclose(gradient, numerical, atol=1e-6)
+    assert_allclose(gradient, numerical, atol=1e-6)
 
 
 @pytest.mark.parametrize("units", [np.ones(3), np.array([1.0, 0.1, 10.0])])
@@ -184,7 +185,7 @@ def test_derivatives_of_the_likelihood_are_the_numerical_ones():
         / (2 * step)
         for change in step * np.eye(N_LEVELS)
     ]
-    np.testing.assert_allclose(gradient, numerical, atol=1e-7)
+    assert_allclose(gradient, numerical, atol=1e-7)
 
     rows = np.repeat(~space.cut, 6)
     J, r = parameters_and_residuals(space, rows)
@@ -199,7 +200,7 @@ def test_derivatives_of_the_likelihood_are_the_numerical_ones():
         for change in step * np.eye(N_LEVELS)
     ]
     forced = np.array([slope[np.ix_(rows, rows)] @ P @ r for slope in slopes])
-    np.testing.assert_allclose(information, 0.5 * forced @ P @ forced.T, atol=1e-7)
+    assert_allclose(information, 0.5 * forced @ P @ forced.T, atol=1e-7)
 
 
 def test_surprises_are_what_leaving_one_out_makes_of_it():
@@ -227,15 +228,15 @@ def test_parts_add_what_a_recording_that_ends_there_would_know():
     space = space_of()
     posterior = Posterior(space, LEVELS)
     parts = posterior.part_products()
-    np.testing.assert_allclose(parts.sum(axis=0), posterior.products, atol=1e-8)
+    assert_allclose(parts.sum(axis=0), posterior.products, atol=1e-8)
     n_known = 9  # of 14 parts, one increment each
     rows = np.repeat(~space.cut, 6) & (np.arange(6 * len(space.columns)) < 6 * n_known)
     V = dense_covariance(space, LEVELS)[np.ix_(rows, rows)]
     columns = space.columns.reshape(-1, N_PARAMETERS + 1)[rows]
     expected = columns.T @ np.linalg.solve(V, columns)
-    np.testing.assert_allclose(parts[:n_known].sum(axis=0), expected, atol=1e-8)
+    assert_allclose(parts[:n_known].sum(axis=0), expected, atol=1e-8)
     halves = Blocks(parts).merged(2)
-    np.testing.assert_allclose(
+    assert_allclose(
         NormalEquations(halves.without()).step[1],
         NormalEquations(parts[:7].sum(axis=0)).step,
         atol=1e-9,
@@ -269,20 +270,20 @@ def test_block_tridiagonal_algebra_is_that_of_the_dense_matrix(n):
     solved = factor.restore(whitened).reshape(n * d, 3)
     on_diagonal, below_diagonal = factor.selected_inverse
 
-    np.testing.assert_allclose(solved, inverse @ flat_right, atol=1e-12)
+    assert_allclose(solved, inverse @ flat_right, atol=1e-12)
     flat_whitened = whitened.reshape(n * d, 3)
     squares = flat_whitened.T @ flat_whitened
     expected = flat_right.T @ inverse @ flat_right
-    np.testing.assert_allclose(squares, expected, rtol=1e-12, atol=1e-12)
+    assert_allclose(squares, expected, rtol=1e-12, atol=1e-12)
     _, log_determinant = np.linalg.slogdet(matrix)
     assert factor.log_determinant == pytest.approx(log_determinant)
     blocks = inverse.reshape(n, d, n, d)
     assert on_diagonal.shape == (n, d, d)
     assert below_diagonal.shape == (n - 1, d, d)
     for k in range(n):
-        np.testing.assert_allclose(on_diagonal[k], blocks[k, :, k], atol=1e-12)
+        assert_allclose(on_diagonal[k], blocks[k, :, k], atol=1e-12)
     for k in range(n - 1):
-        np.testing.assert_allclose(below_diagonal[k], blocks[k + 1, :, k], atol=1e-12)
+        assert_allclose(below_diagonal[k], blocks[k + 1, :, k], atol=1e-12)
     with pytest.raises(np.linalg.LinAlgError):
         Factor(-diagonal, below)
 
@@ -325,17 +326,15 @@ def test_parts_have_the_posterior_of_a_trajectory_that_is_cut_between_them(monke
     posterior = PartwisePosterior(space_of_part, N_POSES, whole.prior, levels)
     assert len([*posterior.parts()]) == 3
     assert posterior.loss == pytest.approx(expected.loss, rel=1e-11)
-    np.testing.assert_allclose(posterior.products, expected.products, atol=1e-9)
+    assert_allclose(posterior.products, expected.products, atol=1e-9)
     step = posterior.normal.step
-    np.testing.assert_allclose(
+    assert_allclose(
         posterior.states_after(step), expected.states_after(step), atol=1e-9
     )
-    np.testing.assert_allclose(
-        posterior.part_products().sum(axis=0), expected.products, atol=1e-9
-    )
+    assert_allclose(posterior.part_products().sum(axis=0), expected.products, atol=1e-9)
     no_spikes = np.zeros(N_POSES, dtype=bool)
     of_walk, of_white = innovation_chi_squares(posterior, no_spikes)
     whole_walk, whole_white = innovation_chi_squares(expected, no_spikes)
-    np.testing.assert_allclose(of_white, whole_white, rtol=1e-6)
-    np.testing.assert_allclose(of_walk[~whole.cut], whole_walk[~whole.cut], rtol=1e-6)
-    np.testing.assert_array_equal(of_walk[whole.cut], 0.0)
+    assert_allclose(of_white, whole_white, rtol=1e-6)
+    assert_allclose(of_walk[~whole.cut], whole_walk[~whole.cut], rtol=1e-6)
+    assert_array_equal(of_walk[whole.cut], 0.0)

@@ -5,6 +5,7 @@ import functools
 
 import numpy as np
 import pytest
+from findings import codes_of
 from motions import (
     T_PARENT_CHILD,
     as_trajectory,
@@ -13,6 +14,7 @@ from motions import (
     noisy_pair,
     wandering_poses,
 )
+from numpy.testing import assert_allclose
 from scipy.ndimage import gaussian_filter1d
 
 import hand_eye_calib as hec
@@ -55,7 +57,7 @@ def test_every_fault_is_named(fault):
         sound.parent, sound.child, severity, np.random.default_rng(0)
     )
     findings = check_streams(*streams).findings
-    assert {finding.code for finding in findings} & fault.named
+    assert set(codes_of(findings)) & fault.named
     for finding in findings:
         assert finding.what
         assert finding.advice
@@ -130,9 +132,7 @@ def test_a_drift_on_a_flat_floor_is_no_scale_of_heights(seed):
     flat = simulate_drive(
         seed, dataclasses.replace(HILLY_DRIVE, terrain_height=0.0), noise
     )
-    assert "axis_scale" not in {
-        finding.code for finding in check_streams(*_streams(flat)).findings
-    }
+    assert "axis_scale" not in codes_of(check_streams(*_streams(flat)).findings)
 
 
 def _streams(simulated):
@@ -189,9 +189,9 @@ class TestGrid:
     def test_millimetres_with_one_decimal_are_fine(self, in_mm, options):
         streams = rounded_pair(step_m=1e-4, in_mm=in_mm)
         result = hec.calibrate(*streams, **options)
-        assert [finding.code for finding in result.findings] == []
+        assert codes_of(result.findings) == []
         assert result.verdict is Verdict.USE
-        np.testing.assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=2e-3)
+        assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=2e-3)
 
     @pytest.mark.parametrize("stream", ["parent", "child"])
     @pytest.mark.parametrize(
@@ -220,7 +220,7 @@ class TestGrid:
         poses[:, 0, 3] = 0.25 * np.cumsum(is_step)
         stream = Trajectory(np.arange(len(is_step)) * 10**8, poses)
 
-        codes = [finding.code for finding in check_stream(stream, "child")]
+        codes = codes_of(check_stream(stream, "child"))
 
         assert "coarse_positions" not in codes
 
@@ -232,7 +232,7 @@ class TestGrid:
 
         findings = check_stream(Trajectory(stamps_ns, poses), "child")
 
-        assert "coarse_positions" in [finding.code for finding in findings]
+        assert "coarse_positions" in codes_of(findings)
 
 
 def straight_at(stream, stamps_ns):
@@ -381,7 +381,7 @@ class TestParentFusedFromTheChild:
         )
         result = hec.calibrate(parent, truth.child)
         assert result.verdict is not Verdict.USE
-        codes = {finding.code for finding in result.findings}
+        codes = set(codes_of(result.findings))
         # Positions that are turned against orientations show the longest times.
         assert codes & {"not_independent", "worlds_turned"}
         clean = hec.calibrate(truth.parent, truth.child)
@@ -419,9 +419,7 @@ class TestParentFusedFromTheChild:
     @pytest.mark.parametrize("seed", [61, 62])
     def test_rotations_about_one_axis_show_no_other_mount(self, seed):
         flat = make("flat_agv", seed)
-        codes = [
-            finding.code for finding in check_streams(flat.parent, flat.child).findings
-        ]
+        codes = codes_of(check_streams(flat.parent, flat.child).findings)
         assert codes == ["one_axis"]
 
     @pytest.mark.parametrize("kind", ["car_ins_lidar", "agv_long"])
@@ -482,7 +480,7 @@ def test_a_world_that_drifts_is_no_mount_that_has_moved():
     """Seen in a short recording, it looks like a shift as well."""
     drive = simulate_drive(1, HILLY_DRIVE, NoiseConfig(gaussian=0.003))
     child = heading_drift(drive.child, 20.0, None)[: len(drive.child) // 3]
-    codes = [finding.code for finding in check_streams(drive.parent, child).findings]
+    codes = codes_of(check_streams(drive.parent, child).findings)
     assert codes == ["world_drift"]
 
 
@@ -514,7 +512,7 @@ def test_a_shift_between_parts_counts_with_half_of_it():
         spread, warnings = possible_shift(products_of(few), 1.0)
         assert (spread.max(), warnings) == (0.0, ())
     spread, _ = possible_shift(products_of(parts(0, 1.0)), 1.0)
-    np.testing.assert_allclose(np.sqrt(np.diag(spread)), np.abs(SHIFT) / 2, atol=4e-3)
+    assert_allclose(np.sqrt(np.diag(spread)), np.abs(SHIFT) / 2, atol=4e-3)
     # Noise explains this one.
     spread, warnings = possible_shift(products_of(parts(1, 0.2)), 1.0)
     assert (np.diag(spread).max() < 1e-6, warnings) == (True, ())
@@ -573,5 +571,5 @@ class TestGraveAgain:
         poses[first:] = se3.inverse(mirrored[0]) @ mirrored
         child = dataclasses.replace(sound.child, poses=poses)
         result = hec.calibrate(sound.parent, child, max_pairs=400)
-        assert "mount_moved" in [finding.code for finding in result.findings]
+        assert "mount_moved" in codes_of(result.findings)
         assert result.verdict is hec.Verdict.DO_NOT_USE

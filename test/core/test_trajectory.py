@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from motions import as_trajectory, wandering_poses
+from numpy.testing import assert_allclose, assert_array_equal
 
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.geometry import se3
@@ -21,7 +22,7 @@ def test_straight_interpolation_lies_on_the_geodesic():
     trajectory = Trajectory(STAMPS, POSES)
     quarter = trajectory.at(np.array([15]), straight=True)[0]
     expected = POSES[1] @ se3.exp(0.5 * se3.log(se3.inverse(POSES[1]) @ POSES[2]))
-    np.testing.assert_allclose(quarter, expected, atol=1e-14)
+    assert_allclose(quarter, expected, atol=1e-14)
 
 
 def test_extrapolation_is_refused_unless_asked_for():
@@ -30,7 +31,7 @@ def test_extrapolation_is_refused_unless_asked_for():
         trajectory.at(np.array([5, 30]))
     beyond = trajectory.at(np.array([30]), extrapolate=True)[0]
     step = se3.log(se3.inverse(POSES[1]) @ POSES[2])
-    np.testing.assert_allclose(beyond, POSES[1] @ se3.exp(2 * step), atol=1e-14)
+    assert_allclose(beyond, POSES[1] @ se3.exp(2 * step), atol=1e-14)
 
 
 # One coordinate of the last pose.
@@ -77,8 +78,8 @@ def test_shift_and_scale_keep_everything_else():
     scaled = trajectory.scaled(2.0)
     assert shifted.stamps_ns.tolist() == [-3, 7, 17]
     assert (shifted.sensor_frame, scaled.world_frame) == ("lidar", "odom")
-    np.testing.assert_array_equal(scaled.poses[:, :3, :3], POSES[:, :3, :3])
-    np.testing.assert_array_equal(scaled.poses[:, :3, 3], 2 * POSES[:, :3, 3])
+    assert_array_equal(scaled.poses[:, :3, :3], POSES[:, :3, :3])
+    assert_array_equal(scaled.poses[:, :3, 3], 2 * POSES[:, :3, 3])
 
 
 def test_equal_trajectories_have_the_same_poses_stamps_and_frames():

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.errors import ConfigError, InputError
@@ -67,8 +68,8 @@ def test_files_of_other_tools(written, both_poses, tmp_path):
     path = tmp_path / "samples.yaml"
     path.write_text(written(both_poses))
     read = read_arm_samples(path)
-    np.testing.assert_allclose(read.robot, both_poses[0], atol=1e-12)
-    np.testing.assert_allclose(read.tracking, both_poses[1], atol=1e-12)
+    assert_allclose(read.robot, both_poses[0], atol=1e-12)
+    assert_allclose(read.tracking, both_poses[1], atol=1e-12)
     frames = {"hand": "tool0", "camera": "camera"} if written is easy_handeye2 else {}
     assert read.frames == frames
 
@@ -93,8 +94,8 @@ def test_the_calibration_of_the_same_name_states_the_place_of_the_camera(
     read = read_arm_samples(path)
     is_beside = kind == "eye_on_base"
     robot = se3.inverse(both_poses[0]) if is_beside else both_poses[0]
-    np.testing.assert_allclose(read.robot, robot, atol=1e-12)
-    np.testing.assert_allclose(read.tracking, both_poses[1], atol=1e-12)
+    assert_allclose(read.robot, robot, atol=1e-12)
+    assert_allclose(read.tracking, both_poses[1], atol=1e-12)
     assert read.setup == ("beside" if is_beside else "hand")
     assert read.frames == {"base": "link0", "camera": "camera"}
     assert read.calibration == calibration
@@ -128,9 +129,7 @@ def test_the_command_names_the_calibration_that_states_the_place(
     assert "arm.calib" in printed.err
     result = json.loads(printed.out)
     assert result["parent_frame"] == "link0"
-    np.testing.assert_allclose(
-        result["T_parent_child"]["matrix"], camera_in_base, atol=1e-6
-    )
+    assert_allclose(result["T_parent_child"]["matrix"], camera_in_base, atol=1e-6)
 
 
 def test_the_report_of_an_arm_states_the_error_of_a_near_object(tmp_path):
@@ -166,8 +165,8 @@ def about(axis, angle_deg):
 )
 def test_angles_of_robots(robot, angles, expected):
     poses = hec.robot_poses([[1.0, 2.0, 3.0, *angles]], robot)
-    np.testing.assert_allclose(poses[0, :3, :3], expected, atol=1e-12)
-    np.testing.assert_allclose(poses[0, :3, 3], [1.0, 2.0, 3.0])
+    assert_allclose(poses[0, :3, :3], expected, atol=1e-12)
+    assert_allclose(poses[0, :3, 3], [1.0, 2.0, 3.0])
 
 
 def test_an_unknown_robot_or_a_wrong_number_of_values_is_refused():
@@ -190,9 +189,7 @@ def test_the_file_of_a_hand_has_the_angles_of_its_robot(both_poses, tmp_path, ca
     command = ["calibrate", str(hand), str(camera), "--order", "none"]
     assert main([*command, "--parent-angles", "kuka", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
-    np.testing.assert_allclose(
-        result["T_parent_child"]["matrix"], T_hand_camera, atol=1e-6
-    )
+    assert_allclose(result["T_parent_child"]["matrix"], T_hand_camera, atol=1e-6)
 
 
 def test_angles_of_a_robot_are_refused_for_samples(tmp_path, capsys):
@@ -241,7 +238,7 @@ def test_a_folder_with_a_file_for_each_pose(write, both_poses, tmp_path):
     for stop, (robot, target) in enumerate(zip(*both_poses, strict=True)):
         write(tmp_path, stop, robot, target)
     read = read_arm_samples(tmp_path)
-    np.testing.assert_allclose([read.robot, read.tracking], both_poses, atol=1e-9)
+    assert_allclose([read.robot, read.tracking], both_poses, atol=1e-9)
 
 
 def test_a_folder_of_poses_is_calibrated(both_poses, tmp_path, capsys):
@@ -306,7 +303,7 @@ def test_arguments_of_opencv_in_a_file_storage(
     path = tmp_path / "samples.yaml"
     path.write_text(f"%YAML:1.0\n---\n{text}")
     read = read_arm_samples(path)
-    np.testing.assert_allclose([read.robot, read.tracking], both_poses, atol=1e-9)
+    assert_allclose([read.robot, read.tracking], both_poses, atol=1e-9)
 
 
 def test_a_file_storage_with_too_few_numbers_is_refused(tmp_path):
@@ -355,7 +352,7 @@ def test_two_stacks_in_an_npz(as_rows, both_poses, tmp_path):
     file = tmp_path / "arm.npz"
     np.savez(file, robot=stacks[0], tracking=stacks[1])
     read = read_arm_samples(file)
-    np.testing.assert_allclose([read.robot, read.tracking], both_poses, atol=1e-12)
+    assert_allclose([read.robot, read.tracking], both_poses, atol=1e-12)
     np.savez(file, first=np.eye(4))
     with pytest.raises(InputError, match="expected samples of an arm"):
         read_arm_samples(file)

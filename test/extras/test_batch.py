@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 from fleet_making import always_dies, dies_once, outcome, recordings_of
 from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
+from numpy.testing import assert_allclose
 from result_making import good_calibration, written_finding
 
 from hand_eye_calib.core.base.errors import ConfigError
@@ -80,7 +81,7 @@ def assert_is_result_of_the_fleet(code, out, err):
     for name, row in rows.items():
         if name != "gone":
             matrix = row["calibration"]["T_parent_child"]["matrix"]
-            np.testing.assert_allclose(matrix, T_PARENT_CHILD, atol=1e-3)
+            assert_allclose(matrix, T_PARENT_CHILD, atol=1e-3)
             assert row["calibration"]["reference"] == "B5"
 
 
@@ -97,7 +98,7 @@ def test_a_batch_on_all_cores_goes_on_where_it_stopped(
     # A pipe gets a line for each recording.
     assert re.search(r"note: [1-4] of 4: drive[0-2]: USE", err)
     saved = load_result(out_dir / "drive1")
-    np.testing.assert_allclose(saved.T_parent_child, T_PARENT_CHILD, atol=1e-3)
+    assert_allclose(saved.T_parent_child, T_PARENT_CHILD, atol=1e-3)
     assert (out_dir / "drive1" / "static_transform.launch.py").exists()
     report = (out_dir / "drive1" / "report.html").read_text(encoding="utf-8")
     assert "Both streams before any solve" in report
@@ -278,7 +279,7 @@ def test_rows_and_page_have_every_recording_and_the_vehicle(
     assert [row["name"] for row in rows] == ["drive0", "drive1", "drive2", "gone"]
     assert rows[0]["start"] == "2023-11-14T22:13:20+00:00"
     assert (rows[3]["x_m"], rows[3]["error"][:10]) == ("", "no bag at ")
-    np.testing.assert_allclose(float(rows[0]["z_m"]), T_PARENT_CHILD[2, 3], atol=1e-3)
+    assert_allclose(float(rows[0]["z_m"]), T_PARENT_CHILD[2, 3], atol=1e-3)
     page = (tmp_path / "1" / "index.html").read_text(encoding="utf-8")
     assert not any(row[4] for row in rows_of(page))
     assert "The 3 recordings agree within their standard deviations" in page

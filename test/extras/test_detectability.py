@@ -6,6 +6,8 @@ from html import unescape
 
 import numpy as np
 import pytest
+from findings import codes_of
+from numpy.testing import assert_allclose
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.geometry import se3
@@ -51,7 +53,7 @@ def test_an_error_of_the_result_is_linear_in_the_evidence(result, pose_pairs, ax
     wrong = result.T_parent_child @ se3.exp(xi)
     before = evidence_of(pose_pairs, result.T_parent_child).solve(range(6))
     after = evidence_of(pose_pairs, wrong).solve(range(6))
-    np.testing.assert_allclose(after - before, -xi, atol=0.002)
+    assert_allclose(after - before, -xi, atol=0.002)
 
 
 def test_an_error_of_the_clock_is_linear_in_the_evidence(result, pose_pairs):
@@ -84,7 +86,7 @@ def test_calibrate_reports_a_shift_from_the_smallest_size_on(
 
     moved = hec.calibrate(drive.parent, replace(drive.child, poses=poses))
 
-    codes = [finding.code for finding in moved.findings]
+    codes = codes_of(moved.findings)
     assert ("mount_moved" in codes) == (abs(factor) > 1.0)
 
 

@@ -18,6 +18,7 @@ from bag_making import (
 )
 from ground_cases import TILT, errors_of, machine
 from ground_making import ELEVATIONS, START_NS
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.errors import ConfigError, NotEnoughDataError
@@ -91,9 +92,7 @@ def test_clouds_in_any_layout_have_the_same_points(name):
     read = rows_of_points(with_layout(plain, *LAYOUTS[name]))
     for axis in "xyz":
         values = read[axis].astype(float)
-        np.testing.assert_allclose(
-            values[np.isfinite(values)], expected[axis], rtol=1e-6
-        )
+        assert_allclose(values[np.isfinite(values)], expected[axis], rtol=1e-6)
 
 
 def test_fields_with_the_same_name_are_no_damage():
@@ -102,7 +101,7 @@ def test_fields_with_the_same_name_are_no_damage():
     field = JAZZY.types["sensor_msgs/msg/PointField"]
     unused = [field(name="_", offset=0, datatype=2, count=1)] * 2
     read = rows_of_points(replace(plain, fields=[*plain.fields, *unused]))
-    np.testing.assert_array_equal(read["x"], rows_of_points(plain)["x"])
+    assert_array_equal(read["x"], rows_of_points(plain)["x"])
 
 
 def from_above(drive, mount, rays):

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from findings import codes_of
 from motions import geodetic, planar_poses, walked, wandering_poses
 
 import hand_eye_calib as hec
@@ -264,10 +265,7 @@ class TestLeverArm:
 
         def codes(parent, child):
             snapshot = whole_snapshot(parent, child, {})
-            return [
-                finding.code
-                for finding in check(snapshot, snapshot.estimate()).findings
-            ]
+            return codes_of(check(snapshot, snapshot.estimate()).findings)
 
         assert codes(parent, child.scaled(1000.0)) == ["units"]
         assert codes(parent, recorded(n_poses=320, seed=8)[1]) == ["unrelated"]

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.geometry import se3
@@ -101,7 +102,7 @@ def test_a_digest_is_small_and_read_as_it_was_written(session, tmp_path):
     assert path.stat().st_size < 10_000
     loaded = read_digest(path)
     for name in ("installed", "covariance", "wander", "evidence"):
-        np.testing.assert_array_equal(getattr(loaded, name), getattr(session, name))
+        assert_array_equal(getattr(loaded, name), getattr(session, name))
     assert (loaded.child_frame, loaded.seconds, loaded.day) == (
         "camera",
         session.seconds,

@@ -13,6 +13,7 @@ from motions import (
     read_trajectory_file,
     wandering_poses,
 )
+from numpy.testing import assert_array_equal
 from rosbags.rosbag2 import Writer
 
 import hand_eye_calib as hec
@@ -357,7 +358,7 @@ class TestMessages:
         fixes = unpack_poses(
             [fix(2), fix(-1)], "sensor_msgs/msg/NavSatFix", False
         ).poses
-        np.testing.assert_array_equal(fixes, [[60.0, 25.0, 30.0], [np.nan] * 3])
+        assert_array_equal(fixes, [[60.0, 25.0, 30.0], [np.nan] * 3])
 
     def test_without_a_fix_a_message_is_left_out(self):
         reader = MessageReader("sensor_msgs/msg/NavSatFix", "positions")

@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from result_making import written_finding
 
 import hand_eye_calib as hec
@@ -56,7 +57,7 @@ def test_extrinsics_and_closure(rig, calibrated):
         @ calibrated.T("front", "rear")
         @ calibrated.T("rear", "lidar")
     )
-    np.testing.assert_allclose(chain, np.eye(4), atol=1e-12)
+    assert_allclose(chain, np.eye(4), atol=1e-12)
     (closure,) = calibrated.closures
     assert closure.closes
     assert 0.0 < closure.chi2 < 16.8
@@ -80,9 +81,7 @@ def test_a_sensor_of_inverse_poses_is_named_and_closes(rig):
         "front_camera",
         "rear",
     ]
-    np.testing.assert_allclose(
-        calibrated.T("lidar", "front_camera"), rig.Xs[1], atol=0.05
-    )
+    assert_allclose(calibrated.T("lidar", "front_camera"), rig.Xs[1], atol=0.05)
     (closure,) = calibrated.closures
     assert closure.closes
 
@@ -181,7 +180,7 @@ def test_the_command_prints_and_saves_all_sensors(files, capsys, tmp_path):
     compile(launch, "launch", "exec")
     assert launch.count("'--frame-id', 'lidar'") == 2
     translation = document["calibrations"]["rear"]["T_parent_child"]["translation"]
-    np.testing.assert_allclose(hec.load("rig/rear").T_parent_child[:3, 3], translation)
+    assert_allclose(hec.load("rig/rear").T_parent_child[:3, 3], translation)
 
 
 def test_a_sensor_may_have_the_name_of_a_file(calibrated, tmp_path):

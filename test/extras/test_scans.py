@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 from bag_making import cloud_of_rows, write_messages
+from numpy.testing import assert_allclose
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -143,9 +144,7 @@ def test_two_lidars_from_their_points(tmp_path, capsys, no_figures):
         kept = tmp_path / f"drive.{name}.odometry.npz"
         stored = np.load(kept)
         truth = body.poses(middle_s) @ T_body_lidar
-        np.testing.assert_allclose(
-            stored["stamps_ns"], START_NS + middle_s * 1e9, atol=1e3
-        )
+        assert_allclose(stored["stamps_ns"], START_NS + middle_s * 1e9, atol=1e3)
         poses = se3.from_quat_xyzw(stored["poses"][:, :3], stored["poses"][:, 3:])
         turns = [se3.log(se3.inverse(T[:-1]) @ T[1:])[:, 3:] for T in (poses, truth)]
         assert np.degrees(np.sqrt(np.mean((turns[0] - turns[1]) ** 2))) < 0.0135

@@ -7,6 +7,7 @@ import functools
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from published_data import data_folder
 from scipy.spatial.transform import Rotation
 
@@ -24,12 +25,12 @@ def test_noise_free_sensors_move_as_one_body():
     drive = simulate_drive(4)
     assert drive == simulate_drive(4) != simulate_drive(5)
     pairs = motion_pairs(drive.parent.poses, drive.child.poses, "B5")
-    np.testing.assert_allclose(
+    assert_allclose(
         pairs.Ts_parenti_parentj @ drive.T_parent_child,
         drive.T_parent_child @ pairs.Ts_childi_childj,
         atol=1e-12,
     )
-    np.testing.assert_allclose(
+    assert_allclose(
         drive.parent.poses @ drive.T_parent_child @ se3.inverse(drive.child.poses),
         np.tile(drive.T_pw_cw, (100, 1, 1)),
         atol=1e-12,
@@ -50,9 +51,7 @@ def test_sensors_at_different_rates_are_on_one_body():
     world = Ts_pw_p @ drive.T_parent_child @ se3.inverse(drive.child.poses[inside])
     assert inside.sum() > 50
     # All that is left is what interpolation over 5 ms leaves.
-    np.testing.assert_allclose(
-        world, np.tile(drive.T_pw_cw, (len(world), 1, 1)), atol=2e-3
-    )
+    assert_allclose(world, np.tile(drive.T_pw_cw, (len(world), 1, 1)), atol=2e-3)
     assert not set(drive.child.stamps_ns[:20]) & set(drive.parent.stamps_ns)
 
 
@@ -66,7 +65,7 @@ def test_vehicle_drives_at_its_speed_and_turns_within_its_limit():
     moves = np.diff(poses[:, :3, 3], axis=0)
     yaw = np.unwrap(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
     yaw_rates = np.diff(yaw) * 100.0
-    np.testing.assert_allclose(np.linalg.norm(moves, axis=1), 0.005, rtol=1e-4)
+    assert_allclose(np.linalg.norm(moves, axis=1), 0.005, rtol=1e-4)
     assert np.abs(yaw_rates).max() <= 2.0 + 1e-9
     # Held for half a second: 50 steps; a change falls into one step or between two.
     is_change = np.abs(np.diff(yaw_rates)) > 1e-6
@@ -78,7 +77,7 @@ def test_vehicle_drives_at_its_speed_and_turns_within_its_limit():
     # It moves where it looks.
     heading = np.arctan2(moves[:, 1], moves[:, 0])
     half_way = 0.5 * (yaw[:-1] + yaw[1:])
-    np.testing.assert_allclose(np.exp(1j * heading), np.exp(1j * half_way), atol=1e-9)
+    assert_allclose(np.exp(1j * heading), np.exp(1j * half_way), atol=1e-9)
 
 
 # --- against the published trajectories -----------------------------------------------
@@ -105,18 +104,16 @@ def test_published_drives_lie_on_our_terrain_with_our_attitude(published_folder)
 
         z, slope_x, slope_y = surface(options.DriveConfig(), x, y)
 
-        np.testing.assert_allclose(height, z, atol=1e-12)
+        assert_allclose(height, z, atol=1e-12)
         normals = np.column_stack([-slope_x, -slope_y, np.ones_like(z)])
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-        np.testing.assert_allclose(np.sin(pitch), normals[:, 0], atol=0.01)
-        np.testing.assert_allclose(np.sin(roll), normals[:, 1], atol=0.01)
+        assert_allclose(np.sin(pitch), normals[:, 0], atol=0.01)
+        assert_allclose(np.sin(roll), normals[:, 1], atol=0.01)
         # Circular arcs: a chord points half-way between the headings at its ends.
         chords = np.arctan2(np.diff(y), np.diff(x))
         turns = np.angle(np.exp(1j * np.diff(yaw)))
         half_way = yaw[:-1] + 0.5 * turns
-        np.testing.assert_allclose(
-            np.exp(1j * chords), np.exp(1j * half_way), atol=1e-9
-        )
+        assert_allclose(np.exp(1j * chords), np.exp(1j * half_way), atol=1e-9)
 
 
 clean_drive = functools.cache(simulate_drive)
@@ -150,7 +147,7 @@ def test_noise_is_as_strong_as_published(published_folder, level, config):
         )
     ]
     medians = np.median(ours, axis=0), np.median(theirs, axis=0)
-    np.testing.assert_allclose(*medians, rtol=0.25, atol=1e-9)
+    assert_allclose(*medians, rtol=0.25, atol=1e-9)
 
 
 # --- the command ----------------------------------------------------------------------
@@ -173,10 +170,10 @@ def test_command_writes_the_published_layout(tmp_path, run):
             ("T_S2_W2", expected.child),
         ):
             written = read_trajectory(folder / f"{name}.txt")
-            np.testing.assert_array_equal(written.stamps_ns, trajectory.stamps_ns)
-            np.testing.assert_allclose(written.poses, trajectory.poses, atol=1e-12)
+            assert_array_equal(written.stamps_ns, trajectory.stamps_ns)
+            assert_allclose(written.poses, trajectory.poses, atol=1e-12)
         truth = read_trajectory(folder / "T_S2_S1.txt").poses
-        np.testing.assert_allclose(truth, [expected.T_parent_child], atol=1e-12)
+        assert_allclose(truth, [expected.T_parent_child], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -200,7 +197,7 @@ def test_command_writes_bags(tmp_path, run, storage, name):
             {stream},
             {f"{stream}_odom"},
         )
-        np.testing.assert_array_equal(ours.poses[:, :3], trajectory.poses[:, :3, 3])
+        assert_array_equal(ours.poses[:, :3], trajectory.poses[:, :3, 3])
 
 
 def test_command_overwrites_nothing(tmp_path, run):

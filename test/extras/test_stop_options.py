@@ -17,6 +17,8 @@ from arm_making import (
     with_outliers,
     with_rotations,
 )
+from findings import codes_of
+from numpy.testing import assert_allclose
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import CalibratorConfig
@@ -88,7 +90,7 @@ class TestOptions:
         robot, tracking, _ = arm(ON_HAND)
         config = CalibratorConfig(**options)
         result = calibrate_arm(of_robot(robot), of_target(tracking), config)
-        assert [finding.code for finding in result.findings] == [code]
+        assert codes_of(result.findings) == [code]
         assert result.verdict is hec.Verdict.DO_NOT_USE
 
 
@@ -103,7 +105,7 @@ class TestInput:
         rows = [se3.to_rows(Ts) for Ts in (robot, tracking)]
         lists = [[T.tolist() for T in Ts] for Ts in (robot, tracking)]
         for first, second in (of_opencv, vectors, rows, lists):
-            np.testing.assert_allclose(
+            assert_allclose(
                 calibrate_arm(first, second).T_parent_child, expected, atol=1e-9
             )
 
@@ -120,7 +122,7 @@ class TestInput:
             arrays.append(list(rotations))
             arrays.append(list(Ts[:, :3, 3].reshape(-1, *shape)))
         result = calibrate_arm(*arrays)
-        np.testing.assert_allclose(result.T_parent_child, expected, atol=1e-9)
+        assert_allclose(result.T_parent_child, expected, atol=1e-9)
 
     def test_three_arrays_of_opencv_are_refused_with_the_right_order(self):
         robot, tracking, _ = arm(ON_HAND)
@@ -168,7 +170,7 @@ def test_two_files_need_no_stamps(tmp_path, capsys):
         )
     assert main(["calibrate", *files, "--order", "none", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
-    np.testing.assert_allclose(
+    assert_allclose(
         np.array(document["T_parent_child"]["matrix"])[:3, 3],
         truth[:3, 3],
         atol=WITHIN_M,
@@ -240,9 +242,7 @@ def test_the_options_that_a_finding_names_lead_to_the_right_answer(name, size, p
     assert np.linalg.norm(error[:3]) < WITHIN_M
     assert result.verdict is not hec.Verdict.DO_NOT_USE
     automatic = calibrate_arm(*sides, CalibratorConfig(scale="auto"))
-    np.testing.assert_allclose(
-        automatic.T_parent_child, result.T_parent_child, atol=1e-9
-    )
+    assert_allclose(automatic.T_parent_child, result.T_parent_child, atol=1e-9)
     assert automatic.verdict is result.verdict
 
 
@@ -273,7 +273,7 @@ def test_a_setup_that_the_stops_contradict_is_refused_alone(setup):
 
     assert obeyed.findings == ()
     assert obeyed.warnings == ()
-    assert [finding.code for finding in refused.findings] == ["setup"]
+    assert codes_of(refused.findings) == ["setup"]
     assert (
         f"the stops fit a camera {SETUPS[setup]}, not one {SETUPS[other]}"
         in refused.headline
@@ -282,13 +282,11 @@ def test_a_setup_that_the_stops_contradict_is_refused_alone(setup):
 
 def test_a_setup_decides_where_the_stops_do_not():
     robot, tracking, _ = arm(ON_HAND, n=3)
-    assert [finding.code for finding in calibrate_arm(robot, tracking).findings] == [
-        "ambiguous"
-    ]
+    assert codes_of(calibrate_arm(robot, tracking).findings) == ["ambiguous"]
     for setup in SETUPS:
         result = calibrate_arm(robot, tracking, setup=setup)
         assert result.setup == setup
-        assert "ambiguous" not in [finding.code for finding in result.findings]
+        assert "ambiguous" not in codes_of(result.findings)
 
 
 def test_an_unknown_setup_is_refused():

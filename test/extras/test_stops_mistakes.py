@@ -21,6 +21,7 @@ from arm_making import (
     transposed_rotations,
     without_middle,
 )
+from findings import codes_of
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import CalibratorConfig
@@ -111,7 +112,7 @@ def test_a_target_of_another_size_is_refused_with_its_scale_and_the_option(
     asked = calibrate_arm(
         robot, scaled(tracking, factor), CalibratorConfig(scale="estimate")
     )
-    assert "scale" not in [finding.code for finding in asked.findings]
+    assert "scale" not in codes_of(asked.findings)
     assert asked.verdict is not hec.Verdict.DO_NOT_USE
 
 
@@ -160,17 +161,17 @@ class TestNoisyStopsAroundATarget:
     def test_a_target_of_twice_the_size_is_refused(self, seed):
         robot, tracking = around_a_target(seed)
         result = calibrate_arm(robot, scaled(tracking, 2.0))
-        assert [finding.code for finding in result.findings] == ["scale"]
+        assert codes_of(result.findings) == ["scale"]
 
     def test_a_missing_row_is_refused(self, seed):
         robot, tracking = around_a_target(seed)
         result = calibrate_arm(np.delete(robot, 22, axis=0), tracking[:-1])
-        assert [finding.code for finding in result.findings] == ["rows"]
+        assert codes_of(result.findings) == ["rows"]
 
     def test_clean_stops_have_no_finding(self, seed):
         robot, tracking = around_a_target(seed)
         result = calibrate_arm(robot, tracking)
-        assert [finding.code for finding in result.findings] == []
+        assert codes_of(result.findings) == []
 
 
 def far_marker(seed):
@@ -287,7 +288,7 @@ def test_what_moved_is_refused_by_name_with_its_size(
 def test_movement_is_not_blamed_for_other_mistakes():
     robot, tracking, _ = arm(ON_HAND, n=32)
     result = calibrate_arm(robot, moved(tracking, "target", 16, 0.08)[::-1])
-    assert [finding.code for finding in result.findings] == ["rows"]
+    assert codes_of(result.findings) == ["rows"]
 
 
 @pytest.mark.parametrize("place", [ON_HAND, BESIDE])

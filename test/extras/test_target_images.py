@@ -8,6 +8,7 @@ import browser
 import numpy as np
 import pytest
 from bag_making import JAZZY, header, write_messages
+from numpy.testing import assert_array_equal
 from scipy.spatial.transform import Rotation
 
 import hand_eye_calib as hec
@@ -232,9 +233,7 @@ def test_the_images_of_a_bag_are_poses_of_the_camera(tmp_path, capsys, no_figure
     (tmp_path / "camera.yaml").write_text(CAMERA_INFO)
     with PoseBag(bag) as opened:
         of_file = f"/eye/image_raw/compressed?{board}@{tmp_path / 'camera.yaml'}"
-        np.testing.assert_array_equal(
-            opened.trajectory(of_file)[0].poses, trajectory.poses
-        )
+        assert_array_equal(opened.trajectory(of_file)[0].poses, trajectory.poses)
         for topic, message in (
             ("/eye/image_raw", "name the target in the images"),
             (f"/hand?{board}", "contains no images"),

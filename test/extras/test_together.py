@@ -8,6 +8,7 @@ import pytest
 import real_data
 from fleet_making import recordings_of
 from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
+from numpy.testing import assert_allclose
 from result_making import SHIFTED_FROM as X
 from result_making import SIGMAS, shift, written_finding
 from result_making import shifted as result
@@ -166,7 +167,7 @@ def test_python_takes_pairs_of_trajectories():
     joint = hec.calibrate_together(
         pairs, ["monday", "tuesday"], method="park", checks=False
     )
-    np.testing.assert_allclose(joint.T_parent_child, T_PARENT_CHILD, atol=3e-3)
+    assert_allclose(joint.T_parent_child, T_PARENT_CHILD, atol=3e-3)
     assert [recording.name for recording in joint.together.recordings] == [
         "monday",
         "tuesday",
@@ -246,11 +247,11 @@ def test_a_single_result_and_one_that_knows_nothing():
     Ts, covariances = results_of(3, 2)
     agreement = agreement_of(Ts[:1], covariances[:1])
     assert (agreement.kind, agreement.dof, agreement.p_value) == ("single", 0, 1.0)
-    np.testing.assert_allclose(agreement.T_parent_child, Ts[0])
+    assert_allclose(agreement.T_parent_child, Ts[0])
     covariances[1] = np.diag([np.inf] * 6)
     agreement = agreement_of(Ts, covariances)
     assert (agreement.kind, agreement.dof) == ("agree", 0)
-    np.testing.assert_allclose(agreement.T_parent_child, Ts[0], atol=1e-9)
+    assert_allclose(agreement.T_parent_child, Ts[0], atol=1e-9)
     assert np.isnan(agreement.deviations[1]).all()
 
 
@@ -273,7 +274,7 @@ def test_results_that_scatter_by_their_sigmas_are_the_same_and_the_power_is_told
         pair_difference.sentence
         == "same: a change of 5.4 cm or 0.8 deg would have been seen"
     )
-    np.testing.assert_allclose(
+    assert_allclose(
         values(pair_difference),
         deviation(result(seed=2).T_parent_child, result(seed=1).T_parent_child),
     )
@@ -522,11 +523,11 @@ def test_a_calibration_is_compared_and_stated_in_the_base_frame(saved, run):
     assert document["comparison"]["verdict"] == "same"
     base = se3.from_rotation_translation(np.eye(3), [1.0, 0.0, 2.0])
     in_base = base @ document["T_parent_child"]["matrix"]
-    np.testing.assert_allclose(in_base, base @ T, atol=5e-3)
-    np.testing.assert_allclose(document["T_base_child"]["matrix"], in_base, atol=1e-6)
+    assert_allclose(in_base, base @ T, atol=5e-3)
+    assert_allclose(document["T_base_child"]["matrix"], in_base, atol=1e-6)
     saved_result = hec.Calibration.from_dict(document)
     hec.save(saved_result, "in_base")
-    np.testing.assert_allclose(hec.load("in_base").T_base_child, in_base, atol=1e-6)
+    assert_allclose(hec.load("in_base").T_base_child, in_base, atol=1e-6)
     assert (
         '<parent link="base"/>'
         in (saved / "in_base" / "extrinsic.urdf.xacro").read_text()

@@ -22,6 +22,7 @@ from backports import zstd
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 from motions import T_PARENT_CHILD, as_trajectory, child_of, wandering_poses
+from numpy.testing import assert_allclose
 from rosbags import rosbag1, rosbag2
 
 from hand_eye_calib.core.base.errors import InputError
@@ -118,7 +119,7 @@ def test_cut_off_anywhere(bag, capsys):
             assert any("lost" in warning for warning in document["warnings"])
             if document["verdict"] != "DO_NOT_USE":
                 matrix = document["T_parent_child"]["matrix"]
-                np.testing.assert_allclose(matrix, T_PARENT_CHILD, atol=1e-6)
+                assert_allclose(matrix, T_PARENT_CHILD, atol=1e-6)
     assert outcomes == (
         {"refused", "recovered"} if path.suffix == ".mcap" else {"refused"}
     )
@@ -129,7 +130,7 @@ def test_a_bit_flipped_anywhere(bag, capsys):
     path.write_bytes(data)
     whole, _ = read(path)
     matrix = replay(path, capsys)["T_parent_child"]["matrix"]
-    np.testing.assert_allclose(matrix, T_PARENT_CHILD, atol=1e-9)
+    assert_allclose(matrix, T_PARENT_CHILD, atol=1e-9)
     harmed = 0
     bits = np.random.default_rng(3).integers(0, 8, PLACES).tolist()
     for place, bit in zip(places(len(data), seed=2), bits, strict=True):
@@ -143,9 +144,7 @@ def test_a_bit_flipped_anywhere(bag, capsys):
         document = replay(path, capsys)
         if document is not None and not document["warnings"]:
             matrix = document["T_parent_child"]["matrix"]
-            np.testing.assert_allclose(
-                matrix, T_PARENT_CHILD, atol=UNNOTICED, err_msg=str(place)
-            )
+            assert_allclose(matrix, T_PARENT_CHILD, atol=UNNOTICED, err_msg=str(place))
     assert harmed >= 10
 
 

@@ -17,6 +17,7 @@ from bag_making import (
     write_messages,
 )
 from motions import T_PARENT_CHILD, child_of, wandering_poses
+from numpy.testing import assert_allclose
 
 from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.geometry import se3
@@ -75,7 +76,7 @@ def test_header_stamps_of_0_are_named_and_the_recorders_times_are_taken_if_asked
         read(path, source)
     rows, warnings = read(path, source, stamps={"child": "receive"})
     assert rows.stamps_ns.tolist() == STAMPS_NS.tolist()
-    np.testing.assert_allclose(rows.poses[:, :3], CHILD[:, :3, 3], atol=1e-12)
+    assert_allclose(rows.poses[:, :3], CHILD[:, :3, 3], atol=1e-12)
     assert "at which the recorder received the messages" in " ".join(warnings)
 
 
@@ -123,9 +124,7 @@ def test_the_command_takes_the_recorders_times_if_asked(tmp_path, capsys, option
     assert "--child-stamps receive" in capsys.readouterr().err
     main(["calibrate", str(path), *TOPICS, option, "receive", "--json"])
     document = json.loads(capsys.readouterr().out)
-    np.testing.assert_allclose(
-        document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6
-    )
+    assert_allclose(document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6)
     assert main(["check", str(path), *TOPICS[:4], option, "receive"]) in (0, 1)
     assert "header stamps" not in capsys.readouterr().err
 

@@ -22,6 +22,7 @@ from bag_making import (
     write_messages,
 )
 from motions import T_PARENT_CHILD, as_trajectory, child_of, wandering_poses
+from numpy.testing import assert_allclose, assert_array_equal
 from published_data import data_folder
 from rosbags import rosbag1, rosbag2
 
@@ -57,7 +58,7 @@ def new_bag(tmp_path):
 
 def assert_same_motion(trajectory, stamps_ns, poses, atol=1e-12):
     assert trajectory.stamps_ns.tolist() == list(stamps_ns)
-    np.testing.assert_allclose(trajectory.poses, poses, atol=atol)
+    assert_allclose(trajectory.poses, poses, atol=atol)
 
 
 @pytest.mark.parametrize("storage", STORAGES)
@@ -77,7 +78,7 @@ def test_poses_come_back_in_the_order_of_time_with_exact_stamps_and_frames(
         assert {(pose.world_frame, pose.sensor_frame) for pose in of_stream} == {frames}
         values = [pose.pose for pose in of_stream]
         quats_xyzw = se3.to_quat_xyzw(source.poses)
-        np.testing.assert_array_equal(values, np.c_[source.poses[:, :3, 3], quats_xyzw])
+        assert_array_equal(values, np.c_[source.poses[:, :3, 3], quats_xyzw])
 
 
 # ---- which topics are meant
@@ -451,4 +452,4 @@ def test_bags_of_other_programs_read_or_are_refused_in_one_line():
         ("odom", "base_footprint")
     }
     lengths = np.linalg.norm([pose.pose[3:] for pose in poses], axis=1)
-    np.testing.assert_allclose(lengths, 1.0, atol=1e-6)
+    assert_allclose(lengths, 1.0, atol=1e-6)

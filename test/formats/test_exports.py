@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 import yaml
+from numpy.testing import assert_allclose
 from result_making import dofs, good_calibration
 from scipy.spatial.transform import Rotation
 from source_code import ROOT
@@ -152,7 +153,7 @@ def test_a_file_maps_a_point_as_it_says_and_reads_back(
         else np.reshape(rotation, (3, 3))
     )
     T = calibration.T_parent_child if is_direct else calibration.T_child_parent
-    np.testing.assert_allclose(R @ POINT[:3] + t, (T @ POINT)[:3], atol=1e-9)
+    assert_allclose(R @ POINT[:3] + t, (T @ POINT)[:3], atol=1e-9)
 
     source, target = (child, parent) if is_direct else (parent, child)
     assert f"Maps coordinates of {source} into {target}" in text
@@ -161,14 +162,10 @@ def test_a_file_maps_a_point_as_it_says_and_reads_back(
 
     (tmp_path / "foreign.yaml").write_text(text)
     installed = open_installed(str(tmp_path / "foreign.yaml"))(parent, child)
-    np.testing.assert_allclose(
-        installed.T_parent_child, calibration.T_parent_child, atol=1e-9
-    )
+    assert_allclose(installed.T_parent_child, calibration.T_parent_child, atol=1e-9)
     if name not in ("opencv", "numpy"):  # which name nothing
         installed = open_installed(str(tmp_path / "foreign.yaml"))(child, parent)
-        np.testing.assert_allclose(
-            installed.T_parent_child, calibration.T_child_parent, atol=1e-9
-        )
+        assert_allclose(installed.T_parent_child, calibration.T_child_parent, atol=1e-9)
 
 
 def test_every_format_is_tried():
@@ -290,7 +287,7 @@ def test_of_several_cameras_the_named_one_is_read(tmp_path):
         )
     )
     T_parent_child = open_installed(str(path))("imu", "cam1").T_parent_child
-    np.testing.assert_allclose(T_parent_child, se3.inverse(moved))
+    assert_allclose(T_parent_child, se3.inverse(moved))
     with pytest.raises(InputError, match="it has several extrinsics, and the names"):
         open_installed(str(path))("imu", "lidar")
 
@@ -304,7 +301,7 @@ def test_the_parsers_of_others_read_the_same(tmp_path):
         path.write_text(calibration.export(name))
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
         T = storage.getNode(key).mat()
-        np.testing.assert_allclose(T, calibration.T_parent_child, atol=1e-6)
+        assert_allclose(T, calibration.T_parent_child, atol=1e-6)
         if name == "vins":
             assert storage.getNode("td").real() == OFFSET_S
     # OpenVINS reads its YAML with OpenCV, too, a row of numbers at a time.
@@ -312,7 +309,7 @@ def test_the_parsers_of_others_read_the_same(tmp_path):
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     rows = storage.getNode("cam0").getNode("T_imu_cam")
     T = [[rows.at(row).at(column).real() for column in range(4)] for row in range(4)]
-    np.testing.assert_allclose(T, calibration.T_parent_child, atol=1e-9)
+    assert_allclose(T, calibration.T_parent_child, atol=1e-9)
 
 
 def test_urdf_and_colmap_read_the_same(tmp_path):
@@ -327,7 +324,7 @@ def test_urdf_and_colmap_read_the_same(tmp_path):
         joint.replace("<robot", '<robot name="r"').replace("<joint", links + "<joint")
     )
     T = yourdfpy.URDF.load(str(path)).get_transform("camera", "base_link")
-    np.testing.assert_allclose(T, calibration.T_parent_child, atol=1e-9)
+    assert_allclose(T, calibration.T_parent_child, atol=1e-9)
 
     pycolmap = pytest.importorskip("pycolmap")
     path = tmp_path / "rig_config.json"
@@ -336,7 +333,7 @@ def test_urdf_and_colmap_read_the_same(tmp_path):
     parent, child = rig.cameras
     assert (parent.ref_sensor, parent.image_prefix) == (True, "base_link")
     T = child.cam_from_rig.matrix()
-    np.testing.assert_allclose(T, calibration.T_child_parent[:3], atol=1e-9)
+    assert_allclose(T, calibration.T_child_parent[:3], atol=1e-9)
 
 
 def test_info_prints_a_format_and_compare_reads_it(tmp_path, capsys):

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 from motions import as_trajectory, geodetic, read_trajectory_file, wandering_poses
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 import hand_eye_calib as hec
@@ -227,8 +228,8 @@ def read(path, **options):
 
 
 def assert_is_the_truth(trajectory, atol=1e-9):
-    np.testing.assert_allclose(trajectory.stamps_ns, TRUTH.stamps_ns, rtol=0, atol=1000)
-    np.testing.assert_allclose(trajectory.poses, TRUTH.poses, rtol=0, atol=atol)
+    assert_allclose(trajectory.stamps_ns, TRUTH.stamps_ns, rtol=0, atol=1000)
+    assert_allclose(trajectory.poses, TRUTH.poses, rtol=0, atol=atol)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -281,10 +282,10 @@ PLACES = {
 @pytest.mark.parametrize("form", PLACES)
 def test_latitudes_are_read_in_every_form(tmp_path, form):
     trajectory = read(written(tmp_path / "ins.txt", PLACES[form])).trajectory
-    np.testing.assert_array_equal(trajectory.stamps_ns, TRUTH.stamps_ns)
+    assert_array_equal(trajectory.stamps_ns, TRUTH.stamps_ns)
     # Of the metres, 12 digits of a latitude leave 1e-5, and the axes of the first position 1e-4.
-    np.testing.assert_allclose(trajectory.poses[:, :3, 3], P - P[0], atol=5e-4)
-    np.testing.assert_allclose(trajectory.poses[:, :3, :3], R, atol=1e-5)
+    assert_allclose(trajectory.poses[:, :3, 3], P - P[0], atol=5e-4)
+    assert_allclose(trajectory.poses[:, :3, :3], R, atol=1e-5)
 
 
 MS_OF_WEEK = [f"{1e3 * float(second):.0f}" for second in SOW]
@@ -325,7 +326,7 @@ def test_milliseconds_of_a_week_are_stamps_without_the_week(tmp_path, name):
     )
     week_ns = 604_800_000_000_000
     of_week_ns = (TRUTH.stamps_ns - 315_964_800_000_000_000) % week_ns
-    np.testing.assert_array_equal(read(path).trajectory.stamps_ns, of_week_ns)
+    assert_array_equal(read(path).trajectory.stamps_ns, of_week_ns)
 
 
 def test_a_table_keeps_the_unit_of_the_second_of_a_week():
@@ -338,7 +339,7 @@ def test_a_table_keeps_the_unit_of_the_second_of_a_week():
     for column, name in enumerate(("qx", "qy", "qz", "qw")):
         table[name] = Q[:, column]
     trajectory = hec.read_trajectory(table)
-    np.testing.assert_array_equal(trajectory.stamps_ns, TRUTH.stamps_ns)
+    assert_array_equal(trajectory.stamps_ns, TRUTH.stamps_ns)
 
 
 @pytest.mark.parametrize(("period_s", "name"), [(604_800, "sow"), (86_400, "time")])
@@ -356,7 +357,7 @@ def test_times_of_day_are_stamps_in_seconds_of_the_day(tmp_path):
     text = text_of(dates("%H:%M:%S.mmm"), P, Q, head=NAMES, separator=",")
     stamps_ns = read(written(tmp_path / "a.csv", text)).trajectory.stamps_ns
     midnight_ns = START_NS // 86_400_000_000_000 * 86_400_000_000_000
-    np.testing.assert_array_equal(stamps_ns, TRUTH.stamps_ns - midnight_ns)
+    assert_array_equal(stamps_ns, TRUTH.stamps_ns - midnight_ns)
 
 
 # ---- rows without a pose
@@ -391,7 +392,7 @@ def test_rows_without_a_pose_are_left_out_and_counted(tmp_path, kind, separator)
     path = written(tmp_path / "poses.txt", head + "\n".join(lines))
     reading = read(path)
     kept = np.delete(np.arange(N), lost)
-    np.testing.assert_allclose(reading.trajectory.poses, TRUTH.poses[kept], atol=1e-9)
+    assert_allclose(reading.trajectory.poses, TRUTH.poses[kept], atol=1e-9)
     assert reading.warnings == []
     (repair,) = reading.repairs
     assert f"3 of {N} poses (5.0%) were left out" in repair
@@ -441,7 +442,7 @@ def test_rows_that_are_paired_are_left_out_of_both_files(tmp_path):
     readings = read_trajectory_files([(file, options) for file in files])
     first, second = (reading.trajectory for reading in readings)
     assert len(first) == len(second) == N - 2
-    np.testing.assert_allclose(first.poses @ mount, second.poses, atol=1e-9)
+    assert_allclose(first.poses @ mount, second.poses, atol=1e-9)
 
 
 def test_arrays_with_nan_and_transposed_matrices():
@@ -450,12 +451,10 @@ def test_arrays_with_nan_and_transposed_matrices():
     times = TRUTH.stamps_ns / 1e9
     with pytest.warns(UserWarning, match="1 of 60 poses"):
         trajectory = hec.read_trajectory(poses, times=times)
-    np.testing.assert_allclose(
-        trajectory.poses, np.delete(TRUTH.poses, 5, axis=0), atol=1e-12
-    )
+    assert_allclose(trajectory.poses, np.delete(TRUTH.poses, 5, axis=0), atol=1e-12)
     with pytest.warns(UserWarning, match="matrices are transposed"):
         trajectory = hec.read_trajectory(np.swapaxes(TRUTH.poses, 1, 2), times=times)
-    np.testing.assert_allclose(trajectory.poses, TRUTH.poses, atol=1e-12)
+    assert_allclose(trajectory.poses, TRUTH.poses, atol=1e-12)
     poses = TRUTH.poses.copy()
     poses[:, 3, 3] = 2.0
     with pytest.raises(InputError, match="the last row of a matrix is not 0 0 0 1"):

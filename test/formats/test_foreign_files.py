@@ -14,6 +14,7 @@ from operator import xor
 import numpy as np
 import pytest
 from motions import as_trajectory, geodetic, read_trajectory_file, wandering_poses
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import hand_eye_calib as hec
@@ -318,19 +319,17 @@ def test_every_format_and_unit_gives_the_same_poses_and_the_same_answer(tmp_path
     file = read_trajectory_file(path, AUTO)
     trajectory = file.trajectory
     start_ns = TRUTH.stamps_ns[0] if name.startswith("vicon") else 0
-    np.testing.assert_allclose(
-        trajectory.stamps_ns, TRUTH.stamps_ns - start_ns, atol=2000, rtol=0
-    )
+    assert_allclose(trajectory.stamps_ns, TRUTH.stamps_ns - start_ns, atol=2000, rtol=0)
     expected = TRUTH.poses.copy()
     if trajectory.measures == "positions":
         expected[:, :3, :3] = np.eye(3)
         expected[:, :3, 3] = P - P[0]
-    np.testing.assert_allclose(trajectory.poses, expected, atol=2e-6)
+    assert_allclose(trajectory.poses, expected, atol=2e-6)
     assert note in " ".join(file.guesses)
     assert trajectory.measures == ("positions" if name in [*FORMATS][-5:] else "poses")
     if trajectory.measures == "poses":
         child = Trajectory(trajectory.stamps_ns, TRUTH.poses @ MOUNT)
-        np.testing.assert_allclose(calibrated(trajectory, child), MOUNT, atol=1e-6)
+        assert_allclose(calibrated(trajectory, child), MOUNT, atol=1e-6)
 
 
 def test_arrays_and_graphs(tmp_path):
@@ -339,7 +338,7 @@ def test_arrays_and_graphs(tmp_path):
     (tmp_path / "a.g2o").write_text(f"{rows}EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 1\n")
     for name in ("a.npy", "a.g2o"):
         file = read_trajectory_file(tmp_path / name, AUTO)
-        np.testing.assert_allclose(file.trajectory.poses, TRUTH.poses, atol=1e-12)
+        assert_allclose(file.trajectory.poses, TRUTH.poses, atol=1e-12)
     assert file.trajectory.stamps_ns[1] == 1_000_000_000
     assert "numbers of its vertices are used as seconds" in file.guesses[0]
 
@@ -363,9 +362,7 @@ def test_poses_without_stamps_are_paired_by_row_or_by_the_names_of_images(
         assert main([*command, "--pair-by", by, "--json"]) in (0, 3)
         document = json.loads(capsys.readouterr().out)
         assert (document["parent_frame"], document["child_frame"]) == ("a", "b")
-        np.testing.assert_allclose(
-            document["T_parent_child"]["matrix"], MOUNT, atol=1e-6
-        )
+        assert_allclose(document["T_parent_child"]["matrix"], MOUNT, atol=1e-6)
         assert main(command) == 1
         assert "the poses have no stamps" in capsys.readouterr().err
     mixed = [
@@ -439,7 +436,7 @@ def test_a_log_of_px4(tmp_path, topics):
         return
     trajectory = read_trajectory_file(tmp_path / "log.ulg", AUTO).trajectory
     expected = TRUTH if "vehicle_odometry" in topics else TRUTH[1:]
-    np.testing.assert_allclose(trajectory.poses, expected.poses, atol=1e-5)
+    assert_allclose(trajectory.poses, expected.poses, atol=1e-5)
     assert (trajectory.stamps_ns == expected.stamps_ns).all()
 
 
@@ -519,11 +516,9 @@ def test_what_cannot_be_read_is_told_in_one_sentence(tmp_path, content, message)
 def test_poses_of_an_ins_turn_with_the_heading(tmp_path, is_short):
     (tmp_path / "log").write_text(of_novatel(is_short))
     trajectory = read_trajectory_file(tmp_path / "log", AUTO).trajectory
-    np.testing.assert_allclose(trajectory.stamps_ns, STAMPS, atol=1_000_000)
-    np.testing.assert_allclose(trajectory.poses[:, :3, 3], P - P[0], atol=1e-4)
-    np.testing.assert_allclose(
-        trajectory.poses[:, :3, :3], TRUTH.poses[:, :3, :3], atol=1e-4
-    )
+    assert_allclose(trajectory.stamps_ns, STAMPS, atol=1_000_000)
+    assert_allclose(trajectory.poses[:, :3, 3], P - P[0], atol=1e-4)
+    assert_allclose(trajectory.poses[:, :3, :3], TRUTH.poses[:, :3, :3], atol=1e-4)
 
 
 def test_of_several_bodies_one_is_named(tmp_path):
@@ -535,7 +530,7 @@ def test_of_several_bodies_one_is_named(tmp_path):
     trajectory = read_trajectory_file(
         tmp_path / "vicon.csv", AUTO, columns="cart:cart"
     ).trajectory
-    np.testing.assert_allclose(trajectory.poses[:, :3, 3], 2 * P, atol=1e-9)
+    assert_allclose(trajectory.poses[:, :3, 3], 2 * P, atol=1e-9)
 
 
 def test_a_take_of_many_markers_needs_memory_for_its_poses_alone(tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from motions import as_trajectory, child_of, wandering_poses
 from motions import messages as messages_of
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import CalibratorConfig
@@ -63,7 +64,7 @@ def test_a_resumed_session_is_the_session(tmp_path, n_poses):
     assert again.snapshot().parent_frame == "lidar"
     assert again.statistics("child") == calibrator.statistics("child")
     for name, value in vars(calibrator.snapshot().pose_pairs).items():
-        np.testing.assert_array_equal(vars(again.snapshot().pose_pairs)[name], value)
+        assert_array_equal(vars(again.snapshot().pose_pairs)[name], value)
     assert np.array_equal(
         again.estimate().T_parent_child, calibrator.estimate().T_parent_child
     )
@@ -79,8 +80,8 @@ def test_its_files_are_trajectories_that_every_program_reads(tmp_path):
     parent, child = (hec.read_trajectory(tmp_path / f"{stream}.tum") for stream in BOTH)
     result = hec.calibrate(parent, child, method="dnl", reference="B3")
     expected = calibrator.snapshot().streams
-    np.testing.assert_array_equal(parent.stamps_ns, expected[0].stamps_ns)
-    np.testing.assert_allclose(child.poses, expected[1].poses, atol=1e-15)
+    assert_array_equal(parent.stamps_ns, expected[0].stamps_ns)
+    assert_allclose(child.poses, expected[1].poses, atol=1e-15)
     assert result.n_poses == 60
     first, *lines = (tmp_path / "parent.tum").read_text().splitlines()
     assert json.loads(first.removeprefix("# "))["topic"] == "/lidar"

@@ -10,6 +10,7 @@ import zlib
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.extras.sensors.target_images import images_in, read_image
@@ -33,8 +34,8 @@ def test_arrays_are_read_by_name(tmp_path):
     path = tmp_path / "stops.npz"
     np.savez_compressed(path, robot=np.eye(4)[None], tracking=np.ones((2, 7)))
     arrays = read_arrays(path)
-    np.testing.assert_array_equal(arrays["robot"], np.eye(4)[None])
-    np.testing.assert_array_equal(arrays["tracking"], np.ones((2, 7)))
+    assert_array_equal(arrays["robot"], np.eye(4)[None])
+    assert_array_equal(arrays["tracking"], np.ones((2, 7)))
 
 
 def test_arrays_of_zeros_are_refused_by_their_unpacked_size(tmp_path):

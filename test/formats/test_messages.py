@@ -5,6 +5,7 @@ import pytest
 from bag_making import JAZZY, NOETIC, ODOMETRY, POSE_STAMPED, TF, header
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
 
 from hand_eye_calib.core.base.errors import printable
 from hand_eye_calib.formats.bags.messages import (
@@ -78,7 +79,7 @@ def assert_unpacked(columns, drawn, message_type):
         for _, _, sensor, _ in drawn
     ]
     assert columns.sensor_frames.tolist() == sensors
-    np.testing.assert_array_equal(columns.poses, [values for _, _, _, values in drawn])
+    assert_array_equal(columns.poses, [values for _, _, _, values in drawn])
 
 
 # Of few frames, so that many messages are alike.
@@ -145,4 +146,4 @@ def test_transforms_lose_the_leading_slash_of_old_frames(encoding, drawn):
     ):
         frames = printable(world).lstrip("/"), printable(sensor).lstrip("/")
         assert fields[:3] == (stamp_ns, *frames)
-        np.testing.assert_array_equal([*fields.position, *fields.quat_xyzw], values)
+        assert_array_equal([*fields.position, *fields.quat_xyzw], values)

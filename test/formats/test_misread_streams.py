@@ -14,6 +14,7 @@ from motions import (
     smooth_poses,
     wandering_poses,
 )
+from numpy.testing import assert_allclose
 
 from hand_eye_calib.core.checks.check import check_streams
 from hand_eye_calib.core.geometry import se3
@@ -157,10 +158,8 @@ def test_rotations_before_translations_are_read_by_rows_or_by_columns(
     order = "column by column" if is_by_columns else "row by row"
     assert f"read {order}" in guesses
     expected = rotations if is_by_columns or not by_columns else written
-    np.testing.assert_allclose(trajectory.poses[:, :3, :3], expected, atol=1e-9)
-    np.testing.assert_allclose(
-        trajectory.poses[:, :3, 3], truth.poses[:, :3, 3], atol=1e-9
-    )
+    assert_allclose(trajectory.poses[:, :3, :3], expected, atol=1e-9)
+    assert_allclose(trajectory.poses[:, :3, 3], truth.poses[:, :3, 3], atol=1e-9)
 
 
 FRAMES = {
@@ -184,7 +183,7 @@ def test_orientations_of_positions_from_the_centre_of_the_earth(tmp_path, frame)
     trajectory, guesses = read(tmp_path / "ecef.tum")
     assert words in guesses
     # Up of a place turns by 1 m / 6,378 km on the way to the next.
-    np.testing.assert_allclose(
+    assert_allclose(
         trajectory.poses[:, :3, :3], axes @ truth.poses[:, :3, :3], atol=2e-4
     )
 
@@ -210,4 +209,4 @@ def test_axes_of_places_are_those_of_their_latitude():
     up = axes_of_places(positions)[:, :, 2]
 
     expected = np.column_stack([x, y, z])
-    np.testing.assert_allclose(up, expected, atol=1e-9)
+    assert_allclose(up, expected, atol=1e-9)

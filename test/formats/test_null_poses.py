@@ -19,6 +19,7 @@ from bag_making import (
     write_messages,
 )
 from motions import T_PARENT_CHILD, child_of, wandering_poses
+from numpy.testing import assert_allclose
 
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.geometry import se3
@@ -102,7 +103,7 @@ def test_null_poses_of_a_bag_are_left_out_and_counted(tmp_path, storage, kind, n
     stamps_ns, poses, warnings = read(path, source)
     kept = np.delete(np.arange(N), FEW)
     assert stamps_ns.tolist() == STAMPS_NS[kept].tolist()
-    np.testing.assert_allclose(poses[:, :3], CHILD[kept, :3], atol=1e-12)
+    assert_allclose(poses[:, :3], CHILD[kept, :3], atol=1e-12)
     assert warnings == [
         f"{name}: 6 of 200 poses (3.0%) were left out: their quaternion is 0, or a value is not "
         "finite or absent"
@@ -136,9 +137,7 @@ def test_the_result_with_null_poses_is_the_truth_and_says_their_number(
     main(["calibrate", str(path), *options])
     document = json.loads(capsys.readouterr().out)
     assert [text for text in document["warnings"] if "6 of 200 poses (3.0%)" in text]
-    np.testing.assert_allclose(
-        document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6
-    )
+    assert_allclose(document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6)
 
 
 def test_a_quaternion_that_is_neither_unit_nor_zero_is_still_refused(tmp_path, capsys):

@@ -9,6 +9,7 @@ import pytest
 from bag_making import JAZZY, header
 from mcap.writer import Writer
 from motions import as_trajectory, geodetic, smooth_poses
+from numpy.testing import assert_allclose
 from rosbags import rosbag2
 from rosbags.typesys import get_types_from_msg
 
@@ -172,10 +173,8 @@ def from_start(poses):
 def test_the_poses_are_those_of_the_truth(bag, source, within):
     trajectory = read_bag_trajectory(bag, source)
     assert trajectory.measures == "poses"
-    np.testing.assert_allclose(trajectory.stamps_ns, TRUTH.stamps_ns, atol=1000, rtol=0)
-    np.testing.assert_allclose(
-        from_start(trajectory.poses), from_start(TRUTH.poses), atol=within
-    )
+    assert_allclose(trajectory.stamps_ns, TRUTH.stamps_ns, atol=1000, rtol=0)
+    assert_allclose(from_start(trajectory.poses), from_start(TRUTH.poses), atol=within)
 
 
 def foxglove(kind, k):
@@ -249,9 +248,9 @@ def test_messages_of_foxglove(tmp_path, kind, write):
     assert (trajectory.stamps_ns == TRUTH.stamps_ns).all()
     if kind == "LocationFix":
         assert trajectory.measures == "positions"
-        np.testing.assert_allclose(trajectory.poses[:, :3, 3], P - P[0], atol=1e-5)
+        assert_allclose(trajectory.poses[:, :3, 3], P - P[0], atol=1e-5)
     else:
-        np.testing.assert_allclose(trajectory.poses, TRUTH.poses, atol=1e-12)
+        assert_allclose(trajectory.poses, TRUTH.poses, atol=1e-12)
 
 
 def test_json_without_what_its_type_has_is_named(tmp_path):
@@ -286,9 +285,7 @@ def test_fields_of_a_place_are_positions(bag):
     for source in (f"/array?{fields}", "/gps"):
         trajectory = read_bag_trajectory(bag, source)
         assert trajectory.measures == "positions"
-        np.testing.assert_allclose(
-            from_start(trajectory.poses)[:, :3, 3], P - P[0], atol=1e-5
-        )
+        assert_allclose(from_start(trajectory.poses)[:, :3, 3], P - P[0], atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import yaml
+from numpy.testing import assert_allclose, assert_array_equal
 from result_making import calibration, dofs, good_calibration
 from source_code import ROOT
 
@@ -34,7 +35,7 @@ FILES = ["extrinsic.urdf.xacro", "extrinsic.yaml", "static_transform.launch.py"]
 
 def assert_same(found, expected):
     for field in dataclasses.fields(Calibration):
-        np.testing.assert_array_equal(
+        assert_array_equal(
             getattr(found, field.name),
             getattr(expected, field.name),
             err_msg=field.name,
@@ -179,7 +180,7 @@ def test_a_rotation_that_is_not_known_has_no_quaternion_and_no_number_for_a_robo
     ]
     assert transform["quat_xyzw"] is None
     assert transform["rpy_deg"][2] is None
-    np.testing.assert_allclose(transform["rpy_deg"][:2], [0, 0], atol=1e-9)
+    assert_allclose(transform["rpy_deg"][:2], [0, 0], atol=1e-9)
     assert_same(load_result(tmp_path), written)
     xacro, launch = (
         (tmp_path / name).read_text(encoding="utf-8") for name in ROBOT_FILES
@@ -219,7 +220,7 @@ def test_the_file_says_where_it_came_from(tmp_path):
         np.array(document["T_parent_child"]["matrix"])
         @ document["T_child_parent"]["matrix"]
     )
-    np.testing.assert_allclose(product, np.eye(4), atol=1e-14)
+    assert_allclose(product, np.eye(4), atol=1e-14)
     provenance = document["provenance"]
     assert provenance["inputs"] == {"bag": "drive", "messages": 7}
     assert provenance["package"] == "hand_eye_calib"
@@ -252,7 +253,7 @@ def test_the_xacro_file_is_a_fixed_joint_with_the_extrinsic(tmp_path):
     assert yaw @ pitch @ roll == pytest.approx(
         written.T_parent_child[:3, :3], abs=1e-12
     )
-    np.testing.assert_array_equal(xyz, written.T_parent_child[:3, 3])
+    assert_array_equal(xyz, written.T_parent_child[:3, 3])
 
 
 def test_the_launch_file_compiles_and_publishes_the_extrinsic(tmp_path):
@@ -287,12 +288,12 @@ def test_the_launch_file_compiles_and_publishes_the_extrinsic(tmp_path):
         for name in ("x", "y", "z", "qx", "qy", "qz", "qw")
     ]
     assert options == {}
-    np.testing.assert_allclose(
+    assert_allclose(
         se3.from_quat_xyzw(values[:3], values[3:]), written.T_parent_child, atol=1e-11
     )
     typed = shlex.split(written.static_transform_command())
     assert typed[:4] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
-    np.testing.assert_allclose(list(map(float, typed[5:18:2])), values, atol=1e-9)
+    assert_allclose(list(map(float, typed[5:18:2])), values, atol=1e-9)
     assert (typed[4::2], typed[-1]) == (arguments[::2], written.child_frame)
 
 
@@ -479,7 +480,7 @@ def test_every_sigma_of_a_document_has_the_allowance_and_its_parts_beside_it():
         document[f"covariance_{name}"]["matrix"] for name in ("measured", "allowance")
     )
     finite = np.array(document["covariance"]["matrix"][0], dtype=float)
-    np.testing.assert_allclose(
+    assert_allclose(
         finite, np.sum([columns[0] for columns in parts], axis=0), rtol=1e-12
     )
 
@@ -509,10 +510,10 @@ def test_a_document_of_version_1_is_read_with_its_covariance_as_the_measured_par
     written = calibration(covariance_allowance=1e-6 * np.eye(6))
     old = of_version_1(written.to_dict()) | {"cross_check": {"x": plain(scatter)}}
     read = Calibration.from_dict(old)
-    np.testing.assert_array_equal(read.covariance_measured, written.covariance_measured)
-    np.testing.assert_array_equal(read.covariance, written.covariance)
-    np.testing.assert_array_equal(read.sigmas, written.sigmas)
-    np.testing.assert_array_equal(read.allowance, written.allowance)
+    assert_array_equal(read.covariance_measured, written.covariance_measured)
+    assert_array_equal(read.covariance, written.covariance)
+    assert_array_equal(read.sigmas, written.sigmas)
+    assert_array_equal(read.allowance, written.allowance)
     assert read.cross_check["x"].sigma == pytest.approx(np.hypot(0.003, 0.001))
 
 

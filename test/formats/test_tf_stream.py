@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from motions import wandering_poses
+from numpy.testing import assert_allclose
 
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.geometry import se3
@@ -56,7 +57,7 @@ def test_a_moving_edge_and_a_mount(events, expected):
     Ts = se3.from_quat_xyzw(
         [pose.position for pose in poses], [pose.quat_xyzw for pose in poses]
     )
-    np.testing.assert_allclose(Ts, expected, atol=1e-12)
+    assert_allclose(Ts, expected, atol=1e-12)
 
 
 def test_two_moving_edges_at_the_stamps_of_the_slower():
@@ -72,9 +73,7 @@ def test_two_moving_edges_at_the_stamps_of_the_slower():
     odometry = Trajectory(10 * MS * np.arange(300), wandering_poses(300))
     k = (stamps_ns // MS - 3) // 100
     expected = wandering_poses(30)[k] @ odometry.at(stamps_ns, straight=True) @ MOUNT
-    np.testing.assert_allclose(
-        [pose.position for pose in poses], expected[:, :3, 3], atol=1e-12
-    )
+    assert_allclose([pose.position for pose in poses], expected[:, :3, 3], atol=1e-12)
 
 
 def test_nothing_is_interpolated_across_a_gap():

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.errors import ConfigError, InputError
@@ -48,8 +49,8 @@ def rows(stamps, order="xyzw", separator=","):
 
 
 def assert_is_the_trajectory(trajectory, stamps_ns=TRAJECTORY.stamps_ns):
-    np.testing.assert_array_equal(trajectory.stamps_ns, stamps_ns)
-    np.testing.assert_allclose(trajectory.poses, TRAJECTORY.poses, atol=1e-12)
+    assert_array_equal(trajectory.stamps_ns, stamps_ns)
+    assert_allclose(trajectory.poses, TRAJECTORY.poses, atol=1e-12)
 
 
 # ---- tum, and what holds for all
@@ -92,9 +93,9 @@ def test_what_is_written_reads_back_to_the_last_bit_of_stamp_and_translation(tmp
     written = Trajectory(stamps_ns, se3.exp(random.normal(size=(200, 6)) * 3))
     write_trajectory(tmp_path / "t.txt", written)
     read = hec.read_trajectory(tmp_path / "t.txt")
-    np.testing.assert_array_equal(read.stamps_ns, written.stamps_ns)
-    np.testing.assert_array_equal(read.poses[:, :3, 3], written.poses[:, :3, 3])
-    np.testing.assert_allclose(read.poses, written.poses, rtol=0, atol=2e-15)
+    assert_array_equal(read.stamps_ns, written.stamps_ns)
+    assert_array_equal(read.poses[:, :3, 3], written.poses[:, :3, 3])
+    assert_allclose(read.poses, written.poses, rtol=0, atol=2e-15)
 
 
 @pytest.mark.parametrize(
@@ -333,9 +334,7 @@ def test_calibrate_reads_each_file_in_its_own_format(tmp_path, file, capsys):
             in err
         )
         document = json.loads(out)
-        np.testing.assert_allclose(
-            document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-3
-        )
+        assert_allclose(document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-3)
     assert main([*command, "--format", "tum"]) == 2
     assert (
         "columns can be set for format csv only; the format is tum"

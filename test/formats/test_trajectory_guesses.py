@@ -11,6 +11,7 @@ from motions import (
     read_trajectory_file,
     wandering_poses,
 )
+from numpy.testing import assert_allclose, assert_array_equal
 from published_data import data_folder
 
 import hand_eye_calib as hec
@@ -68,7 +69,7 @@ def test_motion_or_start_tell_the_order(tmp_path, truth, sentence):
             trajectory, guesses = read(
                 write_unnamed(tmp_path / name, truth, order, separator)
             )
-            np.testing.assert_allclose(trajectory.poses, truth.poses, atol=1e-12)
+            assert_allclose(trajectory.poses, truth.poses, atol=1e-12)
             guesses = [text for text in guesses if "is read as format" not in text]
             assert len(guesses) == (order == SCALAR_FIRST)
             assert all(
@@ -88,7 +89,7 @@ def test_an_order_that_nothing_tells_is_said(tmp_path):
         trajectory, guesses = read(
             write_unnamed(tmp_path / name, truth, SCALAR_LAST, separator)
         )
-        np.testing.assert_allclose(trajectory.poses, truth.poses, atol=1e-12)
+        assert_allclose(trajectory.poses, truth.poses, atol=1e-12)
         assert sum(sentence in text for text in guesses) == is_said
 
 
@@ -131,7 +132,7 @@ def test_roll_pitch_and_yaw_in_degrees_or_radians(tmp_path, header, unit, is_sai
     path = table(tmp_path / "a.csv", f"x,y,z,{header}", *positions, *rpy * unit)
     trajectory, guesses = read(path)
     expected = se3.from_rotation_translation(se3.rotation_from_rpy(rpy.T), positions.T)
-    np.testing.assert_allclose(trajectory.poses, expected, atol=1e-12)
+    assert_allclose(trajectory.poses, expected, atol=1e-12)
     word = "deg" if unit > 1 else "rad"
     sentences = [
         text
@@ -150,10 +151,8 @@ def test_small_angles_in_degrees_are_read_by_the_name_of_their_unit(tmp_path):
         [1.0, 2.0],
     )
     trajectory, guesses = read(path)
-    np.testing.assert_allclose(trajectory.poses[1, :3, 3], [0.5, 0, 0])
-    np.testing.assert_allclose(
-        se3.rotation_to_rpy(trajectory.poses[1, :3, :3])[2], np.radians(2)
-    )
+    assert_allclose(trajectory.poses[1, :3, 3], [0.5, 0, 0])
+    assert_allclose(se3.rotation_to_rpy(trajectory.poses[1, :3, :3])[2], np.radians(2))
     assert [text for text in guesses if "no column" in text] == [
         ": no column of heights: 0 is assumed",
         ": no columns of roll and pitch: 0 is assumed",
@@ -190,7 +189,7 @@ def test_the_motion_tells_which_way_an_angle_is_counted(tmp_path):
         trajectory, guesses = read(
             table(tmp_path / "a.csv", header, *positions, values)
         )
-        np.testing.assert_allclose(
+        assert_allclose(
             np.cos(se3.rotation_to_rpy(trajectory.poses[:, :3, :3])[:, 2] - yaw),
             1,
             atol=1e-12,
@@ -223,14 +222,12 @@ def test_files_with_the_same_columns_are_read_by_one_convention(tmp_path):
         reading.trajectory.poses for reading in read_trajectory_files(settings)
     )
     turned = np.swapaxes(first[:, :3, :3], 1, 2) @ second[:, :3, :3]
-    np.testing.assert_allclose(
-        turned, np.broadcast_to(X[:3, :3], turned.shape), atol=1e-9
-    )
+    assert_allclose(turned, np.broadcast_to(X[:3, :3], turned.shape), atol=1e-9)
     with pytest.warns(
         UserWarning, match="read as that of the world in the sensor's frame"
     ):
         result = hec.calibrate(*map(str, files), method="dnlo", checks=False)
-    np.testing.assert_allclose(result.T_parent_child[:3, :3], X[:3, :3], atol=1e-5)
+    assert_allclose(result.T_parent_child[:3, :3], X[:3, :3], atol=1e-5)
 
 
 def test_files_with_the_same_columns_that_no_convention_fits_are_refused(
@@ -276,7 +273,7 @@ def test_latitude_and_longitude_become_metres_of_the_first_position(
     expected = positions - positions[:, :1]
     assert np.ptp(expected[0]) > 500
     # The axes of the first position are tilted against those of the place by some 1e-5 rad.
-    np.testing.assert_allclose(trajectory.poses[:, :3, 3].T, expected, atol=2e-2)
+    assert_allclose(trajectory.poses[:, :3, 3].T, expected, atol=2e-2)
     assert any(
         "became metres east and north of the first position" in text for text in guesses
     )
@@ -315,9 +312,7 @@ def test_the_example_of_the_epsg_for_metres_east_north_and_up_of_a_place():
     origin = LocalOrigin()
     origin.geodetic = *np.radians([55.0, 5.0]), 200.0
     local = origin.local(np.array([lat]), np.array([lon]), np.array([73.0]))
-    np.testing.assert_allclose(
-        local, [[-189013.869, -128642.040, -4220.171]], atol=1e-3
-    )
+    assert_allclose(local, [[-189013.869, -128642.040, -4220.171]], atol=1e-3)
 
 
 def test_published_files_need_no_options():
@@ -331,7 +326,7 @@ def test_published_files_need_no_options():
         named = read_trajectory_file(
             path, "csv", columns=columns, repair=True
         ).trajectory
-        np.testing.assert_array_equal(trajectory.poses, named.poses)
+        assert_array_equal(trajectory.poses, named.poses)
     ins, _ = read(folder / "raw_bag1" / "bag1-novatel_data-inspvax.csv")
     theirs = read_trajectory_file(folder / "bag1" / "INS_FCPE.mat", AUTO).trajectory
     # Their sensor has x to the right and y forward; their roll and pitch are exchanged.
@@ -344,4 +339,4 @@ def test_published_files_need_no_options():
         np.linalg.norm(np.diff(trajectory.poses[:, :2, 3], axis=0), axis=1)
         for trajectory in (ins, theirs)
     ]
-    np.testing.assert_allclose(lengths[0].sum(), lengths[1].sum(), rtol=6e-4)
+    assert_allclose(lengths[0].sum(), lengths[1].sum(), rtol=6e-4)

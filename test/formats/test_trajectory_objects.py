@@ -7,6 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from motions import as_trajectory, child_of, wandering_poses
+from numpy.testing import assert_allclose
 from result_making import calibration
 
 import hand_eye_calib as hec
@@ -36,7 +37,7 @@ def rows(*names):
 
 def assert_same(trajectory, tolerance_ns=STEP_NS):
     assert np.abs(trajectory.stamps_ns - TRAJECTORY.stamps_ns).max() <= tolerance_ns
-    np.testing.assert_allclose(trajectory.poses, TRAJECTORY.poses, atol=1e-12)
+    assert_allclose(trajectory.poses, TRAJECTORY.poses, atol=1e-12)
 
 
 class TestReading:
@@ -156,9 +157,7 @@ class TestShowing:
             seen = [(panel.get_xlabel(), panel.get_ylabel()) for panel in figure.axes]
             assert seen == [("x (m)", "y (m)"), ("x (m)", "z (m)"), ("y (m)", "z (m)")]
             (ellipse,) = figure.axes[0].patches
-            np.testing.assert_allclose(
-                ellipse.get_center(), result.translation[:2], atol=1e-9
-            )
+            assert_allclose(ellipse.get_center(), result.translation[:2], atol=1e-9)
             assert figure._repr_png_().startswith(b"\x89PNG")
             panels = figure.subplots(1, 3)
             assert source.plot(ax=panels) is figure

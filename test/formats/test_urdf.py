@@ -5,6 +5,7 @@ import time
 import numpy as np
 import pytest
 from bag_making import TF, tf_message, write_messages
+from numpy.testing import assert_allclose
 
 from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.geometry import se3
@@ -37,8 +38,8 @@ def urdf(tmp_path):
 
 def test_frames_through_the_base(urdf):
     T_lidar_camera = read_urdf(urdf).pose("lidar", "camera")
-    np.testing.assert_allclose(T_lidar_camera[:3, 3], [-0.5, 0, -1])
-    np.testing.assert_allclose(
+    assert_allclose(T_lidar_camera[:3, 3], [-0.5, 0, -1])
+    assert_allclose(
         se3.rotation_to_rpy(T_lidar_camera[:3, :3]), [0, 0.1, 0], atol=1e-12
     )
 
@@ -100,7 +101,7 @@ def test_what_is_not_understood_is_refused(urdf, old, new, frames, text):
 def test_installed_from_numbers_and_descriptions(urdf):
     numbers = open_installed("-50cm 0 -1 0 0.1 0deg")("lidar", "camera")
     drawn = open_installed(str(urdf))("lidar", "camera")
-    np.testing.assert_allclose(numbers.T_parent_child, drawn.T_parent_child, atol=1e-12)
+    assert_allclose(numbers.T_parent_child, drawn.T_parent_child, atol=1e-12)
     assert not numbers.covariance.any()
     with pytest.raises(ConfigError, match="installed: no file"):
         open_installed("robot.urdf")("lidar", "camera")
@@ -127,7 +128,7 @@ class TestBag:
             ("base", "camera", T @ T),
         )
         installed = open_installed(str(bag))("lidar", "camera")
-        np.testing.assert_allclose(installed.T_parent_child, T, atol=1e-12)
+        assert_allclose(installed.T_parent_child, T, atol=1e-12)
         with pytest.raises(
             InputError, match="no frame 'radar' in the bag's transforms"
         ):

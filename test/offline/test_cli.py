@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 import yaml
 from motions import disturbed, walked, write_pair
+from numpy.testing import assert_allclose
 from result_making import written_finding
 from source_code import ROOT
 
@@ -123,7 +124,7 @@ def test_replay_finds_the_extrinsic_and_says_it_in_both_directions(
     assert "\nlidar in camera: maps coordinates of lidar into camera\n" in out
     rows = re.findall(r"^  [xyz] +(\S+) \+/- \d\S* m ", out, flags=re.MULTILINE)
     truth = np.concatenate([TRUTH[:3, 3], se3.inverse(TRUTH)[:3, 3]])
-    np.testing.assert_allclose(np.array(rows, dtype=float), truth, atol=1e-3)
+    assert_allclose(np.array(rows, dtype=float), truth, atol=1e-3)
     assert re.search(r"  yaw +\S+ \+/- \d\S* deg  \(.* measured, ", out)
     assert "\nNext\n" not in out
     assert "\nTo publish it (USE)\n  ros2 run tf2_ros static_transform_publisher" in out
@@ -136,7 +137,7 @@ def test_json_is_one_document_on_stdout(run, new_bag):
     )
     document = json.loads(out)
     assert (code, err) == (0, "")
-    np.testing.assert_allclose(document["T_parent_child"]["matrix"], TRUTH, atol=1e-3)
+    assert_allclose(document["T_parent_child"]["matrix"], TRUTH, atol=1e-3)
     assert (document["method"], document["reference"], document["status"]) == (
         "dnl",
         "B2",
@@ -178,7 +179,7 @@ def test_calibrate_on_files_gives_what_replay_gives(run, new_bag, tmp_path):
     assert (code, err) == (0, "")
     from_files = json.loads(out)
     from_bag = json.loads(run("replay", new_bag(), *TOPICS, *options)[1])
-    np.testing.assert_allclose(
+    assert_allclose(
         from_files["T_parent_child"]["matrix"],
         from_bag["T_parent_child"]["matrix"],
         atol=1e-12,
@@ -628,7 +629,7 @@ def test_the_sample_in_the_package_gives_its_true_extrinsic(capsys):
     truth = hec.read_trajectory(
         Path(hec.__file__).parent / "sample" / "truth.tum"
     ).poses[0]
-    np.testing.assert_allclose(matrix, truth, atol=0.005)
+    assert_allclose(matrix, truth, atol=0.005)
 
 
 @pytest.mark.parametrize("name", ["truth.tum", "T_S2_S1.txt"])

@@ -15,6 +15,7 @@ from motions import (
     messages,
     wandering_poses,
 )
+from numpy.testing import assert_allclose
 
 from hand_eye_calib.formats.bags.writer import write_bag
 from hand_eye_calib.formats.journal import JournalWriter
@@ -129,9 +130,7 @@ def test_frames_stand_for_topics(run, bag, tmp_path):
     assert (code, err) == (0, "")
     assert (document["parent_frame"], document["child_frame"]) == ("lidar", "camera")
     assert document["inputs"]["child"]["topic"] == "transform odom:camera"
-    np.testing.assert_allclose(
-        matrix(out), matrix(run(bag, *STREAMS, "--json")[1]), atol=1e-9
-    )
+    assert_allclose(matrix(out), matrix(run(bag, *STREAMS, "--json")[1]), atol=1e-9)
     code, out, err = run(
         path, "--parent-topic", "map:lidar", "--child-topic", "odom:radar"
     )
@@ -148,9 +147,7 @@ def test_a_path_and_a_topic_of_two_bags_together(run, bag, tmp_path):
     both = ["--parent-topic", "/path", "--child-topic", "/b", "--parent-frame", "lidar"]
     code, out, _ = run(bag, path, *both, "--json")
     assert code == 0
-    np.testing.assert_allclose(
-        matrix(out), matrix(run(bag, *STREAMS, "--json")[1]), atol=1e-9
-    )
+    assert_allclose(matrix(out), matrix(run(bag, *STREAMS, "--json")[1]), atol=1e-9)
 
 
 def parts_of(tmp_path, slices, later_s=0.0):
@@ -198,7 +195,7 @@ def test_recordings_are_not_joined_but_give_one_result(run, tmp_path, later_s, r
     together = json.loads(out)["together"]
     names = {recording["name"] for recording in together["recordings"]}
     assert (code, names, together["kind"]) == (0, {"part_0", "part_1"}, "agree")
-    np.testing.assert_allclose(matrix(out), T_PARENT_CHILD, atol=5e-3)
+    assert_allclose(matrix(out), T_PARENT_CHILD, atol=5e-3)
     code, out, err = run(*paths, "--topics", "/a", "/b", "/a")
     assert (code, out) == (1, "")
     assert reason in err

@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import EXPORT_FORMATS, ROBOT_FORMATS
@@ -46,7 +47,7 @@ def test_arm_takes_two_files_as_stops(run, tmp_path):
         np.array(document["T_parent_child"]["matrix"])[:3, :3]
         for document in (alone, both)
     ]
-    np.testing.assert_allclose(*rotation_of, atol=5e-3)
+    assert_allclose(*rotation_of, atol=5e-3)
     assert (alone["setup"], alone["parent_frame"]) == ("hand", "hand")
     placed = as_json(run, "arm", *files, "--setup", "hand")
     assert placed["T_parent_child"] == alone["T_parent_child"]

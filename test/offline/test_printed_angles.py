@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from result_making import calibration as made
 from result_making import dofs
 
@@ -52,16 +53,14 @@ def test_sigmas_are_the_spread_of_the_numbers_in_both_directions(rotation):
     inverse = se3.inverse(T), se3.inverse(drawn), inverse_covariance(T, covariance)
     for of, samples, stated in ((T, drawn, covariance), inverse):
         along = samples[:, :3, 3].std(axis=0)
-        np.testing.assert_allclose(
-            sigmas_in_parent(of[:3, :3], stated)[:3], along, rtol=0.03
-        )
+        assert_allclose(sigmas_in_parent(of[:3, :3], stated)[:3], along, rtol=0.03)
         sigmas = sigmas_rpy(of, stated)
         if np.isfinite(sigmas).all():  # the inverse of one is locked
             off = se3.rotation_to_rpy(samples[:, :3, :3]) - se3.rotation_to_rpy(
                 of[:3, :3]
             )
             spread = np.std((off + np.pi) % (2 * np.pi) - np.pi, axis=0)
-            np.testing.assert_allclose(sigmas, spread, rtol=0.03)
+            assert_allclose(sigmas, spread, rtol=0.03)
 
 
 def test_near_gimbal_lock_roll_and_yaw_are_printed_without_a_sigma():
@@ -123,11 +122,9 @@ def test_a_result_has_the_sigmas_of_its_printed_numbers_in_both_directions():
     document = result.to_dict()
     transform = document["T_parent_child"]
     back = document["T_child_parent"]
-    np.testing.assert_allclose(
-        transform["sigma_rpy_deg"], np.degrees(result.sigmas_rpy)
-    )
+    assert_allclose(transform["sigma_rpy_deg"], np.degrees(result.sigmas_rpy))
     assert transform["sigma_rpy_deg"][1] == pytest.approx(0.57)
-    np.testing.assert_allclose(transform["sigma_translation"], [0.01, 0.02, 0.03])
+    assert_allclose(transform["sigma_translation"], [0.01, 0.02, 0.03])
     # An error of the rotation moves the parent, which is 0.37 m from the child.
     assert back["sigma_translation"][0] > 0.02
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import hand_eye_calib as hec
@@ -285,7 +286,7 @@ def test_a_yaw_that_counts_turns_is_read_in_radians_with_a_note(tmp_path):
     with pytest.warns(UserWarning, match="yaw_rad reaches 40 rad, more than one turn"):
         trajectory = hec.read_trajectory(tmp_path / "turns.csv", "auto")
     rotation = Rotation.from_matrix(trajectory.poses[-1, :3, :3])
-    np.testing.assert_allclose(np.sin(rotation.magnitude()), abs(np.sin(40.0)))
+    assert_allclose(np.sin(rotation.magnitude()), abs(np.sin(40.0)))
 
 
 def test_a_folder_may_be_called_sample():

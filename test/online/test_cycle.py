@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from result_making import calibration, seen, written_finding
 from source_code import ROOT
 
@@ -101,7 +102,7 @@ def test_what_is_kept_is_answered_and_says_why_it_is_not_the_newest(cycle, lines
     assert f"{moved[0, 3]:.4f}" in warning
     assert "(5.0, 10.0, 5.0) mm" in warning
     assert "120 poses" in warning
-    np.testing.assert_array_equal(cycle.result.T_parent_child, kept.T_parent_child)
+    assert_array_equal(cycle.result.T_parent_child, kept.T_parent_child)
     assert cycle.goal.progress.done
     # A better one takes its place, and the note is gone.
     _, text = answered(cycle, 48.0, 0.003, 130)

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from result_making import calibration as made
 from result_making import seen
 
@@ -147,7 +148,7 @@ def test_time_left_follows_from_the_variance_that_falls_with_time():
         result(sigmas_m=(0.004, 0.04, 0.004)), seen(40.0, FLAT)
     )
     assert progress.limiting_axis == "y"
-    np.testing.assert_allclose(seconds_left(progress), [0, 120, 0, 0, 0, 0])
+    assert_allclose(seconds_left(progress), [0, 120, 0, 0, 0, 0])
     assert progress.sentence == (
         "Go on for about 4 min, y takes longest. Tighter curves to both sides help most."
     )

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from findings import codes_of
 from motions import as_trajectory, disturbed, feed, smooth_poses
 from result_making import good_calibration, seen, written_finding
 
@@ -91,7 +92,7 @@ def test_what_only_raw_poses_show_stays_until_a_reset(checks, fault, stays):
     checks.take(CheckResult((fault,)))
     for _ in range(3):
         checks.take(CheckResult(()))
-    assert [finding.code for finding in checks.findings] == [fault.code] * stays
+    assert codes_of(checks.findings) == [fault.code] * stays
     assert [
         fault.code in text or fault.what in text for text in checks.state().findings
     ] == ([True] * stays)

@@ -8,9 +8,10 @@ import threading
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
+from findings import codes_of
 from motions import as_trajectory, child_of, disturbed, feed, wandering_poses
+from numpy.testing import assert_array_equal
 
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.engine.calibrator import BufferLimits, Calibrator
@@ -117,7 +118,7 @@ def test_gives_the_same_bits_as_here_job_after_job(start):
         assert remote.session == session
         for name in ("T_parent_child", "covariance", "objective", "sigmas"):
             values = [getattr(result.calibration, name) for result in (remote, here)]
-            np.testing.assert_array_equal(*values, err_msg=f"{name} with {options}")
+            assert_array_equal(*values, err_msg=f"{name} with {options}")
         assert remote.check.findings == here.check.findings
         assert remote.motion.n_poses == here.motion.n_poses == 250
         assert (remote.time_offset is None) == ("time_offset" not in options)
@@ -239,11 +240,7 @@ def test_what_a_check_is_certain_of_is_solved_with_as_in_a_replay(pairing_starts
     again = answer(Job(1, calibrator, check=True, options=first.options))
     assert again.calibration.time_offset_s == pytest.approx(0.3, abs=0.01)
     for result in (first, again):
-        np.testing.assert_array_equal(
-            result.calibration.T_parent_child, replayed.T_parent_child
-        )
-        np.testing.assert_array_equal(
-            result.calibration.covariance, replayed.covariance
-        )
+        assert_array_equal(result.calibration.T_parent_child, replayed.T_parent_child)
+        assert_array_equal(result.calibration.covariance, replayed.covariance)
     assert (again.options, again.messages) == ({}, ())
-    assert "time_offset" not in {finding.code for finding in again.check.findings}
+    assert "time_offset" not in codes_of(again.check.findings)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
@@ -64,7 +65,7 @@ def test_simulated_drives_have_a_known_answer_and_as_many_pairs_as_asked_for():
     drive = data.simulated_drive(data.SHORT + 5)
     assert len(drive.pairs) == data.SHORT
     T_parent_child = Method("dnlo").solve(drive.pairs).T_parent_child
-    np.testing.assert_allclose(T_parent_child, drive.T_parent_child, atol=0.05)
+    assert_allclose(T_parent_child, drive.T_parent_child, atol=0.05)
 
 
 @pytest.mark.parametrize("method", rows.OPENCV_METHODS)
@@ -75,4 +76,4 @@ def test_opencv_is_given_what_it_expects(method):
     T_parent_child = rows.opencv(
         cv2, method, Ts_pw_p, T_cw_pw @ Ts_pw_p @ data.T_PARENT_CHILD
     )
-    np.testing.assert_allclose(T_parent_child, data.T_PARENT_CHILD, atol=1e-6)
+    assert_allclose(T_parent_child, data.T_PARENT_CHILD, atol=1e-6)

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from published_data import data_folder
 from result_making import calibration
 from sigmas import assert_nees, nees
@@ -101,7 +102,7 @@ def test_recordings_of_a_class_repeat_and_differ():
     parent = recording.parent.poses
     child = recording.child.poses
     A, B = (se3.inverse(poses[0]) @ poses[-1] for poses in (parent, child))
-    np.testing.assert_allclose(A @ X, X @ B, atol=1e-6)
+    assert_allclose(A @ X, X @ B, atol=1e-6)
 
 
 def test_cycle_of_true_answers_closes_and_its_covariance_counts_each_answer():
@@ -120,7 +121,7 @@ def test_cycle_of_true_answers_closes_and_its_covariance_counts_each_answer():
         )
     ]
     xi, covariance = misclosure(answers)
-    np.testing.assert_allclose(xi, 0.0, atol=1e-12)
+    assert_allclose(xi, 0.0, atol=1e-12)
     off = se3.exp(np.array([0.0, 0.0, 0.01, 0.0, 0.0, 0.0]))
     xi, _ = misclosure([*answers[:2], _calibration(T_ca @ off, covariances[2], 0.5)])
     assert xi[2] == pytest.approx(0.02)

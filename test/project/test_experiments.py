@@ -5,6 +5,7 @@ simulator.
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.solvers.all_pairs import solve_park
@@ -58,9 +59,7 @@ def test_mean_has_students_confidence_interval():
     summary = results.mean_summary([1.0, 2.0, 3.0, 4.0])
     # t(0.975, 3) = 3.18245 and s = 1.290994
     assert (summary.centre, summary.n) == (2.5, 4)
-    np.testing.assert_allclose(
-        [summary.low, summary.high], [0.44574, 4.55426], atol=1e-5
-    )
+    assert_allclose([summary.low, summary.high], [0.44574, 4.55426], atol=1e-5)
     # Quartiles and whiskers leave out what is far.
     summary = results.quartile_summary([1.0, 2.0, 3.0, 4.0, 100.0])
     assert (summary.low, summary.centre, summary.high) == (2.0, 3.0, 4.0)
@@ -75,13 +74,11 @@ def test_rows_hold_the_errors_of_what_was_solved(rows):
     expected = metrics.errors(
         pairs, solve_park(pairs).T_parent_child, case.T_parent_child
     )
-    np.testing.assert_allclose(
+    assert_allclose(
         [row[metric] for metric in METRICS],
         np.array(expected) * [1, 180 / np.pi, 1, 180 / np.pi],
     )
-    np.testing.assert_array_equal(
-        row["T_parent_child"], solve_park(pairs).T_parent_child.ravel()
-    )
+    assert_array_equal(row["T_parent_child"], solve_park(pairs).T_parent_child.ravel())
     table = table_of([row])
     assert (table["case"][0], table["why"][0]) == ("noise/0.004/run_02", "")
     assert table["published_e_at"].isna().all()

@@ -9,6 +9,7 @@ import motions
 import numpy as np
 import pytest
 import result_making
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import BACKENDS, METHODS, CalibratorConfig
@@ -120,7 +121,7 @@ class TestOptionsOfCalibrate:
         assert sorted(reports) == reports
         assert (reports[0][0], reports[-1][0]) == (0.0, 1.0)
         again = hec.calibrate(parent, child, reference="B1")
-        np.testing.assert_array_equal(result.T_parent_child, again.T_parent_child)
+        assert_array_equal(result.T_parent_child, again.T_parent_child)
 
 
 class TestPrior:
@@ -195,7 +196,7 @@ class TestResiduals:
         assert METHODS[name].rejects_outliers == (error_m < 1e-4)
         assert METHODS[name].rejects_outliers == (result.n_inliers < result.n_pairs)
         if METHODS[name].rejects_outliers:
-            np.testing.assert_array_equal(residuals.is_inlier, ~crosses)
+            assert_array_equal(residuals.is_inlier, ~crosses)
             assert residuals.translation_m[~crosses].max() < 1e-6
             assert residuals.rotation_rad.max() < 1e-6
         assert residuals.translation_m[crosses].min() > 0.3
@@ -249,10 +250,10 @@ class TestAnswerOfTheMethod:
 
     def test_it_comes_back_from_files_that_have_it(self):
         result = hec.calibrate(*streams(100), reference="B5")
-        np.testing.assert_allclose(result.T_method, result.T_parent_child, atol=1e-12)
+        assert_allclose(result.T_method, result.T_parent_child, atol=1e-12)
         document = result.to_dict()
         loaded = hec.Calibration.from_dict(document)
-        np.testing.assert_array_equal(loaded.T_method, result.T_method)
+        assert_array_equal(loaded.T_method, result.T_method)
         del document["T_method"]
         assert hec.Calibration.from_dict(document).T_method is None
 

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from source_code import ROOT
 
 import hand_eye_calib as hec
@@ -64,10 +65,8 @@ def test_the_roles_may_be_exchanged(names):
     back = hec.calibrate("camera.tum", "lidar.tum")
     apart = se3.log(se3.inverse(result.inverse().T_parent_child) @ back.T_parent_child)
     assert (np.abs(apart) < 0.5 * np.sqrt(np.diag(back.covariance))).all()
-    np.testing.assert_allclose(result.inverse().sigmas, back.sigmas, rtol=0.6)
-    np.testing.assert_allclose(
-        result.inverse().inverse().sigmas, result.sigmas, rtol=1e-6
-    )
+    assert_allclose(result.inverse().sigmas, back.sigmas, rtol=0.6)
+    assert_allclose(result.inverse().inverse().sigmas, result.sigmas, rtol=1e-6)
     assert (result == "another", result == result.inverse()) == (False, False)
 
 
@@ -110,7 +109,7 @@ def test_files_are_calibrated_and_saved(tmp_path, capsys):
     result = imported("calibrate_files").main(*map(str, files))
     assert (tmp_path / "result" / "extrinsic.yaml").exists()
     truth = np.loadtxt(run / "T_S2_S1.txt")[1:4]
-    np.testing.assert_allclose(result.T_parent_child[:3, 3], truth, atol=4e-3)
+    assert_allclose(result.T_parent_child[:3, 3], truth, atol=4e-3)
     assert result.headline in capsys.readouterr().out
 
 

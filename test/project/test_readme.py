@@ -5,8 +5,8 @@ import dataclasses
 import re
 import shlex
 
-import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from source_code import ROOT
 
 from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig
@@ -255,7 +255,7 @@ def test_python_of_the_readme_runs(tmp_path, monkeypatch):
     assert result.T_parent_child.shape == (4, 4)
     assert result.covariance.shape == (6, 6)
     truth = names["hec"].read_trajectory("sample:truth.tum").poses[0]
-    np.testing.assert_allclose(result.T_parent_child, truth, atol=5e-3)
+    assert_allclose(result.T_parent_child, truth, atol=5e-3)
     assert (tmp_path / "python_result" / "extrinsic.yaml").exists()
 
 

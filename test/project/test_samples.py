@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.geometry import se3
@@ -21,8 +22,8 @@ def test_the_bag_has_the_poses_of_the_files():
     for sensor in ("lidar", "camera"):
         in_file = hec.read_trajectory(f"sample:{sensor}.tum")
         in_bag = hec.read_trajectory("sample:drive.mcap", topic=f"/{sensor}/odometry")
-        np.testing.assert_array_equal(in_bag.stamps_ns, in_file.stamps_ns)
-        np.testing.assert_allclose(in_bag.poses, in_file.poses, atol=1e-12)
+        assert_array_equal(in_bag.stamps_ns, in_file.stamps_ns)
+        assert_allclose(in_bag.poses, in_file.poses, atol=1e-12)
         assert in_bag.sensor_frame == sensor
 
 
@@ -53,12 +54,8 @@ def test_the_arm_is_made_by_its_script(tmp_path):
     write_sample_arm(tmp_path / "arm.yaml")
     made = hec.read_arm_samples(tmp_path / "arm.yaml")
     kept = hec.read_arm_samples("sample:arm.yaml")
-    np.testing.assert_allclose(
-        se3.log(se3.inverse(made.robot) @ kept.robot), 0.0, atol=1e-5
-    )
-    np.testing.assert_allclose(
-        se3.log(se3.inverse(made.tracking) @ kept.tracking), 0.0, atol=1e-5
-    )
+    assert_allclose(se3.log(se3.inverse(made.robot) @ kept.robot), 0.0, atol=1e-5)
+    assert_allclose(se3.log(se3.inverse(made.tracking) @ kept.tracking), 0.0, atol=1e-5)
 
 
 def test_two_files_of_the_arm_have_the_stops_of_its_samples(tmp_path):
@@ -68,10 +65,10 @@ def test_two_files_of_the_arm_have_the_stops_of_its_samples(tmp_path):
         made, kept = (
             np.loadtxt(path) for path in (tmp_path / name, local_path(f"sample:{name}"))
         )
-        np.testing.assert_allclose(made, kept, atol=2e-6)
+        assert_allclose(made, kept, atol=2e-6)
     samples = hec.read_arm_samples("sample:arm.yaml")
     hand = hec.read_trajectory("sample:hand.tum")
-    np.testing.assert_allclose(hand.poses, samples.robot, atol=3e-6)
+    assert_allclose(hand.poses, samples.robot, atol=3e-6)
 
 
 def test_the_robot_is_calibrated_within_its_standard_deviations():
@@ -101,4 +98,4 @@ def test_the_robot_is_made_by_its_script(tmp_path):
             np.loadtxt(path, delimiter=separator, skiprows=n_names)
             for path in (tmp_path / name, local_path(f"sample:{name}"))
         )
-        np.testing.assert_allclose(made, kept, atol=2e-4)
+        assert_allclose(made, kept, atol=2e-4)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 
 from hand_eye_calib.core.geometry import se3
 
@@ -31,7 +32,7 @@ def tangents(draw):
 def test_log_inverts_exp(xi):
     # Near half a turn the logarithm's condition grows with 1 / (pi - angle).
     tolerance = 1e-9 * (1 + np.abs(xi[:3]).max())
-    np.testing.assert_allclose(se3.log(se3.exp(xi)), xi, atol=tolerance, rtol=0)
+    assert_allclose(se3.log(se3.exp(xi)), xi, atol=tolerance, rtol=0)
 
 
 @given(tangents())
@@ -50,7 +51,7 @@ def test_exp_agrees_with_the_matrix_exponential(xi):
 def test_adjoint_moves_a_twist_across_a_transform(xi, pose_xi):
     T = se3.exp(pose_xi)
     small = 1e-3 * xi / (1 + np.linalg.norm(xi))
-    np.testing.assert_allclose(
+    assert_allclose(
         T @ se3.exp(small), se3.exp(se3.adjoint(T) @ small) @ T, atol=1e-9, rtol=1e-9
     )
 
@@ -58,10 +59,8 @@ def test_adjoint_moves_a_twist_across_a_transform(xi, pose_xi):
 @given(tangents())
 def test_inverse_and_quaternions_go_round(xi):
     T = se3.exp(xi)
-    np.testing.assert_allclose(se3.inverse(T) @ T, np.eye(4), atol=1e-9)
-    np.testing.assert_allclose(
-        se3.from_quat_xyzw(T[:3, 3], se3.to_quat_xyzw(T)), T, atol=1e-9
-    )
+    assert_allclose(se3.inverse(T) @ T, np.eye(4), atol=1e-9)
+    assert_allclose(se3.from_quat_xyzw(T[:3, 3], se3.to_quat_xyzw(T)), T, atol=1e-9)
 
 
 @given(tangents(), tangents(), st.floats(0, 1))
@@ -69,7 +68,7 @@ def test_interpolation_runs_at_constant_twist(start_xi, step_xi, fraction):
     start = se3.exp(start_xi)
     end = start @ se3.exp(step_xi)
     between = se3.interpolate(start, end, fraction)
-    np.testing.assert_allclose(
+    assert_allclose(
         se3.log(se3.inverse(start) @ between),
         fraction * step_xi,
         atol=1e-7 * (1 + np.abs(step_xi).max()),
@@ -83,7 +82,7 @@ def test_conversions_agree_with_scipy(direction, angle):
     along = np.array(direction) / np.linalg.norm(direction)
     quat = np.r_[np.sin(angle / 2) * along, np.cos(angle / 2)]
     rotation = Rotation.from_quat(quat)
-    np.testing.assert_allclose(
+    assert_allclose(
         se3.from_quat_xyzw(np.zeros(3), 3.0 * quat)[:3, :3],
         rotation.as_matrix(),
         atol=1e-14,
@@ -95,7 +94,7 @@ def test_conversions_agree_with_scipy(direction, angle):
     quat_xyzw = se3.to_quat_xyzw(rotation.as_matrix())
     expected = Rotation.from_matrix(rotation.as_matrix()).as_quat()
     assert quat_xyzw[3] >= 0.0
-    np.testing.assert_allclose(
+    assert_allclose(
         quat_xyzw * np.sign(quat_xyzw @ expected), expected, atol=1e-14, rtol=0
     )
 
@@ -113,10 +112,10 @@ def test_roll_pitch_yaw_agree_with_scipy_up_to_gimbal_lock(roll, pitch, yaw):
         rotation, abs=1e-14
     )
     rpy = se3.rotation_to_rpy(rotation)
-    np.testing.assert_allclose(se3.rotation_from_rpy(rpy), rotation, atol=1e-14, rtol=0)
+    assert_allclose(se3.rotation_from_rpy(rpy), rotation, atol=1e-14, rtol=0)
     if abs(pitch) < 1.51:
         # Half a turn may come out with either sign; near gimbal lock the digits of roll and yaw go.
-        np.testing.assert_allclose(
+        assert_allclose(
             np.exp(1j * rpy),
             np.exp(1j * np.array([roll, pitch, yaw])),
             atol=1e-14 / np.cos(pitch),

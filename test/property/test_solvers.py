@@ -7,6 +7,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from motions import walked
+from numpy.testing import assert_allclose, assert_array_equal
 
 from hand_eye_calib.core.base.config import METHODS
 from hand_eye_calib.core.base.errors import NotEnoughDataError
@@ -84,9 +85,9 @@ def test_noise_free_truth_is_found(method, seed, truth):
         assert rotation_angle(truth) > ZHUANG_IS_SURE_TO
         return
     assert solution.converged
-    np.testing.assert_allclose(solution.T_parent_child, truth, atol=1e-6)
+    assert_allclose(solution.T_parent_child, truth, atol=1e-6)
     assert solution.objective == pytest.approx(0.0, abs=1e-12)
-    np.testing.assert_allclose(solution.weights, np.ones(N_POSES - 1), atol=1e-12)
+    assert_allclose(solution.weights, np.ones(N_POSES - 1), atol=1e-12)
 
 
 @pytest.mark.parametrize("method", PAPER_METHODS)
@@ -95,7 +96,7 @@ def test_noise_free_truth_is_found(method, seed, truth):
 def test_worlds_do_not_matter(method, seed, truth, parent_world, child_world):
     Ts_pw_p, Ts_cw_c = trajectories(seed, truth, noise=0.01)
     moved = answer(method, parent_world @ Ts_pw_p, child_world @ Ts_cw_c)
-    np.testing.assert_allclose(moved, answer(method, Ts_pw_p, Ts_cw_c), atol=1e-6)
+    assert_allclose(moved, answer(method, Ts_pw_p, Ts_cw_c), atol=1e-6)
 
 
 @few_examples
@@ -133,7 +134,7 @@ def test_answer_follows_the_sensor_frames_with_noise(
     expected = (
         se3.inverse(T_parent_new) @ answer(method, Ts_pw_p, Ts_cw_c) @ T_child_new
     )
-    np.testing.assert_allclose(
+    assert_allclose(
         answer(method, Ts_pw_p @ T_parent_new, Ts_cw_c @ T_child_new),
         expected,
         atol=1e-6,
@@ -153,14 +154,14 @@ def test_dnlo_follows_the_sensor_frames_with_outliers(
     Ts_cw_c[9:, :3, 3] += [0.0, 30.0, 0.0]
     pairs = motion_pairs(Ts_pw_p, Ts_cw_c, "B1")
     solution = Method("dnlo").solve(pairs)
-    np.testing.assert_array_equal(np.flatnonzero(solution.weights == 0.0), [4, 8])
-    np.testing.assert_allclose(
+    assert_array_equal(np.flatnonzero(solution.weights == 0.0), [4, 8])
+    assert_allclose(
         solution.T_parent_child,
         Method("dnl").solve(pairs[solution.weights > 0]).T_parent_child,
         atol=1e-6,
     )
     expected = se3.inverse(T_parent_new) @ solution.T_parent_child @ T_child_new
-    np.testing.assert_allclose(
+    assert_allclose(
         answer("dnlo", Ts_pw_p @ T_parent_new, Ts_cw_c @ T_child_new),
         expected,
         atol=1e-6,
@@ -177,7 +178,7 @@ def test_order_of_the_pairs_does_not_matter(method, seed, truth, order):
     )
     ours = Method(method).solve(pairs)
     reordered = Method(method).solve(pairs[np.array(order)])
-    np.testing.assert_allclose(reordered.T_parent_child, ours.T_parent_child, atol=1e-6)
+    assert_allclose(reordered.T_parent_child, ours.T_parent_child, atol=1e-6)
     assert reordered.objective == pytest.approx(ours.objective, rel=1e-6, abs=1e-12)
 
 
@@ -240,9 +241,9 @@ def test_degenerate_motion_gives_a_rigid_transform(method, kind, seed, truth):
     solution = Method(method).solve(pairs)
     T = solution.T_parent_child
     assert np.isfinite(T).all()
-    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
+    assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
     assert np.linalg.det(T[:3, :3]) > 0
-    np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
+    assert_array_equal(T[3], [0, 0, 0, 1])
     assert np.isfinite(solution.objective)
     assert solution.weights.shape == (len(pairs),)
     assert np.isfinite(solution.weights).all()
@@ -273,4 +274,4 @@ def test_planar_motion_still_shows_what_it_can(method, seed, yaw, shift):
     solution = Method(method).solve(pairs)
     assert abs(solution.T_parent_child[2, 3]) < 1e-3
     if method in ("dnl", "zhuang"):
-        np.testing.assert_allclose(solution.T_parent_child[:2], truth[:2], atol=1e-5)
+        assert_allclose(solution.T_parent_child[:2], truth[:2], atol=1e-5)

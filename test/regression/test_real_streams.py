@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import real_data
 from faults import FAULTS
+from findings import codes_of
 from motions import as_trajectory
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from hand_eye_calib.core.checks.check import check_streams
@@ -54,9 +56,7 @@ class TestThreeDevicesWithoutACommonClock:
             (0.434, 0.072, -0.213),
         ]
         for expected, result in zip(translations, results, strict=True):
-            np.testing.assert_allclose(
-                result.T_parent_child[:3, 3], expected, atol=0.02
-            )
+            assert_allclose(result.T_parent_child[:3, 3], expected, atol=0.02)
 
     def test_the_cycle_closes(self, results):
         cycle = np.linalg.multi_dot([result.T_parent_child for result in results])
@@ -75,9 +75,7 @@ class TestRoadVehicle:
         assert result.status is SolveStatus.UNOBSERVABLE
         assert result.unobservable() == ["z"]
         assert rpy_deg(result.T_parent_child)[2] == pytest.approx(-90.78, abs=0.5)
-        np.testing.assert_allclose(
-            result.T_parent_child[:2, 3], (0.002, 0.367), atol=0.04
-        )
+        assert_allclose(result.T_parent_child[:2, 3], (0.002, 0.367), atol=0.04)
         assert abs(result.time_offset_s) < 0.09
 
     def test_prior_holds_what_is_unobservable(self):
@@ -94,9 +92,7 @@ class TestRoadVehicle:
         assert result.T_parent_child[2, 3] == pytest.approx(1.0, abs=0.005)
         assert verdicts["z"].sigma == pytest.approx(0.02, rel=0.1)
         assert max(verdicts["x"].sigma, verdicts["y"].sigma) < 0.05
-        np.testing.assert_allclose(
-            result.T_parent_child[:2, 3], (0.002, 0.367), atol=0.04
-        )
+        assert_allclose(result.T_parent_child[:2, 3], (0.002, 0.367), atol=0.04)
 
     @pytest.mark.parametrize("method", ["auto", "dnlo"])
     def test_a_flat_drive_on_springs_gives_no_height(self, method):
@@ -108,9 +104,7 @@ class TestRoadVehicle:
         result = calibrate(*streams, time_offset="estimate", method=method)
         assert result.unobservable() == ["z"]
         assert result.T_parent_child[2, 3] == pytest.approx(0.0, abs=0.03)
-        np.testing.assert_allclose(
-            result.T_parent_child[:2, 3], (0.40, -0.02), atol=0.05
-        )
+        assert_allclose(result.T_parent_child[:2, 3], (0.40, -0.02), atol=0.05)
 
     @pytest.mark.parametrize(("bag", "scale"), [(1, 3.34), (3, 2.66)])
     def test_monocular_scale(self, bag, scale):
@@ -156,7 +150,7 @@ class TestBoreas:
     def test_two_streams_from_one_ins_are_not_independent(self):
         recording = real_data.boreas()
         findings = check_streams(recording.parent, recording.child).findings
-        assert [finding.code for finding in findings] == ["not_independent"]
+        assert codes_of(findings) == ["not_independent"]
 
 
 @pytest.mark.parametrize(
@@ -174,7 +168,7 @@ def test_lengths_in_millimetres_are_noticed_whatever_carries_the_sensors(recordi
     parent = Trajectory(parent.stamps_ns, np.linalg.inv(parent.poses[0]) @ parent.poses)
     assert check_lengths(parent, parent) == []
     in_mm = parent.scaled(1000.0)
-    assert [finding.code for finding in check_lengths(in_mm, in_mm)] == ["lengths"]
+    assert codes_of(check_lengths(in_mm, in_mm)) == ["lengths"]
 
 
 class TestArms:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from report_inputs import calibrated, reports_folder
 
 from hand_eye_calib.core.geometry import se3
@@ -51,7 +52,7 @@ def assert_is(document, truth):
     T = np.array(document["T_parent_child"]["matrix"])
     R = se3.rotation_from_rpy(np.radians([rpy_deg]))[0]
     assert document["verdict"] != "DO_NOT_USE"
-    np.testing.assert_allclose(T[:3, 3], translation, atol=0.02)
+    assert_allclose(T[:3, 3], translation, atol=0.02)
     assert np.degrees(se3.rotation_angle(R.T @ T[:3, :3])) < 0.2
 
 

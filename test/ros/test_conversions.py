@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from nav_msgs.msg import Odometry
+from numpy.testing import assert_allclose
 from rclpy.serialization import serialize_message
 from result_making import NAMES, dofs, good_calibration
 from sensor_msgs.msg import Imu, NavSatFix
@@ -84,7 +85,7 @@ def test_messages_carry_frames_stamp_and_transform():
     assert pose.header == transform.header
     total = calibration(np.eye(6), covariance_allowance=np.eye(6))
     total = conversions.to_pose_with_covariance(total).pose.covariance
-    np.testing.assert_allclose(np.reshape(total, (6, 6)), 2.0 * np.eye(6), atol=1e-12)
+    assert_allclose(np.reshape(total, (6, 6)), 2.0 * np.eye(6), atol=1e-12)
     for place, turn in (
         (transform.transform.translation, transform.transform.rotation),
         (pose.pose.pose.position, pose.pose.pose.orientation),
@@ -92,7 +93,7 @@ def test_messages_carry_frames_stamp_and_transform():
         read = se3.from_quat_xyzw(
             [place.x, place.y, place.z], [turn.x, turn.y, turn.z, turn.w]
         )
-        np.testing.assert_allclose(read, T_PARENT_CHILD, atol=1e-15)
+        assert_allclose(read, T_PARENT_CHILD, atol=1e-15)
 
 
 def test_markers_draw_sensors_uncertainty_and_what_is_installed():
@@ -107,15 +108,15 @@ def test_markers_draw_sensors_uncertainty_and_what_is_installed():
     assert {marker.header.frame_id for marker in markers} == {"lidar"}
     by_name = {marker.ns: marker for marker in markers}
     assert list(by_name) == ["parent", "child", "uncertainty", "text", "installed"]
-    np.testing.assert_allclose(pose_of(by_name["parent"]), np.eye(4), atol=1e-15)
-    np.testing.assert_allclose(pose_of(by_name["child"]), T_PARENT_CHILD, atol=1e-12)
+    assert_allclose(pose_of(by_name["parent"]), np.eye(4), atol=1e-15)
+    assert_allclose(pose_of(by_name["child"]), T_PARENT_CHILD, atol=1e-12)
     x_axis = pose_of(by_name["installed"])[:3, 0]
-    np.testing.assert_allclose(x_axis, [0.0, 1.0, 0.0], atol=1e-12)
+    assert_allclose(x_axis, [0.0, 1.0, 0.0], atol=1e-12)
     ellipsoid = by_name["uncertainty"]
     size = ellipsoid.scale
-    np.testing.assert_allclose([size.x, size.y, size.z], 6.0 * sigmas_m, rtol=1e-9)
+    assert_allclose([size.x, size.y, size.z], 6.0 * sigmas_m, rtol=1e-9)
     T_parent_ellipsoid = pose_of(ellipsoid)
-    np.testing.assert_allclose(np.abs(T_parent_ellipsoid[:3, :3]), np.eye(3), atol=1e-9)
+    assert_allclose(np.abs(T_parent_ellipsoid[:3, :3]), np.eye(3), atol=1e-9)
     assert "camera in lidar" in by_name["text"].text
 
 

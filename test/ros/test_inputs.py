@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Odometry
+from numpy.testing import assert_allclose
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_harness import (
     RELIABLE_INPUTS,
@@ -53,7 +54,7 @@ def test_unusable_messages_are_refused_by_topic_and_poison_nothing(start_node, p
         len(re.findall(r"message with stamp .* is left out: .*not finite", log)) == 1
     ), log
     assert "Traceback" not in log
-    np.testing.assert_allclose(matrix(extrinsic), T_PARENT_CHILD, atol=1e-3)
+    assert_allclose(matrix(extrinsic), T_PARENT_CHILD, atol=1e-3)
 
 
 def test_a_sensor_frame_without_a_name_is_named_by_default_or_by_parameter(

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TransformStamped
+from numpy.testing import assert_allclose, assert_array_equal
 from result_making import SHIFTED_FROM as X
 from result_making import shifted
 from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive, values_of
@@ -200,7 +201,7 @@ def test_the_base_frame_comes_from_tf(monkeypatch):
     assert "base_frame base_link is not known from /tf_static" in heard.lines[-1]
     heard.hear(edge("base_link", "mast", LIDAR), edge("mast", "lidar", np.eye(4)))
     mounting = heard.robot.complete(result())
-    np.testing.assert_allclose(mounting.T_base_child, LIDAR @ X, atol=1e-12)
+    assert_allclose(mounting.T_base_child, LIDAR @ X, atol=1e-12)
     broadcast = to_transform(mounting, is_mounting=True)
     assert (broadcast.header.frame_id, broadcast.child_frame_id) == (
         "base_link",
@@ -236,13 +237,13 @@ def test_the_one_axis_that_motion_does_not_show_is_that_of_what_is_installed(
     )
     heard = Heard(monkeypatch, installed="7 8 9 0 0 0")
     T = heard.robot.complete(hidden).T_parent_child
-    np.testing.assert_allclose(T[:2, 3], known_pose.T_parent_child[:2, 3], atol=1e-4)
+    assert_allclose(T[:2, 3], known_pose.T_parent_child[:2, 3], atol=1e-4)
     assert T[2, 3] == pytest.approx(9.0)
     assert (
         "z is that of the installed transform (7 8"
         in heard.robot.complete(hidden).warnings[-1]
     )
-    np.testing.assert_array_equal(
+    assert_array_equal(
         heard.robot.complete(known_pose).T_parent_child, known_pose.T_parent_child
     )
 

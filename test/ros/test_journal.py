@@ -4,9 +4,9 @@ import hashlib
 import resource
 import signal
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TransformStamped
+from numpy.testing import assert_allclose
 from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive, matrix
 
 from hand_eye_calib.formats.journal import count_poses, has_session, read_journal
@@ -43,7 +43,7 @@ def test_a_killed_session_goes_on_where_it_ended(start_node, peer, tmp_path):
     assert "60 poses" in answer.message
     assert "camera in lidar" in answer.message
     peer.spin_until(lambda: heard, "the resumed result")
-    np.testing.assert_allclose(matrix(heard[-1]), T_PARENT_CHILD, atol=1e-3)
+    assert_allclose(matrix(heard[-1]), T_PARENT_CHILD, atol=1e-3)
 
 
 def test_an_earlier_session_is_kept_aside_once_and_an_empty_one_is_not(
@@ -101,9 +101,7 @@ def test_a_signal_saves_the_newest_result_and_the_whole_journal(
     code, _ = node.stop(signal.SIGTERM)
     assert (code, "Traceback" in node.log) == (0, False), node.log
     assert f"result saved to {live}: " in node.log
-    np.testing.assert_allclose(
-        load_result(live).T_parent_child, T_PARENT_CHILD, atol=1e-3
-    )
+    assert_allclose(load_result(live).T_parent_child, T_PARENT_CHILD, atol=1e-3)
     assert count_poses(live / "journal") == 240
     for stream, n_bytes in read_journal(live / "journal").whole_bytes.items():
         assert n_bytes == (live / "journal" / f"{stream}.tum").stat().st_size

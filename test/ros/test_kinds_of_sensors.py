@@ -7,6 +7,7 @@ import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from motions import geodetic
 from nav_msgs.msg import Odometry
+from numpy.testing import assert_allclose
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_harness import (
     LATCHED,
@@ -64,9 +65,7 @@ def test_an_antenna_as_child_and_its_origin_after_a_restart(start_node, peer, tm
         lambda: "origin" in read_journal(journal).about["child"], "the origin"
     )
     origin = read_journal(journal).about["child"]["origin"]
-    np.testing.assert_allclose(
-        np.degrees(origin[:2]), [rows[0][2].latitude, rows[0][2].longitude]
-    )
+    assert_allclose(np.degrees(origin[:2]), [rows[0][2].latitude, rows[0][2].longitude])
     node.process.kill()
     node.wait()
     peer.wait_left(*publishers)

@@ -18,6 +18,7 @@ import yaml
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from lifecycle_msgs.srv import GetState
 from nav_msgs.msg import Odometry
+from numpy.testing import assert_allclose
 from source_code import ROOT
 
 import hand_eye_calib as hec
@@ -193,7 +194,7 @@ def others_are_solved_together(start_node, peer, tmp_path):
     node.wait_for_log("rig/report.html\n", may_have_ended=True)
     for name, T in (("camera", ros_harness.T_PARENT_CHILD), ("rear", T_PARENT_REAR)):
         loaded = hec.load(tmp_path / "out/rig" / name)
-        np.testing.assert_allclose(loaded.T_parent_child, T, atol=1e-3)
+        assert_allclose(loaded.T_parent_child, T, atol=1e-3)
     assert not (tmp_path / "out/report.html").exists()
 
 

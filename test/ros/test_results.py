@@ -5,6 +5,7 @@ import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from motions import disturbed
 from nav_msgs.msg import Odometry
+from numpy.testing import assert_allclose
 from published_data import kitti_short
 from ros_harness import (
     POSE_KINDS,
@@ -40,7 +41,7 @@ def test_extrinsic_of_a_noise_free_drive_comes_by_itself(start_node, peer):
     peer.spin_until(
         lambda: extrinsics and stamp_ns() == last_ns and poses, "a result of all"
     )
-    np.testing.assert_allclose(matrix(extrinsics[-1]), T_PARENT_CHILD, atol=1e-3)
+    assert_allclose(matrix(extrinsics[-1]), T_PARENT_CHILD, atol=1e-3)
     assert (extrinsics[-1].header.frame_id, extrinsics[-1].child_frame_id) == (
         "lidar",
         "camera",
@@ -53,7 +54,7 @@ def test_extrinsic_of_a_noise_free_drive_comes_by_itself(start_node, peer):
     assert poses[-1].header.frame_id == "lidar"
     covariance = np.reshape(poses[-1].pose.covariance, (6, 6))
     assert np.isfinite(covariance).all()
-    np.testing.assert_allclose(covariance, covariance.T, atol=1e-12)
+    assert_allclose(covariance, covariance.T, atol=1e-12)
     node.wait_for_log(
         "subscribed to /parent_odom (nav_msgs/msg/Odometry)",
         "subscribed to /child_odom (nav_msgs/msg/Odometry)",
@@ -92,7 +93,7 @@ def test_each_message_type_is_found_from_the_graph(start_node, peer, kind):
     start_node("-p solve_period:=1000.0", *FRAMES, *RELIABLE_INPUTS)
     publishers = peer.publishers(kind, child_kind=Odometry)
     _, extrinsic = peer.solve(publishers, *drive())
-    np.testing.assert_allclose(matrix(extrinsic), T_PARENT_CHILD, atol=1e-3)
+    assert_allclose(matrix(extrinsic), T_PARENT_CHILD, atol=1e-3)
     assert (extrinsic.header.frame_id, extrinsic.child_frame_id) == ("lidar", "camera")
     late = peer.listen(TransformStamped, "extrinsic")
     late_with_covariance = peer.listen(
@@ -179,9 +180,7 @@ def test_a_recording_through_the_node_equals_the_engine_fed_directly(start_node,
     arguments = [f"-p {name}:={value}" for name, value in options.items()]
     start_node("-p solve_period:=1000.0", *arguments, *RELIABLE_INPUTS)
     answer, extrinsic = peer.solve(peer.publishers(), stamps_ns, *Ts_w)
-    np.testing.assert_allclose(
-        matrix(extrinsic), offline.T_parent_child, rtol=0, atol=1e-9
-    )
+    assert_allclose(matrix(extrinsic), offline.T_parent_child, rtol=0, atol=1e-9)
     assert ns_of(extrinsic.header.stamp) == offline.stamp_ns
     counts = (
         f"{offline.n_poses} poses, {offline.n_pairs} pairs, {offline.n_inliers} inliers"
@@ -210,9 +209,7 @@ def test_motion_that_hides_a_direction_is_published_with_a_warning(start_node, p
         "by hand and give a prior, such as prior.z "
     )
     node.wait_for_log("[WARN]", reason)
-    np.testing.assert_allclose(
-        matrix(extrinsic)[:2, 3], T_PARENT_CHILD[:2, 3], atol=1e-3
-    )
+    assert_allclose(matrix(extrinsic)[:2, 3], T_PARENT_CHILD[:2, 3], atol=1e-3)
     peer.spin_until(lambda: poses, "the pose with covariance")
     covariance = np.reshape(poses[-1].pose.covariance, (6, 6))
     assert np.isfinite(covariance).all()

@@ -5,8 +5,8 @@ import signal
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive
 
 from hand_eye_calib.formats.results import load_result
@@ -68,9 +68,7 @@ def test_a_full_temporary_directory_costs_the_report_and_not_the_result(
     assert saved.message.endswith(
         "; report.html cannot be written: No space left on device"
     )
-    np.testing.assert_allclose(
-        load_result(tmp_path).T_parent_child, T_PARENT_CHILD, atol=1e-3
-    )
+    assert_allclose(load_result(tmp_path).T_parent_child, T_PARENT_CHILD, atol=1e-3)
     (tmp_path / "extrinsic.yaml").unlink()
     stopped(node, signal.SIGTERM)
     assert load_result(tmp_path).n_poses == 120
