@@ -21,21 +21,24 @@ METHODS = ("adaptive", "dnlo", "dnl", "park", "taylor", "zhuang", "ali")
 
 def steady(twist):
     """Poses of a sensor that repeats one motion."""
-    return walked(se3.exp(np.tile(twist, (N_POSES - 1, 1))))
+    steps = np.tile(twist, (N_POSES - 1, 1))
+    return walked(se3.exp(steps))
 
 
 def rocking():
     """Poses of an arm that turns one joint to and fro."""
-    angles = np.cumsum(np.random.default_rng(1).normal(0.0, 0.1, N_POSES))
+    random = np.random.default_rng(1)
+    tool = se3.exp(np.array([0.5, 0.2, 0.3, 0.3, 0.2, 0.1]))
     twists = np.zeros((N_POSES, 6))
-    twists[:, 5] = angles
-    return se3.exp(twists) @ se3.exp(np.array([0.5, 0.2, 0.3, 0.3, 0.2, 0.1]))
+    twists[:, 5] = np.cumsum(random.normal(0.0, 0.1, N_POSES))
+    return se3.exp(twists) @ tool
 
 
 def shifted_only():
     """Poses that never turn."""
     rotations = np.tile(np.eye(3), (N_POSES, 1, 1))
-    return se3.from_rotation_translation(rotations, wandering_poses(N_POSES)[:, :3, 3])
+    positions = wandering_poses(N_POSES)[:, :3, 3]
+    return se3.from_rotation_translation(rotations, positions)
 
 
 MOTIONS = {
@@ -110,7 +113,8 @@ def test_a_motion_without_noise(motion, kind):
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_a_motion_without_noise_by_every_method(motion, method):
     parent, child = both_poses(motion)
-    assert_clear_end("poses", STAMPS_NS, parent, child, method=method, checks=False)
+    options = {"method": method, "checks": False}
+    assert_clear_end("poses", STAMPS_NS, parent, child, **options)
 
 
 @pytest.mark.parametrize("unit", [1e3, 1e-3])
@@ -126,7 +130,11 @@ def test_another_unit_of_length(motion, kind, unit):
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_another_unit_of_length_by_some_methods(motion, method, unit):
     parent, child = both_poses(motion, unit, 1e-3)
-    options = {"method": method, "scale": "none", "checks": False}
+    options = {
+        "method": method,
+        "scale": "none",
+        "checks": False,
+    }
     assert_clear_end("poses", STAMPS_NS, parent, child, **options)
 
 
@@ -134,7 +142,8 @@ def test_another_unit_of_length_by_some_methods(motion, method, unit):
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_an_estimated_scale_or_offset(motion, option):
     parent, child = both_poses(motion)
-    assert_clear_end("poses", STAMPS_NS, parent, child, checks=False, **option)
+    options = {"checks": False, **option}
+    assert_clear_end("poses", STAMPS_NS, parent, child, **options)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -148,7 +157,8 @@ def test_identical_streams(motion, kind):
 @pytest.mark.parametrize("n_poses", [0, 1, 2, 3])
 def test_few_poses(n_poses, kind):
     parent, child = both_poses("any")
-    assert_clear_end(kind, STAMPS_NS[:n_poses], parent[:n_poses], child[:n_poses])
+    few = slice(n_poses)
+    assert_clear_end(kind, STAMPS_NS[few], parent[few], child[few])
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -171,7 +181,8 @@ def test_equal_stamps(rows, kind):
 @pytest.mark.parametrize("kind", KINDS[:-1])
 def test_stamps_in_reverse_order(kind):
     parent, child = both_poses("any")
-    assert_clear_end(kind, STAMPS_NS[::-1].copy(), parent, child)
+    reverse_ns = STAMPS_NS[::-1].copy()
+    assert_clear_end(kind, reverse_ns, parent, child)
 
 
 @pytest.fixture
@@ -194,10 +205,12 @@ def test_dnlo_stands_in_if_no_noise_model_fits(singular):
 @pytest.mark.parametrize("options", [{"method": "adaptive"}, {"method": "dnlo"}])
 def test_a_method_that_needs_the_noise_model_says_that_none_fits(singular, options):
     parent, child = both_poses("any", sigma=1e-3)
+    options = {"checks": False, **options}
     with pytest.raises(hec.HandEyeCalibError, match="no noise model fits"):
-        calibrated("poses", STAMPS_NS, parent, child, checks=False, **options)
+        calibrated("poses", STAMPS_NS, parent, child, **options)
 
 
 def test_a_shift_by_evidence_of_one_direction_is_finite():
     tables = 1e30 * np.ones((1, 6, 7))
-    assert np.isfinite(most_likely(tables, 1e-3)).all()
+    shift = most_likely(tables, 1e-3)
+    assert np.isfinite(shift).all()

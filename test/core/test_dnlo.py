@@ -20,10 +20,10 @@ def brute_force_objective(costs, threshold, floor):
     """Return the minimum of eq. (5) over the weights, by linear programming."""
     from scipy.optimize import linprog
 
-    answer = linprog(
-        costs - threshold, A_ub=-np.ones((1, len(costs))), b_ub=[-floor], bounds=(0, 1)
-    )
-    return answer.fun + threshold * len(costs)
+    n_pairs = len(costs)
+    fewest = -np.ones((1, n_pairs))
+    answer = linprog(costs - threshold, A_ub=fewest, b_ub=[-floor], bounds=(0, 1))
+    return answer.fun + threshold * n_pairs
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.31, 0.5, 0.77, 1.0])
@@ -42,10 +42,12 @@ def test_truncation_is_the_optimum_over_the_weights(fraction):
 @pytest.fixture
 def jumpy_pairs():
     """Return motion pairs in which 30 % of the child's poses are outliers."""
+    choice = np.random.default_rng(5)
+    random = np.random.default_rng(6)
     parent = wandering_poses(80)
     child = disturbed(child_of(parent), 1, 0.002, 0.002)
-    thrown = np.random.default_rng(5).choice(80, 24, replace=False)
-    child[thrown, :3, 3] += np.random.default_rng(6).normal(0, 3.0, (24, 3))
+    outliers = choice.choice(80, 24, replace=False)
+    child[outliers, :3, 3] += random.normal(0, 3.0, (24, 3))
     return motion_pairs(parent, child, "B1")
 
 
@@ -66,27 +68,38 @@ def test_many_pairs_are_sampled_for_the_search_only():
     parent = wandering_poses(1500)
     child = disturbed(child_of(parent), 1, 0.001, 0.001)
     child[700:, :3, 3] += 5.0
-    solution = Method("dnlo").solve(motion_pairs(parent, child, "B2"))
+    pairs = motion_pairs(parent, child, "B2")
+
+    solution = Method("dnlo").solve(pairs)
+
     assert_allclose(solution.T_parent_child, T_PARENT_CHILD, atol=2e-3)
 
 
 def test_leaving_pairs_out_agrees_with_solving_without_them(jumpy_pairs):
     method = Method("dnlo", min_inlier_fraction=0.3)
     solution = method.solve(jumpy_pairs)
-    left_out = np.arange(len(jumpy_pairs))[None] // 20 == np.arange(4)[:, None]
+    groups = np.arange(len(jumpy_pairs)) // 20
+    for_each_group = np.arange(4)[:, None]
+    left_out = groups[None] == for_each_group
+
     answers = method.solve_without(jumpy_pairs, solution, left_out)
-    for row, answer in zip(left_out, answers, strict=True):
-        assert answer == pytest.approx(
-            method.solve(jumpy_pairs[~row]).T_parent_child, abs=1e-5
-        )
+
+    for is_left_out, answer in zip(left_out, answers, strict=True):
+        solved_anew = method.solve(jumpy_pairs[~is_left_out])
+        assert answer == pytest.approx(solved_anew.T_parent_child, abs=1e-5)
 
 
 @pytest.mark.parametrize("method", ["dnl", "dnlo"])
 def test_ipopt_and_the_fast_backend_agree(method, jumpy_pairs):
-    fast = Method(method, min_inlier_fraction=0.3).solve(jumpy_pairs)
-    ipopt = Method(method, min_inlier_fraction=0.3, backend="ipopt").solve(jumpy_pairs)
+    fast_method = Method(method, min_inlier_fraction=0.3)
+    ipopt_method = Method(method, min_inlier_fraction=0.3, backend="ipopt")
+
+    fast = fast_method.solve(jumpy_pairs)
+    ipopt = ipopt_method.solve(jumpy_pairs)
+
     assert fast.objective <= ipopt.objective * (1 + 1e-9)
-    if abs(fast.objective - ipopt.objective) < 1e-6 * ipopt.objective:
+    difference = abs(fast.objective - ipopt.objective)
+    if difference < 1e-6 * ipopt.objective:
         assert_allclose(fast.T_parent_child, ipopt.T_parent_child, atol=1e-5)
 
 
@@ -107,27 +120,42 @@ def test_condensed_costs_are_the_matrix_costs(pairs):
         )
 
 
+def quadratic_form_of(pairs):
+    """Return the matrix Q of the cost of all pairs."""
+    condensed = quadratic_form.condense(pairs)
+    return quadratic_form.expand(condensed.sum(axis=0))
+
+
 def test_the_minimum_is_where_no_small_step_goes_down(pairs):
-    Q = quadratic_form.expand(quadratic_form.condense(pairs).sum(axis=0))
-    Ts, values, converged = quadratic_form.minimise(Q, all_pairs.start_rotations(pairs))
-    T = Ts[np.argmin(values)]
-
     def total(xi):
-        return all_pairs.pair_costs(pairs, T @ se3.exp(xi)).sum()
+        costs = all_pairs.pair_costs(pairs, T @ se3.exp(xi))
+        return costs.sum()
 
-    step = 1e-4
-    for direction in np.vstack([np.eye(6), -np.eye(6)]):
-        assert total(step * direction) > total(np.zeros(6))
+    Q = quadratic_form_of(pairs)
+    starts = all_pairs.start_rotations(pairs)
+
+    Ts, values, converged = quadratic_form.minimise(Q, starts)
+
+    T = Ts[np.argmin(values)]
+    lowest = total(np.zeros(6))
+    steps = 1e-4 * np.eye(6)
+    for step in steps:
+        assert total(step) > lowest
+        assert total(-step) > lowest
     assert converged.all()
-    assert_allclose(values.min(), total(np.zeros(6)), rtol=1e-9)
+    assert_allclose(values.min(), lowest, rtol=1e-9)
 
 
 def test_gauss_newton_steps_reach_the_minimum(pairs):
-    Q = quadratic_form.expand(quadratic_form.condense(pairs).sum(axis=0))
-    T = quadratic_form.minimise(Q, all_pairs.start_rotations(pairs)[:1])[0]
-    stepped = T @ se3.exp(np.array([0.05, -0.02, 0.01, 0.05, 0.02, -0.03]))
+    Q = quadratic_form_of(pairs)
+    starts = all_pairs.start_rotations(pairs)
+    T, *_ = quadratic_form.minimise(Q, starts[:1])
+    away = se3.exp(np.array([0.05, -0.02, 0.01, 0.05, 0.02, -0.03]))
+    stepped = T @ away
+
     for _ in range(12):
         stepped = quadratic_form.gauss_newton_step(Q[None], stepped)
+
     assert_allclose(stepped, T, atol=1e-8)
 
 
@@ -154,9 +182,11 @@ def form_of(pairs, solution):
 
 def false_minimum(Q, T_parent_child):
     """Return the highest local minimum near rotations by pi, and its cost over the global one."""
-    Ts, values, _ = quadratic_form.minimise(Q, T_parent_child[:3, :3] @ HALF_TURNS)
+    starts = T_parent_child[:3, :3] @ HALF_TURNS
+    Ts, values, _ = quadratic_form.minimise(Q, starts)
     T = Ts[np.argmax(values)]
-    return T, float(quadratic_form.decrease(Q, T, T_parent_child))
+    cost_above = quadratic_form.decrease(Q, T, T_parent_child)
+    return T, float(cost_above)
 
 
 @settings(max_examples=25)
@@ -166,9 +196,11 @@ def test_the_minimum_is_proved_and_a_false_one_is_not(method, seed, sigma):
     pairs = noisy_pairs(seed, sigma)
     solution = Method(method).solve(pairs)
     Q = form_of(pairs, solution)
+    T_false, cost_above = false_minimum(Q, solution.T_parent_child)
+
     assert is_global(Q, solution.T_parent_child)
-    T_false, above = false_minimum(Q, solution.T_parent_child)
-    if above > 1e-3 * np.trace(Q):
+    least_cost = 1e-3 * np.trace(Q)
+    if cost_above > least_cost:
         assert not is_global(Q, T_false)
 
 

@@ -55,9 +55,11 @@ def bag_of(path, parent, child, storage="mcap"):
 
 
 def calibrated(capsys, *arguments):
-    main(["calibrate", *map(str, arguments), *FAST])
+    words = [str(argument) for argument in arguments]
+    main(["calibrate", *words, *FAST])
     out, err = capsys.readouterr()
-    return (json.loads(out) if out else None), err
+    document = json.loads(out) if out else None
+    return document, err
 
 
 def frames_of(document):
@@ -83,12 +85,15 @@ def frames_of(document):
     ],
 )
 def test_inverse_poses_are_those_of_the_frame_that_is_no_world(world, sensor, expected):
-    assert StreamFrames(sensor, world).inverse_name == expected
+    frames = StreamFrames(sensor, world)
+    assert frames.inverse_name == expected
 
 
 def test_a_name_that_the_user_gives_stays_unless_the_messages_have_it_too():
-    assert StreamFrames("vo", "camera", "front").inverse_name == "front"
-    assert StreamFrames("marker", "camera", "marker").inverse_name == "camera"
+    named = StreamFrames("vo", "camera", "front")
+    already_named = StreamFrames("marker", "camera", "marker")
+    assert named.inverse_name == "front"
+    assert already_named.inverse_name == "camera"
 
 
 OBSERVED = {
@@ -156,40 +161,49 @@ def test_the_repair_that_inverts_a_stream_names_the_result_and_its_files_by_the_
 
 def test_a_camera_beside_an_arm_that_sees_a_marker_on_the_hand_is_named_by_both_readings():
     """Both streams as they are: the marker in the hand. Both inverse: the camera in the base."""
-    base = Trajectory(STAMPS_NS, POSES, "tool0", "base_link")
-    seen = Trajectory(STAMPS_NS, CHILD, "aruco_marker", "camera")
+    arm = Trajectory(STAMPS_NS, POSES, "tool0", "base_link")
+    marker = Trajectory(STAMPS_NS, CHILD, "aruco_marker", "camera")
     options = {"reference": "B5", "checks": False}
-    as_it_is = hec.calibrate(base, seen, **options)
-    inverse = hec.calibrate(
-        base, seen, parent_invert="poses", child_invert="poses", **options
-    )
-    assert (as_it_is.parent_frame, as_it_is.child_frame) == ("tool0", "aruco_marker")
-    assert (inverse.parent_frame, inverse.child_frame) == ("base_link", "camera")
-    assert_allclose(as_it_is.T_parent_child, T_PARENT_CHILD, atol=1e-6)
+    inverse_options = {"parent_invert": "poses", "child_invert": "poses", **options}
     T_base_camera = POSES[0] @ T_PARENT_CHILD @ se3.inverse(CHILD[0])
+
+    as_it_is = hec.calibrate(arm, marker, **options)
+    inverse = hec.calibrate(arm, marker, **inverse_options)
+
+    assert as_it_is.parent_frame == "tool0"
+    assert as_it_is.child_frame == "aruco_marker"
+    assert inverse.parent_frame == "base_link"
+    assert inverse.child_frame == "camera"
+    assert_allclose(as_it_is.T_parent_child, T_PARENT_CHILD, atol=1e-6)
     assert_allclose(inverse.T_parent_child, T_base_camera, atol=1e-6)
+
+
+def feed_messages(engines, stream, message_type, frames, poses):
+    """Feed the poses of a stream as the messages of a live session."""
+    reader = MessageReader(message_type, "poses")
+    for stamp_ns, pose in zip(STAMPS_NS, poses, strict=True):
+        row = se3.to_rows(pose)
+        make = pose_message(message_type, stamp_ns, row, *frames)
+        data = bytes(JAZZY.serialize_cdr(make(JAZZY), message_type))
+        fields = reader(data)
+        if fields.sensor_frame is not None:
+            engines.set_frame(stream, fields.sensor_frame)
+        engines.set_world(stream, fields.world_frame)
+        engines.add_pose(stream, stamp_ns, fields.position, fields.quat_xyzw)
 
 
 @pytest.mark.parametrize("kind", [ODOMETRY, POSE_STAMPED])
 def test_a_live_session_and_its_journal_name_the_camera_too(tmp_path, kind):
     config = CalibratorConfig(child_invert="poses", reference="B5")
     engines = Calibrators(child=Calibrator(config))
-    fed = {"parent": (ODOMETRY, "/base_link", "/tool0", POSES)}
-    fed["child"] = (kind, "/camera", "/aruco_marker", INVERSE)
-    for stream, (message_type, world, sensor, poses) in fed.items():
-        reader = MessageReader(message_type, "poses")
-        for stamp_ns, pose in zip(STAMPS_NS, poses, strict=True):
-            make = pose_message(
-                message_type, stamp_ns, se3.to_rows(pose), world, sensor
-            )
-            data = bytes(JAZZY.serialize_cdr(make(JAZZY), message_type))
-            fields = reader(data)
-            if fields.sensor_frame is not None:
-                engines.set_frame(stream, fields.sensor_frame)
-            engines.set_world(stream, fields.world_frame)
-            engines.add_pose(stream, stamp_ns, fields.position, fields.quat_xyzw)
-    result = engines["child"].snapshot().estimate(cross_check=False)
-    assert (result.parent_frame, result.child_frame) == ("tool0", "camera")
+    feed_messages(engines, "parent", ODOMETRY, ("/base_link", "/tool0"), POSES)
+    feed_messages(engines, "child", kind, ("/camera", "/aruco_marker"), INVERSE)
+
+    snapshot = engines["child"].snapshot()
+    result = snapshot.estimate(cross_check=False)
+
+    assert result.parent_frame == "tool0"
+    assert result.child_frame == "camera"
     assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=1e-6)
 
 
@@ -244,16 +258,28 @@ def test_a_name_of_the_other_stream_is_refused_everywhere():
 def test_other_names_are_taken_as_they_are(names, expected):
     lidar = Trajectory(STAMPS_NS, POSES, "lidar")
     camera = Trajectory(STAMPS_NS, CHILD, "camera")
-    result = hec.calibrate(lidar, camera, reference="B5", checks=False, **names)
-    assert (result.parent_frame, result.child_frame) == expected
+    options = {"reference": "B5", "checks": False, **names}
+
+    result = hec.calibrate(lidar, camera, **options)
+
+    frames = (result.parent_frame, result.child_frame)
+    assert frames == expected
 
 
 def test_two_streams_of_one_frame_are_told_apart_by_names():
     first = Trajectory(STAMPS_NS, POSES, "base_link")
     second = Trajectory(STAMPS_NS, CHILD, "base_link")
-    names = {"parent_frame": "base_link", "child_frame": "camera"}
-    result = hec.calibrate(first, second, reference="B5", checks=False, **names)
-    assert (result.parent_frame, result.child_frame) == ("base_link", "camera")
+    options = {
+        "reference": "B5",
+        "checks": False,
+        "parent_frame": "base_link",
+        "child_frame": "camera",
+    }
+
+    result = hec.calibrate(first, second, **options)
+
+    assert result.parent_frame == "base_link"
+    assert result.child_frame == "camera"
 
 
 # ---- which topic is which stream
@@ -288,12 +314,17 @@ def test_two_streams_of_one_frame_are_told_apart_by_names():
 def test_two_topics_without_frames_are_chosen_by_the_names_of_the_frames(
     tmp_path, topics, frames, expected
 ):
-    first = (topics[0], POSE_STAMPED, "map", "", POSES)
-    second = (topics[1], POSE_STAMPED, "odom", "", CHILD)
+    first_topic, second_topic = topics
+    parent_frame, child_frame = frames
+    first = (first_topic, POSE_STAMPED, "map", "", POSES)
+    second = (second_topic, POSE_STAMPED, "odom", "", CHILD)
     path = bag_of(tmp_path / "bag", first, second)
-    named = dict(zip(("parent", "child"), frames, strict=True))
+    named = {"parent": parent_frame, "child": child_frame}
+
     with PoseBag(path) as bag:
-        assert bag.select(frames=named) == expected
+        selected = bag.select(frames=named)
+
+    assert selected == expected
 
 
 def test_a_topic_whose_messages_name_another_frame_is_not_taken(tmp_path):
@@ -314,10 +345,14 @@ def test_topics_are_not_guessed_against_nothing(tmp_path, capsys):
     second = ("/two", POSE_STAMPED, "odom", "", CHILD)
     path = bag_of(tmp_path / "bag", first, second)
     names = ["--parent-frame", "camera", "--child-frame", "lidar"]
-    assert main(["calibrate", str(path), *names]) == 1
-    error = "the names do not decide which of the topics /one and /two is of camera and lidar: set"
-    assert error in capsys.readouterr().err
     topics = ["--parent-topic", "/two", "--child-topic", "/one"]
+
+    code = main(["calibrate", str(path), *names])
+
+    error = "the names do not decide which of the topics /one and /two is of camera and lidar: set"
+    _, printed = capsys.readouterr()
+    assert code == 1
+    assert error in printed
     document, _ = calibrated(capsys, path, *topics, *names)
     assert frames_of(document) == ("camera", "lidar")
 

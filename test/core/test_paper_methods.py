@@ -28,14 +28,17 @@ def pairs_of(Ts_parenti_parentj, Ts_childi_childj):
 
 def random_pairs(noise=0.0, n_poses=25):
     """Motions of about 1 m and 0.5 rad, with noise (m and rad) on both sensors' poses."""
-    true_poses = wandering_poses(n_poses, step_m=0.6, step_rad=0.4)
-    parent = disturbed(true_poses, 1, noise, noise)
-    child = disturbed(child_of(true_poses, TRUTH, np.eye(4)), 2, noise, noise)
+    true_parent = wandering_poses(n_poses, step_m=0.6, step_rad=0.4)
+    true_child = child_of(true_parent, TRUTH, np.eye(4))
+    parent = disturbed(true_parent, 1, noise, noise)
+    child = disturbed(true_child, 2, noise, noise)
     return motion_pairs(parent, child, "B1")
 
 
 def split(T):
-    return T[:3, :3], T[:3, 3]
+    rotation = T[:3, :3]
+    translation = T[:3, 3]
+    return rotation, translation
 
 
 def squared_translation_residual(pairs, rotation, translation):
@@ -43,7 +46,8 @@ def squared_translation_residual(pairs, rotation, translation):
     for A, B in zip(pairs.Ts_parenti_parentj, pairs.Ts_childi_childj, strict=True):
         R_A, t_A = split(A)
         _, t_B = split(B)
-        total += np.sum((R_A @ translation + t_A - rotation @ t_B - translation) ** 2)
+        residual = R_A @ translation + t_A - rotation @ t_B - translation
+        total += np.sum(residual**2)
     return total
 
 
@@ -55,15 +59,15 @@ def noisy():
 def test_relative_errors_of_a_pair_worked_out_by_hand():
     # The parent turns a quarter about z and moves by (1, 0, 0); X only shifts by (2, 0, 0): R_A t +
     # t_A - R t_B - t = (-1, 2, 0) - t_B.
-    # The parent turns a quarter about z and moves by (1, 0, 0); X only shifts by (2, 0, 0): R_A t +
-    # t_A - R t_B - t = (-1, 2, 0) - t_B.
-    quarter = se3.rotation_exp(np.array([0, 0, np.pi / 2]))
-    less = se3.rotation_exp(np.array([0, 0, np.pi / 2 - 0.25]))
-    A = se3.from_rotation_translation(quarter, [1.0, 0.0, 0.0])
-    B = se3.from_rotation_translation(less, [-1.0, 2.0, 3.0])
+    quarter_rad = np.pi / 2
+    parent_rotation = se3.rotation_exp(np.array([0, 0, quarter_rad]))
+    child_rotation = se3.rotation_exp(np.array([0, 0, quarter_rad - 0.25]))
+    A = se3.from_rotation_translation(parent_rotation, [1.0, 0.0, 0.0])
+    B = se3.from_rotation_translation(child_rotation, [-1.0, 2.0, 3.0])
     X = se3.from_rotation_translation(np.eye(3), [2.0, 0.0, 0.0])
+    pairs = pairs_of([A], [B])
 
-    e_rt, e_rR = relative_errors(pairs_of([A], [B]), X)
+    e_rt, e_rR = relative_errors(pairs, X)
 
     assert e_rt == pytest.approx(3.0, abs=1e-14)
     assert e_rR == pytest.approx(0.25, abs=1e-14)
@@ -71,11 +75,13 @@ def test_relative_errors_of_a_pair_worked_out_by_hand():
 
 @pytest.mark.parametrize("angle", [1e-12, 1e-7, 1e-3, 1.0, np.pi - 1e-7, np.pi])
 def test_absolute_errors_keep_their_digits_at_any_angle(angle):
-    turned = TRUTH @ se3.exp(
-        np.array([0.0, 0.0, 0.0, *(angle * np.array([0.6, 0.0, 0.8]))])
-    )
+    axis = np.array([0.6, 0.0, 0.8])
+    twist = np.concatenate([np.zeros(3), angle * axis])
+    turned = TRUTH @ se3.exp(twist)
     turned[:3, 3] += [3e-9, 0.0, -4e-9]
+
     e_at, e_aR = absolute_errors(turned, TRUTH)
+
     assert e_at == pytest.approx(5e-9, rel=1e-6)
     assert e_aR == pytest.approx(angle, abs=1e-15, rel=1e-9)
 
@@ -113,8 +119,10 @@ def test_rotation_is_never_a_reflection():
 
 def unit_axes(Ts):
     """Unit rotation axes (K, 3) of motions (K, 4, 4)."""
-    rotvecs = se3.rotation_log(Ts[:, :3, :3])
-    return rotvecs / np.linalg.norm(rotvecs, axis=1, keepdims=True)
+    rotations = Ts[:, :3, :3]
+    rotvecs = se3.rotation_log(rotations)
+    angles = np.linalg.norm(rotvecs, axis=1, keepdims=True)
+    return rotvecs / angles
 
 
 def test_zhuang_ends_where_the_written_out_cost_is_lowest(noisy):
@@ -123,15 +131,18 @@ def test_zhuang_ends_where_the_written_out_cost_is_lowest(noisy):
     child = noisy.Ts_childi_childj
     parent_axes = unit_axes(parent)
     child_axes = unit_axes(child)
+    parent_translations = parent[:, :3, 3]
+    child_translations = child[:, :3, 3]
     turns = parent[:, :3, :3] - np.eye(3)
 
     def cost(parameters):
-        z, t = np.split(parameters, 2)
+        z = parameters[:3]
+        t = parameters[3:]
         minus = np.eye(3) - se3.skew(z)
         plus = np.eye(3) + se3.skew(z)
         f = parent_axes @ minus.T - child_axes @ plus.T
-        ahead = turns @ t + parent[:, :3, 3]
-        g = ahead @ minus.T - child[:, :3, 3] @ plus.T
+        ahead = turns @ t + parent_translations
+        g = ahead @ minus.T - child_translations @ plus.T
         return np.sum(f**2) + np.sum(g**2)
 
     rotation, translation = split(zhuang.solve(noisy).T_parent_child)
@@ -169,11 +180,14 @@ def test_ali_minimises_the_translation_residual_over_rotations(noisy):
 def test_ali_is_blind_to_the_rotation_of_the_child(noisy):
     turned = noisy.Ts_childi_childj.copy()
     turned[:, :3, :3] = np.eye(3)
-    same = all_pairs.solve_ali(pairs_of(noisy.Ts_parenti_parentj, turned))
-    assert same.objective == pytest.approx(
-        all_pairs.solve_ali(noisy).objective, rel=1e-9
-    )
-    assert all_pairs.solve_park(noisy).objective > same.objective
+    without_rotation = pairs_of(noisy.Ts_parenti_parentj, turned)
+
+    ali = all_pairs.solve_ali(noisy)
+    same = all_pairs.solve_ali(without_rotation)
+    park = all_pairs.solve_park(noisy)
+
+    assert same.objective == pytest.approx(ali.objective, rel=1e-9)
+    assert park.objective > same.objective
 
 
 def test_ali_as_published_fits_a_matrix_that_is_no_rotation(noisy):

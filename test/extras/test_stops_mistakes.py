@@ -201,12 +201,12 @@ class TestFarMarkerWithStrongNoise:
     def test_flipped_axes_are_refused_though_rough_fits_hardly_differ(self, seed):
         robot, tracking = far_marker(seed)
         result = calibrate_arm(robot, flipped(tracking))
-        assert [finding.code for finding in result.findings] == ["axes"]
+        assert codes_of(result.findings) == ["axes"]
 
     def test_clean_stops_have_no_finding(self, seed):
         robot, tracking = far_marker(seed)
         result = calibrate_arm(robot, tracking)
-        assert [finding.code for finding in result.findings] == []
+        assert codes_of(result.findings) == []
 
 
 @pytest.mark.parametrize("place", [ON_HAND, BESIDE])
