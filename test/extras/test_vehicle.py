@@ -7,6 +7,7 @@ import pytest
 from vehicle_making import machine, pose_errors
 
 import hand_eye_calib as hec
+from hand_eye_calib.core.base.blocks import Blocks
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError, InputError, NotEnoughDataError
 from hand_eye_calib.core.geometry import se3
@@ -335,6 +336,40 @@ def test_ramps_in_the_rhythm_of_the_curves_widen_roll(period, is_counted):
     sigma = np.sqrt(solving._variance_of_ramps(drive, fit))
     # Without a phase in common, the regression of equal rhythms is 1/30 over the root of 2.
     assert sigma == pytest.approx(is_counted * 0.0236, abs=0.006)
+
+
+@pytest.mark.parametrize("course", ["one turn", "curves"])
+def test_the_jackknife_has_the_spread_of_noise_of_shared_poses(course):
+    windows = np.arange(360)
+    turns = np.sin(2 * np.pi * windows / 28.0)
+    column = turns if course == "curves" else np.ones(360)
+    # A body that leans outwards makes errors that change sign with the curve.
+    leaning = 0.5 * turns**3 * np.sign(turns)
+    estimates = []
+    variances = []
+    for seed in range(40):
+        noise = np.diff(np.random.default_rng(seed).standard_normal(361))
+        values = noise + leaning * (course == "curves")
+        rows = np.stack([column, values], axis=-1)[:, None]
+        table = Blocks.of_rows(rows, 360)
+        estimates.append(table.solve([0])[0])
+        variances.append(solving._tapered_jackknife(table, np.zeros((2, 2)))[0, 0])
+    sigma = np.sqrt(np.mean(variances))
+    assert 0.9 < sigma / np.std(estimates) < 2.0
+
+
+def test_an_unknown_y_is_no_lateral_acceleration():
+    turns = 0.3 * np.sin(2 * np.pi * np.arange(360) / 28.0)
+    motions = np.zeros((360, 6))
+    motions[:, 0] = 0.4 - 0.5 * turns
+    motions[:, 5] = turns
+    drive = SimpleNamespace(
+        measured=lambda _: motions, ends_s=np.array([[0.0], [1.0]]), model=None
+    )
+    assert solving._lateral_acceleration(drive, np.eye(4)) == pytest.approx(0, abs=1e-3)
+    motions[:, 5] += 0.3
+    motions[:, 0] = 0.4
+    assert solving._lateral_acceleration(drive, np.eye(4)) > 0.1
 
 
 def test_mecanum_wheels_turn_as_the_machine_moves():
