@@ -17,7 +17,7 @@ the tail of this distribution, where the wheels slip, have weight 0. The covaria
 - the uncertainty of the priors;
 - the square of half of the difference to the estimate over windows twice as long;
 - the square of a share of the difference to the estimate without weights, for slip that is not
-  detected: 3/20, and for the size of a wheel the share that follows from its signal and noise;
+  detected: 3/20, and for wheels and clock the share that follows from signal and noise;
 - the square of the bias of x and y that noise of the turns may cause;
 - the square of the bias of roll and y of a body that leans outwards, if most curves have the same
   direction;
@@ -91,8 +91,8 @@ _SHARE_OF_LONGER = 0.5
 _SHARE_OF_UNWEIGHTED = 0.15
 
 # Sizes of slips, as shares of the speed of a wheel: tyres and rollers slip by 5 to 20 % in curves,
-# and a slip covers only a part of a window.
-_SLIPS = np.array([0.02, 0.05, 0.1])
+# and a slip covers three quarters of a window on average.
+_SLIPS = np.array([0.03, 0.075, 0.15])
 # Largest share of slip that is not detected. Near a share of 1, the bias that slip causes in the
 # parameters of the wheels has no limit.
 _MAX_UNDETECTED = 0.75
@@ -360,6 +360,10 @@ def _shares_of_unweighted(drive: Drive, fit: Fit) -> FloatArray:
         )
         undetected = min(float(undetected), _MAX_UNDETECTED)
         shares[index] = undetected / (1.0 - undetected)
+    # The same slips bias the clock offset and the other parameters of the wheels.
+    others = [CLOCK, *range(N_FIXED + drive.model.n_wheels, len(shares))]
+    of_wheels = shares[N_FIXED : N_FIXED + drive.model.n_wheels]
+    shares[others] = min(_SHARE_OF_UNWEIGHTED, float(of_wheels.min()))
     return shares
 
 
