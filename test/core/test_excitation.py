@@ -117,7 +117,7 @@ def test_a_vehicle_is_told_to_drive_over_a_ramp():
     seen = seen_in(planar_poses(300))
     assert seen.drives
     advice = (
-        "z cannot be determined from the motion so far: tilt the sensors over a ramp or a kerb, or "
+        "z cannot be determined from the motion so far: drive over a ramp or a kerb, or "
         "measure it by hand"
     )
     assert excitation.what_is_missing(seen) == advice

@@ -105,7 +105,7 @@ def test_a_target_below_the_allowance_is_no_fault_of_the_motion():
     progress = Goal(TARGETS).add(result(covariance_allowance=allowance), seen(40.0))
     assert progress.target_is_too_small
     assert progress.sentence == (
-        "No motion makes x good to 2 cm: the allowance for constant errors is 3 cm. "
+        "No motion makes x good to 2 cm. Constant errors alone may be 3 cm. "
         "Stop and save, or set a larger target."
     )
 
@@ -180,7 +180,7 @@ def test_a_motion_that_does_not_observe_an_axis_has_no_time_left():
     hidden = result(sigmas_m=(0.004, 0.004, 0.05))
     flat = Goal(TARGETS).add(hidden, seen(60.0, FLAT))
     assert flat.seconds_left == flat.axes["z"].seconds_left == np.inf
-    assert flat.sentence.startswith("z is not determined well enough yet. Tilt ")
+    assert flat.sentence.startswith("z is not determined well enough yet. Drive ")
     assert not flat.will_not_get_there
     ramps = seen(60.0, (0.5, 9.0, 90.0))
     on_ramps = Goal(TARGETS).add(hidden, seen(60.0, FLAT), newest_motion=ramps)
@@ -289,7 +289,7 @@ def test_a_saved_result_tells_how_far_the_session_was(tmp_path):
     assert f"the session: {progress.sentence}" in text
 
 
-ON_A_FLAT_FLOOR = "Tilt the sensors over a ramp or a kerb, or measure it by hand"
+ON_A_FLAT_FLOOR = "Drive over a ramp or a kerb, or measure it by hand"
 
 
 def test_an_axis_that_stays_unobservable():

@@ -152,9 +152,9 @@ def test_the_script_finds_what_it_looks_for():
         re.findall(r'document\.querySelector(?:All)?\("(\w+)"\)', SCRIPT)
     ) <= set(page.tags)
     assert page.data["data-file"] == list(web.SAVED)
-    assert sorted(page.data["data-request"]) == sorted(view.KEYS)
+    assert sorted(set(page.data["data-request"])) == sorted(view.KEYS)
     assert set(re.findall(r"button\.dataset\.(\w+)", SCRIPT)) == {"request", "sure"}
-    assert len(page.data["data-sure"]) == 3
+    assert len(page.data["data-sure"]) == 4
 
 
 def test_the_word_is_large_on_a_phone_and_larger_on_a_wide_screen(page):
@@ -281,11 +281,23 @@ def test_the_recommended_button_stands_out_and_the_others_are_hidden(page):
 
     assert page.visible_buttons() == ["reset", "save", "solve"]
     assert main_buttons() == []
-    page.show(replace(GO_ON, word="SAVE", buttons=("save", "solve")))
+    page.show(replace(GO_ON, word="SAVE", buttons=("save", "solve"), asked="save"))
     assert page.visible_buttons() == ["save", "solve"]
     assert main_buttons() == ["save"]
     page.show(MOVED)
     assert page.visible_buttons() == []
+
+
+def test_a_reset_that_is_asked_for_is_in_the_fixed_bar(page):
+    footer = "footer button[data-request=reset]"
+    assert page.get(footer, "hidden")
+    page.show(replace(GO_ON, word="RESET", asked="reset"))
+    assert not page.get(footer, "hidden")
+    assert page.get(".apart button[data-request=reset]", "hidden")
+    position = "getComputedStyle(document.querySelector('footer')).position"
+    assert page.browser.evaluate(position) == "fixed"
+    page.browser.click(footer, [True])
+    assert page.request() == "reset"
 
 
 def test_saved_files_are_linked(page, tmp_path):
@@ -311,7 +323,7 @@ def test_evidence_of_the_result_is_readable_at_the_end(page):
 
 
 WITH_PRIOR = replace(
-    GO_ON, word="CHECK THE PRIOR", by_hand=("z", "yaw"), priors=(("z", "1.5m+/-0.02m"),)
+    GO_ON, word="CHECK THE VALUE", by_hand=("z", "yaw"), priors=(("z", "1.5m+/-0.02m"),)
 )
 
 
@@ -364,6 +376,6 @@ def test_a_reset_offers_to_remove_the_priors_too(page):
     messages = page.browser.click("button[data-request=reset]", [True, True])
     assert messages == [
         "Forget all poses?",
-        "Remove the prior, too? It is z = 1.5m+/-0.02m.",
+        "Remove what was typed in, too? It is z = 1.5m+/-0.02m.",
     ]
     assert {page.request(), page.request()} == {"forget", "reset"}

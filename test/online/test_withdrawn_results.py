@@ -105,7 +105,7 @@ FAILURES = {
     "contradicted prior": (
         {"newest": contradicted()},
         Standing.REFUTED,
-        "CHECK THE PRIOR",
+        "CHECK THE VALUE",
         "the prior on z is 18 standard deviations from the estimate from the motion",
     ),
     "faulty streams": (
@@ -189,7 +189,8 @@ def test_every_surface_says_that_the_newest_solve_has_failed(
     assert view.tone in (Tone.BAD, Tone.ACT)
     for shown in (drawn(view), fragment(view)):
         assert word in shown
-    on_the_board = " ".join((view.sentence, *view.reasons))
+    lines = (line.text for line in view.result + view.health)
+    on_the_board = " ".join((view.sentence, *view.reasons, *lines))
     assert sentence.partition("; the result")[0][1:] in on_the_board
     assert (view.values == ()) == is_refuted
     # the file, and the answer of ~/save
@@ -228,7 +229,7 @@ def test_the_form_of_a_contradicted_prior_stays_until_it_is_removed(session):
     view = view_of(session)
     assert (view.by_hand, view.priors) == (("z",), (("z", "1.5m+/-0.02m"),))
     assert "forget" in view.buttons
-    prior = next(line for line in view.result if line.name == "prior")
+    prior = next(line for line in view.result if line.name == "typed in")
     assert (prior.tone, prior.text) == (
         Tone.BAD,
         "z = 1.5m ± 0.02m: contradicts the motion",
@@ -250,8 +251,10 @@ def test_the_end_of_a_node_with_a_refuted_result_is_no_success(session, tmp_path
     board = Board()
     board.take(dataclasses.replace(state_of(session), has_ended=True), 0.0)
     view = board.view(0.5)
-    assert (view.word, view.tone) == ("ENDED", Tone.ACT)
-    assert "DO NOT USE: the prior on z is 18 standard deviations" in view.sentence
+    assert (view.word, view.tone) == ("ENDED", Tone.BAD)
+    cause = "DO NOT USE: the value typed in for z contradicts the motion."
+    assert view.sentence.startswith(f"{cause} The result was saved at ")
+    assert (view.advice, view.by_hand) == ("Mend that, and record again.", ())
 
 
 class TestOptions:

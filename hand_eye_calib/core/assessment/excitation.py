@@ -42,7 +42,7 @@ _MANOEUVRES = ("one wheel over a kerb", "over a ramp or a bump", "curves to both
 
 # Advice about the height of a vehicle that has only turned about its vertical axis, and what a
 # recording, but no live session, may contain in addition.
-_ON_A_FLAT_FLOOR = "tilt the sensors over a ramp or a kerb, or measure it by hand"
+_ON_A_FLAT_FLOOR = "drive over a ramp or a kerb, or measure it by hand"
 _WITH_LIDARS = (
     ", or, if both sensors are lidars, record their clouds and run calibrate on the bag"
 )
@@ -221,6 +221,29 @@ def helpful_motion(axes: Sequence[str], seen: Excitation) -> str:
     return "; ".join(different_hints)
 
 
+def axes_by_hand(axes: Sequence[str], seen: Excitation) -> tuple[str, ...]:
+    """Return the axes for which :func:`helpful_motion` proposes a measurement by hand.
+
+    All rotation so far is about such an axis, so this rotation hides the offset along it.
+
+    Parameters
+    ----------
+    axes : sequence of str
+        Some of x, y, z, roll, pitch and yaw, of the parent sensor.
+    seen : Excitation
+        The motion so far.
+    """
+    if not _turns_about_one_axis(seen):
+        return ()
+    main = AXES[int(np.argmax(seen.rotation))]
+    return tuple(axis for axis in axes if axis == main)
+
+
+def _turns_about_one_axis(seen: Excitation) -> bool:
+    """Whether the motion has rotation about exactly one axis."""
+    return int((seen.rotation < MIN_ROTATION).sum()) == 2
+
+
 def _motion_for(name: str, seen: Excitation) -> str:
     """Describe the motion that reveals most about the axis ``name``."""
     rotation = seen.rotation
@@ -231,7 +254,7 @@ def _motion_for(name: str, seen: Excitation) -> str:
     axis = AXES.index(name) % 3
     others = [other for other in range(3) if other != axis]
     is_main = axis == int(np.argmax(rotation))
-    turns_about_one_axis = int((rotation < MIN_ROTATION).sum()) == 2
+    turns_about_one_axis = _turns_about_one_axis(seen)
     if turns_about_one_axis and is_main:
         return _motion_for_only_axis(name, others, seen)
     if turns_about_one_axis and seen.drives:

@@ -12,7 +12,11 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hand_eye_calib.core.assessment.excitation import Excitation, what_is_missing
+from hand_eye_calib.core.assessment.excitation import (
+    Excitation,
+    axes_by_hand,
+    what_is_missing,
+)
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.base.plain import plain
@@ -20,11 +24,13 @@ from hand_eye_calib.core.base.spelling import Interface
 from hand_eye_calib.core.base.text import duration, in_sentences, parse_targets
 from hand_eye_calib.core.engine.attempts import with_options
 from hand_eye_calib.core.engine.calibrator import Calibrator
-from hand_eye_calib.core.engine.snapshot import Snapshot
+from hand_eye_calib.core.engine.snapshot import STREAMS, Snapshot
 from hand_eye_calib.core.results.calibration import Calibration, SolveStatus, Verdict
 from hand_eye_calib.core.results.context import Comparison
 from hand_eye_calib.online.live.describing import (
+    NO_PAIRS,
     describe,
+    has_just_begun,
     is_held_up,
     is_refuted,
     is_too_little,
@@ -35,7 +41,7 @@ from hand_eye_calib.online.live.describing import (
     with_axis_keys,
     with_newest_halves,
 )
-from hand_eye_calib.online.live.goal import Goal
+from hand_eye_calib.online.live.goal import Goal, no_result_in_words
 from hand_eye_calib.online.live.log import GOES_ON_S, ONCE_S, NodeLog
 from hand_eye_calib.online.live.session import LiveSession
 from hand_eye_calib.online.live.solving import (
@@ -71,6 +77,9 @@ _CHECK_PERIOD_S = 30.0
 # Shortest time between two stream checks in durations of a solve: a check prolongs a solve by a
 # half, so on a busy computer most solves are done without a check.
 _SOLVES_PER_CHECK = 4.0
+
+# Poses of each stream from which streams without pairs have a fault, and have not just begun.
+_MANY_UNPAIRED = 50
 
 # Options that change the verdict on a result, but not the result.
 _TARGETS = ("target_translation", "target_rotation", "target_axes")
@@ -343,23 +352,34 @@ class SolveCycle:
             self._failure = self._failure or Failure(text, is_early=True)
         text = self._report(self._failure) if self._failure is not None else ""
         if calibration is None:
-            self._keep_result(self._advice_after_failure())
+            self._keep_result(*self._advice_after_failure())
             return False, text
         newest = self._with_warnings(calibration)
         if newest.status is SolveStatus.CONTRADICTED:
             return self._refute(newest)
         if newest.status.failure:
             self._failure = Failure(newest.status.failure)
-            self._keep_result(f"No usable result: {newest.status.failure}.")
+            self._keep_result(no_result_in_words(newest.status.failure))
             return False, self._describe(newest)
         return self._take(self._complete(newest))
 
-    def _advice_after_failure(self) -> str:
-        """Return which motion is missing; if none, why the newest solve has failed."""
-        missing = "" if is_too_little(self._motion) else what_is_missing(self._motion)
+    def _advice_after_failure(self) -> tuple[str, tuple[str, ...]]:
+        """Return what to do after a failed solve, and axes that may be measured by hand.
+
+        After a short motion, the advice is to move on. Then it is the motion that is missing; if
+        none is, it is the reason of the failure.
+        """
+        motion = self._motion
+        statistics = map(self._session.calibrator.statistics, STREAMS)
+        n_received = min(stream.received for stream in statistics)
+        if not motion.n_poses and n_received >= _MANY_UNPAIRED:
+            return NO_PAIRS, ()
+        if has_just_begun(motion):
+            return too_little_in_words(motion), ()
+        if missing := what_is_missing(motion):
+            return in_sentences(missing), axes_by_hand(motion.hidden_axes(), motion)
         failure = self._failure.what if self._failure is not None else ""
-        advice = missing or failure
-        return advice if advice.endswith(".") or not advice else in_sentences(advice)
+        return in_sentences(failure), ()
 
     def _with_warnings(self, calibration: Calibration) -> Calibration:
         """Return a calibration with findings and warnings of the session; log the warnings."""
@@ -386,12 +406,12 @@ class SolveCycle:
         elif answer.is_checked:
             self._check_due_s = 0.0
 
-    def _keep_result(self, advice: str) -> None:
+    def _keep_result(self, advice: str, by_hand: tuple[str, ...] = ()) -> None:
         """Keep the result after a failed solve, and mark the result as outdated.
 
         Without a result, the advice becomes the progress of the session.
         """
-        self.goal.wait(advice)
+        self.goal.wait(advice, by_hand)
         if self._failing_since_s is None:
             self._failing_since_s = time.monotonic()
 
@@ -415,7 +435,9 @@ class SolveCycle:
         """Make a usable calibration the session's result, unless the goal has a better one."""
         was_done = self.goal.progress.done
         faults = self.checks.faults()
-        progress = self.goal.add(newest, self._motion, faults, self._newest_motion)
+        progress = self.goal.add(
+            newest, self._motion, faults, self._newest_motion, self._job_s
+        )
         result = self.goal.best or newest
         if result is newest:
             self._solved = self._submitted, self._check_options
@@ -424,15 +446,11 @@ class SolveCycle:
                 f"the result of {result.n_poses} poses is kept, "
                 "because the newest result is worse"
             )
-            warning = f"{reason}: {describe(newest)}"
-            self._log.info(warning, ONCE_S, key="kept")
-            result = replace(result, warnings=(*result.warnings, warning))
+            self._log.info(f"{reason}: {describe(newest)}", ONCE_S, key="kept")
+            result = replace(result, warnings=(*result.warnings, reason))
             result = with_newest_halves(result, newest)
         result = self._with_findings(result)
         self._set_result(result)
-        if not progress.is_faulty and progress.sentence:
-            write = self._log.warning if progress.will_not_get_there else self._log.info
-            write(progress.sentence, GOES_ON_S, key=f"now {progress.done}")
         every_s = GOES_ON_S if progress.done == was_done else 0.0
         return result.status is SolveStatus.OK, self._describe(result, every_s)
 

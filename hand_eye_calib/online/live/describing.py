@@ -15,6 +15,7 @@ from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.context import Comparison
 from hand_eye_calib.core.results.parts import facts_of
 from hand_eye_calib.core.results.records import AXES
+from hand_eye_calib.online.live.brief import of_reason
 from hand_eye_calib.online.live.progress import AXIS_KEYS
 from hand_eye_calib.online.live.state import (
     Condition,
@@ -28,6 +29,11 @@ from hand_eye_calib.online.live.state import (
 # that, estimates and advice jump.
 _MIN_MOTION_S = 20.0
 _MIN_ROTATION_RAD = float(np.radians(30.0))
+
+# Advice while both streams have poses that cannot be paired.
+NO_PAIRS = (
+    "The poses of both sensors do not pair. Compare their clocks and their rates."
+)
 
 # Solves that last longer than this (s) are reported, because advice and time left refer to the data
 # before the solve.
@@ -66,8 +72,15 @@ def is_too_little(motion: Excitation) -> bool:
     return bool(motion.motion_s < _MIN_MOTION_S and not has_rotated)
 
 
+def has_just_begun(motion: Excitation) -> bool:
+    """Whether the motion is too short for advice about the motion that is missing."""
+    return motion.motion_s < _MIN_MOTION_S
+
+
 def too_little_in_words(motion: Excitation) -> str:
     """Return a sentence about the motion that a first result needs, and the motion so far."""
+    if not is_too_little(motion):
+        return f"No result yet after {motion.motion_s:.0f} s of motion: keep moving."
     rotation_deg = np.floor(np.degrees(motion.rotation.max()))
     return (
         f"Move the sensors for {_MIN_MOTION_S:g} s, or turn them by "
@@ -144,6 +157,7 @@ def state_of_result(result: Calibration, age_s: float) -> ResultState:
     """Return the diagnostics of a result that was computed ``age_s`` seconds ago."""
     pose = se3.xyz_rpy(result.T_parent_child)
     sigmas = result.sigmas_printed
+    problem, step = of_reason(result.reasons[0]) if result.reasons else ("", "")
     return ResultState(
         parent_frame=result.parent_frame,
         child_frame=result.child_frame,
@@ -161,6 +175,8 @@ def state_of_result(result: Calibration, age_s: float) -> ResultState:
         scale=result.scale,
         age_s=age_s,
         facts=tuple(facts_of(result)),
+        caution=problem,
+        step=step,
     )
 
 

@@ -21,6 +21,7 @@ import numpy as np
 from hand_eye_calib.core.assessment.excitation import (
     MIN_ROTATION,
     Excitation,
+    axes_by_hand,
     helpful_motion,
 )
 from hand_eye_calib.core.base.arrays import FloatArray
@@ -33,6 +34,7 @@ from hand_eye_calib.core.results.calibration import (
     Verdict,
 )
 from hand_eye_calib.core.results.records import AXES
+from hand_eye_calib.online.live.brief import of_reason
 from hand_eye_calib.online.live.progress import AXIS_KEYS, AxisProgress, Progress
 
 # Bounds of the motion (s) that confirms a first result within the targets. Within these bounds, the
@@ -116,6 +118,8 @@ class Goal:
         # Motion of the newest result, and faults of its streams.
         self._motion: Excitation | None = None
         self._faults: Sequence[str] = ()
+        # Time until the next result (s).
+        self._period_s = 0.0
         self._start_over(_NO_RESULT)
 
     def _start_over(self, sentence: str) -> None:
@@ -127,10 +131,13 @@ class Goal:
         self._steps = np.full(7, len(_STEPS_S) - 1)
         self.progress = self._nothing_yet(sentence)
 
-    def wait(self, sentence: str) -> None:
-        """Use a sentence as the progress of a session without a result; otherwise ignore it."""
+    def wait(self, sentence: str, by_hand: tuple[str, ...] = ()) -> None:
+        """Use a sentence as the progress of a session without a result; otherwise ignore it.
+
+        ``by_hand`` are the axes that the sentence proposes to measure by hand.
+        """
         if self._motion is None:
-            self.progress = self._nothing_yet(sentence)
+            self.progress = replace(self._nothing_yet(sentence), by_hand=by_hand)
 
     def follow(self, targets: Targets) -> None:
         """Start over with new targets, because options have changed.
@@ -152,7 +159,7 @@ class Goal:
         """
         self.follow(targets)
         if self._motion is not None:
-            self.add(calibration, self._motion, self._faults)
+            self.add(calibration, self._motion, self._faults, period_s=self._period_s)
 
     def add(
         self,
@@ -160,6 +167,7 @@ class Goal:
         motion: Excitation,
         faults: Sequence[str] = (),
         newest_motion: Excitation | None = None,
+        period_s: float = 0.0,
     ) -> Progress:
         """Add the next result of the session and update ``best`` and ``progress``.
 
@@ -172,8 +180,11 @@ class Goal:
             Findings of the stream checks. The goal is not reached while there are any.
         newest_motion : Excitation, optional
             The motion of the last minute. Default: ``motion``.
+        period_s : float
+            Time until the next result (s): a confirmation takes at least as long.
         """
         self._motion = motion
+        self._period_s = period_s
         self._faults = faults or _own_faults(calibration)
         self._append(calibration, motion.motion_s)
         if calibration.status is SolveStatus.CONTRADICTED:
@@ -311,9 +322,8 @@ class Goal:
         total_s += _confirming_motion(motion_s + total_s)
         *axes_left_s, total_s = self._in_steps(np.append(left_s, total_s))
         if is_confirming:
-            step = np.searchsorted(
-                _CONFIRMING_STEPS_S, 0.99 * self._confirmation_s(newest)
-            )
+            total_s = max(self._confirmation_s(newest), self._period_s)
+            step = np.searchsorted(_CONFIRMING_STEPS_S[:-1], 0.99 * total_s)
             total_s = float(_CONFIRMING_STEPS_S[step])
             # Forget the last reported total, which was estimated.
             self._steps[-1] = len(_STEPS_S) - 1
@@ -362,6 +372,7 @@ class Goal:
         will_not_get_there = is_long and row.seconds_left == np.inf and not is_helpful
         assert self._motion is not None
         motion = capital(helpful_motion([axis], self._motion))
+        by_hand = () if is_helpful else axes_by_hand([axis], self._motion)
         axis_text = axes_in_words([axis])
         if will_not_get_there:
             sentence = (
@@ -381,19 +392,20 @@ class Goal:
                     f"Go on for about {left}, {axis_text} takes longest. {motion}."
                 )
             else:
-                sentence = f"{axis_text} is not determined well enough yet. {motion}."
+                sentence = f"{_not_yet_in_words(axis, ratios)}. {motion}."
         return replace(
             progress,
             sentence=sentence,
             limiting_axis=AXIS_KEYS[axis],
             will_not_get_there=will_not_get_there,
+            by_hand=by_hand,
         )
 
     def _progress_at_goal(self, best: Calibration) -> Progress:
         """Return the progress after the goal is reached, with the axes of the best result."""
         precision = what_is_known(best)
         return Progress(
-            sentence=self._reason_to_stop(best) or f"Done: {precision}. Stop and save.",
+            sentence=self._reason_to_stop(best) or _done_in_words(best, precision),
             done=not self._faults,
             precision=precision,
             seconds_left=0.0,
@@ -445,7 +457,7 @@ class Goal:
         if self._faults:
             return f"Stop: the streams are faulty: {self._faults[0]}."
         if newest.status.failure:
-            return f"No usable result: {newest.status.failure}."
+            return no_result_in_words(newest.status.failure)
         return ""
 
 
@@ -484,10 +496,34 @@ def _turns_about(motion: Excitation, axis: str) -> bool:
     return int(np.argmax(motion.rotation)) == AXES.index(axis) % 3
 
 
+def no_result_in_words(failure: str) -> str:
+    """Return a sentence about a solve that has failed, with the next step."""
+    return f"No usable result yet: {failure}. Go on, with turns to both sides."
+
+
+def _done_in_words(best: Calibration, precision: str) -> str:
+    """Return the sentence of a session that has reached its goal, with the verdict."""
+    if not best.reasons:
+        return f"Done: {precision}. Stop and save."
+    problem, step = of_reason(best.reasons[0])
+    return f"Done. {best.verdict.value}: {problem}. Save. {step}"
+
+
+def _not_yet_in_words(limiting: str, ratios: FloatArray) -> str:
+    """Return that an axis is not determined, with all others that have no result at all."""
+    axes = [limiting]
+    if np.isinf(ratios[AXES.index(limiting)]):
+        axes = [
+            axis for axis, ratio in zip(AXES, ratios, strict=True) if ratio == np.inf
+        ]
+    verb = "is" if len(axes) == 1 else "are"
+    return f"{axes_in_words(axes)} {verb} not determined well enough yet"
+
+
 def _too_small_in_words(axis: str, target: float, allowance: float) -> str:
     """Return the sentence about a target below the allowance."""
     return (
-        f"No motion makes {axes_in_words([axis])} good to {amount(axis, target)}: "
-        f"the allowance for constant errors is {amount(axis, allowance)}. "
+        f"No motion makes {axes_in_words([axis])} good to {amount(axis, target)}. "
+        f"Constant errors alone may be {amount(axis, allowance)}. "
         "Stop and save, or set a larger target."
     )

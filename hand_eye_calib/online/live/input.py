@@ -16,15 +16,21 @@ from typing import Any, NamedTuple, TypeAlias
 
 from hand_eye_calib.core.base.config import STAMP_UNITS, CalibratorConfig
 from hand_eye_calib.core.base.errors import HandEyeCalibError, NoPoseError
-from hand_eye_calib.core.base.text import MUCH_NULL, duration, listing, share
+from hand_eye_calib.core.base.text import MUCH_NULL, duration, share
 from hand_eye_calib.core.engine.calibrator import StreamStatistics
 from hand_eye_calib.core.geometry.frames import check_not_null
 from hand_eye_calib.formats.transforms import PoseFields
+from hand_eye_calib.online.live.brief import (
+    CHECK_SOURCE,
+    START_SOURCE,
+    START_SOURCE_AGAIN,
+    publishers_in_words,
+)
 from hand_eye_calib.online.live.log import GOES_ON_S, NodeLog
 from hand_eye_calib.online.live.session import LiveSession
 from hand_eye_calib.online.live.state import (
     REPORT_PERIOD_S,
-    Condition,
+    InputCondition,
     InputState,
     Level,
 )
@@ -481,7 +487,9 @@ class PoseInput:
         rate_hz = arrived / seconds if seconds > 0 else 0.0
         lost_share = lost / max(arrived + lost, 1)
         null_share = (now.null - oldest.null) / max(arrived, 1)
-        level, text = self._condition(steady_s, rate_hz, lost_share, may_rest)
+        level, text, step, needs_reset = self._condition(
+            steady_s, rate_hz, lost_share, may_rest
+        )
         accepted = self._session.engines.statistics(self.name)
         if level is Level.OK and self._longest_gap_ns > NEAR_NS:
             text = f"{text}, longest gap {duration(self._longest_gap_ns * 1e-9)}"
@@ -507,6 +515,8 @@ class PoseInput:
             publishers=None if self.publishers is None else len(self.publishers),
             is_paused=self.is_paused(steady_s),
             silent_s=self.silent_s(steady_s),
+            step=step,
+            needs_reset=needs_reset,
         )
 
     def _advice(self, null_share: float, accepted: StreamStatistics) -> str:
@@ -524,33 +534,36 @@ class PoseInput:
 
     def _condition(
         self, steady_s: float, rate_hz: float, lost_share: float, may_rest: bool
-    ) -> Condition:
-        """Return level and text of the gravest condition of the input."""
+    ) -> InputCondition:
+        """Return the gravest condition of the input."""
         if self._arrived_s is None:
             text = f"no message on {self.topic} yet"
-            return Level.WARN, f"{text}: {self.problem}" if self.problem else text
+            text = f"{text}: {self.problem}" if self.problem else text
+            step = CHECK_SOURCE if self.publishers else START_SOURCE
+            return InputCondition(Level.WARN, text, step)
         if steady_s - self._bad_at_s < _REPORTS:
-            return Level.ERROR, f"{self.topic}: {self._bad}"
+            return InputCondition(Level.ERROR, f"{self.topic}: {self._bad}")
         if text := self._why_paused(steady_s, self._arrived_s):
             if may_rest:
-                return Level.OK, text
+                return InputCondition(Level.OK, text)
             self._log.info(text, GOES_ON_S)
-            return Level.WARN, text
+            step = START_SOURCE_AGAIN if self.is_silent(steady_s) else ""
+            return InputCondition(Level.WARN, text, step)
         if self.publishers is not None and len(self.publishers) > 1:
-            names = sorted(self.publishers)
-            has_several = f"{self.topic} has {len(names)} publishers: {listing(names)}"
-            text = f"{has_several}. Stop all but one, then reset"
+            several = publishers_in_words(self.publishers)
+            text = f"{self.topic} has {several}. Stop all but one, then reset"
             self._log.warning(text)
-            return Level.WARN, text
+            return InputCondition(Level.WARN, text, needs_reset=True)
         if self._mixed:
-            had_several = f"{self.topic} had {len(self._mixed)} publishers: {listing(self._mixed)}"
-            return Level.WARN, f"{had_several}. Their poses are mixed: reset"
+            several = publishers_in_words(self._mixed)
+            text = f"{self.topic} had {several}. Their poses are mixed: reset"
+            return InputCondition(Level.WARN, text, needs_reset=True)
         if lost_share < _MAX_LOST_SHARE:
-            return Level.OK, f"{rate_hz:.1f} Hz"
+            return InputCondition(Level.OK, f"{rate_hz:.1f} Hz")
         text = f"{share(lost_share)} of the messages are lost"
         advice = "Free processor time, or publish at a lower rate"
         self._log.warning(f"{self.topic}: {text}. {advice}")
-        return Level.WARN, f"{text} at {rate_hz:.0f} Hz. {advice}"
+        return InputCondition(Level.WARN, f"{text} at {rate_hz:.0f} Hz. {advice}")
 
     def _why_paused(self, steady_s: float, arrived_s: float) -> str:
         """Return why poses no longer arrive; empty if they arrive, or if the reason is unknown."""

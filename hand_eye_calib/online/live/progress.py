@@ -55,6 +55,8 @@ class Progress:
         Whether more of the present motion cannot bring the limiting axis to its target.
     target_is_too_small : bool
         Whether the allowance for constant errors alone exceeds the target of the limiting axis.
+    by_hand : tuple of str
+        Axes x, y, z that a person may measure by hand, because the present motion hides them.
     axes : mapping of str to AxisProgress
         Progress of each axis; the keys are the values of ``AXIS_KEYS``.
     """
@@ -67,6 +69,7 @@ class Progress:
     limiting_axis: str = ""
     will_not_get_there: bool = False
     target_is_too_small: bool = False
+    by_hand: tuple[str, ...] = ()
     axes: Mapping[str, AxisProgress] = field(default_factory=dict)
 
 

@@ -8,7 +8,7 @@ about_y and about_z. Those of a printed pose have roll, pitch and yaw in place o
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.plain import plain
@@ -101,6 +101,8 @@ class ResultState:
         that is not determined.
     facts : tuple of str
         Sentences about the evidence, such as the smallest error that would have shown.
+    caution, step : str
+        The gravest reason for the verdict and the next step, in a few words; empty for ``USE``.
     age_s : float
         Time since the solve (s).
     """
@@ -118,6 +120,8 @@ class ResultState:
     scale: float
     age_s: float
     facts: tuple[str, ...] = ()
+    caution: str = ""
+    step: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,6 +188,15 @@ class ProgressState(Part):
     comparison: Comparison | None
 
 
+class InputCondition(NamedTuple):
+    """The fields of an :class:`InputState` that follow from its messages."""
+
+    level: Level
+    text: str
+    step: str = ""
+    needs_reset: bool = False
+
+
 @dataclass(frozen=True, kw_only=True)
 class InputState(Part):
     """The messages of one input.
@@ -205,6 +218,10 @@ class InputState(Part):
         Whether poses have arrived in this session, but arrive no longer.
     silent_s : float or None
         Time since the last pose (s); None before the first pose of the session.
+    step : str
+        What a person should do, as a sentence; empty if the text contains it.
+    needs_reset : bool
+        Whether the session has poses of several publishers, which only a reset removes.
     """
 
     topic: str
@@ -217,6 +234,8 @@ class InputState(Part):
     publishers: int | None = None
     is_paused: bool = False
     silent_s: float | None = None
+    step: str = ""
+    needs_reset: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,11 +249,17 @@ class ChecksState(Part):
     findings : tuple of str
     gravest : str
         The gravest finding that counts, without cause and remedy; empty if there is none.
+    step : str
+        What a person should do about it, as a sentence.
+    needs_reset : bool
+        Whether the session keeps the fault until it is reset.
     """
 
     age_s: float | None = None
     findings: tuple[str, ...] = ()
     gravest: str = ""
+    step: str = ""
+    needs_reset: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -313,6 +338,8 @@ class NodeState:
         Newest save of the session.
     has_ended : bool
         Whether the node ends, so that this is its last state.
+    headline : str
+        What a person should do first, as ``watch`` displays it and as the log contains it.
     """
 
     node: str
@@ -324,6 +351,7 @@ class NodeState:
     journal: JournalState | None = None
     saved: SavedState | None = None
     has_ended: bool = False
+    headline: str = ""
 
     @property
     def result(self) -> ResultState | None:

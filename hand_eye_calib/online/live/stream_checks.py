@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from hand_eye_calib.core.checks.findings import (
 )
 from hand_eye_calib.core.engine.run import with_open_errors
 from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.online.live.brief import step_after
 from hand_eye_calib.online.live.log import NodeLog
 from hand_eye_calib.online.live.state import ChecksState, Level
 
@@ -122,7 +124,7 @@ class StreamChecks:
                 f"{finding.severity.value}: {_in_parameters(finding)}"
                 for finding in findings
             ),
-            gravest=self.findings[0].what if self._faults else "",
+            **_gravest_of(self.findings),
         )
 
 
@@ -138,6 +140,18 @@ def merged(
         finding for finding in earlier if (finding.code, finding.stream) not in keys
     ]
     return gravest_first([*newest, *kept])
+
+
+def _gravest_of(findings: Sequence[Finding]) -> dict[str, Any]:
+    """Return the fields of a state about the gravest of the reported findings."""
+    if not findings:
+        return {}
+    gravest = findings[0]
+    return {
+        "gravest": gravest.what,
+        "step": step_after(gravest),
+        "needs_reset": gravest.makes_unusable and not gravest.options,
+    }
 
 
 def _in_parameters(finding: Finding) -> str:

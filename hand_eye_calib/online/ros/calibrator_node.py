@@ -44,6 +44,11 @@ from hand_eye_calib.online.ros.tf import (
     TfBroadcaster,
     message_type,
 )
+from hand_eye_calib.online.watch.headline import (
+    CHANGE_MOTION,
+    CHANGE_TARGET,
+    headline_of,
+)
 
 
 class CalibratorNode(ManagedNode):
@@ -293,7 +298,13 @@ class CalibratorNode(ManagedNode):
         if not has_ended:
             self.take_messages()
         clock_ns = self.get_clock().now().nanoseconds
-        self._states.publish(replace(self._state(), has_ended=has_ended), clock_ns)
+        state = replace(self._state(), has_ended=has_ended)
+        headline = headline_of(state)
+        self._states.publish(replace(state, headline=headline.line), clock_ns)
+        if self._mount is None:
+            is_warning = headline.word in (CHANGE_MOTION, CHANGE_TARGET)
+            write = self._log.warning if is_warning else self._log.info
+            write(headline.line, GOES_ON_S)
         self._cycle.answer_overdue()
 
     def _why_not_broadcast(self) -> str:

@@ -106,7 +106,7 @@ def diagnostics(state: NodeState, clock_ns: int) -> DiagnosticArray:
     """Return the message for ``/diagnostics``, with one status for each part of the node.
 
     The name of a status begins with the fully qualified name of the node, so that two nodes have
-    different names.
+    different names. The status of the progress has the headline of the node.
     """
     message = DiagnosticArray()
     message.header.stamp = to_time(clock_ns)
@@ -115,7 +115,7 @@ def diagnostics(state: NodeState, clock_ns: int) -> DiagnosticArray:
         status = DiagnosticStatus(
             level=bytes([part.level]),
             name=f"{state.node}: {name}",
-            message=part.text,
+            message=state.headline if name == "progress" else part.text,
             hardware_id="hand_eye_calib",
             values=[KeyValue(key=key, value=text) for key, text in values.items()],
         )

@@ -40,7 +40,7 @@ _REQUESTS = {key: request for request, key in KEYS.items()}
 _CONSEQUENCES = {
     "reset": "forgets all poses",
     "recalibrate": "stops watching and calibrates anew",
-    "forget": "removes all priors",
+    "forget": "removes all values that were typed in",
 }
 
 

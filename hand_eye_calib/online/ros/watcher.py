@@ -18,7 +18,6 @@ from std_srvs.srv import Trigger
 
 from hand_eye_calib.core.base.config import POSE_TYPES
 from hand_eye_calib.core.base.errors import printable
-from hand_eye_calib.core.base.text import counted
 from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.online.live.state import ANSWER_WITHIN_S, REPORT_PERIOD_S
 from hand_eye_calib.online.ros.conversions import LATCHED
@@ -158,16 +157,19 @@ class Watcher:
             for topic, types in topics
             for type_name in types
             if type_name in POSE_TYPES and topic.rpartition("/")[0] not in self._sources
+            if topic not in self._board.inputs and self._node.count_publishers(topic)
         ]
         lines = [
             self._describe(topic, type_name) for topic, type_name in poses[:_MAX_NAMES]
         ]
-        self._board.topics = tuple(lines or ["none is published here"])
+        self._board.topics = tuple(
+            lines or ["no other topic with poses is published here"]
+        )
 
     def _describe(self, topic: str, type_name: str) -> str:
-        """Return a line with type, publishers and reliability of a topic."""
+        """Return a line with type and reliability of a topic."""
         publishers = self._node.get_publishers_info_by_topic(topic)
-        texts = [type_name.rpartition("/")[2], counted(len(publishers), "publisher")]
+        texts = [type_name.rpartition("/")[2]]
         if publishers:
             names = {publisher.qos_profile.reliability.name for publisher in publishers}
             texts.append(" and ".join(sorted(names)).lower().replace("_", " "))

@@ -8,7 +8,6 @@ from hand_eye_calib.core.base.text import (
     ABOUT,
     amount,
     change,
-    duration,
     fixed,
     two_digits,
 )
@@ -40,14 +39,17 @@ def bar_of(axis: str, session: ProgressState, extrinsic: ExtrinsicState | None) 
     """Return the bar of an axis."""
     row = session.progress.axes[AXIS_KEYS[axis]]
     target = amount(axis, row.target)
+    has_result = not session.progress.is_faulty
     if extrinsic and extrinsic.contradicted:
+        has_result = False
+    if not has_result:
         tone = Tone.UNKNOWN
         word = "no usable result"
         sigma = f"wanted: {target}"
     elif math.isfinite(row.sigma):
         tone, word = _progress_in_words(row, session, axis)
         sigma = f"± {amount(axis, row.sigma)}"
-        sigma += ", from the prior" if _has_prior(row) else f" of {target}"
+        sigma += ", typed in" if _has_prior(row) else f" of {target}"
     else:
         tone = Tone.UNKNOWN
         # The time left is 0 without a standard deviation: these streams never observe the axis.
@@ -56,7 +58,8 @@ def bar_of(axis: str, session: ProgressState, extrinsic: ExtrinsicState | None) 
         sigma = "" if is_out_of_reach else f"wanted: {target}"
     meaning = _ON_A_VEHICLE[axis] if extrinsic and extrinsic.has_vehicle_axes else ""
     difference = _difference(axis, session)
-    return Bar(_NAMES[axis], meaning, _share_of(row), tone, word, sigma, difference)
+    share = _share_of(row) if has_result else 0.0
+    return Bar(_NAMES[axis], meaning, share, tone, word, sigma, difference)
 
 
 def _has_prior(row: AxisProgress) -> bool:
@@ -83,15 +86,15 @@ def _progress_in_words(
     row: AxisProgress, session: ProgressState, axis: str
 ) -> tuple[Tone, str]:
     """Return tone and word of an axis that has a standard deviation."""
-    if session.progress.is_faulty:
-        return Tone.UNKNOWN, "of faulty streams"
     if row.seconds_left == 0:
         return Tone.GOOD, "enough"
     will_fail = session.progress.will_not_get_there
-    word = "not with this motion" if will_fail else "not enough yet"
-    if math.isfinite(row.seconds_left):
-        word = f"{duration(row.seconds_left)} left"
     is_limiting = session.progress.limiting_axis == AXIS_KEYS[axis]
+    word = "not enough yet"
+    if math.isfinite(row.seconds_left):
+        word = "takes longest" if is_limiting else word
+    elif will_fail:
+        word = "not with this motion"
     return Tone.ACT if is_limiting else Tone.BUSY, word
 
 

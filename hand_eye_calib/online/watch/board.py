@@ -12,7 +12,7 @@ from typing import Any
 from hand_eye_calib.core.base.errors import printable
 from hand_eye_calib.core.base.plain import from_plain
 from hand_eye_calib.core.base.text import duration
-from hand_eye_calib.core.results.records import AXES
+from hand_eye_calib.core.results.records import AXES, ROTATIONS
 from hand_eye_calib.online.live.progress import AXIS_KEYS
 from hand_eye_calib.online.live.state import (
     REPORT_PERIOD_S,
@@ -26,7 +26,6 @@ from hand_eye_calib.online.live.state import (
 )
 from hand_eye_calib.online.watch.axes import bar_of, mount_line, pose_values
 from hand_eye_calib.online.watch.headline import (
-    CHANGE_MOTION,
     DONE,
     MOVED,
     headline_of,
@@ -51,6 +50,15 @@ _TONES: dict[object, Tone] = {
     Broadcast.WAITING: Tone.BUSY,
 }
 
+# States of a broadcast in words, where these differ from the values.
+_BROADCASTS = {Broadcast.ON: "yes, as a static transform"}
+
+# The reason of the solver is displayed if no newest result explains the state.
+_WITHOUT_RESULT = (Standing.NONE, Standing.OUTDATED)
+
+# Units of the values that a person types without one.
+_TYPED_UNITS = {axis: "deg" if axis in ROTATIONS else "m" for axis in AXES}
+
 
 class Board:
     """Stores the newest state of one node, and makes views from it. Several threads may use it.
@@ -64,7 +72,7 @@ class Board:
     Attributes
     ----------
     topics : tuple of str
-        A line for each topic with poses.
+        A line for each topic with poses that the displayed node does not use.
     """
 
     def __init__(self, wanted: str = "") -> None:
@@ -81,6 +89,13 @@ class Board:
     def priors(self) -> Texts:
         """Axes of the displayed node that have a prior."""
         return tuple(dict(_priors_of(self._newest[0]))) if self._newest else ()
+
+    @property
+    def inputs(self) -> Texts:
+        """Topics that the displayed node uses."""
+        if self._newest is None:
+            return ()
+        return tuple(stream.topic for stream in self._newest[0].inputs.values())
 
     @property
     def node(self) -> str:
@@ -121,8 +136,9 @@ class Board:
                 advice="Check it, then recalibrate.",
                 facts=f"{view.facts}; acknowledged",
                 buttons=("recalibrate", "reset"),
+                asked="recalibrate",
             )
-        if view.word in ("CHECK INPUT", "BAD INPUT"):
+        if _lacks_messages(state):
             view = replace(view, topics=self.topics)
         if self._answer and now_s - self._answer[1] < _ANSWER_FOR_S:
             view = replace(view, answer=self._answer[:1])
@@ -132,6 +148,11 @@ class Board:
 def _alarm_of(state: NodeState) -> tuple[str, int | None]:
     """Return node and start (ns) of an alarm of the mount: they identify the alarm."""
     return state.node, state.mount.since_ns if state.mount else None
+
+
+def _lacks_messages(state: NodeState) -> bool:
+    """Whether an input has no message yet: its topic may have another name."""
+    return any(stream.messages == 0 for stream in state.inputs.values())
 
 
 def _priors_of(state: NodeState) -> AxisTexts:
@@ -149,22 +170,29 @@ def _view(state: NodeState, silent_s: float) -> View:
     headline = headline_of(state, silent_s if is_silent else 0.0)
     view = View(
         state.node,
-        *headline,
+        headline.tone,
+        headline.word,
+        headline.sentence,
+        headline.advice,
+        asked="" if is_old else headline.request,
         health=() if state.has_ended else tuple(_health(state, is_old)),
         saved_in=state.saved.directory if state.saved else "",
     )
     if state.mount is not None:
         return _with_mount(view, state.mount)
     view = _with_result(view, state)
-    view = replace(
-        view, facts=_facts(state, is_old), by_hand=_axes_by_hand(state, view.word)
-    )
+    view = replace(view, facts=_facts(state, is_old))
     if progress := state.progress:
         bars = tuple(bar_of(axis, progress, state.extrinsic) for axis in AXES)
         view = replace(view, bars=bars)
     if is_old:
         return view
-    return replace(view, priors=_priors_of(state), buttons=_buttons(state, view.word))
+    return replace(
+        view,
+        priors=_priors_of(state),
+        by_hand=_axes_by_hand(state),
+        buttons=_buttons(state, view.asked),
+    )
 
 
 def _with_result(view: View, state: NodeState) -> View:
@@ -192,30 +220,33 @@ def _with_mount(view: View, mount: MountState) -> View:
     return replace(view, facts=f"{facts}; a reset ends the alarm", buttons=buttons)
 
 
-def _buttons(state: NodeState, word: str) -> Texts:
-    """Return the possible requests to a node that calibrates, the recommended one first."""
+def _buttons(state: NodeState, asked: str) -> Texts:
+    """Return the possible requests to a node that calibrates, the recommended one first.
+
+    ``asked`` is the request that the headline recommends; empty if there is none.
+    """
     buttons: Texts = ("reset",)
-    if state.result:
+    if state.result and state.extrinsic and state.extrinsic.contradicted:
+        buttons = ("solve", "reset")
+    elif state.result:
         buttons = ("solve", "save", "reset")
-        if word == DONE and not state.saved:
-            buttons = ("save", "solve", "reset")
     if state.extrinsic and state.extrinsic.priors:
         buttons += ("forget",)
-    return buttons
+    return tuple(sorted(buttons, key=lambda request: request != asked))
 
 
-def _axes_by_hand(state: NodeState, word: str) -> Texts:
+def _axes_by_hand(state: NodeState) -> Texts:
     """Return axes whose prior a person may set, correct or remove, the most important first.
 
-    ``word`` is the status on the board. These are the axes whose prior contradicts the motion, the
-    axis that the present motion cannot determine, and all other axes with a prior.
+    These are the axes whose prior contradicts the motion, the axes that the present motion cannot
+    determine, and all other axes with a prior.
     """
     extrinsic = state.extrinsic
     if extrinsic is None or state.progress is None:
         return ()
-    axes = [*extrinsic.contradicted]
     progress = state.progress.progress
-    if progress.will_not_get_there and word == CHANGE_MOTION:
+    axes = [*extrinsic.contradicted, *progress.by_hand]
+    if progress.will_not_get_there and not progress.target_is_too_small:
         axes += [
             axis for axis, key in AXIS_KEYS.items() if key == progress.limiting_axis
         ]
@@ -224,12 +255,17 @@ def _axes_by_hand(state: NodeState, word: str) -> Texts:
 
 
 def _facts(state: NodeState, is_old: bool) -> str:
-    """Return path length, duration of motion and age of the result; empty without poses."""
+    """Return path length, duration of motion and age of the result; empty without poses.
+
+    While the session is paused, the age of the result does not matter.
+    """
     extrinsic = state.extrinsic
     if extrinsic is None or not extrinsic.n_poses:
         return ""
     facts = f"{extrinsic.path_m:,.0f} m, {duration(extrinsic.motion_s)} of motion"
-    if extrinsic.result and not is_old and extrinsic.standing is not Standing.REFUTED:
+    is_paused = any(stream.is_paused for stream in state.inputs.values())
+    is_refuted = extrinsic.standing is Standing.REFUTED
+    if extrinsic.result and not (is_old or is_paused or is_refuted):
         facts += f", result {duration(extrinsic.result.age_s)} old"
     if extrinsic.standing is Standing.OUTDATED:
         facts += ", newer solves fail"
@@ -242,12 +278,18 @@ def _health(state: NodeState, is_old: bool) -> Iterator[Line]:
     A state that is old has no tones: its conditions may have changed.
     """
     for name, part in state.parts():
+        has_problem = part.level is not Level.OK and part.text
+        if name == "extrinsic" and state.standing in _WITHOUT_RESULT and has_problem:
+            yield Line(Tone.UNKNOWN if is_old else Tone.ACT, "solver", part.text)
         if name in ("extrinsic", "progress", "mount"):
             continue
         tone = _TONES[part.level]
         text = part.text
         # Before the first check, the level is WARN, but a person need not act.
         if part is state.checks and state.checks.age_s is None:
+            tone = Tone.BUSY
+        # A robot that is parked has no poses, and a person need not act.
+        if isinstance(part, InputState) and part.is_paused and tone is Tone.GOOD:
             tone = Tone.BUSY
         if isinstance(part, InputState) and part.topic not in text:
             text = f"{text}, {part.topic}"
@@ -265,7 +307,8 @@ def _result(state: NodeState, word: str) -> Iterator[Line]:
     if result:
         for warning in result.warnings:
             yield Line(Tone.ACT, "note", typeset(warning))
-        if word == DONE:
+        # The reasons of another verdict contain the same numbers.
+        if word == DONE and result.verdict == "USE":
             for fact in result.facts:
                 yield Line(Tone.GOOD, "evidence", typeset(fact))
     yield from _prior_lines(state)
@@ -277,7 +320,7 @@ def _result(state: NodeState, word: str) -> Iterator[Line]:
     if state.extrinsic and state.extrinsic.tf_static is not Broadcast.OFF:
         yield _broadcast(state.extrinsic, state.has_ended)
     if state.saved:
-        tone = Tone.BAD if state.saved.verdict == "DO NOT USE" else Tone.GOOD
+        tone = _TONES.get(state.saved.verdict, Tone.GOOD)
         yield Line(tone, "saved", f"{saved_at(state.saved)}: {state.saved.text}")
 
 
@@ -286,22 +329,24 @@ def _prior_lines(state: NodeState) -> Iterator[Line]:
     contradicted = state.extrinsic.contradicted if state.extrinsic else ()
     for axis, prior in _priors_of(state):
         text = f"{axis} = {prior.replace('+/-', ' ± ')}"
+        if not any(character.isalpha() for character in prior):
+            text = f"{text} {_TYPED_UNITS[axis]}"
         if axis in contradicted:
-            yield Line(Tone.BAD, "prior", f"{text}: contradicts the motion")
+            yield Line(Tone.BAD, "typed in", f"{text}: contradicts the motion")
         else:
-            yield Line(Tone.BUSY, "prior", text)
+            yield Line(Tone.BUSY, "typed in", text)
 
 
 def _broadcast(extrinsic: ExtrinsicState, has_ended: bool) -> Line:
-    """Return the line about the broadcast of the result on /tf_static."""
+    """Return the line about the broadcast of the result to other programs."""
     tone = _TONES[extrinsic.tf_static]
-    text = extrinsic.tf_static.value
+    text = _BROADCASTS.get(extrinsic.tf_static, extrinsic.tf_static.value)
     if extrinsic.tf_static_reason:
         text += f": {extrinsic.tf_static_reason}"
     if has_ended:
         tone = Tone.ACT
         text = "nothing: the node has ended"
-    return Line(tone, "on /tf_static", text)
+    return Line(tone, "sent to other programs", text)
 
 
 def state_of(text: str) -> NodeState | None:

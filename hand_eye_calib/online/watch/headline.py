@@ -1,20 +1,37 @@
-"""The headline of a node: its most important fact, in a word and a sentence."""
+"""The headline of a node: its most important fact, in a word and a sentence.
+
+:func:`headline_of` is the only place that decides what a person at the machine should do first. The
+page and the terminal of ``watch``, the topics and the log contain the headline that it returns.
+"""
 
 import math
 from collections.abc import Iterator
 from datetime import datetime
 from typing import NamedTuple
 
-from hand_eye_calib.core.base.text import AXIS_UNITS, amount, axes_in_words, capital
+from hand_eye_calib.core.base.text import (
+    AXIS_UNITS,
+    amount,
+    axes_in_words,
+    capital,
+    duration,
+    listing,
+)
 from hand_eye_calib.core.results.context import Difference
+from hand_eye_calib.online.live.brief import (
+    RESET_AFTER_REPAIR,
+    START_SOURCE_AGAIN,
+    in_one_breath,
+)
 from hand_eye_calib.online.live.progress import AXIS_KEYS
 from hand_eye_calib.online.live.state import (
     ChecksState,
-    ExtrinsicState,
+    InputState,
     Level,
     NodeState,
     Part,
     ProgressState,
+    ResultState,
     SavedState,
     Standing,
 )
@@ -24,12 +41,11 @@ from hand_eye_calib.online.watch.view import Tone
 MOVED = "MOUNT MOVED"
 CHANGE_MOTION = "CHANGE THE MOTION"
 CHANGE_TARGET = "CHANGE THE TARGET"
+CHECK_VALUE = "CHECK THE VALUE"
+CHECK_STREAMS = "CHECK THE STREAMS"
 DONE = "DONE"
 
-
-# Most words of a text in a headline: a person at the machine reads it aloud in one breath. Longer
-# texts are on the same page below the headline.
-_MAX_WORDS = 15
+_ACKNOWLEDGE = "Check it, then recalibrate or acknowledge."
 
 
 class Headline(NamedTuple):
@@ -43,15 +59,23 @@ class Headline(NamedTuple):
     sentence : str
     advice : str
         What to do; empty if the sentence contains it.
+    request : str
+        The request of ``view.KEYS`` that the person should send; empty if there is none.
     """
 
     tone: Tone
     word: str
     sentence: str
     advice: str = ""
+    request: str = ""
+
+    @property
+    def line(self) -> str:
+        """The headline in one line, for the log and for topics."""
+        return f"{self.word}: {self.sentence} {self.advice}".rstrip()
 
 
-def headline_of(state: NodeState, silent_s: float) -> Headline:
+def headline_of(state: NodeState, silent_s: float = 0.0) -> Headline:
     """Return the headline of a node.
 
     ``silent_s`` is the time (s) since the last message of a node that is silent, otherwise 0.
@@ -65,65 +89,134 @@ def headline_of(state: NodeState, silent_s: float) -> Headline:
 
 def _alarm(state: NodeState) -> Headline | None:
     """Return the gravest condition that requires a person; None if there is none."""
-    for tone, word, level, part in _conditions(state):
-        if part is not None and part.level is level:
-            advice = (
-                "Check it, then recalibrate or acknowledge." if word == MOVED else ""
+    for condition in _conditions(state):
+        part = condition.part
+        if part is not None and part.level is condition.level:
+            text = condition.text or part.text
+            sentence = _sentence(in_one_breath(text, condition.otherwise or text))
+            return Headline(
+                condition.tone,
+                condition.word,
+                sentence,
+                condition.advice,
+                condition.request,
             )
-            return Headline(tone, word, _sentence(_headline_text(part)), advice)
     return None
 
 
-def _headline_text(part: Part) -> str:
-    """Return the text of a part in a condition that requires a person."""
-    if (
-        isinstance(part, ExtrinsicState)
-        and part.contradicted
-        and part.level is Level.WARN
-    ):
-        priors = f"the prior on {axes_in_words(part.contradicted)}"
-        return (
-            f"{priors} contradicts the motion. Check value, unit and sign, or remove it"
-        )
-    if not isinstance(part, ChecksState) or not part.gravest:
-        return part.text
-    return _in_one_breath(
-        part.gravest, "the streams have a fault: read the checks below"
-    )
+class _Condition(NamedTuple):
+    """A condition of a node, which it is in if a part of the node has a level.
 
-
-def _in_one_breath(text: str, otherwise: str) -> str:
-    """Return a text if a person can read it aloud in one breath, otherwise another text."""
-    return text if len(text.split()) <= _MAX_WORDS else otherwise
-
-
-def _conditions(state: NodeState) -> Iterator[tuple[Tone, str, Level, Part | None]]:
-    """Yield conditions, the gravest first.
-
-    A condition has the tone and the word of its headline, a level, and a part of the node. The node
-    is in this condition if the part has the level.
+    Attributes
+    ----------
+    tone, word, advice, request
+        See :class:`Headline`.
+    level : Level
+    part : Part or None
+    text : str
+        Text of the headline. Default: the text of the part.
+    otherwise : str
+        Text of the headline if the first text is too long.
     """
-    extrinsic = state.extrinsic
-    checks = state.checks
+
+    tone: Tone
+    word: str
+    level: Level
+    part: Part | None
+    advice: str = ""
+    request: str = ""
+    text: str = ""
+    otherwise: str = ""
+
+
+def _conditions(state: NodeState) -> Iterator[_Condition]:
+    """Yield conditions that require a person, the gravest first."""
     # The inputs of further child sensors are displayed, but do not become a headline.
     inputs = [
         stream for name, stream in state.inputs.items() if name in ("parent", "child")
     ]
-    yield Tone.BAD, "BROKEN", Level.ERROR, extrinsic
-    yield Tone.BAD, MOVED, Level.ERROR, state.mount
+    yield _Condition(
+        Tone.BAD,
+        "BROKEN",
+        Level.ERROR,
+        state.extrinsic,
+        advice="Look at the log. The next solve may succeed.",
+        otherwise="the solve failed unexpectedly",
+    )
+    yield _Condition(
+        Tone.BAD, MOVED, Level.ERROR, state.mount, _ACKNOWLEDGE, "recalibrate"
+    )
+    extrinsic = state.extrinsic
     if extrinsic and extrinsic.contradicted:
-        yield Tone.BAD, "CHECK THE PRIOR", Level.WARN, extrinsic
+        axes = axes_in_words(extrinsic.contradicted)
+        yield _Condition(
+            Tone.BAD,
+            CHECK_VALUE,
+            Level.WARN,
+            extrinsic,
+            "Correct it (value, unit, sign), or remove it.",
+            text=f"the value typed in for {axes} contradicts the motion",
+        )
     for stream in inputs:
-        yield Tone.BAD, "BAD INPUT", Level.ERROR, stream
-    yield Tone.BAD, "BROKEN", Level.ERROR, None if _is_saved(state) else state.journal
+        yield _Condition(
+            Tone.BAD,
+            "BAD INPUT",
+            Level.ERROR,
+            stream,
+            "Correct its source.",
+            otherwise=f"messages on {stream.topic} are unusable",
+        )
+    yield _Condition(
+        Tone.BAD,
+        "BROKEN",
+        Level.ERROR,
+        None if _is_saved(state) else state.journal,
+        "Save: a crash would lose the session.",
+        "save",
+        text="the session cannot be written to the disk",
+    )
     for stream in inputs:
-        is_paused = stream.is_paused and state.progress is not None
-        yield Tone.ACT, "PAUSED" if is_paused else "CHECK INPUT", Level.WARN, stream
-    if checks and checks.age_s is not None:
-        yield Tone.ACT, "CHECK THE STREAMS", Level.WARN, checks
+        yield _of_input(stream, state)
+    if state.checks and state.checks.age_s is not None:
+        yield _of_checks(state.checks)
     if state.standing is Standing.OUTDATED:
-        yield Tone.ACT, "OLD RESULT", Level.WARN, extrinsic
-    yield Tone.ACT, "NOT WATCHING", Level.WARN, state.mount
+        yield _Condition(
+            Tone.ACT,
+            "OLD RESULT",
+            Level.WARN,
+            extrinsic,
+            "Drive on. If this stays, reset.",
+            "reset",
+            text="the newest solves fail, and the result is older",
+        )
+    yield _Condition(Tone.ACT, "NOT WATCHING", Level.WARN, state.mount)
+
+
+def _of_input(stream: InputState, state: NodeState) -> _Condition:
+    """Return the condition of an input that has no poses, or unsuitable ones."""
+    is_paused = stream.is_paused and state.progress is not None
+    return _Condition(
+        Tone.ACT,
+        "PAUSED" if is_paused else "CHECK INPUT",
+        Level.WARN,
+        stream,
+        stream.step,
+        "reset" if stream.needs_reset else "",
+    )
+
+
+def _of_checks(checks: ChecksState) -> _Condition:
+    """Return the condition that the streams have a fault."""
+    return _Condition(
+        Tone.ACT,
+        CHECK_STREAMS,
+        Level.WARN,
+        checks,
+        checks.step,
+        "reset" if checks.needs_reset else "",
+        checks.gravest,
+        "the streams have a fault: read the checks below" if checks.gravest else "",
+    )
 
 
 def _is_saved(state: NodeState) -> bool:
@@ -146,50 +239,69 @@ def _activity(state: NodeState) -> Headline:
     sentence = _sentence(session.text)
     # Streams may become faulty after the goal is reached.
     if session.progress.is_faulty:
-        return Headline(Tone.ACT, "CHECK THE STREAMS", sentence)
+        text = in_one_breath(
+            sentence, "The streams have a fault: read the reasons below."
+        )
+        return Headline(Tone.ACT, CHECK_STREAMS, text, RESET_AFTER_REPAIR, "reset")
     if session.progress.done:
         return _at_goal(state, session)
     tone = Tone.BUSY if session.level is Level.OK else Tone.ACT
     if session.is_paused:
-        return Headline(tone, "PAUSED", sentence)
+        return _pause(tone, state, sentence)
     # Until the next result, neither bars nor advice change, whatever the person does.
     slow = state.extrinsic.slow if state.extrinsic else ""
     if state.result is None:
-        return Headline(Tone.BUSY, "START", sentence, slow)
+        has_moved = state.extrinsic is not None and state.extrinsic.motion_s > 0.0
+        return Headline(Tone.BUSY, "GO ON" if has_moved else "START", sentence, slow)
     if session.progress.target_is_too_small:
-        return Headline(tone, CHANGE_TARGET, sentence, slow)
+        return Headline(tone, CHANGE_TARGET, sentence, slow, "save")
     return Headline(
         tone, "GO ON" if tone is Tone.BUSY else CHANGE_MOTION, sentence, slow
     )
 
 
+def _pause(tone: Tone, state: NodeState, sentence: str) -> Headline:
+    """Return the headline of a session without new poses; ``sentence`` if the inputs rest."""
+    paused = {name: stream for name, stream in state.inputs.items() if stream.is_paused}
+    if not paused:
+        return Headline(tone, "PAUSED", sentence)
+    longest_s = max(stream.silent_s or 0.0 for stream in paused.values())
+    text = f"No pose of {listing([*paused])} for {duration(longest_s)}."
+    advice = "Drive on, or save." if tone is Tone.BUSY else START_SOURCE_AGAIN
+    return Headline(tone, "PAUSED", text, advice)
+
+
 def _at_goal(state: NodeState, session: ProgressState) -> Headline:
     """Return the headline of a session that has reached its goal.
 
-    If the sensor has moved against the installed transform, the sentence states by how much.
-    Otherwise the sentence states the precision. If the verdict is not ``USE``, the advice contains
-    the gravest reason.
+    The sentence states how far the sensor has moved against the installed transform. Otherwise it
+    states the precision or, if the verdict is not ``USE``, the verdict with its gravest reason.
     """
-    tone = Tone.GOOD
+    result = state.result
     sentence = _sentence(session.progress.precision)
-    advice = "Stop and save."
-    caution = ""
-    if state.result and state.result.verdict != "USE":
+    steps = ["" if state.saved else "Stop and save."]
+    tone = Tone.GOOD
+    caution = _caution(result) if result else ""
+    if result and caution:
         tone = Tone.ACT
-        reasons = [
-            _in_one_breath(reason, "read the reasons below")
-            for reason in state.result.reasons[:1]
-        ]
-        caution = _sentence(": ".join((state.result.verdict, *reasons)))
-    if state.result and session.comparison and session.comparison.verdict == "moved":
+        sentence = caution
+        steps = ["" if state.saved else "Save.", result.step]
+    if result and session.comparison and session.comparison.verdict == "moved":
         tone = Tone.ACT
         displacement = _displacement(session.comparison.differences[0])
-        sentence = f"{state.result.child_frame} HAS MOVED by {displacement}."
-        advice = "Save."
+        sentence = f"{result.child_frame} HAS MOVED by {displacement}."
+        steps = ["" if state.saved else "Save.", caution]
     if state.saved:
-        sentence = f"{sentence} Saved {saved_at(state.saved)}."
-        advice = ""
-    return Headline(tone, DONE, sentence, f"{advice} {caution}".strip())
+        sentence = f"{sentence} Saved at {_time_of(state.saved)}."
+    advice = " ".join(step for step in steps if step)
+    return Headline(tone, DONE, sentence, advice, "" if state.saved else "save")
+
+
+def _caution(result: ResultState) -> str:
+    """Return verdict and gravest reason as a sentence; empty if the verdict is ``USE``."""
+    if result.verdict == "USE":
+        return ""
+    return f"{result.verdict}: {result.caution or 'read the reasons below'}."
 
 
 def _displacement(difference: Difference) -> str:
@@ -225,22 +337,27 @@ def _silence(state: NodeState, silent_s: float) -> Headline:
 
 def _end(state: NodeState) -> Headline:
     """Return the headline of a node that has ended."""
-    tone = Tone.ACT
-    saved = state.saved
     text = "The node has ended"
+    saved = state.saved
     if state.mount is not None:
-        text += ": the mount is not monitored."
-    elif saved is not None:
-        text += f". The result was saved {saved_at(saved)}."
-        if saved.verdict == "DO NOT USE":
-            text += f" {_sentence(saved.text)}"
-        else:
-            tone = Tone.GOOD
-    elif state.result:
-        text += ". The result is not saved: the log contains the reason."
-    else:
-        text += ". There was no result yet."
-    return Headline(tone, "ENDED", text)
+        return Headline(Tone.ACT, "ENDED", f"{text}: the mount is not monitored.")
+    if saved is None:
+        reason = (
+            "The result is not saved: the log contains the reason."
+            if state.result
+            else "There was no result yet. Start it again to go on."
+        )
+        return Headline(Tone.ACT, "ENDED", f"{text}. {reason}")
+    saved_text = f"The result was saved at {_time_of(saved)}."
+    caution = _caution(state.result) if state.result else ""
+    if saved.verdict == "DO NOT USE":
+        caution = caution or f"{saved.verdict}: read the reasons below."
+        return Headline(
+            Tone.BAD, "ENDED", f"{caution} {saved_text}", "Mend that, and record again."
+        )
+    if state.result and caution:
+        return Headline(Tone.ACT, "ENDED", f"{caution} {saved_text}", state.result.step)
+    return Headline(Tone.GOOD, "ENDED", f"{text}. {saved_text}")
 
 
 def typeset(text: str) -> str:
@@ -256,4 +373,9 @@ def _sentence(text: str) -> str:
 
 def saved_at(saved: SavedState) -> str:
     """Return time of day and directory of a saved result."""
-    return f"at {datetime.fromtimestamp(saved.at_s):%H:%M} in {saved.directory}"
+    return f"at {_time_of(saved)} in {saved.directory}"
+
+
+def _time_of(saved: SavedState) -> str:
+    """Return the time of day of a saved result."""
+    return f"{datetime.fromtimestamp(saved.at_s):%H:%M}"

@@ -26,7 +26,7 @@ _MIN_WIDTH = 76
 _MAX_REASONS = 3
 
 # Labels of requests, where they differ from the names of the requests.
-_LABELS = {"forget": "forget priors"}
+_LABELS = {"forget": "remove typed values"}
 
 
 def screen(view: View, width: int, footer: str = "") -> RenderableType:

@@ -56,7 +56,7 @@ class Bar:
         information is the inverse of the variance.
     tone : Tone
     word : str
-        Progress in words, such as "30 s left".
+        Progress in words, such as "enough". The only time left is in the headline.
     sigma : str
         Standard deviation and target, such as "± 0.065 deg of 0.3 deg".
     difference : str
@@ -104,6 +104,8 @@ class View:
         Topics with poses, if an input lacks poses.
     buttons : tuple of str
         Requests that are possible now, the recommended request first.
+    asked : str
+        The request that the headline asks for; empty if there is none.
     by_hand : tuple of str
         Axes whose prior a person may set, correct or remove, the most important first.
     priors : tuple of (str, str)
@@ -129,6 +131,7 @@ class View:
     health: Lines = ()
     topics: Texts = ()
     buttons: Texts = ()
+    asked: str = ""
     by_hand: Texts = ()
     priors: AxisTexts = ()
     saved_in: str = ""

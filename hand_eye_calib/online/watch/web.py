@@ -307,6 +307,7 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
     health += _lines(view.result[1:] + view.health)
     return (
         f'<div id="state" class="{view.tone.name.lower()}" data-buttons="{" ".join(view.buttons)}" '
+        f'data-asked="{view.asked}" '
         f'data-by-hand="{" ".join(view.by_hand)}" '
         f'data-priors="{escape(json.dumps(dict(view.priors)))}" '
         f'data-files="{" ".join(files)}">'

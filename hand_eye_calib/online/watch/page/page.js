@@ -58,12 +58,14 @@ function display(html) {
   view.innerHTML = html;
   const state = element("state"), requests = state.dataset.buttons.split(" ");
   for (const button of buttons) {
-    button.hidden = !requests.includes(button.dataset.request);
-    // The first request is recommended, except solve and reset.
-    button.classList.toggle("main", requests[0] === button.dataset.request
-      && !["solve", "reset"].includes(requests[0]));
+    const request = button.dataset.request;
+    const isInFooter = footer.contains(button), isAsked = request === state.dataset.asked;
+    button.hidden = !requests.includes(request);
+    // Reset is always within reach if the headline asks for it, otherwise apart at the end.
+    if (request === "reset" && isInFooter !== isAsked) button.hidden = true;
+    button.classList.toggle("main", isInFooter && isAsked);
   }
-  footer.hidden = ["", "reset"].includes(requests[0]);
+  footer.hidden = [...footer.children].every((button) => button.hidden);
   element("files").hidden = state.dataset.files === "";
   offerAxes(state.dataset.byHand.split(" ").filter(Boolean), JSON.parse(state.dataset.priors));
   for (const link of links) {
@@ -101,6 +103,9 @@ function offerAxes(axes, newPriors) {
 function updateForm() {
   element("unit").textContent = "xyz".includes(axisByHand.value) ? "m" : "deg";
   element("forget").hidden = !(axisByHand.value in priors);
+  const [value, sigma] = (priors[axisByHand.value] || "").split("+/-");
+  form.elements.value.placeholder = value;
+  form.elements.sigma.placeholder = sigma || "";
 }
 
 function connect() {
@@ -143,7 +148,7 @@ for (const button of buttons) {
     // A reset keeps the priors unless the person removes them.
     const texts = Object.entries(priors).map(([axis, prior]) => `${axis} = ${prior}`).join(", ");
     const isReset = button.dataset.request === "reset";
-    if (isReset && texts && confirm(`Remove the prior, too? It is ${texts}.`)) post("forget");
+    if (isReset && texts && confirm(`Remove what was typed in, too? It is ${texts}.`)) post("forget");
     post(button.dataset.request);
   });
 }

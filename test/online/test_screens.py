@@ -1,0 +1,405 @@
+"""Every screen of ``watch``: its texts agree, and a driver reads them aloud in one breath."""
+
+from dataclasses import replace
+
+import pytest
+from node_states import (
+    BEHIND,
+    CHECKS,
+    EXTRINSIC,
+    FULL,
+    INF,
+    REACHED,
+    RESULT,
+    SAVED,
+    inputs,
+    mount,
+    state,
+    view_of,
+)
+from result_making import seen, written_finding
+from screen_rules import faults_of
+
+from hand_eye_calib.core.results.context import (
+    AxisDifference,
+    Comparison,
+    Difference,
+)
+from hand_eye_calib.core.results.records import AXES, Severity
+from hand_eye_calib.core.results.verdict import RULES, Reason, Verdict
+from hand_eye_calib.online.live.brief import (
+    CHECK_SOURCE,
+    START_SOURCE,
+    START_SOURCE_AGAIN,
+    of_reason,
+    publishers_in_words,
+    step_after,
+)
+from hand_eye_calib.online.live.describing import NO_PAIRS, too_little_in_words
+from hand_eye_calib.online.live.goal import no_result_in_words
+from hand_eye_calib.online.live.progress import AXIS_KEYS, AxisProgress
+from hand_eye_calib.online.live.state import Level, Standing
+from hand_eye_calib.online.watch import terminal
+from hand_eye_calib.online.watch.web import fragment
+
+FULL_BARS = dict.fromkeys(
+    AXIS_KEYS.values(), AxisProgress(sigma=0.001, target=0.02, seconds_left=0.0)
+)
+DONE = REACHED | {"axes": FULL_BARS, "sentence": "Done: good to 4 mm. Stop and save."}
+UNSEEN = AxisProgress(sigma=INF, target=0.02, seconds_left=INF)
+NOTHING = {"axes": dict.fromkeys(AXIS_KEYS.values(), UNSEEN), "limiting_axis": ""}
+HEIGHT_UNKNOWN = {"z": replace(BEHIND, seconds_left=INF)}
+HAND = "Drive over a ramp or a kerb, or measure it by hand."
+
+
+def moving(motion_s, result=None, **fields):
+    """The state of the solver after a motion."""
+    return replace(EXTRINSIC, motion_s=motion_s, result=result, **fields)
+
+
+def at(sentence, **fields):
+    return NOTHING | {"sentence": sentence} | fields
+
+
+def stream(name, text, **fields):
+    """Both inputs; one of them needs a person."""
+    both = inputs()
+    both = {key: replace(both[key], topic=f"/{key}_odom", messages=9) for key in both}
+    return both | {name: replace(both[name], level=Level.WARN, text=text, **fields)}
+
+
+def silent(name, level=Level.WARN):
+    text = f"/{name}_odom has been silent for 19 s"
+    both = stream(name, text, is_paused=True, silent_s=19.0, step=START_SOURCE_AGAIN)
+    return both | {name: replace(both[name], level=level)}
+
+
+def reason(rule, axes):
+    sentence = (
+        "the recording contradicts only errors above 12 cm along x, 19 cm y, 40 cm z"
+    )
+    return Reason(rule.name, rule.verdict, sentence, "compare with a tape", axes)
+
+
+def judged(rule, axes=("x", "y", "z")):
+    """A result with one reason."""
+    problem, step = of_reason(reason(rule, axes))
+    verdict = rule.verdict.value
+    fact = "would have shown from 12 cm along x on"
+    reasons = ("the recording contradicts only errors above 12 cm: compare",)
+    return replace(
+        RESULT,
+        verdict=verdict,
+        caution=problem,
+        step=step,
+        facts=(fact,),
+        reasons=reasons,
+    )
+
+
+UNDETECTABLE = next(rule for rule in RULES if rule.name == "undetectable")
+CONTRADICTED = next(rule for rule in RULES if rule.name == "prior")
+PUBLISHERS = publishers_in_words(["/peer", "/peer"])
+FAULT = replace(
+    CHECKS,
+    level=Level.WARN,
+    text="the extrinsic changes 60 s after the start by 2.9 deg: tighten it",
+    gravest="the extrinsic changes 60 s after the start by 2.9 deg",
+    step=step_after(
+        replace(
+            written_finding("mount_moved", Severity.ERROR, "moves", "tighten it"),
+            code="mount_moved",
+        )
+    ),
+    needs_reset=True,
+)
+DIFFERS = AxisDifference(difference=0.15, sigma=0.004, visible=0.01, verdict="moved")
+MOVED = Comparison(
+    sentence="moved: x by +15 cm +/- 4 mm",
+    verdict="moved",
+    differences=(
+        Difference(
+            first="a",
+            second="b",
+            verdict="moved",
+            sentence="",
+            axes=dict.fromkeys(AXIS_KEYS.values(), DIFFERS),
+        ),
+    ),
+)
+BUSY = "The computer is busy: a result takes 10 s."
+CARE = replace(EXTRINSIC, motion_s=83.0, result=judged(UNDETECTABLE))
+GOOD = replace(EXTRINSIC, motion_s=83.0)
+REFUTED = replace(
+    EXTRINSIC,
+    level=Level.WARN,
+    text="DO NOT USE: the prior on z is 158 standard deviations from the motion",
+    motion_s=40.0,
+    standing=Standing.REFUTED,
+    priors={"z": "1.5+/-0.01"},
+    contradicted=("z",),
+    result=judged(CONTRADICTED, ("z",)),
+)
+NO_USE = replace(SAVED, verdict="DO NOT USE", text="DO NOT USE: the prior on z")
+
+SCREENS = {
+    "no node": None,
+    "no publisher": state(
+        extrinsic=moving(0.0),
+        at=at("No result yet: move the sensors, with rotations."),
+        inputs=stream(
+            "parent",
+            "no message on /parent_odom yet: 0 publishers",
+            step=START_SOURCE,
+            messages=0,
+        ),
+    ),
+    "a publisher without messages": state(
+        extrinsic=moving(0.0),
+        at=at("No result yet: move the sensors, with rotations."),
+        inputs=stream(
+            "parent",
+            "no message on /parent_odom yet: 1 publisher",
+            step=CHECK_SOURCE,
+            messages=0,
+        ),
+    ),
+    "nothing moves": state(
+        extrinsic=moving(0.0), at=at("No result yet: move the sensors, with rotations.")
+    ),
+    "first seconds": state(
+        extrinsic=moving(3.0),
+        at=at(too_little_in_words(seen(3.0, (0.0, 0.0, 21.0)))),
+    ),
+    "first seconds, turned": state(
+        extrinsic=moving(3.0),
+        at=at(too_little_in_words(seen(3.0, (0.0, 0.0, 40.0)))),
+    ),
+    "streams do not pair": state(
+        extrinsic=moving(0.0, text="10 synchronised pose pairs are needed, found 0"),
+        at=at(NO_PAIRS),
+    ),
+    "no height yet": state(
+        extrinsic=moving(25.0),
+        at=at(f"z cannot be determined from the motion so far. {HAND}", by_hand=("z",)),
+    ),
+    "not converged": state(
+        extrinsic=moving(24.0),
+        at=at(no_result_in_words("the solver did not converge")),
+    ),
+    "flat": state(
+        axes=HEIGHT_UNKNOWN,
+        extrinsic=GOOD,
+        at={
+            "sentence": f"z is not determined well enough yet. {HAND}",
+            "by_hand": ("z",),
+        },
+    ),
+    "ramps": state(
+        axes=HEIGHT_UNKNOWN,
+        extrinsic=GOOD,
+        at={
+            "sentence": "z is not determined well enough yet. This motion is right, more of it.",
+        },
+    ),
+    "time left": state(
+        extrinsic=GOOD,
+        at={
+            "sentence": "Go on for about 90 s, z takes longest. This motion is right, more of it."
+        },
+    ),
+    "change": state(
+        axes=HEIGHT_UNKNOWN,
+        extrinsic=GOOD,
+        level=Level.WARN,
+        at={
+            "sentence": f"This motion will not determine z well enough. {HAND}",
+            "will_not_get_there": True,
+            "by_hand": ("z",),
+        },
+    ),
+    "target": state(
+        extrinsic=GOOD,
+        level=Level.WARN,
+        at={
+            "sentence": "No motion makes z good to 2 mm. Constant errors alone may be 5 mm. "
+            "Stop and save, or set a larger target.",
+            "target_is_too_small": True,
+            "will_not_get_there": True,
+        },
+    ),
+    "confirming": state(
+        extrinsic=GOOD,
+        at=at(
+            "Confirming, 20 s: every axis is within its target. Go on.", axes=FULL_BARS
+        ),
+    ),
+    "confirming, busy": state(
+        extrinsic=replace(GOOD, slow=BUSY),
+        at=at(
+            "Confirming, 20 s: every axis is within its target. Go on.", axes=FULL_BARS
+        ),
+    ),
+    "done": state(extrinsic=GOOD, at=DONE),
+    "done, saved": state(extrinsic=GOOD, at=DONE, saved=SAVED),
+    "done, moved": state(extrinsic=GOOD, at=DONE, comparison=MOVED),
+    "done with care": state(extrinsic=CARE, at=DONE),
+    "done with care, saved": state(extrinsic=CARE, at=DONE, saved=SAVED),
+    "done with care, moved": state(extrinsic=CARE, at=DONE, comparison=MOVED),
+    "one stream is silent": state(extrinsic=GOOD, inputs=silent("child")),
+    "parked": state(
+        extrinsic=GOOD,
+        inputs={
+            name: replace(part, is_paused=True, level=Level.OK)
+            for name, part in silent("child").items()
+        },
+        is_paused=True,
+    ),
+    "two publishers": state(
+        extrinsic=GOOD,
+        inputs=stream(
+            "child",
+            f"/child_odom has {PUBLISHERS}. Stop all but one, then reset",
+            needs_reset=True,
+        ),
+    ),
+    "had two publishers": state(
+        extrinsic=GOOD,
+        inputs=stream(
+            "child",
+            f"/child_odom had {PUBLISHERS}. Their poses are mixed: reset",
+            needs_reset=True,
+        ),
+    ),
+    "bad input": state(inputs=inputs(child=Level.ERROR)),
+    "lost messages": state(
+        inputs=stream(
+            "child",
+            "12 % of the messages are lost at 50 Hz. "
+            "Free processor time, or publish at a lower rate",
+        )
+    ),
+    "the mount was knocked": state(
+        extrinsic=GOOD,
+        checks=FAULT,
+        at={
+            "is_faulty": True,
+            "axes": FULL_BARS,
+            "sentence": "Stop: the streams differ.",
+        },
+    ),
+    "a fault without a check": state(
+        extrinsic=GOOD,
+        at={
+            "is_faulty": True,
+            "axes": FULL_BARS,
+            "sentence": "Stop: the streams differ.",
+        },
+    ),
+    "a value contradicts": state(
+        extrinsic=REFUTED, level=Level.WARN, at=at("No usable result: a prior.")
+    ),
+    "outdated": state(
+        extrinsic=replace(
+            GOOD,
+            level=Level.WARN,
+            text="USE, but every solve has failed for 60 s: no overlap; the result is old",
+            standing=Standing.OUTDATED,
+        ),
+        level=Level.WARN,
+    ),
+    "a defect": state(extrinsic=replace(EXTRINSIC, level=Level.ERROR, text="a " * 20)),
+    "no disk": state(extrinsic=GOOD, journal=FULL),
+    "ended": replace(state(extrinsic=GOOD, at=DONE, saved=SAVED), has_ended=True),
+    "ended with care": replace(
+        state(extrinsic=CARE, at=DONE, saved=replace(SAVED, verdict="USE WITH CARE")),
+        has_ended=True,
+    ),
+    "ended, not to be used": replace(
+        state(extrinsic=REFUTED, at=at("No usable result: a prior."), saved=NO_USE),
+        has_ended=True,
+    ),
+    "ended before a result": replace(
+        state(extrinsic=moving(9.0), at=at("No result yet.")), has_ended=True
+    ),
+    "monitor": mount(),
+    "monitor learns": mount(is_learning=True),
+}
+
+
+@pytest.mark.parametrize("name", SCREENS)
+def test_the_texts_of_a_screen_agree(name):
+    document = SCREENS[name]
+    view = view_of(document)
+    if document is not None:
+        assert list(faults_of(view, document)) == []
+    # Page and terminal display the same sentences.
+    for sentence in (view.word, view.sentence):
+        assert sentence in terminal.lines(view)[0]
+        assert sentence.replace("'", "&#x27;") in fragment(view)
+
+
+@pytest.mark.parametrize("rule", RULES, ids=[rule.name for rule in RULES])
+@pytest.mark.parametrize("axes", [(), ("z",), AXES[:5], AXES], ids=len)
+def test_a_session_is_done_with_each_reason_in_a_few_words(rule, axes):
+    extrinsic = replace(GOOD, result=judged(rule, tuple(axes)))
+    verdict = rule.verdict.value
+    saved = replace(SAVED, verdict=verdict)
+    documents = [replace(state(extrinsic=extrinsic, saved=saved), has_ended=True)]
+    if rule.verdict is not Verdict.DO_NOT_USE:
+        documents.append(state(extrinsic=extrinsic, at=DONE))
+    for document in documents:
+        view = view_of(document)
+        assert list(faults_of(view, document)) == []
+        assert verdict in view.text
+        assert extrinsic.result.caution in view.text
+
+
+@pytest.mark.parametrize("has_options", [False, True])
+@pytest.mark.parametrize("severity", [Severity.ERROR, Severity.WARNING])
+@pytest.mark.parametrize("code", ["mount_moved", "interleaved", "lengths"])
+@pytest.mark.parametrize("n_words", [4, 40])
+def test_a_fault_of_the_streams_has_a_next_step(code, severity, has_options, n_words):
+    options = {"time_offset": 0.02} if has_options else {}
+    advice = "correct " + "that " * n_words
+    fault = written_finding(code, severity, "a " * n_words, advice, options=options)
+    is_reset = fault.makes_unusable and not has_options
+    checks = replace(
+        FAULT, gravest=fault.what, step=step_after(fault), needs_reset=is_reset
+    )
+    document = state(extrinsic=GOOD, checks=checks)
+    view = view_of(document)
+    assert list(faults_of(view, document)) == []
+    assert (view.word, view.asked) == ("CHECK THE STREAMS", "reset" if is_reset else "")
+
+
+BROKEN = {
+    "a verdict that is not named": (SCREENS["done with care"], {"sentence": "Good."}),
+    "two times left": (SCREENS["time left"], {"advice": "Confirming, 20 s."}),
+    "no step": (SCREENS["one stream is silent"], {"advice": ""}),
+    "a reset out of reach": (SCREENS["two publishers"], {"asked": ""}),
+    "no field": (SCREENS["flat"], {"by_hand": ()}),
+    "jargon": (SCREENS["flat"], {"sentence": "Raise max_gap by hand."}),
+    "too long": (SCREENS["flat"], {"sentence": "a " * 16 + "by hand."}),
+    "a name twice": (SCREENS["two publishers"], {"sentence": "/a and /a: reset."}),
+    "a form after the end": (SCREENS["ended"], {"by_hand": ("z",)}),
+    "START while moving": (SCREENS["not converged"], {"word": "START"}),
+    "early advice": (
+        SCREENS["first seconds"],
+        {"sentence": "z cannot be determined."},
+    ),
+    "bars that are not full": (SCREENS["time left"], {"word": "DONE"}),
+    "an old result": (SCREENS["one stream is silent"], {"facts": "result 2 s old"}),
+    "a good input without poses": (
+        SCREENS["time left"],
+        {"sentence": "No poses of parent."},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_the_rules_find_a_screen_that_contradicts_itself(name):
+    document, fields = BROKEN[name]
+    view = view_of(document)
+    assert not list(faults_of(view, document))
+    assert list(faults_of(replace(view, **fields), document))
