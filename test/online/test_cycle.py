@@ -79,8 +79,9 @@ def answered(cycle, motion_s, sigmas_m=0.005, n_poses=100, check=None, **fields)
     return cycle.conclude(Answer(0, 0.1, seen(motion_s), newest, check=check))
 
 
-# Motion of 25 s that hides no axis.
-DETERMINED = dataclasses.replace(seen(25.0, (40.0, 40.0, 40.0)), lever_arms=np.eye(3))
+def determined():
+    """Motion of 25 s that hides no axis."""
+    return dataclasses.replace(seen(25.0, (40.0, 40.0, 40.0)), lever_arms=np.eye(3))
 
 
 def reach_goal(cycle):
@@ -182,7 +183,7 @@ def test_a_first_result_takes_20_s_of_motion_or_a_rotation_of_30_deg(
             Answer(
                 0,
                 0.1,
-                DETERMINED,
+                determined(),
                 failure=Failure("3 pairs: 9 poses; record longer"),
             ),
             "3 pairs. 9 poses. Record longer.",

@@ -42,10 +42,14 @@ from hand_eye_calib.online.live.state import Level, Standing
 from hand_eye_calib.online.watch import terminal
 from hand_eye_calib.online.watch.web import fragment
 
-FULL_BARS = dict.fromkeys(
-    AXIS_KEYS.values(), AxisProgress(sigma=0.001, target=0.02, seconds_left=0.0)
-)
-DONE = REACHED | {"axes": FULL_BARS, "sentence": "Done: good to 4 mm. Stop and save."}
+
+def full_bars():
+    """Progress of six axes that are within their targets."""
+    row = AxisProgress(sigma=0.001, target=0.02, seconds_left=0.0)
+    return dict.fromkeys(AXIS_KEYS.values(), row)
+
+
+DONE = REACHED | {"axes": full_bars(), "sentence": "Done: good to 4 mm. Stop and save."}
 UNSEEN = AxisProgress(sigma=INF, target=0.02, seconds_left=INF)
 NOTHING = {"axes": dict.fromkeys(AXIS_KEYS.values(), UNSEEN), "limiting_axis": ""}
 HEIGHT_UNKNOWN = {"z": replace(BEHIND, seconds_left=INF)}
@@ -113,20 +117,25 @@ FAULT = replace(
     ),
     needs_reset=True,
 )
-DIFFERS = AxisDifference(difference=0.15, sigma=0.004, visible=0.01, verdict="moved")
-MOVED = Comparison(
-    sentence="moved: x by +15 cm +/- 4 mm",
-    verdict="moved",
-    differences=(
-        Difference(
-            first="a",
-            second="b",
-            verdict="moved",
-            sentence="",
-            axes=dict.fromkeys(AXIS_KEYS.values(), DIFFERS),
-        ),
-    ),
-)
+
+
+def moved():
+    """A comparison in which every axis has moved."""
+    row = AxisDifference(difference=0.15, sigma=0.004, visible=0.01, verdict="moved")
+    difference = Difference(
+        first="a",
+        second="b",
+        verdict="moved",
+        sentence="",
+        axes=dict.fromkeys(AXIS_KEYS.values(), row),
+    )
+    return Comparison(
+        sentence="moved: x by +15 cm +/- 4 mm",
+        verdict="moved",
+        differences=(difference,),
+    )
+
+
 BUSY = "The computer is busy: a result takes 10 s."
 CARE = replace(EXTRINSIC, motion_s=83.0, result=judged(UNDETECTABLE))
 GOOD = replace(EXTRINSIC, motion_s=83.0)
@@ -231,21 +240,23 @@ SCREENS = {
     "confirming": state(
         extrinsic=GOOD,
         at=at(
-            "Confirming, 20 s: every axis is within its target. Go on.", axes=FULL_BARS
+            "Confirming, 20 s: every axis is within its target. Go on.",
+            axes=full_bars(),
         ),
     ),
     "confirming, busy": state(
         extrinsic=replace(GOOD, slow=BUSY),
         at=at(
-            "Confirming, 20 s: every axis is within its target. Go on.", axes=FULL_BARS
+            "Confirming, 20 s: every axis is within its target. Go on.",
+            axes=full_bars(),
         ),
     ),
     "done": state(extrinsic=GOOD, at=DONE),
     "done, saved": state(extrinsic=GOOD, at=DONE, saved=SAVED),
-    "done, moved": state(extrinsic=GOOD, at=DONE, comparison=MOVED),
+    "done, moved": state(extrinsic=GOOD, at=DONE, comparison=moved()),
     "done with care": state(extrinsic=CARE, at=DONE),
     "done with care, saved": state(extrinsic=CARE, at=DONE, saved=SAVED),
-    "done with care, moved": state(extrinsic=CARE, at=DONE, comparison=MOVED),
+    "done with care, moved": state(extrinsic=CARE, at=DONE, comparison=moved()),
     "one stream is silent": state(extrinsic=GOOD, inputs=silent("child")),
     "parked": state(
         extrinsic=GOOD,
@@ -284,7 +295,7 @@ SCREENS = {
         checks=FAULT,
         at={
             "is_faulty": True,
-            "axes": FULL_BARS,
+            "axes": full_bars(),
             "sentence": "Stop: the streams differ.",
         },
     ),
@@ -292,7 +303,7 @@ SCREENS = {
         extrinsic=GOOD,
         at={
             "is_faulty": True,
-            "axes": FULL_BARS,
+            "axes": full_bars(),
             "sentence": "Stop: the streams differ.",
         },
     ),

@@ -56,8 +56,9 @@ def test_a_contradicted_prior_withdraws_the_result_until_it_is_removed(
         lambda: sentence in statuses["/calibrator: extrinsic"].message,
         "the contradiction",
     )
+    advice = "The value typed in for z contradicts the motion"
     peer.spin_until(
-        lambda: sentence in statuses["/calibrator: progress"].message, "the same advice"
+        lambda: advice in statuses["/calibrator: progress"].message, "the advice"
     )
     answer = peer.trigger("solve")
     assert (
@@ -67,12 +68,14 @@ def test_a_contradicted_prior_withdraws_the_result_until_it_is_removed(
         False,
         True,
     )
-    for name in ("extrinsic", "progress"):
+    endings = {
+        "extrinsic": "check value, unit and sign of prior.z, or remove it",
+        "progress": "Correct it (value, unit, sign), or remove it.",
+    }
+    for name in endings:
         status = statuses[f"/calibrator: {name}"]
         assert status.level == status.WARN
-        assert status.message.endswith(
-            "check value, unit and sign of prior.z, or remove it"
-        )
+        assert status.message.endswith(endings[name])
     values = values_of(statuses["/calibrator: extrinsic"])
     assert (values["standing"], values["contradicted"]) == ("refuted", "z")
     assert json.loads(states[-1].data)["extrinsic"]["result"]["verdict"] == "DO NOT USE"

@@ -1,11 +1,14 @@
 """The parent is the wheels of a vehicle, the child a sensor on it."""
 
+import json
+
 import numpy as np
 import pytest
 from geometry_msgs.msg import TransformStamped, TwistStamped
 from nav_msgs.msg import Odometry
 from ros_harness import RELIABLE_INPUTS, matrix, message
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 
 import hand_eye_calib as hec
 from reproduction.machines import simulate_machine
@@ -125,7 +128,20 @@ def test_wheels_as_parent(start_node, peer, tmp_path, case):
         *RELIABLE_INPUTS,
     )
     transforms = peer.listen(TransformStamped, "extrinsic")
+    states = peer.listen(String, "progress")
     publish(peer, make_messages(machine), machine)
+
+    def have_arrived():
+        """Whether both inputs have messages, and no more in the last states."""
+        inputs = [json.loads(state.data)["inputs"] for state in states[-3:]]
+        numbers = [
+            {name: part["messages"] for name, part in state.items()} for state in inputs
+        ]
+        return (
+            len(numbers) == 3 and numbers[0] == numbers[2] and all(numbers[0].values())
+        )
+
+    peer.spin_until(have_arrived, "all messages")
     assert peer.trigger("solve").success
     peer.spin_until(lambda: transforms, "the extrinsic")
     errors_m = (matrix(transforms[-1]) - machine.T_base_sensor)[:2, 3]

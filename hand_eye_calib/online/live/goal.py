@@ -78,12 +78,15 @@ class _Result:
         Motion of the session up to the result (s).
     sigmas_measured : (6,) array
         Standard deviations without the allowance (m, rad).
+    allowance : (6,) array
+        Allowance for constant errors (m, rad); infinite if options have changed since.
     is_usable : bool
         Whether the solve succeeded and the streams had no faults.
     """
 
     motion_s: float
     sigmas_measured: FloatArray
+    allowance: FloatArray
     is_usable: bool
 
 
@@ -146,6 +149,8 @@ class Goal:
         """
         self._targets = np.asarray(targets, dtype=float)
         has_result = self._motion is not None
+        unknown = np.full(6, np.inf)
+        self._results = [replace(result, allowance=unknown) for result in self._results]
         self._start_over("Solving with the new options." if has_result else _NO_RESULT)
 
     def retarget(self, calibration: Calibration, targets: Targets) -> None:
@@ -207,14 +212,17 @@ class Goal:
         if self._results and motion_s <= self._results[-1].motion_s:
             motion_s = self._results.pop().motion_s
         is_usable = not self._faults and not calibration.status.failure
-        self._results.append(_Result(motion_s, calibration.sigmas_measured, is_usable))
+        result = _Result(
+            motion_s, calibration.sigmas_measured, calibration.allowance, is_usable
+        )
+        self._results.append(result)
         # A confirmation also needs the last result before the longest confirming motion.
         start_s = motion_s - _MAX_CONFIRMATION_S
         while len(self._results) > 1 and self._results[1].motion_s <= start_s:
             del self._results[0]
 
     def _variance_ratios(
-        self, newest: Calibration, sigmas_measured: FloatArray | None = None
+        self, newest: Calibration, earlier: _Result | None = None
     ) -> FloatArray:
         """Return measured variances (6,) divided by ``target**2 - allowance**2``.
 
@@ -225,14 +233,18 @@ class Goal:
         Parameters
         ----------
         newest : Calibration
-            Its allowance and priors are used, because options may have changed since an earlier
-            result.
-        sigmas_measured : (6,) array, optional
-            Standard deviations of an earlier result. Default: those of the newest result.
+            Its priors are used, because options may have changed since an earlier result.
+        earlier : _Result, optional
+            An earlier result with its standard deviations and the smaller of both allowances: the
+            allowance is an estimate that varies from result to result, and a confirmation must not
+            begin anew because the newest allowance is larger. Default: the newest result.
         """
-        if sigmas_measured is None:
-            sigmas_measured = newest.sigmas_measured
-        allowed = self._targets**2 - newest.allowance**2
+        sigmas_measured = newest.sigmas_measured
+        allowance = newest.allowance
+        if earlier is not None:
+            sigmas_measured = earlier.sigmas_measured
+            allowance = np.minimum(allowance, earlier.allowance)
+        allowed = self._targets**2 - allowance**2
         ratios = np.full(6, np.inf)
         np.divide(sigmas_measured**2, allowed, out=ratios, where=allowed > 0.0)
         ratios[np.isin(AXES, newest.out_of_reach)] = 0.0
@@ -267,9 +279,7 @@ class Goal:
         # Motion (s) of the first result in the latest run of results within the targets.
         first_s = motion_s
         for result in reversed(self._results):
-            is_within = (
-                self._variance_ratios(newest, result.sigmas_measured).max() <= 1.0
-            )
+            is_within = self._variance_ratios(newest, result).max() <= 1.0
             if not is_within or not result.is_usable:
                 break
             first_s = result.motion_s
@@ -293,7 +303,7 @@ class Goal:
             further_s = motion_s - result.motion_s
             if further_s < _MIN_MOTION_TO_JUDGE_S:
                 break
-            earlier = self._variance_ratios(newest, result.sigmas_measured)
+            earlier = self._variance_ratios(newest, result)
             earlier_share = 1.0 / np.maximum(earlier, 1.0)
             rate = np.maximum(rate, (share - earlier_share) / further_s)
         left_s = np.full(6, np.inf)
