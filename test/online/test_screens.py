@@ -28,7 +28,6 @@ from hand_eye_calib.core.results.context import (
 from hand_eye_calib.core.results.records import AXES, Severity
 from hand_eye_calib.core.results.verdict import RULES, Reason, Verdict
 from hand_eye_calib.online.live.brief import (
-    CHECK_SOURCE,
     START_SOURCE,
     START_SOURCE_AGAIN,
     of_reason,
@@ -136,7 +135,6 @@ def moved():
     )
 
 
-BUSY = "The computer is busy: a result takes 10 s."
 CARE = replace(EXTRINSIC, motion_s=83.0, result=judged(UNDETECTABLE))
 GOOD = replace(EXTRINSIC, motion_s=83.0)
 REFUTED = replace(
@@ -160,16 +158,6 @@ SCREENS = {
             "parent",
             "no message on /parent_odom yet: 0 publishers",
             step=START_SOURCE,
-            messages=0,
-        ),
-    ),
-    "a publisher without messages": state(
-        extrinsic=moving(0.0),
-        at=at("No result yet: move the sensors, with rotations."),
-        inputs=stream(
-            "parent",
-            "no message on /parent_odom yet: 1 publisher",
-            step=CHECK_SOURCE,
             messages=0,
         ),
     ),
@@ -244,18 +232,10 @@ SCREENS = {
             axes=full_bars(),
         ),
     ),
-    "confirming, busy": state(
-        extrinsic=replace(GOOD, slow=BUSY),
-        at=at(
-            "Confirming, 20 s: every axis is within its target. Go on.",
-            axes=full_bars(),
-        ),
-    ),
     "done": state(extrinsic=GOOD, at=DONE),
     "done, saved": state(extrinsic=GOOD, at=DONE, saved=SAVED),
     "done, moved": state(extrinsic=GOOD, at=DONE, comparison=moved()),
     "done with care": state(extrinsic=CARE, at=DONE),
-    "done with care, saved": state(extrinsic=CARE, at=DONE, saved=SAVED),
     "done with care, moved": state(extrinsic=CARE, at=DONE, comparison=moved()),
     "one stream is silent": state(extrinsic=GOOD, inputs=silent("child")),
     "parked": state(
@@ -400,7 +380,6 @@ BROKEN = {
         {"sentence": "z cannot be determined."},
     ),
     "bars that are not full": (SCREENS["time left"], {"word": "DONE"}),
-    "an old result": (SCREENS["one stream is silent"], {"facts": "result 2 s old"}),
     "a good input without poses": (
         SCREENS["time left"],
         {"sentence": "No poses of parent."},
