@@ -107,7 +107,8 @@ class Streams(Columns):
         rates = se3.log(self.motions_c) / np.diff(self.stamps_s)[:, None]
         padded = np.pad(rates, ((2, 2), (0, 0)), mode="edge")
         windows = np.lib.stride_tricks.sliding_window_view(padded, 4, axis=0)
-        return np.median(windows, axis=2)
+        # The median of four numbers. np.median would import numpy.ma for 7 ms.
+        return np.sort(windows, axis=2)[:, :, 1:3].mean(axis=2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -260,12 +260,35 @@ def _number(text: str) -> Decimal | None:
     return None
 
 
+def decimals(texts: Sequence[str]) -> list[Decimal]:
+    """Return the numbers in texts, as :func:`stamp_of` does for one column.
+
+    Raises
+    ------
+    ValueError
+        If :func:`stamp_of` would not read one of the texts as a plain number.
+    """
+    try:
+        numbers = [*map(Decimal, texts)]
+    except InvalidOperation:
+        raise ValueError("not all stamps are plain numbers") from None
+    is_plain = "_" not in "".join(texts)
+    if not is_plain or not all(map(_is_stamp, numbers)):
+        raise ValueError("not all stamps are plain numbers")
+    return numbers
+
+
+def _is_stamp(number: Decimal) -> bool:
+    """Whether a number is finite and not too large for a stamp."""
+    return number.is_finite() and number.adjusted() <= 30
+
+
 def _decimal(text: str) -> Decimal:
     """Return the number in a text, in an unknown unit, or the seconds of a date or time of day."""
     stamp = _number(text)
     if stamp is None and is_date_or_time(text):
         return seconds_of(text)
-    if stamp is None or not stamp.is_finite() or stamp.adjusted() > 30:
+    if stamp is None or not _is_stamp(stamp):
         raise ValueError(f"found {text!r} for the timestamp")
     return stamp
 

@@ -11,6 +11,7 @@ from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
+from itertools import islice
 from pathlib import Path
 from typing import Any, Self
 
@@ -41,7 +42,7 @@ from hand_eye_calib.formats.trajectory_files.columns import (
     named_columns,
     stamp_columns,
 )
-from hand_eye_calib.formats.trajectory_files.dates import seconds, stamp_of
+from hand_eye_calib.formats.trajectory_files.dates import decimals, seconds, stamp_of
 
 # Groups of quantities, each of which is an orientation. A tracker that is lost writes 0 for all
 # quantities of the group; a valid orientation is never all 0.
@@ -50,6 +51,9 @@ _ORIENTATIONS = (QUATERNION, SCALAR_FIRST, UNNAMED, ROTATION)
 # Largest number of different names in a column of sensors. A column with more names is about
 # something else, such as images.
 _MOST_SENSORS = 20
+
+# Number of rows that are converted at once. It limits the memory for the texts of cells.
+_ROWS_AT_ONCE = 1000
 
 
 @dataclass
@@ -223,16 +227,14 @@ class Table:
             At the first line with another number of cells, or with text instead of a number; and if
             the poses are those of several sensors.
         """
-        n_columns = len(self.names)
-        for line_number, content in lines:
-            cells = cells_of(content)
-            if len(cells) != n_columns:
-                cells = self._padded(cells, line_number, content)
-            try:
-                self._add(cells, line_number)
-            except ValueError as error:
-                reason = f"expected {self.expected}; {shortened(str(error))}"
-                raise InputError(f"{self.path}, line {line_number}: {reason}") from None
+        remaining = iter(lines)
+        while numbered := list(islice(remaining, _ROWS_AT_ONCE)):
+            line_numbers = [line_number for line_number, _ in numbered]
+            rows = [cells_of(content) for _, content in numbered]
+            if self._add_at_once(rows, line_numbers):
+                continue
+            for (line_number, content), cells in zip(numbered, rows, strict=True):
+                self._add_row(cells, line_number, content)
         if 1 < len(self._sensors) <= _MOST_SENSORS:
             column = self.names[self._sensor_at[0]]
             raise InputError(
@@ -246,24 +248,75 @@ class Table:
         self, values: FloatArray, stamps: Sequence[Decimal | None] | None
     ) -> None:
         """Add the rows of values (N, k) that have a pose and, if ``stamps`` are given, a stamp."""
+        self._add_arrays(values, stamps, range(1, len(values) + 1))
+
+    def _add_arrays(
+        self,
+        values: FloatArray,
+        stamps: Sequence[Decimal | None] | None,
+        line_numbers: Sequence[int],
+    ) -> None:
+        """Add rows as :meth:`fill_from_arrays` does, from lines with these numbers."""
         is_pose = np.isfinite(values).all(axis=1)
         if self._orientation_at:
             is_pose &= values[:, self._orientation_at].any(axis=1)
         if stamps is not None:
             is_pose &= np.array([stamp is not None for stamp in stamps], dtype=bool)
             stamps_and_uses = zip(stamps, is_pose, strict=True)
-            self.stamps = [
+            self.stamps += [
                 stamp
                 for stamp, is_used in stamps_and_uses
                 if is_used and stamp is not None
             ]
         rows = np.flatnonzero(is_pose).tolist()
         self.numbers.frombytes(np.ascontiguousarray(values[is_pose]).tobytes())
-        self.line_numbers.extend(row + 1 for row in rows)
-        self.rows.extend(rows)
-        self.n_rows = len(values)
-        if self.n_left_out:
-            self.first_skipped = int(np.argmin(is_pose)) + 1
+        self.line_numbers.extend(line_numbers[row] for row in rows)
+        self.rows.extend(self.n_rows + row for row in rows)
+        self.n_rows += len(values)
+        if self.first_skipped is None and len(rows) < len(values):
+            self.first_skipped = line_numbers[int(np.argmin(is_pose))]
+
+    def _add_at_once(
+        self, rows: Sequence[Sequence[str]], line_numbers: Sequence[int]
+    ) -> bool:
+        """Add rows of cells at once, column by column, if all their cells are plain numbers.
+
+        Returns
+        -------
+        bool
+            Whether the rows were added. If not, nothing has changed.
+        """
+        has_names = self._image_at or self._sensor_at
+        if has_names or len(self.stamp_at) > 1 or {*map(len, rows)} != {len(self.names)}:
+            return False
+        columns = [*zip(*rows, strict=True)]
+        values = np.empty((len(rows), len(self._value_at)))
+        stamps = None
+        try:
+            for place, column in enumerate(self._value_at):
+                values[:, place] = [*map(float, columns[column])]
+            if self.stamp_at:
+                stamps = decimals(columns[self.stamp_at[0]])
+        except ValueError:
+            return False
+        self._add_arrays(values, stamps, line_numbers)
+        return True
+
+    def _add_row(self, cells: Sequence[str], line_number: int, content: object) -> None:
+        """Add the row of one line.
+
+        Raises
+        ------
+        InputError
+            If the line has another number of cells, or text instead of a number.
+        """
+        if len(cells) != len(self.names):
+            cells = self._padded(cells, line_number, content)
+        try:
+            self._add(cells, line_number)
+        except ValueError as error:
+            reason = f"expected {self.expected}; {shortened(str(error))}"
+            raise InputError(f"{self.path}, line {line_number}: {reason}") from None
 
     def _add(self, cells: Sequence[str], line_number: int) -> None:
         """Add a row; if it has no pose, count it only.
