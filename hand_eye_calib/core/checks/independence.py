@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.stats import (
     median,
+    medians,
     quantile,
     robust_regression,
     robust_weights,
@@ -406,11 +407,12 @@ def _apart_in_windows(
         round(_WINDOW_S * 1e9), round(2 * MIN_PAIRS * median(np.diff(stamps_ns)))
     )
     windows = (stamps_ns - stamps_ns[0]) // window_ns
-    distances_m = [
-        median(_alignment(points[windows == window], others[windows == window])[1])
-        for window in np.unique(windows)
-        if (windows == window).sum() >= MIN_PAIRS
-    ]
+    _, firsts, counts = np.unique(windows, return_index=True, return_counts=True)
+    distances_m = []
+    # Windows with equal numbers of points are aligned at once.
+    for count in np.unique(counts[counts >= MIN_PAIRS]):
+        rows = firsts[counts == count, None] + np.arange(count)
+        distances_m += medians(_alignment(points[rows], others[rows])[1]).tolist()
     return median(distances_m) if distances_m else 0.0
 
 
@@ -538,21 +540,22 @@ def _residuals(rows: FloatArray, targets: FloatArray) -> FloatArray:
 
 
 def _alignment(points: FloatArray, others: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Align points (N, 3) robustly by a rotation and a translation.
+    """Align points (..., N, 3) robustly by a rotation and a translation.
 
     Returns
     -------
-    (3, 3) array, (N,) array
+    (..., 3, 3) array, (..., N) array
         Rotation from the others to the points, and distances of the aligned points, m.
     """
-    weights = np.ones(len(points))
+    weights = np.ones(points.shape[:-1])
     for _ in range(ROUNDS):
-        # np.average takes longer than the rest of a round for the few points of a window.
-        shares = weights / weights.sum()
+        shares = (weights / weights.sum(axis=-1, keepdims=True))[..., None, :]
         from_mean = points - shares @ points
         others_from_mean = others - shares @ others
-        R = se3.nearest_rotation((weights[:, None] * from_mean).T @ others_from_mean)
-        distances_m = np.linalg.norm(from_mean - others_from_mean @ R.T, axis=1)
-        usual_m = 2.0 * median(distances_m) + 1e-9
+        weighted = weights[..., None] * from_mean
+        R = se3.nearest_rotation(np.swapaxes(weighted, -1, -2) @ others_from_mean)
+        aligned = others_from_mean @ np.swapaxes(R, -1, -2)
+        distances_m = np.linalg.norm(from_mean - aligned, axis=-1)
+        usual_m = 2.0 * medians(distances_m)[..., None] + 1e-9
         weights = robust_weights("cauchy", (distances_m / usual_m) ** 2)
     return R, distances_m

@@ -17,6 +17,7 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.noise.increments import (
     N_SYSTEMATIC,
     Course,
+    Linearisation,
     Streams,
     course_of,
     linearise,
@@ -68,13 +69,20 @@ class Problem:
         values = fit.parameters[self.columns]
         return prior_products(values, fit.sigmas[self.columns], 7 + len(values))
 
+    def linearised(self, fit: Fit) -> Linearisation:
+        """Return the residuals at a fit and their derivatives."""
+        return linearise(
+            fit.poses, fit.course, fit.T, fit.parameters, self.columns, fit.error
+        )
+
     def space(self, fit: Fit, kept: IntArray | None = None) -> StateSpace:
         """Return the state space at a fit, of all poses or of the subset ``kept`` (indices)."""
         if kept is not None:
             fit = fit.at_poses(kept, self.tuning.burst[-1])
-        linearisation = linearise(
-            fit.poses, fit.course, fit.T, fit.parameters, self.columns, fit.error
-        )
+        return self.space_of(fit, self.linearised(fit))
+
+    def space_of(self, fit: Fit, linearisation: Linearisation) -> StateSpace:
+        """Return the state space of all poses at a fit, given its linearisation."""
         return fit.model.state_space(
             fit.poses,
             linearisation,
@@ -99,7 +107,7 @@ class Problem:
 
 
 class Workspace:
-    """Problem with a cache: the posterior of the last fit.
+    """Problem with a cache: the posterior and the linearisation of the last fit.
 
     Attributes
     ----------
@@ -111,12 +119,15 @@ class Workspace:
         # Only one posterior is stored, because the posterior of a long recording is large.
         self._fit: Fit | None = None
         self._posterior: Posterior | PartwisePosterior | None = None
+        self._linearisation: Linearisation | None = None
 
     def posterior(self, fit: Fit) -> Posterior | PartwisePosterior:
         """Return the posterior of all poses at a fit; the same fit again costs nothing."""
         if self._posterior is None or self._fit is not fit:
             # Release the memory of the stored posterior before the next one is computed.
             self._posterior = None
+            if self._fit is None or not fit.is_linearised_as(self._fit):
+                self._linearisation = None
             self._posterior = self._new_posterior(fit)
             self._fit = fit
         return self._posterior
@@ -125,7 +136,9 @@ class Workspace:
         problem = self.problem
         n_poses = len(problem.streams)
         if n_poses <= MAX_POSES:
-            return Posterior(problem.space(fit), fit.levels)
+            if self._linearisation is None:
+                self._linearisation = problem.linearised(fit)
+            return Posterior(problem.space_of(fit, self._linearisation), fit.levels)
 
         def space_of(poses: IntArray) -> StateSpace:
             return problem.space(fit, poses)
@@ -174,6 +187,19 @@ class Fit:
     sigmas: FloatArray
     has_heavy_tails: bool = False
     parameters: FloatArray = field(default_factory=lambda: np.zeros(N_SYSTEMATIC))
+
+    def is_linearised_as(self, other: Fit) -> bool:
+        """Return whether the residuals and derivatives are those of another fit.
+
+        Fits that differ in levels or weights share these arrays.
+        """
+        return (
+            self.poses is other.poses
+            and self.error is other.error
+            and self.course is other.course
+            and self.T is other.T
+            and self.parameters is other.parameters
+        )
 
     def at_poses(self, kept: IntArray, longest_gap: int) -> Fit:
         """Return the fit for a subset of poses (indices), see :meth:`Outliers.across`."""

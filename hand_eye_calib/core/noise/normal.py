@@ -20,12 +20,16 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hand_eye_calib.core.base.arrays import FloatArray
 
 # Cyclic reduction ends if at most this number of rows remains; they become one dense matrix. At
-# least this number of triangular matrices is inverted row by row, in half the time of LAPACK.
+# least this number of triangular matrices is inverted at once, in a quarter of the time of LAPACK.
 _FEW = 64
+
+# Number of triangular matrices that are inverted at once, so that they fit into the cache.
+_CACHED = 500
 
 # Smallest eigenvalue of normal equations with ones on the diagonal that counts as information.
 # Smaller eigenvalues are rounding.
@@ -35,6 +39,15 @@ _MIN_INFORMATION = 1e-12
 def transposed(blocks: FloatArray) -> FloatArray:
     """Return the transposes (..., k, d) of matrices (..., d, k)."""
     return blocks.swapaxes(-1, -2)
+
+
+def gram(blocks: FloatArray) -> FloatArray:
+    """Return the products ``B' B`` (n, k, k) of blocks B (n, d, k).
+
+    numpy multiplies an array by its own transpose with a routine that takes three times as long for
+    small matrices. So one factor is a copy.
+    """
+    return transposed(blocks) @ blocks.copy()
 
 
 def multiplied(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -62,14 +75,28 @@ def inverse_roots(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
     log_determinants = np.asarray(2.0 * np.log(pivots).sum(axis=1))
     if len(lower) < _FEW:
         return np.linalg.inv(lower), log_determinants
-    inverse = np.zeros_like(lower)
-    for row in range(lower.shape[1]):
-        inverse[:, row, row] = 1.0
-        inverse[:, row, :row] = -(lower[:, row, None, :row] @ inverse[:, :row, :row])[
-            :, 0
-        ]
-        inverse[:, row] /= pivots[:, row, None]
+    inverse = np.empty(lower.shape)
+    for start in range(0, len(lower), _CACHED):
+        part = slice(start, start + _CACHED)
+        inverse[part] = _triangular_inverses(lower[part])
     return inverse, log_determinants
+
+
+def _triangular_inverses(lower: NDArray[np.floating]) -> FloatArray:
+    """Return the inverses of lower triangular matrices (n, d, d) by forward substitution.
+
+    All matrices are eliminated at once, so their index is the last one in memory.
+    """
+    rows = np.ascontiguousarray(lower.transpose(1, 2, 0))
+    inverse = np.zeros_like(rows)
+    for row in range(len(rows)):
+        until_row = slice(row + 1)
+        inverse[row, row] = 1.0
+        inverse[row, until_row] /= rows[row, row]
+        inverse[row + 1 :, until_row] -= (
+            rows[row + 1 :, row, None] * inverse[row, until_row]
+        )
+    return inverse.transpose(2, 0, 1)
 
 
 class _Round(NamedTuple):
@@ -116,8 +143,8 @@ class Factor:
             self._rounds.append(_Round(inverse, before, after))
             self.log_determinant += float(log_determinants.sum())
             diagonal = diagonal[::2].copy()
-            diagonal[: len(before)] -= transposed(before) @ before
-            diagonal[1 : 1 + n_after] -= transposed(after) @ after
+            diagonal[: len(before)] -= gram(before)
+            diagonal[1 : 1 + n_after] -= gram(after)
             below = -transposed(after) @ before[:n_after]
         # The blocks that remain become one dense matrix.
         self._n_last, self._size, _ = diagonal.shape
@@ -186,7 +213,7 @@ class Factor:
             with_before[:n_after] += to_after @ below[:n_after]
             with_after = diagonal[1 : 1 + n_after] @ transposed(to_after)
             with_after += below[:n_after] @ transposed(to_before[:n_after])
-            eliminated = root @ inverse
+            eliminated = gram(inverse)
             eliminated += with_before @ transposed(to_before)
             eliminated[:n_after] += transposed(to_after @ with_after)
             neighbours = diagonal

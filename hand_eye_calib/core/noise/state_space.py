@@ -36,6 +36,7 @@ from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.noise.normal import (
     Factor,
     NormalEquations,
+    gram,
     inverse_roots,
     multiplied,
     transposed,
@@ -113,7 +114,7 @@ class StateSpace:
         roots, log_determinants = inverse_roots(
             total_covariance(levels, self.white_bases)
         )
-        return transposed(roots) @ roots, log_determinants
+        return gram(roots), log_determinants
 
     def apply_u(self, states: FloatArray) -> FloatArray:
         """Return ``U x`` (n, 6, k) for k columns of states (N, d, k)."""
@@ -179,7 +180,10 @@ class Markov:
         self.after = 1.0 / variances_of_q
         self.between = -phi * self.after
         self.before = phi**2 * self.after
-        self.diagonal = np.r_[self.first, self.after] + np.r_[self.before, 0.0]
+        self.diagonal = np.empty(len(intervals_s) + 1)
+        self.diagonal[0] = self.first
+        self.diagonal[1:] = self.after
+        self.diagonal[:-1] += self.before
         self.log_determinant = float(levels[0] + np.log(variances_of_q).sum())
 
     def changed(self, change: FloatArray) -> Markov:

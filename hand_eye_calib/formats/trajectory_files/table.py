@@ -287,7 +287,11 @@ class Table:
             Whether the rows were added. If not, nothing has changed.
         """
         has_names = self._image_at or self._sensor_at
-        if has_names or len(self.stamp_at) > 1 or {*map(len, rows)} != {len(self.names)}:
+        if (
+            has_names
+            or len(self.stamp_at) > 1
+            or {*map(len, rows)} != {len(self.names)}
+        ):
             return False
         columns = [*zip(*rows, strict=True)]
         values = np.empty((len(rows), len(self._value_at)))
