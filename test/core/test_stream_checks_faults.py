@@ -476,6 +476,16 @@ def test_a_shift_is_found_with_its_time_and_size(share):
     assert error @ np.linalg.solve(change.covariance, error) < 25.0
 
 
+def test_the_size_of_a_small_shift_is_right_on_average():
+    sizes = []
+    for seed in range(5):
+        pose_pairs, truth = recording(seed, lambda at: np.where(at < 0.5, 0.0, 0.3))
+        change = find_change(pose_pairs, truth)
+        weights = np.linalg.inv(change.covariance)
+        sizes.append(change.xi @ weights @ SHIFT / (SHIFT @ weights @ SHIFT))
+    assert np.mean(sizes) == pytest.approx(0.3, rel=0.1)
+
+
 def test_a_world_that_drifts_is_no_mount_that_has_moved():
     """Seen in a short recording, it looks like a shift as well."""
     drive = simulate_drive(1, HILLY_DRIVE, NoiseConfig(gaussian=0.003))

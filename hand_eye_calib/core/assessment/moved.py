@@ -14,8 +14,9 @@ scatters more than H predicts. The ratio tests many possible times of a shift.
 A motion pair within a recording has the residual ``e = Log(B^-1 X0^-1 A X0)`` (6,) at an extrinsic
 X0. If the mount has moved by xi, to ``X0 exp(xi)``, then ``e = -J xi + noise`` with ``J = I -
 Ad(B^-1)``. With the noise covariance C each second has ``H = sum J' C^-1 J`` and ``S = -sum J' C^-1
-e``; H and S are sums over time. Large residuals have less weight, so a large shift is
-underestimated: compute H and S again at the shifted extrinsic.
+e``; H and S are sums over time. Large residuals have less weight, so a shift is underestimated: a
+small one by a known share, a large one by more. Then compute H and S again at the shifted
+extrinsic.
 
 Successive motions have correlated noise, which the long-run variance measures. Errors that drift
 over minutes, such as a bias or a bent map, also cause a large ratio. The stream checks therefore
@@ -291,10 +292,12 @@ def find_change(
     ratios[len(ratios) - n_edge + 1 :] = -np.inf
     best = int(np.argmax(ratios))
     damped = information(shifts[best]) + _PRIOR_SHARE * SHIFT_INFORMATION
+    # The weights belong to the extrinsic X0, so the estimate is only a share of the shift.
+    share = stats.share_of_step(6)
     return MountChange(
         at_ns=int(starts_ns[best + 1]),
-        xi=most_likely(shifts[best], _PRIOR_SHARE),
-        covariance=long_run * inverse(damped),
+        xi=most_likely(shifts[best], _PRIOR_SHARE) / share,
+        covariance=long_run * inverse(damped) / share**2,
         log_ratio=float(ratios[best]),
     )
 

@@ -81,6 +81,16 @@ def robust_sigma(vectors: FloatArray) -> FloatArray:
     return medians(lengths) / MEDIAN_LENGTH
 
 
+def share_of_step(n_components: int) -> float:
+    """Return the share of a small change that one step with fixed Student weights estimates.
+
+    Weights depend on the residuals: the score of a residual grows less than its weight times the
+    residual. ``n_components`` is the number of components of a residual. K. L. Lange, R. J. A.
+    Little, J. M. G. Taylor, *Robust statistical modeling using the t distribution*, JASA 84, 1989.
+    """
+    return (STUDENT + n_components) / (STUDENT + n_components + 2.0)
+
+
 def student_weights(squared: FloatArray, degrees: float = STUDENT) -> FloatArray:
     """Return weights of vectors of six values for Student's t distribution; their mean is 1.
 

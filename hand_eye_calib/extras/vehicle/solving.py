@@ -31,7 +31,7 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.blocks import Blocks, inverse, solve
-from hand_eye_calib.core.base.stats import CHI2, STUDENT
+from hand_eye_calib.core.base.stats import CHI2, STUDENT, share_of_step
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.vehicle.wheels import WheelModel, motions
 
@@ -395,14 +395,6 @@ def _difference(
     return np.concatenate([(T - from_T)[:2, 3], turn, others - from_others])
 
 
-def _spread_of_weights(n_components: int) -> float:
-    """Return the variance of an estimate with Student weights, divided by that with fixed weights.
-
-    ``n_components`` is the number of components of a residual.
-    """
-    return ((STUDENT + n_components + 2.0) / (STUDENT + n_components)) ** 2
-
-
 def _solve(
     drive: Drive,
     start: FloatArray,
@@ -451,7 +443,7 @@ def _solve(
             break
     spread = _tapered_jackknife(Blocks.of_rows(weighted, len(weighted)), prior)
     if is_weighted:
-        spread *= _spread_of_weights(len(drive.components))
+        spread /= share_of_step(len(drive.components)) ** 2
     return Fit(
         T_base_sensor=T,
         others=others,
