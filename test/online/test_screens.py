@@ -135,8 +135,8 @@ def moved():
     )
 
 
-CARE = replace(EXTRINSIC, motion_s=83.0, result=judged(UNDETECTABLE))
 GOOD = replace(EXTRINSIC, motion_s=83.0)
+CARE = replace(GOOD, result=judged(UNDETECTABLE))
 REFUTED = replace(
     EXTRINSIC,
     level=Level.WARN,
