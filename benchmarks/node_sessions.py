@@ -843,13 +843,14 @@ def main():
     for name in arguments.sessions:
         if name not in SESSIONS:
             parser.error(f"no session {name!r}; the sessions are {names}")
+    scratch_or_out = arguments.out.resolve() if arguments.out else None
     rows = []
     all_problems = []
     with tempfile.TemporaryDirectory() as scratch:
         for number, name in enumerate(SESSIONS):
             if arguments.sessions and name not in arguments.sessions:
                 continue
-            folder = (arguments.out or Path(scratch)) / f"session_{number}"
+            folder = (scratch_or_out or Path(scratch)) / f"session_{number}"
             folder.mkdir(parents=True, exist_ok=True)
             (row, witness), problems = run(name, SESSIONS[name], folder, SEED + number)
             rows.append([name, *row, str(len(problems))])

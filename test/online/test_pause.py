@@ -247,3 +247,14 @@ def test_poses_of_two_publishers_stay_a_warning_until_a_reset(node):
     child.restart()
     run(node, 1.0)
     assert state_of(node).inputs["child"].text == "10.0 Hz"
+
+
+def test_numbers_that_fall_are_no_lost_messages(node):
+    """A publisher is started again, or a second publisher is not discovered yet."""
+    parent, child = node.inputs
+    for number in (1, 2, 3, 1, 2, 3, 7):
+        parent.count(number)
+    for number in (600, 601, 1, 602, 2, 603, 3):
+        child.count(number)
+    lost = [source.state(node.now[0], False).lost for source in node.inputs]
+    assert lost == [3, 0]

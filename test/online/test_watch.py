@@ -314,9 +314,10 @@ def test_the_pose_has_the_angles_as_printed_with_their_own_standard_deviations()
     assert (values["x"], values["roll"]) == ("0.420 m ± 4 mm", "0.57 ± 0.57 deg")
     assert values["z"] == "? not observed"
     moved = replace(EXTRINSIC, motion_s=75.0)
-    assert (
-        view_of(state(extrinsic=moved)).facts == "3 m, 75 s of motion, result 1.0 s old"
-    )
+    assert view_of(state(extrinsic=moved)).facts == "3 m, 75 s of motion"
+    late = replace(moved, result=replace(RESULT, age_s=40.0))
+    view = view_of(state(extrinsic=late))
+    assert view.facts == "3 m, 75 s of motion, result 40 s old"
     gone = view_of(state(extrinsic=replace(EXTRINSIC, result=None)))
     assert (gone.title, gone.values, gone.buttons) == ("", (), ("reset",))
 

@@ -44,10 +44,8 @@ _MIN_MESSAGES = 20
 # Fewest turns of the publishers of a topic after which their poses are mixed in the session.
 _MIN_TURNS = 10
 
-# Number of reports, one a second, over which rates and shares are computed. A bad message is
-# reported for as many seconds.
+# Reports, one a second, of a rate or share. A bad message is reported for as many seconds.
 _REPORTS = 10
-
 # Fewest messages, held in sequence, whose stamps are taken for a real change. Corrupt stamps come
 # in shorter sequences.
 MIN_HELD = 6
@@ -260,6 +258,7 @@ class PoseInput:
         self._lost = 0
         self._reports = deque([_Counts(time.monotonic(), 0, 0, 0)], maxlen=_REPORTS + 1)
         self._next_number: int | None = None
+        self._has_fallen = False
         # Time (steady, s) of the last message.
         self._arrived_s: float | None = None
         # Time (steady, s) and fault of the last message that was refused.
@@ -318,9 +317,13 @@ class PoseInput:
         """
         expected = self._next_number
         self._next_number = None if sequence_number is None else sequence_number + 1
-        # After a restart of the publisher, its numbers begin anew.
         if expected is not None and sequence_number is not None:
-            self._lost += max(sequence_number - expected, 0)
+            # Numbers that fall begin anew: the publisher was started again, or there is a second
+            # publisher that is not discovered yet. Then the next rise is the turn of the first.
+            has_fallen = sequence_number < expected
+            if not (has_fallen or self._has_fallen):
+                self._lost += sequence_number - expected
+            self._has_fallen = has_fallen
 
     def count_mixed(self, sequence_number: int) -> None:
         """Count the turns of the publishers of a topic that has several.

@@ -37,6 +37,9 @@ from hand_eye_calib.online.watch.view import AxisTexts, Line, Texts, Tone, View
 # A node is silent if its newest state is older than this (s): three reports are missing.
 _SILENT_AFTER_S = 3.5 * REPORT_PERIOD_S
 
+# Age (s) of a result from which the age is displayed.
+_MIN_AGE_S = 30.0
+
 # Time (s) for which the answer to a button is displayed.
 _ANSWER_FOR_S = 20.0
 
@@ -257,7 +260,7 @@ def _axes_by_hand(state: NodeState) -> Texts:
 def _facts(state: NodeState, is_old: bool) -> str:
     """Return path length, duration of motion and age of the result; empty without poses.
 
-    While the session is paused, the age of the result does not matter.
+    The age matters while solves take long, and does not while the session is paused.
     """
     extrinsic = state.extrinsic
     if extrinsic is None or not extrinsic.n_poses:
@@ -265,7 +268,8 @@ def _facts(state: NodeState, is_old: bool) -> str:
     facts = f"{extrinsic.path_m:,.0f} m, {duration(extrinsic.motion_s)} of motion"
     is_paused = any(stream.is_paused for stream in state.inputs.values())
     is_refuted = extrinsic.standing is Standing.REFUTED
-    if extrinsic.result and not (is_old or is_paused or is_refuted):
+    has_age = extrinsic.result and not (is_old or is_paused or is_refuted)
+    if extrinsic.result and has_age and extrinsic.result.age_s >= _MIN_AGE_S:
         facts += f", result {duration(extrinsic.result.age_s)} old"
     if extrinsic.standing is Standing.OUTDATED:
         facts += ", newer solves fail"
