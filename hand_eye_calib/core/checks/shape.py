@@ -21,12 +21,14 @@ _TARGET_LOG_RATIO = 0.5
 # Reweighted rounds of the search for the point with the shortest path.
 _ROUNDS = 5
 
-# Two frames may be the same frame up to this distance (m) and this angle (rad). If both streams
-# have the same world, the lever arm between the worlds is no evidence.
-_SAME_FRAME_M = 0.03
-_SAME_FRAME_RAD = 0.01
+# Two frames with a smaller angle (rad) may be the same frame, up to the drift of the streams. In 50
+# simulated recordings of up to four minutes in one world, the drift was at most 0.03 rad.
+_SAME_FRAME_RAD = 0.1
 # Shorter lever arms (m) count as this length.
 _MIN_ARM_M = 0.01
+# Largest absolute evidence of the lever arms. Two worlds may have the same origin by chance. So the
+# lever arms must not outweigh clear paths, whose log ratio was 0.7 at least on machines.
+_MAX_OF_ARMS = 0.5
 
 # Reach of a robot arm (m). The path of the hand may be longer than that of the base in the frame of
 # the hand. Poses within this distance may therefore be right although they look inverse.
@@ -69,8 +71,9 @@ def evidence_for_inverse(right: StreamPair, fit: SimilarityFit) -> tuple[float, 
     Returns
     -------
     float, float
-        Log ratio of the paths, and half the log ratio of the lever arms: those of the streams as
-        they are over those of inverse streams. Positive values are evidence for inverse poses.
+        Log ratio of the paths, and half the log ratio of the lever arms (limited): those of the
+        streams as they are over those of inverse streams. Positive values are evidence for inverse
+        poses.
     """
     logs = []
     for stream in (right.parent, right.child):
@@ -90,17 +93,19 @@ def evidence_for_inverse(right: StreamPair, fit: SimilarityFit) -> tuple[float, 
 def _evidence_of_lever_arms(right: StreamPair, fit: SimilarityFit) -> float:
     """Return half the log ratio of the lever arms between the sensors and between the worlds.
 
-    The result is 0 if both sensors, or both worlds, may have the same frame.
+    The result has limits, see _MAX_OF_ARMS. The result is 0 if the shorter lever arm is that of two
+    frames that may be the same. Two streams may have the same world, apart from drift, or the same
+    sensor frame: their short lever arm is no evidence.
     """
     pairs = right.synchronised.child_scaled(fit.scale)
     worlds = pairs.Ts_pw_p @ fit.T_parent_child @ se3.inverse(pairs.Ts_cw_c)
     Ts = np.array([fit.T_parent_child, medians(np.moveaxis(worlds, 0, 2))])
     arms_m = np.maximum(np.linalg.norm(se3.translation_of(Ts), axis=1), _MIN_ARM_M)
     angles_rad = se3.rotation_angle(se3.rotation_of(Ts))
-    are_same = (arms_m <= _SAME_FRAME_M) & (angles_rad <= _SAME_FRAME_RAD)
-    if are_same.any():
+    if angles_rad[np.argmin(arms_m)] <= _SAME_FRAME_RAD:
         return 0.0
-    return float(0.5 * np.log(arms_m[0] / arms_m[1]))
+    evidence = 0.5 * np.log(arms_m[0] / arms_m[1])
+    return float(np.clip(evidence, -_MAX_OF_ARMS, _MAX_OF_ARMS))
 
 
 def _shortest_path(poses: FloatArray, order: int) -> tuple[float, float]:

@@ -4,9 +4,10 @@ A reading is an interpretation of both streams, as poses or as inverse poses of 
 second reading inverts all poses of the first one. Both readings fit equally well
 (:class:`~hand_eye_calib.core.checks.hypothesis.Readings`), so two other criteria distinguish them:
 the likelihood of the noise (:mod:`~hand_eye_calib.core.noise.readings`) and the shape of the
-motion. The noise has priority. In a small space the shape must support the noise, because the poses
-of a camera that observes a target have the same noise as inverted poses. If the criteria are not
-clear, both results are reported, and the verdict is DO NOT USE.
+motion. The noise decides unless a clear shape contradicts the noise. In a small space the shape
+must support the noise, because the poses of a camera that observes a target have the same noise as
+inverted poses. If the criteria are not clear, both results are reported, and the verdict is DO NOT
+USE.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -122,12 +123,14 @@ def decide(
     by_noise = 0
     if abs(difference) > CLEAR_NOISE:
         by_noise = -int(np.sign(difference))
+    # Late stamps move each pose along its path, which looks like the noise of inverse poses. Then a
+    # clear shape decides alone.
+    if has_late_stamps and readings.by_shape != 0:
+        by_noise = 0
     choice = _vote(readings, by_noise)
     can_be_right = readings.hypotheses[0].is_uninverted
     if choice == 1 and can_be_right and has_late_stamps and readings.by_shape <= 0:
-        # Late stamps move each pose along its path, which looks like the noise of inverse poses.
-        # Without the shape, the noise then does not decide against the streams as given. An
-        # excavator with such stamps was read as inverse, 5 m off.
+        # An excavator with late stamps was read as inverse, 5 m off.
         return None
     if choice == 0 and can_be_right:
         # Without a clear vote, the streams stay as they are if no criterion supports an inversion.
@@ -147,9 +150,9 @@ def _vote(readings: Readings, by_noise: int) -> int:
         return by_shape if readings.is_clear else 0
     if readings.is_small and by_noise != by_shape:
         return _vote_in_small_space(readings, by_noise)
-    # Only a very clear shape overrules the noise.
-    if by_noise == -by_shape and abs(readings.shape) > _OVERRULING_SHAPE:
-        return by_shape
+    if by_noise == -by_shape:
+        # Only a very clear shape overrules the noise. The noise overrules no clear shape.
+        return by_shape if abs(readings.shape) > _OVERRULING_SHAPE else 0
     return by_noise
 
 
