@@ -174,6 +174,43 @@ class TestNoisyStopsAroundATarget:
         assert codes_of(result.findings) == []
 
 
+def pointing_down(seed):
+    """Poses of a hand that points down, rolls of both signs, and of a target in its camera."""
+    random = np.random.default_rng(seed)
+    roll = np.pi * (1.0 + random.normal(size=20) * 0.08)
+    pitch = random.normal(size=20) * 0.25
+    yaw = random.uniform(-1.2, 1.2, size=20)
+    rotations = se3.rotation_from_rpy(np.stack([roll, pitch, yaw], axis=1))
+    positions = [0.45, 0.0, 0.4] + random.normal(size=(20, 3)) * 0.1
+    robot = se3.from_rotation_translation(rotations, positions)
+    camera = pose((0.06, -0.03, 0.09), (0.1, -0.05, 1.5))
+    target = pose((0.5, 0.05, 0.02), (0.0, 0.0, 0.4))
+    noise = se3.exp(random.normal(size=(20, 6)) * 0.001)
+    return robot, se3.inverse(robot @ camera) @ target @ noise
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+class TestAnglesOfAHandThatPointsDown:
+    def test_angles_near_half_a_turn_are_named(self, seed):
+        robot, tracking = pointing_down(seed)
+        lengths = np.linalg.norm(se3.rotation_to_rpy(robot[:, :3, :3]), axis=1)
+        assert 4 <= np.sum(lengths > np.pi) <= 16
+        result = calibrate_arm(angles_as_vectors(robot), tracking)
+        (finding,) = result.findings
+        assert finding.code == "angles"
+        assert "roll, pitch, yaw" in finding.what
+
+    def test_right_angles_have_no_finding(self, seed):
+        assert calibrate_arm(*pointing_down(seed)).findings == ()
+
+    def test_rows_in_random_order_are_not_blamed_on_angles(self, seed):
+        robot, tracking = pointing_down(seed)
+        order = np.random.default_rng(seed).permutation(len(robot))
+        result = calibrate_arm(robot[order], tracking)
+        assert result.findings[0].code in ("rows", "unrelated")
+        assert result.verdict is hec.Verdict.DO_NOT_USE
+
+
 def far_marker(seed):
     """Poses of the hand, and of a marker at 1.5 m whose distance and tilt have strong noise."""
     random = np.random.default_rng(seed)

@@ -55,6 +55,11 @@ _MIN_BLOCK_GAIN = 0.3
 # Kinds of angles whose differences are within this factor of the smallest one agree equally well.
 _MAX_EQUAL_RATIO = 1.5
 
+# Rotation vectors of a tool that points down are short or long, by stop: number of stops whose
+# vector is tried both ways as a start, and largest number of rounds over all stops.
+_N_STARTING_STOPS = 3
+_MAX_CHOICE_ROUNDS = 5
+
 # Number of random orders of rows that the given order is compared with.
 _N_RANDOM_ORDERS = 8
 
@@ -310,21 +315,69 @@ def _other_kinds(
     ``angles_of_other`` are the angles (N, N) between the stops of the other stream, rad.
     """
     Ts = getattr(sample, stream)
-    for read_as, numbers_of in _NUMBERS_OF:
-        numbers = numbers_of(se3.rotation_of(Ts))
-        for meant, rotations_of in _ROTATIONS_OF.items():
-            if meant == read_as:
-                continue
-            rotations = rotations_of(numbers)
-            reread = se3.from_rotation_translation(rotations, se3.translation_of(Ts))
-            yield _AngleKind(
-                difference_rad=median_difference(
-                    angles_between(reread), angles_of_other
-                ),
-                stream=stream,
-                text=f"{meant}, not {read_as}",
-                poses=sample.with_side(stream, reread),
-            )
+    R = se3.rotation_of(Ts)
+    for meant, rotations_of in _ROTATIONS_OF.items():
+        for read_as, numbers_of in _NUMBERS_OF:
+            if meant != read_as:
+                text = f"{meant}, not {read_as}"
+                rotations = rotations_of(numbers_of(R))
+                yield _angle_kind(sample, stream, rotations, text, angles_of_other)
+        if meant != _VECTORS:
+            text = f"{meant}, not {_VECTORS}"
+            both = rotations_of(se3.rotation_log(R)), rotations_of(_long_vectors(R))
+            rotations = _agreeing_rotations(both, angles_of_other)
+            yield _angle_kind(sample, stream, rotations, text, angles_of_other)
+
+
+def _angle_kind(
+    sample: StopPoses,
+    stream: str,
+    rotations: FloatArray,
+    text: str,
+    angles_of_other: FloatArray,
+) -> _AngleKind:
+    """Return a kind of angles, whose rotations (N, 3, 3) of ``stream`` are compared."""
+    positions = se3.translation_of(getattr(sample, stream))
+    reread = se3.from_rotation_translation(rotations, positions)
+    difference_rad = median_difference(angles_between(reread), angles_of_other)
+    return _AngleKind(difference_rad, stream, text, sample.with_side(stream, reread))
+
+
+def _agreeing_rotations(
+    both: tuple[FloatArray, FloatArray], angles_of_other: FloatArray
+) -> FloatArray:
+    """Return for each of N stops that of two rotations which agrees with the other side.
+
+    A start takes one rotation of one stop, and for the other stops those that agree with it. Then
+    the rotations that agree best with all others are taken, until they stay the same.
+
+    Parameters
+    ----------
+    both : two (N, 3, 3) arrays
+        Rotations by the short and by the long rotation vector of each stop.
+    angles_of_other : (N, N) array
+        Angles between the stops of the other side, rad.
+    """
+    n = len(angles_of_other)
+    R = np.concatenate(both)
+    angles = angles_between(se3.from_rotation_translation(R, np.zeros((2 * n, 3))))
+    differences = np.abs(angles - np.tile(angles_of_other, (2, 2)))
+    best = np.arange(n)
+    smallest_rad = np.inf
+    stops = np.unique(np.linspace(0, n - 1, _N_STARTING_STOPS).astype(np.int64))
+    for start in (*stops, *(stops + n)):
+        rows = np.arange(n) + n * differences[start].reshape(2, n).argmin(axis=0)
+        for _ in range(_MAX_CHOICE_ROUNDS):
+            costs = np.median(differences[:, rows], axis=1)
+            updated = np.arange(n) + n * costs.reshape(2, n).argmin(axis=0)
+            if np.array_equal(updated, rows):
+                break
+            rows = updated
+        difference_rad = median(above_diagonal(differences[np.ix_(rows, rows)]))
+        if difference_rad < smallest_rad:
+            best = rows
+            smallest_rad = difference_rad
+    return R[best]
 
 
 def _are_unrelated(of_parent: FloatArray, of_child: FloatArray) -> bool:
