@@ -52,7 +52,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "outliers": {"without": ("outliers", "tails")},
     "heavy tails": {"without": ("tails",)},
     "time-correlated errors": {"without": ("time_correlated",)},
-    "rotation about a world's origin": _with(centre_ratio=0.0),
+    "rotation about a world's origin": {"without": ("centre",)},
     "systematic errors": {"systematic": ()},
     "bias": {"systematic": ("scale", "time")},
     "scale": {"systematic": ("bias", "time")},

@@ -144,7 +144,6 @@ def numbers_of(case, tuning):
 # Another value of each number, and a case that it changes.
 CHANGES = {
     "start_reference": ("A", "drive"),
-    "centre_ratio": (0.02, "target"),
     "most_poses": (150, "drive"),
     "burst": ((0, 1, 2), "drive"),
     "jitter": (-12.0, "drive"),

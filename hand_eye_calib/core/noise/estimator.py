@@ -371,7 +371,8 @@ def solve(
         Whether the clock offset was estimated from these poses. If so, it is certainly among the
         systematic errors.
     without : collection of str
-        Names of :data:`~hand_eye_calib.core.noise.stages.STAGES` that are skipped.
+        Names of :data:`~hand_eye_calib.core.noise.stages.STAGES` that are skipped. With "centre",
+        rotation errors turn about the sensors.
     tuning : Tuning
         Numbers of the search.
 

@@ -54,7 +54,7 @@ class Problem:
         Whether the time offset was estimated from the same poses. It is certainly among the
         systematic errors then.
     without : frozenset of str
-        Names of the stages that are skipped.
+        Names of the stages that are skipped. With "centre", rotation errors turn about the sensors.
     tuning : Tuning
     """
 
@@ -193,13 +193,8 @@ class Fit:
 
         Fits that differ in levels or weights share these arrays.
         """
-        return (
-            self.poses is other.poses
-            and self.error is other.error
-            and self.course is other.course
-            and self.T is other.T
-            and self.parameters is other.parameters
-        )
+        names = ("poses", "error", "course", "T", "parameters")
+        return all(getattr(self, name) is getattr(other, name) for name in names)
 
     def at_poses(self, kept: IntArray, longest_gap: int) -> Fit:
         """Return the fit for a subset of poses (indices), see :meth:`Outliers.across`."""

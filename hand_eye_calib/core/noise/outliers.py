@@ -252,16 +252,8 @@ def bridge_outliers(
         se3.inverse(streams.Ts_pw_p[outlier_poses - 1]) @ streams.Ts_pw_p[outlier_poses]
     )
     Bs = se3.inverse(T_parent_child) @ As @ T_parent_child
-    # All outlier poses whose previous pose is final, until none remains.
-    is_open = spikes.copy()
-    is_open[0] = False
-    while len(outlier_poses):
-        is_next = ~is_open[outlier_poses - 1]
-        poses = outlier_poses[is_next]
-        Ts_cw_c[poses] = Ts_cw_c[poses - 1] @ Bs[is_next]
-        is_open[poses] = False
-        outlier_poses = outlier_poses[~is_next]
-        Bs = Bs[~is_next]
+    for pose, B in zip(outlier_poses, Bs, strict=True):
+        Ts_cw_c[pose] = Ts_cw_c[pose - 1] @ B
     return Streams(streams.stamps_s, streams.Ts_pw_p, Ts_cw_c)
 
 

@@ -97,7 +97,9 @@ def start(problem: Problem) -> Fit:
     outliers = first_outliers(streams, course, T, residuals, tuning)
     interval_s = median(np.diff(streams.stamps_s))
     duration_s = float(np.ptp(streams.stamps_s))
-    centre = _centre_of_rotations(streams, T, residuals, tuning.centre_ratio)
+    centre = "sensors"
+    if "centre" not in problem.without:
+        centre = _centre_of_rotations(streams, T, residuals)
     left_out = outliers.jumps | outliers.spikes[1:] | outliers.spikes[:-1]
     return Fit(
         poses=bridge_outliers(streams, T, outliers.spikes),
@@ -112,13 +114,10 @@ def start(problem: Problem) -> Fit:
     )
 
 
-def _centre_of_rotations(
-    streams: Streams, T: FloatArray, residuals: FloatArray, max_ratio: float
-) -> str:
-    """Return the point of CENTRES that white rotation errors turn about.
+def _centre_of_rotations(streams: Streams, T: FloatArray, residuals: FloatArray) -> str:
+    """Return the point of CENTRES at which the translations of residuals (n, 6) are smallest.
 
-    It is the origin of a world if the translations of residuals (n, 6) at this origin are smaller
-    than ``max_ratio`` times those at the sensors.
+    White rotation errors turn about this point.
     """
     translations = residuals[:, :3]
     rotations = residuals[:, 3:]
@@ -128,8 +127,7 @@ def _centre_of_rotations(
         to_origin = se3.translation_of(se3.inverse(poses))
         at_origin = translations + np.cross(rotations, to_origin)
         sizes[world] = median(np.linalg.norm(at_origin, axis=1))
-    best = min(CENTRES, key=lambda centre: sizes[centre])
-    return best if sizes[best] < max_ratio * sizes["sensors"] else "sensors"
+    return min(CENTRES, key=lambda centre: sizes[centre])
 
 
 def noise(workspace: Workspace, fit: Fit) -> Fit:

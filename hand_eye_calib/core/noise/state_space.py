@@ -180,10 +180,7 @@ class Markov:
         self.after = 1.0 / variances_of_q
         self.between = -phi * self.after
         self.before = phi**2 * self.after
-        self.diagonal = np.empty(len(intervals_s) + 1)
-        self.diagonal[0] = self.first
-        self.diagonal[1:] = self.after
-        self.diagonal[:-1] += self.before
+        self.diagonal = np.append(self.first, self.after) + np.append(self.before, 0.0)
         self.log_determinant = float(levels[0] + np.log(variances_of_q).sum())
 
     def changed(self, change: FloatArray) -> Markov:

@@ -20,9 +20,6 @@ class Tuning:
     # Reference (distance between poses) of DNLO for the first estimate of X. DNLO is robust to
     # jumps and needs no noise levels.
     start_reference: str = "B3"
-    # The model in which rotation errors turn about the origin of a world is used if its residuals
-    # are smaller than this share of those of the model in which they turn about the sensors.
-    centre_ratio: float = 0.7
 
     # -- Noise levels, which are logarithms of variances --
     # Largest number of poses that noise levels are fitted to.

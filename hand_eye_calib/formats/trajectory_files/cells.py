@@ -152,17 +152,12 @@ def separator_of(lines: Sequence[str]) -> str:
     is used for which the cells that are numbers contain the most digits. If no cell is a number,
     the first possible separator in the first line is used.
     """
-    # Separators that do not occur split the lines into the same cells. The first of them suffices.
-    text = "\n".join(lines)
-    absent = [separator for separator in _SEPARATORS if separator not in text]
     n_digits = {}
     for separator in _SEPARATORS:
-        if separator in absent[1:]:
-            continue
         cells_of = splitter(separator)
         n_digits[separator] = sum(_digits_in_numbers(cells_of(line)) for line in lines)
     if any(n_digits.values()):
-        return max(n_digits, key=n_digits.__getitem__)
+        return max(_SEPARATORS, key=n_digits.__getitem__)
     first_line = lines[0] if lines else ""
     return next(separator for separator in _SEPARATORS if separator in first_line)
 
