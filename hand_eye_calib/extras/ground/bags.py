@@ -50,7 +50,8 @@ def verticals_of_bag(
         Streams and options of the calibration.
     """
     config = snapshot.config
-    if config.measured != "poses" or min(map(len, snapshot.streams)) < config.min_pairs:
+    fewest_poses = min(map(len, snapshot.streams))
+    if config.measured != "poses" or fewest_poses < config.min_pairs:
         return (), []
     with PoseBag(*paths) as bag:
         topics_of = _topics_by_frame(bag)
@@ -133,16 +134,23 @@ def vertical_track(
         force = message.linear_acceleration
         stamps_ns.append(ns_of(message.header.stamp))
         forces.append([force.x, force.y, force.z])
-    stamps = np.array(stamps_ns, dtype=np.int64)
-    return gravity_from_accelerations(stamps, np.array(forces), stream)
+    return gravity_from_accelerations(
+        np.array(stamps_ns, dtype=np.int64),
+        np.array(forces),
+        stream,
+    )
 
 
 def _clouds(bag: PoseBag, topic: str) -> Iterator[tuple[int, FloatArray]]:
     """Yield the stamp (ns) and the finite points (N, 3), m, of at most ``_MAX_SCANS`` scans."""
-    for message in _messages(bag, topic, bag.duration_s / _MAX_SCANS * 1e9):
+    every_ns = bag.duration_s / _MAX_SCANS * 1e9
+    for message in _messages(bag, topic, every_ns):
         rows = rows_of_points(message)
-        points = np.stack([rows[axis] for axis in "xyz"], axis=-1).astype(float)
-        yield ns_of(message.header.stamp) or 0, points[np.isfinite(points).all(axis=1)]
+        columns = [rows[axis] for axis in "xyz"]
+        points = np.stack(columns, axis=-1).astype(float)
+        is_finite = np.isfinite(points).all(axis=1)
+        stamp_ns = ns_of(message.header.stamp) or 0
+        yield stamp_ns, points[is_finite]
 
 
 def _messages(bag: PoseBag, topic: str, every_ns: float) -> Iterator[Any]:
@@ -154,5 +162,8 @@ def _messages(bag: PoseBag, topic: str, every_ns: float) -> Iterator[Any]:
             if bag_ns >= next_ns:
                 used.append(row)
                 next_ns = bag_ns + every_ns
-        messages = [run.messages[row] for row in used]
-        yield from run._replace(messages=messages, bag_ns=run.bag_ns[used]).decoded()
+        used_run = run._replace(
+            messages=[run.messages[row] for row in used],
+            bag_ns=run.bag_ns[used],
+        )
+        yield from used_run.decoded()

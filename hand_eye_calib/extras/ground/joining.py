@@ -100,11 +100,11 @@ class VerticalPair:
         values, H = measurement.values, measurement.jacobian
         C = calibration.covariance
         S = H @ C @ H.T + measurement.covariance
-        distances = np.abs(values) / np.sqrt(np.diag(S))
+        sigmas = np.sqrt(np.diag(S))
+        distances = np.abs(values) / sigmas
         squared = float(values @ np.linalg.solve(S, values))
-        agrees = bool(
-            distances.max() < CONTRADICTED_SIGMAS and squared < CHI2[0.01][len(values)]
-        )
+        limit = CHI2[0.01][len(values)]
+        agrees = bool(distances.max() < CONTRADICTED_SIGMAS and squared < limit)
         updated = calibration
         if agrees:
             gain = np.asarray(np.linalg.solve(S, H @ C).T, dtype=float)
@@ -164,16 +164,20 @@ def _at_same_times(
     The instants of a row differ by less than the usual interval of the child. ``offset_s`` is added
     to the stamps of the child.
     """
-    child = child[np.argsort(child.stamps_ns, kind="stable")]
+    order = np.argsort(child.stamps_ns, kind="stable")
+    child = child[order]
     stamps_ns = child.stamps_ns + round(offset_s * 1e9)
     after = np.searchsorted(stamps_ns, parent.stamps_ns)
     after = np.clip(after, 1, len(stamps_ns) - 1)
-    to_before_ns, to_after_ns = np.abs(stamps_ns[[after - 1, after]] - parent.stamps_ns)
+    to_before_ns = np.abs(stamps_ns[after - 1] - parent.stamps_ns)
+    to_after_ns = np.abs(stamps_ns[after] - parent.stamps_ns)
     is_before_nearer = to_before_ns <= to_after_ns
     nearest = after - is_before_nearer
+    to_nearest_ns = np.minimum(to_before_ns, to_after_ns)
     usual_interval_ns = median(np.diff(stamps_ns))
-    is_near = np.minimum(to_before_ns, to_after_ns) < usual_interval_ns
-    return parent[is_near], child[nearest[is_near]]
+    is_near = to_nearest_ns < usual_interval_ns
+    near_rows = nearest[is_near]
+    return parent[is_near], child[near_rows]
 
 
 def _measured_axes(ups: FloatArray) -> tuple[FloatArray, tuple[str, str, str]]:
@@ -190,12 +194,16 @@ def _measured_axes(ups: FloatArray) -> tuple[FloatArray, tuple[str, str, str]]:
     up = ups.mean(axis=0)
     up /= np.linalg.norm(up)
     third = int(np.abs(up).argmax())
-    first, second = (third + 1) % 3, (third + 2) % 3
+    first = (third + 1) % 3
+    second = (third + 2) % 3
     vertical = up * np.sign(up[third])
-    horizontal = np.eye(3)[first] - vertical[first] * vertical
+    first_axis = np.eye(3)[first]
+    horizontal = first_axis - vertical[first] * vertical
     horizontal /= np.linalg.norm(horizontal)
-    basis = np.column_stack([horizontal, np.cross(vertical, horizontal), vertical])
-    return basis, (ROTATIONS[first], ROTATIONS[second], TRANSLATIONS[third])
+    other_horizontal = np.cross(vertical, horizontal)
+    basis = np.column_stack([horizontal, other_horizontal, vertical])
+    axes = (ROTATIONS[first], ROTATIONS[second], TRANSLATIONS[third])
+    return basis, axes
 
 
 def _differences(
@@ -218,12 +226,15 @@ def _differences(
         angles, sines, out=np.ones_like(sines), where=sines > 0.0
     )
     rotation_vectors = angle_per_sine[:, None] * crosses
-    tilts = rotation_vectors @ basis[:, :2]
+    horizontal = basis[:, :2]
+    tilts = rotation_vectors @ horizontal
     if parent.heights_m is None or child.heights_m is None:
         return tilts
-    errors_m = child.heights_m - parent.heights_m - parent.ups @ se3.translation_of(T)
+    predicted_m = parent.ups @ se3.translation_of(T)
+    errors_m = child.heights_m - parent.heights_m - predicted_m
     # The vertical of the basis points down if the nearest axis of the parent does.
-    sign = np.sign(basis[:, 2] @ parent.ups[0])
+    vertical = basis[:, 2]
+    sign = np.sign(vertical @ parent.ups[0])
     return np.column_stack([tilts, sign * errors_m])
 
 
@@ -246,11 +257,15 @@ def _slope_derivatives(
         track, stream = child, streams[1]
         # Tilts are parent minus child, so the normal of the child has a negative sign.
         to_parent = -R
-    rotations = se3.rotation_of(stream.at(track.stamps_ns, extrapolate=True))
+    poses = stream.at(track.stamps_ns, extrapolate=True)
+    rotations = se3.rotation_of(poses)
     ups_in_world = np.einsum("kij,kj->ki", rotations, track.ups)
-    horizontal = _measured_axes(ups_in_world)[0][:, :2]
-    in_parent = to_parent @ np.swapaxes(rotations, 1, 2) @ horizontal
-    return basis[:, :2].T @ se3.skew(parent.ups) @ in_parent
+    world_basis, _ = _measured_axes(ups_in_world)
+    horizontal = world_basis[:, :2]
+    to_sensor = np.swapaxes(rotations, 1, 2)
+    in_parent = to_parent @ to_sensor @ horizontal
+    tilt_axes = basis[:, :2].T
+    return tilt_axes @ se3.skew(parent.ups) @ in_parent
 
 
 def _are_inliers(differences: FloatArray) -> BoolArray:
@@ -261,7 +276,8 @@ def _are_inliers(differences: FloatArray) -> BoolArray:
     """
     deviations = np.abs(differences - medians(differences.T))
     sigmas = medians(deviations.T) / MEDIAN_NORMAL
-    return np.asarray((deviations <= CONTRADICTED_SIGMAS * sigmas).all(axis=1))
+    is_near = deviations <= CONTRADICTED_SIGMAS * sigmas
+    return np.asarray(is_near.all(axis=1))
 
 
 def _sections_of(stream: Trajectory, stamps_ns: IntArray) -> IntArray:
@@ -269,8 +285,10 @@ def _sections_of(stream: Trajectory, stamps_ns: IntArray) -> IntArray:
     steps = np.diff(se3.translation_of(stream.poses), axis=0)
     steps_m = np.linalg.norm(steps, axis=1)
     driven_m = np.append(0.0, np.cumsum(steps_m))
-    shares = np.interp(stamps_ns, stream.stamps_ns, driven_m) / driven_m[-1]
-    return np.minimum((_N_SECTIONS * shares).astype(int), _N_SECTIONS - 1)
+    places_m = np.interp(stamps_ns, stream.stamps_ns, driven_m)
+    shares = places_m / driven_m[-1]
+    sections = (_N_SECTIONS * shares).astype(int)
+    return np.minimum(sections, _N_SECTIONS - 1)
 
 
 def _means(values: FloatArray, sections: IntArray) -> FloatArray:
@@ -278,7 +296,9 @@ def _means(values: FloatArray, sections: IntArray) -> FloatArray:
     numbers, row_of_value = np.unique(sections, return_inverse=True)
     counts = np.bincount(row_of_value)
     sums = Blocks.gathered(values, row_of_value, len(numbers)).sums
-    return sums / counts.reshape(-1, *[1] * (values.ndim - 1))
+    n_further_axes = values.ndim - 1
+    columns = counts.reshape(-1, *[1] * n_further_axes)
+    return sums / columns
 
 
 def _fit(means: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -289,8 +309,10 @@ def _fit(means: FloatArray) -> tuple[FloatArray, FloatArray]:
     center = means.mean(axis=0)
     residuals = means - center
     count = len(means)
-    covariance = residuals.T @ residuals / (count * (count - 1))
-    return center, covariance * _correlation_factor(residuals)
+    n_products = count * (count - 1)
+    covariance = residuals.T @ residuals / n_products
+    factor = _correlation_factor(residuals)
+    return center, covariance * factor
 
 
 def _fit_with_slope(
@@ -315,17 +337,23 @@ def _fit_with_slope(
     count = len(means)
     # Unknowns: two tilts of the mount, which are the same in all sections, then two slopes.
     of_mount = np.tile(np.eye(2), (count, 1, 1))
-    rows = np.concatenate([of_mount, slope_derivatives], axis=2).reshape(-1, 4)
-    prior = np.diag([0.0, 0.0, _SLOPE_SIGMA_RAD**-2, _SLOPE_SIGMA_RAD**-2])
+    derivatives = np.concatenate([of_mount, slope_derivatives], axis=2)
+    rows = derivatives.reshape(-1, 4)
+    products = rows.T @ rows
+    slope_information = _SLOPE_SIGMA_RAD**-2
+    prior = np.diag([0.0, 0.0, slope_information, slope_information])
     # The first solve has no prior. Its residuals determine the variance, which weights the prior.
     variance = 0.0
     for _ in range(2):
-        information = rows.T @ rows + variance * prior
-        solution = np.linalg.lstsq(information, rows.T @ means.ravel(), rcond=None)[0]
-        residuals = means - (rows @ solution).reshape(-1, 2)
-        scatter = (residuals**2).sum() / (2 * count - 4)
+        information = products + variance * prior
+        score = rows.T @ means.ravel()
+        solution, *_ = np.linalg.lstsq(information, score, rcond=None)
+        predicted = rows @ solution
+        residuals = means - predicted.reshape(-1, 2)
+        degrees_of_freedom = 2 * count - 4
+        scatter = (residuals**2).sum() / degrees_of_freedom
         variance = scatter * _correlation_factor(residuals)
-    covariance = np.linalg.inv(rows.T @ rows / variance + prior)
+    covariance = np.linalg.inv(products / variance + prior)
     return solution[:2], covariance[:2, :2]
 
 
@@ -335,7 +363,8 @@ def _correlation_factor(residuals: FloatArray) -> float:
     W. K. Newey, K. D. West, Econometrica 55, 1987, with one lag.
     """
     products = residuals[1:] * residuals[:-1]
-    correlation = float(products.sum() / (residuals**2).sum())
+    squares = residuals**2
+    correlation = float(products.sum() / squares.sum())
     return 1.0 + 2.0 * max(correlation, 0.0)
 
 
@@ -346,20 +375,24 @@ def _updated(
 
     Its covariance is the Joseph form ``(I - K H) C (I - K H)' + K V K'``.
     """
-    T = se3.retracted(calibration.T_parent_child, gain @ measurement.values)
+    correction = gain @ measurement.values
+    T = se3.retracted(calibration.T_parent_child, correction)
     from_motion = np.eye(6) - gain @ measurement.jacobian
     allowance = from_motion @ calibration.covariance_allowance @ from_motion.T
     covariance = from_motion @ calibration.covariance_measured @ from_motion.T
     covariance += gain @ measurement.covariance @ gain.T
-    sigmas = sigmas_in_parent(se3.rotation_of(T), covariance)
-    totals = np.hypot(sigmas, sigmas_in_parent(se3.rotation_of(T), allowance))
+    R = se3.rotation_of(T)
+    sigmas = sigmas_in_parent(R, covariance)
+    allowance_sigmas = sigmas_in_parent(R, allowance)
+    totals = np.hypot(sigmas, allowance_sigmas)
     is_from_ground = halves_variance(totals, calibration.sigmas)
     dofs = []
     for of_motion, sigma, has_prior in zip(
         calibration.observability_measured, sigmas.tolist(), is_from_ground, strict=True
     ):
         dof = judged(of_motion.name, sigma)
-        if dof.verdict is DofVerdict.UNOBSERVABLE and np.isfinite(of_motion.sigma):
+        is_unobservable = dof.verdict is DofVerdict.UNOBSERVABLE
+        if is_unobservable and np.isfinite(of_motion.sigma):
             # The rotation of the child has turned an unobservable direction slightly.
             dof = of_motion
         is_by_ground = has_prior and dof.verdict is not DofVerdict.UNOBSERVABLE
@@ -394,11 +427,12 @@ def _ground_axes(
     axes = []
     for row, name in enumerate(measurement.axes):
         column = AXES.index(name)
+        from_motion = values[column]
         axis = GroundAxis(
             name=name,
-            motion=values[column],
+            motion=from_motion,
             motion_sigma=float(calibration.sigmas[column]),
-            ground=values[column] + float(measurement.values[row]),
+            ground=from_motion + float(measurement.values[row]),
             ground_sigma=float(ground_sigmas[row]),
             distance=float(distances[row]),
             is_from_ground=bool(is_from_ground[column]),

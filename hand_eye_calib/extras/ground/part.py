@@ -86,20 +86,23 @@ class GroundPart(Part):
 
 def _source(value: GroundResult) -> str:
     """Return the measured quantities of both sensors, such as "the ground and gravity"."""
-    names = {"ground": "the ground", "gravity": "gravity"}
-    # A dict has equal names once, in their order.
-    return listing([*dict.fromkeys([names[value.parent], names[value.child]])])
+    words = {"ground": "the ground", "gravity": "gravity"}
+    names = [words[value.parent]]
+    if value.child != value.parent:
+        names.append(words[value.child])
+    return listing(names)
 
 
 def _line(value: GroundResult, axis: GroundAxis) -> str:
     """Return the line of an axis: its value by the ground or gravity, and by the motion."""
+    source = _source(value)
     by_ground = _number(axis.name, axis.ground, axis.ground_sigma)
-    if not np.isfinite(axis.motion_sigma):
-        by_motion = "the motion does not determine it"
-    else:
-        by_motion = f"by motion {_number(axis.name, axis.motion, axis.motion_sigma)}"
+    by_motion = "the motion does not determine it"
+    if np.isfinite(axis.motion_sigma):
+        number = _number(axis.name, axis.motion, axis.motion_sigma)
+        by_motion = f"by motion {number}"
     end = "" if value.is_joined else ": not used"
-    return f"{axis.name} by {_source(value)}: {by_ground}; {by_motion}{end}"
+    return f"{axis.name} by {source}: {by_ground}; {by_motion}{end}"
 
 
 def _number(name: str, value: float, sigma: float) -> str:
@@ -108,7 +111,9 @@ def _number(name: str, value: float, sigma: float) -> str:
     ``name`` is the axis of the value.
     """
     if name in ROTATIONS:
-        return f"{with_sigma(np.degrees(value), np.degrees(sigma), 2)} deg"
+        value_deg = np.degrees(value)
+        sigma_deg = np.degrees(sigma)
+        return f"{with_sigma(value_deg, sigma_deg, 2)} deg"
     return f"{with_sigma(value, sigma, 3)} m"
 
 
@@ -121,18 +126,21 @@ def disagreements(result: Any) -> Iterator[Ground]:
     # All axes together may contradict the motion (chi-square) although no single axis does. The
     # axis with the largest distance is named then.
     limit = min(CONTRADICTED_SIGMAS, farthest)
-    far = [axis for axis in value.axes if axis.distance >= limit]
+    source = _source(value)
+    names = []
     texts = []
-    for axis in far:
+    for axis in value.axes:
+        if axis.distance < limit:
+            continue
         by_ground = _number(axis.name, axis.ground, axis.ground_sigma)
         by_motion = _number(axis.name, axis.motion, axis.motion_sigma)
+        names.append(axis.name)
         texts.append(
-            f"{axis.name} is {by_ground} by {_source(value)}, {by_motion} by the motion"
+            f"{axis.name} is {by_ground} by {source}, {by_motion} by the motion"
         )
-    names = tuple(axis.name for axis in far)
     yield Ground(
         "; ".join(texts),
         "check that the lidar sees the road (not a loading edge or a ramp), and that clouds and "
         "IMU data are in the frame of the sensor; ground off leaves them out",
-        names,
+        tuple(names),
     )

@@ -68,22 +68,29 @@ def ground_of(
         return None
     # The first fit uses the inliers of RANSAC, the second fit those of the first fit.
     for _ in range(2):
-        is_inlier = np.abs(cells[:, 2] - _heights(cells, plane)) < _MAX_INLIER_HEIGHT_M
+        distances_m = np.abs(cells[:, 2] - _heights(cells, plane))
+        is_inlier = distances_m < _MAX_INLIER_HEIGHT_M
         inliers = cells[is_inlier]
-        solution, *_ = np.linalg.lstsq(_rows(inliers), inliers[:, 2], rcond=None)
+        rows = _rows(inliers)
+        heights_m = inliers[:, 2]
+        solution, *_ = np.linalg.lstsq(rows, heights_m, rcond=None)
         plane = np.asarray(solution, dtype=float)
     if not _is_ground(cells, inliers, plane):
         return None
     a, b, c = plane
+    upwards = np.array([-a, -b, 1.0])
     length = np.sqrt(1.0 + a * a + b * b)
-    return Plane(rotation.T @ np.array([-a, -b, 1.0]) / length, float(-c / length))
+    normal = rotation.T @ upwards / length
+    height_m = float(-c / length)
+    return Plane(normal, height_m)
 
 
 def _rotation_to_level(up: FloatArray, ahead: FloatArray) -> FloatArray:
     """Return the rotation (3, 3) that turns ``up`` into z, and ``ahead`` into the x-z plane."""
     left = np.cross(up, ahead)
     left /= np.linalg.norm(left)
-    return np.array([np.cross(left, up), left, up])
+    level_ahead = np.cross(left, up)
+    return np.array([level_ahead, left, up])
 
 
 def _cell_means(points: FloatArray, width_m: float) -> FloatArray:
@@ -98,16 +105,18 @@ def _cell_means(points: FloatArray, width_m: float) -> FloatArray:
     """
     x, y, z = points.T
     ranges = np.hypot(x, y)
-    in_range = (ranges > _MIN_RANGE_M) & (ranges < _MAX_RANGE_M)
+    is_beyond_machine = ranges > _MIN_RANGE_M
+    is_near = ranges < _MAX_RANGE_M
     in_lane = np.abs(y) < width_m / 2
-    used = points[in_range & in_lane & (z < 0.0)]
+    is_below_sensor = z < 0.0
+    used = points[is_beyond_machine & is_near & in_lane & is_below_sensor]
     # Cells are cubes: a wall fills cubes of its own, and does not raise the ground at its foot.
     cubes = np.floor(used / _CELL_M).astype(int)
     _, cell_of_point, counts = np.unique(
         cubes, axis=0, return_inverse=True, return_counts=True
     )
-    sums = Blocks.gathered(used, cell_of_point.ravel(), len(counts)).sums
-    return sums / counts[:, None]
+    points_of_cells = Blocks.gathered(used, cell_of_point.ravel(), len(counts))
+    return points_of_cells.sums / counts[:, None]
 
 
 def _rows(cells: FloatArray) -> FloatArray:
@@ -126,17 +135,23 @@ def _plane_by_ransac(cells: FloatArray) -> FloatArray | None:
     Return None if all random planes are too steep, or their cells nearly on a line.
     """
     rng = np.random.default_rng(0)
-    triangles = cells[rng.integers(len(cells), size=(_N_TRIALS, 3))]
-    rows = np.dstack([triangles[..., :2], np.ones((_N_TRIALS, 3))])
+    corners = rng.integers(len(cells), size=(_N_TRIALS, 3))
+    triangles = cells[corners]
+    ones = np.ones((_N_TRIALS, 3))
+    rows = np.dstack([triangles[..., :2], ones])
     # The determinant is twice the area of the triangle (m^2). A thin one determines no plane.
-    is_regular = np.abs(np.linalg.det(rows)) > 1.0
-    heights = triangles[is_regular][..., 2:]
-    planes = np.linalg.solve(rows[is_regular], heights)[..., 0]
-    planes = planes[_slopes(planes) < _MAX_SLOPE]
+    double_areas_m2 = np.abs(np.linalg.det(rows))
+    is_regular = double_areas_m2 > 1.0
+    regular_rows = rows[is_regular]
+    heights_m = triangles[is_regular][..., 2:]
+    planes = np.linalg.solve(regular_rows, heights_m)[..., 0]
+    is_level = _slopes(planes) < _MAX_SLOPE
+    planes = planes[is_level]
     if not len(planes):
         return None
-    distances = np.abs(cells[:, 2] - _heights(cells, planes))
-    n_inliers = (distances < _MAX_INLIER_HEIGHT_M).sum(axis=1)
+    distances_m = np.abs(cells[:, 2] - _heights(cells, planes))
+    is_inlier = distances_m < _MAX_INLIER_HEIGHT_M
+    n_inliers = is_inlier.sum(axis=1)
     return planes[n_inliers.argmax()]
 
 
@@ -155,13 +170,17 @@ def _is_ground(cells: FloatArray, inliers: FloatArray, plane: FloatArray) -> boo
         The cells in the plane.
     plane : (3,) array
     """
-    horizontal = inliers[:, :2] - inliers[:, :2].mean(axis=0)
-    covariance = horizontal.T @ horizontal / len(inliers)
+    places = inliers[:, :2]
+    deviations = places - places.mean(axis=0)
+    covariance = deviations.T @ deviations / len(inliers)
     # A single ring of a lidar is nearly a line, which determines no plane.
-    is_wide = np.linalg.eigvalsh(covariance)[0] > _CELL_M**2
-    lowest = _heights(cells, plane) - 3 * _MAX_INLIER_HEIGHT_M
-    share_below = (cells[:, 2] < lowest).mean()
+    smallest_variance = np.linalg.eigvalsh(covariance)[0]
+    is_wide = smallest_variance > _CELL_M**2
+    lowest_m = _heights(cells, plane) - 3 * _MAX_INLIER_HEIGHT_M
+    is_below = cells[:, 2] < lowest_m
+    share_below = is_below.mean()
     is_lowest = share_below < _MAX_SHARE_BELOW
     is_level = _slopes(plane) < _MAX_SLOPE
-    is_beyond_machine = np.hypot(*inliers[:, :2].T).max() > _MIN_REACH_M
+    reach_m = np.hypot(*places.T).max()
+    is_beyond_machine = reach_m > _MIN_REACH_M
     return bool(is_wide and is_lowest and is_level and is_beyond_machine)

@@ -202,9 +202,9 @@ def gravity_from_accelerations(
     margin_ns = int(_WINDOW_S / 10 * 1e9)
     first_ns = trajectory.stamps_ns[0] + margin_ns
     last_ns = trajectory.stamps_ns[-1] - margin_ns
-    is_used = (
-        (stamps_ns > first_ns) & (stamps_ns < last_ns) & np.isfinite(forces).all(axis=1)
-    )
+    has_poses = (stamps_ns > first_ns) & (stamps_ns < last_ns)
+    is_finite = np.isfinite(forces).all(axis=1)
+    is_used = has_poses & is_finite
     stamps_ns = stamps_ns[is_used]
     forces = forces[is_used]
     n_windows = 0
@@ -242,17 +242,21 @@ def _verticals_of_windows(
     verticals : (W, 3) array
         ``g u`` of the module, m/s^2.
     """
-    rotations = se3.rotation_of(trajectory.at(stamps_ns, extrapolate=True))
+    poses = trajectory.at(stamps_ns, extrapolate=True)
+    rotations = se3.rotation_of(poses)
     in_world = np.einsum("nij,nj->ni", rotations, forces)
     middles_ns = []
     verticals = []
     for rows in np.array_split(np.arange(len(stamps_ns)), n_windows):
         ends_ns = stamps_ns[rows[[0, -1]]]
-        duration_s = (ends_ns[1] - ends_ns[0]) * 1e-9
+        duration_ns = ends_ns[1] - ends_ns[0]
+        duration_s = duration_ns * 1e-9
         velocities = _velocities(trajectory, ends_ns)
         acceleration = (velocities[1] - velocities[0]) / duration_s
-        verticals.append(in_world[rows].mean(axis=0) - acceleration)
-        middles_ns.append(ends_ns.sum() // 2)
+        mean_force = in_world[rows].mean(axis=0)
+        middle_ns = ends_ns.sum() // 2
+        verticals.append(mean_force - acceleration)
+        middles_ns.append(middle_ns)
     return np.array(middles_ns, dtype=np.int64), np.array(verticals)
 
 
@@ -272,7 +276,8 @@ def gravity_from_attitude(trajectory: Trajectory) -> VerticalTrack:
     >>> hec.gravity_from_attitude(hec.simulate(0, poses=50).parent).source
     'gravity'
     """
-    ups = np.tile([0.0, 0.0, 1.0], (len(trajectory), 1))
+    up = np.array([0.0, 0.0, 1.0])
+    ups = np.tile(up, (len(trajectory), 1))
     return _in_sensor(trajectory, trajectory.stamps_ns, ups)
 
 
@@ -280,10 +285,12 @@ def _in_sensor(
     trajectory: Trajectory, stamps_ns: IntArray, ups: FloatArray
 ) -> VerticalTrack:
     """Return the track of a sensor from verticals (N, 3) in the world of its poses."""
-    rotations = se3.rotation_of(trajectory.at(stamps_ns, extrapolate=True))
+    poses = trajectory.at(stamps_ns, extrapolate=True)
+    rotations = se3.rotation_of(poses)
     # Transposed rotations: from the world to the sensor.
-    ups = np.einsum("nji,nj->ni", rotations, ups)
-    return VerticalTrack(stamps_ns, ups / np.linalg.norm(ups, axis=1, keepdims=True))
+    in_sensor = np.einsum("nji,nj->ni", rotations, ups)
+    lengths = np.linalg.norm(in_sensor, axis=1, keepdims=True)
+    return VerticalTrack(stamps_ns, in_sensor / lengths)
 
 
 def _velocities(trajectory: Trajectory, stamps_ns: IntArray) -> FloatArray:
@@ -292,7 +299,8 @@ def _velocities(trajectory: Trajectory, stamps_ns: IntArray) -> FloatArray:
     before = trajectory.at(stamps_ns - half_ns, extrapolate=True)
     after = trajectory.at(stamps_ns + half_ns, extrapolate=True)
     moved_m = se3.translation_of(after) - se3.translation_of(before)
-    return moved_m * 1e9 / (2 * half_ns)
+    duration_ns = 2 * half_ns
+    return moved_m * 1e9 / duration_ns
 
 
 def turning_axis(trajectory: Trajectory) -> FloatArray:
@@ -307,14 +315,18 @@ def turning_axis(trajectory: Trajectory) -> FloatArray:
     """
     # Rotations over a second are larger than the noise of single poses.
     step = max(1, round(1.0 / trajectory.interval_s))
-    rotations = se3.rotation_of(trajectory.poses[::step])
+    poses = trajectory.poses[::step]
+    rotations = se3.rotation_of(poses)
     turns = se3.rotations_between(rotations[:-1], rotations[1:])
-    squares, axes = np.linalg.eigh(turns.T @ turns)
+    products = turns.T @ turns
+    squares, axes = np.linalg.eigh(products)
     # The eigenvalues are ascending.
-    if squares[1] >= _MAX_OTHER_SHARE**2 * squares[2]:
+    largest_other = _MAX_OTHER_SHARE**2 * squares[2]
+    if squares[1] >= largest_other:
         raise NotEnoughDataError("the sensor does not turn about the vertical alone")
     axis = axes[:, 2]
-    return axis * np.sign(axis[2])
+    sign = np.sign(axis[2])
+    return axis * sign
 
 
 def driving_direction(trajectory: Trajectory) -> FloatArray:
@@ -324,6 +336,9 @@ def driving_direction(trajectory: Trajectory) -> FloatArray:
     """
     step = max(1, round(1.0 / trajectory.interval_s))
     before = trajectory.poses[:-step:step]
-    motions = se3.translation_of(se3.inverse(before) @ trajectory.poses[step::step])
-    _, axes = np.linalg.eigh(motions.T @ motions)
+    after = trajectory.poses[step::step]
+    motions = se3.inverse(before) @ after
+    displacements = se3.translation_of(motions)
+    products = displacements.T @ displacements
+    _, axes = np.linalg.eigh(products)
     return axes[:, 2]
