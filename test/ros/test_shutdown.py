@@ -95,7 +95,9 @@ def test_a_solving_process_that_hangs_is_noticed_and_the_node_goes_on(start_node
     os.kill(int(Path(f"/proc/{pid}/task/{pid}/children").read_text()), signal.SIGSTOP)
     answer = peer.trigger("solve")
     sentence = "the solving process had no answer after 5 s and was killed"
-    assert (answer.success, sentence in answer.message) == (False, True)
+    # On a busy computer, the answer may come before the end of the process.
+    is_answered = sentence in answer.message or "still solving" in answer.message
+    assert (answer.success, is_answered) == (False, True)
     node.wait_for_log(sentence, "it was started again")
     answer, _ = peer.solve(peer.publishers(), *drive())
     assert answer.success
