@@ -34,9 +34,11 @@ from reproduction.coverage.classes import make
 @pytest.fixture(scope="module")
 def streams():
     poses = wandering_poses(500)
+    child_poses = disturbed(child_of(poses), 1, 0.002, 0.001)
     parent = as_trajectory(poses)
-    child = as_trajectory(disturbed(child_of(poses), 1, 0.002, 0.001))
-    return parent, child, hec.calibrate(parent, child, reference="B5").T_parent_child
+    child = as_trajectory(child_poses)
+    expected = hec.calibrate(parent, child, reference="B5")
+    return parent, child, expected.T_parent_child
 
 
 def test_a_clock_offset_that_is_certain_is_used_and_said(streams):
@@ -54,11 +56,16 @@ def test_a_clock_offset_that_is_certain_is_used_and_said(streams):
 def test_a_check_states_the_clock_offset_and_the_scale_of_the_solution(streams):
     parent, child, _ = streams
     other = child.shifted(-0.3).scaled(0.4)
-    found = {issue.code: issue for issue in examine(whole_snapshot(parent, other, {}))}
+    snapshot = whole_snapshot(parent, other, {})
+
+    issues = {issue.code: issue for issue in examine(snapshot)}
     result = hec.calibrate(parent, other)
-    assert found["time_offset"].evidence["size_s"] == result.time_offset_s
-    assert found["time_offset"].evidence["sigma_s"] == result.time_offset_sigma_s
-    assert found["scale"].evidence["scale"] == result.scale
+
+    offset = issues["time_offset"].evidence
+    scale = issues["scale"].evidence
+    assert offset["size_s"] == result.time_offset_s
+    assert offset["sigma_s"] == result.time_offset_sigma_s
+    assert scale["scale"] == result.scale
 
 
 def test_an_axis_with_a_prior_is_not_called_unknown():
@@ -76,34 +83,51 @@ def test_an_axis_with_a_prior_is_not_called_unknown():
 
 def test_a_unit_that_is_certain_is_used_and_said(streams):
     parent, child, expected = streams
-    result = hec.calibrate(parent, child.scaled(1000.0), reference="B5")
-    assert (result.scale, result.findings) == (0.001, ())
+    in_millimetres = child.scaled(1000.0)
+
+    result = hec.calibrate(parent, in_millimetres, reference="B5")
+
+    assert result.scale == 0.001
+    assert result.findings == ()
     assert_allclose(result.T_parent_child, expected, atol=0.01)
-    assert any("solved with scale=0.001" in text for text in result.warnings)
-    thrice = hec.calibrate(parent.scaled(3.0), child)
-    assert (thrice.scale, thrice.findings) == (pytest.approx(3.0, abs=0.01), ())
+    assert "solved with scale=0.001" in "\n".join(result.warnings)
+
+
+def test_a_parent_with_another_scale_has_no_finding(streams):
+    parent, child, _ = streams
+    result = hec.calibrate(parent.scaled(3.0), child)
+    assert result.scale == pytest.approx(3.0, abs=0.01)
+    assert result.findings == ()
 
 
 def test_both_streams_in_millimetres_are_never_used(streams):
     parent, child, expected = streams
-    result = hec.calibrate(parent.scaled(1000.0), child.scaled(1000.0), reference="B5")
-    assert result.verdict is Verdict.DO_NOT_USE
+    parent_mm = parent.scaled(1000.0)
+    child_mm = child.scaled(1000.0)
+
+    result = hec.calibrate(parent_mm, child_mm, reference="B5")
+
     (finding,) = result.findings
-    assert (finding.code, finding.stream) == ("lengths", "both")
+    assert result.verdict is Verdict.DO_NOT_USE
+    assert finding.code == "lengths"
+    assert finding.stream == "both"
     assert "both streams' lengths seem to be in millimetres" in result.headline
     assert finding.evidence["speed_m_s"] > 1000
-    asked = hec.calibrate(
-        parent.scaled(1000.0), child.scaled(1000.0), reference="B5", **finding.options
-    )
-    assert_allclose(asked.T_parent_child, expected, atol=1e-9)
+    options = {"reference": "B5", **finding.options}
+    answered = hec.calibrate(parent_mm, child_mm, **options)
+    assert_allclose(answered.T_parent_child, expected, atol=1e-9)
 
 
 def written_otherwise(trajectory, convention):
     """As another program writes it: what the option of that name puts right."""
-    poses = se3.put_right(trajectory.poses, convention.get("invert", "none"))
-    if order := convention.get("quaternion"):
-        quats = np.roll(se3.to_quat_xyzw(poses), order.index("x"), axis=1)
-        poses = se3.from_quat_xyzw(poses[:, :3, 3], quats)
+    inversion = convention.get("invert", "none")
+    poses = se3.put_right(trajectory.poses, inversion)
+    order = convention.get("quaternion")
+    if order:
+        positions = poses[:, :3, 3]
+        quats_xyzw = se3.to_quat_xyzw(poses)
+        quats = np.roll(quats_xyzw, order.index("x"), axis=1)
+        poses = se3.from_quat_xyzw(positions, quats)
     return replace(trajectory, poses=poses)
 
 
@@ -111,23 +135,30 @@ REPAIRS = [{"invert": "poses"}, {"invert": "orientations"}, {"quaternion": "wxyz
 REPAIRS += [{"quaternion": "wxyz", "invert": "poses"}, {"quaternion": "yzwx"}]
 
 
+def as_options(options):
+    """Options as a warning writes them."""
+    assignments = [f'{name}="{value}"' for name, value in options.items()]
+    return ", ".join(assignments)
+
+
 @pytest.mark.parametrize("convention", REPAIRS, ids=str)
 @pytest.mark.parametrize("stream", ["parent", "child"])
 def test_a_stream_in_another_convention_is_repaired_and_that_is_said(
     streams, stream, convention
 ):
-    trajectories = dict(zip(("parent", "child"), streams, strict=False))
+    parent, child, expected = streams
+    trajectories = {"parent": parent, "child": child}
     trajectories[stream] = written_otherwise(trajectories[stream], convention)
+    repairs = {f"{stream}_{name}": value for name, value in convention.items()}
+    defaults = {name: getattr(CalibratorConfig, name) for name in repairs}
+
     result = hec.calibrate(**trajectories, reference="B5")
-    assert_allclose(result.T_parent_child, streams[2], atol=1e-9)
+
+    assert_allclose(result.T_parent_child, expected, atol=1e-9)
     assert result.verdict is Verdict.USE
     (warning,) = (text for text in result.warnings if text.startswith("repaired: "))
-    done = {f"{stream}_{name}": value for name, value in convention.items()}
-    usual = {name: getattr(CalibratorConfig, name) for name in done}
-    solved, undo = (
-        ", ".join(f'{name}="{value}"' for name, value in options.items())
-        for options in (done, usual)
-    )
+    solved = as_options(repairs)
+    undo = as_options(defaults)
     sentence = (
         f"Solved with {solved}: USE; as the streams are: DO NOT USE (undo with {undo})"
     )
@@ -137,12 +168,15 @@ def test_a_stream_in_another_convention_is_repaired_and_that_is_said(
 @pytest.mark.parametrize("scale", [{}, {"scale": "estimate"}])
 def test_inverse_poses_on_a_clock_an_hour_off_and_in_feet(streams, scale):
     parent, child, expected = streams
-    child = written_otherwise(child, REPAIRS[0]).shifted(3600.0).scaled(1 / 0.3048)
-    result = hec.calibrate(parent, child, reference="B5", **scale)
+    inverse = written_otherwise(child, REPAIRS[0])
+    other = inverse.shifted(3600.0).scaled(1 / 0.3048)
+
+    result = hec.calibrate(parent, other, reference="B5", **scale)
+
     assert_allclose(result.T_parent_child, expected, atol=1e-3)
     assert result.verdict is Verdict.USE_WITH_CARE
     assert result.time_offset_s == pytest.approx(-3600.0, abs=1e-3)
-    assert any("as the streams are: no result" in text for text in result.warnings)
+    assert "as the streams are: no result" in "\n".join(result.warnings)
 
 
 def test_what_was_given_is_kept_spoils_the_verdict_and_the_advice_undoes_it(streams):
@@ -164,31 +198,43 @@ def test_what_was_given_is_kept_spoils_the_verdict_and_the_advice_undoes_it(stre
 
 def test_kept_pairs_are_put_right_like_poses(streams):
     parent, child, expected = streams
-    child = written_otherwise(child, REPAIRS[0])
-    snapshot = whole_snapshot(parent, child, {"reference": "B5"})
-    nothing = {"buffered_parent": parent[:0], "buffered_child": child[:0]}
-    kept = replace(snapshot, kept=snapshot.pose_pairs, paired_at="child", **nothing)
+    inverse = written_otherwise(child, REPAIRS[0])
+    snapshot = whole_snapshot(parent, inverse, {"reference": "B5"})
+    kept = replace(
+        snapshot,
+        kept=snapshot.pose_pairs,
+        paired_at="child",
+        buffered_parent=parent[:0],
+        buffered_child=inverse[:0],
+    )
+
     repaired = with_options(kept, {"child_invert": "poses"})
+    with_offset = with_options(kept, {"child_invert": "poses", "time_offset": 0.0})
+
     assert_allclose(repaired.estimate().T_parent_child, expected, atol=1e-9)
-    shifted = with_options(kept, {"child_invert": "poses", "time_offset": 0.0})
-    assert_allclose(shifted.estimate().T_parent_child, expected, atol=1e-9)
+    assert_allclose(with_offset.estimate().T_parent_child, expected, atol=1e-9)
 
 
 def test_a_slow_arm_in_millimetres_is_noticed_and_a_drone_in_metres_is_not():
     arm = as_trajectory(wandering_poses(1200, step_m=0.006))
     drone = as_trajectory(wandering_poses(1200, step_m=1.0))
-    assert check_lengths(arm, arm) == check_lengths(drone, drone) == []
-    in_mm = arm.scaled(1000.0)
-    assert codes_of(check_lengths(in_mm, in_mm)) == ["lengths"]
+    arm_in_mm = arm.scaled(1000.0)
+
+    assert check_lengths(arm, arm) == []
+    assert check_lengths(drone, drone) == []
+    findings = check_lengths(arm_in_mm, arm_in_mm)
+    assert codes_of(findings) == ["lengths"]
 
 
 def test_a_scale_that_was_given_is_left_by_the_noise_model_too(streams):
     parent, child, _ = streams
     longer = child.scaled(1.03)
-    assert hec.calibrate(parent, longer).scale == pytest.approx(1 / 1.03, abs=0.002)
+    estimated = hec.calibrate(parent, longer)
+    assert estimated.scale == pytest.approx(1 / 1.03, abs=0.002)
     for scale in (1.0, "none"):
         result = hec.calibrate(parent, longer, scale=scale)
-        assert (result.scale, result.scale_sigma) == (1.0, 0.0)
+        assert result.scale == 1.0
+        assert result.scale_sigma == 0.0
         assert "scale" in codes_of(result.findings)
 
 
@@ -281,10 +327,16 @@ def test_a_scale_with_which_the_noise_model_does_not_fit_is_not_used():
     child = child_of(poses)
     # A drift of 5 % of the path along one axis of the child, hence partly along the path.
     steps = se3.inverse(child[:-1]) @ child[1:]
-    steps[:, 0, 3] += 0.05 * np.linalg.norm(steps[:, :3, 3], axis=1)
-    result = hec.calibrate(as_trajectory(poses), as_trajectory(walked(steps, child[0])))
-    assert set(codes_of(result.findings)) == {"scale", "not_independent"}
-    assert (result.method, result.scale) == ("adaptive", 1.0)
+    lengths_m = np.linalg.norm(steps[:, :3, 3], axis=1)
+    steps[:, 0, 3] += 0.05 * lengths_m
+    drifting_child = walked(steps, child[0])
+
+    result = hec.calibrate(as_trajectory(poses), as_trajectory(drifting_child))
+
+    codes = codes_of(result.findings)
+    assert set(codes) == {"scale", "not_independent"}
+    assert result.method == "adaptive"
+    assert result.scale == 1.0
     assert result.noise.systematic == "bias"
 
 
@@ -292,8 +344,9 @@ def test_a_scale_with_which_the_noise_model_does_not_fit_is_not_used():
 def late():
     """Snapshot of streams whose clocks are apart."""
     poses = wandering_poses(300)
+    child_poses = disturbed(child_of(poses), 1, 0.002, 0.001)
     parent = as_trajectory(poses)
-    child = as_trajectory(disturbed(child_of(poses), 1, 0.002, 0.001)).shifted(-0.05)
+    child = as_trajectory(child_poses).shifted(-0.05)
     return whole_snapshot(parent, child, {})
 
 
@@ -301,19 +354,25 @@ def late():
     "options", [{"time_offset": 0.0}, {"method": "dnlo", "time_offset": 0.05}]
 )
 def test_a_clock_that_the_user_set_stays(late, options):
-    other = replace(late, config=replace(late.config, given=options, **options))
-    assert run(other).snapshot is other
+    config = replace(late.config, given=options, **options)
+    other = replace(late, config=config)
+    attempt = run(other)
+    assert attempt.snapshot is other
 
 
 def test_a_large_offset_that_nobody_asked_for_is_used_with_care(late):
     child = late.buffered_child.shifted(5.0)
-    result = run(replace(late, buffered_child=child)).calibration
+    config = replace(late.config, time_offset="estimate", given={"time_offset"})
+    unasked = replace(late, buffered_child=child)
+    asked = replace(late, buffered_child=child, config=config)
+
+    result = run(unasked).calibration
+    asked_result = run(asked).calibration
+
     assert result.time_offset_s == pytest.approx(-5.0, abs=0.1)
     assert result.verdict is not Verdict.USE
-    assert {"time_offset"} == set(codes_of(result.findings))
-    config = replace(late.config, time_offset="estimate", given={"time_offset"})
-    asked = run(replace(late, buffered_child=child, config=config)).calibration
-    assert asked.findings == ()
+    assert set(codes_of(result.findings)) == {"time_offset"}
+    assert asked_result.findings == ()
 
 
 @pytest.mark.parametrize(
@@ -327,12 +386,14 @@ def test_a_model_that_fits_does_not_rule_out_smoothing_without_a_delay(
     kind, span_s, code
 ):
     drive = make(kind, 932)
+    width = round(span_s / drive.dt)
     poses = drive.child.poses.copy()
-    poses[:, :3, 3] = uniform_filter1d(
-        poses[:, :3, 3], round(span_s / drive.dt), axis=0, mode="nearest"
-    )
+    positions = poses[:, :3, 3]
+    poses[:, :3, 3] = uniform_filter1d(positions, width, axis=0, mode="nearest")
     smoothed = Trajectory(drive.child.stamps_ns, poses)
+
     result = hec.calibrate(drive.parent, smoothed)
+
     assert result.noise.misfit < 2.0
     assert code in codes_of(result.findings)
     assert result.verdict is Verdict.DO_NOT_USE
@@ -371,8 +432,12 @@ def test_a_scale_that_the_noise_model_finds_unasked_is_stated(factor, severity, 
 @pytest.mark.parametrize("scale", ["auto", "estimate"])
 def test_a_scale_that_was_asked_for_is_no_finding(scale):
     poses = wandering_poses(500)
-    parent = as_trajectory(disturbed(poses, 4, 0.002, 0.001))
-    child = as_trajectory(disturbed(child_of(poses), 5, 0.002, 0.001)).scaled(1.06)
+    parent_poses = disturbed(poses, 4, 0.002, 0.001)
+    child_poses = disturbed(child_of(poses), 5, 0.002, 0.001)
+    parent = as_trajectory(parent_poses)
+    child = as_trajectory(child_poses).scaled(1.06)
+
     result = hec.calibrate(parent, child, scale=scale)
+
     assert result.scale == pytest.approx(1.0 / 1.06, abs=0.002)
     assert "model_scale" not in codes_of(result.findings)

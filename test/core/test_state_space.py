@@ -68,30 +68,44 @@ def space_of(seed=1, cut=(4,)):
 
 def parameters_and_residuals(space, rows=slice(None)):
     """Return J and e, of all rows or of some."""
-    columns = space.columns.reshape(-1, N_PARAMETERS + 1)[rows]
-    return columns[:, :-1], columns[:, -1]
+    columns = space.columns.reshape(-1, N_PARAMETERS + 1)
+    chosen = columns[rows]
+    J = chosen[:, :-1]
+    e = chosen[:, -1]
+    return J, e
 
 
 LEVELS = np.random.default_rng(2).uniform(-1.0, 1.0, N_LEVELS)
 
 
-def dense_covariance(space, levels):
-    """Return V (6 n, 6 n) by its definition, also for increments without information."""
-    variances = np.exp(levels)
-    n_steps, _, d = space.h0.shape
+def dense_prior(space, variances):
+    """Return the covariance (6 n, 6 n) of the states of all poses."""
+    d = space.h0.shape[2]
     prior = np.zeros((N_POSES, d, N_POSES, d))
     for pose in range(N_POSES):
         white = np.zeros((6, 6))
         for variance, basis in zip(variances, space.white_bases, strict=False):
-            white = white + variance * basis[pose if len(basis) > 1 else 0]
+            of_pose = basis[pose] if len(basis) > 1 else basis[0]
+            white = white + variance * of_pose
         prior[pose, :6, pose, :6] = white / space.weights[pose]
 
     times_s = np.r_[0.0, np.cumsum(space.intervals_s)]
     distances_s = np.abs(times_s[:, None] - times_s)
     groups = np.repeat(range(len(SIZES)), SIZES)
     for state, group in enumerate(groups, start=6):
-        variance, tau_s = variances[5 + 2 * group : 7 + 2 * group]
-        prior[:, state, :, state] = variance * np.exp(-distances_s / tau_s)
+        first = 5 + 2 * group
+        variance = variances[first]
+        tau_s = variances[first + 1]
+        correlations = np.exp(-distances_s / tau_s)
+        prior[:, state, :, state] = variance * correlations
+    return prior.reshape(N_POSES * d, -1)
+
+
+def dense_covariance(space, levels):
+    """Return V (6 n, 6 n) by its definition, also for increments without information."""
+    variances = np.exp(levels)
+    n_steps, _, d = space.h0.shape
+    prior = dense_prior(space, variances)
 
     entries = np.zeros((n_steps, 6, N_POSES, d))
     for step in range(n_steps):
@@ -99,10 +113,12 @@ def dense_covariance(space, levels):
         entries[step, :, step + 1, 6:] = space.h1_processes[step]
         entries[step, :, step] = -space.h0[step]
     entries = entries.reshape(6 * n_steps, -1)
-    prior = prior.reshape(N_POSES * d, -1)
-    walk = variances[3] * space.walk_bases[0] + variances[4] * space.walk_bases[1]
+    of_states = entries @ prior @ entries.T
+
+    first_basis, second_basis = space.walk_bases
+    walk = variances[3] * first_basis + variances[4] * second_basis
     of_walk = np.kron(np.diag(space.walk_factors), walk)
-    return entries @ prior @ entries.T + of_walk
+    return of_states + of_walk
 
 
 def dense_loss(space, levels):
@@ -110,21 +126,38 @@ def dense_loss(space, levels):
     rows = np.repeat(~space.cut, 6)
     V = dense_covariance(space, levels)[np.ix_(rows, rows)]
     J, r = parameters_and_residuals(space, rows)
-    information = J.T @ np.linalg.solve(V, J)
-    step = -np.linalg.solve(information, J.T @ np.linalg.solve(V, r))
+    weighted_J = np.linalg.solve(V, J)
+    weighted_r = np.linalg.solve(V, r)
+    information = J.T @ weighted_J
+    gradient = J.T @ weighted_r
+    step = -np.linalg.solve(information, gradient)
     rest = r + J @ step
-    log_determinants = np.linalg.slogdet(V)[1] + np.linalg.slogdet(information)[1]
-    loss = 0.5 * (log_determinants + rest @ np.linalg.solve(V, rest))
-    return loss, step, np.linalg.inv(information)
+    squares = rest @ np.linalg.solve(V, rest)
+    _, log_det_V = np.linalg.slogdet(V)
+    _, log_det_information = np.linalg.slogdet(information)
+    loss = 0.5 * (log_det_V + log_det_information + squares)
+    covariance = np.linalg.inv(information)
+    return loss, step, covariance
+
+
+def projection(V, J):
+    """Return P = V^-1 - V^-1 J (J' V^-1 J)^-1 J' V^-1 of the restricted likelihood."""
+    inverse = np.linalg.inv(V)
+    information = J.T @ inverse @ J
+    covariance = np.linalg.inv(information)
+    return inverse - inverse @ J @ covariance @ J.T @ inverse
 
 
 def test_the_likelihood_is_that_of_the_dense_covariance():
     space = space_of()
     loss, step, covariance = dense_loss(space, LEVELS)
+
     posterior = Posterior(space, LEVELS)
+
+    normal = posterior.normal
     assert posterior.loss == pytest.approx(loss, rel=1e-11, abs=1e-9)
-    assert_allclose(posterior.normal.step, step, atol=1e-9)
-    assert_allclose(posterior.normal.covariance, covariance, atol=1e-9)
+    assert_allclose(normal.step, step, atol=1e-9)
+    assert_allclose(normal.covariance, covariance, atol=1e-9)
 
 
 def test_the_likelihood_stays_exact_where_there_is_hardly_any_walk_or_white_noise():
@@ -157,16 +190,19 @@ def test_a_parameter_without_information_changes_no_derivative():
 
 @pytest.mark.parametrize("units", [np.ones(3), np.array([1.0, 0.1, 10.0])])
 def test_the_log_determinant_is_that_of_the_directions_with_information(units):
-    information = np.diag([4.0, 9.0, 0.0])
-    turned = se3.rotation_exp(np.array([0.3, -0.2, 0.5]))
-    information = turned @ information @ turned.T
+    turn = se3.rotation_exp(np.array([0.3, -0.2, 0.5]))
+    information = turn @ np.diag([4.0, 9.0, 0.0]) @ turn.T
+    scaled_information = information / np.outer(units, units)
     products = np.zeros((4, 4))
-    products[:3, :3] = information / np.outer(units, units)
-    # Without one direction, the product of the eigenvalues that are not zero.
-    values = np.linalg.eigvalsh(products[:3, :3])[1:]
+    products[:3, :3] = scaled_information
+
     result = NormalEquations(products)
+
+    # Without one direction, the product of the eigenvalues that are not zero.
+    _, *values = np.linalg.eigvalsh(scaled_information)
+    log_determinant = np.log(values).sum()
     assert len(result.unseen.T) == 1
-    assert result.log_determinant == pytest.approx(np.log(values).sum(), rel=1e-9)
+    assert result.log_determinant == pytest.approx(log_determinant, rel=1e-9)
 
 
 def test_no_information_at_all_is_no_error():
@@ -177,50 +213,56 @@ def test_no_information_at_all_is_no_error():
 
 
 def test_derivatives_of_the_likelihood_are_the_numerical_ones():
+    def slope(function, change):
+        ahead = function(space, LEVELS + change)
+        behind = function(space, LEVELS - change)
+        return (ahead - behind) / (2 * step)
+
+    def loss_alone(space, levels):
+        loss, *_ = dense_loss(space, levels)
+        return loss
+
     space = space_of()
     step = 1e-5
+    changes = step * np.eye(N_LEVELS)
     gradient, information = reml.derivatives(Posterior(space, LEVELS))
-    numerical = [
-        (dense_loss(space, LEVELS + change)[0] - dense_loss(space, LEVELS - change)[0])
-        / (2 * step)
-        for change in step * np.eye(N_LEVELS)
-    ]
+
+    numerical = [slope(loss_alone, change) for change in changes]
     assert_allclose(gradient, numerical, atol=1e-7)
 
     rows = np.repeat(~space.cut, 6)
+    of_rows = np.ix_(rows, rows)
     J, r = parameters_and_residuals(space, rows)
-    inverse = np.linalg.inv(dense_covariance(space, LEVELS)[np.ix_(rows, rows)])
-    P = inverse - inverse @ J @ np.linalg.inv(J.T @ inverse @ J) @ J.T @ inverse
-    slopes = [
-        (
-            dense_covariance(space, LEVELS + change)
-            - dense_covariance(space, LEVELS - change)
-        )
-        / (2 * step)
-        for change in step * np.eye(N_LEVELS)
-    ]
-    forced = np.array([slope[np.ix_(rows, rows)] @ P @ r for slope in slopes])
+    V = dense_covariance(space, LEVELS)[of_rows]
+    P = projection(V, J)
+    forced = []
+    for change in changes:
+        V_slope = slope(dense_covariance, change)[of_rows]
+        forced.append(V_slope @ P @ r)
+    forced = np.array(forced)
     assert_allclose(information, 0.5 * forced @ P @ forced.T, atol=1e-7)
 
 
 def test_surprises_are_what_leaving_one_out_makes_of_it():
+    no_spikes = np.zeros(N_POSES, dtype=bool)
     space = space_of(cut=())
-    of_walk, _ = innovation_chi_squares(
-        Posterior(space, LEVELS), np.zeros(N_POSES, dtype=bool)
-    )
     V = dense_covariance(space, LEVELS)
     J, r = parameters_and_residuals(space)
-    inverse = np.linalg.inv(V)
-    P = inverse - inverse @ J @ np.linalg.inv(J.T @ inverse @ J) @ J.T @ inverse
-    u = (P @ r).reshape(-1, 6)
+    P = projection(V, J)
+    forces = (P @ r).reshape(-1, 6)
+
+    posterior = Posterior(space, LEVELS)
+    of_walk, _ = innovation_chi_squares(posterior, no_spikes)
+
     for i, surprise in enumerate(of_walk):
-        own = P[6 * i : 6 * i + 6, 6 * i : 6 * i + 6]
-        assert surprise == pytest.approx(u[i] @ np.linalg.solve(own, u[i]), rel=1e-5)
+        block = slice(6 * i, 6 * i + 6)
+        own = P[block, block]
+        force = forces[i]
+        expected = force @ np.linalg.solve(own, force)
+        assert surprise == pytest.approx(expected, rel=1e-5)
     # An increment that is no evidence is judged by the same number.
-    without = space_of(cut=(6,))
-    again, _ = innovation_chi_squares(
-        Posterior(without, LEVELS), np.zeros(N_POSES, dtype=bool)
-    )
+    without = Posterior(space_of(cut=(6,)), LEVELS)
+    again, _ = innovation_chi_squares(without, no_spikes)
     assert again[6] == pytest.approx(of_walk[6], rel=1e-5)
 
 
@@ -229,19 +271,26 @@ def test_parts_add_what_a_recording_that_ends_there_would_know():
     posterior = Posterior(space, LEVELS)
     parts = posterior.part_products()
     assert_allclose(parts.sum(axis=0), posterior.products, atol=1e-8)
+
     n_known = 9  # of 14 parts, one increment each
-    rows = np.repeat(~space.cut, 6) & (np.arange(6 * len(space.columns)) < 6 * n_known)
+    is_evidence = np.repeat(~space.cut, 6)
+    is_known = np.arange(6 * len(space.columns)) < 6 * n_known
+    rows = is_evidence & is_known
     V = dense_covariance(space, LEVELS)[np.ix_(rows, rows)]
     columns = space.columns.reshape(-1, N_PARAMETERS + 1)[rows]
     expected = columns.T @ np.linalg.solve(V, columns)
-    assert_allclose(parts[:n_known].sum(axis=0), expected, atol=1e-8)
+    of_known = parts[:n_known].sum(axis=0)
+    assert_allclose(of_known, expected, atol=1e-8)
+
     halves = Blocks(parts).merged(2)
-    assert_allclose(
-        NormalEquations(halves.without()).step[1],
-        NormalEquations(parts[:7].sum(axis=0)).step,
-        atol=1e-9,
-    )
-    rounding = 1e-12 * np.random.default_rng(0).normal(size=(7, 7))
+    without_half = NormalEquations(halves.without())
+    first_half = NormalEquations(parts[:7].sum(axis=0))
+    assert_allclose(without_half.step[1], first_half.step, atol=1e-9)
+
+
+def test_information_of_rounding_errors_is_not_complete():
+    random = np.random.default_rng(0)
+    rounding = 1e-12 * random.normal(size=(7, 7))
     np.fill_diagonal(rounding, [0, 0, 5e-10, 5e-10, 5e-10, 5e10, 0.5])
     equations = NormalEquations(rounding + rounding.T)
     assert not equations.is_complete
@@ -289,10 +338,14 @@ def test_block_tridiagonal_algebra_is_that_of_the_dense_matrix(n):
 
 
 def test_chi_squares_of_jitter_along_one_velocity_are_finite():
-    prior = 1.7e5 * np.ones((1, 6, 6)) + 1e-14 * np.eye(6)
+    of_velocity = np.ones((1, 6, 6))
+    rounding = 1e-14 * np.eye(6)
+    prior = 1.7e5 * of_velocity + rounding
+    posterior = 0.004 * prior
     values = np.ones((1, 6))
-    chi_square = chi_squares(values, prior, 0.004 * prior, np.array([False]))
-    assert 0.0 <= chi_square[0] < 1e-3
+    is_cut = np.array([False])
+    (chi_square,) = chi_squares(values, prior, posterior, is_cut)
+    assert 0.0 <= chi_square < 1e-3
 
 
 def test_parts_have_the_posterior_of_a_trajectory_that_is_cut_between_them(monkeypatch):

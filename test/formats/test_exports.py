@@ -76,68 +76,135 @@ def document(text):
     )
 
 
-def matrix_of(name, text):
-    """The pose (4, 4) in a file, taken out of it by hand."""
+def autoware_pose(text):
+    ((_, children),) = document(text).items()
+    ((_, values),) = children.items()
+    translation = [values["x"], values["y"], values["z"]]
+    angles = [values["roll"], values["pitch"], values["yaw"]]
+    return translation, Rotation.from_euler("xyz", angles)
+
+
+def fast_lio_pose(text):
     fields = document(text)
-    if name == "autoware":
-        ((_, children),) = fields.items()
-        ((_, values),) = children.items()
-        rotation = Rotation.from_euler(
-            "xyz", [values[key] for key in ("roll", "pitch", "yaw")]
-        )
-        return [values[key] for key in "xyz"], rotation
-    if name in ("fast_lio", "fast_livo2"):
-        section = fields.get("mapping") or fields["extrin_calib"]
-        keys = ("Pcl", "Rcl") if "Pcl" in section else ("extrinsic_T", "extrinsic_R")
-        return section[keys[0]], section[keys[1]]
-    if name == "lio_sam":
-        assert fields["lio_sam"]["extrinsicRPY"] == fields["lio_sam"]["extrinsicRot"]
-        return fields["lio_sam"]["extrinsicTrans"], fields["lio_sam"]["extrinsicRot"]
-    if name == "dlio":
-        ((_, values),) = fields["dlio"]["extrinsics"].items()
-        return values["t"], values["R"]
-    if name in ("kalibr", "openvins"):
-        ((_, camera),) = fields.items()
-        T = np.array(
-            next(matrix for key, matrix in camera.items() if key.startswith("T_"))
-        )
-        return T[:3, 3], T[:3, :3].ravel()
-    if name in ("vins", "orbslam3", "opencv"):
-        T = np.array(
-            next(block["data"] for block in fields.values() if isinstance(block, dict))
-        )
-        return T.reshape(4, 4)[:3, 3], T.reshape(4, 4)[:3, :3].ravel()
-    if name in ("apollo", "easy_handeye2"):
-        pose = fields["transform"]
-        rotation = Rotation.from_quat([pose["rotation"][key] for key in "xyzw"])
-        return [pose["translation"][key] for key in "xyz"], rotation
-    if name == "glim":
-        values = json.loads(text)["sensors"]["T_lidar_imu"]
-        return values[:3], Rotation.from_quat(values[3:])
-    if name == "msa":
-        ((_, entry),) = fields.items()
-        return entry["value"][:3], Rotation.from_quat(entry["value"][3:])
-    if name == "kitti":
-        lines = dict(line.split(":", 1) for line in text.splitlines())
-        return [float(number) for number in lines["T"].split()], [
-            *map(float, lines["R"].split())
-        ]
-    if name == "nuscenes":
-        (record,) = json.loads(text)
-        return record["translation"], Rotation.from_quat(
-            np.roll(record["rotation"], -1)
-        )
-    if name == "colmap":
-        camera = json.loads(text)[0]["cameras"][1]
-        rotation = Rotation.from_quat(np.roll(camera["cam_from_rig_rotation"], -1))
-        return camera["cam_from_rig_translation"], rotation
-    if name == "driveworks":
-        pose = json.loads(text)["rig"]["sensors"][0]["nominalSensor2Rig_FLU"]
-        return pose["t"], Rotation.from_euler(
-            "xyz", pose["roll-pitch-yaw"], degrees=True
-        )
+    section = fields.get("mapping") or fields["extrin_calib"]
+    if "Pcl" in section:
+        return section["Pcl"], section["Rcl"]
+    return section["extrinsic_T"], section["extrinsic_R"]
+
+
+def lio_sam_pose(text):
+    section = document(text)["lio_sam"]
+    assert section["extrinsicRPY"] == section["extrinsicRot"]
+    return section["extrinsicTrans"], section["extrinsicRot"]
+
+
+def dlio_pose(text):
+    extrinsics = document(text)["dlio"]["extrinsics"]
+    ((_, values),) = extrinsics.items()
+    return values["t"], values["R"]
+
+
+def parts_of(T):
+    """Translation, and rotation (9,) by rows."""
+    rotation = T[:3, :3]
+    return T[:3, 3], rotation.ravel()
+
+
+def kalibr_pose(text):
+    ((_, camera),) = document(text).items()
+    matrices = [value for key, value in camera.items() if key.startswith("T_")]
+    return parts_of(np.array(matrices[0]))
+
+
+def opencv_pose(text):
+    values = document(text).values()
+    blocks = [value for value in values if isinstance(value, dict)]
+    T = np.array(blocks[0]["data"])
+    return parts_of(T.reshape(4, 4))
+
+
+def named_components(text):
+    pose = document(text)["transform"]
+    translation = pose["translation"]
+    rotation = pose["rotation"]
+    position = [translation[axis] for axis in "xyz"]
+    quat_xyzw = [rotation[component] for component in "xyzw"]
+    return position, Rotation.from_quat(quat_xyzw)
+
+
+def position_and_quaternion(row):
+    """Translation and rotation of x y z qx qy qz qw."""
+    return row[:3], Rotation.from_quat(row[3:])
+
+
+def glim_pose(text):
+    sensors = json.loads(text)["sensors"]
+    return position_and_quaternion(sensors["T_lidar_imu"])
+
+
+def msa_pose(text):
+    ((_, entry),) = document(text).items()
+    return position_and_quaternion(entry["value"])
+
+
+def kitti_pose(text):
+    lines = dict(line.split(":", 1) for line in text.splitlines())
+    translation = [float(number) for number in lines["T"].split()]
+    rotation = [float(number) for number in lines["R"].split()]
+    return translation, rotation
+
+
+def rotation_of_wxyz(quat_wxyz):
+    quat_xyzw = np.roll(quat_wxyz, -1)
+    return Rotation.from_quat(quat_xyzw)
+
+
+def nuscenes_pose(text):
+    (record,) = json.loads(text)
+    return record["translation"], rotation_of_wxyz(record["rotation"])
+
+
+def colmap_pose(text):
+    (rig, *_) = json.loads(text)
+    camera = rig["cameras"][1]
+    rotation = rotation_of_wxyz(camera["cam_from_rig_rotation"])
+    return camera["cam_from_rig_translation"], rotation
+
+
+def driveworks_pose(text):
+    sensor = json.loads(text)["rig"]["sensors"][0]
+    pose = sensor["nominalSensor2Rig_FLU"]
+    angles_deg = pose["roll-pitch-yaw"]
+    return pose["t"], Rotation.from_euler("xyz", angles_deg, degrees=True)
+
+
+def numpy_pose(text):
     T = np.loadtxt(text.splitlines())
-    return T[:3, 3], T[:3, :3].ravel()
+    return parts_of(T)
+
+
+# Functions that take translation and rotation out of a file by hand.
+READERS = {
+    "autoware": autoware_pose,
+    "fast_lio": fast_lio_pose,
+    "fast_livo2": fast_lio_pose,
+    "lio_sam": lio_sam_pose,
+    "dlio": dlio_pose,
+    "kalibr": kalibr_pose,
+    "openvins": kalibr_pose,
+    "vins": opencv_pose,
+    "orbslam3": opencv_pose,
+    "opencv": opencv_pose,
+    "apollo": named_components,
+    "easy_handeye2": named_components,
+    "glim": glim_pose,
+    "msa": msa_pose,
+    "kitti": kitti_pose,
+    "nuscenes": nuscenes_pose,
+    "colmap": colmap_pose,
+    "driveworks": driveworks_pose,
+    "numpy": numpy_pose,
+}
 
 
 @pytest.mark.parametrize(("name", "parent", "child", "is_direct"), CASES)
@@ -145,26 +212,34 @@ def test_a_file_maps_a_point_as_it_says_and_reads_back(
     name, parent, child, is_direct, tmp_path
 ):
     calibration = result(parent, child)
-    text = calibration.export(name)
-    t, rotation = matrix_of(name, text)
-    R = (
-        rotation.as_matrix()
-        if isinstance(rotation, Rotation)
-        else np.reshape(rotation, (3, 3))
-    )
-    T = calibration.T_parent_child if is_direct else calibration.T_child_parent
-    assert_allclose(R @ POINT[:3] + t, (T @ POINT)[:3], atol=1e-9)
+    file = tmp_path / "foreign.yaml"
+    if is_direct:
+        source, target = child, parent
+        T = calibration.T_parent_child
+    else:
+        source, target = parent, child
+        T = calibration.T_child_parent
 
-    source, target = (child, parent) if is_direct else (parent, child)
+    text = calibration.export(name)
+
+    translation, rotation = READERS[name](text)
+    if isinstance(rotation, Rotation):
+        rotation = rotation.as_matrix()
+    R = np.reshape(rotation, (3, 3))
+    mapped = R @ POINT[:3] + translation
+    expected = T @ POINT
+    assert_allclose(mapped, expected[:3], atol=1e-9)
     assert f"Maps coordinates of {source} into {target}" in text
     assert ("Inverted" in text) is not is_direct
     assert "Assumed" not in text
 
-    (tmp_path / "foreign.yaml").write_text(text)
-    installed = open_installed(str(tmp_path / "foreign.yaml"))(parent, child)
+    file.write_text(text)
+    pose_between = open_installed(str(file))
+    installed = pose_between(parent, child)
     assert_allclose(installed.T_parent_child, calibration.T_parent_child, atol=1e-9)
-    if name not in ("opencv", "numpy"):  # which name nothing
-        installed = open_installed(str(tmp_path / "foreign.yaml"))(child, parent)
+    # These two formats name no frames.
+    if name not in ("opencv", "numpy"):
+        installed = pose_between(child, parent)
         assert_allclose(installed.T_parent_child, calibration.T_child_parent, atol=1e-9)
 
 
