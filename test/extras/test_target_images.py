@@ -41,28 +41,37 @@ distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}
 """
 
 
-def rendered(picture, T_camera_picture, rng):
-    """A grey image of a flat picture, whose pixels are in metres along x and down along y."""
+def homography_of(T_camera_picture):
+    """Homography from pixels of a picture to finer pixels of its image."""
     to_metres = np.diag([1 / PIXELS_PER_M, 1 / PIXELS_PER_M, 1.0])
     to_metres[:2, 2] = 0.5 / PIXELS_PER_M
-    to_fine = np.array(
-        [[SUPER, 0, (SUPER - 1) / 2], [0, SUPER, (SUPER - 1) / 2], [0, 0, 1.0]]
-    )
-    homography = to_fine @ MATRIX @ T_camera_picture[:3, [0, 1, 3]] @ to_metres
+    half_pixel = (SUPER - 1) / 2
+    to_fine = np.array([[SUPER, 0, half_pixel], [0, SUPER, half_pixel], [0, 0, 1.0]])
+    to_camera = T_camera_picture[:3, [0, 1, 3]]
+    return to_fine @ MATRIX @ to_camera @ to_metres
+
+
+def rendered(picture, T_camera_picture, rng):
+    """A grey image of a flat picture, whose pixels are in metres along x and down along y."""
+    homography = homography_of(T_camera_picture)
     height, width = picture.shape
     corners = homography @ [[0, width, 0, width], [0, 0, height, height], [1, 1, 1, 1]]
-    seen = corners[:2] / corners[2] / SUPER
-    left, top = np.clip(seen.min(axis=1) - 2, 0, SIZE).astype(int)
-    columns, rows = np.clip(seen.max(axis=1) + 3, 0, SIZE).astype(int) - [left, top]
+    pixels = corners[:2] / corners[2] / SUPER
+    left, top = np.clip(pixels.min(axis=1) - 2, 0, SIZE).astype(int)
+    right, bottom = np.clip(pixels.max(axis=1) + 3, 0, SIZE).astype(int)
+    columns = int(right - left)
+    rows = int(bottom - top)
     homography[:2] -= SUPER * np.outer([left, top], homography[2])
-    size = (int(SUPER * columns), int(SUPER * rows))
+
     look = cv2.INTER_AREA
+    size = (SUPER * columns, SUPER * rows)
     fine = cv2.warpPerspective(picture, homography, size, flags=look, borderValue=200)
-    image = np.full(SIZE[::-1], 200, np.uint8)  # beside the picture
-    image[top : top + rows, left : left + columns] = cv2.resize(
-        fine, (int(columns), int(rows)), interpolation=look
-    )
-    return np.clip(image + rng.normal(0.0, 3.0, image.shape), 0, 255).astype(np.uint8)
+    coarse = cv2.resize(fine, (columns, rows), interpolation=look)
+    # Grey beside the picture.
+    image = np.full(SIZE[::-1], 200, np.uint8)
+    image[top:bottom, left:right] = coarse
+    noise = rng.normal(0.0, 3.0, image.shape)
+    return np.clip(image + noise, 0, 255).astype(np.uint8)
 
 
 def charuco_picture():
@@ -109,9 +118,12 @@ def poses_of_target(images, target, camera):
 
 def views(count, center, rng):
     """Poses of the picture in the camera, some half a metre before it."""
-    turns = Rotation.from_rotvec(rng.uniform(-0.5, 0.5, (count, 3))).as_matrix()
-    places = np.c_[rng.uniform(-0.08, 0.08, (count, 2)), rng.uniform(0.5, 0.7, count)]
-    return se3.from_rotation_translation(turns, places - turns @ center)
+    rotation_vectors = rng.uniform(-0.5, 0.5, (count, 3))
+    turns = Rotation.from_rotvec(rotation_vectors).as_matrix()
+    sideways = rng.uniform(-0.08, 0.08, (count, 2))
+    depths = rng.uniform(0.5, 0.7, count)
+    centers = np.c_[sideways, depths]
+    return se3.from_rotation_translation(turns, centers - turns @ center)
 
 
 def test_thirty_images_calibrate_a_hand(tmp_path, capsys, no_figures):
@@ -364,8 +376,10 @@ def chessboard_picture(columns, rows, square):
     side = round(square * PIXELS_PER_M)
     y, x = np.indices((rows + 3, columns + 3))
     is_inside = (x > 0) & (x < columns + 2) & (y > 0) & (y < rows + 2)
-    is_black = is_inside & ((x + y) % 2 == 0)
-    return np.kron(np.where(is_black, 0, 255), np.ones((side, side))).astype(np.uint8)
+    is_even = (x + y) % 2 == 0
+    colours = np.where(is_inside & is_even, 0, 255)
+    square_pixels = np.ones((side, side))
+    return np.kron(colours, square_pixels).astype(np.uint8)
 
 
 def marker_picture(name, number, size):
@@ -389,8 +403,10 @@ def old_charuco_picture(columns, rows, square, marker):
 
 def rolled(Ts, angles):
     """Poses in a camera that is turned about its optical axis."""
-    turns = Rotation.from_rotvec(np.outer(angles, [0.0, 0.0, 1.0])).as_matrix()
-    return se3.from_rotation_translation(turns, np.zeros((len(turns), 3))) @ Ts
+    rotation_vectors = np.outer(angles, [0.0, 0.0, 1.0])
+    rotations = Rotation.from_rotvec(rotation_vectors).as_matrix()
+    no_shift = np.zeros((len(rotations), 3))
+    return se3.from_rotation_translation(rotations, no_shift) @ Ts
 
 
 BOARDS = {
@@ -411,18 +427,24 @@ def test_motions_of_other_targets(text):
     """The camera turns about its optical axis, so that no side of the target stays up."""
     rng = np.random.default_rng(8)
     picture = (BOARDS | MARKERS)[text]()
-    center = np.array([picture.shape[1], picture.shape[0], 0.0]) / PIXELS_PER_M / 2.0
-    truth = rolled(views(8, center, rng), 2.0 * np.pi * np.arange(8) / 8)
+    height, width = picture.shape
+    center = np.array([width, height, 0.0]) / PIXELS_PER_M / 2.0
+    angles = 2.0 * np.pi * np.arange(8) / 8
+    truth = rolled(views(8, center, rng), angles)
     camera = Camera(MATRIX, np.zeros(5), is_fisheye=False)
     images = [rendered(picture, T, rng) for T in truth]
+
     tracking = poses_of_target(images, Target.parse(text), camera)
+
     assert len(tracking.images) >= 7
     # Origin and axes of a target differ from those of its picture by a constant pose.
-    offsets = se3.inverse(truth[tracking.images]) @ tracking.Ts_camera_target
-    errors = se3.log(se3.inverse(offsets[0]) @ offsets)
+    from_camera = se3.inverse(truth[tracking.images])
+    offsets = from_camera @ tracking.Ts_camera_target
+    deviations = se3.inverse(offsets[0]) @ offsets
+    errors = np.abs(se3.log(deviations))
     most_m, most_rad = (0.001, 0.003) if text in BOARDS else (0.003, 0.01)
-    assert np.abs(errors[:, :3]).max() < most_m
-    assert np.abs(errors[:, 3:]).max() < most_rad
+    assert errors[:, :3].max() < most_m
+    assert errors[:, 3:].max() < most_rad
 
 
 def test_only_the_marker_of_the_target_is_used():
@@ -452,19 +474,28 @@ def test_sigmas_are_as_large_as_the_errors(text, monkeypatch):
     """Corners with errors of 0.2 pixels. Only two of a marker's eight residuals are redundant."""
     rng = np.random.default_rng(61)
     target = Target.parse(text)
-    finder = TargetFinder(target, Camera(MATRIX, np.zeros(5), is_fisheye=False))
+    camera = Camera(MATRIX, np.zeros(5), is_fisheye=False)
+    finder = TargetFinder(target, camera)
     corners = finder._corners
     numbers = target.number + np.arange(len(corners))
     monkeypatch.setattr(finder, "_detect", lambda pixels: (pixels, numbers))
-    truth = views(400, corners.reshape(-1, 3).mean(axis=0), rng)
+    center = corners.reshape(-1, 3).mean(axis=0)
+    truth = views(400, center, rng)
     for T in truth:
-        rays = (corners @ T[:3, :3].T + T[:3, 3]) @ MATRIX.T
+        in_camera = corners @ T[:3, :3].T + T[:3, 3]
+        rays = in_camera @ MATRIX.T
         pixels = rays[..., :2] / rays[..., 2:]
-        finder.look(pixels + rng.normal(0.0, 0.2, pixels.shape))
+        noise = rng.normal(0.0, 0.2, pixels.shape)
+        finder.look(pixels + noise)
+
     tracking = finder.found()
-    errors = se3.log(se3.inverse(truth) @ tracking.Ts_camera_target).reshape(-1, 2, 3)
-    ratios = np.sqrt((errors**2).mean(axis=(0, 2)) / (tracking.sigmas**2).mean(axis=0))
-    assert ratios == pytest.approx([1.0, 1.0], abs=0.2)
+
+    deviations = se3.inverse(truth) @ tracking.Ts_camera_target
+    errors = se3.log(deviations).reshape(-1, 2, 3)
+    mean_squares = (errors**2).mean(axis=(0, 2))
+    variances = (tracking.sigmas**2).mean(axis=0)
+    ratios = np.sqrt(mean_squares / variances)
+    assert ratios == pytest.approx([1.0, 1.0], abs=0.2), "errors over sigmas"
 
 
 # ------------------------------------------------------------------ pictures of the report

@@ -259,11 +259,13 @@ def test_a_single_result_and_one_that_knows_nothing():
 
 
 def values(difference):
-    return np.array([axis.difference for axis in difference.axes.values()])
+    rows = difference.axes.values()
+    return np.array([row.difference for row in rows])
 
 
 def axes(difference, verdict):
-    return [axis for axis, row in difference.axes.items() if row.verdict == verdict]
+    rows = difference.axes.items()
+    return [axis for axis, row in rows if row.verdict == verdict]
 
 
 def test_results_that_scatter_by_their_sigmas_are_the_same_and_the_power_is_told():
@@ -351,17 +353,22 @@ def test_what_a_flight_alone_is_off_by_is_no_move():
 @pytest.mark.parametrize("sigma_z", [0.002, 0.05], ids=["in hand", "vehicle"])
 @pytest.mark.parametrize("axis", range(3))
 def test_a_mount_that_moved_by_3_cm_and_1_deg_is_found(sigma_z, axis):
-    sigmas = np.r_[0.002, 0.002, sigma_z, np.full(3, np.radians(0.05))]
-    moved = shift(AXES[axis], 0.03) + shift(AXES[axis + 3], np.radians(1.0))
-    floor = np.diag(np.r_[np.full(3, 0.005**2), np.full(3, np.radians(0.15) ** 2)])
+    rotation_axis = AXES[axis + 3]
+    sigma_rad = np.radians(0.05)
+    sigmas = np.array([0.002, 0.002, sigma_z, sigma_rad, sigma_rad, sigma_rad])
+    floor_sigmas = np.repeat([0.005, np.radians(0.15)], 3)
+    options = {"sigmas": sigmas, "covariance_allowance": np.diag(floor_sigmas**2)}
+    moved = shift(AXES[axis], 0.03) + shift(rotation_axis, np.radians(1.0))
+    drawing = Extrinsic(X, "drawing")
     for seed in range(5):
-        first = result(sigmas=sigmas, seed=seed, covariance_allowance=floor)
-        second = result(
-            moved, sigmas=sigmas, seed=100 + seed, covariance_allowance=floor
-        )
-        assert AXES[axis + 3] in axes(compare([first, second]).differences[0], "moved")
-        against = compare([second], Extrinsic(X, "drawing")).differences[0]
-        assert AXES[axis + 3] in axes(against, "moved")
+        first = result(seed=seed, **options)
+        second = result(moved, seed=100 + seed, **options)
+
+        from_first = compare([first, second]).differences[0]
+        from_drawing = compare([second], drawing).differences[0]
+
+        assert rotation_axis in axes(from_first, "moved")
+        assert rotation_axis in axes(from_drawing, "moved")
 
 
 def test_an_axis_is_the_same_by_its_own_target():

@@ -32,7 +32,8 @@ _SILENT = (ast.expr_context, ast.operator, ast.unaryop, ast.cmpop, ast.boolop)
 
 
 def n_nodes(tree):
-    return sum(not isinstance(node, _SILENT) for node in ast.walk(tree))
+    nodes = [node for node in ast.walk(tree) if not isinstance(node, _SILENT)]
+    return len(nodes)
 
 
 def n_code_lines(source, tree):
@@ -51,28 +52,30 @@ def n_code_lines(source, tree):
     return len(lines)
 
 
+def has_number(expression):
+    """True if an expression contains a number."""
+    for node in ast.walk(expression):
+        if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+            return True
+    return False
+
+
 def n_constants(statement):
     """Numbers that a statement at the top of a module names, and fields of a class Tuning."""
     if isinstance(statement, ast.ClassDef) and statement.name.endswith("Tuning"):
         return sum(isinstance(field, ast.AnnAssign) for field in statement.body)
-    if not isinstance(statement, ast.Assign | ast.AnnAssign) or statement.value is None:
+    if isinstance(statement, ast.Assign):
+        targets = statement.targets
+    elif isinstance(statement, ast.AnnAssign) and statement.value is not None:
+        targets = [statement.target]
+    else:
         return 0
-    targets = (
-        statement.targets if isinstance(statement, ast.Assign) else [statement.target]
-    )
     nodes = [node for target in targets for node in ast.walk(target)]
     names = [node.id for node in nodes if isinstance(node, ast.Name)]
-    values = [
-        node.value
-        for node in ast.walk(statement.value)
-        if isinstance(node, ast.Constant)
-    ]
-    has_number = any(type(value) in (int, float) for value in values)
-    return (
-        len(names)
-        if has_number and all(name.lstrip("_").isupper() for name in names)
-        else 0
-    )
+    is_constant = all(name.lstrip("_").isupper() for name in names)
+    if is_constant and has_number(statement.value):
+        return len(names)
+    return 0
 
 
 def measured(folder):
