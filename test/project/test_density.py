@@ -14,7 +14,7 @@ from source_code import ROOT
 # Whoever makes one smaller lowers its limit. The aim is 132,000 nodes, 6.0 a line, 300 constants.
 LIMITS = {
     "hand_eye_calib": (234_000, 6.0, 990),
-    "test": (190_000, 6.3, 320),
+    "test": (190_000, 6.1, 320),
     "reproduction": (53_500, 6.6, 212),
 }
 
