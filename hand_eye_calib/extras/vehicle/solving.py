@@ -17,8 +17,8 @@ the tail of this distribution, where the wheels slip, have weight 0. The covaria
 - the uncertainty of the priors;
 - the square of half of the difference to the estimate over windows twice as long;
 - the square of a share of the difference to the estimate without weights, for slip that is not
-  detected: 3/20, 1/2 for x, pitch and yaw, and for wheels and clock the share that follows from
-  signal and noise;
+  detected: 3/20, 1/2 for x, pitch and yaw, and for parameters of the wheels the share that follows
+  from signal and noise;
 - the square of the bias of x and y that noise of the turns may cause;
 - the square of the bias of roll and y of a body that leans outwards, if most curves have the same
   direction;
@@ -366,10 +366,10 @@ def _shares_of_unweighted(drive: Drive, fit: Fit) -> FloatArray:
         )
         undetected = min(float(undetected), _MAX_UNDETECTED)
         shares[index] = undetected / (1.0 - undetected)
-    # The same slips bias the clock offset and the other parameters of the wheels.
-    others = [CLOCK, *range(N_FIXED + drive.model.n_wheels, len(shares))]
-    of_wheels = shares[N_FIXED : N_FIXED + drive.model.n_wheels]
-    shares[others] = min(_SHARE_OF_UNWEIGHTED, float(of_wheels.min()))
+    # The same slips bias the other parameters of the wheels.
+    first_other = N_FIXED + drive.model.n_wheels
+    of_wheels = shares[N_FIXED:first_other]
+    shares[first_other:] = min(_SHARE_OF_UNWEIGHTED, float(of_wheels.min()))
     return shares
 
 
