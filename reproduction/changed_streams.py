@@ -39,21 +39,24 @@ def moved_at(stream: Trajectory, where: Any, transforms: FloatArray) -> Trajecto
 
 
 def positions_of(stream: Trajectory) -> FloatArray:
-    return stream.poses[:, :3, 3]
+    return se3.translation_of(stream.poses)
 
 
 def angles_of(stream: Trajectory) -> FloatArray:
     """Yaw, pitch and roll (N, 3), rad."""
-    return Rotation.from_matrix(stream.poses[:, :3, :3]).as_euler("ZYX")
+    rotations = Rotation.from_matrix(se3.rotation_of(stream.poses))
+    return rotations.as_euler("ZYX")
 
 
 def turned(stream: Trajectory, angles: FloatArray) -> Trajectory:
     """The stream with other yaw, pitch and roll (N, 3)."""
-    return with_parts(stream, Rotation.from_euler("ZYX", angles).as_matrix())
+    rotations = Rotation.from_euler("ZYX", angles)
+    return with_parts(stream, rotations.as_matrix())
 
 
 def with_quats(stream: Trajectory, quats: FloatArray) -> Trajectory:
-    return Trajectory(stream.stamps_ns, se3.from_quat_xyzw(positions_of(stream), quats))
+    poses = se3.from_quat_xyzw(positions_of(stream), quats)
+    return Trajectory(stream.stamps_ns, poses)
 
 
 def at_stamps(stamps_ns: Any, poses: FloatArray) -> Trajectory:
@@ -65,7 +68,8 @@ def at_stamps(stamps_ns: Any, poses: FloatArray) -> Trajectory:
 
 def seconds_of(stream: Trajectory) -> FloatArray:
     """Times (N,) since the first pose, s."""
-    return (stream.stamps_ns - stream.stamps_ns[0]) * 1e-9
+    since_ns = stream.stamps_ns - stream.stamps_ns[0]
+    return since_ns * 1e-9
 
 
 def noisy(stream: Trajectory, metres: float, random: Random) -> Trajectory:
@@ -93,7 +97,7 @@ def filtered_positions(stream: Trajectory, tau_s: float) -> FloatArray:
 def filtered_rotations(stream: Trajectory, tau_s: float) -> FloatArray:
     intervals_s = np.diff(stream.stamps_ns) * 1e-9
     gains = 1.0 - np.exp(-intervals_s / tau_s)
-    measured = stream.poses[:, :3, :3]
+    measured = se3.rotation_of(stream.poses)
     rotations = measured.copy()
     for k, gain in enumerate(gains):
         change = rotations[k].T @ measured[k + 1]
@@ -105,7 +109,8 @@ def filtered_rotations(stream: Trajectory, tau_s: float) -> FloatArray:
 def upright(stream: Trajectory, share: float = 1.0) -> Trajectory:
     """A stream with a share less of roll and pitch."""
     remaining = 1.0 - share
-    return turned(stream, angles_of(stream) * [1.0, remaining, remaining])
+    angles = angles_of(stream) * [1.0, remaining, remaining]
+    return turned(stream, angles)
 
 
 def higher(stream: Trajectory, factor: float) -> Trajectory:
@@ -115,9 +120,11 @@ def higher(stream: Trajectory, factor: float) -> Trajectory:
 
 def delayed(stream: Trajectory, delay_s: float) -> FloatArray:
     """Poses (N, 4, 4) as they were so long before."""
-    return stream.shifted(delay_s).at(stream.stamps_ns, extrapolate=True)
+    later = stream.shifted(delay_s)
+    return later.at(stream.stamps_ns, extrapolate=True)
 
 
 def beside(metres: float) -> FloatArray:
     """Pose of another sensor beside the child."""
-    return se3.from_rotation_translation(np.eye(3), [metres, 0.0, 0.0])
+    translation = [metres, 0.0, 0.0]
+    return se3.from_rotation_translation(np.eye(3), translation)

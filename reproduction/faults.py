@@ -7,12 +7,12 @@ that was interrupted goes on from ``faults.jsonl``. ``--clean`` solves the clean
 
 import argparse
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,7 +27,9 @@ from hand_eye_calib.extras.simulation.drive import simulate_drive
 from hand_eye_calib.extras.simulation.options import HILLY_DRIVE, NoiseConfig
 from hand_eye_calib.offline.calibrate import MethodName, calibrate
 from reproduction import clean_recordings
-from reproduction.fault_cases import GROUPS, Fault
+from reproduction.fault_cases import FAULTS
+from reproduction.fault_entry import Fault
+from reproduction.later_faults import LATER, SILENT
 from reproduction.recordings import real_rigs
 from reproduction.runner import kept
 from reproduction.writing import counted, markdown_table, put_into_page
@@ -49,6 +51,12 @@ _SHORT = {"DO NOT USE": "no", "USE WITH CARE": "care", "USE": "use"}
 _SOUND = "none"
 _CLEAN = "clean"
 
+# Groups of the page: title to faults.
+GROUPS = {
+    "Faults": FAULTS,
+    "Faults that were built later, without a limit for them": LATER,
+    "Faults that were silent before their columns": SILENT,
+}
 _FAULTS = {fault.code: fault for fault in chain(*GROUPS.values())}
 
 # Rules of the verdict that state how a recording is, not that something is wrong.
@@ -69,8 +77,9 @@ class Case:
 
     @property
     def key(self) -> str:
-        """Its name."""
-        return f"{self.fault} {self.severity} {self.recording} {self.method}"
+        """Name of the case."""
+        words = (self.fault, str(self.severity), self.recording, self.method)
+        return " ".join(words)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,25 +122,25 @@ def _plain_outcome(case: Case, folder: Path | None) -> dict[str, Any]:
 def recordings(folder: Path | None, first_seed: int = 0) -> list[str]:
     """Names of the recordings that faults are put into; simulated drives from a seed on."""
     seeds = range(first_seed, first_seed + _N_DRIVES)
-    return [f"hilly_{seed}" for seed in seeds] + list(_TANGO if folder else ())
+    names = [f"hilly_{seed}" for seed in seeds]
+    if folder:
+        names += _TANGO
+    return names
 
 
 def cases(folder: Path | None, first_seed: int = 0) -> list[Case]:
     """All cases of the study: recordings without faults, with each fault, and clean recordings."""
     names = recordings(folder, first_seed)
-    faulty = (
-        _cases(code, len(fault.severities), names) for code, fault in _FAULTS.items()
-    )
-    return [
-        *_cases(_SOUND, 1, names),
-        *chain.from_iterable(faulty),
-        *clean_cases(folder),
-    ]
+    cases_of_study = _cases(_SOUND, 1, names)
+    for code, fault in _FAULTS.items():
+        cases_of_study += _cases(code, len(fault.severities), names)
+    return cases_of_study + clean_cases(folder)
 
 
 def clean_cases(folder: Path | None) -> list[Case]:
     """The clean recordings, by the default method."""
-    return _cases(_CLEAN, 1, clean_recordings.names(folder), ("auto",))
+    names = clean_recordings.names(folder)
+    return _cases(_CLEAN, 1, names, methods=("auto",))
 
 
 def _cases(
@@ -152,24 +161,22 @@ def outcome(case: Case, folder: Path | None) -> Outcome:
     """Solve a case."""
     if case.fault == _CLEAN:
         return _of_clean(case, folder)
-    parent, child, T_parent_child, options = _sound(case.recording, case.method, folder)
+    parent, child, T_parent_child = _sound(case.recording, case.method, folder)
+    options: Mapping[str, Any] = {}
     fault = _FAULTS.get(case.fault)
     if fault:
-        random = np.random.default_rng(sum(map(ord, case.recording)))
-        parent, child = fault.damage(
-            parent, child, fault.severities[case.severity], random
-        )
-        options = {**options, **fault.options}
+        seed = sum(map(ord, case.recording))
+        random = np.random.default_rng(seed)
+        severity = fault.severities[case.severity]
+        parent, child = fault.damage(parent, child, severity, random)
+        options = fault.options
     try:
         result = calibrate(
             parent, child, method=case.method, max_pairs=_MAX_PAIRS, **options
         )
     except HandEyeCalibError:
-        return Outcome(
-            key=case.key,
-            verdict=_NO_ANSWER,
-            findings=_named(check_streams(parent, child).findings),
-        )
+        findings = _named(check_streams(parent, child).findings)
+        return Outcome(key=case.key, verdict=_NO_ANSWER, findings=findings)
     return _judged(case.key, result, T_parent_child)
 
 
@@ -182,15 +189,18 @@ def _of_clean(case: Case, folder: Path | None) -> Outcome:
 
 
 def _named(findings: Iterable[Any]) -> list[str]:
-    return [
-        ("note:" if finding.severity is Severity.NOTE else "") + finding.code
-        for finding in findings
-    ]
+    """Codes of findings; ``note:`` precedes the codes of notes."""
+    codes = []
+    for finding in findings:
+        is_note = finding.severity is Severity.NOTE
+        codes.append(f"note:{finding.code}" if is_note else finding.code)
+    return codes
 
 
 def _judged(
     key: str, result: Calibration, T_parent_child: FloatArray | None
 ) -> Outcome:
+    """Outcome of a result; without a truth, errors are NaN."""
     outcome = Outcome(
         key=key,
         verdict=result.verdict.value,
@@ -200,143 +210,205 @@ def _judged(
     if T_parent_child is None:
         return outcome
     xi = se3.log(se3.inverse(T_parent_child) @ result.T_parent_child)
-    rotation = T_parent_child[:3, :3]
-    along = np.concatenate([rotation @ xi[:3], rotation @ xi[3:]])
-    seen = np.isfinite(result.sigmas)
-    ratios = np.abs(along[seen]) / np.maximum(result.sigmas[seen], 1e-9)
+    rotation = se3.rotation_of(T_parent_child)
+    translation_errors = rotation @ xi[:3]
+    errors = np.concatenate([translation_errors, rotation @ xi[3:]])
+    is_seen = np.isfinite(result.sigmas)
+    sigmas = np.maximum(result.sigmas[is_seen], 1e-9)
+    ratios = np.abs(errors[is_seen]) / sigmas
+    radians = np.linalg.norm(xi[3:])
     return replace(
         outcome,
-        metres=float(np.linalg.norm(along[:3][seen[:3]])),
-        degrees=float(np.degrees(np.linalg.norm(xi[3:]))),
+        metres=float(np.linalg.norm(translation_errors[is_seen[:3]])),
+        degrees=float(np.degrees(radians)),
         z=float(ratios.max(initial=0.0)),
     )
 
 
-_Sound = tuple[Trajectory, Trajectory, FloatArray, dict[str, Any]]
+class _Sound(NamedTuple):
+    """A recording without a fault, and its answer."""
+
+    parent: Trajectory
+    child: Trajectory
+    T_parent_child: FloatArray
 
 
 @cache
 def _sound(name: str, method: MethodName, folder: Path | None) -> _Sound:
-    """A recording without a fault, its answer and the options that it needs."""
+    """Return a recording without a fault; the answer of a real one has no fault either."""
     if name.startswith("hilly"):
-        drive = simulate_drive(int(name.rsplit("_", 1)[1]), HILLY_DRIVE, _NOISE)
-        return drive.parent, drive.child, drive.T_parent_child, {}
-    rig = next(rig for rig in real_rigs(folder or Path())[0] if rig.name == name)
+        _, seed = name.rsplit("_", 1)
+        drive = simulate_drive(int(seed), HILLY_DRIVE, _NOISE)
+        return _Sound(drive.parent, drive.child, drive.T_parent_child)
+    rigs, _ = real_rigs(folder or Path())
+    rig = next(rig for rig in rigs if rig.name == name)
     (recording,) = rig.recordings.values()
-    checked = check_streams(recording.parent, recording.child)
     parent = recording.parent
     child = recording.child
+    checked = check_streams(parent, child)
     offset = next(f for f in checked.findings if f.code == "time_offset")
     child = child.shifted(float(offset.options["time_offset"]))
-    fit = checked.fit
-    child = child.scaled(fit.scale if fit else 1.0)
+    scale = checked.fit.scale if checked.fit else 1.0
+    child = child.scaled(scale)
     result = calibrate(parent, child, method=method, max_pairs=_MAX_PAIRS)
-    return parent, child, result.T_parent_child, {}
+    return _Sound(parent, child, result.T_parent_child)
 
 
 # ------------------------------------------------------------------ the page
 
 
 def report(outcomes: Sequence[Outcome], folder: Path | None) -> str:
-    """Text of the page."""
+    """Return the text of the page."""
     by_fault: dict[str, list[Outcome]] = {}
     for outcome in outcomes:
-        by_fault.setdefault(outcome.key.split()[0], []).append(outcome)
+        fault, *_ = outcome.key.split()
+        by_fault.setdefault(fault, []).append(outcome)
     clean = by_fault.pop(_CLEAN, [])
     sound = by_fault.pop(_SOUND, [])
     faulty = list(chain.from_iterable(by_fault.values()))
-    unsafe = [
-        outcome
-        for outcome in faulty
-        if outcome.verdict == "USE" and outcome.z > _LIMIT_Z
-    ]
     parts = []
     if faulty:
-        parts += [
-            f"{len(faulty)} calibrations with `{'` or `'.join(METHODS)}`: of simulated hilly "
-            "drives of 120 s at 1.5 m/s (hilly), and of recordings of hand-held devices (tango), "
-            "whose answer without the fault counts as the truth. z is the largest error of an axis "
-            "in its standard deviations with the floor. Verdicts and the three most frequent "
-            "findings are counted: `no` is DO NOT USE, `care` USE WITH CARE.",
-            f"{len(unsafe)} of them are more than {_LIMIT_Z:g} standard deviations off and called "
-            f"USE{':' if unsafe else '.'}\n"
-            + "\n".join(
-                f"- {outcome.key}: z {outcome.z:.1f}, {1e3 * outcome.metres:.0f} mm, "
-                f"{outcome.degrees:.2f} deg"
-                for outcome in unsafe
-            ),
-            f"Without a fault, these recordings end in {counted(f.verdict for f in sound)}; z is "
-            f"at most {max((f.z for f in sound), default=0.0):.1f}.",
-        ]
+        parts += [_about(faulty), _unsafe_text(faulty), _sound_text(sound)]
     for title, faults in GROUPS.items():
-        rows = [
-            _row(fault, by_fault[fault.code])
-            for fault in faults
-            if fault.code in by_fault
-        ]
+        rows = []
+        for case in faults:
+            if case.code in by_fault:
+                rows.append(_row(case, by_fault[case.code]))
         if rows:
-            parts.append(f"### {title}\n\n" + markdown_table(rows))
+            parts.append(f"### {title}\n\n{markdown_table(rows)}")
     if clean:
-        parts.append("### No false alarms\n\n" + _clean_text(clean, folder))
+        parts.append(f"### No false alarms\n\n{_clean_text(clean, folder)}")
     return "\n\n".join(parts)
 
 
-def _row(fault: Fault, outcomes: Sequence[Outcome]) -> dict[str, str]:
-    named = (
-        code.removeprefix("note:")
-        for outcome in outcomes
-        for code in dict.fromkeys(outcome.findings)
-        if not code.endswith(("gaps", "one_axis"))
+def _about(faulty: Sequence[Outcome]) -> str:
+    """Return the text about the recordings with faults."""
+    methods = "` or `".join(METHODS)
+    return (
+        f"{len(faulty)} calibrations with `{methods}`: of simulated hilly "
+        "drives of 120 s at 1.5 m/s (hilly), and of recordings of hand-held devices (tango), "
+        "whose answer without the fault counts as the truth. z is the largest error of an axis "
+        "in its standard deviations with the floor. Verdicts and the three most frequent "
+        "findings are counted: `no` is DO NOT USE, `care` USE WITH CARE."
     )
-    answered = [outcome for outcome in outcomes if math.isfinite(outcome.z)]
+
+
+def _unsafe_text(faulty: Sequence[Outcome]) -> str:
+    """Return the text about wrong results that may be used, with a line for each."""
+    lines = []
+    for outcome in faulty:
+        if outcome.verdict == "USE" and outcome.z > _LIMIT_Z:
+            millimetres = 1e3 * outcome.metres
+            lines.append(
+                f"- {outcome.key}: z {outcome.z:.1f}, {millimetres:.0f} mm, "
+                f"{outcome.degrees:.2f} deg"
+            )
+    end = ":" if lines else "."
+    about = (
+        f"{len(lines)} of them are more than {_LIMIT_Z:g} standard deviations off and called "
+        f"USE{end}"
+    )
+    listed = "\n".join(lines)
+    return f"{about}\n{listed}"
+
+
+def _sound_text(sound: Sequence[Outcome]) -> str:
+    """Return the text about the same recordings without a fault."""
+    largest = max((outcome.z for outcome in sound), default=0.0)
+    return (
+        f"Without a fault, these recordings end in {_verdicts_in_full(sound)}; z is "
+        f"at most {largest:.1f}."
+    )
+
+
+def _verdicts_in_full(outcomes: Sequence[Outcome]) -> str:
+    return counted(outcome.verdict for outcome in outcomes)
+
+
+def _short_verdicts(outcomes: Sequence[Outcome]) -> str:
+    """Return the verdicts in one word each, with their counts."""
+    verdicts = [outcome.verdict for outcome in outcomes]
+    return counted(_SHORT.get(verdict, verdict) for verdict in verdicts)
+
+
+def _row(fault: Fault, outcomes: Sequence[Outcome]) -> dict[str, str]:
+    """Return the row of a fault."""
+    codes = []
+    for outcome in outcomes:
+        for code in dict.fromkeys(outcome.findings):
+            if not code.endswith(("gaps", "one_axis")):
+                codes.append(code.removeprefix("note:"))
+    answered = [outcome.z for outcome in outcomes if math.isfinite(outcome.z)]
     return {
         "": fault.code,
         "fault": fault.what,
-        "findings": counted(named, most=3) or "none",
-        "verdicts": counted(
-            _SHORT.get(outcome.verdict, outcome.verdict) for outcome in outcomes
-        ),
-        "largest z": f"{max(outcome.z for outcome in answered):.1f}"
-        if answered
-        else "",
+        "findings": counted(codes, most=3) or "none",
+        "verdicts": _short_verdicts(outcomes),
+        "largest z": f"{max(answered):.1f}" if answered else "",
     }
 
 
-def _clean_text(outcomes: Sequence[Outcome], folder: Path | None) -> str:
-    """How clean recordings end, and what was found in them that is not there."""
-    kinds: dict[str, list[Outcome]] = {}
-    wrong: dict[str, list[str]] = {}
-    for outcome in outcomes:
-        name = outcome.key.split(" ", 2)[2].rpartition(" ")[0]
-        known_codes = clean_recordings.known_in(name, folder)
-        codes = [
-            c
-            for c in outcome.findings
-            if not c.startswith("note:") and c not in known_codes
-        ]
-        kinds.setdefault(clean_recordings.kind_of(name), []).append(outcome)
-        wrong.setdefault(clean_recordings.kind_of(name), []).extend(codes[:1])
-    n_wrong = sum(map(len, wrong.values()))
-    n_own = sum(not set(outcome.rules) - _PHYSICAL for outcome in outcomes)
-    rows = [
-        {
+@dataclass(frozen=True)
+class _CleanGroup:
+    """Outcomes of the clean recordings of a kind, and the wrong findings in them."""
+
+    outcomes: list[Outcome] = field(default_factory=list)
+    wrong_codes: list[str] = field(default_factory=list)
+
+    def is_listed(self) -> bool:
+        """Whether a finding is wrong, a reason is not physical, or an error is large."""
+        are_far = [outcome.z > _LIMIT_Z for outcome in self.outcomes]
+        are_physical = [_is_physical(outcome) for outcome in self.outcomes]
+        return bool(self.wrong_codes) or any(are_far) or not all(are_physical)
+
+    def row(self, kind: str) -> dict[str, object]:
+        """Return the row of a kind of recordings."""
+        rules: list[str] = []
+        for outcome in self.outcomes:
+            rules += dict.fromkeys(outcome.rules)
+        answered = [o.z for o in self.outcomes if not math.isnan(o.z)]
+        largest = max(answered, default=0.0)
+        return {
             "clean recordings": kind,
-            "solved": len(group),
-            "wrong findings": counted(wrong[kind]) or "none",
-            "verdict": counted(
-                _SHORT.get(outcome.verdict, outcome.verdict) for outcome in group
-            ),
-            "reasons": counted(
-                rule for outcome in group for rule in dict.fromkeys(outcome.rules)
-            ),
-            "largest z": f"{max((o.z for o in group if o.z == o.z), default=0.0):.1f}",
+            "solved": len(self.outcomes),
+            "wrong findings": counted(self.wrong_codes) or "none",
+            "verdict": _short_verdicts(self.outcomes),
+            "reasons": counted(rules),
+            "largest z": f"{largest:.1f}",
         }
-        for kind, group in kinds.items()
-        if wrong[kind]
-        or any(
-            set(outcome.rules) - _PHYSICAL or outcome.z > _LIMIT_Z for outcome in group
-        )
-    ]
+
+
+def _is_physical(outcome: Outcome) -> bool:
+    """Whether all reasons of the verdict state how the recording is."""
+    return _PHYSICAL.issuperset(outcome.rules)
+
+
+def _clean_groups(
+    outcomes: Sequence[Outcome], folder: Path | None
+) -> dict[str, _CleanGroup]:
+    """Return the clean recordings by kind; only the first wrong finding of each counts."""
+    groups: dict[str, _CleanGroup] = {}
+    for outcome in outcomes:
+        # Fault, severity, name and method.
+        _, _, name_and_method = outcome.key.split(" ", 2)
+        name, _, _ = name_and_method.rpartition(" ")
+        known_codes = clean_recordings.known_in(name, folder)
+        wrong_codes = []
+        for code in outcome.findings:
+            if not code.startswith("note:") and code not in known_codes:
+                wrong_codes.append(code)
+        group = groups.setdefault(clean_recordings.kind_of(name), _CleanGroup())
+        group.outcomes.append(outcome)
+        group.wrong_codes.extend(wrong_codes[:1])
+    return groups
+
+
+def _clean_text(outcomes: Sequence[Outcome], folder: Path | None) -> str:
+    """Return how clean recordings end, and which findings in them are wrong."""
+    groups = _clean_groups(outcomes, folder)
+    n_wrong = sum(len(group.wrong_codes) for group in groups.values())
+    n_own = sum(_is_physical(outcome) for outcome in outcomes)
+    rows = [group.row(kind) for kind, group in groups.items() if group.is_listed()]
     return (
         f"Wrong findings in {n_wrong} of {len(outcomes)} clean recordings, solved with the default "
         f"method. {n_own} of {len(outcomes)} results are called USE or have reasons that the "

@@ -6,7 +6,6 @@ be used.
 """
 
 import argparse
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeAlias
@@ -21,51 +20,17 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import Calibration
-from hand_eye_calib.core.results.records import Severity
 from hand_eye_calib.offline.cli.main import exit_code_of
-from reproduction.coverage import motions
-from reproduction.coverage.classes import LIDAR_ODOMETRY, VIO, slam, stamps_ns
-from reproduction.coverage.sensor_errors import SensorErrors, draw, sigmas
+from reproduction import fault_counts
+from reproduction.coverage.classes import stamps_ns
+from reproduction.platforms import PLATFORMS
 from reproduction.writing import markdown_table, study_parser
 
 # Paths and rates are made at this rate (Hz) before a sensor takes its samples.
 _FINE_HZ = 200.0
 
-# A result is wrong if an axis is farther off than so many of its standard deviations.
-FAR_SIGMAS = 3.3
-
 # Targets for which verdicts do not depend on the accuracy: m, rad.
 WIDE: Mapping[str, Any] = {"target_translation": 0.3, "target_rotation": 0.0175}
-
-_WHEELS = SensorErrors(white=sigmas(0.002, 0.02), walk_by_metre=sigmas(0.004, 0.05))
-
-
-class Platform(NamedTuple):
-    """A motion, the odometry with its rate (Hz), the duration (s); the size of the lever arm (m),
-    the noise of positions (m) and their rate (Hz).
-    """
-
-    motion: Callable[[np.random.Generator, float], motions.Motion]
-    odometry: SensorErrors
-    rate_hz: float
-    duration_s: float
-    lever_m: float
-    noise_m: float
-    positions_hz: float
-
-
-PLATFORMS = {
-    "car": Platform(motions.car, LIDAR_ODOMETRY, 10.0, 240.0, 2.0, 0.01, 10.0),
-    "excavator": Platform(
-        motions.excavator, LIDAR_ODOMETRY, 10.0, 240.0, 2.0, 0.01, 5.0
-    ),
-    "hand": Platform(motions.hand_held, VIO, 30.0, 90.0, 0.3, 0.003, 20.0),
-    "drone": Platform(motions.drone, VIO, 20.0, 120.0, 0.3, 0.01, 10.0),
-    "drone_slam": Platform(
-        motions.drone, slam(10.0, 0.05, 0.1), 20.0, 120.0, 0.5, 0.005, 20.0
-    ),
-    "agv": Platform(motions.agv, _WHEELS, 10.0, 240.0, 0.8, 0.005, 10.0),
-}
 
 # A consumer gyroscope: bias (rad/s), noise of a sample (rad/s), walk of the bias (rad/s per root
 # s), and by how much its stamps are late (s).
@@ -95,73 +60,99 @@ class Recording(NamedTuple):
 _Random: TypeAlias = np.random.Generator
 
 
-def _low_passed(values: FloatArray, tau_s: float) -> FloatArray:
+def _unchanged(values: FloatArray) -> FloatArray:
+    return values
+
+
+def _low_passed(values: FloatArray, tau_s: float = 0.2) -> FloatArray:
+    """Values (N, k) at the fine rate after a first-order low-pass filter."""
     step_s = 1.0 / _FINE_HZ
     share = step_s / (tau_s + step_s)
-    start = ((1.0 - share) * values[0])[None]
-    return np.asarray(lfilter([share], [1.0, share - 1.0], values, axis=0, zi=start)[0])
+    rest = 1.0 - share
+    start = rest * values[:1]
+    filtered, _ = lfilter([share], [1.0, -rest], values, axis=0, zi=start)
+    return np.asarray(filtered)
 
 
-def _heights(values: FloatArray, heights: FloatArray) -> FloatArray:
-    return np.column_stack([values[:, :2], heights])
+def _smoothed(values: FloatArray) -> FloatArray:
+    sigma = 0.25 * _FINE_HZ
+    return gaussian_filter1d(values, sigma, 0, mode="nearest")
 
 
-def _later(values: FloatArray, delay_s: float) -> FloatArray:
-    times_s = np.arange(len(values)) / _FINE_HZ
-    return np.interp(times_s - delay_s, times_s, values)
+def _with_heights(positions: FloatArray, heights: FloatArray) -> FloatArray:
+    result = positions.copy()
+    result[:, 2] = heights
+    return result
+
+
+def _barometric(path: FloatArray) -> FloatArray:
+    heights = _low_passed(path[:, 2:], 1.0)
+    return _with_heights(path, heights[:, 0])
+
+
+def _height_late(path: FloatArray) -> FloatArray:
+    times_s = np.arange(len(path)) / _FINE_HZ
+    heights = np.interp(times_s - 0.3, times_s, path[:, 2])
+    return _with_heights(path, heights)
 
 
 # What a fault makes of the path (N, 3) of an antenna at the fine rate.
 _OF_PATH: Mapping[str, Callable[[FloatArray], FloatArray]] = {
-    "clean": lambda path: path,
-    "delayed 150 ms": lambda path: path,
-    "low-passed 200 ms": lambda path: _low_passed(path, 0.2),
-    "smoothed 250 ms": lambda path: gaussian_filter1d(
-        path, 0.25 * _FINE_HZ, 0, mode="nearest"
-    ),
-    "1 Hz interpolated": lambda path: path,
-    "constant height": lambda path: path,
-    "barometric height": lambda path: _heights(
-        path, _low_passed(path[:, 2:], 1.0)[:, 0]
-    ),
+    "clean": _unchanged,
+    "delayed 150 ms": _unchanged,
+    "low-passed 200 ms": _low_passed,
+    "smoothed 250 ms": _smoothed,
+    "1 Hz interpolated": _unchanged,
+    "constant height": _unchanged,
+    "barometric height": _barometric,
     "height in feet": lambda path: path * [1.0, 1.0, 3.28084],
-    "height 300 ms late": lambda path: _heights(path, _later(path[:, 2], 0.3)),
+    "height 300 ms late": _height_late,
     "Web Mercator": lambda path: path / np.cos(np.radians(51.0)),
     "UTM": lambda path: path * 0.9996,
     "scale 1.05": lambda path: path * 1.05,
-    "steps of 10 cm": lambda path: path,
+    "steps of 10 cm": _unchanged,
 }
+
+
+def _with_pressure_drift(
+    positions: FloatArray, rate_hz: float, random: _Random
+) -> FloatArray:
+    """Add a random walk of 0.3 m per root minute to the heights."""
+    steps = random.standard_normal(len(positions))
+    drift = 0.3 * np.cumsum(steps) / (60 * rate_hz) ** 0.5
+    return _with_heights(positions, positions[:, 2] + drift)
+
 
 # What a fault makes of measured positions (N, 3), at so many a second.
 _OF_POSITIONS: Mapping[str, Callable[[FloatArray, float, _Random], FloatArray]] = {
     "1 Hz interpolated": lambda positions, hz, _: _interpolated(positions, round(hz)),
     "constant height": lambda positions, hz, _: positions * [1.0, 1.0, 0.0],
-    "barometric height": lambda positions, hz, random: _heights(
-        positions,
-        positions[:, 2]
-        + 0.3 * np.cumsum(random.standard_normal(len(positions))) / (60 * hz) ** 0.5,
-    ),
+    "barometric height": _with_pressure_drift,
     "steps of 10 cm": lambda positions, hz, _: np.round(positions / 0.1) * 0.1,
 }
+
+# Pose of a world in another world.
+_OTHER_WORLD = se3.exp(np.array([3.0, 4.0, 1.0, 0.1, 0.2, 2.0]))
+
+
+def _beside(stream: Trajectory, translations: FloatArray) -> Trajectory:
+    """Poses of a sensor at translations (3,) or (N, 3) in the frame of another one."""
+    mounts = se3.from_rotation_translation(np.eye(3), translations)
+    return replace(stream, poses=stream.poses @ mounts)
+
 
 # Positions that were computed from the poses of the other sensor.
 _COPIES: Mapping[str, Callable[[Trajectory, FloatArray, _Random], Trajectory]] = {
     "copied": lambda parent, lever_arm, _: parent,
-    "copied with noise": lambda parent, lever_arm, random: replace(
-        parent,
-        poses=parent.poses
-        @ se3.from_rotation_translation(
-            np.eye(3), 0.003 * random.standard_normal((len(parent), 3))
-        ),
+    "copied with noise": lambda parent, lever_arm, random: _beside(
+        parent, 0.003 * random.standard_normal((len(parent), 3))
     ),
     "copied, resampled": lambda parent, lever_arm, _: _resampled(parent, 7.0),
     "copied, world turned": lambda parent, lever_arm, _: replace(
-        parent, poses=se3.exp(np.array([3.0, 4.0, 1.0, 0.1, 0.2, 2.0])) @ parent.poses
+        parent, poses=_OTHER_WORLD @ parent.poses
     ),
-    "computed with a wrong lever arm": lambda parent, lever_arm, _: replace(
-        parent,
-        poses=parent.poses
-        @ se3.from_rotation_translation(np.eye(3), lever_arm + _WRONG_BY_M),
+    "computed with a wrong lever arm": lambda parent, lever_arm, _: _beside(
+        parent, lever_arm + _WRONG_BY_M
     ),
 }
 
@@ -191,7 +182,7 @@ def positions(platform: str, fault: str, seed: int) -> Recording:
     motion_rng, mount_rng, odometry_rng, random = np.random.default_rng(seeds).spawn(4)
     motion = kind.motion(motion_rng, kind.duration_s)
     lever_arm = kind.lever_m * mount_rng.standard_normal(3) * [1.0, 1.0, 0.7]
-    parent = _odometry(kind, motion, odometry_rng)
+    parent = kind.measured(motion, odometry_rng)
     if fault in _COPIES:
         copy = _COPIES[fault](parent, lever_arm, random)
         child = Trajectory.from_positions(
@@ -215,29 +206,17 @@ def positions(platform: str, fault: str, seed: int) -> Recording:
     )
 
 
-def _odometry(kind: Platform, motion: motions.Motion, random: _Random) -> Trajectory:
-    times_s: FloatArray = (
-        np.arange(round(kind.duration_s * kind.rate_hz)) / kind.rate_hz
-    )
-    drawn = draw(
-        kind.odometry,
-        motion.at(times_s),
-        motion.twists(times_s),
-        1 / kind.rate_hz,
-        random,
-    )
-    return Trajectory(stamps_ns(times_s), drawn.poses, "lidar", "odom")
-
-
 def _misaligned(rates: FloatArray) -> FloatArray:
     matrix = np.eye(3)
     matrix[0] = np.cos(np.radians(3.0)), np.sin(np.radians(3.0)), 0.0
     return rates @ matrix.T
 
 
-def _moved(rates: FloatArray) -> FloatArray:
-    half = len(rates) // 2
-    return np.concatenate([rates[:half], rates[half:] @ se3.rotation_exp(_TURNED)])
+def _moved(values: FloatArray) -> FloatArray:
+    """Rates (N, 3) or orientations (N, 3, 3) of a mount that moves half-way."""
+    half = len(values) // 2
+    later = values[half:] @ se3.rotation_exp(_TURNED)
+    return np.concatenate([values[:half], later])
 
 
 def _clipped(rates: FloatArray) -> FloatArray:
@@ -249,27 +228,23 @@ def _stepped(rates: FloatArray) -> FloatArray:
     return np.round(rates / _RATE_STEP) * _RATE_STEP
 
 
-def _smoothed(values: FloatArray) -> FloatArray:
-    return gaussian_filter1d(values, 0.25 * _FINE_HZ, 0, mode="nearest")
-
-
 # What a fault makes of the rates (N, 3) of a gyroscope.
 _OF_RATES: Mapping[str, Callable[[FloatArray], FloatArray]] = {
-    "clean": lambda rates: rates,
-    "own rates": lambda rates: rates,
-    "copied, turned": lambda rates: rates,
+    "clean": _unchanged,
+    "own rates": _unchanged,
+    "copied, turned": _unchanged,
     "axis misaligned 3 deg": _misaligned,
     "gain of an axis 1.03": lambda rates: rates * [1.03, 1.0, 1.0],
-    "delayed 100 ms": lambda rates: rates,
+    "delayed 100 ms": _unchanged,
     "mount moved 2 deg": _moved,
     "two axes swapped": lambda rates: rates[:, [1, 0, 2]],
     "sign of an axis": lambda rates: rates * [-1.0, 1.0, 1.0],
-    "bias walks": lambda rates: rates,
+    "bias walks": _unchanged,
     "low-passed 200 ms": lambda rates: _low_passed(rates, 0.2),
     "smoothed 250 ms": _smoothed,
-    "clipped": lambda rates: rates,
-    "steps of 2 deg/s": lambda rates: rates,
-    "degrees": lambda rates: np.degrees(rates),
+    "clipped": _unchanged,
+    "steps of 2 deg/s": _unchanged,
+    "degrees": np.degrees,
 }
 
 # What a fault makes of measured rates (N, 3), with bias and noise.
@@ -288,7 +263,7 @@ def rates(platform: str, fault: str, seed: int) -> Recording:
     motion_rng, mount_rng, odometry_rng, random = np.random.default_rng(seeds).spawn(4)
     motion = kind.motion(motion_rng, kind.duration_s)
     rotation = se3.rotation_exp(mount_rng.uniform(-1.7, 1.7, 3))
-    parent = _odometry(kind, motion, odometry_rng)
+    parent = kind.measured(motion, odometry_rng)
     if fault == "copied, turned":
         return Recording(parent, _differentiated(parent, rotation), rotation)
     fine_s = np.arange(round(kind.duration_s * _FINE_HZ)) / _FINE_HZ
@@ -308,10 +283,11 @@ def rates(platform: str, fault: str, seed: int) -> Recording:
 
 def _differentiated(parent: Trajectory, rotation: FloatArray) -> Trajectory:
     """Rates that were computed from the orientations of the parent, as a TF tree does."""
-    orientations = parent.poses[:, :3, :3] @ rotation
-    steps = se3.rotation_log(np.swapaxes(orientations[:-1], 1, 2) @ orientations[1:])
-    intervals_s = np.diff(parent.stamps_ns) * 1e-9
-    middles_ns = (parent.stamps_ns[:-1] + parent.stamps_ns[1:]) // 2
+    orientations = se3.rotation_of(parent.poses) @ rotation
+    steps = se3.rotations_between(orientations[:-1], orientations[1:])
+    stamps_ns = parent.stamps_ns
+    intervals_s = np.diff(stamps_ns) * 1e-9
+    middles_ns = (stamps_ns[:-1] + stamps_ns[1:]) // 2
     return Trajectory.from_rates(middles_ns, steps / intervals_s[:, None], "imu")
 
 
@@ -322,11 +298,19 @@ _ATTITUDE_WALK = np.radians(0.02)
 
 
 def _yaws(rotations: FloatArray) -> FloatArray:
-    return np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0])
+    sines = rotations[:, 1, 0]
+    cosines = rotations[:, 0, 0]
+    return np.arctan2(sines, cosines)
 
 
 def _about_z(angles: FloatArray) -> FloatArray:
-    return se3.rotation_exp(angles[:, None] * [0.0, 0.0, 1.0])
+    vectors = angles[:, None] * [0.0, 0.0, 1.0]
+    return se3.rotation_exp(vectors)
+
+
+def _with_yaw_gain(rotations: FloatArray) -> FloatArray:
+    excess = 0.05 * np.unwrap(_yaws(rotations))
+    return _about_z(excess) @ rotations
 
 
 def _filtered(
@@ -338,33 +322,25 @@ def _filtered(
 
 def _reordered(rotations: FloatArray) -> FloatArray:
     quats_xyzw = Rotation.from_matrix(rotations).as_quat()
-    return Rotation.from_quat(np.roll(quats_xyzw, 1, axis=1)).as_matrix()
+    quats_wxyz = np.roll(quats_xyzw, 1, axis=1)
+    return Rotation.from_quat(quats_wxyz).as_matrix()
 
 
 # What a fault makes of the orientations (N, 3, 3) of an attitude sensor at the fine rate.
 _OF_ROTATIONS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
-    "clean": lambda rotations: rotations,
-    "copied": lambda rotations: rotations,
-    "copied, turned": lambda rotations: rotations,
-    "delayed 100 ms": lambda rotations: rotations,
-    "low-passed 200 ms": lambda rotations: _filtered(
-        rotations, lambda x: _low_passed(x, 0.2)
-    ),
+    "clean": _unchanged,
+    "copied": _unchanged,
+    "copied, turned": _unchanged,
+    "delayed 100 ms": _unchanged,
+    "low-passed 200 ms": lambda rotations: _filtered(rotations, _low_passed),
     "smoothed 250 ms": lambda rotations: _filtered(rotations, _smoothed),
-    "mount moved 2 deg": lambda rotations: np.concatenate(
-        [
-            rotations[: len(rotations) // 2],
-            rotations[len(rotations) // 2 :] @ se3.rotation_exp(_TURNED),
-        ]
-    ),
+    "mount moved 2 deg": _moved,
     "inverse": lambda rotations: np.swapaxes(rotations, 1, 2),
-    "order w x y z": lambda rotations: _reordered(rotations),
+    "order w x y z": _reordered,
     "yaw only": lambda rotations: _about_z(_yaws(rotations)),
-    "yaw gain 1.05": lambda rotations: (
-        _about_z(0.05 * np.unwrap(_yaws(rotations))) @ rotations
-    ),
-    "yaw wanders": lambda rotations: rotations,
-    "steps of 1 deg": lambda rotations: rotations,
+    "yaw gain 1.05": _with_yaw_gain,
+    "yaw wanders": _unchanged,
+    "steps of 1 deg": _unchanged,
 }
 
 OF_ROTATIONS = tuple(_OF_ROTATIONS)
@@ -377,7 +353,7 @@ def rotations(platform: str, fault: str, seed: int) -> Recording:
     motion_rng, mount_rng, odometry_rng, random = np.random.default_rng(seeds).spawn(4)
     motion = kind.motion(motion_rng, kind.duration_s)
     mount = se3.rotation_exp(mount_rng.uniform(-1.7, 1.7, 3))
-    parent = _odometry(kind, motion, odometry_rng)
+    parent = kind.measured(motion, odometry_rng)
     if fault.startswith("copied"):
         turned = mount if fault == "copied, turned" else np.eye(3)
         poses = parent.poses @ se3.from_rotation_translation(turned, np.zeros(3))
@@ -465,8 +441,13 @@ _NAMED: Mapping[str, Mapping[str, str]] = {
 
 # Targets that a person would set: m for positions; deg for rates and rotations.
 _TARGETS_M = {
-    "car": 0.15, "excavator": 0.05, "hand": 0.01, "drone": 0.05, "drone_slam": 0.05, "agv": 0.05
-}  # fmt: skip
+    "car": 0.15,
+    "excavator": 0.05,
+    "hand": 0.01,
+    "drone": 0.05,
+    "drone_slam": 0.05,
+    "agv": 0.05,
+}
 _SLOW_TARGET_DEG = 0.5
 _TARGET_DEG = 0.3
 _SLOW = ("excavator", "agv")
@@ -485,15 +466,12 @@ def largest_ratio(kind: str, result: Calibration, truth: FloatArray) -> float:
 
     The standard deviation includes the allowance for constant errors.
     """
+    T = result.T_parent_child
     if kind == "positions":
-        errors = result.T_parent_child[:3, 3] - truth
-        axes = slice(0, 3)
-    else:
-        errors = se3.rotation_log(truth @ result.T_parent_child[:3, :3].T)
-        axes = slice(3, 6)
-    sigmas = result.sigmas[axes]
-    is_known = np.isfinite(sigmas)
-    return float(np.abs(errors[is_known] / sigmas[is_known]).max(initial=0.0))
+        errors = se3.translation_of(T) - truth
+        return fault_counts.largest_ratio(errors, result.sigmas[:3])
+    errors = se3.rotation_log(truth @ se3.rotation_of(T).T)
+    return fault_counts.largest_ratio(errors, result.sigmas[3:])
 
 
 def rows(kind: str, seeds: Sequence[int]) -> Iterator[dict[str, object]]:
@@ -501,39 +479,23 @@ def rows(kind: str, seeds: Sequence[int]) -> Iterator[dict[str, object]]:
     make, faults = KINDS[kind]
     for fault in faults:
         names = set(_NAMED[kind].get(fault, "").split())
-        verdicts = Counter[str]()
-        distances = []
-        n_named = 0
-        n_findings = 0
-        n_far = 0
+        tally = fault_counts.Tally()
         for platform in PLATFORMS:
+            options = options_of(kind, platform)
             for seed in seeds:
                 recording = make(platform, fault, seed)
-                options = options_of(kind, platform)
                 result = hec.calibrate(recording.parent, recording.child, **options)
-                verdicts[result.verdict.value] += 1
-                codes = {
-                    found.code
-                    for found in result.findings
-                    if found.severity is not Severity.NOTE
-                }
-                n_named += bool(codes & names)
-                n_findings += bool(codes)
-                if result.verdict is not hec.Verdict.DO_NOT_USE:
-                    distances.append(largest_ratio(kind, result, recording.truth))
-                    n_far += (
-                        result.verdict is hec.Verdict.USE and distances[-1] > FAR_SIGMAS
-                    )
-        total = verdicts.total()
+                ratio = largest_ratio(kind, result, recording.truth)
+                tally.add(result, ratio, names)
+        named = f"({tally.n_with_findings} findings)"
+        if names:
+            named = f"{tally.n_named} of {tally.verdicts.total()}"
         yield {
             "Fault": fault,
             "Finding": " or ".join(sorted(names)) or "none",
-            "Named": f"{n_named} of {total}" if names else f"({n_findings} findings)",
-            "Verdicts": ", ".join(
-                f"{name} {count}" for name, count in verdicts.most_common()
-            ),
-            "USE beyond 3.3 sigma": n_far,
-            "Largest z that is not DO NOT USE": f"{max(distances, default=0.0):.1f}",
+            "Named": named,
+            **tally.verdict_cells(),
+            **tally.error_cells(),
         }
 
 

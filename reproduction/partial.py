@@ -37,9 +37,27 @@ class Machine(NamedTuple):
 
 
 MACHINES = {
-    "car": Machine(motions.car, LIDAR_ODOMETRY, 10.0, 240.0, 2.0),
-    "excavator": Machine(motions.excavator, LIDAR_ODOMETRY, 10.0, 240.0, 2.0),
-    "hand-held": Machine(motions.hand_held, VIO, 30.0, 120.0, 0.3),
+    "car": Machine(
+        motion=motions.car,
+        odometry=LIDAR_ODOMETRY,
+        rate_hz=10.0,
+        duration_s=240.0,
+        lever_m=2.0,
+    ),
+    "excavator": Machine(
+        motion=motions.excavator,
+        odometry=LIDAR_ODOMETRY,
+        rate_hz=10.0,
+        duration_s=240.0,
+        lever_m=2.0,
+    ),
+    "hand-held": Machine(
+        motion=motions.hand_held,
+        odometry=VIO,
+        rate_hz=30.0,
+        duration_s=120.0,
+        lever_m=0.3,
+    ),
 }
 
 # An RTK receiver: rate, white noise of a fixed solution (m); outages per second and how long they
@@ -64,11 +82,12 @@ _LATE_S = 0.005
 _TURNING: dict[str, tuple[_Motion, SensorErrors]] = {
     "hand-held, visual-inertial odometry": (motions.hand_held, VIO),
     "hand-held, white noise of 0.2 deg": (
-        motions.hand_held, SensorErrors(white=sigmas(0.003, 0.2))
+        motions.hand_held,
+        SensorErrors(white=sigmas(0.003, 0.2)),
     ),
     "drone, visual-inertial odometry": (motions.drone, VIO),
     "drone, SLAM": (motions.drone, slam(10.0, 0.05, 0.1)),
-}  # fmt: skip
+}
 
 
 def simulated_positions(

@@ -5,7 +5,6 @@ and results beyond 3.3 standard deviations (with the allowance) that may be used
 """
 
 import argparse
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple, TypeAlias
@@ -17,12 +16,12 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import Calibration
-from hand_eye_calib.core.results.records import Severity
 from hand_eye_calib.offline.cli.main import exit_code_of
+from reproduction import fault_counts
 from reproduction.coverage.classes import LIDAR_ODOMETRY, VIO, stamps_ns
 from reproduction.coverage.sensor_errors import SensorErrors, draw, sigmas
-from reproduction.part_faults import FAR_SIGMAS, PLATFORMS
-from reproduction.writing import markdown_table, study_parser
+from reproduction.platforms import PLATFORMS
+from reproduction.writing import counted, markdown_table, study_parser
 
 _CAMERA = SensorErrors(white=sigmas(0.001, 0.04), walk=sigmas(0.006, 0.05))
 _STEREO = SensorErrors(white=sigmas(0.004, 0.02), walk_by_metre=sigmas(0.004, 0.01))
@@ -167,12 +166,15 @@ def late(scatter_s: float) -> _Damage:
 
     def damage(streams: Streams, random: _Random) -> Streams:
         count = len(streams.child)
-        delays_ns = np.round(1e9 * random.exponential(scatter_s, count))
-        arrival_ns = streams.child.stamps_ns + delays_ns.astype(np.int64)
+        delays_s = random.exponential(scatter_s, count)
+        delays_ns = np.round(1e9 * delays_s).astype(np.int64)
+        arrival_ns = streams.child.stamps_ns + delays_ns
         # Stamps increase by at least the shortest time between two.
-        least_ns = round(1e9 * _TOGETHER_S) * np.arange(count)
+        interval_ns = round(1e9 * _TOGETHER_S)
+        least_ns = interval_ns * np.arange(count)
         stamps_ns = np.maximum.accumulate(arrival_ns - least_ns) + least_ns
-        return streams._replace(child=replace(streams.child, stamps_ns=stamps_ns))
+        child = replace(streams.child, stamps_ns=stamps_ns)
+        return streams._replace(child=child)
 
     return damage
 
@@ -214,22 +216,32 @@ def fused(tau_s: float) -> _Damage:
     return damage
 
 
-#: Damage of each fault, and the codes of the findings that name it.
-FAULTS: Mapping[str, tuple[_Damage, frozenset[str]]] = {
-    "positions at 1 Hz interpolated": (interpolated(1.0), frozenset({"interpolated"})),
-    "positions at 2 Hz interpolated": (interpolated(2.0), frozenset({"interpolated"})),
-    "positions at 5 Hz interpolated": (interpolated(5.0), frozenset({"interpolated"})),
-    "predicted at constant velocity, 2 Hz": (
-        at_constant_velocity(2.0),
-        frozenset({"propagated"}),
+class _Fault(NamedTuple):
+    """Damage of a fault, and the codes of the findings that name it."""
+
+    damage: _Damage
+    codes: frozenset[str]
+
+
+_INTERPOLATED = frozenset({"interpolated"})
+_PROPAGATED = frozenset({"propagated"})
+_ARRIVAL = frozenset({"arrival"})
+_DEPENDENT = frozenset({"not_independent"})
+
+FAULTS: Mapping[str, _Fault] = {
+    "positions at 1 Hz interpolated": _Fault(interpolated(1.0), _INTERPOLATED),
+    "positions at 2 Hz interpolated": _Fault(interpolated(2.0), _INTERPOLATED),
+    "positions at 5 Hz interpolated": _Fault(interpolated(5.0), _INTERPOLATED),
+    "predicted at constant velocity, 2 Hz": _Fault(
+        at_constant_velocity(2.0), _PROPAGATED
     ),
-    "predicted by an IMU, 1 Hz": (by_imu(1.0), frozenset({"propagated"})),
-    "predicted by an IMU, 2 Hz": (by_imu(2.0), frozenset({"propagated"})),
-    "stamps of arrival, 30 ms": (late(0.03), frozenset({"arrival"})),
-    "computed from the parent": (computed(0.0), frozenset({"not_independent"})),
-    "computed, noise of 3 mm": (computed(0.003), frozenset({"not_independent"})),
-    "corrected by the parent, 0.3 s": (fused(0.3), frozenset({"not_independent"})),
-    "corrected by the parent, 2 s": (fused(2.0), frozenset({"not_independent"})),
+    "predicted by an IMU, 1 Hz": _Fault(by_imu(1.0), _PROPAGATED),
+    "predicted by an IMU, 2 Hz": _Fault(by_imu(2.0), _PROPAGATED),
+    "stamps of arrival, 30 ms": _Fault(late(0.03), _ARRIVAL),
+    "computed from the parent": _Fault(computed(0.0), _DEPENDENT),
+    "computed, noise of 3 mm": _Fault(computed(0.003), _DEPENDENT),
+    "corrected by the parent, 0.3 s": _Fault(fused(0.3), _DEPENDENT),
+    "corrected by the parent, 2 s": _Fault(fused(2.0), _DEPENDENT),
 }
 
 
@@ -238,9 +250,8 @@ def faulty(platform: str, fault: str, seed: int) -> Streams:
     streams = clean(platform, seed)
     if fault == "clean":
         return streams
-    damage, _ = FAULTS[fault]
     random = np.random.default_rng((seed, 903))
-    return damage(streams, random)
+    return FAULTS[fault].damage(streams, random)
 
 
 def largest_ratio(result: Calibration, truth: FloatArray) -> float:
@@ -248,23 +259,15 @@ def largest_ratio(result: Calibration, truth: FloatArray) -> float:
 
     The standard deviation includes the allowance for constant errors.
     """
-    T = result.T_parent_child
-    translation = T[:3, 3] - truth[:3, 3]
-    rotation = se3.rotation_log(T[:3, :3] @ truth[:3, :3].T)
-    errors = np.concatenate([translation, rotation])
-    is_known = np.isfinite(result.sigmas)
-    ratios = errors[is_known] / result.sigmas[is_known]
-    return float(np.abs(ratios).max(initial=0.0))
+    errors = se3.deviation(result.T_parent_child, truth)
+    return fault_counts.largest_ratio(errors, result.sigmas)
 
 
 def rows(faults: Sequence[str], seeds: Sequence[int]) -> Iterator[dict[str, object]]:
     """Rows of the table, one for each fault."""
     for fault in faults:
-        verdicts = Counter[str]()
-        codes = Counter[str]()
-        distances = []
-        n_named = 0
-        n_far = 0
+        names = FAULTS[fault].codes if fault in FAULTS else frozenset()
+        tally = fault_counts.Tally()
         for platform, (metres, degrees) in _TARGETS.items():
             for seed in seeds:
                 streams = faulty(platform, fault, seed)
@@ -274,30 +277,14 @@ def rows(faults: Sequence[str], seeds: Sequence[int]) -> Iterator[dict[str, obje
                     target_translation=metres,
                     target_rotation=float(np.radians(degrees)),
                 )
-                verdicts[result.verdict.value] += 1
-                serious = {
-                    found.code
-                    for found in result.findings
-                    if found.severity is not Severity.NOTE
-                }
-                codes.update(serious)
-                n_named += fault != "clean" and bool(serious & FAULTS[fault][1])
-                if result.verdict is not hec.Verdict.DO_NOT_USE:
-                    distances.append(largest_ratio(result, streams.T_parent_child))
-                    n_far += (
-                        result.verdict is hec.Verdict.USE and distances[-1] > FAR_SIGMAS
-                    )
+                ratio = largest_ratio(result, streams.T_parent_child)
+                tally.add(result, ratio, names)
         yield {
             "Fault": fault,
-            "Named": f"{n_named} of {verdicts.total()}",
-            "Verdicts": ", ".join(
-                f"{name} {count}" for name, count in verdicts.most_common()
-            ),
-            "Findings": ", ".join(
-                f"{name} {count}" for name, count in codes.most_common()
-            ),
-            "USE beyond 3.3 sigma": n_far,
-            "Largest z that is not DO NOT USE": f"{max(distances, default=0.0):.1f}",
+            "Named": f"{tally.n_named} of {tally.verdicts.total()}",
+            **tally.verdict_cells(),
+            "Findings": counted(tally.codes.elements()),
+            **tally.error_cells(),
         }
 
 

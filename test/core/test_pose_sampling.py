@@ -8,7 +8,7 @@ from hand_eye_calib.core.checks.check import check_streams
 from hand_eye_calib.core.checks.sampling import check_sampling, step_velocities
 from hand_eye_calib.core.checks.streams import check_stream
 from hand_eye_calib.core.geometry.trajectory import Trajectory
-from reproduction.part_faults import PLATFORMS
+from reproduction.platforms import PLATFORMS
 from reproduction.pose_faults import FAULTS, clean, computed, faulty
 
 OF_ONE_STREAM = [

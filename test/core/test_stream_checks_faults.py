@@ -35,7 +35,8 @@ from hand_eye_calib.extras.simulation.drive import simulate_drive
 from hand_eye_calib.extras.simulation.options import HILLY_DRIVE, REALISTIC, NoiseConfig
 from reproduction import pose_faults
 from reproduction.coverage.classes import make
-from reproduction.fault_cases import FAULTS, LATER, SILENT, heading_drift
+from reproduction.fault_cases import FAULTS
+from reproduction.later_faults import LATER, SILENT, heading_drift
 
 # Not the strongest: seen by a solve or with no effect then, or named already if it is small.
 STRONGEST = {"S13": 1, "S10b": 2, "V1": 1, "U7": 0, "U12": 1}

@@ -13,6 +13,7 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.extras.partial.position_columns import posterior_smoothing
 from reproduction import part_faults
 from reproduction.coverage import classes
+from reproduction.platforms import PLATFORMS
 
 SEED = 31
 
@@ -177,7 +178,7 @@ def test_a_fault_of_rotations_is_named_and_its_error_is_within_sigma(
         assert part_faults.largest_ratio(kind, result, truth) < 2.5
 
 
-@pytest.mark.parametrize("platform", part_faults.PLATFORMS)
+@pytest.mark.parametrize("platform", PLATFORMS)
 def test_clean_positions_have_no_finding_and_may_be_used(platform):
     result = solved("positions", "clean", platform)
     assert codes(result) == []
@@ -186,7 +187,7 @@ def test_clean_positions_have_no_finding_and_may_be_used(platform):
 
 
 @pytest.mark.parametrize("kind", ["rates", "rotations"])
-@pytest.mark.parametrize("platform", part_faults.PLATFORMS)
+@pytest.mark.parametrize("platform", PLATFORMS)
 def test_clean_rotations_have_no_finding_and_may_be_used(kind, platform):
     result = solved(kind, "clean", platform)
     assert codes(result) == []

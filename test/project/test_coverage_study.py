@@ -23,7 +23,7 @@ from reproduction.coverage import __main__ as study
 from reproduction.coverage import classes, motions, sensor_errors
 from reproduction.coverage.bound import ideal_estimate
 from reproduction.coverage.scores import misclosure, truth_cases
-from reproduction.fault_cases import LATER
+from reproduction.later_faults import LATER
 from reproduction.recordings import CYCLE, Truth, real_rigs
 
 # White, walk, scale and slow errors fixed to body and world: every term of the state space.
