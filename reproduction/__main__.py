@@ -100,18 +100,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     add = parser.add_argument
     add("id", metavar="ID", choices=tuple(EXPERIMENTS), help=", ".join(EXPERIMENTS))
-    add("--data", choices=("published", "simulated"), default="published",
-        help="published trajectories, or drives of our simulator. Default: published")  # fmt: skip
-    add("--seed", type=int, default=0,
-        help="with --data simulated, and of the drives of faults. Default: 0")  # fmt: skip
+    add(
+        "--data",
+        choices=("published", "simulated"),
+        default="published",
+        help="published trajectories, or drives of our simulator. Default: published",
+    )
+    add(
+        "--seed",
+        type=int,
+        default=0,
+        help="with --data simulated, and of the drives of faults. Default: 0",
+    )
     add(
         "--runs",
         type=int,
         default=published.N_RUNS,
         help="simulated drives. Default: 38",
     )
-    add("--out", metavar="DIR", type=Path, default=Path("reproduced"),
-        help="directory for the files. Default: reproduced")  # fmt: skip
+    add(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        default=Path("reproduced"),
+        help="directory for the files. Default: reproduced",
+    )
     add(
         "--jobs",
         type=int,

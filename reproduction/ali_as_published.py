@@ -54,44 +54,49 @@ def solve(pairs: MotionPairs) -> Solution:
     # Residuals through the triangular factor, not through its square: on noise-free data the square
     # loses half of the digits.
     rows = np.asarray(np.linalg.qr(residual_rows(pairs), mode="r"))
-    start_gradient = np.abs(_derivatives(_IDENTITY, rows)[1]).max()
-    rows *= np.sqrt(
-        min(1.0, _LARGEST_START_GRADIENT / max(start_gradient, np.finfo(float).tiny))
-    )
+    _, start_gradient, _ = _derivatives(_IDENTITY, rows)
+    largest = max(np.abs(start_gradient).max(), np.finfo(float).tiny)
+    rows *= np.sqrt(min(1.0, _LARGEST_START_GRADIENT / largest))
     parameters = _IDENTITY
     shift = 0.0
     for _ in range(_MAX_ITERATIONS):
         value, gradient, hessian = _derivatives(parameters, rows)
         step, shift = _descent_step(gradient, hessian, shift)
+        slope = gradient @ step
+        rounding = _ROUNDING * value
         length = 1.0
-        while (
-            _value(parameters + length * step, rows) - value
-            > _SUFFICIENT_DECREASE * length * (gradient @ step) + _ROUNDING * value
-        ):
+        rise = _value(parameters + step, rows) - value
+        while rise > _SUFFICIENT_DECREASE * length * slope + rounding:
             length /= 2
+            rise = _value(parameters + length * step, rows) - value
         parameters = parameters + length * step
         converged = bool(np.abs(step).max() < _STEP_TOLERANCE)
         if converged:
             break
-    rotation = Rotation.from_quat(np.roll(parameters[:4], -1)).as_matrix()
+    quat_xyzw = np.roll(parameters[:4], -1)
+    rotation = Rotation.from_quat(quat_xyzw).as_matrix()
     T_parent_child = se3.from_rotation_translation(rotation, parameters[4:])
-    objective = float((pairs.residuals(T_parent_child)[0] ** 2).sum())
+    translation_residuals, _ = pairs.residuals(T_parent_child)
+    objective = float(np.sum(translation_residuals**2))
     return Solution(T_parent_child, objective, converged, np.ones(len(pairs)))
 
 
 def _descent_step(
     gradient: FloatArray, hessian: FloatArray, last_shift: float
 ) -> tuple[FloatArray, float]:
-    """Newton step and the shift of the Hessian's diagonal it took: none, else about a third of the
-    last one and up.
+    """Newton step, and the shift of the Hessian's diagonal that makes it positive definite.
+
+    The first shift is zero. Further shifts grow from about a third of the last one.
     """
+    growth = 100.0
+    first_shift = 1e-4
+    if last_shift:
+        growth = 8.0
+        first_shift = max(last_shift / 3, 1e-20)
+    smallest = np.linalg.eigvalsh(hessian)[0]
     shift = 0.0
-    growth = 8.0 if last_shift else 100.0
-    while np.linalg.eigvalsh(hessian)[0] + shift <= 0.0:
-        if shift:
-            shift *= growth
-        else:
-            shift = max(last_shift / 3, 1e-20) if last_shift else 1e-4
+    while smallest + shift <= 0.0:
+        shift = shift * growth if shift else first_shift
     step = -np.linalg.solve(hessian + shift * np.eye(7), gradient)
     return np.asarray(step), shift or last_shift
 
@@ -125,11 +130,10 @@ def _factor(q: FloatArray) -> tuple[float, FloatArray, FloatArray]:
     """``sqrt(|q|)`` with its gradient and Hessian."""
     squared = q @ q
     factor = float(squared**0.25)
-    return (
-        factor,
-        factor * q / (2 * squared),
-        factor * (np.eye(4) / (2 * squared) - 0.75 * np.outer(q, q) / squared**2),
-    )
+    gradient = factor * q / (2 * squared)
+    curvature = 0.75 * np.outer(q, q) / squared**2
+    hessian = factor * (np.eye(4) / (2 * squared) - curvature)
+    return factor, gradient, hessian
 
 
 def _lift(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -138,16 +142,18 @@ def _lift(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
     factor, factor_gradient, _ = _factor(q)
     half_gradient = _P @ q
     P = half_gradient @ q
+    M = np.eye(3).ravel() + 2 * factor * P
+    x = np.concatenate([M, parameters[4:], [1.0]])
+    of_factor = 2 * np.outer(P, factor_gradient)
     derivative = np.zeros((13, 7))
-    derivative[:9, :4] = 2 * np.outer(P, factor_gradient) + 4 * factor * half_gradient
+    derivative[:9, :4] = of_factor + 4 * factor * half_gradient
     derivative[9:12, 4:] = np.eye(3)
-    return np.concatenate(
-        [np.eye(3).ravel() + 2 * factor * P, parameters[4:], [1.0]]
-    ), derivative
+    return x, derivative
 
 
 def _value(parameters: FloatArray, rows: FloatArray) -> float:
-    residuals = rows @ _lift(parameters)[0]
+    x, _ = _lift(parameters)
+    residuals = rows @ x
     return float(residuals @ residuals)
 
 
@@ -160,10 +166,12 @@ def _derivatives(
     residuals = rows @ x
     slope = rows @ derivative
     factor, factor_gradient, factor_hessian = _factor(q)
-    weighted = np.tensordot((residuals @ rows)[:9], _P, axes=1)
+    weights = residuals @ rows
+    weighted = np.tensordot(weights[:9], _P, axes=1)
     cross = np.outer(factor_gradient, 2 * weighted @ q)
+    of_factor = factor_hessian * (q @ weighted @ q)
+    curvature = of_factor + cross + cross.T + 2 * factor * weighted
     hessian = 2 * slope.T @ slope
-    hessian[:4, :4] += 4 * (
-        factor_hessian * (q @ weighted @ q) + cross + cross.T + 2 * factor * weighted
-    )
-    return float(residuals @ residuals), 2 * residuals @ slope, hessian
+    hessian[:4, :4] += 4 * curvature
+    gradient = 2 * residuals @ slope
+    return float(residuals @ residuals), gradient, hessian

@@ -82,5 +82,8 @@ def describe_dnlo(rows: pd.DataFrame) -> str:
 
 def reasons(rows: pd.DataFrame) -> str:
     """Why rows differ, with counts, in one string."""
-    counts = rows["why"][~rows["agrees"] & (rows["why"] != "")].value_counts()
-    return "; ".join(f"{n} of {len(rows)} rows: {why}" for why, n in counts.items())
+    whys = rows["why"]
+    is_explained = ~rows["agrees"] & (whys != "")
+    counts = whys[is_explained].value_counts()
+    words = [f"{count} of {len(rows)} rows: {why}" for why, count in counts.items()]
+    return "; ".join(words)

@@ -58,8 +58,9 @@ def data_of(folder: Path, tier: str) -> Path:
 
 def solve_ours(sequence: Any) -> hec.Calibration:
     """Calibrate a sequence as a user would who knows its clock offset."""
-    is_monocular = sequence.manifest["track"] == "monocular" or sequence.scale != 1.0
-    options: dict[str, Any] = {"scale": "estimate"} if is_monocular else {}
+    options: dict[str, Any] = {}
+    if sequence.manifest["track"] == "monocular" or sequence.scale != 1.0:
+        options["scale"] = "estimate"
     if sequence.manifest["sampling_mode"] == "stations":
         robot, camera = sequence.axyb_poses()
         return hec.calibrate_stops(robot, camera, hec.CalibratorConfig(**options))
@@ -73,16 +74,19 @@ def solve_ours(sequence: Any) -> hec.Calibration:
 
 
 def _trajectory(seconds: FloatArray, poses: FloatArray) -> hec.Trajectory:
-    return hec.Trajectory(np.round((_START_S + seconds) * 1e9).astype(np.int64), poses)
+    stamps_ns = np.round((_START_S + seconds) * 1e9)
+    return hec.Trajectory(stamps_ns.astype(np.int64), poses)
 
 
 def score(result: hec.Calibration, truth: FloatArray) -> Score:
     """Return errors of a result as KinHEC defines them, and the covered share of the six axes."""
     errors = se3.deviation(result.T_parent_child, truth)
+    metres = np.linalg.norm(errors[:3])
+    radians = np.linalg.norm(errors[3:])
     is_covered = np.abs(errors) < _INTERVAL_SIGMAS * result.sigmas_measured
     return Score(
-        rotation_deg=float(np.degrees(np.linalg.norm(errors[3:]))),
-        translation_mm=1e3 * float(np.linalg.norm(errors[:3])),
+        rotation_deg=float(np.degrees(radians)),
+        translation_mm=1e3 * float(metres),
         covered=float(is_covered.mean()),
     )
 
@@ -90,10 +94,9 @@ def score(result: hec.Calibration, truth: FloatArray) -> Score:
 def results_of(data: Path) -> pd.DataFrame:
     """Return a row for each sequence and solver, ours included."""
     rows = []
-    for k, sequence in enumerate(kinhec.io.iter_sequences(data)):
-        theirs = evaluate_sequence(
-            sequence, list(SOLVERS), rng=np.random.default_rng(k)
-        )
+    for number, sequence in enumerate(kinhec.io.iter_sequences(data)):
+        rng = np.random.default_rng(number)
+        theirs = evaluate_sequence(sequence, list(SOLVERS), rng=rng)
         try:
             ours = score(solve_ours(sequence), sequence.X)
         except hec.HandEyeCalibError as error:
@@ -127,28 +130,31 @@ def table(results: pd.DataFrame) -> Iterator[dict[str, str]]:
         theirs = rows[~is_ours & has_answers].groupby("solver")
         line = {"recordings": f"{kind}, {track}", "sequences": str(len(ours))}
         for title, column in (("deg", _ROTATION), ("mm", _TRANSLATION)):
-            means = theirs[column].mean()
-            quantiles = theirs[column].quantile(0.9)
-            line[f"mean, {title}"] = _beside(ours[column].mean(), means)
-            line[f"90 % quantile, {title}"] = _beside(
-                ours[column].quantile(0.9), quantiles
-            )
-        line["90 % intervals cover"] = f"{ours['covered'].mean():.0%}"
+            own_errors = ours[column]
+            errors = theirs[column]
+            means = _beside(own_errors.mean(), errors.mean())
+            quantiles = _beside(own_errors.quantile(0.9), errors.quantile(0.9))
+            line[f"mean, {title}"] = means
+            line[f"90 % quantile, {title}"] = quantiles
+        covered = ours["covered"].mean()
+        line["90 % intervals cover"] = f"{covered:.0%}"
         yield line
 
 
 def _beside(error: float, errors_of_solvers: pd.Series) -> str:
     """Return our error and the smallest of KinHEC's solvers as text; ours is bold if first."""
     best = errors_of_solvers.min()
-    texts = f"{error:.3f}", f"{best:.3f}"
+    solver = errors_of_solvers.idxmin()
+    own_text = f"{error:.3f}"
     if error <= best:
-        texts = f"**{texts[0]}**", texts[1]
-    return f"{texts[0]} / {texts[1]} {errors_of_solvers.idxmin()}"
+        own_text = f"**{own_text}**"
+    return f"{own_text} / {best:.3f} {solver}"
 
 
 def page(data: Path, tier: str, results: pd.DataFrame) -> str:
     """Return the table of a tier as Markdown, with the version of KinHEC and the data's digest."""
-    digest = hashlib.sha256((data / "sequences.csv").read_bytes()).hexdigest()[:12]
+    content = (data / "sequences.csv").read_bytes()
+    digest = hashlib.sha256(content).hexdigest()[:12]
     text = (
         f"Tier `{tier}` of KinHEC {kinhec.__version__} (sequences.csv {digest}), "
         f"`python -m reproduction.kinhec --tier {tier}`. Cells: ours / the best of its solvers."

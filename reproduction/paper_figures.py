@@ -61,9 +61,11 @@ METHOD_LOOKS = {
 }
 
 METRIC_TITLES = {
-    "e_rt": "$e_{rt}$ (m)\nrelative translation", "e_rR": "$e_{rR}$ (deg)\nrelative rotation",
-    "e_at": "$e_{at}$ (m)\nabsolute translation", "e_aR": "$e_{aR}$ (deg)\nabsolute rotation",
-}  # fmt: skip
+    "e_rt": "$e_{rt}$ (m)\nrelative translation",
+    "e_rR": "$e_{rR}$ (deg)\nrelative rotation",
+    "e_at": "$e_{at}$ (m)\nabsolute translation",
+    "e_aR": "$e_{aR}$ (deg)\nabsolute rotation",
+}
 _DATASET_TITLES = {
     "noise": ("(a) Gaussian noise", "level $a$ (m, 2$a$ rad)"),
     "outliers": ("(b) outliers", "share of poses (%)"),
@@ -86,10 +88,15 @@ _LETTER = 0.075
 _SMALL_BOLD: dict[str, Any] = {"fontweight": "bold", "fontsize": 6.2}
 _BARS: dict[str, Any] = {"elinewidth": 0.7, "capsize": 1.2, "capthick": 0.7, "mew": 0.8}
 _LEGEND: dict[str, Any] = {
-    "loc": "center left", "bbox_to_anchor": (1.0, 0.5), "frameon": False, "handlelength": 2.0,
-    "fontsize": 6.5, "title": "by $e_{at}$, worst first", "title_fontsize": 6.0,
+    "loc": "center left",
+    "bbox_to_anchor": (1.0, 0.5),
+    "frameon": False,
+    "handlelength": 2.0,
+    "fontsize": 6.5,
+    "title": "by $e_{at}$, worst first",
+    "title_fontsize": 6.0,
     "alignment": "left",
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
@@ -111,33 +118,49 @@ class Line:
 def draw_errors(
     title: str, note: str, panels: Mapping[tuple[str, str], Sequence[Line]], stem: Path
 ) -> list[Path]:
-    """Errors of several references or methods: a row per data set, a column per metric. ``panels``
-    maps (dataset, metric) to lines; ``stem`` is the path of the files without their ending. Gives
-    the paths.
+    """Draw errors of several references or methods; return the paths of the files.
+
+    The page has a row for each data set and a column for each metric. ``panels`` maps (dataset,
+    metric) to lines. ``stem`` is the path of the files without their ending.
     """
-    datasets = [
-        name for name in _DATASET_TITLES if any(key[0] == name for key in panels)
-    ]
+    drawn = {dataset for dataset, _ in panels}
+    datasets = [dataset for dataset in _DATASET_TITLES if dataset in drawn]
+    n_rows = len(datasets)
     with page_style(**_STYLE):
-        figure = _new_page(2.05 * len(datasets) + 0.7, title, note)
-        axes = figure.subplots(len(datasets), len(METRIC_TITLES), squeeze=False)
+        figure = _new_page(2.05 * n_rows + 0.7, title, note)
+        axes = figure.subplots(n_rows, len(METRIC_TITLES), squeeze=False)
         for row, dataset in zip(axes, datasets, strict=True):
+            dataset_title, level_title = _DATASET_TITLES[dataset]
             for ax, metric in zip(row, METRIC_TITLES, strict=True):
-                lines = panels[dataset, metric]
-                _scale(ax, lines, metric)
-                (_draw_boxes if dataset == "mixture" else _draw_lines)(ax, lines)
-                ax.set_xlabel(_DATASET_TITLES[dataset][1])
-            row[0].set_ylabel(
-                _DATASET_TITLES[dataset][0], fontweight="bold", fontsize=8
-            )
-            named = [line for line in panels[dataset, "e_at"] if line.name]
-            if named:
-                named.sort(key=lambda line: line.summaries[-1].centre, reverse=True)
-                handles = [_handle(line.name, *line.look) for line in named]
-                row[-1].legend(handles=handles, **_LEGEND)
-        for ax, metric in zip(axes[0], METRIC_TITLES, strict=True):
-            ax.set_title(METRIC_TITLES[metric], fontsize=6.8)
+                _draw_panel(ax, dataset, metric, panels[dataset, metric])
+                ax.set_xlabel(level_title)
+            row[0].set_ylabel(dataset_title, fontweight="bold", fontsize=8)
+            _add_legend(row[-1], panels[dataset, "e_at"])
+        for ax, metric_title in zip(axes[0], METRIC_TITLES.values(), strict=True):
+            ax.set_title(metric_title, fontsize=6.8)
         return _save(figure, stem)
+
+
+def _draw_panel(ax: Axes, dataset: str, metric: str, lines: Sequence[Line]) -> None:
+    """Draw the errors of a data set by a metric."""
+    _scale(ax, lines, metric)
+    if dataset == "mixture":
+        _draw_boxes(ax, lines)
+    else:
+        _draw_lines(ax, lines)
+
+
+def _add_legend(ax: Axes, lines: Sequence[Line]) -> None:
+    """Add a legend of the lines that have a full name, the largest error first."""
+
+    def last_centre(line: Line) -> float:
+        return line.summaries[-1].centre
+
+    named = [line for line in lines if line.name]
+    named.sort(key=last_centre, reverse=True)
+    if named:
+        handles = [_handle(line.name, *line.look) for line in named]
+        ax.legend(handles=handles, **_LEGEND)
 
 
 def _new_page(height: float, title: str, note: str) -> Figure:
@@ -153,90 +176,121 @@ def _handle(label: str, colour: str, marker: str, dashes: str) -> Line2D:
 
 def _save(figure: Figure, stem: Path) -> list[Path]:
     """Write ``stem``.png and ``stem``.svg; returns both paths."""
-    paths = [stem.with_name(f"{stem.name}.{kind}") for kind in ("png", "svg")]
-    figure.savefig(paths[0], metadata={"Software": None})
-    figure.set_layout_engine("none")  # that of the first file serves for the second
-    figure.savefig(paths[1], metadata={"Date": None})
-    return paths
+    png = stem.with_name(f"{stem.name}.png")
+    svg = stem.with_name(f"{stem.name}.svg")
+    figure.savefig(png, metadata={"Software": None})
+    # The second file has the layout of the first one.
+    figure.set_layout_engine("none")
+    figure.savefig(svg, metadata={"Date": None})
+    return [png, svg]
 
 
 def _scale(ax: Axes, lines: Sequence[Line], metric: str) -> None:
-    """A logarithmic axis that includes zero; box plots need none, their errors are never zero."""
-    centres = [summary.centre for line in lines for summary in line.summaries]
+    """Set a logarithmic axis that includes zero; errors of a box plot are never zero."""
     if not lines[0].levels:
         ax.set_yscale("log")
         ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         _write_plainly(ax)
         return
-    above = [centre for centre in centres if centre > _LINEAR_BELOW[metric]]
-    decade = (
-        10.0 ** math.floor(math.log10(min(above))) if above else _LINEAR_BELOW[metric]
-    )
-    ax.set_yscale("symlog", linthresh=decade, linscale=0.35)
+    linear_below = _LINEAR_BELOW[metric]
+    centres = [summary.centre for line in lines for summary in line.summaries]
+    larger = [centre for centre in centres if centre > linear_below]
+    if larger:
+        exponent = math.floor(math.log10(min(larger)))
+        linear_below = 10.0**exponent
+    ax.set_yscale("symlog", linthresh=linear_below, linscale=0.35)
     _write_plainly(ax)
 
 
 def _write_plainly(ax: Axes) -> None:
-    """Powers of ten up the axis as 0.01, without minor ticks."""
+    """Write powers of ten on the axis as 0.01, without minor ticks."""
     ax.yaxis.set_major_formatter("{x:g}")
     ax.minorticks_off()
 
 
 def _draw_lines(ax: Axes, lines: Sequence[Line]) -> None:
-    first = lines[0].levels[0]
-    last = lines[0].levels[-1]
+    levels = lines[0].levels
+    first = levels[0]
+    last = levels[-1]
     span = last - first
+    middle = (len(lines) - 1) / 2
     for number, line in enumerate(lines):
-        # Side by side, so that the intervals can be told apart.
-        shift = 0.012 * span * (number - (len(lines) - 1) / 2)
-        centres = [summary.centre for summary in line.summaries]
-        # An error is not negative, however wide the interval of its mean.
-        below = [summary.centre - max(summary.low, 0.0) for summary in line.summaries]
-        above = [summary.high - summary.centre for summary in line.summaries]
-        colour, marker, dashes = line.look
-        at = [level + shift for level in line.levels]
-        look: dict[str, Any] = {"color": colour, "marker": marker, "ls": dashes}
-        ax.errorbar(at, centres, yerr=[below, above], **look, **_BARS)
+        # Side by side, so that the intervals can be distinguished.
+        shift = 0.012 * span * (number - middle)
+        _draw_line(ax, line, shift)
     largest = max(summary.high for line in lines for summary in line.summaries)
     if largest < _ZERO:
         ax.text(0.5, 0.5, "all zero", transform=ax.transAxes, ha="center", color=_GREY)
-    ax.set_ylim(0.0, None if largest >= _ZERO else 1.0)
-    room = _LABEL_ROOM + _LETTER * max(len(line.label) for line in lines)
+        ax.set_ylim(0.0, 1.0)
+    else:
+        ax.set_ylim(0.0, None)
+    longest = max(len(line.label) for line in lines)
+    room = _LABEL_ROOM + _LETTER * longest
     ax.set_xlim(first - 0.06 * span, last + room * span)
     ax.set_xticks([first, last], [f"{first:g}", f"{last:g}"])
-    ax.set_xticks(lines[0].levels, minor=True)
+    ax.set_xticks(levels, minor=True)
     _label_ends(ax, lines, span)
 
 
+def _draw_line(ax: Axes, line: Line, shift: float) -> None:
+    """Draw the errors of a line and their intervals, shifted along the axis of levels."""
+    levels = [level + shift for level in line.levels]
+    centres = []
+    below = []
+    above = []
+    for summary in line.summaries:
+        # An error is not negative, however wide the interval of its mean.
+        low = max(summary.low, 0.0)
+        centres.append(summary.centre)
+        below.append(summary.centre - low)
+        above.append(summary.high - summary.centre)
+    colour, marker, dashes = line.look
+    look: dict[str, Any] = {"color": colour, "marker": marker, "ls": dashes}
+    ax.errorbar(levels, centres, yerr=[below, above], **look, **_BARS)
+
+
 def _label_ends(ax: Axes, lines: Sequence[Line], span: float) -> None:
-    """The name of each line at its right end, moved apart where they would overlap."""
-    to_fraction = ax.transData + ax.transAxes.inverted()
+    """Write the name of each line at its right end; names that would overlap are moved apart."""
+    to_axes = ax.transData + ax.transAxes.inverted()
     last = lines[0].levels[-1]
-    heights = [
-        to_fraction.transform((last, line.summaries[-1].centre))[1] for line in lines
-    ]
+    heights = []
+    for line in lines:
+        _, height = to_axes.transform((last, line.summaries[-1].centre))
+        heights.append(height)
+    label_heights = _moved_apart(heights)
+    right, _ = to_axes.transform((last + 0.04 * span, 0.0))
+    label_start, _ = to_axes.transform((last + 0.09 * span, 0.0))
+    for line, height, label_height in zip(lines, heights, label_heights, strict=True):
+        look: dict[str, Any] = {"color": line.look[0], "transform": ax.transAxes}
+        ax.plot([right, label_start], [height, label_height], lw=0.5, **look)
+        look |= _SMALL_BOLD
+        ax.text(label_start, label_height, f" {line.label}", va="center", **look)
+
+
+def _moved_apart(heights: Sequence[float]) -> list[float]:
+    """Return heights (share of the axes) with gaps for labels, inside the axes if possible."""
     placed = list(heights)
     order = sorted(range(len(heights)), key=lambda index: heights[index])
     for before, after in pairwise(order):
-        placed[after] = max(placed[after], placed[before] + _LABEL_GAP)
-    shift = max(0.0, 0.02 - min(placed)) - max(0.0, max(placed) - 0.98)
-    right, text = (
-        to_fraction.transform((last + x * span, 0.0))[0] for x in (0.04, 0.09)
-    )
-    for line, height, place in zip(lines, heights, placed, strict=True):
-        look: dict[str, Any] = {"color": line.look[0], "transform": ax.transAxes}
-        ax.plot([right, text], [height, place + shift], lw=0.5, **look)
-        ax.text(
-            text, place + shift, f" {line.label}", va="center", **_SMALL_BOLD, **look
-        )
+        lowest = placed[before] + _LABEL_GAP
+        placed[after] = max(placed[after], lowest)
+    up = max(0.0, 0.02 - min(placed))
+    down = max(0.0, max(placed) - 0.98)
+    shift = up - down
+    return [height + shift for height in placed]
 
 
 def _draw_boxes(ax: Axes, lines: Sequence[Line]) -> None:
+    labels = []
+    colours = []
     for place, line in enumerate(lines):
-        _draw_box(ax, place, line.summaries[0], line.look[0])
-    labels = [line.label for line in lines]
-    _coloured_ticks(ax, labels, [line.look[0] for line in lines], **_SMALL_BOLD)
-    if max(map(len, labels)) > 4:
+        colour = line.look[0]
+        _draw_box(ax, place, line.summaries[0], colour)
+        labels.append(line.label)
+        colours.append(colour)
+    _coloured_ticks(ax, labels, colours, **_SMALL_BOLD)
+    longest = max(len(label) for label in labels)
+    if longest > 4:
         ax.tick_params(axis="x", rotation=90)
 
 
@@ -251,10 +305,16 @@ def _coloured_ticks(
 
 def _draw_box(ax: Axes, place: float, summary: Summary, colour: str) -> None:
     low, high = summary.whiskers
-    quartiles = {"med": summary.centre, "q1": summary.low, "q3": summary.high}
+    statistics = {
+        "med": summary.centre,
+        "q1": summary.low,
+        "q3": summary.high,
+        "whislo": low,
+        "whishi": high,
+    }
     thin = {"color": colour, "lw": 0.8}
     ax.bxp(
-        [{**quartiles, "whislo": low, "whishi": high}],
+        [statistics],
         positions=[place],
         widths=0.62,
         showfliers=False,
@@ -270,18 +330,19 @@ def _draw_box(ax: Axes, place: float, summary: Summary, colour: str) -> None:
 def draw_components(
     title: str, note: str, components: Mapping[str, Mapping[str, Summary]], stem: Path
 ) -> list[Path]:
-    """Box plots of the components of the relative motions, by component with its unit and by
-    reference; gives the paths.
+    """Draw box plots of the components of the relative motions; return the paths of the files.
+
+    ``components`` maps the name of a component to its summaries by reference.
     """
     with page_style(**_STYLE):
         figure = _new_page(4.0, title, note)
         axes = figure.subplots(2, 3, sharey="row")
         for ax, (name, summaries) in zip(axes.flat, components.items(), strict=True):
-            colours = [REFERENCE_LOOKS[reference][0] for reference in summaries]
-            for place, (summary, colour) in enumerate(
-                zip(summaries.values(), colours, strict=True)
-            ):
+            colours = []
+            for place, (reference, summary) in enumerate(summaries.items()):
+                colour = REFERENCE_LOOKS[reference][0]
                 _draw_box(ax, place, summary, colour)
+                colours.append(colour)
             ax.set_title(name)
             _coloured_ticks(ax, summaries, colours, fontweight="bold")
         for row, unit, lowest in zip(axes, ("m", "deg"), (3e-4, 3e-2), strict=True):

@@ -8,6 +8,7 @@ in TUM format, ``calib`` (or ``published``) one CSV of results per test set.
 import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -114,7 +115,8 @@ class Case:
     @property
     def name(self) -> str:
         """Such as noise/0.002/run_12."""
-        return "/".join([*path_to(self.dataset, self.level), self.run])
+        folders = path_to(self.dataset, self.level)
+        return "/".join([*folders, self.run])
 
     @property
     def stamps_ns(self) -> IntArray:
@@ -128,7 +130,9 @@ class Case:
 
 def path_to(dataset: str, level: float | None) -> list[str]:
     """The data set and, if it has one, the level."""
-    return [dataset] if level is None else [dataset, f"{level:g}"]
+    if level is None:
+        return [dataset]
+    return [dataset, f"{level:g}"]
 
 
 # Name, parent, child, truth.
@@ -165,11 +169,11 @@ def load_kitti_short(folder: str | Path) -> Case:
     """
     return _kitti_case(
         Path(folder),
-        "kitti_short",
-        KITTI_DRIVES[0],
-        ("LIDAR_HDL64E/traj_HDL_aft_opt.csv", f"cam01/{KEYFRAMES}"),
-        "camera_gray_left_in_velo_link.txt",
-        "kitti_tests_keyframe.csv",
+        dataset="kitti_short",
+        name=KITTI_DRIVES[0],
+        streams=("LIDAR_HDL64E/traj_HDL_aft_opt.csv", f"cam01/{KEYFRAMES}"),
+        truth="camera_gray_left_in_velo_link.txt",
+        results_file="kitti_tests_keyframe.csv",
         first=1,
     )
 
@@ -180,11 +184,11 @@ def load_kitti_long(folder: str | Path) -> Case:
     """
     return _kitti_case(
         Path(folder),
-        "kitti_long",
-        KITTI_DRIVES[1],
-        (f"cam01/{KEYFRAMES}", f"cam23/{KEYFRAMES}"),
-        "camera_color_left_in_camera_gray_left.txt",
-        "kitti_tests_long_cam.csv",
+        dataset="kitti_long",
+        name=KITTI_DRIVES[1],
+        streams=(f"cam01/{KEYFRAMES}", f"cam23/{KEYFRAMES}"),
+        truth="camera_color_left_in_camera_gray_left.txt",
+        results_file="kitti_tests_long_cam.csv",
     )
 
 
@@ -203,13 +207,20 @@ def _kitti_case(
     child = child[first:]
     # As in the paper: the parent's poses at the child's stamps, extrapolated along its end segments
     # if the child's stamps reach further.
-    parent_at_child = Trajectory(
-        child.stamps_ns, parent.at(child.stamps_ns, extrapolate=True, straight=True)
-    )
-    published = _read_results(results_folder(folder) / results_file, None)[None]
+    parent_poses = parent.at(child.stamps_ns, extrapolate=True, straight=True)
+    parent_at_child = Trajectory(child.stamps_ns, parent_poses)
     T_parent_child = read_trajectory(drive / truth).poses[0]
+    published = _read_results(results_folder(folder) / results_file, None)[None]
     results = {key: rows[0] for key, rows in published.items()}
-    return Case(dataset, None, name, parent_at_child, child, T_parent_child, results)
+    return Case(
+        dataset=dataset,
+        level=None,
+        run=name,
+        parent=parent_at_child,
+        child=child,
+        T_parent_child=T_parent_child,
+        results=results,
+    )
 
 
 def load_simulated(
@@ -224,30 +235,24 @@ def load_simulated(
     folder = Path(folder)
     cases = []
     for dataset in datasets:
-        results = _read_results(
-            results_folder(folder) / f"simulation_tests_{dataset}.csv",
-            _LEVEL_COLUMNS[dataset],
-        )
+        file = results_folder(folder) / f"simulation_tests_{dataset}.csv"
+        results = _read_results(file, _LEVEL_COLUMNS[dataset])
         for level_folder, level in _LEVELS[dataset].items():
             if levels is None or level is None or level in levels:
-                runs_folder = folder / "simulation_tests" / dataset / level_folder
-                cases += _match_runs(
-                    dataset, level, _read_runs(runs_folder), results.get(level, {})
-                )
+                runs = _read_runs(folder / "simulation_tests" / dataset / level_folder)
+                cases += _match_runs(dataset, level, runs, results.get(level, {}))
     return cases
 
 
 def _read_runs(folder: Path) -> list[Run]:
     """(name, parent, child, truth) of every run."""
-    return [
-        (
-            run.name,
-            read_trajectory(run / "T_S1_W1.txt"),
-            read_trajectory(run / "T_S2_W2.txt"),
-            read_trajectory(run / "T_S2_S1.txt").poses[0],
-        )
-        for run in sorted(folder.glob("run_*"))
-    ]
+    runs = []
+    for run in sorted(folder.glob("run_*")):
+        parent = read_trajectory(run / "T_S1_W1.txt")
+        child = read_trajectory(run / "T_S2_W2.txt")
+        truth = read_trajectory(run / "T_S2_S1.txt").poses[0]
+        runs.append((run.name, parent, child, truth))
+    return runs
 
 
 def _match_runs(
@@ -261,36 +266,41 @@ def _match_runs(
     Every (method, reference) block lists the same trajectories in the same order. Park has a
     unique answer, so its block identifies them.
     """
-    complete = all(
-        len(results.get((method, reference), ())) == N_RUNS
-        for method in METHODS
-        for reference in REFERENCES
-    )
-    if len(runs) == N_RUNS and complete:
-        published = np.array([row.T_parent_child for row in results["park", "B1"]])
-        ours = np.array(
-            [
-                all_pairs.solve_park(
-                    motion_pairs(parent.poses, child.poses, "B1")
-                ).T_parent_child
-                for _, parent, child, _ in runs
-            ]
+    order = _order_of_runs(runs, results)
+    if order is None:
+        where = dataset if level is None else f"{dataset} at level {level:g}"
+        raise InputError(
+            f"the trajectories of {where} do not go with the published results: expected "
+            f"{N_RUNS} runs (found {len(runs)}) and {N_RUNS} rows of every method and "
+            "reference, one for each run; get the data again"
         )
-        distance = np.abs(published[:, None] - ours).max(axis=(2, 3))
-        order = distance.argmin(axis=1)
-        if len(set(order)) == N_RUNS and distance.min(axis=1).max() < _SAME_ANSWER:
-            cases = []
-            for position, index in enumerate(order):
-                run, parent, child, truth = runs[index]
-                of_run = {key: rows[position] for key, rows in results.items()}
-                cases.append(Case(dataset, level, run, parent, child, truth, of_run))
-            return cases
-    raise InputError(
-        f"the trajectories of {dataset}{'' if level is None else f' at level {level:g}'} "
-        "do not go with the published results: expected "
-        f"{N_RUNS} runs (found {len(runs)}) and {N_RUNS} rows of every method and "
-        "reference, one for each run; get the data again"
-    )
+    cases = []
+    for position, index in enumerate(order):
+        run, parent, child, truth = runs[index]
+        results_of_run = {key: rows[position] for key, rows in results.items()}
+        cases.append(Case(dataset, level, run, parent, child, truth, results_of_run))
+    return cases
+
+
+def _order_of_runs(
+    runs: Sequence[Run], results: Mapping[tuple[str, str], Sequence[PublishedResult]]
+) -> list[int] | None:
+    """Index of the run of each published row; None if runs and rows do not match."""
+    if len(runs) != N_RUNS:
+        return None
+    for key in product(METHODS, REFERENCES):
+        if len(results.get(key, ())) != N_RUNS:
+            return None
+    published = np.array([row.T_parent_child for row in results["park", "B1"]])
+    answers = []
+    for _, parent, child, _ in runs:
+        pairs = motion_pairs(parent.poses, child.poses, "B1")
+        answers.append(all_pairs.solve_park(pairs).T_parent_child)
+    differences = np.abs(published[:, None] - np.array(answers))
+    distances = differences.max(axis=(2, 3))
+    order = distances.argmin(axis=1).tolist()
+    is_same = distances.min(axis=1).max() < _SAME_ANSWER
+    return order if is_same and len(set(order)) == N_RUNS else None
 
 
 def _read_results(path: Path, level_column: str | None) -> PublishedResults:
@@ -301,21 +311,19 @@ def _read_results(path: Path, level_column: str | None) -> PublishedResults:
     with open(path, newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
             level = float(row[level_column]) if level_column else None
-            key = (
-                row["algorithm"].lower(),
-                "A" if row["method"] == "A1" else row["method"],
-            )
-            results.setdefault(level, {}).setdefault(key, []).append(_result(row))
+            method = row["algorithm"].lower()
+            reference = row["method"].replace("A1", "A")
+            results_of_level = results.setdefault(level, {})
+            rows_of_method = results_of_level.setdefault((method, reference), [])
+            rows_of_method.append(_result(row))
     return results
 
 
 def _result(row: Mapping[str, str]) -> PublishedResult:
-    numbers = np.array(
-        row["T"].replace("[", " ").replace("]", " ").split(), dtype=float
-    )
+    words = row["T"].replace("[", " ").replace("]", " ").split()
+    T_parent_child = np.array(words, dtype=float).reshape(4, 4)
     e_rt = float(row["err_tr"])
+    e_rR = float(np.radians(float(row["err_R"])))
     e_at = float(row["abs_tr"])
-    e_rR, e_aR = (
-        float(np.radians(float(row[column]))) for column in ("err_R", "abs_R")
-    )
-    return PublishedResult(numbers.reshape(4, 4), Errors(e_rt, e_rR, e_at, e_aR))
+    e_aR = float(np.radians(float(row["abs_R"])))
+    return PublishedResult(T_parent_child, Errors(e_rt, e_rR, e_at, e_aR))

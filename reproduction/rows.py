@@ -112,7 +112,9 @@ def _solve(case: Case, method: str, reference: str) -> dict[str, Any]:
 
 def in_m_and_deg(errors: Errors) -> tuple[float, ...]:
     """The four metrics, rotations in degrees."""
-    return tuple((np.array(errors) * [1, 180 / np.pi, 1, 180 / np.pi]).tolist())
+    units = [1, 180 / np.pi, 1, 180 / np.pi]
+    values = np.array(errors) * units
+    return tuple(values.tolist())
 
 
 def published_name(method: str) -> str:
@@ -180,7 +182,8 @@ def table_of(rows: Sequence[dict[str, Any]]) -> pd.DataFrame:
 
 def agree(ours: FloatArray | float, theirs: FloatArray | float) -> BoolArray:
     """Whether errors (m or deg) are the same."""
-    return np.abs(ours - theirs) <= np.maximum(_RELATIVE * np.abs(theirs), _ABSOLUTE)
+    tolerances = np.maximum(_RELATIVE * np.abs(theirs), _ABSOLUTE)
+    return np.abs(ours - theirs) <= tolerances
 
 
 def _is_above(objective: FloatArray, other: FloatArray) -> BoolArray:

@@ -9,10 +9,12 @@ import argparse
 import json
 import shutil
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from hand_eye_calib.core.base.arrays import FloatArray
@@ -87,7 +89,7 @@ def write_sample_arm(path: Path) -> None:
     for robot, tracking in zip(Ts_base_gripper, Ts_camera_target, strict=True):
         lines.append(f"- robot: {json.dumps(message_of(robot))}")
         lines.append(f"  tracking: {json.dumps(message_of(tracking))}")
-    path.write_text("\n".join([*lines, ""]), encoding="utf-8")
+    _write_lines(path, lines)
 
 
 def write_sample_arm_files(folder: Path) -> None:
@@ -98,9 +100,23 @@ def write_sample_arm_files(folder: Path) -> None:
         "camera_in_target.tum": se3.inverse(samples.tracking),
     }
     for name, poses in stacks.items():
-        rows = np.column_stack([np.arange(len(poses)), se3.to_rows(poses)])
-        lines = [" ".join(f"{value:.6f}" for value in row) for row in rows.tolist()]
-        (folder / name).write_text("\n".join([*lines, ""]), encoding="utf-8")
+        numbers = np.arange(len(poses))
+        _write_tum(folder / name, numbers, poses)
+
+
+def _write_tum(path: Path, times_s: ArrayLike, poses: FloatArray) -> None:
+    """Write times (N,) and poses (N, 4, 4) with six decimals."""
+    rows = np.column_stack([times_s, se3.to_rows(poses)])
+    lines = []
+    for row in rows.tolist():
+        words = [f"{value:.6f}" for value in row]
+        lines.append(" ".join(words))
+    _write_lines(path, lines)
+
+
+def _write_lines(path: Path, lines: Sequence[str]) -> None:
+    text = "\n".join([*lines, ""])
+    path.write_text(text, encoding="utf-8")
 
 
 def sample_robot() -> Machine:
@@ -111,34 +127,29 @@ def sample_robot() -> Machine:
 def write_sample_robot(folder: Path) -> None:
     """Write the trajectory of the lidar, and the rates of the wheels at 25 Hz."""
     robot = sample_robot()
-    rows = np.column_stack(
-        [robot.sensor.stamps_ns * 1e-9, se3.to_rows(robot.sensor.poses)]
-    )
-    lines = [" ".join(f"{value:.6f}" for value in row) for row in rows.tolist()]
-    (folder / "robot_lidar.tum").write_text("\n".join([*lines, ""]), encoding="utf-8")
+    lidar = robot.sensor
+    _write_tum(folder / "robot_lidar.tum", lidar.stamps_ns * 1e-9, lidar.poses)
     blocks = robot.values.reshape(-1, ROBOT_ROWS, 2)
     times_s = robot.stamps_ns.reshape(-1, ROBOT_ROWS) * 1e-9
     rows = np.column_stack([times_s.mean(axis=1), blocks.mean(axis=1)])
     lines = ["t,left_rad_s,right_rad_s"]
-    lines += [
-        f"{time:.3f},{left:.4f},{right:.4f}" for time, left, right in rows.tolist()
-    ]
-    (folder / "robot_wheels.csv").write_text("\n".join([*lines, ""]), encoding="utf-8")
+    for time_s, left, right in rows.tolist():
+        lines.append(f"{time_s:.3f},{left:.4f},{right:.4f}")
+    _write_lines(folder / "robot_wheels.csv", lines)
 
 
 def se3_of(values: list[float]) -> FloatArray:
     """Return the transform (4, 4) of a position and a rotation vector."""
-    return se3.from_rotation_translation(
-        se3.rotation_exp(np.array(values[3:])), values[:3]
-    )
+    rotation = se3.rotation_exp(np.array(values[3:]))
+    return se3.from_rotation_translation(rotation, values[:3])
 
 
 def message_of(T: FloatArray) -> dict[str, dict[str, float]]:
     """Return a transform as the fields of geometry_msgs/Transform, to a micrometre."""
-    x, y, z, *quat_xyzw = (round(value, 6) for value in se3.to_rows(T).tolist())
+    values = [round(value, 6) for value in se3.to_rows(T).tolist()]
     return {
-        "translation": {"x": x, "y": y, "z": z},
-        "rotation": dict(zip("xyzw", quat_xyzw, strict=True)),
+        "translation": dict(zip("xyz", values[:3], strict=True)),
+        "rotation": dict(zip("xyzw", values[3:], strict=True)),
     }
 
 

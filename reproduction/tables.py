@@ -86,7 +86,11 @@ def with_rectified(rows: pd.DataFrame) -> pd.DataFrame:
 
 def best_variants(rows: pd.DataFrame, by: str = _ERRORS[2]) -> pd.DataFrame:
     """Return the row of each method with the smallest error ``by``, from :func:`with_rectified`."""
-    return rows.loc[[rows.loc[[method]][by].idxmin() for method in METHODS]]
+    best = []
+    for method in METHODS:
+        rows_of_method = rows.loc[[method]]
+        best.append(rows_of_method[by].idxmin())
+    return rows.loc[best]
 
 
 def write_summary_table(name: str, results: Results) -> list[Path]:
