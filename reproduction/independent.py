@@ -61,7 +61,8 @@ class Row:
 
 def digest(path: Path) -> str:
     """Start of the SHA-256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    content = path.read_bytes()
+    return hashlib.sha256(content).hexdigest()[:12]
 
 
 def closure(
@@ -70,12 +71,15 @@ def closure(
     """Root mean squares of the angles (deg) and distances (mm) between ``A X`` and ``Z B``."""
     from_left = Ts_a @ X
     from_right = Z @ Ts_b
-    back = np.swapaxes(from_left[:, :3, :3], 1, 2)
-    angles = se3.rotation_angle(back @ from_right[:, :3, :3])
-    angle_deg = np.degrees(np.sqrt(np.mean(angles**2)))
-    apart = from_left[:, :3, 3] - from_right[:, :3, 3]
+    turns = se3.relative_rotations(
+        se3.rotation_of(from_left), se3.rotation_of(from_right)
+    )
+    angles = se3.rotation_angle(turns)
+    angle_rad = np.sqrt(np.mean(angles**2))
+    apart = se3.translation_of(from_left) - se3.translation_of(from_right)
     squares = np.sum(apart**2, axis=1)
-    return float(angle_deg), 1e3 * float(np.sqrt(np.mean(squares)))
+    distance_m = np.sqrt(np.mean(squares))
+    return float(np.degrees(angle_rad)), 1e3 * float(distance_m)
 
 
 def closure_of_motions(

@@ -124,7 +124,8 @@ def simulate_machine(
 
 
 def _stamps_ns(times_s: FloatArray) -> IntArray:
-    return _START_NS + np.round(times_s * 1e9).astype(np.int64)
+    since_ns = np.round(times_s * 1e9)
+    return _START_NS + since_ns.astype(np.int64)
 
 
 def _course(
@@ -134,7 +135,8 @@ def _course(
     phases = rng.uniform(0, 2 * np.pi, 3)
 
     def wave(period_s: float, phase: float) -> FloatArray:
-        return np.sin(2 * np.pi * times_s / period_s + phase)
+        angles = 2 * np.pi * times_s / period_s
+        return np.sin(angles + phase)
 
     speed = 0.8 + 0.15 * wave(23, phases[0])
     speed += 0.1 * wave(7.1, phases[1])
@@ -176,15 +178,15 @@ def _poses(
     """
     speed, left_speed, yaw_rate = driven
     # The vehicle pitches as the floor below it rises and falls.
-
     phases = 2 * np.pi * np.cumsum(speed) * _STEP_S / _RAMP_M
     pitch = ramp_rad * np.sin(phases)
-    headings = np.cumsum(yaw_rate / np.cos(pitch)) * _STEP_S
+    level = np.cos(pitch)
+    headings = np.cumsum(yaw_rate / level) * _STEP_S
     middle_headings = headings - yaw_rate * _STEP_S / 2
 
     # Horizontal velocities and positions are complex numbers x + iy.
-    ahead = speed * np.cos(pitch)
-    velocities = (ahead + 1j * left_speed) * np.exp(1j * middle_headings)
+    in_base = speed * level + 1j * left_speed
+    velocities = in_base * np.exp(1j * middle_headings)
     places = np.cumsum(velocities) * _STEP_S
     climbs = speed * np.sin(pitch)
     heights = -np.cumsum(climbs) * _STEP_S
@@ -195,10 +197,11 @@ def _poses(
     correlated = lfilter([1.0], [1.0, -decay], shocks, axis=0)
     bumps = noise * correlated * [0.004, 0.004, 0.003]
     lean = noise * 0.01 * speed * yaw_rate
-    roll = bumps[:, 0] + lean
-    angles = np.column_stack([roll, pitch + bumps[:, 1], headings])
-    positions = np.column_stack([places.real, places.imag, heights + bumps[:, 2]])
-    return se3.from_rotation_translation(se3.rotation_from_rpy(angles), positions)
+    roll_bumps, pitch_bumps, height_bumps = bumps.T
+    rpy = np.column_stack([roll_bumps + lean, pitch + pitch_bumps, headings])
+    rotations = se3.rotation_from_rpy(rpy)
+    positions = [places.real, places.imag, heights + height_bumps]
+    return se3.from_rotation_translation(rotations, np.column_stack(positions))
 
 
 def _slip_of_wheels(

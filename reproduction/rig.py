@@ -66,7 +66,8 @@ def simulated(seed: int, n_poses: int, errors: FloatArray) -> Rig:
 def _errors(
     random: np.random.Generator, n: int, metres: float, radians: float
 ) -> FloatArray:
-    return se3.exp(random.standard_normal((n, 6)) * np.repeat([metres, radians], 3))
+    sigmas = np.repeat([metres, radians], 3)
+    return se3.exp(random.standard_normal((n, 6)) * sigmas)
 
 
 def alike(n_sensors: int) -> FloatArray:
@@ -78,8 +79,10 @@ def unequal(n_sensors: int) -> FloatArray:
     """Sigmas of which the last sensor's are twice the first one's in translation, and half in
     rotation.
     """
-    share = np.linspace(1.0, 2.0, n_sensors)
-    return _ERRORS * np.stack([share, share[::-1], share, share[::-1]], axis=1)
+    larger = np.linspace(1.0, 2.0, n_sensors)
+    smaller = larger[::-1]
+    factors = np.stack([larger, smaller, larger, smaller], axis=1)
+    return _ERRORS * factors
 
 
 class Outcome(NamedTuple):

@@ -178,15 +178,20 @@ def _shift_found(
     if not stated:
         return np.zeros(0, dtype=bool)
     axis = rng.choice(stated)
+    sign = rng.choice([-1.0, 1.0])
     in_parent = np.zeros(6)
-    in_parent[AXES.index(axis)] = rng.choice([-1.0, 1.0]) * sizes.shifts[axis]
+    in_parent[AXES.index(axis)] = sign * sizes.shifts[axis]
     R = se3.rotation_of(result.T_parent_child)
+    to_child = np.kron(np.eye(2), R.T)
+    shift = se3.exp(to_child @ in_parent)
     parent, child = again
     poses = child.poses.copy()
-    since = int(rng.uniform(*_MIDDLE) * len(poses))
-    poses[since:] = poses[since:] @ se3.exp(np.kron(np.eye(2), R.T) @ in_parent)
+    share = rng.uniform(*_MIDDLE)
+    since = int(share * len(poses))
+    poses[since:] = poses[since:] @ shift
     moved = hec.calibrate(parent, replace(child, poses=poses), **options)
-    return np.array([any(finding.code == "mount_moved" for finding in moved.findings)])
+    codes = {finding.code for finding in moved.findings}
+    return np.array(["mount_moved" in codes])
 
 
 def of_recordings(folder: Path) -> Iterator[Outcome]:

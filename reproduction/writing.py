@@ -88,7 +88,10 @@ def study_parser(
 
 def seed_of(seed: int | None) -> int:
     """The seed that is given, or another one at every run."""
-    return int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed
+    if seed is not None:
+        return seed
+    state = np.random.SeedSequence().generate_state(1)
+    return int(state[0])
 
 
 def show(page: Path | None, tables: Mapping[str, str]) -> None:
@@ -101,7 +104,9 @@ def show(page: Path | None, tables: Mapping[str, str]) -> None:
 
 def percent(count: int, whole: int) -> str:
     """Such as "4328 of 4332 (99.91 %)", rounded down: only all is 100 %."""
-    share = int(1e4 * count / whole) / 100 if whole else 0.0
+    share = 0.0
+    if whole:
+        share = int(1e4 * count / whole) / 100
     return f"{count} of {whole} ({share:.2f} %)"
 
 
@@ -114,4 +119,5 @@ def counted(words: Iterable[str], most: int | None = None) -> str:
 
 def triple(values: Iterable[float], factor: float = 1.0, form: str = ".1f") -> str:
     """Numbers times a factor, a comma between them."""
-    return ", ".join(f"{factor * value:{form}}" for value in values)
+    words = [f"{factor * value:{form}}" for value in values]
+    return ", ".join(words)

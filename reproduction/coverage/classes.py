@@ -160,72 +160,101 @@ _drone = partial(RecordingClass, motion=motions.drone, lever_m=0.3)
 _arm = partial(RecordingClass, motion=motions.arm, lever_m=0.15)
 
 CLASSES = {
-    "hand_white": _hand(60.0, 20.0, _HAND, _white(0.004, 0.3)),
-    "hand_vio_walk": _hand(90.0, 20.0, _MOCAP, VIO),
+    "hand_white": _hand(
+        duration_s=60.0,
+        rate_hz=20.0,
+        parent=_HAND,
+        child=_white(0.004, 0.3),
+    ),
+    "hand_vio_walk": _hand(
+        duration_s=90.0,
+        rate_hz=20.0,
+        parent=_MOCAP,
+        child=VIO,
+    ),
     "hand_gm_1s": _hand(
-        100.0, 20.0, _white(0.001, 0.08), _slow(_white(0.001, 0.08), 1.0, 0.005, 0.3)
+        duration_s=100.0,
+        rate_hz=20.0,
+        parent=_white(0.001, 0.08),
+        child=_slow(_white(0.001, 0.08), 1.0, 0.005, 0.3),
     ),
     "hand_gm_03s_white": _hand(
-        80.0, 20.0, _slow(_HAND, 0.3, 0.003, 0.2), _slow(_HAND, 0.3, 0.006, 0.4)
+        duration_s=80.0,
+        rate_hz=20.0,
+        parent=_slow(_HAND, 0.3, 0.003, 0.2),
+        child=_slow(_HAND, 0.3, 0.006, 0.4),
     ),
     "hand_flicker": _hand(
-        80.0, 15.0, _MOCAP, replace(_white(0.001, 0.06), slow=_FLICKER)
+        duration_s=80.0,
+        rate_hz=15.0,
+        parent=_MOCAP,
+        child=replace(_white(0.001, 0.06), slow=_FLICKER),
     ),
-    "car_ins_lidar": _car(240.0, 10.0, _INS, LIDAR_ODOMETRY),
+    "car_ins_lidar": _car(
+        duration_s=240.0,
+        rate_hz=10.0,
+        parent=_INS,
+        child=LIDAR_ODOMETRY,
+    ),
     "car_vo_scale": _car(
-        240.0,
-        10.0,
-        _INS,
-        replace(
+        duration_s=240.0,
+        rate_hz=10.0,
+        parent=_INS,
+        child=replace(
             _white(0.004, 0.02), walk_by_metre=sigmas(0.004, 0.01), scale=(0.01, 40.0)
         ),
         lever_m=1.2,
     ),
     "car_jitter": _car(
-        180.0,
-        10.0,
-        replace(_INS, jitter_s=0.001),
-        replace(LIDAR_ODOMETRY, jitter_s=0.004),
+        duration_s=180.0,
+        rate_hz=10.0,
+        parent=replace(_INS, jitter_s=0.001),
+        child=replace(LIDAR_ODOMETRY, jitter_s=0.004),
         lever_m=1.0,
     ),
     "car_lever": _car(
-        200.0,
-        10.0,
-        replace(_white(0.01, 0.08), walk=sigmas(0.01, 0.01)),
-        replace(_white(0.01, 0.08), walk_by_metre=sigmas(0.004, 0.008)),
+        duration_s=200.0,
+        rate_hz=10.0,
+        parent=replace(_white(0.01, 0.08), walk=sigmas(0.01, 0.01)),
+        child=replace(_white(0.01, 0.08), walk_by_metre=sigmas(0.004, 0.008)),
         lever_m=5.0,
     ),
-    "car_two_slams": _car(250.0, 10.0, slam(12.0, 0.05, 0.08), slam(8.0, 0.08, 0.12)),
+    "car_two_slams": _car(
+        duration_s=250.0,
+        rate_hz=10.0,
+        parent=slam(12.0, 0.05, 0.08),
+        child=slam(8.0, 0.08, 0.12),
+    ),
     "agv_ramps": _agv(
-        240.0,
-        10.0,
-        replace(_white(0.001, 0.01), walk_by_metre=sigmas(0.004, 0.05)),
-        _slow(_white(0.004, 0.04), 3.0, 0.01, 0.06, in_world=True),
+        duration_s=240.0,
+        rate_hz=10.0,
+        parent=replace(_white(0.001, 0.01), walk_by_metre=sigmas(0.004, 0.05)),
+        child=_slow(_white(0.004, 0.04), 3.0, 0.01, 0.06, in_world=True),
     ),
     "agv_long": _agv(
-        1200.0,
-        2.5,
-        replace(_white(0.002, 0.02), walk_by_metre=sigmas(0.004, 0.05)),
-        _slow(_white(0.005, 0.05), 20.0, 0.015, 0.08, in_world=True),
+        duration_s=1200.0,
+        rate_hz=2.5,
+        parent=replace(_white(0.002, 0.02), walk_by_metre=sigmas(0.004, 0.05)),
+        child=_slow(_white(0.005, 0.05), 20.0, 0.015, 0.08, in_world=True),
     ),
     "drone_gnss_vio": _drone(
-        150.0,
-        20.0,
-        _slow(_white(0.004, 0.05), 15.0, 0.15, 0.2, in_world=True),
-        VIO,
+        duration_s=150.0,
+        rate_hz=20.0,
+        parent=_slow(_white(0.004, 0.05), 15.0, 0.15, 0.2, in_world=True),
+        child=VIO,
         lever_m=0.2,
     ),
     "drone_rotation_1deg": _drone(
-        100.0,
-        20.0,
-        _white(0.002, 1.0),
-        replace(_white(0.003, 0.3), walk=sigmas(0.002, 0.02)),
+        duration_s=100.0,
+        rate_hz=20.0,
+        parent=_white(0.002, 1.0),
+        child=replace(_white(0.003, 0.3), walk=sigmas(0.002, 0.02)),
     ),
     "arm_target": _arm(
-        150.0,
-        10.0,
-        _slow(_white(0.0001, 0.005), 5.0, 0.0003, 0.02),
-        _slow(
+        duration_s=150.0,
+        rate_hz=10.0,
+        parent=_slow(_white(0.0001, 0.005), 5.0, 0.0003, 0.02),
+        child=_slow(
             SensorErrors(
                 white=sigmas(
                     np.array([0.0008, 0.0008, 0.003]), np.array([0.3, 0.3, 0.06])
@@ -237,39 +266,39 @@ CLASSES = {
         ),
     ),
     "hand_t3": _hand(
-        60.0,
-        20.0,
-        _STEADY,
-        replace(_white(0.003, 0.2), tail=Tail("student", factor=3.0)),
+        duration_s=60.0,
+        rate_hz=20.0,
+        parent=_STEADY,
+        child=replace(_white(0.003, 0.2), tail=Tail("student", factor=3.0)),
     ),
     "hand_spikes": _hand(
-        60.0,
-        20.0,
-        _STEADY,
-        replace(_white(0.003, 0.2), tail=Tail("spikes", 0.05, 20.0)),
+        duration_s=60.0,
+        rate_hz=20.0,
+        parent=_STEADY,
+        child=replace(_white(0.003, 0.2), tail=Tail("spikes", 0.05, 20.0)),
     ),
     "hand_bursts": _hand(
-        90.0,
-        20.0,
-        replace(_STEADY, walk=sigmas(0.001, 0.02)),
-        replace(_white(0.002, 0.15), tail=Tail("bursts", 0.15, 10.0)),
+        duration_s=90.0,
+        rate_hz=20.0,
+        parent=replace(_STEADY, walk=sigmas(0.001, 0.02)),
+        child=replace(_white(0.002, 0.15), tail=Tail("bursts", 0.15, 10.0)),
     ),
     "drone_anisotropic": _drone(
-        120.0,
-        20.0,
-        SensorErrors(
+        duration_s=120.0,
+        rate_hz=20.0,
+        parent=SensorErrors(
             white=sigmas(np.array([0.002, 0.002, 0.012]), np.array([0.3, 0.1, 0.1]))
         ),
-        SensorErrors(
+        child=SensorErrors(
             white=sigmas(np.array([0.015, 0.003, 0.003]), np.array([0.1, 0.1, 0.5])),
             walk=sigmas(np.array([0.004, 0.001, 0.001]), np.array([0.01, 0.01, 0.04])),
         ),
     ),
     "hand_mixture_30s": _hand(
-        30.0,
-        30.0,
-        _white(0.001, 0.08),
-        _slow(
+        duration_s=30.0,
+        rate_hz=30.0,
+        parent=_white(0.001, 0.08),
+        child=_slow(
             replace(_white(0.002, 0.1), walk=sigmas(0.003, 0.05), jumps_per_s=0.2),
             2.0,
             0.002,
@@ -277,17 +306,19 @@ CLASSES = {
         ),
     ),
     "drone_two_vios": _drone(
-        140.0,
-        15.0,
-        VIO,
-        replace(_white(0.001, 0.04), walk=sigmas(0.006, 0.05), scale=(0.005, 20.0)),
+        duration_s=140.0,
+        rate_hz=15.0,
+        parent=VIO,
+        child=replace(
+            _white(0.001, 0.04), walk=sigmas(0.006, 0.05), scale=(0.005, 20.0)
+        ),
         lever_m=0.1,
     ),
     "flat_agv": _flat_agv(
-        200.0,
-        10.0,
-        replace(_white(0.002, 0.02), walk_by_metre=sigmas(0.004, 0.05)),
-        replace(_white(0.005, 0.05), walk_by_metre=sigmas(0.003, 0.03)),
+        duration_s=200.0,
+        rate_hz=10.0,
+        parent=replace(_white(0.002, 0.02), walk_by_metre=sigmas(0.004, 0.05)),
+        child=replace(_white(0.005, 0.05), walk_by_metre=sigmas(0.003, 0.03)),
     ),
 }
 

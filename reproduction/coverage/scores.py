@@ -117,7 +117,8 @@ def level_row(folder: Path, dataset: str, level: float | None, method: str) -> R
 
 
 def _squared(xi: FloatArray, covariance: FloatArray) -> float:
-    return float(xi @ np.linalg.solve(covariance, xi))
+    weighted = np.linalg.solve(covariance, xi)
+    return float(xi @ weighted)
 
 
 def truth_row(rig: Rig, name: str, method: str) -> Row:
@@ -176,7 +177,11 @@ def _knows(result: Calibration) -> BoolArray:
 
 
 def _by_axis(values: BoolArray, is_comparable: BoolArray) -> dict[str, float]:
-    return {axis: float(values[k]) for k, axis in enumerate(AXES) if is_comparable[k]}
+    by_axis = {}
+    for axis, value, is_used in zip(AXES, values, is_comparable, strict=True):
+        if is_used:
+            by_axis[axis] = float(value)
+    return by_axis
 
 
 def refused_row(rig: Rig, name: str, method: str) -> Row:

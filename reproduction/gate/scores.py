@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
-from hand_eye_calib.core.geometry.se3 import deviation
+from hand_eye_calib.core.geometry.se3 import deviation, rotation_of
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.reasons import Verdict
 from reproduction.coverage.measures import MEDIAN_3
@@ -119,7 +119,8 @@ def _errors_of(
 
 def _to_parent(result: Calibration) -> FloatArray:
     """Return the rotation (6, 6) of errors from the child's axes to the parent's axes."""
-    return np.asarray(np.kron(np.eye(2), result.T_parent_child[:3, :3]))
+    rotation = rotation_of(result.T_parent_child)
+    return np.asarray(np.kron(np.eye(2), rotation))
 
 
 def score_simulated(family: str, seed: int, number: int) -> Score:
@@ -129,7 +130,8 @@ def score_simulated(family: str, seed: int, number: int) -> Score:
 
 def _squared(errors: FloatArray, covariance: FloatArray) -> float:
     """Return the squared Mahalanobis distance of errors."""
-    return float(errors @ np.linalg.solve(covariance, errors))
+    weighted = np.linalg.solve(covariance, errors)
+    return float(errors @ weighted)
 
 
 def _sizes(errors: FloatArray, truth_sigmas: FloatArray) -> tuple[float, ...]:

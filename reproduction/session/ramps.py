@@ -28,9 +28,24 @@ CLASSES_IN_TURN = ("agv_long", "agv_ramps")
 # Target in units of the default target: 4 cm and 0.6 deg.
 *_, FACTOR = FACTORS
 RULES = [
-    Rule(1.0, 0.5, 20.0, 75.0),
-    Rule(1.0, 0.5, 40.0, 75.0),
-    Rule(1.0, 1.0, 45.0, 75.0),
+    Rule(
+        of_target=1.0,
+        of_motion=0.5,
+        shortest_s=20.0,
+        longest_s=75.0,
+    ),
+    Rule(
+        of_target=1.0,
+        of_motion=0.5,
+        shortest_s=40.0,
+        longest_s=75.0,
+    ),
+    Rule(
+        of_target=1.0,
+        of_motion=1.0,
+        shortest_s=45.0,
+        longest_s=75.0,
+    ),
 ]
 
 # Ends (s) of the parts of a recording.

@@ -88,17 +88,72 @@ class Rule(NamedTuple):
 
 
 RULES = [
-    Rule(0.7, 0.0, 0.0, 0.0),
-    Rule(1.0, 0.0, 0.0, 0.0),
-    Rule(1.0, 0.0, 20.0, 20.0),
-    Rule(1.0, 0.0, 30.0, 30.0),
-    Rule(1.0, 0.0, 60.0, 60.0),
-    Rule(1.0, 0.5, 20.0, 60.0),
-    Rule(1.0, 0.5, 20.0, 75.0),
-    Rule(1.0, 0.5, 20.0, 90.0),
-    Rule(1.0, 0.5, 20.0, np.inf),
-    Rule(1.0, 1.0, 20.0, 90.0),
-    Rule(1.0, 1.0, 20.0, np.inf),
+    Rule(
+        of_target=0.7,
+        of_motion=0.0,
+        shortest_s=0.0,
+        longest_s=0.0,
+    ),
+    Rule(
+        of_target=1.0,
+        of_motion=0.0,
+        shortest_s=0.0,
+        longest_s=0.0,
+    ),
+    Rule(
+        of_target=1.0,
+        of_motion=0.0,
+        shortest_s=20.0,
+        longest_s=20.0,
+    ),
+    Rule(
+        of_target=1.0,
+        of_motion=0.0,
+        shortest_s=30.0,
+        longest_s=30.0,
+    ),
+    Rule(
+        of_target=1.0,
+        of_motion=0.0,
+        shortest_s=60.0,
+        longest_s=60.0,
+    ),
+    Rule(
+        of_target=1.0,
+        of_motion=0.5,
+        shortest_s=20.0,
+        longest_s=60.0,
+    ),
+    Rule(
+        of_target=1.0,
+        of_motion=0.5,
+        shortest_s=20.0,
+        longest_s=75.0,
+    ),
+    Rule(
+        of_target=1.0,
+        of_motion=0.5,
+        shortest_s=20.0,
+        longest_s=90.0,
+    ),
+    Rule(
+        of_target=1.0,
+        of_motion=0.5,
+        shortest_s=20.0,
+        longest_s=np.inf,
+    ),
+    Rule(
+        of_target=1.0,
+        of_motion=1.0,
+        shortest_s=20.0,
+        longest_s=90.0,
+    ),
+    Rule(
+        of_target=1.0,
+        of_motion=1.0,
+        shortest_s=20.0,
+        longest_s=np.inf,
+    ),
 ]
 
 
