@@ -98,7 +98,10 @@ TABLE = """
 2 | calibrate lidar.tum camera.tum --setup hand | run arm with the samples of an arm
 2 | calibrate lidar.tum camera.tum --parent-angles ur | it needs two files and --order none
 2 | calibrate lidar.tum camera.tum --target charuco:5x7 | --target and --camera go together
-1 | calibrate samples.yaml | samples.yaml: expected samples of an arm
+1 | calibrate samples.yaml | samples.yaml: the list of samples is empty; expected samples of an arm
+1 | arm half.yaml | half.yaml, sample 1: robot has no tracking; each sample needs both poses
+1 | calibrate lidar.tum camera.tum --columns t,x,x,y,z,qx,qy,qz,qw | 2 columns have the name x
+2 | calibrate lidar.tum camera.tum --format kity | did you mean kitti?
 1 | calibrate samples.npz | cannot read samples.npz: File is not a zip file
 1 | arm lidar.tum camera.tum | or calibrate streams with stamps by time
 2 | arm sample:arm.yaml --setup both | invalid choice: 'both' (choose from 'hand', 'beside')
@@ -136,7 +139,7 @@ TABLE = """
 2 | compare saved --with "1 2 3 4 5" | expected a URDF, extrinsic.yaml, a bag, or X Y Z
 2 | export saved urdff | did you mean urdf?
 2 | simulate --out new --drive hily | did you mean hilly?
-2 | check | expected one bag or two trajectory files; got 0
+2 | check | got 0: for example, hand_eye_calib check sample:lidar.tum sample:camera.tum
 2 | check drive.mcap camera.tum | drive.mcap is a bag, and another path is not
 1 | info absent | cannot read absent: No such file or directory
 1 | info list.yaml | expected format hand_eye_calib/extrinsic
@@ -172,6 +175,7 @@ TEXTS = {
     "value.yaml": "max_gap: fast\n",
     "other.yaml": "/talker:\n  ros__parameters:\n    rate: 3\n",
     "samples.yaml": "samples: []\n",
+    "half.yaml": "- robot: [1, 0, 0, 0, 0, 0, 1]\n",
     "samples.npz": "junk",
     "junk.mcap": "junk" * 10,
     "junk.db3": "junk" * 10,

@@ -267,7 +267,8 @@ def require_same_frames(results: Iterable[Calibration]) -> None:
     frames = {f"{result.child_frame} in {result.parent_frame}" for result in results}
     if len(frames) > 1:
         raise InputError(
-            f"expected results of one pair of frames; found {' and '.join(sorted(frames))}"
+            f"expected results of one pair of frames; found {' and '.join(sorted(frames))}: "
+            "calibrate all with the same parent_frame and child_frame"
         )
 
 

@@ -169,7 +169,8 @@ def _listed_samples(path: str | Path, document: Any) -> ArmSamples:
     elif isinstance(document, Mapping):
         document = [*_numbered_pairs(document)]
     if not isinstance(document, list) or not document:
-        raise InputError(f"{path}: expected {_EXPECTED}")
+        empty = "the list of samples is empty; " if document == [] else ""
+        raise InputError(f"{path}: {empty}expected {_EXPECTED}")
     poses = []
     for number, sample in enumerate(document, 1):
         with located(f"{path}, sample {number}"):
@@ -225,10 +226,24 @@ def _both_poses(sample: Any) -> Sequence[Any]:
     """Return both poses of a sample, the robot's first."""
     if isinstance(sample, Mapping):
         names = next((names for names in _NAMES if {*names} <= sample.keys()), ())
+        if not names:
+            _refuse_half_sample(sample)
         sample = [sample[name] for name in names]
     if not isinstance(sample, Sequence) or len(sample) != 2:
         raise InputError(f"expected {_EXPECTED}")
     return sample
+
+
+def _refuse_half_sample(sample: Mapping[str, Any]) -> None:
+    """Raise an InputError if a sample has the pose of one side only."""
+    for names in _NAMES:
+        missing = [name for name in names if name not in sample]
+        if len(missing) == 1:
+            (present,) = {*names} - {*missing}
+            raise InputError(
+                f"{present} has no {missing[0]}; each sample needs both poses: complete or remove "
+                "the sample"
+            )
 
 
 # ------------------------------------------------------------------ arguments of OpenCV

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from hand_eye_calib.core.base.config import PAIR_BY, STAMP_UNITS, TRAJECTORY_FORMATS
 from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.base.option import did_you_mean
 
 #: Value of the options ``format`` and ``measures``: recognise them from the content of the file.
 AUTO = "auto"
@@ -52,4 +53,5 @@ def _refuse_unknown(setting: str, value: str, choices: Sequence[str]) -> None:
     if value not in choices:
         raise ConfigError(
             f"unknown {setting} {value!r}; known are {', '.join(choices)}"
+            f"{did_you_mean(value, choices)}"
         )

@@ -168,7 +168,13 @@ class Table:
             )
         for name in (*self.stamp_names, *quantities):
             if len(columns[name]) > 1:
-                listed = self._listed([self.names[column] for column in columns[name]])
+                found = [self.names[column] for column in columns[name]]
+                if len({*found}) == 1:
+                    raise InputError(
+                        f"{self.path}: {len(found)} columns have the name {found[0]}; name each "
+                        "column once, with `columns`"
+                    )
+                listed = self._listed(found)
                 raise InputError(
                     f"{self.path}: each of the columns {listed} could be {name}; "
                     "name them with `columns`"
