@@ -39,7 +39,8 @@ def notebook_files(path):
 
 
 def on_page_content(html, **_):
-    """Roles of Sphinx in docstrings become plain names."""
+    """Roles of Sphinx in docstrings become plain names, empty headings of tables plain cells."""
+    html = re.sub(r"<th[^>]*></th>", "<td></td>", html)
     return re.sub(r":\w+:<code>~?(?:[\w.]+\.)?(\w+)</code>", r"<code>\1</code>", html)
 
 

@@ -1,6 +1,7 @@
 """The Python functions :func:`calibrate` and :func:`cross_check`, for two whole trajectories."""
 
 import inspect
+import re
 import textwrap
 import warnings
 from collections.abc import Mapping, Sequence
@@ -126,7 +127,6 @@ def calibrate(
         if ``reference`` is set. Default: it is compared unless ``reference`` is set.
     progress : callable, optional
         Called with the finished share of the work, 0 to 1, and the name of the next step.
-    OPTIONS
 
     Raises
     ------
@@ -247,8 +247,8 @@ def _read_bag(path: Path, topics: Mapping[str, str | None]) -> Sequence[Trajecto
     return trajectories
 
 
-def _options_in_words() -> str:
-    """Return the parameters of :func:`calibrate` that are options, as text for its docstring."""
+def _options_in_words() -> list[str]:
+    """Return the parameters of :func:`calibrate` that are options, as lines of its docstring."""
     names = inspect.signature(calibrate).parameters
     lines = []
     for field in fields(CalibratorConfig):
@@ -262,12 +262,21 @@ def _options_in_words() -> str:
         lines.append(f"{field.name} : {kind}, optional")
         description = textwrap.wrap(f"{field.metadata['doc']} Default: {default}.", 92)
         lines += [f"    {line}" for line in description]
-    return "\n    ".join(lines)
+    return lines
+
+
+def _with_options(docstring: str) -> str:
+    """Return a docstring with all options at the end of its parameters."""
+    parameters, heading, rest = re.split(r"(\n\n *Raises\n)", docstring, maxsplit=1)
+    # Python 3.13 removes the indentation of docstrings.
+    indentation = heading.strip("\n").removesuffix("Raises")
+    options = "".join(f"\n{indentation}{line}" for line in _options_in_words())
+    return parameters + options + heading + rest
 
 
 # python -OO removes docstrings.
 if calibrate.__doc__:
-    calibrate.__doc__ = calibrate.__doc__.replace("OPTIONS", _options_in_words())
+    calibrate.__doc__ = _with_options(calibrate.__doc__)
 
 
 def prior_fields(prior: Prior) -> dict[str, str]:
