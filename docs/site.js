@@ -9,6 +9,8 @@ function complete() {
   for (const [selector, name, value] of missing) {
     for (const element of document.querySelectorAll(selector)) {
       if (element.getAttribute(name) !== value) element.setAttribute(name, value);
+      // An element without a role has no name.
+      if (value === "presentation") element.removeAttribute("aria-label");
     }
   }
 }
