@@ -199,18 +199,33 @@ def test_clouds_without_overlap_are_said_to_prove_nothing(tmp_path):
     assert "proves nothing" in figure.caption
 
 
+def points_between(rng, count, **fixed):
+    """Points within 3 m of the origin, with some coordinates fixed."""
+    points = []
+    for axis in "xyz":
+        if axis in fixed:
+            points.append(np.full(count, fixed[axis]))
+        else:
+            points.append(rng.uniform(-3, 3, count))
+    return np.column_stack(points)
+
+
 def test_walls_are_parallel_to_an_axis_of_the_picture_if_a_sensor_moves_in_all_directions():
     rng = np.random.default_rng(5)
     # Floor and two walls of a room, with few points on the floor.
-    floor = np.column_stack([rng.uniform(-3, 3, (400, 2)), np.full(400, -1.0)])
-    wall = np.column_stack([np.full(900, 3.0), rng.uniform(-3, 3, (900, 2))])
-    other = np.column_stack(
-        [rng.uniform(-3, 3, 800), np.full(800, -3.0), rng.uniform(-3, 3, 800)]
-    )
-    room = np.vstack([floor, wall, other]) + 0.005 * rng.standard_normal((2100, 3))
-    R = se3.rotation_from_rpy([0.3, -0.4, 1.0])
-    axis = merging._axis_of_surfaces(room @ R.T, np.array([0.0, 0.0, 1.0]))
-    assert np.degrees(np.arccos(axis @ R[:, 2])) < 0.5
+    floor = points_between(rng, 400, z=-1.0)
+    wall = points_between(rng, 900, x=3.0)
+    other_wall = points_between(rng, 800, y=-3.0)
+    noise_m = 0.005 * rng.standard_normal((2100, 3))
+    room = np.vstack([floor, wall, other_wall]) + noise_m
+    rotation = se3.rotation_from_rpy([0.3, -0.4, 1.0])
+    up = np.array([0.0, 0.0, 1.0])
+
+    axis = merging._axis_of_surfaces(room @ rotation.T, up)
+
+    true_up = rotation[:, 2]
+    angle = np.arccos(axis @ true_up)
+    assert np.degrees(angle) < 0.5
 
 
 def test_one_lidar_alone_has_no_picture(tmp_path):

@@ -40,16 +40,24 @@ def smooth_streams(n_poses=600, noise_rad=2e-4, seed=1):
     bias."""
     random = np.random.default_rng(seed)
     stamps_ns = START_NS + STEP_NS * np.arange(n_poses)
-    parent = Trajectory(stamps_ns, wandering_poses(n_poses, seed))
-    child = Trajectory(stamps_ns, child_of(parent.poses))
-    fine_ns = START_NS + STEP_NS // 5 * np.arange(5 * (n_poses - 1))
-    fine = child.at(fine_ns)
-    steps = np.swapaxes(fine[:-1, :3, :3], 1, 2) @ fine[1:, :3, :3]
-    rates = se3.rotation_log(steps) / (STEP_NS / 5 * 1e-9) + BIAS
-    middle_ns = fine_ns[:-1] + STEP_NS // 10 - round(OFFSET_S * 1e9)
-    noise = noise_rad * random.normal(size=(n_poses, 3))
-    noisy = parent.poses @ se3.exp(np.c_[np.zeros((n_poses, 3)), noise])
-    return Trajectory(stamps_ns, noisy, "lidar"), middle_ns, rates
+    parent_poses = wandering_poses(n_poses, seed)
+    child = Trajectory(stamps_ns, child_of(parent_poses))
+
+    n_fine = 5 * (n_poses - 1)
+    fine_step_ns = STEP_NS // 5
+    fine_ns = START_NS + fine_step_ns * np.arange(n_fine)
+    rotations = child.at(fine_ns)[:, :3, :3]
+    back = np.swapaxes(rotations[:-1], 1, 2)
+    turns = se3.rotation_log(back @ rotations[1:])
+    rates = turns / (STEP_NS / 5 * 1e-9) + BIAS
+    offset_ns = round(OFFSET_S * 1e9)
+    middle_ns = fine_ns[:-1] + STEP_NS // 10 - offset_ns
+
+    no_shift = np.zeros((n_poses, 3))
+    turn_noise = noise_rad * random.normal(size=(n_poses, 3))
+    noise = se3.exp(np.c_[no_shift, turn_noise])
+    parent = Trajectory(stamps_ns, parent_poses @ noise, "lidar")
+    return parent, middle_ns, rates
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +72,9 @@ def result(streams):
 
 
 def angle_to(rotation, result):
-    return float(se3.rotation_angle(rotation.T @ result.T_parent_child[:3, :3]))
+    estimated = result.T_parent_child[:3, :3]
+    difference = rotation.T @ estimated
+    return float(se3.rotation_angle(difference))
 
 
 class TestRates:
@@ -169,8 +179,10 @@ class TestIntegration:
         assert np.abs(np.concatenate(parts) - whole).max() < 1e-12
 
     def test_a_rate_that_is_not_finite_is_refused(self):
+        stamps_ns = np.arange(2)
+        rates = [[0, 0, 0], [np.nan, 0, 0]]
         with pytest.raises(InputError, match="rate 1"):
-            Trajectory.from_rates(np.arange(2), [[0, 0, 0], [np.nan, 0, 0]])
+            Trajectory.from_rates(stamps_ns, rates)
 
 
 class TestFiles:

@@ -134,7 +134,9 @@ def test_noise_is_as_strong_as_published(published_folder, level, config):
     noisy = published_runs(published_folder, level)
 
     def rms(noisy, clean):
-        return np.sqrt(np.square(noisy[:, :3, 3] - clean[:, :3, 3]).sum(axis=1).mean())
+        errors = noisy[:, :3, 3] - clean[:, :3, 3]
+        squared_distances = np.square(errors).sum(axis=1)
+        return np.sqrt(squared_distances.mean())
 
     theirs = [list(map(rms, *sensors)) for sensors in zip(noisy, clean, strict=True)]
     ours = [

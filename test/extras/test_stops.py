@@ -26,10 +26,13 @@ def random():
 
 def arm(random, n=25, is_in_hand=True, turn_rad=(0.5, 0.5, 0.5)):
     """Poses of the hand in the base, of the target in the camera, and where the camera is."""
-    X, Z = se3.exp(random.normal(size=(2, 6)) * np.repeat([0.1, 1.0], 3))
-    robot = se3.exp(random.normal(size=(n, 6)) * [0.3, 0.3, 0.3, *turn_rad])
+    mount_sigmas = np.repeat([0.1, 1.0], 3)
+    X, Z = se3.exp(random.normal(size=(2, 6)) * mount_sigmas)
+    robot_sigmas = [0.3, 0.3, 0.3, *turn_rad]
+    robot = se3.exp(random.normal(size=(n, 6)) * robot_sigmas)
     moving = robot if is_in_hand else se3.inverse(robot)
-    tracking = se3.inverse(moving @ X) @ Z @ se3.exp(random.normal(size=(n, 6)) * NOISE)
+    noise = se3.exp(random.normal(size=(n, 6)) * NOISE)
+    tracking = se3.inverse(moving @ X) @ Z @ noise
     return robot, tracking, X, Z
 
 
@@ -73,8 +76,10 @@ def test_inverse_poses_are_named(random):
 
 def test_priors_on_wrong_axes_contradict(random):
     robot, tracking, X, _ = arm(random)
-    config = CalibratorConfig(prior_x=f"{X[0, 3] + 1.0}+/-0.001")
-    assert calibrate_arm(robot, tracking, config).status is hec.SolveStatus.CONTRADICTED
+    wrong_x = X[0, 3] + 1.0
+    config = CalibratorConfig(prior_x=f"{wrong_x}+/-0.001")
+    result = calibrate_arm(robot, tracking, config)
+    assert result.status is hec.SolveStatus.CONTRADICTED
 
 
 @pytest.mark.parametrize(

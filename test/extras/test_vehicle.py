@@ -180,9 +180,14 @@ def test_a_mount_that_moved_is_a_warning():
 
 def test_clocks_that_differ_by_seconds():
     drive = machine()
-    result = hec.calibrate_vehicle(drive.sensor.shifted(-3.0), drive.wheels)
-    assert result.time_offset_s == pytest.approx(3.0 + drive.clock_s, abs=0.008)
-    assert np.abs(pose_errors(result, drive.T_base_sensor))[:2].max() < 0.01
+    early_sensor = drive.sensor.shifted(-3.0)
+
+    result = hec.calibrate_vehicle(early_sensor, drive.wheels)
+
+    offset_s = 3.0 + drive.clock_s
+    assert result.time_offset_s == pytest.approx(offset_s, abs=0.008)
+    errors = np.abs(pose_errors(result, drive.T_base_sensor))
+    assert errors[:2].max() < 0.01
 
 
 def test_two_dimensional_poses_have_no_roll_and_pitch():
@@ -243,13 +248,17 @@ def test_too_short_a_drive_raises():
 
 
 def test_speeds_in_another_unit_are_refused():
+    stamps_ns = np.arange(3) * 20_000_000
+    in_mm_s = [[0.0, 2000.0]] * 3
     with pytest.raises(InputError, match=r"in rad/s or m/s"):
-        hec.wheel_trajectory(np.arange(3) * 20_000_000, [[0.0, 2000.0]] * 3, "wheels")
+        hec.wheel_trajectory(stamps_ns, in_mm_s, "wheels")
 
 
 def test_wheels_need_increasing_stamps():
+    equal_stamps_ns = np.zeros(3, dtype=np.int64)
+    speeds = np.ones((3, 2))
     with pytest.raises(InputError, match="increase"):
-        hec.wheel_trajectory(np.zeros(3, dtype=np.int64), np.ones((3, 2)), "wheels")
+        hec.wheel_trajectory(equal_stamps_ns, speeds, "wheels")
 
 
 # ------------------------------------------------------------------ options
@@ -301,14 +310,19 @@ def document_with(**options):
 
 
 def test_every_option_is_in_a_table():
-    options = {name for name in CalibratorConfig().to_options() if "prior." not in name}
-    names = {name.replace(".", "_") for name in options}
-    assert names == ({*OBEYED, *REFUSED} - {"prior"}) | {"parent_measures"}
+    options = set()
+    for name in CalibratorConfig().to_options():
+        if "prior." not in name:
+            options.add(name.replace(".", "_"))
+    in_tables = {*OBEYED, *REFUSED} - {"prior"}
+    assert options == in_tables | {"parent_measures"}
 
 
 @pytest.mark.parametrize("option", OBEYED)
 def test_an_option_is_obeyed(option):
-    assert document_with(**{option: OBEYED[option]}) != document_with()
+    with_option = document_with(**{option: OBEYED[option]})
+    without = document_with()
+    assert with_option != without
 
 
 @pytest.mark.parametrize("option", REFUSED)
@@ -326,16 +340,19 @@ def test_an_option_is_refused(option):
     ids=["rhythm of the curves", "another rhythm"],
 )
 def test_ramps_in_the_rhythm_of_the_curves_widen_roll(period, is_counted):
-    windows = np.arange(360)
+    angles = 2 * np.pi * np.arange(360)
     motions = np.zeros((360, 6))
-    motions[:, 5] = 0.3 * np.sin(2 * np.pi * windows / 28.0)
+    motions[:, 5] = 0.3 * np.sin(angles / 28.0)
     residuals = np.zeros((360, 6))
-    residuals[:, 4] = 0.01 * np.sin(2 * np.pi * windows / period)
+    residuals[:, 4] = 0.01 * np.sin(angles / period)
     drive = SimpleNamespace(measured=lambda _: motions, components=range(6))
     fit = SimpleNamespace(residuals=residuals, T_base_sensor=np.eye(4))
-    sigma = np.sqrt(solving._variance_of_ramps(drive, fit))
+
+    variance = solving._variance_of_ramps(drive, fit)
+
     # Without a phase in common, the regression of equal rhythms is 1/30 over the root of 2.
-    assert sigma == pytest.approx(is_counted * 0.0236, abs=0.006)
+    expected = 0.0236 if is_counted else 0.0
+    assert np.sqrt(variance) == pytest.approx(expected, abs=0.006)
 
 
 @pytest.mark.parametrize("course", ["one turn", "curves"])
@@ -374,7 +391,10 @@ def test_an_unknown_y_is_no_lateral_acceleration():
 
 def test_mecanum_wheels_turn_as_the_machine_moves():
     still = simulate_machine(4, "mecanum", duration_s=30.0, noise=0.0)
-    forward, left, turn = still.values.T * np.array(still.parameters)[:, None]
+    parameters = np.array(still.parameters)
+    forward, left, turn = parameters[:, None] * still.values.T
+    fastest_left = np.abs(left).max()
+    fastest_turn = np.abs(turn).max()
     assert forward == pytest.approx(0.8, abs=0.3)
-    assert np.abs(left).max() == pytest.approx(0.4, abs=0.01)
-    assert np.abs(turn).max() == pytest.approx(0.9 * 0.9, abs=0.2)
+    assert fastest_left == pytest.approx(0.4, abs=0.01)
+    assert fastest_turn == pytest.approx(0.9 * 0.9, abs=0.2)

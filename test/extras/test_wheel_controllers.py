@@ -80,14 +80,18 @@ def diff_drive(parameters, rates, seconds):
 
 
 def ackermann(parameters, rates, seconds):
-    forward = rates[:, 0] * parameters["traction_wheels_radius"] * seconds
-    return driven(forward, forward * np.tan(rates[:, 1]) / parameters["wheelbase"])
+    wheel_rates, angles = rates.T
+    forward = wheel_rates * parameters["traction_wheels_radius"] * seconds
+    turns = forward * np.tan(angles) / parameters["wheelbase"]
+    return driven(forward, turns)
 
 
 def tricycle(parameters, rates, seconds):
-    rolled = rates[:, 0] * parameters["wheel_radius"] * seconds
-    turns = rolled * np.sin(rates[:, 1]) / parameters["wheelbase"]
-    return driven(rolled * np.cos(rates[:, 1]), turns)
+    wheel_rates, angles = rates.T
+    rolled = wheel_rates * parameters["wheel_radius"] * seconds
+    forward = rolled * np.cos(angles)
+    turns = rolled * np.sin(angles) / parameters["wheelbase"]
+    return driven(forward, turns)
 
 
 # Equations of the controller, and its parameters by the drawing. The wheels of the machines are

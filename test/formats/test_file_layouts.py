@@ -281,11 +281,16 @@ PLACES = {
 
 @pytest.mark.parametrize("form", PLACES)
 def test_latitudes_are_read_in_every_form(tmp_path, form):
-    trajectory = read(written(tmp_path / "ins.txt", PLACES[form])).trajectory
+    path = written(tmp_path / "ins.txt", PLACES[form])
+
+    trajectory = read(path).trajectory
+
+    positions = trajectory.poses[:, :3, 3]
+    rotations = trajectory.poses[:, :3, :3]
     assert_array_equal(trajectory.stamps_ns, TRUTH.stamps_ns)
     # Of the metres, 12 digits of a latitude leave 1e-5, and the axes of the first position 1e-4.
-    assert_allclose(trajectory.poses[:, :3, 3], P - P[0], atol=5e-4)
-    assert_allclose(trajectory.poses[:, :3, :3], R, atol=1e-5)
+    assert_allclose(positions, P - P[0], atol=5e-4)
+    assert_allclose(rotations, R, atol=1e-5)
 
 
 MS_OF_WEEK = [f"{1e3 * float(second):.0f}" for second in SOW]

@@ -50,36 +50,45 @@ def with_poses(stream, rotations, positions):
 
 
 def of_motions(stream):
-    steps = se3.inverse(stream.poses[:-1]) @ stream.poses[1:]
-    return dataclasses.replace(stream, stamps_ns=stream.stamps_ns[1:], poses=steps)
+    poses = stream.poses
+    steps = se3.inverse(poses[:-1]) @ poses[1:]
+    ends_ns = stream.stamps_ns[1:]
+    return dataclasses.replace(stream, stamps_ns=ends_ns, poses=steps)
 
 
 def of_backward_motions(stream):
-    steps = se3.inverse(stream.poses[1:]) @ stream.poses[:-1]
-    return dataclasses.replace(stream, stamps_ns=stream.stamps_ns[1:], poses=steps)
+    poses = stream.poses
+    steps = se3.inverse(poses[1:]) @ poses[:-1]
+    ends_ns = stream.stamps_ns[1:]
+    return dataclasses.replace(stream, stamps_ns=ends_ns, poses=steps)
 
 
 def in_turning_axes(stream):
     """Angles about turning axes, roll first, read as those about fixed axes."""
     rotations = stream.poses[:, :3, :3]
-    pitch = np.arcsin(np.clip(rotations[:, 0, 2], -1.0, 1.0))
+    positions = stream.poses[:, :3, 3]
+    sine = np.clip(rotations[:, 0, 2], -1.0, 1.0)
+    pitch = np.arcsin(sine)
     roll = np.arctan2(-rotations[:, 1, 2], rotations[:, 2, 2])
     yaw = np.arctan2(-rotations[:, 0, 1], rotations[:, 0, 0])
-    return with_poses(
-        stream, se3.rotation_from_rpy(np.c_[roll, pitch, yaw]), stream.poses[:, :3, 3]
-    )
+    misread = se3.rotation_from_rpy(np.c_[roll, pitch, yaw])
+    return with_poses(stream, misread, positions)
 
 
 def turned(stream):
     turn = se3.rotation_exp(np.array([0.7, -0.4, 1.1]))
-    return with_poses(stream, stream.poses[:, :3, :3], stream.poses[:, :3, 3] @ turn.T)
+    rotations = stream.poses[:, :3, :3]
+    positions = stream.poses[:, :3, 3]
+    return with_poses(stream, rotations, positions @ turn.T)
 
 
 def from_the_centre(stream):
     """Positions from the centre of the earth with orientations in axes of the place."""
-    axes = axes_of_places(HANNOVER_M[None])[0]
-    positions = stream.poses[:, :3, 3] @ axes.T + HANNOVER_M
-    return with_poses(stream, stream.poses[:, :3, :3], positions)
+    (axes,) = axes_of_places(HANNOVER_M[None])
+    rotations = stream.poses[:, :3, :3]
+    positions = stream.poses[:, :3, 3]
+    from_centre = positions @ axes.T + HANNOVER_M
+    return with_poses(stream, rotations, from_centre)
 
 
 def mirrored_about_the_vertical(stream):
@@ -122,7 +131,9 @@ def test_what_a_stream_is_in_truth_is_named(kind, path, stream):
 @pytest.mark.parametrize("path", PATHS)
 @pytest.mark.parametrize("seed", range(3))
 def test_right_streams_are_not_named(path, seed):
-    assert errors(check_streams(*pair(path, seed))) == set()
+    parent, child = pair(path, seed)
+    checked = check_streams(parent, child)
+    assert errors(checked) == set()
 
 
 def test_streams_of_two_bodies_stay_unrelated():

@@ -38,9 +38,11 @@ def write_unnamed(path, trajectory, order, separator=" "):
 
 def driven(seed=0):
     """A vehicle on flat ground, its sensor mounted in some direction."""
-    poses = planar_poses(400, seed) @ se3.exp(np.array([0.3, 0.1, 1.0, 0.4, -1.0, 0.8]))
+    mount = se3.exp(np.array([0.3, 0.1, 1.0, 0.4, -1.0, 0.8]))
     # Anywhere but at the identity.
-    return as_trajectory(se3.exp(np.array([10.0, -5.0, 2.0, 0.2, 0.1, 2.0])) @ poses)
+    T_world = se3.exp(np.array([10.0, -5.0, 2.0, 0.2, 0.1, 2.0]))
+    sensor = planar_poses(400, seed) @ mount
+    return as_trajectory(T_world @ sensor)
 
 
 def read(path, **options):
@@ -113,9 +115,13 @@ def table(path, header, *columns):
 def angles(seed=1):
     """Positions (N, 3), and roll, pitch and yaw (N, 3), of a vehicle on uneven ground."""
     poses = planar_poses(300, seed)
+    positions = poses[:, :3, 3]
+    numbers = np.arange(300)
+    roll = 0.1 * np.sin(numbers / 7.0)
+    pitch = 0.1 * np.sin(numbers / 11.0)
     yaw = np.unwrap(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
-    tilt = 0.1 * np.sin(np.arange(300) / [[7.0], [11.0]])
-    return poses[:, :3, 3].T, np.stack([*tilt, (yaw + np.pi) % (2 * np.pi) - np.pi])
+    wrapped_yaw = (yaw + np.pi) % (2 * np.pi) - np.pi
+    return positions.T, np.stack([roll, pitch, wrapped_yaw])
 
 
 @pytest.mark.parametrize(
@@ -308,10 +314,16 @@ def test_latitudes_that_cannot_be_are_refused(tmp_path, lat, lon, message):
 
 
 def test_the_example_of_the_epsg_for_metres_east_north_and_up_of_a_place():
-    lat, lon = np.radians([53 + 48 / 60 + 33.820 / 3600, 2 + 7 / 60 + 46.380 / 3600])
+    latitude_deg = 53 + 48 / 60 + 33.820 / 3600
+    longitude_deg = 2 + 7 / 60 + 46.380 / 3600
+    latitude = np.radians([latitude_deg])
+    longitude = np.radians([longitude_deg])
+    height = np.array([73.0])
     origin = LocalOrigin()
     origin.geodetic = *np.radians([55.0, 5.0]), 200.0
-    local = origin.local(np.array([lat]), np.array([lon]), np.array([73.0]))
+
+    local = origin.local(latitude, longitude, height)
+
     assert_allclose(local, [[-189013.869, -128642.040, -4220.171]], atol=1e-3)
 
 
