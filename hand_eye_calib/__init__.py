@@ -26,7 +26,7 @@ _MODULES = {
     "load": "hand_eye_calib.formats.results",
     "save": "hand_eye_calib.formats.results",
     "read_trajectory": "hand_eye_calib.formats.trajectory_files.reading",
-    "write_trajectory": "hand_eye_calib.formats.trajectory_files.table",
+    "write_trajectory": "hand_eye_calib.formats.trajectory_files.writing",
     "plot": "hand_eye_calib.offline.report.views",
     "Calibration": "hand_eye_calib.core.results.calibration",
     "Residuals": "hand_eye_calib.core.results.records",

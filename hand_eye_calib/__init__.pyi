@@ -42,7 +42,7 @@ from hand_eye_calib.formats.results import save as save
 from hand_eye_calib.formats.trajectory_files.reading import (
     read_trajectory as read_trajectory,
 )
-from hand_eye_calib.formats.trajectory_files.table import (
+from hand_eye_calib.formats.trajectory_files.writing import (
     write_trajectory as write_trajectory,
 )
 from hand_eye_calib.offline.calibrate import calibrate as calibrate

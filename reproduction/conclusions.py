@@ -1,6 +1,6 @@
 """The paper's conclusions: whether our run shows each of them, and by which figures.
 
-On simulated drives, Ali is the variant that was published, unless it is called proper.
+On simulated drives, "Ali" is the variant as published; "Ali proper" is ours.
 """
 
 from __future__ import annotations

@@ -79,10 +79,11 @@ _LINEAR_BELOW = {"e_rt": 1e-3, "e_rR": 1e-2, "e_at": 1e-3, "e_aR": 1e-2}
 # Errors (m or deg) below this are rounding.
 _ZERO = 1e-6
 
-# Of the axes' height: distance of labels. Of the levels' range: room for a label, and for each of
-# its letters.
+# Smallest distance between two labels, as a share of the height of the axes.
 _LABEL_GAP = 0.088
+# Room right of the curves for a label, as a share of the range of levels.
 _LABEL_ROOM = 0.12
+# Additional room for each letter, as a share of the range of levels.
 _LETTER = 0.075
 
 _SMALL_BOLD: dict[str, Any] = {"fontweight": "bold", "fontsize": 6.2}

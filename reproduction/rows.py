@@ -45,8 +45,8 @@ _COLUMNS = (
 _RELATIVE = 1e-3
 _ABSOLUTE = 1e-6
 
-# An objective is above another when it is so by more than this share, and by more than the rounding
-# of a perfect fit.
+# An objective is larger than another if the difference exceeds this share of the other plus the
+# rounding of a perfect fit.
 _OBJECTIVE_SHARE = 1e-6
 _OBJECTIVE_FLOOR = 1e-15
 

@@ -66,7 +66,7 @@ class Outcome(NamedTuple):
 
 
 def of_drive(seed: int) -> Outcome:
-    """Simulate a drive twice."""
+    """Calibrate a simulated drive, and inject errors into the same drive with fresh noise."""
     name = _KINDS[seed % len(_KINDS)]
     length = _LENGTHS[seed // len(_KINDS) % len(_LENGTHS)]
     kind = replace(CLASSES[name], duration_s=length * CLASSES[name].duration_s)

@@ -10,7 +10,7 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.formats.geodetic import LocalOrigin
 from hand_eye_calib.formats.trajectory_files.file_options import FileOptions
 from hand_eye_calib.formats.trajectory_files.reading import read_trajectory_files
-from hand_eye_calib.formats.trajectory_files.table import write_trajectory
+from hand_eye_calib.formats.trajectory_files.writing import write_trajectory
 
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.2, 0.7, 0.3, -1.2, 0.6]))
 

@@ -8,7 +8,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from hand_eye_calib.formats.trajectory_files.table import write_trajectory
+from hand_eye_calib.formats.trajectory_files.writing import write_trajectory
 from suite.baseline import NUMPY
 from suite.data import LONG, MESSAGES
 from suite.measuring import row_of

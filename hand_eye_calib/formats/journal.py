@@ -30,7 +30,7 @@ from hand_eye_calib.core.base.errors import InputError, located
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.engine.calibrator import Calibrators
 from hand_eye_calib.formats.files import LONGEST_LINE, open_regular
-from hand_eye_calib.formats.trajectory_files.table import tum_line
+from hand_eye_calib.formats.trajectory_files.writing import tum_line
 
 _FORMAT = "hand_eye_calib/journal"
 # Version of the format; journals of other versions are rejected.

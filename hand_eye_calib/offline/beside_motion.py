@@ -1,4 +1,4 @@
-"""Measurements of the extrinsic beside motion, from the bag of the recording."""
+"""Measurements of the extrinsic in addition to motion, from the bag of the recording."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -19,7 +19,7 @@ def switched_off(values: Mapping[str, Any]) -> list[str]:
 def with_measurements(
     snapshot: "Snapshot", paths: Sequence[Path], without: Collection[str] = ()
 ) -> "tuple[Snapshot, list[str]]":
-    """Add the measurements beside motion that a bag has, and the paths of the bag.
+    """Add the measurements in addition to motion that a bag has, and the paths of the bag.
 
     Parameters
     ----------

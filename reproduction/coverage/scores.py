@@ -256,7 +256,8 @@ def cycle_row(rigs: Mapping[str, Rig], method: str) -> Row:
 
 def misclosure(answers: list[Calibration]) -> tuple[FloatArray, FloatArray]:
     """Error (6,) of a closed chain of answers, first parent to last child, with its covariance
-    (6, 6), both in the frame of the last child. Scales are those of the parents in turn.
+    (6, 6), both in the frame of the last child. The lengths of each answer are multiplied by the
+    scales of the answers before it: all lengths are in the unit of the first parent.
     """
     closed = np.eye(4)
     covariance = np.zeros((6, 6))

@@ -27,8 +27,8 @@ class Case(NamedTuple):
     T_parent_child: FloatArray
     sigmas: FloatArray
     bound: FloatArray | None = None
-    # The motion leaves an axis open: an answer on all six axes is wrong.
-    is_refused: bool = False
+    # The motion does not determine all axes: the verdict USE is wrong.
+    must_not_be_used: bool = False
 
 
 def simulated_case(family: str, seed: int, number: int) -> Case:
@@ -45,7 +45,7 @@ def simulated_case(family: str, seed: int, number: int) -> Case:
         T_parent_child=drive.T_parent_child,
         sigmas=np.zeros(6),
         bound=drive.bound(),
-        is_refused=family in classes.REFUSED,
+        must_not_be_used=family in classes.REFUSED,
     )
 
 

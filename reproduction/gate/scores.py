@@ -56,7 +56,7 @@ def score(case: Case) -> Score:
     if result is None:
         return Score(family=case.family, name=case.name, verdict="")
     is_use = result.verdict is Verdict.USE
-    if case.is_refused:
+    if case.must_not_be_used:
         return Score(
             family=case.family,
             name=case.name,

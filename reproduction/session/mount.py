@@ -111,7 +111,7 @@ def false_alarms(name: str, hours: float) -> Watched:
 
 
 def alarm_table(watched: Sequence[Watched]) -> str:
-    """A row for every motion."""
+    """Return a table of false alarms, and of shifts that cause an alarm, by class of motion."""
     groups: dict[str, list[Watched]] = {}
     for drive in watched:
         groups.setdefault(drive.name.partition("_")[0], []).append(drive)
@@ -131,7 +131,7 @@ def alarm_table(watched: Sequence[Watched]) -> str:
     alarms = sum(drive.alarms for drive in watched)
     return (
         f"{alarms} alarms in {hours:g} h of motion without a shift. The last columns: which shift "
-        f"ten minutes of any of them would show nine times out of ten.\n\n{markdown_table(rows)}"
+        f"ten minutes of such motion would show nine times out of ten.\n\n{markdown_table(rows)}"
     )
 
 

@@ -24,7 +24,7 @@ from hand_eye_calib.extras.sensors.target_images import (
 )
 from hand_eye_calib.formats.bags.reader import PoseBag
 from hand_eye_calib.formats.bags.writer import stamped_messages
-from hand_eye_calib.formats.trajectory_files.table import write_trajectory
+from hand_eye_calib.formats.trajectory_files.writing import write_trajectory
 from hand_eye_calib.offline.cli.main import main
 
 cv2 = pytest.importorskip("cv2", reason="needs opencv-python-headless")

@@ -16,7 +16,7 @@ from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.extras.fleet.batch import stored
 from hand_eye_calib.extras.fleet.work import Task
 from hand_eye_calib.formats.results import load_result, save_result
-from hand_eye_calib.formats.trajectory_files.table import write_trajectory
+from hand_eye_calib.formats.trajectory_files.writing import write_trajectory
 from hand_eye_calib.formats.yaml_files import read_yaml
 from hand_eye_calib.offline import calibrate as offline
 

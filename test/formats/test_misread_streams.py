@@ -20,7 +20,7 @@ from hand_eye_calib.core.checks.check import check_streams
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.formats.geodetic import axes_of_places
 from hand_eye_calib.formats.trajectory_files.file_options import AUTO
-from hand_eye_calib.formats.trajectory_files.table import write_trajectory
+from hand_eye_calib.formats.trajectory_files.writing import write_trajectory
 
 # Place on the earth (m from its centre).
 HANNOVER_M = np.array([3_861_442.9, 660_048.4, 5_016_536.7])

@@ -14,7 +14,7 @@ from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.formats.trajectory_files.dates import seconds
-from hand_eye_calib.formats.trajectory_files.table import write_trajectory
+from hand_eye_calib.formats.trajectory_files.writing import write_trajectory
 from hand_eye_calib.offline.cli.main import main
 
 POSE = "1 2 3 0 0 0 1"

@@ -22,7 +22,7 @@ from motions import as_trajectory, child_of, disturbed, messages, wandering_pose
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.formats.bags.writer import write_bag
 from hand_eye_calib.formats.journal import JournalWriter
-from hand_eye_calib.formats.trajectory_files.table import write_trajectory
+from hand_eye_calib.formats.trajectory_files.writing import write_trajectory
 
 FORMATS = ("mcap", "sqlite3", "rosbag1", "tum", "kitti", "euroc", "csv", "journal")
 N_INPUTS = int(os.environ.get("FUZZ_INPUTS", 24 * len(FORMATS))) // len(FORMATS)

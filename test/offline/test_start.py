@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from hand_eye_calib.extras.simulation.drive import simulate_drive
-from hand_eye_calib.formats.trajectory_files.table import write_trajectory
+from hand_eye_calib.formats.trajectory_files.writing import write_trajectory
 from hand_eye_calib.offline.cli.main import main
 
 # Each takes from a tenth of a second to a second to load.

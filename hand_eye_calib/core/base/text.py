@@ -103,7 +103,10 @@ def axes_in_words(axes: Sequence[str]) -> str:
 
 
 def two_digits(value: float) -> str:
-    """Format a number with two significant digits, without trailing zeros of its decimals."""
+    """Format a number with two significant digits, or all digits before the decimal point.
+
+    Trailing zeros of the decimals are left out.
+    """
     if abs(value) < 1e-3:
         return "less than 0.001" if value else "0"
     decimals = max(1 - math.floor(math.log10(abs(value))), 0)

@@ -54,7 +54,9 @@ def may_be_an_arm(streams: StreamPair) -> bool:
     return True
 
 
-def evidence_for_inverse(right: StreamPair, fit: SimilarityFit) -> tuple[float, float]:
+def evidence_for_inverse(
+    corrected: StreamPair, fit: SimilarityFit
+) -> tuple[float, float]:
     """Compute the evidence for inverse poses in both streams.
 
     Sensors that move around a target have paths like those of inverse poses. Their shortest path,
@@ -63,7 +65,7 @@ def evidence_for_inverse(right: StreamPair, fit: SimilarityFit) -> tuple[float, 
 
     Parameters
     ----------
-    right : StreamPair
+    corrected : StreamPair
         Streams without other mistakes.
     fit : SimilarityFit
         Fit of these streams.
@@ -76,7 +78,7 @@ def evidence_for_inverse(right: StreamPair, fit: SimilarityFit) -> tuple[float, 
         poses.
     """
     logs = []
-    for stream in (right.parent, right.child):
+    for stream in (corrected.parent, corrected.child):
         poses = coarse(stream, LAGS_S[-1]).poses
         # Stops are poses without the motion between them, so that changes of velocity are unknown.
         order = 2 if stream.interval_s < LAGS_S[-1] else 1
@@ -87,17 +89,17 @@ def evidence_for_inverse(right: StreamPair, fit: SimilarityFit) -> tuple[float, 
     looks_at_a_point = relative_to_origin < np.log(0.5)
     if looks_at_a_point and paths > 0.0:
         paths = max(paths - _TARGET_LOG_RATIO, 0.0)
-    return float(paths), _evidence_of_lever_arms(right, fit)
+    return float(paths), _evidence_of_lever_arms(corrected, fit)
 
 
-def _evidence_of_lever_arms(right: StreamPair, fit: SimilarityFit) -> float:
+def _evidence_of_lever_arms(corrected: StreamPair, fit: SimilarityFit) -> float:
     """Return half the log ratio of the lever arms between the sensors and between the worlds.
 
     The result has limits, see _MAX_OF_ARMS. The result is 0 if the shorter lever arm is that of two
     frames that may be the same. Two streams may have the same world, apart from drift, or the same
     sensor frame: their short lever arm is no evidence.
     """
-    pairs = right.synchronised.child_scaled(fit.scale)
+    pairs = corrected.synchronised.child_scaled(fit.scale)
     worlds = pairs.Ts_pw_p @ fit.T_parent_child @ se3.inverse(pairs.Ts_cw_c)
     Ts = np.array([fit.T_parent_child, medians(np.moveaxis(worlds, 0, 2))])
     arms_m = np.maximum(np.linalg.norm(se3.translation_of(Ts), axis=1), _MIN_ARM_M)

@@ -85,7 +85,10 @@ class Attempt:
         return is_improved and self.noise_fits >= other.noise_fits
 
     def with_findings(self, findings: Collection[Finding]) -> "Attempt":
-        """Return the attempt with other findings, and without an open choice of the reading."""
+        """Return the attempt with other findings.
+
+        An open choice between poses and inverse poses is dropped.
+        """
         sorted_findings = gravest_first(tuple(findings))
         return replace(
             self,

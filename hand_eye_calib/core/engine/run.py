@@ -426,7 +426,7 @@ def _estimated(
 def _unit_doubts(
     findings: Collection[Finding], calibration: Calibration
 ) -> tuple[Finding, ...]:
-    """Return findings that a difference of lengths, estimated as a scale, may be a wrong unit.
+    """Return findings which warn that an estimated scale may be a wrong unit of length.
 
     A finding is an error if the scale in the check or in the result equals that of the unit within
     its uncertainty, otherwise a warning.

@@ -63,8 +63,8 @@ class Snapshot:
     time_offset : TimeOffset or None
         Time offset of the kept pairs, if it was estimated.
     beside_motion : tuple
-        Measurements of the extrinsic beside motion. Each has a method ``joined(calibration,
-        snapshot)``, which returns the calibration joined with the measurement.
+        Measurements of the extrinsic in addition to motion, such as by the ground. The method
+        ``joined(calibration, snapshot)`` of each returns the calibration joined with it.
     bags : tuple of Path
         Bags that contain the streams, for pictures of the report; empty for other sources.
     """
@@ -110,7 +110,7 @@ class Snapshot:
 
     @property
     def frame_warnings(self) -> tuple[str, ...]:
-        """Warnings about sensor frames without a name, or with another name by an inversion."""
+        """Warnings about sensor frames without a name, or renamed because poses are inverted."""
         warnings = []
         for stream, frame in zip(
             STREAMS, (self.parent_frame, self.child_frame), strict=True

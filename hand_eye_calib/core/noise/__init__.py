@@ -17,7 +17,8 @@ Model, for poses i = 0 ... N - 1 and the increments from pose i to pose i + 1:
   driving noise. M_ik is the matrix from process k to c_i.
 - d_i: errors of the path, a drifting scale and direction, which are processes like g_ik; D_i is the
   derivative of e_i with respect to them.
-- w_i (6,): step of a random walk, the drift of odometry.
+- w_i (6,): step of a random walk, the drift of odometry. Its variance grows with time, not with the
+  length of the path.
 - x_i (d,): state of pose i, which is v_i followed by all processes.
 
 v, g and w are Gaussian. Their variances and the time constants of g are unknown: a *level* is the
@@ -25,14 +26,20 @@ logarithm of one of them. The estimate has three parts:
 
 1. The states x and the walk w are marginalised exactly, by linear algebra in time linear in N.
 2. The levels maximise their posterior density: the restricted likelihood (REML), in which beta is
-   marginalised, too, times weak priors. They are fitted to a sample of the poses if there are many.
+   marginalised, too, times weak priors of the jitter and of the time constants. The variances have
+   only bounds. The levels are fitted to a sample of the poses if there are many.
 3. beta is estimated by generalised least squares at these levels, and e is linearised again.
 
 Jumps, outlier poses and the choice of processes and systematic errors are decided between these
 parts, in the order of the stages.
 
-A *process* is one scalar; the processes of one error share variance and time constant, and form a
-*group*.
+A process g_ik is one scalar. The one or three processes of one error share variance and time
+constant, and form a *group*. The names of the groups, such as "body", are also called processes.
+
+Limits: the linearisation is of first order, the noise levels are constant in time, and about 30
+poses are needed. Method "auto" uses DNLO instead if X does not settle, or if the rotation noise of
+single poses exceeds their rotation. The covariance is that of this model: constant errors and a
+shift of the mount are added in :mod:`hand_eye_calib.core.assessment`.
 
 Reading order: :mod:`~hand_eye_calib.core.noise.tuning` (limits, in the order of their
 use), :mod:`~hand_eye_calib.core.noise.increments` (e and J),
@@ -40,6 +47,7 @@ use), :mod:`~hand_eye_calib.core.noise.increments` (e and J),
 :mod:`~hand_eye_calib.core.noise.state_space` (likelihood and posterior of the states),
 :mod:`~hand_eye_calib.core.noise.normal` (linear algebra), :mod:`~hand_eye_calib.core.noise.reml`
 (levels), :mod:`~hand_eye_calib.core.noise.outliers` (jumps, outlier poses and heavy tails),
+:mod:`~hand_eye_calib.core.noise.fit` (state of the search),
 :mod:`~hand_eye_calib.core.noise.stages` (steps of the search),
 :mod:`~hand_eye_calib.core.noise.estimator` (the search and its solution). docs/adaptive.md has the
 derivation.

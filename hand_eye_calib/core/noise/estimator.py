@@ -103,7 +103,7 @@ class ModelSolution:
     objective : float
         Negative log likelihood.
     converged : bool
-        Whether X has settled.
+        Whether X and all parameters have settled. If not, the method "auto" uses DNLO.
     """
 
     model: NoiseModel
@@ -203,7 +203,7 @@ class AdaptiveSolution(ModelSolution):
     def rotation_variance(self, n_intervals: IntArray | int) -> FloatArray:
         """Return the error variance (rad^2) per axis of the measured rotation between two poses.
 
-        The poses are ``n_intervals`` typical intervals apart.
+        The poses are ``n_intervals`` typical intervals of the model apart.
         """
         white, walk = np.exp(self.levels[[ROTATION, WALK_ROTATION]])
         variance = 2 * white + n_intervals * walk
@@ -268,7 +268,10 @@ class AdaptiveSolution(ModelSolution):
             root_metres = self.metres_per_pose**0.5
             after_1_m = length(sigmas.walk_translation_m / root_metres)
             turned_after_1_m = angle(sigmas.walk_rotation_rad / root_metres)
-            drift = f"{after_1_m} and {turned_after_1_m} after 1 m, ten times that after 100 m"
+            drift = (
+                f"{after_1_m} and {turned_after_1_m} after 1 m at the mean speed, "
+                "ten times that after 100 m"
+            )
         else:
             # Streams of rotations have no translations.
             processes = tuple(
@@ -368,8 +371,8 @@ def solve(
     quick : bool
         Skip the stages for heavy tails and time-correlated errors.
     is_clock_free : bool
-        Whether the clock offset was estimated from these poses. If so, it is certainly among the
-        systematic errors.
+        Whether the clock offset was estimated from these poses. If so, it is always a parameter, so
+        that the covariance of X contains its uncertainty.
     without : collection of str
         Names of :data:`~hand_eye_calib.core.noise.stages.STAGES` that are skipped. With "centre",
         rotation errors turn about the sensors.

@@ -51,8 +51,8 @@ class Problem:
         Indices of the systematic errors in the model, see
         :data:`~hand_eye_calib.core.noise.increments.PARAMETERS`.
     is_clock_free : bool
-        Whether the time offset was estimated from the same poses. It is certainly among the
-        systematic errors then.
+        Whether the time offset was estimated from the same poses. It is then always a parameter, so
+        that the covariance of X contains its uncertainty.
     without : frozenset of str
         Names of the stages that are skipped. With "centre", rotation errors turn about the sensors.
     tuning : Tuning
@@ -221,7 +221,7 @@ class Fit:
         return replace(self, T=self.T @ se3.exp(step[:6]), parameters=parameters)
 
     def corrected(self, streams: Streams, states: FloatArray) -> Fit:
-        """Return the fit with poses from which the estimated errors are removed.
+        """Return the fit with poses from which the smoothed errors c are removed.
 
         White errors are split between both sensors in proportion to their covariances. All other
         errors, and errors of outlier poses, are split in halves. The covariances of white noise do

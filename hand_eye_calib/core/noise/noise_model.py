@@ -11,9 +11,9 @@ errors:
   ``M = Ad(X^-1) blkdiag(R_p', R_p')`` with the orientation R_p of the parent;
 - Gauss-Markov processes of increments: a drifting scale, or a drifting direction of travel.
 
-Each error has one variance for all axes; white rotations also shift the child, by its lever arm,
-and jitter acts along the velocity alone. A level is the logarithm of a variance or of a time
-constant. Derivation: docs/adaptive.md.
+Each error has one variance for all axes. Rotations of white noise and of the walk also shift the
+child, by its lever arm. Jitter acts along the velocity alone. A level is the logarithm of a
+variance or of a time constant. Derivation: docs/adaptive.md.
 """
 
 from __future__ import annotations

@@ -291,7 +291,8 @@ class NormalEquations:
         kept = np.where(both_have, information, 0.0)
         scaled = scale[..., :, None] * kept * scale[..., None, :]
         values, vectors = np.linalg.eigh(scaled)
-        # Eigenvalue 1 in place of rounding, which the mask excludes from root and log determinant.
+        # Eigenvalues that are rounding become 1: log 1 = 0 adds nothing to the log determinant, and
+        # the mask excludes them from the root.
         self._is_observed = values > _MIN_INFORMATION
         values = np.where(self._is_observed, values, 1.0)
         self._axes = scale[..., :, None] * vectors

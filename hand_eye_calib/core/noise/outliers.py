@@ -120,8 +120,9 @@ def innovation_chi_squares(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the chi-squares of the increments (n,) and of the white errors of poses (N,).
 
-    ``spikes`` (N,) are outlier poses, which were not used. The chi-square is zero for an increment
-    between two parts of a long recording.
+    Each chi-square tests data against the prediction from all other data, earlier and later.
+    Outlier poses, ``spikes`` (N,), were not used. The chi-square is zero for an increment between
+    two parts of a long recording.
     """
     of_walk = []
     of_white = []

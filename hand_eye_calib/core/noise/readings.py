@@ -1,6 +1,6 @@
-"""Comparison of two readings of the same data by the likelihood of their noise.
+"""Comparison of two interpretations of the same poses by the likelihood of their noise.
 
-A reading is an interpretation of both streams: as poses of the sensors, or as inverse poses. If all
+A *reading* interprets both streams as poses of the sensors, or as inverse poses. If all
 poses are inverted, A Y = Y B holds for the pose Y of one world in the other, and the residuals are
 as small as before. So residuals cannot decide between two readings, but the noise can. In the right
 reading, drift accumulates in the sensor frame, and rotation errors turn about the sensor, or about

@@ -131,7 +131,10 @@ def _centre_of_rotations(streams: Streams, T: FloatArray, residuals: FloatArray)
 
 
 def noise(workspace: Workspace, fit: Fit) -> Fit:
-    """Fit all levels of the model, then take one step of X. Systematic errors do not change."""
+    """Fit all levels of the model, then take one step of X, both on a sample of the poses.
+
+    Systematic errors do not change.
+    """
     problem = workspace.problem
     tuning = problem.tuning
     space = problem.space(fit, sample(len(problem.streams), tuning))
@@ -288,7 +291,8 @@ def systematic(workspace: Workspace, fit: Fit) -> Fit:
     """Choose the likeliest set of systematic errors, then take a step of X and of these errors.
 
     The child's path has a scale, or a bias along one of its axes, or neither of them. Each of these
-    sets is tried with and without a time offset. The estimated errors are removed from the poses.
+    sets is tried with and without a time offset. The smoothed errors c are removed from
+    the poses; systematic errors stay parameters.
     """
     problem = workspace.problem
     tuning = problem.tuning

@@ -24,11 +24,11 @@ class Tuning:
     # -- Noise levels, which are logarithms of variances --
     # Largest number of poses that noise levels are fitted to.
     most_poses: int = 300
-    # Indices of the poses of one burst, relative to its first pose. Bursts are spread evenly: fast
-    # errors are visible within a burst, slow errors between bursts. An increment over more poses
-    # than the longest index is not used: over such a gap, a walk of the rotation shifts positions,
-    # which the model of one increment does not contain. In recordings of thousands of poses, the
-    # fitted walk was a tenth of the true one.
+    # Indices of the poses of one burst, relative to its first pose. Bursts are spread evenly. An
+    # increment over more poses than the longest index is not used: over such a gap, a walk of the
+    # rotation shifts positions, which the model of one increment does not contain. In recordings of
+    # thousands of poses, the fitted walk was a tenth of the true one. So slow errors are visible
+    # within a burst only, except in recordings below about 3,200 poses, whose bursts are connected.
     burst: tuple[int, ...] = (0, 1, 2, 3, 5, 8, 13, 21, 34, 55)
     # Prior mean of the log variance of the jitter of stamps (s^2): the variance of 1 ms.
     jitter: float = -14.0
@@ -112,8 +112,8 @@ class Tuning:
     max_sigma_growth: float = 3.0
 
     # -- The end --
-    # Largest number of rounds in which outliers are detected. Also the largest number of last steps
-    # of X, including the step that computes the solution.
+    # Largest number of rounds in which outliers are detected. Also the largest number of steps of
+    # X and all parameters at the end, the step that computes the solution included.
     max_rounds: int = 6
     # X is settled if its next step is shorter than this share of its standard deviation.
     settled_sigmas: float = 0.1

@@ -180,8 +180,8 @@ def _caption(calibration: Calibration, merged: MergedClouds) -> str:
         before = "as if both sensors had one pose"
     text = (
         f"A few scans of both sensors, placed by the poses of {parent}, which turned by "
-        f"{angle(merged.turn_rad)} between them: left {before}, right through the result. Right, "
-        "each wall should be one thin line of both colours."
+        f"{angle(merged.turn_rad)} between them. The left picture is {before}, the right picture "
+        "uses the result: there, each wall should be one thin line of both colours."
     )
     after_m = distances_from_surfaces(merged.parent, merged.after)
     shared = float(np.isfinite(after_m).mean())

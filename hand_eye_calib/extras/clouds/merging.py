@@ -34,8 +34,8 @@ class Tuning:
     longest_s: float = 30.0
     # Turn (rad) between these scans that is sufficient.
     sufficient_turn: float = np.pi / 2
-    # Time (s) between compared poses. A scan may be earlier or later by twice this time, where the
-    # sensor turns more slowly.
+    # Time (s) between compared poses. Each scan is then moved by up to twice this time, to where
+    # the sensor turns most slowly.
     step_s: float = 0.5
     # Largest number of points of a scan, evenly drawn.
     max_points: int = 5_000
@@ -303,9 +303,10 @@ def _moved(T: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def _axis_of_surfaces(surfaces: FloatArray, direction: FloatArray) -> FloatArray:
-    """Return the principal axis (3,) of the normals of surfaces (N, 3) nearest to a direction.
+    """Return the principal axis (3,) of the normals of surfaces (N, 3).
 
-    Without planes, it is any axis of the world.
+    Of the three principal axes, it is the one nearest to the direction. Without planes, it is any
+    axis of the world.
     """
     every = -(-len(surfaces) // TUNING.max_points)
     _, normals = _planes(surfaces, surfaces[::every])

@@ -15,11 +15,11 @@ def register() -> None:
     RESULT_EXAMINATIONS["detectability"] = _examine
     RESULT_PARTS["detectability"] = _part
     EXTRA_RULES["undetectable"] = ExtraRule(
-        "unconfirmed",
-        False,
-        "an error of three times the size that the standard deviation makes detectable is not "
+        after="unconfirmed",
+        forbids=False,
+        when="an error of three times the size that the standard deviation makes detectable is not "
         "found in nine of ten splits of the recording",
-        _undetectable,
+        find=_undetectable,
     )
 
 

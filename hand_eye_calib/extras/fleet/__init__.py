@@ -28,17 +28,17 @@ def register() -> None:
     )
     RESULT_PARTS["together"] = _together
     EXTRA_RULES["recordings_differ"] = ExtraRule(
-        "nothing_known",
-        True,
-        "of several recordings two differ and there is no third, all differ, or the mount has "
+        after="nothing_known",
+        forbids=True,
+        when="of several recordings two differ and there is no third, all differ, or the mount has "
         "moved between them",
-        _recordings_differ,
+        find=_recordings_differ,
     )
     EXTRA_RULES["recordings"] = ExtraRule(
-        "warning_finding",
-        False,
-        "of several recordings one is off and left out, or all scatter more than usual",
-        _recordings,
+        after="warning_finding",
+        forbids=False,
+        when="of several recordings one is off and left out, or all scatter more than usual",
+        find=_recordings,
     )
     ROUTES["batch"] = Route(_add_arguments, _is_batch, _run_batch)
     SEVERAL_RECORDINGS["one rig"] = _run_together

@@ -73,23 +73,29 @@ def run_batch(arguments: argparse.Namespace) -> int:
         _print_json(title, done, vehicles)
     else:
         _print_results(done, vehicles)
-    alone = [
-        outcome
-        for outcome in done
-        if outcome.row["verdict"] and not outcome.row["vehicle"]
-    ]
-    n_alone = len(alone)
-    if n_alone > 1:
-        why = "set --vehicle to"
-        if arguments.vehicle:
-            why = f"--vehicle {shown_value(arguments.vehicle)} fits none of their paths; set it to"
-        note(
-            f"{n_alone} recordings are not compared with each other: {why} the position of the "
-            "vehicle in their paths, such as 'fleet/{vehicle}/*'"
-        )
+    _note_recordings_without_vehicle(done, arguments.vehicle)
     codes = [outcome.code for outcome in done]
     codes += [_code_of_vehicle(result) for result in vehicles.values()]
     return gravest_code(codes)
+
+
+def _note_recordings_without_vehicle(
+    done: Sequence[Outcome], pattern: str | None
+) -> None:
+    """Print that results without a vehicle are not compared, and how they get one."""
+    n_alone = 0
+    for outcome in done:
+        if outcome.row["verdict"] and not outcome.row["vehicle"]:
+            n_alone += 1
+    if n_alone <= 1:
+        return
+    why = "set --vehicle to"
+    if pattern:
+        why = f"--vehicle {shown_value(pattern)} fits none of their paths; set it to"
+    note(
+        f"{n_alone} recordings are not compared with each other: {why} the position of the "
+        "vehicle in their paths, such as 'fleet/{vehicle}/*'"
+    )
 
 
 def _code_of_vehicle(result: Calibration) -> int:

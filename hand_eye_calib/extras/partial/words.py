@@ -21,8 +21,8 @@ WORDS = {
     ),
     "no_lever_arm": FindingWords(
         "the positions are those of the other sensor: the lever arm is zero ({size})",
-        "give the positions of the antenna or prism itself; if it is there, say so by priors, such "
-        "as prior.x 0+/-0.01",
+        "give the positions of the antenna or prism itself; if it is at the origin of the other "
+        "sensor, give priors, such as prior.x 0+/-0.01",
         "such as positions of a fused pose, or of the other topic of one receiver",
         code="same_position",
     ),

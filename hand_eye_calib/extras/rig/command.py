@@ -77,7 +77,7 @@ def _completed(
     snapshots: "dict[str, Snapshot]",
     snapshot: "Snapshot",
 ) -> "Snapshot":
-    """Return the snapshot of two sensors with the measurements beside motion of a bag.
+    """Return the snapshot of two sensors with the measurements in addition to motion of a bag.
 
     It is stored in ``snapshots`` by the frame of the child.
     """

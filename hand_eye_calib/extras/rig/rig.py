@@ -89,7 +89,7 @@ def calibrated(
 ) -> RigCalibration:
     """Calibrate a rig; see :func:`calibrate_rig`.
 
-    ``complete`` adds measurements beside motion to the snapshot of two sensors.
+    ``complete`` adds measurements in addition to motion to the snapshot of two sensors.
     """
     _require_rig(trajectories, options)
     first, *others = [

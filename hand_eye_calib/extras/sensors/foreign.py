@@ -527,7 +527,7 @@ PROGRAMS: dict[bytes, _Reader | str] = {
     rb"\A(ply\r?\n|# \.PCD|VERSION 0?\.7)": "points, no trajectory; record the odometry as a bag",
     rb"\A[#%][A-Z\d]+A,[^;\n]*;": _of_novatel,
     rb"\A(%YAML|---\s|[A-Za-z]\w*: *\n[ -])": "YAML without a trajectory; record a bag, or "
-    "pass the samples of an arm alone",
+    "pass samples of an arm as the only file",
     rb"\A\x93NUMPY": _of_numpy,
     rb"\AULog\x01\x12\x35": _of_ulog,
     rb"\A(\{|\[\s*[\[{\"\d-])": _of_json,

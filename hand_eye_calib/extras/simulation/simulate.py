@@ -102,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Simulate and write recordings; return the exit code."""
     from hand_eye_calib.core.geometry.trajectory import Trajectory
     from hand_eye_calib.extras.simulation.drive import simulate_drive
-    from hand_eye_calib.formats.trajectory_files.table import write_trajectory
+    from hand_eye_calib.formats.trajectory_files.writing import write_trajectory
 
     config = _DRIVES[arguments.drive]
     config = dataclasses.replace(config, poses=arguments.poses or config.poses)

@@ -129,9 +129,10 @@ def _usual_orders(n: int) -> Iterator[_Order]:
         by_name = np.argsort([str(row + first) for row in rows], kind="stable")
         if np.array_equal(by_name, rows):
             continue
-        text = f"if one side was sorted by names {first}, {first + 1}, 10, 11, ..."
-        yield _Order(f"{text} and the other by numbers (child)", by_name, rows)
-        yield _Order(f"{text} and the other by numbers (parent)", rows, by_name)
+        names = "0, 1, 10, 11, ..., 2" if first == 0 else "1, 10, 11, ..., 2"
+        text = f"are sorted by name ({names}), those of the other side by number"
+        yield _Order(f"if the child's {text}", by_name, rows)
+        yield _Order(f"if the parent's {text}", rows, by_name)
 
 
 def _check_shifted_block(

@@ -143,7 +143,8 @@ class WheelJoints:
         if steered:
             raise InputError(
                 f"{self._topic} has steering joints, {listing(steered)}: set parent_measures to "
-                "steering (the wheels of the fixed axle) or to tricycle (the steered wheel drives)"
+                "steering if the speed is that of the fixed axle, or to tricycle if the steered "
+                "wheel drives"
             )
         left = tuple(name for name in wheels if re.search(_LEFT, name.lower()))
         right = tuple(name for name in wheels if re.search(_RIGHT, name.lower()))

@@ -154,6 +154,7 @@ def _solve(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
         fixed.append(Y)
     if _is_flat(drive):
         fixed += TILT
+    # The same drive in longer windows: its difference to the fit enlarges the covariance.
     longer = _drive(pairs, wheels, config, offset_s, 2.0 * window_s)
     fit = fit_drive(drive, longer, fixed)
     findings = _check_fit(fit, drive, config)
@@ -164,6 +165,7 @@ def _solve(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
             replace(drive, model=model), replace(longer, model=model), fixed
         )
         if _log_ratio(other, fit) > SIGNIFICANT:
+            # This finding is the cause of all others, and replaces them.
             findings = (finding(f"speed_of_{rival}"),)
     return _calibration(fit, findings, drive, pairs, offset_s, config)
 
@@ -342,7 +344,8 @@ def _assessed(fit: Fit, unknown_axes: Sequence[str]) -> covariance.Assessment:
     """Return the pose of a fit with its covariance, without the axes that are unknown."""
     T = fit.T_base_sensor
     without_z = fit.covariance[:CLOCK, :CLOCK]
-    # Covariance (6, 6) of the pose in the axes of the vehicle; row and column 2 are those of z.
+    # Covariance (6, 6) of the pose in the axes of the vehicle. The row and column of z are 0, since
+    # z is among the unknown axes.
     in_base = np.insert(np.insert(without_z, 2, 0.0, axis=0), 2, 0.0, axis=1)
     to_child = se3.block_diagonal(se3.rotation_of(T).T)
     unknown = to_child[:, [AXES.index(axis) for axis in unknown_axes]]

@@ -1,8 +1,7 @@
 """Table of the numbers of a trajectory, before they become poses.
 
 A table contains the values of its quantities ("x", "qw", ...) row by row. The names of the columns
-define the quantities. The rows come from the lines of a file or from numbers in memory. This module
-also writes files in the format tum.
+define the quantities. The rows come from the lines of a file or from numbers in memory.
 """
 
 import math
@@ -12,22 +11,17 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 from itertools import islice
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.base.config import STAMP_UNITS
-from hand_eye_calib.core.base.errors import InputError, require_type
+from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.text import shortened, shown_value
-from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.trajectory import ROTATION_TOLERANCE, Trajectory
+from hand_eye_calib.core.geometry.trajectory import ROTATION_TOLERANCE
 from hand_eye_calib.formats.files import (
     LONGEST_NAME,
-    path_of,
-    write_atomically,
-    writing,
 )
 from hand_eye_calib.formats.trajectory_files.cells import angle, is_null, number
 from hand_eye_calib.formats.trajectory_files.columns import (
@@ -36,13 +30,12 @@ from hand_eye_calib.formats.trajectory_files.columns import (
     QUATERNION,
     ROTATION,
     SCALAR_FIRST,
-    TUM_COLUMNS,
     UNNAMED,
     measured,
     named_columns,
     stamp_columns,
 )
-from hand_eye_calib.formats.trajectory_files.dates import decimals, seconds, stamp_of
+from hand_eye_calib.formats.trajectory_files.dates import decimals, stamp_of
 
 # Groups of quantities, each of which is an orientation. A tracker that is lost writes 0 for all
 # quantities of the group; a valid orientation is never all 0.
@@ -579,41 +572,3 @@ def _stamps_of_objects(times: Any, table: Table, n_poses: int) -> list[Decimal |
         Decimal(stamp) if is_valid else None
         for stamp, is_valid in zip(stamps.tolist(), is_time.tolist(), strict=True)
     ]
-
-
-# ---- writing
-
-
-def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:
-    """Write a trajectory to a text file in the format tum, which evo also reads.
-
-    An existing file is replaced. Reading the file returns the same stamps and poses.
-
-    Parameters
-    ----------
-    path : str or path-like
-    trajectory : Trajectory
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-
-    Examples
-    --------
-    >>> hec.write_trajectory("moved.tum", child.shifted(result.time_offset_s))
-    """
-    path = path_of("path", path)
-    require_type("trajectory", trajectory, Trajectory)
-    stamps_ns = trajectory.stamps_ns.tolist()
-    poses = se3.to_rows(trajectory.poses).tolist()
-    lines = map(tum_line, stamps_ns, poses)
-    text = "\n".join([f"# {TUM_COLUMNS}", *lines, ""])
-    with writing(path):
-        write_atomically({path: text})
-
-
-def tum_line(stamp_ns: int, pose: Iterable[float]) -> str:
-    """Return the line of the format tum for a pose x y z qx qy qz qw, with all digits."""
-    numbers = " ".join(map(repr, pose))
-    return f"{seconds(stamp_ns)} {numbers}"

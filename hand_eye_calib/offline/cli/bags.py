@@ -69,7 +69,7 @@ def read_recording(
     options : mapping
         Options that the user has set.
     without : collection of str
-        Names of the measurements beside motion that are switched off.
+        Names of the measurements in addition to motion that are switched off.
 
     Raises
     ------

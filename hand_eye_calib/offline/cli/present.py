@@ -321,17 +321,8 @@ def next_steps(
     options = {name: value for name, value in options.items() if value != PLACEHOLDER}
     steps = []
     if calibration.verdict is not Verdict.DO_NOT_USE:
-        is_improvable = any(
-            dof.verdict in _IMPROVABLE for dof in calibration.observability
-        )
-        if is_improvable and snapshot is not None and calibration.measured == "poses":
-            from hand_eye_calib.core.assessment.excitation import (
-                excitation,
-                what_is_missing,
-            )
-
-            if motion := what_is_missing(excitation(snapshot.pose_pairs), calibration):
-                steps.append(motion)
+        if motion := _missing_motion(calibration, snapshot):
+            steps.append(motion)
         if axes := calibration.hidden:
             priors = typed_options((f"prior.{axis}", PLACEHOLDER) for axis in axes)
             steps.append(
@@ -344,6 +335,16 @@ def next_steps(
     if options:
         steps.append(command_with(arguments.typed, options))
     return steps
+
+
+def _missing_motion(calibration: Calibration, snapshot: "Snapshot | None") -> str:
+    """Return the motion that would improve an axis; empty if there is none."""
+    is_improvable = any(dof.verdict in _IMPROVABLE for dof in calibration.observability)
+    if not is_improvable or snapshot is None or calibration.measured != "poses":
+        return ""
+    from hand_eye_calib.core.assessment.excitation import excitation, what_is_missing
+
+    return what_is_missing(excitation(snapshot.pose_pairs), calibration)
 
 
 def allowance_lines(calibration: Calibration) -> list[str]:

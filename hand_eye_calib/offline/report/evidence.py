@@ -284,8 +284,9 @@ def _angles(
     """Return the angles (N, 3) turned about the parent's axes as measured, and as computed.
 
     The measured angles (rad) are the sum of the rotation vectors from pose to pose. They have no
-    singularity, unlike roll, pitch and yaw at a pitch of 90 deg. The computed angles add the
-    rotation vector from the measured pose to the pose from the child's stream and the result.
+    singularity, unlike roll, pitch and yaw at a pitch of 90 deg. The computed angles are
+    the measured angles plus the rotation vector that leads from the measured pose to the pose
+    computed from the child's stream and the result.
     """
     Ts_cw_p = pose_pairs.Ts_cw_c @ calibration.T_child_parent
     measured = se3.rotation_of(pose_pairs.Ts_pw_p)

@@ -43,6 +43,7 @@ from hand_eye_calib.online.live.describing import (
 )
 from hand_eye_calib.online.live.goal import Goal, no_result_in_words
 from hand_eye_calib.online.live.log import GOES_ON_S, ONCE_S, NodeLog
+from hand_eye_calib.online.live.result_log import ResultLog
 from hand_eye_calib.online.live.session import LiveSession
 from hand_eye_calib.online.live.solving import (
     NO_MOTION,
@@ -124,6 +125,7 @@ class SolveCycle:
         self.is_solving = False
         self.checks = StreamChecks(log)
         self.goal = Goal(targets)
+        self._results = ResultLog(log)
         self._session = session
         self._log = log
         self._complete = complete
@@ -156,8 +158,6 @@ class SolveCycle:
         self._failure: Failure | None = None
         # Time of the first failure (steady time, s) if every solve since the result has failed.
         self._failing_since_s: float | None = None
-        # Sentences of the reasons for a verdict that were logged as warnings, by their rules.
-        self._warned: dict[str, str] = {}
         # Options that checks of this session have set, and the warnings about these options.
         self._check_options: Options = {}
         self._option_warnings: tuple[str, ...] = ()
@@ -167,6 +167,7 @@ class SolveCycle:
         self._check_due_s = 0.0
         self.checks.restart()
         self.goal.restart()
+        self._results.restart()
 
     def follow(self, config: CalibratorConfig, before: CalibratorConfig) -> None:
         """Apply changed options; check the streams again at once.
@@ -350,7 +351,7 @@ class SolveCycle:
             calibration = None
             text = too_little_in_words(self._motion)
             self._failure = self._failure or Failure(text, is_early=True)
-        text = self._report(self._failure) if self._failure is not None else ""
+        text = self._results.failure(self._failure) if self._failure else ""
         if calibration is None:
             self._keep_result(*self._advice_after_failure())
             return False, text
@@ -360,7 +361,7 @@ class SolveCycle:
         if newest.status.failure:
             self._failure = Failure(newest.status.failure)
             self._keep_result(no_result_in_words(newest.status.failure))
-            return False, self._describe(newest)
+            return False, self._results.result(newest, self.goal.progress)
         return self._take(self._complete(newest))
 
     def _advice_after_failure(self) -> tuple[str, tuple[str, ...]]:
@@ -423,7 +424,7 @@ class SolveCycle:
         self.goal.add(newest, self._motion, self.checks.faults())
         self._solved = self._submitted, self._check_options
         self._set_result(newest)
-        return False, self._describe(newest)
+        return False, self._results.result(newest, self.goal.progress)
 
     def _set_result(self, result: Calibration) -> None:
         """Store the result of the session as current."""
@@ -452,31 +453,8 @@ class SolveCycle:
         result = self._with_findings(result)
         self._set_result(result)
         every_s = GOES_ON_S if progress.done == was_done else 0.0
-        return result.status is SolveStatus.OK, self._describe(result, every_s)
-
-    def _describe(self, calibration: Calibration, every_s: float = GOES_ON_S) -> str:
-        """Return a line about a calibration with its reasons and warnings; log what is new.
-
-        As long as more motion helps, the progress names what to do. So the reasons for the verdict
-        are logged only if more motion does not help.
-        """
-        texts = [describe(calibration)]
-        progress = self.goal.progress
-        self._log.info(texts[0], every_s, key="result")
-        is_final = (
-            progress.done or progress.will_not_get_there or calibration.status.failure
-        )
-        for reason in calibration.reasons:
-            text = f"{reason.sentence}; {reason.advice_on(Interface.NODE)}"
-            texts.append(text)
-            # The stream checks have logged the findings.
-            if is_final and not reason.is_finding:
-                self._log.warning(f"{reason.verdict.value}: {text}")
-                self._warned[reason.rule] = reason.sentence
-        rules = {reason.rule for reason in calibration.reasons}
-        for rule in self._warned.keys() - rules:
-            self._log.info(f"no longer found: {self._warned.pop(rule)}")
-        return "; ".join((*texts, *calibration.warnings))
+        text = self._results.result(result, progress, every_s)
+        return result.status is SolveStatus.OK, text
 
     def _with_findings(self, calibration: Calibration) -> Calibration:
         """Return the calibration with the findings of the stream checks.
@@ -491,18 +469,6 @@ class SolveCycle:
         if calibration.findings == findings:
             return calibration
         return replace(calibration, findings=findings)
-
-    def _report(self, failure: Failure) -> str:
-        """Log a failure and return its text."""
-        if failure.details:
-            text = f"the solve failed unexpectedly: {failure.what}"
-            self._log.error(f"{text}\n{failure.details}")
-            return f"{text}; see the log"
-        if failure.is_early:
-            self._log.info(f"cannot solve yet: {failure.what}", ONCE_S)
-        else:
-            self._log.warning(f"cannot solve: {failure.what}")
-        return failure.what
 
     # -------------------------------------------------------------------- state
 

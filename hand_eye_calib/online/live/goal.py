@@ -392,7 +392,8 @@ class Goal:
             if is_helpful:
                 motion = "This motion is right, more of it"
             elif _turns_about(newest_motion, axis):
-                # No rotation observes the axis: its time ends as soon as the motion is changed.
+                # A rotation about an axis does not observe this axis. The motion must change, so
+                # the time left at the present motion is no forecast.
                 row = replace(row, seconds_left=np.inf)
                 axes = {**progress.axes, AXIS_KEYS[axis]: row}
                 progress = replace(progress, seconds_left=np.inf, axes=axes)

@@ -183,7 +183,9 @@ def answer(job: Job) -> Answer:
     except Exception as error:
         result = replace(result, failure=result.failure or _failure(error))
     if result.check is not None:
-        result = replace(result, check=with_raw_findings(result.check, received))
+        result = replace(
+            result, check=with_findings_before_pairing(result.check, received)
+        )
     return replace(
         result,
         seconds=time.monotonic() - start_s,
@@ -214,7 +216,9 @@ def _checked(result: Answer, snapshot: Snapshot, options: Options) -> Answer:
     )
 
 
-def with_raw_findings(result: CheckResult, snapshot: Snapshot) -> CheckResult:
+def with_findings_before_pairing(
+    result: CheckResult, snapshot: Snapshot
+) -> CheckResult:
     """Add errors in the received poses to a check of the pairs, if older poses are paired already.
 
     Pairing interpolates one stream, and this hides poses of two sources that alternate. So the

@@ -17,11 +17,13 @@ from hand_eye_calib.online.live.progress import AXIS_KEYS
 from hand_eye_calib.online.live.state import (
     REPORT_PERIOD_S,
     Broadcast,
+    ChecksState,
     ExtrinsicState,
     InputState,
     Level,
     MountState,
     NodeState,
+    Part,
     Standing,
 )
 from hand_eye_calib.online.watch.axes import bar_of, mount_line, pose_values
@@ -287,17 +289,22 @@ def _health(state: NodeState, is_old: bool) -> Iterator[Line]:
             yield Line(Tone.UNKNOWN if is_old else Tone.ACT, "solver", part.text)
         if name in ("extrinsic", "progress", "mount"):
             continue
-        tone = _TONES[part.level]
         text = part.text
-        # Before the first check, the level is WARN, but a person need not act.
-        if part is state.checks and state.checks.age_s is None:
-            tone = Tone.BUSY
-        # A robot that is parked has no poses, and a person need not act.
-        if isinstance(part, InputState) and part.is_paused and tone is Tone.GOOD:
-            tone = Tone.BUSY
         if isinstance(part, InputState) and part.topic not in text:
             text = f"{text}, {part.topic}"
-        yield Line(Tone.UNKNOWN if is_old else tone, name, text)
+        yield Line(Tone.UNKNOWN if is_old else _tone_of(part), name, text)
+
+
+def _tone_of(part: Part) -> Tone:
+    """Return the tone of the line of an input, of the checks or of the journal."""
+    # Before the first check, the level is WARN, but a person need not act.
+    if isinstance(part, ChecksState) and part.age_s is None:
+        return Tone.BUSY
+    tone = _TONES[part.level]
+    # A robot that is parked has no poses, and a person need not act.
+    if isinstance(part, InputState) and part.is_paused and tone is Tone.GOOD:
+        return Tone.BUSY
+    return tone
 
 
 def _result(state: NodeState, word: str) -> Iterator[Line]:

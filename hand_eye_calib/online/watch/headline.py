@@ -28,6 +28,7 @@ from hand_eye_calib.online.live.state import (
     ChecksState,
     InputState,
     Level,
+    MountState,
     NodeState,
     Part,
     ProgressState,
@@ -228,10 +229,7 @@ def _is_saved(state: NodeState) -> bool:
 def _activity(state: NodeState) -> Headline:
     """Return the headline of a node without an alarm."""
     if state.mount is not None:
-        sentence = _sentence(state.mount.text)
-        if state.mount.is_learning:
-            return Headline(Tone.BUSY, "LEARNING", sentence)
-        return Headline(Tone.GOOD, "WATCHING", sentence)
+        return _monitoring(state.mount)
     session = state.progress
     if session is None:
         text = "The node runs, and has no result yet."
@@ -258,6 +256,14 @@ def _activity(state: NodeState) -> Headline:
     return Headline(
         tone, "GO ON" if tone is Tone.BUSY else CHANGE_MOTION, sentence, slow
     )
+
+
+def _monitoring(mount: MountState) -> Headline:
+    """Return the headline of a node that monitors a mount, without an alarm."""
+    sentence = _sentence(mount.text)
+    if mount.is_learning:
+        return Headline(Tone.BUSY, "LEARNING", sentence)
+    return Headline(Tone.GOOD, "WATCHING", sentence)
 
 
 def _pause(tone: Tone, state: NodeState, sentence: str) -> Headline:
