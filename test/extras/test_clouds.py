@@ -180,7 +180,7 @@ def test_the_installed_transform_is_before(recorded):
     )
     assert merged.after == pytest.approx(right.after)
     (figure,) = figures_of_clouds(compared, result.recording)
-    assert "left as installed" in figure.caption
+    assert "left picture is as installed" in figure.caption
 
 
 def test_a_wrong_result_is_visible(recorded):
