@@ -89,3 +89,22 @@ def no_figures(monkeypatch):
     monkeypatch.setattr(
         "hand_eye_calib.offline.report.report.figures_of", lambda *_: []
     )
+
+
+@pytest.fixture
+def refused(run):
+    """Run a command that must end in one line on stderr, nothing on stdout; returns the line."""
+
+    def call(*arguments, code=1):
+        exit_code, out, err = run(*arguments)
+        assert (exit_code, out) == (code, "")
+        lines = [
+            line
+            for line in err.splitlines()
+            if not line.startswith("hand_eye_calib: note: ")
+        ]
+        assert len(lines) == 1, err
+        assert lines[0].startswith("hand_eye_calib: error: ")
+        return lines[0]
+
+    return call

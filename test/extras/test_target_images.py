@@ -1,22 +1,27 @@
 """Stops of a hand from images of a target, rendered here."""
 
-import base64
-import re
 from functools import partial
 
-import browser
 import numpy as np
 import pytest
 from bag_making import JAZZY, header, write_messages
 from numpy.testing import assert_array_equal
 from scipy.spatial.transform import Rotation
+from target_rendering import (
+    CAMERA_INFO,
+    MATRIX,
+    PIXELS_PER_M,
+    aprilgrid_picture,
+    charuco_picture,
+    rendered,
+    views,
+)
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.extras.sensors.cameras import Camera, read_camera
-from hand_eye_calib.extras.sensors.corners import figures_of_corners, reprojections
 from hand_eye_calib.extras.sensors.target_images import (
     Target,
     TargetFinder,
@@ -28,77 +33,6 @@ from hand_eye_calib.formats.trajectory_files.writing import write_trajectory
 from hand_eye_calib.offline.cli.main import main
 
 cv2 = pytest.importorskip("cv2", reason="needs opencv-python-headless")
-
-MATRIX = np.array([[900.0, 0.0, 640.0], [0.0, 900.0, 480.0], [0.0, 0.0, 1.0]])
-SIZE = (1280, 960)
-SUPER = 3
-BOARD = (7, 5, 0.05, 0.037)
-PIXELS_PER_M = 4000
-CAMERA_INFO = """\
-camera_matrix: {rows: 3, cols: 3, data: [900, 0, 640, 0, 900, 480, 0, 0, 1]}
-distortion_model: plumb_bob
-distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}
-"""
-
-
-def homography_of(T_camera_picture):
-    """Homography from pixels of a picture to finer pixels of its image."""
-    to_metres = np.diag([1 / PIXELS_PER_M, 1 / PIXELS_PER_M, 1.0])
-    to_metres[:2, 2] = 0.5 / PIXELS_PER_M
-    half_pixel = (SUPER - 1) / 2
-    to_fine = np.array([[SUPER, 0, half_pixel], [0, SUPER, half_pixel], [0, 0, 1.0]])
-    to_camera = T_camera_picture[:3, [0, 1, 3]]
-    return to_fine @ MATRIX @ to_camera @ to_metres
-
-
-def rendered(picture, T_camera_picture, rng):
-    """A grey image of a flat picture, whose pixels are in metres along x and down along y."""
-    homography = homography_of(T_camera_picture)
-    height, width = picture.shape
-    corners = homography @ [[0, width, 0, width], [0, 0, height, height], [1, 1, 1, 1]]
-    pixels = corners[:2] / corners[2] / SUPER
-    left, top = np.clip(pixels.min(axis=1) - 2, 0, SIZE).astype(int)
-    right, bottom = np.clip(pixels.max(axis=1) + 3, 0, SIZE).astype(int)
-    columns = int(right - left)
-    rows = int(bottom - top)
-    homography[:2] -= SUPER * np.outer([left, top], homography[2])
-
-    look = cv2.INTER_AREA
-    size = (SUPER * columns, SUPER * rows)
-    fine = cv2.warpPerspective(picture, homography, size, flags=look, borderValue=200)
-    coarse = cv2.resize(fine, (columns, rows), interpolation=look)
-    # Grey beside the picture.
-    image = np.full(SIZE[::-1], 200, np.uint8)
-    image[top:bottom, left:right] = coarse
-    noise = rng.normal(0.0, 3.0, image.shape)
-    return np.clip(image + noise, 0, 255).astype(np.uint8)
-
-
-def charuco_picture():
-    columns, rows, square, marker = BOARD
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
-    board = cv2.aruco.CharucoBoard((columns, rows), square, marker, dictionary)
-    return board.generateImage(
-        (round(columns * square * PIXELS_PER_M), round(rows * square * PIXELS_PER_M))
-    )
-
-
-def aprilgrid_picture(columns, rows, size, gap):
-    """As Kalibr prints it: from the lower left tag on, upright, with a border of two bits."""
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-    side = round(size * PIXELS_PER_M)
-    step = round((size + gap) * PIXELS_PER_M)
-    picture = np.full((rows * step, columns * step), 255, dtype=np.uint8)
-    for number in range(columns * rows):
-        # OpenCV draws the tags of this family upside down.
-        tag = cv2.aruco.generateImageMarker(dictionary, number, side, borderBits=2)[
-            ::-1, ::-1
-        ]
-        left = number % columns * step
-        bottom = picture.shape[0] - number // columns * step
-        picture[bottom - side : bottom, left : left + side] = tag
-    return picture
-
 
 VISP_CAMERA = """<?xml version="1.0"?><root><camera><name>Camera</name>
 <model><type>perspectiveProjWithoutDistortion</type>
@@ -114,16 +48,6 @@ def poses_of_target(images, target, camera):
     for image in images:
         finder.look(image)
     return finder.found()
-
-
-def views(count, center, rng):
-    """Poses of the picture in the camera, some half a metre before it."""
-    rotation_vectors = rng.uniform(-0.5, 0.5, (count, 3))
-    turns = Rotation.from_rotvec(rotation_vectors).as_matrix()
-    sideways = rng.uniform(-0.08, 0.08, (count, 2))
-    depths = rng.uniform(0.5, 0.7, count)
-    centers = np.c_[sideways, depths]
-    return se3.from_rotation_translation(turns, centers - turns @ center)
 
 
 def test_thirty_images_calibrate_a_hand(tmp_path, capsys, no_figures):
@@ -496,121 +420,3 @@ def test_sigmas_are_as_large_as_the_errors(text, monkeypatch):
     variances = (tracking.sigmas**2).mean(axis=0)
     ratios = np.sqrt(mean_squares / variances)
     assert ratios == pytest.approx([1.0, 1.0], abs=0.2), "errors over sigmas"
-
-
-# ------------------------------------------------------------------ pictures of the report
-
-TARGET = "charuco:7x5:0.05:0.037:5X5_100"
-X = se3.exp([0.03, -0.05, 0.08, 0.2, -0.4, 1.2])
-Z = se3.exp([0.7, 0.2, 0.1, 2.0, 0.5, -0.3])
-# The stop whose robot pose is wrong, from 0.
-WRONG = 6
-N_STOPS = 12
-
-
-@pytest.fixture(scope="module")
-def arm_images(tmp_path_factory):
-    """Folder with images and intrinsics, the images, and the poses of the target."""
-    folder = tmp_path_factory.mktemp("arm")
-    rng = np.random.default_rng(77)
-    Ts_camera_target = views(N_STOPS, [0.175, 0.125, 0.0], rng)
-    picture = charuco_picture()
-    images = [rendered(picture, T, rng) for T in Ts_camera_target]
-    (folder / "images").mkdir()
-    for number, image in enumerate(images):
-        cv2.imwrite(str(folder / "images" / f"view_{number}.png"), image)
-    (folder / "camera.yaml").write_text(CAMERA_INFO)
-    return folder, images, Ts_camera_target
-
-
-def robot_of(Ts_camera_target, setup):
-    """Poses of the hand in the base, the one of the stop WRONG displaced by 2 cm."""
-    rng = np.random.default_rng(78)
-    hand = Z @ se3.inverse(X @ Ts_camera_target)
-    if setup == "beside":
-        # X is the camera in the base, Z the target in the hand.
-        hand = X @ Ts_camera_target @ se3.inverse(Z)
-    hand = hand @ se3.exp(rng.normal(0.0, 2e-4, (N_STOPS, 6)))
-    hand[WRONG] = hand[WRONG] @ se3.exp([0.02, 0, 0, 0, 0, 0])
-    return hand
-
-
-@pytest.mark.parametrize("setup", ["hand", "beside"])
-def test_corners_through_the_result_are_those_of_the_robot(arm_images, setup):
-    folder, images, Ts_camera_target = arm_images
-    hand = robot_of(Ts_camera_target, setup)
-    finder = TargetFinder.parse(TARGET, folder / "camera.yaml")
-    for image in images:
-        finder.look(image)
-    found = finder.found()
-    result = hec.calibrate_arm(hand, found.Ts_camera_target, setup=setup)
-    stops = reprojections(result, found, finder.camera)
-    # From the poses of the robot, X and Z by another way than that of the program.
-    Ts = se3.inverse(hand @ result.T_parent_child) @ result.T_world_world
-    if setup == "beside":
-        Ts = se3.inverse(result.T_parent_child) @ hand @ result.T_world_world
-    for T, corners, stop in zip(Ts, found.corners, stops, strict=True):
-        in_camera = corners @ T[:3, :3].T + T[:3, 3]
-        pixels = in_camera @ MATRIX.T
-        expected = pixels[:, :2] / pixels[:, 2:]
-        assert stop.predicted == pytest.approx(expected, abs=0.01)
-    sizes = np.array([stop.rms_px for stop in stops])
-    assert sizes.argmax() == WRONG
-    # 2 cm at 0.6 m and 900 pixels.
-    assert 15.0 < sizes[WRONG] < 60.0
-    assert np.delete(sizes, WRONG).max() < 3.0
-
-
-def test_the_worst_stop_is_drawn_first_and_named(arm_images, capsys):
-    folder, _, Ts_camera_target = arm_images
-    hand = robot_of(Ts_camera_target, "hand")
-    stamps_ns = 10**9 * np.arange(1, N_STOPS + 1)
-    write_trajectory(folder / "hand.tum", Trajectory(stamps_ns, hand))
-    paths = [str(folder / "hand.tum"), str(folder / "images")]
-    options = ["--target", TARGET, "--camera", str(folder / "camera.yaml")]
-    out = folder / "out"
-    assert main(["arm", *paths, *options, "--out", str(out)]) == 0
-    page = (out / "report.html").read_text()
-    (figure,) = re.findall(r'<figure[^>]*id="figure-corners".*?</figure>', page, re.S)
-    assert f"the worst, stop {WRONG + 1}," in figure
-    assert "the fit leaves this stop out" in figure
-    tiles = re.findall(r'<g transform="translate.*?</g>.*?</g>', figure, re.S)
-    assert len(tiles) == 4
-    assert f"worst: stop {WRONG + 1}, view_{WRONG}.png" in tiles[0]
-    far = []
-    for tile in tiles:
-        circles = np.array(
-            re.findall(r'<circle cx="([\d.]+)" cy="([\d.]+)"', tile), dtype=float
-        )
-        # A cross begins at its left end.
-        left = re.findall(r"M([\d.-]+) ([\d.-]+)h12", tile)
-        crosses = np.add(np.array(left, dtype=float), [6.0, 0.0])
-        assert len(circles) == 24
-        distances = np.linalg.norm(circles[:, None] - crosses, axis=2).min(axis=1)
-        far.append(np.median(distances))
-        (data,) = re.findall(r"base64,([^\"]+)", tile)
-        part = cv2.imdecode(
-            np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_GRAYSCALE
-        )
-        # A corner of a board is between dark and bright squares, at the place of its circle.
-        (width,) = re.findall(r'<image width="([\d.]+)"', tile)
-        for u, v in circles * part.shape[1] / float(width):
-            near = part[round(v) - 4 : round(v) + 5, round(u) - 4 : round(u) + 5]
-            assert np.ptp(near.astype(int)) > 100
-    assert far[0] > 6.0 > 3.0 > max(far[1:])
-    assert sum(map(len, tiles)) < 400_000
-    assert browser.printed_pages(out / "report.html", folder) == 2
-
-
-def test_poses_that_the_result_does_not_use_as_they_are_have_no_picture(arm_images):
-    folder, images, Ts_camera_target = arm_images
-    finder = TargetFinder.parse(TARGET, folder / "camera.yaml")
-    for image in images:
-        finder.look(image)
-    found = finder.found()
-    result = hec.calibrate_arm(
-        robot_of(Ts_camera_target, "hand")[1:], found.Ts_camera_target[1:]
-    )
-    assert (
-        figures_of_corners(result, found, finder.camera, [], images.__getitem__) == []
-    )

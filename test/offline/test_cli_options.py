@@ -1,0 +1,229 @@
+"""Options of the commands: help, values, configuration files."""
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import pytest
+from numpy.testing import assert_allclose
+from source_code import ROOT
+
+import hand_eye_calib as hec
+from hand_eye_calib.core.base.config import CalibratorConfig
+from hand_eye_calib.core.base.option import option_name
+from hand_eye_calib.core.base.registry import COMMANDS
+from hand_eye_calib.offline.cli.main import main
+
+pytestmark = pytest.mark.usefixtures("no_figures")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_fits_a_screen_and_names_options_that_exist(run, command):
+    code, brief, _ = run(command, "--help")
+    assert code == 0
+    assert len(brief.splitlines()) <= 30
+    _, whole, _ = run(command, "--help", "all")
+    if brief != whole:
+        assert f"all options: hand_eye_calib {command} --help all" in brief
+    named = set(re.findall(r"--[a-z][a-z-]+", brief)) - {
+        "--help",
+        "--ros-args",
+        "--params-file",
+    }
+    assert named <= set(re.findall(r"--[a-z][a-z-]+", whole))
+
+
+def test_help_lists_every_option_with_its_default(run):
+    code, out, _ = run("calibrate", "--help", "all")
+    assert code == 0
+    assert out.startswith("usage: hand_eye_calib calibrate [OPTION ...] PATH ...\n")
+    assert out.index("--method") < out.index("rarely needed") < out.index("--max-gap")
+    words = " ".join(out.partition("\nexamples:")[0].split())
+    assert " --prior AXIS=VALUE+/-SIGMA " in words
+    for field in dataclasses.fields(CalibratorConfig):
+        if field.name.startswith("prior_"):
+            continue
+        name = f"--{option_name(field).replace('.', '-').replace('_', '-')}"
+        entry = words[words.rindex(f" {name} ") :].replace("- ", "-")
+        entry = entry[: entry.find(" --", 1)]
+        assert field.metadata["doc"] in entry, name
+        assert (
+            f"Unit: {field.metadata['unit']}" in entry or not field.metadata["unit"]
+        ), name
+        assert f"Default: {field.default}." in entry or field.default == "", name
+
+
+@pytest.mark.parametrize(
+    ("options", "changed"),
+    [
+        (["--keyframe-min-translation", "0.5"], {"keyframe_min_translation": 0.5}),
+        (["--time-offset", "-1e-3"], {"time_offset": -1e-3}),
+        (
+            ["--prior", "z=-1.85+/-0.02", "--prior", "yaw=-90deg+/-2deg"],
+            {"prior_z": "-1.85+/-0.02", "prior_yaw": "-90deg+/-2deg"},
+        ),
+        (["--scale", "none"], {}),
+        (
+            ["--min-pairs", "20", "--reference", "C5"],
+            {"min_pairs": 20, "reference": "C5"},
+        ),
+    ],
+)
+def test_options_reach_the_engine(options, changed):
+    assert parsed(options) == dataclasses.replace(CalibratorConfig(), **changed)
+
+
+def parsed(options):
+    """The configuration that ``calibrate`` makes of its options."""
+    import argparse
+
+    from hand_eye_calib.offline.cli.options import add_config_arguments, options_from
+
+    parser = argparse.ArgumentParser()
+    add_config_arguments(parser)
+    return CalibratorConfig.from_options(options_from(parser.parse_args(options)))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fly"], "invalid choice: 'fly'"),
+        (
+            ["calibrate", str(ROOT / "README.md")],
+            "is one trajectory file: pass those of two",
+        ),
+        (["calibrate", "a.tum", "b.mcap"], "b.mcap is a bag, and another path is not"),
+        (["check", "a.mcap", "b.mcap"], "expected one bag or two trajectory files"),
+        (
+            ["replay", "bag", "--methd", "dnl"],
+            "unknown '--methd'; did you mean --method?",
+        ),
+        (
+            ["replay", "bag", "--threshold", "-1"],
+            "--threshold: must be at least 1e-12 m^2; got -1",
+        ),
+        (
+            ["replay", "bag", "--threshold", "big"],
+            "--threshold: must be a number in m^2; got 'big'",
+        ),
+        (
+            ["replay", "bag", "--reference", "D4"],
+            "--reference: must be auto, A, B<n> such as B5",
+        ),
+        (["replay", "bag", "--method", "dnlp"], "got 'dnlp'; did you mean dnl"),
+        (["info", "a", "b"], "unknown 'b'"),
+        (["chek", "bag"], "did you mean check?"),
+        (["info"], "the following arguments are required: RESULT"),
+        (["replay", "bag", "--vehicle", "a"], "--dask and --vehicle need --batch"),
+        (
+            ["replay", "bag", "--batch", "fleet"],
+            "--batch cannot be combined with PATH or --list",
+        ),
+        (["replay", "--batch", "none*"], "no bag matches none*"),
+        (["watch", "--web", "high"], "expected PORT or HOST:PORT, got 'high'"),
+        (["watch", "--web", "99999"], "expected PORT or HOST:PORT, got '99999'"),
+        (
+            ["replay"],
+            "usage: hand_eye_calib replay [OPTION ...] PATH ...\n\nexamples:\n",
+        ),
+    ],
+)
+def test_wrong_usage(run, arguments, message):
+    code, out, err = run(*arguments)
+    assert (code, out) == (2, "")
+    assert message in err
+
+
+@pytest.fixture
+def config_file(tmp_path):
+    """Writes text into a file and returns the option that names it."""
+
+    def write(text):
+        path = tmp_path / "config.yaml"
+        path.write_text(text)
+        return ["--config", str(path)]
+
+    return write
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{method: dnl, threshold: 1e-3, keyframe.min_interval: 1}",
+        "/**: {ros__parameters: {method: dnl, threshold: 0.001, keyframe: {min_interval: 1.0}}}",
+        "/**: {ros__parameters: {method: dnlo, threshold: 0.001}}\n"
+        "robot: {calibrator: {ros__parameters: {method: dnl, keyframe.min_interval: 1.0}}}\n"
+        "/camera_driver: {ros__parameters: {exposure: 3}}",
+    ],
+)
+def test_config_file_plain_or_for_ros(config_file, text):
+    expected = CalibratorConfig(method="dnl", threshold=1e-3, keyframe_min_interval=1.0)
+    assert parsed(config_file(text)) == expected
+    options = ["--method", "dnlo", "--target-translation", "5cm"]
+    other = dataclasses.replace(expected, method="dnlo", target_translation=0.05)
+    assert parsed([*config_file(text), *options]) == other
+
+
+def test_the_config_file_of_the_package_holds_the_defaults(config_file, capsys):
+    assert (
+        parsed(["--config", str(ROOT / "config" / "calibrator.yaml")])
+        == CalibratorConfig()
+    )
+    assert parsed(config_file("/**: {ros__parameters: }")) == CalibratorConfig()
+    assert "only the node uses 'solve_period'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "{methd: dnl}",
+            r"config\.yaml: unknown option 'methd'; did you mean 'method'\?",
+        ),
+        ("{threshold: -1.0}", r"config\.yaml: 'threshold' must be at least"),
+        (
+            "[1, 2]",
+            r"config\.yaml: expected a mapping of options to values; found list",
+        ),
+        (
+            "/slam: {ros__parameters: {a: 1}}",
+            "named calibrator; the file has those of /slam",
+        ),
+        (
+            "/calibrator: {ros__parameters: [1]}",
+            "unknown option '/calibrator.ros__parameters'",
+        ),
+        ("reference: B" + "9" * 3000, "reference"),
+        ("max_gap: 2024-13-45", "max_gap"),
+        ("5: 6", "unknown option '5'"),
+    ],
+)
+def test_config_files_that_are_wrong_end_with_usage_error(
+    refused, config_file, text, message
+):
+    line = refused("calibrate", "a", "b", *config_file(text), code=2)
+    assert re.search(message, line)
+    assert len(line) < 1000
+
+
+def test_the_sample_in_the_package_gives_its_true_extrinsic(capsys):
+    assert main(["calibrate", "sample:lidar.tum", "sample:camera.tum", "--json"]) == 0
+    matrix = json.loads(capsys.readouterr().out)["T_parent_child"]["matrix"]
+    truth = hec.read_trajectory(
+        Path(hec.__file__).parent / "sample" / "truth.tum"
+    ).poses[0]
+    assert_allclose(matrix, truth, atol=0.005)
+
+
+@pytest.mark.parametrize("name", ["truth.tum", "T_S2_S1.txt"])
+def test_the_truth_of_a_simulation_is_compared_whatever_its_ending(
+    tmp_path, capsys, name
+):
+    sample = Path(hec.__file__).parent / "sample" / "truth.tum"
+    (tmp_path / name).write_bytes(sample.read_bytes())
+    result = str(tmp_path / "result")
+    main(["calibrate", "sample:lidar.tum", "sample:camera.tum", "--out", result])
+
+    assert main(["compare", result, "--with", str(tmp_path / name)]) == 0
+    assert "same" in capsys.readouterr().out
