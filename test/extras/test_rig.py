@@ -142,6 +142,23 @@ def test_a_bad_result_of_a_loop_does_not_lower_the_verdict_of_the_other(
     assert verdicts == [hec.Verdict.USE, hec.Verdict.DO_NOT_USE]
 
 
+@pytest.mark.parametrize("mounted", [False, True], ids=["same frame", "other frame"])
+def test_copies_of_a_sensor_other_than_the_first_are_not_used(rig, mounted):
+    lidar, front, rear = trajectories_of(rig).values()
+    X = se3.exp(np.array([0.3, -0.2, 0.1, 0.5, 0.4, -0.7])) if mounted else np.eye(4)
+    copy = hec.Trajectory(front.stamps_ns, front.poses @ X)
+    calibrated = hec.calibrate_rig(
+        {"lidar": lidar, "front": front, "rear": rear, "copy": copy}
+    )
+    assert calibrated.verdict is hec.Verdict.DO_NOT_USE
+    verdicts = [result.verdict is hec.Verdict.USE for result in calibrated.calibrations]
+    assert verdicts == [False, True, False]
+    for result in (calibrated.calibrations[0], calibrated.calibrations[2]):
+        assert result.findings[0].code == "not_independent"
+        assert result.findings[0].what.startswith("front and copy: both streams agree")
+    assert calibrated.headline == "DO NOT USE: front and copy of 4 sensors"
+
+
 def test_what_is_of_two_sensors_is_refused(rig):
     trajectories = trajectories_of(rig)
     with pytest.raises(InputError, match="at least three"):

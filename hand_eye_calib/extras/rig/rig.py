@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,9 @@ from hand_eye_calib.core.base.errors import ConfigError, InputError, require_typ
 from hand_eye_calib.core.base.plain import Document, plain
 from hand_eye_calib.core.base.stats import CHI2
 from hand_eye_calib.core.base.text import angle, frame_name, length, listing
+from hand_eye_calib.core.checks import independence
 from hand_eye_calib.core.checks.findings import finding
+from hand_eye_calib.core.checks.stream_pair import StreamPair
 from hand_eye_calib.core.engine.attempts import Attempt
 from hand_eye_calib.core.engine.estimation import solve_poses
 from hand_eye_calib.core.engine.run import run
@@ -30,7 +33,7 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import synchronise
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
-from hand_eye_calib.core.results.records import Finding
+from hand_eye_calib.core.results.records import Finding, gravest_first
 
 # Beginnings of the names of options that a rig does not have, because they concern two sensors.
 _OF_ONE_PAIR = ("parent_", "child_", "base_frame", "prior")
@@ -112,7 +115,49 @@ def calibrated(
         for calibration, parent, child in zip(star, aligned, aligned[1:], strict=False)
     ]
     sensors = (first.sensor_frame, *(calibration.child_frame for calibration in star))
+    star = _with_copies(star, others, aligned, max_gap_s)
     return RigCalibration.of(sensors, star, neighbours)
+
+
+def _with_copies(
+    star: Sequence[Calibration],
+    others: Sequence[Trajectory],
+    aligned: Sequence[Trajectory],
+    max_gap_s: float,
+) -> list[Calibration]:
+    """Return the results with a finding in both results of two sensors that are copies.
+
+    The calibration with the first sensor has checked that sensor already. Each result alone agrees
+    with the first sensor, so that only two other sensors reveal a copy.
+
+    Parameters
+    ----------
+    star : sequence of Calibration
+        Each other sensor in the frame of the first sensor.
+    others, aligned : sequence of Trajectory
+        The other sensors' streams as recorded, and on the clock of the first sensor.
+    max_gap_s : float
+        Longest interval between two poses that is interpolated, s.
+    """
+    results = list(star)
+    for i, k in combinations(range(len(star)), 2):
+        if Verdict.DO_NOT_USE in (star[i].verdict, star[k].verdict):
+            # Streams with another fault differ by this fault, or have their finding already.
+            continue
+        copied = independence.check_copies(
+            StreamPair(others[i], others[k], max_gap_s),
+            StreamPair(aligned[i], aligned[k], max_gap_s),
+            are_exact=False,
+        )
+        for found in copied:
+            names = {"first": star[i].child_frame, "second": star[k].child_frame}
+            named = replace(
+                found, key="copied_in_rig", values={**found.values, **names}
+            )
+            for number in (i, k):
+                findings = gravest_first([named, *results[number].findings])
+                results[number] = replace(results[number], findings=findings)
+    return results
 
 
 def _aligned(child: Trajectory, attempt: Attempt) -> Trajectory:

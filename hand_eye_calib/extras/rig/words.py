@@ -12,4 +12,11 @@ WORDS = {
         "a sensor that moved on its mount, or a scale that changed during the recording",
         severity=Severity.WARNING,
     ),
+    "copied_in_rig": FindingWords(
+        "{first} and {second}: {evidence}. Was one computed from the other (TF, fusion, a copy of "
+        "the file)? Then the rig has a sensor less",
+        "give the poses that both sensors measured by themselves, or omit {first} or {second}",
+        severity=Severity.WARNING,
+        code="not_independent",
+    ),
 }
