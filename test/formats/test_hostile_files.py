@@ -154,8 +154,10 @@ def test_a_pipe_is_refused_rather_than_waited_for(tmp_path):
         with pytest.raises(InputError, match="is not a regular file") as caught:
             motions.read_trajectory_file(path, format)
         one_line(caught)
+    result = tmp_path / "extrinsic.yaml"
+    os.mkfifo(result)
     with pytest.raises(InputError, match="is not a regular file"):
-        load_result(path)
+        load_result(result)
 
 
 def test_a_pose_takes_little_more_memory_than_its_line_and_its_matrix_and_few_blocks(
