@@ -208,7 +208,10 @@ def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
             return se3.inverse(T) if is_inverted else T
     if len(numbers_of(document)) in (12, 16):
         return pose_of(document)
-    raise InputError(f"expected {_EXPECTED}")
+    raise InputError(
+        "no transform with position and rotation in it; pass extrinsic.yaml, a URDF, a bag, or "
+        '"X Y Z ROLL PITCH YAW"'
+    )
 
 
 def _fits(layout: Layout, nodes: "Sequence[_Node]") -> bool:

@@ -334,9 +334,15 @@ def test_what_the_names_do_not_say_is_assumed_and_said():
             "cam0: {T_cam_imu: [[1,0,0,0],[0,2,0,0],[0,0,1,0],[0,0,0,1]]}",
             "not a rotation matrix",
         ),
-        ("param set EKF2_EV_POS_X 0.1", "have a position but no rotation"),
-        ("some: text", "expected a calibration: extrinsic.yaml"),
-        ("[1, 2, 3]", "expected a calibration"),
+        (
+            "param set EKF2_EV_POS_X 0.1",
+            "no transform with position and rotation in it",
+        ),
+        (
+            "some: text",
+            "in it; pass extrinsic.yaml, a URDF, a bag, or",
+        ),
+        ("[1, 2, 3]", "no transform with position and rotation in it"),
         (
             "base_link: {other: {x: 0, y: 0, z: 0, roll: 0, pitch: 0, yaw: 0}}",
             "no frame 'imu' in",

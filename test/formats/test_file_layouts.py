@@ -509,7 +509,7 @@ REFUSED = {
     ),
     "angles without names": (
         text_of(SECONDS, P, RPY_DEG),
-        "so their order is unknown; name the 7",
+        "Otherwise name the 7",
     ),
     "a row in between with another number": (
         text_of(SECONDS, P, Q).replace("\n", "\n1 2 3\n", 1),

@@ -115,7 +115,7 @@ def parsed(options):
         (["info", "a", "b"], "unknown 'b'"),
         (["chek", "bag"], "did you mean check?"),
         (["info"], "the following arguments are required: RESULT"),
-        (["replay", "bag", "--vehicle", "a"], "--dask and --vehicle need --batch"),
+        (["replay", "bag", "--vehicle", "a"], "--vehicle is an option of batch"),
         (
             ["replay", "bag", "--batch", "fleet"],
             "--batch cannot be combined with PATH or --list",

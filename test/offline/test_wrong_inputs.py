@@ -1,5 +1,6 @@
 """Wrong inputs: each is answered by one line that names the cause, with the right exit code."""
 
+import dataclasses
 import gzip
 import shlex
 import shutil
@@ -29,17 +30,20 @@ TABLE = """
 1 | calibrate words.tum camera.tum | words.tum: no column for x, y, z, qx, qy, qz, qw
 1 | calibrate binary.tum camera.tum | binary.tum: not a text file
 1 | calibrate html.tum camera.tum | html.tum: it is a web page, perhaps of a sign-in
-1 | calibrate short.tum camera.tum | name the 7 with --columns
+1 | calibrate short.tum camera.tum | 7 numbers in a line, tum has 8 (t x y z qx qy qz qw): is one
 1 | calibrate quat2.tum camera.tum | line 1: found a quaternion of length 2
 1 | calibrate zeroq.tum camera.tum | all 600 rows are empty, zero or not finite
 1 | calibrate nan.tum camera.tum | all 600 rows are empty, zero or not finite
 1 | calibrate far.tum camera.tum | line 1: position (1e+12,
 1 | calibrate same_stamp.tum camera.tum | 600 poses have 5 different stamps; write all digits
+1 | calibrate lidar.tum nohead.csv | name the 4 with --child-columns
+1 | calibrate commas.csv camera.tum | names 4 columns, but the rows have 8 cells; their numbers seem
+1 | calibrate commas.txt camera.tum | with decimal points, or with ; between cells
 1 | calibrate float32.tum camera.tum | are the same (numbers of 32 bits have steps of 128 s here)
 1 | calibrate degrees.csv camera.tum | yaw_rad reaches 358.8, more than one turn (2 pi rad)
 1 | calibrate tilt.csv camera.tum | pitch_rad reaches 12, more than one turn
 1 | calibrate cells.tum camera.tum | for the timestamp
-1 | calibrate nohead.csv camera.tum | name the 4 with --columns
+1 | calibrate nohead.csv camera.tum | name the 4 with --parent-columns, such as t,wx,wy,wz
 1 | calibrate kitti.txt camera.tum --parent-times times.txt | 20 poses, but times.txt has 2 stamps
 1 | calibrate image.png camera.tum | image.png: not a text file
 1 | calibrate folder | no bag in folder: expected files that end in
@@ -93,17 +97,18 @@ TABLE = """
 2 | calibrate lidar.tum camera.tum --parent-quaternion zyxw | must be one of xyzw, wxyz, yzwx
 1 | calibrate lidar.tum camera.tum --min-pairs 100000 | 100000 synchronised pose pairs are needed
 2 | calibrate lidar.tum camera.tum --batch x | --batch cannot be combined with PATH
-2 | calibrate lidar.tum camera.tum --vehicle x | --dask and --vehicle need --batch
+2 | calibrate lidar.tum camera.tum --vehicle x | hand_eye_calib batch BAG ... --vehicle x
 2 | calibrate lidar.tum camera.tum --jobs 0 | expected a whole number of at least 1, got '0'
 2 | calibrate lidar.tum camera.tum --setup hand | run arm with the samples of an arm
 2 | calibrate lidar.tum camera.tum --parent-angles ur | it needs two files and --order none
+2 | calibrate lidar.tum camera.tum --target 0 | the accuracy is --target-translation, --target-r
 2 | calibrate lidar.tum camera.tum --target charuco:5x7 | --target and --camera go together
 1 | calibrate samples.yaml | samples.yaml: the list of samples is empty; expected samples of an arm
 1 | arm half.yaml | half.yaml, sample 1: robot has no tracking; each sample needs both poses
 1 | calibrate lidar.tum camera.tum --columns t,x,x,y,z,qx,qy,qz,qw | 2 columns have the name x
 2 | calibrate lidar.tum camera.tum --format kity | did you mean kitti?
 1 | calibrate samples.npz | cannot read samples.npz: File is not a zip file
-1 | arm lidar.tum camera.tum | or calibrate streams with stamps by time
+1 | arm lidar.tum camera.tum | by time: hand_eye_calib calibrate lidar.tum camera.tum
 2 | arm sample:arm.yaml --setup both | invalid choice: 'both' (choose from 'hand', 'beside')
 1 | rig lidar.tum camera.tum empty.tum | empty.tum: the file contains no poses
 1 | rig drive.mcap --topics /lidar/odometry /camera/odometry /x | no topic /x in drive.mcap
@@ -134,6 +139,7 @@ TABLE = """
 1 | compare torn.yaml --with robot.urdf | restore the file, or calibrate again
 1 | compare saved | or one and the installed transform (--with
 1 | compare saved saved | saved appears twice: name each result once
+1 | compare saved --with other.json | in it; pass extrinsic.yaml, a URDF, a bag, or "X Y
 1 | compare saved --with lidar.tum | an installed transform is one pose
 1 | compare saved --with robot.urdf | in the robot description; it has no transforms
 2 | compare saved --with "1 2 3 4 5" | expected a URDF, extrinsic.yaml, a bag, or X Y Z
@@ -148,7 +154,17 @@ TABLE = """
 2 | compare | required: RESULT
 2 | simulate | required: --out
 2 | simulate --out new --drive rocky | choose from 'published', 'hilly'
-2 | watch --port x | unknown '--port'
+2 | watch --port x | unknown '--port' (
+2 | calibrate lidar.tum camera.tum --fleet f.html | compare RESULT ... --fleet f.html
+2 | calibrate lidar.tum camera.tum --fleet=f.html | hand_eye_calib compare RESULT ... --fleet=f.html
+2 | check lidar.tum camera.tum --out x | --out is an option of calibrate
+2 | check lidar.tum camera.tum --vehicle x | --vehicle is an option of batch: hand_eye_calib batch
+2 | info saved --with a.urdf | compare: hand_eye_calib compare RESULT ... --with a.urdf
+2 | compare saved --out x | --out is an option of calibrate
+2 | calibrate lidar.tum camera.tum --foobar | unknown '--foobar' (
+2 | calibrate lidar.tum camera.tum --foo | unknown '--foo' (
+2 | calibrate lidar.tum camera.tum -o x | unknown '-o'; did you mean --out? (
+2 | calibrate lidar.tum camera.tum --mathod park | did you mean --method?
 """
 ROWS = [
     [cell.strip() for cell in row.split(" | ")] for row in TABLE.strip().splitlines()
@@ -167,6 +183,9 @@ TEXTS = {
     "torn.yaml": "format: {a: 1,\n",
     "robot.urdf": "<robot name='r'><link name='a'/></robot>",
     "nohead.csv": "0,1,2,3\n1,2,3,4\n",
+    "commas.csv": "t,x,y,z\n" + "1,5,0,25,3,125,-4,5\n" * 20,
+    "commas.txt": "1,5,0,25,3,125,-4,5,1,5,0,25,3,125,-4,5\n" * 20,
+    "other.json": '{"a": 1}',
     "kitti.txt": "1 0 0 0 0 1 0 0 0 0 1 0\n" * 20,
     "times.txt": "0\n1\n",
     "bad.yaml": "a: [1\n",
@@ -302,6 +321,7 @@ def test_a_folder_may_be_called_sample():
 
 SAMPLES = hec.read_arm_samples("sample:arm.yaml")
 LIDAR = hec.read_trajectory("sample:lidar.tum")
+RESULT = hec.calibrate(LIDAR, hec.read_trajectory("sample:camera.tum"))
 IN_PYTHON = {
     "no child": (
         lambda: hec.calibrate(LIDAR),
@@ -347,10 +367,12 @@ IN_PYTHON = {
         lambda: hec.calibrate_arm("hand.tum", "camera.tum"),
         "robot: expected poses, not a path; read_arm_samples",
     ),
+    "a matrix as installed": (
+        lambda: hec.compare([RESULT], installed=np.eye(3)),
+        "installed must be an earlier result, such as hec.load(DIR); got ndarray",
+    ),
     "one result": (
-        lambda: hec.compare(
-            [hec.calibrate(LIDAR, hec.read_trajectory("sample:camera.tum"))]
-        ),
+        lambda: hec.compare([RESULT]),
         "or one and the installed transform",
     ),
 }
@@ -363,6 +385,21 @@ def test_a_wrong_argument_in_python_is_answered_in_one_line(name):
         call()
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_result_with_exchanged_frames_is_compared_as_its_inverse():
+    for comparison in (
+        hec.compare([RESULT, RESULT.inverse()]),
+        hec.compare([RESULT], installed=RESULT.inverse()),
+    ):
+        assert comparison.verdict == "same"
+        for row in comparison.differences[0].axes.values():
+            assert_allclose(row.difference, 0.0, atol=1e-9)
+    moved = RESULT.inverse()
+    T = moved.T_parent_child.copy()
+    T[0, 3] += 0.5
+    moved = dataclasses.replace(moved, T_parent_child=T)
+    assert hec.compare([RESULT, moved]).verdict == "moved"
 
 
 def test_a_topic_that_another_sensor_has_is_not_proposed(run, inputs, monkeypatch):

@@ -366,7 +366,7 @@ def solved():
         ),
         (
             lambda result: hec.compare([result], "robot.urdf"),
-            "installed must be of type Calibration",
+            "installed must be an earlier result",
         ),
         (
             lambda result: hec.cross_check(result, 3, CHILD),

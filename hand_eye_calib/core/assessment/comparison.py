@@ -35,6 +35,8 @@ def compare(
 ) -> Comparison:
     """Compare results with the installed extrinsic, or with each other.
 
+    A result whose parent and child are exchanged is inverted: it gets the frames of the first.
+
     Parameters
     ----------
     results : sequence of Calibration
@@ -63,8 +65,15 @@ def compare(
     require_type("results", results, Sequence)
     for result in results:
         require_type("each result", result, Calibration)
-    if installed is not None:
-        require_type("installed", installed, Calibration, Extrinsic)
+    if installed is not None and not isinstance(installed, Calibration | Extrinsic):
+        raise InputError(
+            "installed must be an earlier result, such as hec.load(DIR); got "
+            f"{type(installed).__name__}. For another source, run hand_eye_calib compare DIR "
+            "--with SOURCE"
+        )
+    results = [_in_frames_of(results[0], result) for result in results]
+    if isinstance(installed, Calibration) and results:
+        installed = _in_frames_of(results[0], installed)
     by_name = _by_name(results, names)
     require_same_frames(
         extrinsic
@@ -74,6 +83,15 @@ def compare(
     if installed is not None:
         return _comparison_with_installed(by_name, installed)
     return _comparison_with_each_other(by_name)
+
+
+def _in_frames_of(first: Calibration, result: Calibration) -> Calibration:
+    """Return a result, inverted if its parent and child are the child and parent of the first."""
+    is_exchanged = (
+        result.parent_frame == first.child_frame
+        and result.child_frame == first.parent_frame
+    )
+    return result.inverse() if is_exchanged else result
 
 
 def _comparison_with_installed(

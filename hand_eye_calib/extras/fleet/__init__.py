@@ -78,8 +78,12 @@ def _add_arguments(parser: Any) -> None:
 
 
 def _is_batch(arguments: Any) -> bool:
-    if not arguments.batch and (arguments.dask or arguments.vehicle):
-        raise ConfigError("--dask and --vehicle need --batch")
+    for name in ("vehicle", "dask"):
+        value = getattr(arguments, name)
+        if value and not arguments.batch:
+            raise ConfigError(
+                f"--{name} is an option of batch: hand_eye_calib batch BAG ... --{name} {value}"
+            )
     return bool(arguments.batch)
 
 

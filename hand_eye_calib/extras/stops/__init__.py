@@ -73,6 +73,11 @@ def _add_arguments(parser: Any) -> None:
 
 def _are_stops(arguments: Any) -> bool:
     """Return whether the arguments name stops; raise ConfigError if they contradict."""
+    if arguments.target and arguments.target[0] in "-.0123456789":
+        raise ConfigError(
+            "--target is a printed target in images, such as charuco:5x7:0.04:0.03:4X4_50; the "
+            "accuracy is --target-translation, --target-rotation"
+        )
     are_images = bool(arguments.target) and not arguments.child_topic
     if not arguments.child_topic and are_images != bool(arguments.camera):
         raise ConfigError(

@@ -43,6 +43,11 @@ def is_number(cell: str) -> bool:
     return bool(_NUMBER.fullmatch(cell) or _DECIMAL_COMMA.fullmatch(cell))
 
 
+def are_whole(cells: Sequence[str]) -> bool:
+    """Whether all cells are whole numbers, which may be parts of numbers with decimal commas."""
+    return all(cell.lstrip("+-").isdecimal() for cell in cells)
+
+
 def is_value(cell: str) -> bool:
     """Whether a cell is a number, an angle, a date or time, or the mark of a missing value."""
     return (

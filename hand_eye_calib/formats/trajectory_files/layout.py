@@ -17,6 +17,7 @@ from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.formats.files import LONGEST_LINE
 from hand_eye_calib.formats.trajectory_files.cells import (
     CellsOf,
+    are_whole,
     is_angle,
     is_number,
     is_value,
@@ -43,6 +44,11 @@ from hand_eye_calib.formats.trajectory_files.recognition import (
 #: below. These are times in March 1973, so the unit of later stamps is clear.
 UNIT_EXPONENTS = {"ns": 17, "us": 14, "ms": 11}
 COMMENTS = ("#", "//")
+#: Remedy for commas both between cells and in numbers.
+DECIMAL_COMMAS = (
+    "their numbers seem to have decimal commas: export with decimal points, or with ; "
+    "between cells"
+)
 _LINE = re.compile(r"\S[^\r\n]*")
 
 # Largest number of lines from which the layout is recognised; comments do not count. Text above the
@@ -319,10 +325,12 @@ def _refuse_other_number_of_names(
     for line_number, line in lines:
         names = names_in(line, separator)[0]
         if _are_names_of_quantities(names) and len(row) > 1:
+            advice = "write one name for each column, or name all with `columns`"
+            if len(row) > len(names) and separator == "," and are_whole(row):
+                advice = DECIMAL_COMMAS
             raise InputError(
                 f"{path}, line {line_number}: names {len(names)} columns, but "
-                f"the rows have {len(row)} cells; write one name for each "
-                "column, or name all with `columns`"
+                f"the rows have {len(row)} cells; {advice}"
             )
 
 

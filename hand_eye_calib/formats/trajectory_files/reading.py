@@ -4,6 +4,7 @@ Files have the format TUM, KITTI or EuRoC, are tables with named columns, or com
 formats of their own (``extras/sensors/foreign.py``).
 """
 
+import shlex
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -313,9 +314,11 @@ def _rows_without_stamps(tables: Sequence[Table], pair_by: str) -> list[IntArray
     n_rows = [table.n_rows for table in tables]
     if pair_by == "row" and len({*n_rows}) > 1:
         counts = listing([f"{table.n_rows:,} in {table.path}" for table in tables])
+        paths = shlex.join(str(table.path) for table in tables)
         raise InputError(
             f"pairing by row needs as many poses in each file; found {counts}: write a row for "
-            "each stop into both, or calibrate streams with stamps by time"
+            "each stop into both, or calibrate streams with stamps by time: hand_eye_calib "
+            f"calibrate {paths}"
         )
     # Index of the pose with each name, or from each row of the file.
     indices: list[dict[Any, int]] = []

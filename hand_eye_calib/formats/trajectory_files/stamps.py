@@ -155,9 +155,7 @@ def refuse_coarse(table: Table, stamps_ns: IntArray, values: FloatArray) -> None
     if step_s := _step_of_32_bits(different):
         problem += f" (numbers of 32 bits have steps of {step_s:.4g} s here)"
         advice += ", and numbers of 64 bits (float64)"
-    raise InputError(
-        f"{table.path}: the timestamps {problem}; {advice}, or set `times`"
-    )
+    raise InputError(f"{table.path}: the timestamps {problem}; {advice}")
 
 
 def _step_of_32_bits(different: IntArray) -> float:

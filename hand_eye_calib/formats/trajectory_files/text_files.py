@@ -10,6 +10,7 @@ from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.registry import FILE_READERS
 from hand_eye_calib.core.base.text import shortened
 from hand_eye_calib.formats.files import LONGEST_NAME, decoded, read_bytes, read_text
+from hand_eye_calib.formats.trajectory_files.cells import are_whole
 from hand_eye_calib.formats.trajectory_files.columns import (
     MATRIX,
     POSITION,
@@ -20,6 +21,7 @@ from hand_eye_calib.formats.trajectory_files.columns import (
 from hand_eye_calib.formats.trajectory_files.dates import notes_on_stamps
 from hand_eye_calib.formats.trajectory_files.file_options import AUTO, FileOptions
 from hand_eye_calib.formats.trajectory_files.layout import (
+    DECIMAL_COMMAS,
     TUM,
     Layout,
     layout_of,
@@ -42,6 +44,9 @@ _EXPECTED = (
     "lines of a trajectory: save the poses of MATLAB, HDF5, Arrow, spreadsheets, receivers and "
     "autopilots as csv, a model of COLMAP as text"
 )
+# Columns in the message about a file without names of columns, by their number, or else.
+_EXAMPLES = {4: "t,wx,wy,wz", 7: "t,x,y,z,roll_deg,pitch_deg,yaw_deg"}
+_EXAMPLE = "t,x,y,z,qx,qy,qz,qw"
 # Name of the file with the stamps of the poses in another file of the same folder, as in KITTI.
 _TIMES = "times.txt"
 # Bytes of Latin-1 that may occur in headers: the signs for degree, squared and micro, and letters
@@ -164,12 +169,7 @@ def _empty_table(path: str | Path, layout: Layout, options: FileOptions) -> Tabl
     n_columns = len(layout.row)
     columns = layout.columns
     if columns is None and n_columns:
-        raise InputError(
-            f"{path}: the first line does not name the columns, so their "
-            f"order is unknown; name the {n_columns} with `columns`, such as "
-            "t,x,y,z,qx,qy,qz,qw, t,x,y,z,roll_deg,pitch_deg,yaw_deg or "
-            "t,wx,wy,wz"
-        )
+        raise InputError(f"{path}: {_advice_on_columns(layout.row)}")
     columns = columns or STAMPED_POSE
     if layout.format == "euroc":
         columns += ("",) * (n_columns - len(columns))
@@ -177,6 +177,21 @@ def _empty_table(path: str | Path, layout: Layout, options: FileOptions) -> Tabl
     expected = _FORMATS.get(layout.format, ("", ""))[1]
     return Table(
         path, columns, measures, expected, layout.format, layout.is_transposable
+    )
+
+
+def _advice_on_columns(row: Sequence[str]) -> str:
+    """Return the message about rows whose columns have no names and do not fit a known order."""
+    if len(row) > len(TUM) and are_whole(row):
+        return f"rows of {len(row)} cells without a decimal point; {DECIMAL_COMMAS}"
+    naming = f"name the {len(row)} with `columns`, such as {_EXAMPLES.get(len(row), _EXAMPLE)}"
+    if len(row) == len(TUM) - 1:
+        return (
+            "7 numbers in a line, tum has 8 (t x y z qx qy qz qw): is one missing? Otherwise "
+            f"{naming}"
+        )
+    return (
+        f"the first line does not name the columns, so their order is unknown; {naming}"
     )
 
 

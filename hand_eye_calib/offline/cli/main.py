@@ -8,8 +8,10 @@ command.
 import argparse
 import os
 import re
+import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -22,7 +24,7 @@ from hand_eye_calib.core.base.errors import (
 )
 from hand_eye_calib.core.base.option import did_you_mean
 from hand_eye_calib.core.base.registry import COMMANDS
-from hand_eye_calib.core.base.text import shown_value
+from hand_eye_calib.core.base.text import listing, shown_value
 from hand_eye_calib.formats.files import limit_memory
 from hand_eye_calib.offline.cli.options import Exit, as_typed, command_with, fail
 
@@ -255,5 +257,57 @@ def _refuse(rest: Sequence[str], parser: argparse.ArgumentParser) -> NoReturn:
     options = [word for word in rest if word.startswith("-")]
     first, *_ = [*options, *rest]
     option, _, _ = first.partition("=")
-    hint = did_you_mean(option, parser._option_string_actions)
+    owners = _commands_with(option) if options else {}
+    if owners:
+        parser.error(_option_of(owners, rest[rest.index(first) :]))
+    # Compare the names without dashes, which would make short names similar.
+    known = [name.lstrip("-") for name in parser._option_string_actions]
+    word = _SHORT_NAMES.get(option, option).lstrip("-")
+    similar = did_you_mean(word, known) if options else ""
+    hint = re.sub(r"(mean|or) (?=\w)", r"\1 --", similar)
     parser.error(f"unknown {option!r}{hint}")
+
+
+# Options of other programs with one letter, and the options here with the same purpose.
+_SHORT_NAMES = {"-o": "--out"}
+
+
+def _commands_with(option: str) -> dict[str, argparse.ArgumentParser]:
+    """Return the parsers of the commands that have an option, by the command's name.
+
+    If the short help of some of these commands lists the option, only these are returned. So are
+    commands with the option in their own examples.
+    """
+    owners: dict[str, argparse.ArgumentParser] = {}
+    for name, command in COMMANDS.items():
+        parser: argparse.ArgumentParser = CommandParser(prog=f"hand_eye_calib {name}")
+        with suppress(ImportError):
+            command.load().add_arguments(parser)
+        if option in parser._option_string_actions and option != "-h":
+            owners[name] = parser
+    typical = {}
+    for name, parser in owners.items():
+        short_help = f"{parser.get_default('brief')}\n{parser.epilog}"
+        for line in map(str.strip, short_help.splitlines()):
+            is_own = line.startswith(("--", f"{parser.prog} "))
+            if is_own and option in line.replace(",", " ").split():
+                typical[name] = parser
+    return typical or owners
+
+
+def _option_of(
+    owners: Mapping[str, argparse.ArgumentParser], words: Sequence[str]
+) -> str:
+    """Return the message about an option of other commands, with the usage of the first command.
+
+    ``words`` are the option as typed, and the arguments after it.
+    """
+    first, *others = words
+    option, equals, _ = first.partition("=")
+    parser = next(iter(owners.values()))
+    typed = [first]
+    if not equals and parser._option_string_actions[option].nargs != 0:
+        typed += others[:1]
+    usage = (parser.usage or "%(prog)s") % {"prog": parser.prog}
+    usage = usage.replace("[OPTION ...] ", "")
+    return f"{option} is an option of {listing([*owners])}: {usage} {shlex.join(typed)}"

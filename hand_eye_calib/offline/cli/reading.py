@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hand_eye_calib.core.base.config import CalibratorConfig
-from hand_eye_calib.core.base.errors import ConfigError
+from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.engine.run import run
@@ -207,19 +207,33 @@ def read_files(
     files = []
     for path, stream in zip(paths, streams, strict=True):
         files.append((Path(path), _options_of_file(arguments, stream, options)))
-    with waiting_for(f"reading {' and '.join(map(str, paths))}"):
-        readings = read_trajectory_files(files)
+    try:
+        with waiting_for(f"reading {' and '.join(map(str, paths))}"):
+            readings = read_trajectory_files(files)
+    except InputError as error:
+        raise type(error)(_with_option_of_file(str(error), paths, streams)) from None
     repairs: list[str] = []
     warnings: list[str] = []
     for (path, _), reading, stream in zip(files, readings, streams, strict=True):
         repairs += [text.replace(str(path), path.name) for text in reading.repairs]
         warnings += [text.replace(str(path), path.name) for text in reading.warnings]
         for text in reading.guesses:
-            # With two files, replace an option of both files by that of this file.
-            if stream:
-                text = re.sub(f"`({'|'.join(FILE_OPTIONS)})`", rf"`{stream}_\1`", text)
+            text = _with_option_of_file(text, [path], [stream])
             note(text.replace(str(path), path.name))
     return FilesRead([reading.trajectory for reading in readings], repairs, warnings)
+
+
+def _with_option_of_file(
+    text: str, paths: Sequence[Path | str], streams: Sequence[str]
+) -> str:
+    """Return a message that begins with a path, with the options of the file in `columns`' place.
+
+    The option of both files is replaced by that of this file, if the file has a stream.
+    """
+    for path, stream in zip(paths, streams, strict=True):
+        if stream and text.startswith(str(path)):
+            return re.sub(f"`({'|'.join(FILE_OPTIONS)})`", rf"`{stream}_\1`", text)
+    return text
 
 
 def _refuse_options_of_two_files(arguments: Namespace) -> None:
