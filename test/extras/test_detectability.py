@@ -212,7 +212,7 @@ def test_details_and_report_state_it(capsys, tmp_path):
             assert fact in text
         assert "deg about y" in text
         assert (
-            "half of the recording contradicts such an error in nine of ten trials"
+            "half of the recording contradicts such errors in nine of ten trials"
             in text
         )
 

@@ -104,7 +104,8 @@ def test_the_stream_that_is_not_named_is_chosen_alone():
         (
             [LIDAR, ("/joint_states", JOINTS, 900)],
             (),
-            "/joint_states may be the other stream",
+            ". If /lidar/odometry is not computed from the wheels, /joint_states is the other "
+            "stream",
             {"parent_topic": "/joint_states", "child_topic": "/lidar/odometry"},
         ),
         (
@@ -134,6 +135,34 @@ def test_without_an_obvious_pair_the_error_names_cause_and_options(
     with pytest.raises(UnclearStreamsError) as caught:
         chosen(rows, edges=edges)
     assert message in str(caught.value)
+    assert caught.value.options == options
+
+
+@pytest.mark.parametrize(
+    ("rows", "message", "options"),
+    [
+        (
+            [("/imu", IMU, 900), ("/joint_states", JOINTS, 900)],
+            "no other topic has poses; /imu has rates",
+            {"child_topic": "/imu"},
+        ),
+        (
+            [("/imu", IMU, 900), ("/fix", FIX, 900)],
+            "no other topic has poses; /fix has positions",
+            {"child_topic": "/fix"},
+        ),
+        (
+            [("/joint_states", JOINTS, 900)],
+            "no other topic has poses: run the odometry or SLAM of the other sensor, and record "
+            "it. The bag has /joint_states",
+            {},
+        ),
+    ],
+)
+def test_beside_a_named_topic_the_error_names_the_other_stream(rows, message, options):
+    with pytest.raises(UnclearStreamsError) as caught:
+        chosen(rows, missing=("child",))
+    assert str(caught.value).startswith(message)
     assert caught.value.options == options
 
 

@@ -1,5 +1,7 @@
 """The standard deviations beside the printed angles are those of these angles."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -13,7 +15,11 @@ from hand_eye_calib.core.geometry.se3 import (
     sigmas_rpy,
 )
 from hand_eye_calib.core.results.calibration import SolveStatus
-from hand_eye_calib.core.results.document import printed_numbers, transforms_of
+from hand_eye_calib.core.results.document import (
+    angles_in_words,
+    printed_numbers,
+    transforms_of,
+)
 from hand_eye_calib.offline.cli.present import as_lines
 
 SAMPLES = 20_000
@@ -184,3 +190,15 @@ def test_an_axis_with_a_negligible_allowance_has_no_parts_printed():
         observability_measured=dofs([0.02] * 6),
     )
     assert "  z          0.100 +/- 0.020 m" in as_lines(result)
+
+
+def test_with_an_unknown_pitch_no_angle_is_explained():
+    rotation = se3.rotation_from_rpy(np.radians([20.0, 60.0, 70.0]))
+    result = calibration(rotation, (0.3, 0.2, 0.1))
+    known = transforms_of(result)["T_parent_child"]
+    assert "roll and yaw vary together at pitch 60 deg" in angles_in_words(
+        known, result
+    )
+    pitch_unknown = replace(known, rpy_deg=np.array([20.0, np.nan, 70.0]))
+    assert printed_numbers(pitch_unknown, ())["pitch"] == "unknown"
+    assert angles_in_words(pitch_unknown, result) == ""

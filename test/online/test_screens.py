@@ -88,7 +88,7 @@ def judged(rule, axes=("x", "y", "z")):
     """A result with one reason."""
     problem, step = of_reason(reason(rule, axes))
     verdict = rule.verdict.value
-    fact = "would have shown from 12 cm along x on"
+    fact = "Errors larger than 12 cm along x would have been noticed"
     reasons = ("the recording contradicts only errors above 12 cm: compare",)
     return replace(
         RESULT,

@@ -41,7 +41,7 @@ from hand_eye_calib.online.watch.web import fragment
 
 
 def test_evidence_is_displayed_at_the_end_alone():
-    fact = "An error of the result would have shown from 2 cm along x on"
+    fact = "Errors larger than 2 cm along x would have been noticed"
     extrinsic = replace(EXTRINSIC, result=replace(RESULT, facts=(fact,)))
     view = view_of(state(at=REACHED, extrinsic=extrinsic))
     assert view.word == "DONE"

@@ -312,7 +312,7 @@ def test_saved_files_are_linked(page, tmp_path):
 
 
 def test_evidence_of_the_result_is_readable_at_the_end(page):
-    fact = "An error of the result would have shown from 2 cm along x on: <b> & 0.5 deg"
+    fact = "Errors larger than 2 cm along x would have been noticed: <b> & 0.5 deg"
     page.show(replace(GO_ON, word="DONE", result=(Line(Tone.GOOD, "evidence", fact),)))
     assert fact in page.get(".health", "innerText")
     assert page.get(".health", "checkVisibility()")

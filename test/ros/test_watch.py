@@ -119,7 +119,7 @@ def test_a_person_sees_the_session_from_the_first_message_to_done(
     # The state, the page and the saved result state the same smallest errors.
     saved = hec.load(tmp_path / "out")
     errors, shifts = facts_of(saved)
-    assert "An error of the result would have shown from" in errors
+    assert "Errors larger than" in errors
     assert errors in unescape(shown)
     assert shifts in unescape(shown)
     assert saved.detectability.errors["x"] < 0.2

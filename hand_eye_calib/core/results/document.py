@@ -364,6 +364,8 @@ def angles_in_words(transform: Notation, result: Result) -> str:
     excess_deg = float(sigmas_deg[are_known].max()) - math.degrees(rotation_rad)
     if not round(excess_deg, 1) > 0.0:
         return _about_axes_in_words(transform, are_known)
+    if not np.isfinite(transform.rpy_deg).all():
+        return ""
     return (
         f"roll and yaw vary together at pitch {transform.rpy_deg[1]:.0f} deg; the rotation itself "
         f"is good to {amount('roll', rotation_rad)}"

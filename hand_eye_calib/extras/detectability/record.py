@@ -109,25 +109,26 @@ class DetectabilityPart(Part):
         facts = []
         if errors := _amounts(value.errors):
             facts.append(
-                f"An error of the result would have shown from {errors} on{_of_streams(value)}: "
-                "half of the recording contradicts such an error in nine of ten trials"
+                f"Errors larger than {errors}{_of_streams(value)} would have been noticed: "
+                "half of the recording contradicts such errors in nine of ten trials"
             )
         if shifts := _amounts(value.shifts):
             facts.append(
-                f"A shift of the mount half-way would have shown from {shifts} on: the stream "
-                "checks report such a shift in nine of ten trials"
+                f"Shifts of the mount half-way larger than {shifts} would have been noticed: the "
+                "stream checks report such shifts in nine of ten trials"
             )
         return facts
 
 
 def _of_streams(value: Detectability) -> str:
-    """Return the errors of clock and scale that would have shown; an empty text if none would."""
+    """Return the noticeable errors of clock and scale; an empty text if there are none."""
     if not (math.isfinite(value.time_offset_s) and math.isfinite(value.scale)):
         return ""
     milliseconds = two_digits(1e3 * value.time_offset_s)
     percent = two_digits(1e2 * value.scale)
-    of_clocks = f"an error of the clocks from {milliseconds} ms"
-    return f", {of_clocks}, and of the child's lengths from {percent}%"
+    return (
+        f", {milliseconds} ms between the clocks and {percent}% of the child's lengths"
+    )
 
 
 def _amounts(sizes: Mapping[str, float]) -> str:

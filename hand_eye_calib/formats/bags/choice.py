@@ -198,7 +198,7 @@ def _unclear(
         return UnclearStreamsError(problem, _options(missing, sources))
     advice = "record the odometry of the other sensor"
     if not sensors:
-        advice = _advice({topic.type for topic in topics})
+        advice = _advice({topic.type for topic in topics}, len(missing))
     listed = (
         f"The bag has {_listed(topics)}" if topics else "The bag has no other topics"
     )
@@ -228,19 +228,20 @@ def _problem_and_sources(
         problem = f"only one topic has poses, {sensors[0]}"
         if len(names) == 1 and wheels:
             problem += (
-                f". Unless they are computed from wheels, {wheels[0].name} may be the "
-                "other stream"
+                f". If {sensors[0].name} is not computed from the wheels, {wheels[0].name} is "
+                "the other stream"
             )
             # Wheels are the parent.
             names = [wheels[0].name, *names]
         return problem, names
+    # A topic that the user has named is not among the topics.
+    no_poses = "no topic has poses" if n_missing > 1 else "no other topic has poses"
     if len(pairs) >= n_missing:
         listed = shortened(listing(pairs), _LONGEST_LIST)
-        return f"no topic has poses, but transforms have: {listed}", pairs
+        return f"{no_poses}, but transforms have: {listed}", pairs
     if len(clouds) >= n_missing:
         problem = (
-            "no topic has poses; the odometry of lidars can be "
-            f"computed from {_listed(clouds)}"
+            f"{no_poses}; the odometry of lidars can be computed from {_listed(clouds)}"
         )
         return problem, [topic.name for topic in clouds]
     frames = {edge.split(":")[-1] for edge in edges}
@@ -248,14 +249,19 @@ def _problem_and_sources(
     if len(frames - worlds) >= n_missing and not sensors:
         listed = shortened(listing(sorted(edges)), _LONGEST_LIST)
         problem = (
-            f"no topic has poses, and the transforms share a frame ({listed}; if two sensors "
+            f"{no_poses}, and the transforms share a frame ({listed}; if two sensors "
             "measured them, name both)"
         )
         return problem, []
-    return "no topic has poses", []
+    if n_missing == 1:
+        for type_, quantity in ((_FIX, "positions"), (_IMU, "rates")):
+            if partial := _of_types(topics, {type_}):
+                name = partial[0].name
+                return f"{no_poses}; {name} has {quantity}", [name]
+    return no_poses, []
 
 
-def _advice(types: set[str]) -> str:
+def _advice(types: set[str], n_missing: int) -> str:
     """Return what to do with a bag whose topics have messages of these types, but no poses."""
     if messages.POINTS_TYPE in types:
         return "run the odometry of both sensors and record it; clouds of one lidar are one stream"
@@ -265,7 +271,8 @@ def _advice(types: set[str]) -> str:
         return (
             "GNSS and IMU need the poses of another sensor: record its odometry or SLAM"
         )
-    return "run the odometry or SLAM of both sensors, and record it"
+    sensors = "both sensors" if n_missing > 1 else "the other sensor"
+    return f"run the odometry or SLAM of {sensors}, and record it"
 
 
 def _separate_edges(edges: Collection[str]) -> list[str]:
