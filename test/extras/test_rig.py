@@ -156,7 +156,7 @@ def test_copies_of_a_sensor_other_than_the_first_are_not_used(rig, mounted):
     for result in (calibrated.calibrations[0], calibrated.calibrations[2]):
         assert result.findings[0].code == "not_independent"
         assert result.findings[0].what.startswith("front and copy: both streams agree")
-    assert calibrated.headline == "DO NOT USE: front and copy of 4 sensors"
+    assert calibrated.headline == ("DO NOT USE: front and copy of 4 sensors; USE: rear")
 
 
 def test_what_is_of_two_sensors_is_refused(rig):

@@ -395,11 +395,27 @@ def test_a_result_with_exchanged_frames_is_compared_as_its_inverse():
         assert comparison.verdict == "same"
         for row in comparison.differences[0].axes.values():
             assert_allclose(row.difference, 0.0, atol=1e-9)
-    moved = RESULT.inverse()
-    T = moved.T_parent_child.copy()
-    T[0, 3] += 0.5
-    moved = dataclasses.replace(moved, T_parent_child=T)
+    moved = dataclasses.replace(RESULT.inverse(), T_parent_child=np.eye(4))
     assert hec.compare([RESULT, moved]).verdict == "moved"
+
+
+def test_the_name_of_a_frame_with_a_space_gets_a_note(run):
+    paths = ("sample:lidar.tum", "sample:camera.tum")
+    code, _, err = run("calibrate", *paths, "--parent-frame", "base link")
+    assert (code, "'base link' contains a space; 'base_link' may" in err) == (0, True)
+
+
+def test_a_note_on_a_unit_names_the_other_unit_which_is_obeyed(tmp_path):
+    rows = np.loadtxt(local_path("sample:lidar.tum"))[:, :3] * [1.0, 1e-5, 1e-5]
+    path = tmp_path / "fixes.csv"
+    np.savetxt(path, rows, "%.9f", ",", header="t,latitude,longitude", comments="")
+    with pytest.warns(UserWarning, match="read in rad, .* such as lon_deg"):
+        in_rad = hec.read_trajectory(path, "auto")
+    np.savetxt(path, rows, "%.9f", ",", header="t,lat_deg,lon_deg", comments="")
+    with pytest.warns(UserWarning, match="positions only"):
+        in_deg = hec.read_trajectory(path, "auto")
+    lengths = [np.ptp(positions.poses[:, 0, 3]) for positions in (in_rad, in_deg)]
+    assert_allclose(lengths[0] / lengths[1], np.degrees(1.0), rtol=1e-3)
 
 
 def test_a_topic_that_another_sensor_has_is_not_proposed(run, inputs, monkeypatch):

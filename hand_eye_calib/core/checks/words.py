@@ -36,8 +36,8 @@ class FindingWords:
 #: What to do about streams that do not agree.
 UNRELATED_ADVICE = (
     "check that both sensors are on one rigid body, and that both streams are of one recording and "
-    "in known units; if the clocks differ, have the offset estimated (time_offset estimate); in a "
-    "file, call angles that are clockwise from north heading, not yaw"
+    "in known units; if the clocks differ, have the offset estimated (time_offset estimate); if a "
+    "file has angles clockwise from north, name them heading, not yaw"
 )
 
 #: Words of the findings of the core, by the key of the finding.
@@ -233,7 +233,7 @@ WORDS = {
     "large_time_offset": FindingWords(
         "the child's clock is {size_s:.2f} s {direction} the parent's, and no offset was given",
         "check that both streams are of one vehicle; if the clocks differ so much, give "
-        "time_offset {total_s} or estimate",
+        "time_offset estimate",
         "a clock of another epoch (start of the computer or of the recording, GPS week) or time "
         "scale (TAI is 37 s ahead of UTC, GPS 18 s), or a sensor on a vehicle that follows",
         severity=Severity.WARNING,

@@ -208,8 +208,8 @@ def _require_rig(
             raise ConfigError(f"{name} applies to two sensors; omit it for a rig")
         if name in ("time_offset", "scale") and not isinstance(value, str):
             raise ConfigError(
-                f"{name} {value} does not name a sensor of the rig; set "
-                f"{name} estimate, or correct the trajectories before"
+                f"{name} {value} applies to two sensors; for a rig, set {name} estimate, or "
+                "correct the trajectories before"
             )
 
 
@@ -354,15 +354,15 @@ class RigCalibration:
 
     @property
     def headline(self) -> str:
-        """The verdict, and the names of its sensors if other sensors have a better verdict."""
-        results = self.calibrations
-        gravest = [
-            result.child_frame for result in results if result.verdict is self.verdict
-        ]
-        of_sensors = f"{len(self.sensors)} sensors"
-        if len(gravest) < len(results):
-            of_sensors = f"{listing(gravest)} of {of_sensors}"
-        return f"{self.verdict.value}: {of_sensors}"
+        """The verdict; if the sensors differ, each verdict with its sensors, the gravest first."""
+        of_verdict: dict[Verdict, list[str]] = {verdict: [] for verdict in Verdict}
+        for result in self.calibrations:
+            of_verdict[result.verdict].append(result.child_frame)
+        groups = [(verdict, of_verdict[verdict]) for verdict in reversed(Verdict)]
+        texts = [f"{verdict.value}: {listing(of)}" for verdict, of in groups if of]
+        if len(texts) == 1:
+            return f"{self.verdict.value}: {len(self.sensors)} sensors"
+        return f"{texts[0]} of {len(self.sensors)} sensors; {'; '.join(texts[1:])}"
 
     def __repr__(self) -> str:
         return self.headline

@@ -275,12 +275,12 @@ def _in_si(table: Table, names: Sequence[str], kind: str) -> FloatArray:
     # The first two units are those of columns without a unit.
     first, second, *_ = factors
     largest = float(magnitudes.max())
-    unit = second if largest > largest_of_first else first
+    unit, other = (second, first) if largest > largest_of_first else (first, second)
     if kind != "length":
         table.guess(
             f"{', '.join(names)} read in {unit}, the largest is "
             f"{largest:.4g}; to change this, name the unit in the header, "
-            f"such as {names[-1]}_{unit.replace('/', '_')}"
+            f"such as {names[-1]}_{other.replace('/', '_')}"
         )
     return values * factors[unit]
 

@@ -355,7 +355,11 @@ def _checked_option(name: str, value: object) -> tuple[str, OptionValue]:
         # If the text is no number, check_value below reports what is expected.
         with suppress(ValueError):
             value = kind(value)
-    return name, check_value(field, value)
+    checked = check_value(field, value)
+    if name.endswith("_frame") and len(str(checked).split()) > 1:
+        proposed = "_".join(str(checked).split())
+        note(f"the frame name {checked!r} contains a space; {proposed!r} may be meant")
+    return name, checked
 
 
 def options_from(arguments: argparse.Namespace) -> Options:
