@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from findings import codes_of
 from vehicle_making import machine, pose_errors
 
 import hand_eye_calib as hec
@@ -137,6 +138,15 @@ def test_an_articulated_machine_is_no_car():
     assert "bends in its middle" in result.findings[0].cause
     assert [found.code for found in result.findings] == ["unrelated"]
     assert result.verdict.value != "USE"
+
+
+def test_wheels_that_do_not_determine_the_clock_offset_are_refused():
+    drive = simulate_machine(391507204, "articulated", "eights")
+
+    result = hec.calibrate_vehicle(drive.sensor, drive.wheels, child_kind="exact")
+
+    assert result.verdict is hec.Verdict.DO_NOT_USE
+    assert codes_of(result.findings) == ["unrelated"]
 
 
 def test_tracks_that_slip_in_curves_keep_the_pose():
