@@ -137,6 +137,9 @@ TABLE = """
 1 | info lidar.tum | a file of poses, not a saved result: calibrate PARENT CHILD --out DIR
 1 | info torn.yaml | torn.yaml is not readable YAML
 1 | compare torn.yaml --with robot.urdf | restore the file, or calibrate again
+1 | calibrate saved | saved is a saved result, not a bag: hand_eye_calib info saved
+1 | calibrate saved/extrinsic.yaml | show it with hand_eye_calib info saved/extrinsic.yaml
+2 | lidar.tum camera.tum | a command comes first: hand_eye_calib calibrate lidar.tum camera.tum
 1 | compare saved | or one and the installed transform (--with
 1 | compare saved saved | saved appears twice: name each result once
 1 | compare saved --with other.json | in it; pass extrinsic.yaml, a URDF, a bag, or "X Y

@@ -159,6 +159,11 @@ def _listed_samples(path: str | Path, document: Any) -> ArmSamples:
     """Return the samples of a document that lists the stops one by one (MoveIt, easy_handeye)."""
     parameters: Mapping[str, Any] = {}
     calibration = None
+    if isinstance(document, Mapping) and "T_parent_child" in document:
+        raise InputError(
+            f"{path} is a saved result: show it with hand_eye_calib info {path}, or pass the "
+            "streams again"
+        )
     if isinstance(document, Mapping) and "samples" in document:
         parameters = _parameters_of(document)
         if not parameters.get(_TYPE):

@@ -162,6 +162,8 @@ def _no_files(folder: Path) -> str:
             f"{_listing(missing)}, and no such file is there; copy the whole "
             "bag"
         )
+    if (folder / "extrinsic.yaml").is_file():
+        return f"{folder} is a saved result, not a bag: hand_eye_calib info {folder}"
     advice = "check the path"
     for subfolder in sorted(
         file.parent for file in [*folder.glob("*/*"), *folder.glob("*/*/*")]

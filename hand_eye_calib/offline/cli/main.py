@@ -182,6 +182,9 @@ def _run(argv: Sequence[str]) -> int:
         known = (
             f"expected one of {', '.join(COMMANDS)}{did_you_mean(command, COMMANDS)}"
         )
+        if Path(command).exists():
+            line = f"hand_eye_calib calibrate {shlex.join(argv)}"
+            parser.error(f"{command!r} is a path; a command comes first: {line}")
         parser.error(f"invalid choice: {command!r}, {known}")
     parsers = _add_commands(parser)
     if command is not None:
