@@ -237,6 +237,16 @@ def test_an_axis_that_is_not_shown_does_not_spoil_the_others():
     )
 
 
+def test_axes_out_of_reach_are_not_among_the_known_axes():
+    rotations = good(
+        measured="rotations",
+        observability_measured=observed(x=np.inf, y=np.inf, z=np.inf, yaw=np.inf),
+    )
+    assert rotations.headline == (
+        "USE WITH CARE: roll and pitch only; measure yaw by hand"
+    )
+
+
 def test_a_file_keeps_what_the_verdict_comes_from():
     result = good(**CASES["error_finding"] | CASES["target"])
     document = result.to_dict()

@@ -183,7 +183,10 @@ def test_an_alarm_within_a_session_is_printed_and_is_no_good_exit(
     assert compare_digests(arguments(tmp_path)) == 4
     lines = capsys.readouterr().out.splitlines()
     assert f"alarm in the session of {last.day}: moved about z by 1.5 deg" in lines[0]
-    assert lines[-1] == "  -- alarm in this session: moved about z by 1.5 deg"
+    assert lines[-2:] == [
+        "  -- alarm in this session: moved about z by 1.5 deg",
+        "     (the offset above is of the whole session, also before the alarm)",
+    ]
     assert compare_digests(arguments(tmp_path, json=True)) == 4
     alarms = json.loads(capsys.readouterr().out)["alarms"]
     assert alarms == {last.day: "moved about z by 1.5 deg"}

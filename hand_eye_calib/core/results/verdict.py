@@ -8,6 +8,7 @@ from hand_eye_calib.core.base.text import (
     listing,
 )
 from hand_eye_calib.core.results.axes import (
+    axes_within_reach,
     what_is_known,
 )
 from hand_eye_calib.core.results.parts import part
@@ -71,6 +72,11 @@ class Judged(Result):
             hidden = listing(first.axes)
             them = hidden if len(first.axes) == 1 else "them"
             text = f"all but {hidden}; measure {them} by hand"
+            if self.out_of_reach:
+                # Axes out of reach are not among the hidden axes, and are not known either.
+                axes = axes_within_reach(self)
+                known = listing([axis.name for axis in axes if not axis.is_hidden])
+                text = f"{known} only; measure {them} by hand"
             if others:
                 text += f"; {others[0].sentence}"
         else:

@@ -108,3 +108,4 @@ def _lines(history: History) -> Iterator[str]:
         )
         if digest.alarm:
             yield f"  -- alarm in this session: {digest.alarm}"
+            yield "     (the offset above is of the whole session, also before the alarm)"

@@ -38,8 +38,9 @@ _DETERMINED = 0.3
 _CAPTION = (
     "Offset from the installed pose along and about the parent's axes, from all sessions since the "
     "last change. The band is three standard deviations; it shrinks with the sessions. A dashed "
-    "line is a change of the mount, a dotted line an alarm within a session. An axis that the "
-    "motion does not determine has no line."
+    "line is a change of the mount, a dotted line an alarm within a session. The offset of such a "
+    "session is of the whole session, also before the alarm. An axis that the motion does not "
+    "determine has no line."
 )
 
 

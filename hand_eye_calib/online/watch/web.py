@@ -41,6 +41,8 @@ _FOLDER = files("hand_eye_calib.online.watch").joinpath("page")
 # Sketch of a vehicle with the names of its axes. It is drawn from the left, so its y axis points
 # towards the reader.
 _SKETCH = _FOLDER.joinpath("sketch.svg").read_text(encoding="utf-8")
+# Advice on options in a reason, which ends the reason: the form of the page replaces the options.
+_PRIOR_ADVICE = re.compile("and give (a prior|priors), such as [^<]*")
 # Files of a saved result to which the page links.
 SAVED = ("report.html", "extrinsic.yaml")
 # Media types by extension; all other files are plain text.
@@ -303,7 +305,10 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
         bars = _SKETCH + bars
     pose = [_element("dt", axis) + _element("dd", text) for axis, text in view.values]
     # The first line of the result is the verdict. The reasons for the verdict follow it.
-    health = _lines(view.result[:1]) + _listed(view.reasons)
+    reasons = _listed(view.reasons)
+    if view.by_hand:
+        reasons = _PRIOR_ADVICE.sub("and type it above", reasons)
+    health = _lines(view.result[:1]) + reasons
     health += _lines(view.result[1:] + view.health)
     return (
         f'<div id="state" class="{view.tone.name.lower()}" data-buttons="{" ".join(view.buttons)}" '
