@@ -3,7 +3,7 @@
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray
-from hand_eye_calib.core.base.text import listing
+from hand_eye_calib.core.base.text import counted, listing
 from hand_eye_calib.core.checks.findings import Finding, Severity, finding
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.stops.closed_form import Stops
@@ -11,7 +11,7 @@ from hand_eye_calib.extras.stops.flat_target import sines_of_views, usual_sine
 from hand_eye_calib.extras.stops.robot_world import RobotWorld
 
 # Squared Mahalanobis distance (six values) of a stop above which an outlier is reported. Outliers
-# below it are left out silently: errors of a target's pose differ by some times between views.
+# below it are only counted: errors of a target's pose differ by some times between views.
 # Measured on simulated images of three targets.
 _MIN_REPORTED_SQUARED = 225.0
 
@@ -33,6 +33,10 @@ def check_left_out(fit: RobotWorld, stops: Stops) -> list[Finding]:
     if count > _MAX_LISTED:
         numbers = [*numbers[:_MAX_LISTED], f"{count - _MAX_LISTED} more"]
     is_large = count > _MAX_LEFT_OUT * len(stops)
+    n_smaller = int(np.sum(fit.weights == 0.0)) - count
+    smaller = ""
+    if n_smaller:
+        smaller = f" (and {counted(n_smaller, 'smaller outlier')}, see the residuals)"
     return [
         finding(
             "outlier_stops",
@@ -40,6 +44,9 @@ def check_left_out(fit: RobotWorld, stops: Stops) -> list[Finding]:
             count=count,
             n_stops=len(stops),
             numbers=f"{'stop' if count == 1 else 'stops'} {listing(numbers)}",
+            do="does" if count == 1 else "do",
+            were="was" if count == 1 else "were",
+            smaller=smaller,
         )
     ]
 

@@ -75,7 +75,8 @@ WORDS = {
         code="same_frame",
     ),
     "outlier_stops": FindingWords(
-        "{count} of {n_stops} stops clearly do not fit the others and were left out: {numbers}",
+        "{count} of {n_stops} stops clearly {do} not fit the others and {were} left out: {numbers}"
+        "{smaller}",
         "look at these stops: is the target detected well, and does the arm rest?",
         "a target that was detected mirrored, or a stop during a motion",
         severity=Severity.WARNING,

@@ -1,6 +1,7 @@
 """Stamps of a table in whole nanoseconds, and their order."""
 
 from decimal import Decimal
+from pathlib import Path
 
 import numpy as np
 
@@ -55,10 +56,16 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
         If the table has no stamps, if stamps are too large, or if their unit is unclear.
     """
     if not table.stamps:
-        raise InputError(
-            f"{table.path}: the poses have no stamps; name their column t, "
-            "set `times`, or pair poses by row with `pair_by`"
-        )
+        if isinstance(table.path, Path):
+            remedy = (
+                "name their column t, set `times`, or pair poses by row with `pair_by`"
+            )
+        else:
+            remedy = (
+                "read them with read_trajectory(poses, times=stamps); stops without stamps are "
+                "for calibrate_stops"
+            )
+        raise InputError(f"{table.path}: the poses have no stamps; {remedy}")
     unit = stamp_unit or table.stamp_unit
     stamps = table.stamps
     if not unit and min(stamps) >= _FIRST_PACKED and max(stamps) < _END_OF_PACKED:

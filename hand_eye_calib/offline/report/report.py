@@ -248,6 +248,7 @@ def render_brief(calibration: Calibration) -> str:
         calibration=calibration,
         numbers=printed_numbers(transform, calibration.out_of_reach, "±"),
         parts=parts_of_sigmas(transform),
+        angles=angles_in_words(transform, calibration),
         allowance=spelled(allowance_in_words(calibration), Interface.PYTHON),
         views=figure_of_views([calibration]),
     )
