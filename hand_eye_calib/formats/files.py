@@ -137,7 +137,14 @@ def similar(path: str | Path) -> str:
     # The folder may not exist, or the path may contain a zero byte.
     with suppress(OSError, ValueError):
         if not Path(path).exists():
-            return did_you_mean(Path(path).name, os.listdir(Path(path).parent))
+            wanted = Path(path)
+            # Compare the names without suffixes first: a common suffix makes short names similar.
+            names = [
+                name
+                for name in os.listdir(wanted.parent)
+                if did_you_mean(wanted.stem, [Path(name).stem])
+            ]
+            return did_you_mean(wanted.name, names)
     return ""
 
 

@@ -320,6 +320,8 @@ def load_result(path: str | Path) -> Calibration:
         document = read_yaml(path)
     except UnreadableYamlError as error:
         raise InputError(f"{error}; restore the file, or calibrate again") from None
+    if document is None:
+        raise InputError(f"{path}: the file is empty; restore it, or calibrate again")
     with located(path):
         return Calibration.from_dict(document)
 

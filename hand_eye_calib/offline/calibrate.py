@@ -1,6 +1,7 @@
 """The Python functions :func:`calibrate` and :func:`cross_check`, for two whole trajectories."""
 
 import inspect
+import math
 import re
 import textwrap
 import warnings
@@ -310,6 +311,11 @@ def _prior_text(axis: str, pair: Any) -> str:
             f"prior {axis} must be (value, standard deviation) or a text such as '1.85+/-0.02'; "
             f"got {pair!r}"
         ) from None
+    if AXIS_UNITS[axis] == "rad" and abs(value) > 2.0 * math.pi:
+        raise ConfigError(
+            f"prior {axis} is in rad; got {value:g}: for degrees write "
+            f"'{value:g}deg+/-{sigma:g}deg', or convert both numbers with np.deg2rad"
+        )
     return f"{value!r}+/-{sigma!r}"
 
 

@@ -170,7 +170,7 @@ class TestRefusals:
             0.0,
             0.0,
             {"reference": "B50"},
-            "too few common poses for the chosen reference",
+            "reference B50 needs more than 50 common poses; 11 are there",
         ),
         (40, 0.005, 0.0, {"max_gap": 0.01}, "raise max_gap"),
     ],

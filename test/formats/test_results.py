@@ -384,7 +384,7 @@ def edited(**changes):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "not a saved result: expected format hand_eye_calib/extrinsic"),
+        ("", "the file is empty; restore it, or calibrate again"),
         ("- 1", "not a saved result"),
         (
             edited(version=3),

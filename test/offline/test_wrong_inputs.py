@@ -137,7 +137,8 @@ TABLE = """
 1 | info lidar.tum | a file of poses, not a saved result: calibrate PARENT CHILD --out DIR
 1 | info torn.yaml | torn.yaml is not readable YAML
 1 | compare torn.yaml --with robot.urdf | restore the file, or calibrate again
-1 | calibrate saved | saved is a saved result, not a bag: hand_eye_calib info saved
+1 | calibrate saved | saved is a saved result: show it with hand_eye_calib info saved
+1 | check saved | saved is a saved result, not a bag: hand_eye_calib info saved
 1 | calibrate saved/extrinsic.yaml | show it with hand_eye_calib info saved/extrinsic.yaml
 2 | lidar.tum camera.tum | a command comes first: hand_eye_calib calibrate lidar.tum camera.tum
 1 | compare saved | or one and the installed transform (--with
@@ -168,6 +169,24 @@ TABLE = """
 2 | calibrate lidar.tum camera.tum --foo | unknown '--foo' (
 2 | calibrate lidar.tum camera.tum -o x | unknown '-o'; did you mean --out? (
 2 | calibrate lidar.tum camera.tum --mathod park | did you mean --method?
+1 | calibrate lidar.tum camera.tum --time-offset 1000 | leave it out, they overlap without it
+1 | calibrate lidar.tum saved/extrinsic.yaml | extrinsic.yaml is a saved result: show it with
+1 | calibrate lidar.tum saved | saved is a saved result: show it with hand_eye_calib info saved
+2 | saved | a command comes first: hand_eye_calib info saved
+2 | replay lidar.tum camera.tum | trajectory files: hand_eye_calib calibrate lidar.tum camera.tum
+2 | watch lidar.tum | watch takes no file: it displays the running node
+2 | calibrate "lidar.tum camera.tum" | leave out the quotes and commas: lidar.tum camera.tum
+2 | calibrate lidar.tum,camera.tum | 2 files in one argument: leave out the quotes and commas
+2 | calibrate lidar.tum camera.tum --prior z=1+/-1 yaw=1+/-1 | repeat --prior before each axis
+2 | calibrate lidar.tum camera.tum --prior z=1+/-1 --prior z=2+/-1 | --prior z is given twice
+2 | arm lidar.tum camera.tum --parent-angles foo | --parent-angles must be one of abb, fanuc
+2 | calibrate lidar.tum camera.tum --topics /a /b | --topics applies to bags only
+2 | calibrate lidar.tum camera.tum --out "" | the name is empty
+2 | simulate --out "" | the name is empty
+1 | calibrate lidar.tum camera.tum --reference B100000 | needs more than 100000 common poses
+1 | arm nothing.yaml | nothing.yaml: the file is empty; expected samples
+1 | info nothing.yaml | nothing.yaml: the file is empty; restore it
+2 | arm lidar.tum image.png | is an image: pass the folder of images, --target and --camera
 """
 ROWS = [
     [cell.strip() for cell in row.split(" | ")] for row in TABLE.strip().splitlines()
@@ -175,6 +194,7 @@ ROWS = [
 
 TEXTS = {
     "empty.tum": "",
+    "nothing.yaml": "",
     "comment.tum": "# nothing\n",
     "one.tum": "0 0 0 0 0 0 0 1\n",
     "words.tum": "hello world\nthis is text\n",
@@ -342,6 +362,10 @@ IN_PYTHON = {
         lambda: hec.CalibratorConfig(prior_z=1.85),
         "prior.z must be a text with its standard deviation, such as '1.85",
     ),
+    "a prior in degrees": (
+        lambda: hec.calibrate(LIDAR, LIDAR, prior={"yaw": (-62, 2)}),
+        "write '-62deg+/-2deg', or convert both numbers with np.deg2rad",
+    ),
     "a text as target": (
         lambda: hec.CalibratorConfig(target_translation="two"),
         "target.translation must be a number in m; got 'two'",
@@ -419,6 +443,15 @@ def test_a_note_on_a_unit_names_the_other_unit_which_is_obeyed(tmp_path):
         in_deg = hec.read_trajectory(path, "auto")
     lengths = [np.ptp(positions.poses[:, 0, 3]) for positions in (in_rad, in_deg)]
     assert_allclose(lengths[0] / lengths[1], np.degrees(1.0), rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["wrong.tum", "missing.yaml"])
+def test_a_file_of_another_name_is_not_proposed(run, inputs, monkeypatch, name):
+    """A common suffix does not make names similar."""
+    monkeypatch.chdir(inputs)
+    _, _, err = run("calibrate", name, "lidar.tum")
+    assert f"cannot read {name}" in err
+    assert "did you mean" not in err
 
 
 def test_a_topic_that_another_sensor_has_is_not_proposed(run, inputs, monkeypatch):

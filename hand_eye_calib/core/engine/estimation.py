@@ -482,6 +482,11 @@ def _solve_pairs(
         solution: Solution = best.solution
     else:
         pairs = motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
+        if len(pairs) == 0:
+            raise NotEnoughDataError(
+                f"reference {reference} needs more than {reference[1:] or 1} common poses; "
+                f"{len(pose_pairs)} are there"
+            )
         solution = method.solve(pairs)
     solve_without = partial(method.solve_without, pairs, solution)
     return Solved(

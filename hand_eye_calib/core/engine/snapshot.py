@@ -296,6 +296,16 @@ class Snapshot:
         common_s = (min(parent.stamps_ns[-1], child.stamps_ns[-1]) - start_ns) * 1e-9
         counts = f"{len(parent)} parent and {len(child)} child poses"
         if common_s < 0:
+            offset_s = float(self.config.time_offset)
+            before, after = self.unpaired
+            overlap_s = min(before.stamps_ns[-1], after.stamps_ns[-1]) - max(
+                before.stamps_ns[0], after.stamps_ns[0]
+            )
+            if offset_s and overlap_s > 0:
+                return (
+                    f"{needed}: after the {offset_s:g} s of time_offset the streams do not overlap "
+                    f"({counts}); leave it out, they overlap without it"
+                )
             return (
                 f"{needed}: the streams do not overlap in time ({counts}, {-common_s:.3f} s "
                 "apart); if their clocks differ, set time_offset to estimate or to the seconds "

@@ -70,12 +70,24 @@ def _is_rig(arguments: Any) -> bool:
             if getattr(arguments, name, None):
                 flag = name.replace("_", "-")
                 raise ConfigError(f"--topics cannot be combined with --{flag}")
+        _refuse_files(arguments.paths)
         return True
     if len(arguments.paths) < 3 or arguments.command == "replay":
         return False
     from hand_eye_calib.offline.cli.reading import are_bags
 
     return not are_bags(arguments.paths)
+
+
+def _refuse_files(paths: Any) -> None:
+    """Raise a ConfigError if a path is a trajectory file, which has no topics."""
+    from hand_eye_calib.offline.cli.reading import is_plain_file
+
+    for path in paths:
+        if is_plain_file(path):
+            raise ConfigError(
+                f"--topics applies to bags only; {path} is a trajectory file"
+            )
 
 
 def _calibrate_rig(arguments: Any, restore_urls: Any) -> int:

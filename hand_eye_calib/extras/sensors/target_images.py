@@ -27,7 +27,7 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.sensors.cameras import Camera, read_camera
 from hand_eye_calib.formats.files import read_bytes
 
-_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".tif", ".tiff")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".tif", ".tiff")
 # Most pixels of an image that is decoded. The largest industrial sensors have 65 million.
 _MOST_PIXELS = 130_000_000
 # OpenCV's conversion from each encoding of ROS to grey. OpenCV names a Bayer pattern by its second
@@ -182,7 +182,7 @@ def _no_target(text: str) -> ConfigError:
 def images_in(folder: Path) -> list[Path]:
     """Return the image files of a folder by name; numbers in names sort by value."""
     images = [
-        path for path in folder.iterdir() if path.suffix.lower() in _IMAGE_SUFFIXES
+        path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES
     ]
     return sorted(images, key=lambda path: _by_number(path.name))
 

@@ -21,6 +21,7 @@ from hand_eye_calib.core.base.python_path import trusted_environment
 from hand_eye_calib.core.base.text import angle, length
 from hand_eye_calib.extras.simulation.options import HILLY_DRIVE, REALISTIC
 from hand_eye_calib.offline.cli.options import note, print_result, waiting_for
+from hand_eye_calib.offline.cli.paths import directory
 
 if TYPE_CHECKING:
     from numpy import ndarray
@@ -50,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "earlier demo are replaced. Default: demo_output"
     )
     parser.add_argument(
-        "--out", metavar="DIR", type=Path, default=Path("demo_output"), help=out
+        "--out", metavar="DIR", type=directory, default=Path("demo_output"), help=out
     )
 
 

@@ -18,6 +18,7 @@ from hand_eye_calib.offline.cli.options import (
     print_result,
     with_progress,
 )
+from hand_eye_calib.offline.cli.paths import directory
 
 # Names of the files in the published simulations, in which sensor 1 is the parent.
 PARENT_FILE = "T_S1_W1.txt"
@@ -62,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     add = parser.add_argument
     out = "directory to make; it must be empty or not exist"
-    add("--out", metavar="DIR", type=Path, required=True, help=out)
+    add("--out", metavar="DIR", type=directory, required=True, help=out)
     add(
         "--runs",
         type=at_least(1),

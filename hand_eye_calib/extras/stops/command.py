@@ -15,9 +15,10 @@ import numpy as np
 
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError, InputError
-from hand_eye_calib.core.base.option import Options
+from hand_eye_calib.core.base.option import Options, did_you_mean
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.registry import TARGET_IMAGES
+from hand_eye_calib.core.base.text import shown_value
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.extras.stops.calibrate import (
@@ -26,7 +27,7 @@ from hand_eye_calib.extras.stops.calibrate import (
     calibrate_stops,
 )
 from hand_eye_calib.extras.stops.pose_files import read_robot_folder
-from hand_eye_calib.extras.stops.robot_angles import read_robot_poses
+from hand_eye_calib.extras.stops.robot_angles import ROBOTS, read_robot_poses
 from hand_eye_calib.extras.stops.samples import read_arm_samples
 from hand_eye_calib.offline.cli.options import (
     FILE_OPTIONS,
@@ -83,6 +84,11 @@ def _from_two_files(
     arguments: Namespace, config: CalibratorConfig, options: Options
 ) -> SolvedInput:
     """Calibrate an arm or two sensors from two files whose rows belong together."""
+    image = Path(arguments.paths[1])
+    if image.suffix.lower() in TARGET_IMAGES["folder"]().IMAGE_SUFFIXES:
+        raise ConfigError(
+            f"{image} is an image: pass the folder of images, --target and --camera"
+        )
     if arguments.parent_angles:
         parent = _robot(arguments)
         (child,) = _read(arguments, arguments.paths[1:], options, STREAMS[1:])
@@ -160,6 +166,12 @@ def _read(
 
 def _robot(arguments: Namespace) -> Trajectory:
     """Read the poses of the hand, the first path, in the convention of its robot."""
+    robot = arguments.parent_angles
+    if robot not in ROBOTS:
+        raise ConfigError(
+            f"--parent-angles must be one of {', '.join(ROBOTS)}; got {shown_value(robot)}"
+            f"{did_you_mean(robot, ROBOTS)}"
+        )
     poses = read_robot_poses(Path(arguments.paths[0]), arguments.parent_angles)
     return Trajectory(np.arange(len(poses)), poses)
 

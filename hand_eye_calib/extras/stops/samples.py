@@ -148,6 +148,8 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
         return ArmSamples(robot, tracking, {})
     is_npz = path.suffix == ".npz"
     document: Any = read_arrays(path) if is_npz else read_yaml(path, _EXPECTED)
+    if document is None:
+        raise InputError(f"{path}: the file is empty; expected {_EXPECTED}")
     with located(path):
         samples = _opencv_samples(document) if isinstance(document, Mapping) else None
         if is_npz:

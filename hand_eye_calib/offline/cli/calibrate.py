@@ -9,7 +9,6 @@ import argparse
 import dataclasses
 import sys
 from contextlib import suppress
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hand_eye_calib.core.base.errors import ConfigError, InputError
@@ -17,6 +16,7 @@ from hand_eye_calib.core.base.registry import BESIDE_MOTION, ROUTES, SEVERAL_REC
 from hand_eye_calib.offline.beside_motion import switched_off
 from hand_eye_calib.offline.cli import options
 from hand_eye_calib.offline.cli.options import note, print_result, waiting_for
+from hand_eye_calib.offline.cli.paths import directory, refuse_wrong_paths
 
 if TYPE_CHECKING:
     from hand_eye_calib.core.base.plain import Document
@@ -88,7 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "save the result in this directory: extrinsic.yaml, extrinsic.urdf.xacro, "
         "static_transform.launch.py and report.html"
     )
-    group.add_argument("--out", metavar="DIR", type=Path, help=out)
+    group.add_argument("--out", metavar="DIR", type=directory, help=out)
     group.add_argument(
         "--label",
         metavar="NAME=VALUE",
@@ -160,6 +160,7 @@ def _run_locally(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int
 
     ``with_urls`` replaces, in plain values, the paths of downloaded copies by their URLs.
     """
+    refuse_wrong_paths(arguments.command, arguments.paths)
     # A route is the way of an extra, such as the stops of an arm. takes() raises a ConfigError for
     # arguments that exclude each other.
     routes = [route for route in ROUTES.values() if route.takes(arguments)]

@@ -27,6 +27,7 @@ from hand_eye_calib.core.base.registry import COMMANDS
 from hand_eye_calib.core.base.text import listing, shown_value
 from hand_eye_calib.formats.files import limit_memory
 from hand_eye_calib.offline.cli.options import Exit, as_typed, command_with, fail
+from hand_eye_calib.offline.cli.paths import calibrating, misplaced
 
 _EPILOG = """\
 examples:
@@ -182,8 +183,7 @@ def _run(argv: Sequence[str]) -> int:
         known = (
             f"expected one of {', '.join(COMMANDS)}{did_you_mean(command, COMMANDS)}"
         )
-        if Path(command).exists():
-            line = f"hand_eye_calib calibrate {shlex.join(argv)}"
+        if line := calibrating(argv):
             parser.error(f"{command!r} is a path; a command comes first: {line}")
         parser.error(f"invalid choice: {command!r}, {known}")
     parsers = _add_commands(parser)
@@ -193,6 +193,8 @@ def _run(argv: Sequence[str]) -> int:
         module.add_arguments(parsers[command])
     arguments, rest = parser.parse_known_args(argv)
     if rest and command != "calibrator":
+        if message := misplaced(arguments.command, rest):
+            parsers[arguments.command].error(message)
         _refuse(rest, parsers.get(command or "", parser))
     if arguments.version:
         from hand_eye_calib.core.base.version import version_of
