@@ -97,7 +97,8 @@ class VerticalPair:
         measurement = self.measurement(calibration, snapshot)
         if measurement is None:
             return calibration
-        values, H = measurement.values, measurement.jacobian
+        values = measurement.values
+        H = measurement.jacobian
         C = calibration.covariance
         S = H @ C @ H.T + measurement.covariance
         sigmas = np.sqrt(np.diag(S))
@@ -251,10 +252,12 @@ def _slope_derivatives(
     ground: changes of the normal of the ground along two horizontal directions.
     """
     if parent.source == "ground":
-        track, stream = parent, streams[0]
+        track = parent
+        stream = streams[0]
         to_parent = np.eye(3)
     else:
-        track, stream = child, streams[1]
+        track = child
+        stream = streams[1]
         # Tilts are parent minus child, so the normal of the child has a negative sign.
         to_parent = -R
     poses = stream.at(track.stamps_ns, extrapolate=True)
