@@ -42,8 +42,11 @@ def write_bag(path, topics=("/a/points", "/b/points"), raised_m=0.0, storage="mc
     """Write the bag of the machine; ``raised_m`` raises the points of the child."""
     drive, clouds = machine()
     messages = []
-    # A third sensor has no clouds.
-    third = replace(drive.child, sensor_frame="camera")
+    # A third sensor has no clouds. Its noise is 2 mm and 1 mrad.
+    noise = np.random.default_rng(3).normal(size=(len(drive.child), 6))
+    noise *= np.repeat([0.002, 0.001], 3)
+    poses = drive.child.poses @ se3.exp(noise)
+    third = replace(drive.child, poses=poses, sensor_frame="camera")
     streams = (("/a", drive.parent), ("/b", drive.child), ("/c", third))
     for topic, stream in streams:
         rows = se3.to_rows(stream.poses)

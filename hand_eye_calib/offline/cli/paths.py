@@ -12,6 +12,7 @@ from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.base.text import AXIS_UNITS, shown_value
 from hand_eye_calib.formats.bags.patterns import has_suffix_of_bag
 from hand_eye_calib.formats.files import open_regular
+from hand_eye_calib.formats.journal import has_session
 from hand_eye_calib.offline.cli.options import argument_type
 
 # Name of the file of a result, and the line that only such a file has.
@@ -95,8 +96,9 @@ def _is_result(path: Path) -> bool:
     if path.is_dir():
         if not (path / _RESULT).is_file():
             return False
-        # A session writes its result beside its journal.
-        return not any(map(has_suffix_of_bag, path.rglob("*")))
+        # A session writes its result beside its journal and its recording.
+        has_journal = any(map(has_session, [path, *path.iterdir()]))
+        return not (has_journal or any(map(has_suffix_of_bag, path.rglob("*"))))
     if path.suffix not in (".yaml", ".yml") or not path.is_file():
         return False
     with open_regular(path) as file:
