@@ -439,6 +439,17 @@ def _of_model(
     )
 
 
+def _motion_pairs(pose_pairs: PosePairs, reference: str) -> MotionPairs:
+    """Return the motion pairs of a reference; a NotEnoughDataError if there are none."""
+    pairs = motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
+    if len(pairs) == 0:
+        raise NotEnoughDataError(
+            f"reference {reference} needs more than {reference[1:] or 1} common poses; "
+            f"{len(pose_pairs)} are there"
+        )
+    return pairs
+
+
 def _solve_pairs(
     pose_pairs: PosePairs,
     config: CalibratorConfig,
@@ -481,12 +492,7 @@ def _solve_pairs(
         pairs = best.pairs
         solution: Solution = best.solution
     else:
-        pairs = motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
-        if len(pairs) == 0:
-            raise NotEnoughDataError(
-                f"reference {reference} needs more than {reference[1:] or 1} common poses; "
-                f"{len(pose_pairs)} are there"
-            )
+        pairs = _motion_pairs(pose_pairs, reference)
         solution = method.solve(pairs)
     solve_without = partial(method.solve_without, pairs, solution)
     return Solved(

@@ -161,25 +161,14 @@ def _listed_samples(path: str | Path, document: Any) -> ArmSamples:
     """Return the samples of a document that lists the stops one by one (MoveIt, easy_handeye)."""
     parameters: Mapping[str, Any] = {}
     calibration = None
-    if isinstance(document, Mapping) and "T_parent_child" in document:
-        raise InputError(
-            f"{path} is a saved result: show it with hand_eye_calib info {path}, or pass the "
-            "streams again"
-        )
     if isinstance(document, Mapping) and "samples" in document:
         parameters = _parameters_of(document)
         if not parameters.get(_TYPE):
             calibration = _calibration_beside(Path(path))
         if calibration is not None:
             parameters = _parameters_of(read_yaml(calibration, _CALIBRATION))
-        document = document["samples"]
-    elif isinstance(document, Mapping):
-        document = [*_numbered_pairs(document)]
-    if not isinstance(document, list) or not document:
-        empty = "the list of samples is empty; " if document == [] else ""
-        raise InputError(f"{path}: {empty}expected {_EXPECTED}")
     poses = []
-    for number, sample in enumerate(document, 1):
+    for number, sample in enumerate(_samples_in(path, document), 1):
         with located(f"{path}, sample {number}"):
             poses.append([pose_of(value) for value in _both_poses(sample)])
     robot, tracking = np.swapaxes(poses, 0, 1)
@@ -191,6 +180,30 @@ def _listed_samples(path: str | Path, document: Any) -> ArmSamples:
     if setup == "beside":
         robot = se3.inverse(robot)
     return ArmSamples(robot, tracking, frames, setup, calibration)
+
+
+def _samples_in(path: str | Path, document: Any) -> list[Any]:
+    """Return the samples of a document, one for each stop.
+
+    Raises
+    ------
+    InputError
+        If the document has no samples.
+    """
+    samples = document
+    if isinstance(document, Mapping):
+        if "T_parent_child" in document:
+            raise InputError(
+                f"{path} is a saved result: show it with hand_eye_calib info {path}, or pass the "
+                "streams again"
+            )
+        samples = document.get("samples")
+        if "samples" not in document:
+            samples = [*_numbered_pairs(document)]
+    if not isinstance(samples, list) or not samples:
+        empty = "the list of samples is empty; " if samples == [] else ""
+        raise InputError(f"{path}: {empty}expected {_EXPECTED}")
+    return samples
 
 
 def _parameters_of(document: Any) -> Mapping[str, Any]:

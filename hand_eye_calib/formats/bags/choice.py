@@ -222,18 +222,7 @@ def _problem_and_sources(
         problem = f"{len(sensors)} topics have poses: {_listed(sensors)}"
         return problem, [topic.name for topic in sensors]
     if sensors:
-        partners = [*_of_types(topics, {_FIX}), *clouds, *_of_types(topics, {_IMU})]
-        wheels = _of_types(topics, {messages.JOINTS_TYPE})
-        names = [topic.name for topic in (sensors[0], *partners)] + pairs
-        problem = f"only one topic has poses, {sensors[0]}"
-        if len(names) == 1 and wheels:
-            problem += (
-                f". If {sensors[0].name} is not computed from the wheels, {wheels[0].name} is "
-                "the other stream"
-            )
-            # Wheels are the parent.
-            names = [wheels[0].name, *names]
-        return problem, names
+        return _partners_of(sensors[0], topics, pairs)
     # A topic that the user has named is not among the topics.
     no_poses = "no topic has poses" if n_missing > 1 else "no other topic has poses"
     if len(pairs) >= n_missing:
@@ -246,19 +235,47 @@ def _problem_and_sources(
         return problem, [topic.name for topic in clouds]
     frames = {edge.split(":")[-1] for edge in edges}
     worlds = {edge.split(":")[0] for edge in edges}
-    if len(frames - worlds) >= n_missing and not sensors:
+    if len(frames - worlds) >= n_missing:
         listed = shortened(listing(sorted(edges)), _LONGEST_LIST)
         problem = (
             f"{no_poses}, and the transforms share a frame ({listed}; if two sensors "
             "measured them, name both)"
         )
         return problem, []
-    if n_missing == 1:
-        for type_, quantity in ((_FIX, "positions"), (_IMU, "rates")):
-            if partial := _of_types(topics, {type_}):
-                name = partial[0].name
-                return f"{no_poses}; {name} has {quantity}", [name]
-    return no_poses, []
+    partial = _partial_topic(topics) if n_missing == 1 else None
+    if partial is None:
+        return no_poses, []
+    quantity = "positions" if partial.type == _FIX else "rates"
+    return f"{no_poses}; {partial.name} has {quantity}", [partial.name]
+
+
+def _partners_of(
+    sensor: TopicInfo, topics: Sequence[TopicInfo], pairs: Sequence[str]
+) -> tuple[str, list[str]]:
+    """Return that only one topic has poses, and the possible partners of this topic.
+
+    ``pairs`` are pairs of frames in transforms.
+    """
+    partners: list[TopicInfo] = []
+    for type_ in (_FIX, messages.POINTS_TYPE, _IMU):
+        partners += _of_types(topics, {type_})
+    names = [topic.name for topic in (sensor, *partners)] + [*pairs]
+    problem = f"only one topic has poses, {sensor}"
+    wheels = _of_types(topics, {messages.JOINTS_TYPE})
+    if len(names) == 1 and wheels:
+        problem += (
+            f". If {sensor.name} is not computed from the wheels, {wheels[0].name} is "
+            "the other stream"
+        )
+        # Wheels are the parent.
+        names = [wheels[0].name, *names]
+    return problem, names
+
+
+def _partial_topic(topics: Sequence[TopicInfo]) -> TopicInfo | None:
+    """Return the first topic of positions, else of rates; None if there is none."""
+    partial = [*_of_types(topics, {_FIX}), *_of_types(topics, {_IMU})]
+    return partial[0] if partial else None
 
 
 def _advice(types: set[str], n_missing: int) -> str:

@@ -36,6 +36,17 @@ _SHORT_STEP_S = 1e-3
 _SAME = 1e-12
 
 
+def _without_stamps(table: Table) -> str:
+    """Return the message for a table without stamps."""
+    remedy = "name their column t, set `times`, or pair poses by row with `pair_by`"
+    if not isinstance(table.path, Path):
+        remedy = (
+            "read them with read_trajectory(poses, times=stamps); stops without stamps are for "
+            "calibrate_stops"
+        )
+    return f"{table.path}: the poses have no stamps; {remedy}"
+
+
 def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
     """Return the stamps of a table in nanoseconds.
 
@@ -56,16 +67,7 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
         If the table has no stamps, if stamps are too large, or if their unit is unclear.
     """
     if not table.stamps:
-        if isinstance(table.path, Path):
-            remedy = (
-                "name their column t, set `times`, or pair poses by row with `pair_by`"
-            )
-        else:
-            remedy = (
-                "read them with read_trajectory(poses, times=stamps); stops without stamps are "
-                "for calibrate_stops"
-            )
-        raise InputError(f"{table.path}: the poses have no stamps; {remedy}")
+        raise InputError(_without_stamps(table))
     unit = stamp_unit or table.stamp_unit
     stamps = table.stamps
     if not unit and min(stamps) >= _FIRST_PACKED and max(stamps) < _END_OF_PACKED:

@@ -368,15 +368,7 @@ class Goal:
         axis = AXES[limiting]
         row = progress.axes[AXIS_KEYS[axis]]
         if is_out_of_reach[limiting]:
-            return replace(
-                progress,
-                sentence=_too_small_in_words(
-                    axis, row.target, newest.allowance[limiting]
-                ),
-                limiting_axis=AXIS_KEYS[axis],
-                will_not_get_there=True,
-                target_is_too_small=True,
-            )
+            return _with_small_target(progress, axis, newest.allowance[limiting])
         is_helpful = _is_helpful(newest_motion, axis)
         is_long = self._results[-1].motion_s >= _MIN_MOTION_TO_JUDGE_S
         will_not_get_there = is_long and row.seconds_left == np.inf and not is_helpful
@@ -529,6 +521,19 @@ def _not_yet_in_words(limiting: str, ratios: FloatArray) -> str:
         ]
     verb = "is" if len(axes) == 1 else "are"
     return f"{axes_in_words(axes)} {verb} not determined well enough yet"
+
+
+def _with_small_target(progress: Progress, axis: str, allowance: float) -> Progress:
+    """Return the progress of a session whose target for an axis is below the allowance."""
+    key = AXIS_KEYS[axis]
+    sentence = _too_small_in_words(axis, progress.axes[key].target, allowance)
+    return replace(
+        progress,
+        sentence=sentence,
+        limiting_axis=key,
+        will_not_get_there=True,
+        target_is_too_small=True,
+    )
 
 
 def _too_small_in_words(axis: str, target: float, allowance: float) -> str:

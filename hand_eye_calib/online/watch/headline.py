@@ -246,6 +246,12 @@ def _activity(state: NodeState) -> Headline:
     tone = Tone.BUSY if session.level is Level.OK else Tone.ACT
     if session.is_paused:
         return _pause(tone, state, sentence)
+    return _under_way(tone, state, session)
+
+
+def _under_way(tone: Tone, state: NodeState, session: ProgressState) -> Headline:
+    """Return the headline of a session that receives poses and has not reached its goal."""
+    sentence = _sentence(session.text)
     # Until the next result, neither bars nor advice change, whatever the person does.
     slow = state.extrinsic.slow if state.extrinsic else ""
     if state.result is None:
