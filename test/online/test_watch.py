@@ -269,6 +269,8 @@ def test_bars_show_the_share_of_the_information_and_the_time_left():
     ]
     # Twice the target is a quarter of the information.
     assert bars["z"].share == pytest.approx(0.25)
+    nearly = AxisProgress(sigma=0.02001, target=0.02, seconds_left=25.0)
+    assert view_of(state(axes={"z": nearly})).bars[2].share == 0.99
     assert (bars["z"].tone, bars["z"].word) == (Tone.ACT, "takes longest")
     assert (bars["z"].sigma, bars["yaw"].sigma) == (
         "± 4 cm of 2 cm",

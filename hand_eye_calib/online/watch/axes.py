@@ -34,6 +34,10 @@ _ON_A_VEHICLE = {
     "yaw": "turn",
 }
 
+# Largest share of the bar of an axis that is not within its target. A bar that rounds to full
+# would contradict "go on".
+_LARGEST_OUTSIDE = 0.99
+
 
 def bar_of(axis: str, session: ProgressState, extrinsic: ExtrinsicState | None) -> Bar:
     """Return the bar of an axis."""
@@ -71,7 +75,7 @@ def _share_of(row: AxisProgress) -> float:
     """Return the information of an axis (1 / variance) as a share of what the target needs."""
     if row.sigma <= row.target or _has_prior(row):
         return 1.0
-    return (row.target / row.sigma) ** 2
+    return min((row.target / row.sigma) ** 2, _LARGEST_OUTSIDE)
 
 
 def _difference(axis: str, session: ProgressState) -> str:
