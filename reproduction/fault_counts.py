@@ -12,7 +12,7 @@ from hand_eye_calib.core.results.reasons import Verdict
 from hand_eye_calib.core.results.records import Severity
 from reproduction.writing import counted
 
-# A result is wrong if an axis is farther off than so many of its standard deviations.
+# A result is wrong if the error of an axis exceeds this number of its standard deviations.
 FAR_SIGMAS = 3.3
 
 

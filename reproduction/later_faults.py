@@ -34,7 +34,7 @@ _TOGETHER_S = 0.001
     unit="s gap",
 )
 def restarted(child: Trajectory, gap_s: float, _: Random) -> Trajectory:
-    """With a world of its own."""
+    """Start anew in the middle, after a gap and in a world of its own."""
     half = len(child) // 2
     poses = child.poses.copy()
     poses[half:] = se3.inverse(poses[half]) @ poses[half:]

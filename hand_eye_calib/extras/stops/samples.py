@@ -197,9 +197,8 @@ def _samples_in(path: str | Path, document: Any) -> list[Any]:
                 f"{path} is a saved result: show it with hand_eye_calib info {path}, or pass the "
                 "streams again"
             )
-        samples = document.get("samples")
-        if "samples" not in document:
-            samples = [*_numbered_pairs(document)]
+        has_list = "samples" in document
+        samples = document["samples"] if has_list else [*_numbered_pairs(document)]
     if not isinstance(samples, list) or not samples:
         empty = "the list of samples is empty; " if samples == [] else ""
         raise InputError(f"{path}: {empty}expected {_EXPECTED}")
@@ -215,8 +214,8 @@ def _parameters_of(document: Any) -> Mapping[str, Any]:
 def _calibration_beside(samples: Path) -> Path | None:
     """Return easy_handeye2's calibration with the name of the samples; None if there is none.
 
-    It is in the folder of the samples, or in the folder ``calibrations`` beside that folder. The
-    samples of easy_handeye2 have empty parameters.
+    The calibration is in the folder of the samples, or in the folder ``calibrations`` beside that
+    folder. The samples of easy_handeye2 have empty parameters.
     """
     name = samples.with_suffix(_CALIBRATION_ENDING).name
     folder = samples.absolute().parent

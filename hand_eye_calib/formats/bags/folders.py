@@ -21,6 +21,7 @@ from hand_eye_calib.formats.bags.storage import (
     reason_of,
     zstd_module,
 )
+from hand_eye_calib.formats.results import FILE_NAME
 from hand_eye_calib.formats.yaml_files import read_yaml
 
 # What a path of a bag may be, for messages.
@@ -162,7 +163,7 @@ def _no_files(folder: Path) -> str:
             f"{_listing(missing)}, and no such file is there; copy the whole "
             "bag"
         )
-    if (folder / "extrinsic.yaml").is_file():
+    if (folder / FILE_NAME).is_file():
         return f"{folder} is a saved result, not a bag: hand_eye_calib info {folder}"
     advice = "check the path"
     for subfolder in sorted(

@@ -12,11 +12,9 @@ from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.base.text import AXIS_UNITS, shown_value
 from hand_eye_calib.formats.bags.patterns import has_suffix_of_bag
 from hand_eye_calib.formats.files import open_regular
-from hand_eye_calib.formats.journal import has_session
 from hand_eye_calib.offline.cli.options import argument_type
 
-# Name of the file of a result, and the line that only such a file has.
-_RESULT = "extrinsic.yaml"
+# Line that only the file of a result has.
 _LINE_OF_RESULT = re.compile(rb"^format: hand_eye_calib/extrinsic\s*$", re.MULTILINE)
 # The line is among the first bytes of the file.
 _BEGINNING = 4096
@@ -94,7 +92,11 @@ def directory(text: str) -> Path:
 def _is_result(path: Path) -> bool:
     """Return whether a path is a saved result: its file, or its folder without a recording."""
     if path.is_dir():
-        if not (path / _RESULT).is_file():
+        # These modules load numpy, which the start of a command does not need.
+        from hand_eye_calib.formats.journal import has_session
+        from hand_eye_calib.formats.results import FILE_NAME
+
+        if not (path / FILE_NAME).is_file():
             return False
         # A session writes its result beside its journal and its recording.
         has_journal = any(map(has_session, [path, *path.iterdir()]))
