@@ -36,7 +36,7 @@ _ROBOT = """\
 
 
 def make(folder: Path) -> None:
-    """Fill a folder: ``my_drive/``, ``lidar.tum``, ``camera.tum``, ``camera.csv``, ``ins.csv``,
+    """Fill a folder: ``my_drive/``, ``my_yard/``, ``lidar.tum``, ``camera.tum``, ``camera.csv``, ``ins.csv``,
     ``gnss.csv``, ``imu.csv``, ``flange.tum``, ``camera_on_arm.tum``,
     ``samples.yaml``, ``robot.urdf``, ``robot_lidar.tum``, ``wheels.csv``, and results.
 
@@ -65,6 +65,7 @@ def _write_drive(folder):
     imu_ns, rates = _rates(camera)
     places = _geodetic(camera)
     _write_bag(folder / "my_drive", lidar, camera, places, (imu_ns, rates))
+    _write_bag_of_two_lidars(folder / "my_yard", lidar, camera)
     _write_ins(folder / "ins.csv", camera, places)
     columns = _after_times(camera.stamps_ns, places)
     _write_csv(folder / "gnss.csv", "time,latitude,longitude,height", columns)
@@ -158,6 +159,17 @@ def _write_bag(path, lidar, camera, places, rates):
         )
         for stamp_ns, rate in zip(rates[0].tolist(), rates[1].tolist(), strict=True):
             writer.write(connection, stamp_ns, imu(rate, stamp_ns=stamp_ns))
+
+
+def _write_bag_of_two_lidars(path, front, rear):
+    """Odometry of a front and a rear lidar."""
+    storage = rosbag2.StoragePlugin.MCAP
+    with rosbag2.Writer(path, version=9, storage_plugin=storage) as writer:
+        streams = {
+            "/front/odometry": (front, _ODOMETRY),
+            "/rear/odometry": (rear, _ODOMETRY),
+        }
+        write_streams(writer, streams, "mcap")
 
 
 def _write_ins(path, trajectory, places):
